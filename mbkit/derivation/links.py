@@ -301,14 +301,14 @@ class Links:
         q, v = kin.coordinates(joint), kin.velocities(joint)
         R, p = joint.type.placement(kin.formulas, values, q)
         link = Link(joint, parent, _factors(R_J, self._short), [_rounded(x) for x in p_J])
-        link.turn, link.slide = [Matrix([[_number(x) for x in row] for row in R])], [_number(x) for x in p]
+        link.turn, link.slide = [Matrix([[_rounded(x) for x in row] for row in R])], [_rounded(x) for x in p]
         first, ratio = self._velocities(joint), values.ratio if joint.mimic else 1.0
         for k in range(joint.type.nv):
             unit = [1.0 if i == k else 0.0 for i in range(joint.type.nv)]
             linear, angular = joint.type.twist(kin.formulas, values, q, unit)
-            link.columns.append((first + k, [ratio * _number(x) for x in (*linear, *angular)]))
+            link.columns.append((first + k, [ratio * _rounded(x) for x in (*linear, *angular)]))
         linear, angular = joint.type.twist(kin.formulas, values, q, v)
-        link.rate = [_number(x) for x in (*linear, *angular)]
+        link.rate = [_rounded(x) for x in (*linear, *angular)]
         link.drift = _drift(link.rate, kin)
         link.rotors = [x * ratio * ratio for x in values.armature]
         self.links.append(link)
@@ -370,10 +370,6 @@ def _movable(link: Link, own: Inertia) -> Inertia:
 
 
 def _rounded(x: Any) -> Any:
-    return x if isinstance(x, ca.SX) else float(x)
-
-
-def _number(x: Any) -> Any:
     return x if isinstance(x, ca.SX) else float(x)
 
 
