@@ -89,7 +89,7 @@ def draw(data, folder):
     """Write ``operations.svg`` to a folder."""
     style()
     folder.mkdir(parents=True, exist_ok=True)
-    drawn(data).savefig(folder / "operations.svg", transparent=True, metadata={"Date": None})
+    drawn(data).savefig(folder / "operations.svg", transparent=True, bbox_inches="tight", metadata={"Date": None})
     plt.close("all")
 
 
