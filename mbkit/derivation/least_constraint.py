@@ -228,7 +228,7 @@ _SHRINK, _LAST_REACH = 0.3, 1e-4
 
 @lru_cache(maxsize=64)
 def loses_digits(model: Model) -> bool:
-    """Return whether forward dynamics by LᵀDL of the mass matrix loses more than some 6 digits at some pose.
+    """Return whether eliminating one acceleration after the other loses more than some 5 digits at some pose.
 
     Decided at nominal parameters. False where the orthogonal solver is not available: energies, a parameter without a
     value, a tree too large, a mass matrix singular at every pose, inertias that are no sum of squares.

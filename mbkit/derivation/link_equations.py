@@ -1,8 +1,11 @@
 """The equations of motion from link to link: fewer operations than derivatives of the energies take.
 
 The same quantities as `mbkit.derivation.equations`, which derives them from T and V: inverse dynamics by d'Alembert's
-principle (`mbkit.derivation.link_mechanics`), M and forward dynamics from Gauss's function
-(`mbkit.derivation.gauss_elimination`). The energies stay those of the bodies.
+principle (`mbkit.derivation.link_mechanics`), M by composite bodies (`mbkit.derivation.composite_bodies`), forward
+dynamics from Gauss's function (`mbkit.derivation.gauss_elimination`). The energies stay those of the bodies.
+
+Forces and accelerations are derived twice: in short frames, with matter moved, and in the description's own. The short
+form is taken where it has fewer operations and both agree to rounding at hard poses.
 """
 
 from __future__ import annotations

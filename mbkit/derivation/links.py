@@ -14,7 +14,8 @@ Osuka 1990). Matter whose motion a joint does not change is moved to the parent:
 moment along z and one transverse moment, behind a slide the whole inertia, behind a ball joint the mass. T is the same
 function of q and v, and V up to a constant. Matter that nothing moves vanishes.
 
-Numbers are moved in 120 bits and rounded once. Numbers with parameters stay where they are.
+Numbers are moved in 120 bits and rounded once. Numbers with parameters stay where they are. The plain links have no
+matter moved, and the frames and constants of the description.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ class LagrangianDynamics(Dynamics):
     ``"links"`` eliminates one acceleration after the other, link by link, from Gauss's function, and M and inverse
     dynamics are those of the links too; with the operations of the articulated-body, composite-rigid-body and recursive
     Newton-Euler algorithms (Featherstone 2008, ch. 5 to 7). ``"mass matrix"`` derives every term from the bodies'
-    energies by Lagrange's equations, and factors M = LᵀDL: an independent route, with two to five times as many
+    energies by Lagrange's equations, and factors M = LᵀDL: an independent route, with about two to four times as many
     operations. ``"least constraint"`` makes the columns of the bodies' velocities orthogonal, and forms no M.
 
     Elimination loses M_kk/D_k of the digits, D_k being the remainder of a diagonal entry once all beyond joint k gives
