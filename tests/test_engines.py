@@ -63,8 +63,11 @@ def calls(dyn, q, v, a, tau):
     for name, letters in ARGUMENTS.items():
         if name in dyn.supports:
             given = {"q": q, "v": v, "a": a, "tau": tau}
-            more = {"frame": "tip"} if name in ("pose", "jacobian") else {}
-            yield name, partial(getattr(dyn, name), **more), {x: given[x] for x in letters}
+            method = getattr(dyn, name)
+            takes = inspect.signature(method).parameters
+            more = {"frame": "tip"} if "frame" in takes else {}
+            more |= {"wrenches": {"tip": np.arange(1.0, 7.0)}} if "wrenches" in takes else {}
+            yield name, partial(method, **more), {x: given[x] for x in letters}
 
 
 def refusal(call, given):
@@ -90,7 +93,7 @@ def test_engines_agree_on_trees_of_every_joint_kind(engine, seed, mimic):
     for name, letters in VECTORS.items():
         args = arguments(letters, q, v, a, tau)
         assert off(getattr(other, name)(*args), getattr(own, name)(*args)) < close(name, own, q), name
-    for axes in ("world", "body"):
+    for axes in ("local", "world", "local_world_aligned"):
         assert off(other.jacobian(q, "tip", axes), own.jacobian(q, "tip", axes)) < CLOSE
     assert off(other.pose(q, "tip"), own.pose(q, "tip")) < CLOSE
     assert off(other.coriolis_force(q, v), own.coriolis_force(q, v)) < CLOSE
@@ -451,7 +454,7 @@ def test_unknown_names_suggest_near_ones():
     for engine in ENGINES:
         assert np.array_equal(mb.dynamics(model, engine).pose(model.neutral(), "world"), np.eye(4))
     with pytest.raises(InputError, match="axes"):
-        mb.dynamics(model).jacobian(model.neutral(), "wrist_3_link", "local")
+        mb.dynamics(model).jacobian(model.neutral(), "wrist_3_link", "mine")
     with pytest.raises(InputError, match="Model"):
         mb.dynamics("ur5")
 

@@ -363,7 +363,7 @@ def test_functions_have_the_stated_names_and_dense_shapes():
     model = random_tree(2, 10)
     dyn = mb.dynamics(model, "lagrangian")
     one = {"kinetic_energy": (1, 1), "potential_energy": (1, 1), "energy_rate": (1, 1)}
-    square = ("mass_matrix", "coriolis_matrix")
+    square = ("mass_matrix", "mass_matrix_inverse", "coriolis_matrix")
     for name, arguments in FUNCTIONS.items():
         if name.endswith("derivatives"):
             continue
@@ -373,7 +373,7 @@ def test_functions_have_the_stated_names_and_dense_shapes():
         assert [f.size1_in(k) for k in range(f.n_in())] == [model.nq if n == "q" else model.nv for n in arguments]
         assert f.size_out(0) == one.get(name, (model.nv, model.nv if name in square else 1))
         assert f.sparsity_out(0).is_dense()
-    J = dyn.equations.jacobian("tip", "world")
+    J = dyn.equations.body_quantity("jacobian", ("tip",), "world")
     assert J.size_out(0) == (6, model.nv)
     assert J.sparsity_out(0).is_dense()
 

@@ -196,7 +196,7 @@ def test_poses_and_jacobians():
     oracle, own = mb.dynamics(model, "oracle"), mb.dynamics(model, "lagrangian")
     q, *_ = states(model, 3)
     assert np.abs(oracle.pose(q, "tip") - own.pose(q, "tip")).max() < 1e-14
-    for axes in ("world", "body"):
+    for axes in ("local", "world", "local_world_aligned"):
         assert np.abs(oracle.jacobian(q, "tip", axes) - own.jacobian(q, "tip", axes)).max() < 1e-13
         high, _ = oracle.extended("jacobian", q, "tip", axes)
         assert np.array_equal(high, oracle.jacobian(q, "tip", axes))

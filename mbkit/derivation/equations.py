@@ -20,14 +20,14 @@ import casadi as ca
 import numpy as np
 
 from mbkit.derivation import kinematics as energies
+from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyMotion
 from mbkit.derivation.fingerprint import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
-from mbkit.derivation.kinematics import Kinematics, add, constant_transposed_times
+from mbkit.derivation.kinematics import Kinematics
 from mbkit.derivation.least_constraint import LeastConstraint, squares
 from mbkit.derivation.mass_matrix_solve import elimination_order, solve
 from mbkit.derivation.model_values import Constants, scalar
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
-from mbkit.model.joint_types import cross3
 
 Elimination = Literal["links", "mass matrix", "least constraint"]
 ELIMINATIONS: Final[tuple[Elimination, ...]] = get_args(Elimination)
@@ -35,6 +35,7 @@ ELIMINATIONS: Final[tuple[Elimination, ...]] = get_args(Elimination)
 #: Name of each quantity -> the arguments of its function.
 FUNCTIONS: Final = {
     "mass_matrix": ("q",),
+    "mass_matrix_inverse": ("q",),
     "coriolis_matrix": ("q", "v"),
     "gravity": ("q",),
     "nle": ("q", "v"),
@@ -213,6 +214,11 @@ class Equations:
         return solve(self.mass_matrix, f, self.elimination_order)
 
     @cached_property
+    def mass_matrix_inverse(self) -> Any:
+        """M⁻¹, by the same elimination as forward dynamics."""
+        return self.over_mass(ca.SX.eye(self.model.nv))
+
+    @cached_property
     def elimination_order(self) -> tuple[int, ...]:
         """Velocity indices with every parent before its children."""
         return elimination_order(self.model)
@@ -273,27 +279,19 @@ class Equations:
         given = {**dict(zip(argument_names, arguments, strict=True)), **self.extra_arguments}
         return ca.Function(name, list(given.values()), dense, list(given), labels)
 
-    def pose(self, frame: str) -> ca.Function:
-        """Return X_WF(q), 4 by 4."""
-        body, f = self._frame(frame)
-        columns = [self.kin.to_world(body, [row[k] for row in f.rotation], 0.0) for k in range(3)]
-        columns.append(self.kin.to_world(body, f.translation))
-        top = ca.horzcat(*(ca.vertcat(*c) for c in columns))
-        X = ca.vertcat(ca.SX(top), ca.SX([[0.0, 0.0, 0.0, 1.0]]))
-        return self.named("pose", ["q"], [self.q], X)
+    @cached_property
+    def motion(self) -> BodyMotion:
+        """Motion, momentum and loads of the bodies."""
+        return BodyMotion(self.kin, self.a)
 
-    def jacobian(self, frame: str, axes: str) -> ca.Function:
-        """Return the Jacobian of a frame's velocity, linear then angular."""
-        body, f = self._frame(frame)
-        linear, angular = self.kin.twists[body]
-        linear = add(linear, cross3(angular, f.translation))
-        if axes == "world":
-            halves = [self.kin.to_world(body, x, 0.0) for x in (linear, angular)]
-        else:
-            halves = [constant_transposed_times(f.rotation, x) for x in (linear, angular)]
-        twist = ca.vertcat(*(ca.SX(x) for half in halves for x in half))
-        return self.named("jacobian", ["q"], [self.q], ca.jacobian(twist, self.v))
-
-    def _frame(self, name: str) -> tuple[str, Any]:
-        frame = self.model.frame(name)
-        return frame.body, self.kin.values.frame(frame)
+    def body_quantity(self, name: str, *extra: Any) -> ca.Function:
+        """Return one of `BODY_QUANTITIES` as a function; `extra` are its names of frames and the like."""
+        quantity, given = BODY_QUANTITIES[name], {"q": self.q, "v": self.v, "a": self.a}
+        names = quantity.arguments
+        if "wrenches" in names:
+            *_, frames, _ = extra
+            wrenches = given["wrenches"] = ca.SX.sym("wrenches", 6 * len(frames))
+            extra = (*extra, wrenches)
+            # Where none acts there is no such argument.
+            names = names if frames else tuple(x for x in names if x != "wrenches")
+        return self.named(name, names, [given[n] for n in names], quantity.make(self.motion, *extra))

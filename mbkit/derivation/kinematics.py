@@ -116,6 +116,10 @@ class Kinematics:
             )
         return out
 
+    def carrier(self, body: str) -> Joint:
+        """Return the joint that carries a body."""
+        return self._carrier[body]
+
     def to_parent(self, joint: Joint, x: Vector, weight: Any = 1.0) -> Vector:
         """Return R_PC x + weight · p_PC: a point (weight 1), vector (0) or first moment (mass)."""
         R, p = self.placements[joint.name]

@@ -13,6 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, all_finite, batch_of, real
+from mbkit.engines import frames_and_momenta, loads
+from mbkit.engines.frames_and_momenta import LOCAL, FramesAndMomenta, axes_named
+from mbkit.engines.loads import Loads, Wrenches
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import DEFAULT_METHOD, Method, explicit_method
@@ -23,7 +26,9 @@ from mbkit.model.manifold import NEAR_UNIT
 
 QUANTITIES: Final = (
     *("mass_matrix", "coriolis_matrix", "coriolis_force", "gravity", "nle", "passive"),
-    *("inverse_dynamics", "forward_dynamics", "kinetic_energy", "potential_energy", "pose", "jacobian", "function"),
+    *("inverse_dynamics", "forward_dynamics", "kinetic_energy", "potential_energy", "function"),
+    *frames_and_momenta.QUANTITIES,
+    *loads.QUANTITIES,
 )
 
 #: Bits of a double's significand.
@@ -97,14 +102,15 @@ def scalar(value: Array) -> Any:
     return value if value.ndim else float(value)
 
 
-class Dynamics:
+class Dynamics(FramesAndMomenta, Loads):
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
     Every method takes one state or a batch with one leading axis, checks shapes, finite numbers and unit quaternions,
     and returns new arrays.
 
-    An adapter defines a method for each quantity, named after it: `_mass_matrix(q)`, `_nle(q, v)`, `_pose(q, frame)`.
-    Its arguments are checked float64 arrays. Derivatives are stacked, (3, nv, nv) or (N, 3, nv, nv).
+    An adapter defines a method for each quantity, named after it: `_mass_matrix(q)`, `_nle(q, v)`,
+    `_velocity(q, v, frames, axes)`. States are checked float64 arrays, and come first; of frames there are several, and
+    their values are stacked: (k, 6) or (N, k, 6). Derivatives are stacked, (3, nv, nv) or (N, 3, nv, nv).
 
     Raises
     ------
@@ -148,7 +154,8 @@ class Dynamics:
     @property
     def supports(self) -> frozenset[str]:
         """Names of the quantities that this engine can give."""
-        return frozenset(QUANTITIES) - frozenset(self.refuses)
+        needed = {x: loads.FOLLOWING.get(x, x) for x in QUANTITIES}
+        return frozenset(x for x, y in needed.items() if y not in self.refuses and hasattr(self, f"_{y}"))
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.model.name!r}: nq={self.model.nq}, nv={self.model.nv}>"
@@ -229,13 +236,29 @@ class Dynamics:
         """Return the generalized force of springs and dampers, shape (nv,) or (N, nv)."""
         return self._evaluate("passive", q=q, v=v)
 
-    def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
-        """Return τ = M a + nle - τ_passive, shape (nv,) or (N, nv)."""
-        return self._evaluate("inverse_dynamics", q=q, v=v, a=a)
+    def inverse_dynamics(
+        self, q: ArrayLike, v: ArrayLike, a: ArrayLike, wrenches: Wrenches | None = None, axes: str = LOCAL
+    ) -> Array:
+        """Return τ = M a + nle - τ_passive - Σ Jᵀ w, shape (nv,) or (N, nv).
 
-    def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
-        """Return v̇ = M⁻¹ (τ + τ_passive - nle), shape (nv,) or (N, nv)."""
-        return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
+        `wrenches` on frames and their `axes` are those of `generalized_force`.
+        """
+        if not wrenches:
+            return self._evaluate("inverse_dynamics", q=q, v=v, a=a)
+        frames, w = self._stacked_wrenches(wrenches)
+        return self._evaluate("inverse_dynamics_with_wrenches", frames, axes_named(axes), q=q, v=v, a=a, wrenches=w)
+
+    def forward_dynamics(
+        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: Wrenches | None = None, axes: str = LOCAL
+    ) -> Array:
+        """Return v̇ = M⁻¹ (τ + τ_passive - nle + Σ Jᵀ w), shape (nv,) or (N, nv).
+
+        `wrenches` on frames and their `axes` are those of `generalized_force`.
+        """
+        if not wrenches:
+            return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
+        frames, w = self._stacked_wrenches(wrenches)
+        return self._evaluate("forward_dynamics_with_wrenches", frames, axes_named(axes), q=q, v=v, tau=tau, wrenches=w)
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> Any:
         """Return ½ vᵀ M v in J, a float or shape (N,)."""
@@ -247,21 +270,6 @@ class Dynamics:
         Gravity's part is zero where every centre of mass is at the world's origin.
         """
         return scalar(self._evaluate("potential_energy", q=q))
-
-    def pose(self, q: ArrayLike, frame: str) -> Array:
-        """Return X_WF of a frame or body, shape (4, 4) or (N, 4, 4)."""
-        return self._evaluate("pose", self.model.frame(frame), q=q)
-
-    def jacobian(self, q: ArrayLike, frame: str, axes: str = "world") -> Array:
-        """Return the Jacobian of the velocity of a frame or body, shape (6, nv) or (N, 6, nv).
-
-        The velocity is that of the frame's origin, linear then angular, written in the axes of the world or, with
-        ``axes="body"``, of the frame.
-        """
-        place = self.model.frame(frame)
-        if axes not in ("world", "body"):
-            raise InputError(f"axes: expected 'world' or 'body', got {axes!r}")
-        return self._evaluate("jacobian", place, axes, q=q)
 
     def function(self, name: str) -> Any:
         """Return a quantity as a `casadi.Function`; the lagrangian engine only.
@@ -381,7 +389,7 @@ class Dynamics:
                 good = error.args[0]
         if not good.all():
             # A mass matrix that is singular at the start has a message of its own.
-            self.forward_dynamics(**states)
+            self.forward_dynamics(states["q"], states["v"], states["tau"])
             sample = f" in sample {int(np.argmin(good))}" if good.ndim else ""
             raise NumericalError(
                 f"{self.engine}: step of {self.model.name} by {chosen.name}: the state is not finite{sample} after "
@@ -447,7 +455,10 @@ class Dynamics:
 
     def _states(self, arguments: dict[str, ArrayLike]) -> tuple[dict[str, Array], int | None]:
         """Return arguments as checked arrays, all single states or all batches, and the size of the batch."""
+        wrenches = arguments.pop("wrenches", None)
         checked = {k: self.model.check_q(x) if k == "q" else self.model.check_v(x, k) for k, x in arguments.items()}
+        if wrenches is not None:
+            checked["wrenches"] = np.asarray(wrenches)
         size = batch_of(**checked)
         if size is not None:
             checked = {k: np.broadcast_to(x, (size, x.shape[-1])) for k, x in checked.items()}
@@ -541,9 +552,10 @@ class MappedDynamics(Dynamics):
         out[self._v_index] = f
         return out
 
-    def _pose(self, q: Array, frame: Frame) -> Array:
-        X = np.eye(4)
-        X[:3, :3], X[:3, 3] = self._placement(q, frame)
+    def _pose(self, q: Array, frames: tuple[Frame, ...]) -> Array:
+        X = np.tile(np.eye(4), (len(frames), 1, 1))
+        for k, frame in enumerate(frames):
+            X[k, :3, :3], X[k, :3, 3] = self._placement(q, frame)
         return X
 
     def _placement(self, q: Array, frame: Frame) -> tuple[Array, Array]:

@@ -15,11 +15,12 @@ from mbkit._check import Array, count, finite_array, real
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
+from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity
 from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import Dynamics, scalar
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
-from mbkit.model import Frame, Model
+from mbkit.model import Model
 
 if TYPE_CHECKING:
     from mbkit.derivation.steps.fixed import Part
@@ -35,11 +36,21 @@ def _column(name: str, value: ArrayLike) -> Array:
     return finite_array(f"parameter {name!r}", value, (len(np.asarray(value)),))
 
 
+def _trimmed(quantity: BodyQuantity) -> Callable[[Array], Array]:
+    if quantity.axes == 1:
+        return lambda x: x[..., 0]
+    if quantity.axes == 2:
+        return lambda x: x
+    rows = quantity.rows
+    return lambda x: x.reshape(*x.shape[:-2], x.shape[-2] // rows, rows, x.shape[-1])
+
+
 #: Three derivatives side by side, which `_TRIM` puts one behind the other.
 _STACKED: Final = "stacked"
 #: What one compiled function gives, and how its result loses the axes that the quantity does not have.
 _TRIM: Final[dict[str, Callable[[Array], Array]]] = {
-    **dict.fromkeys(("mass_matrix", "coriolis_matrix", "pose", "jacobian"), lambda x: x),
+    **{name: _trimmed(quantity) for name, quantity in BODY_QUANTITIES.items()},
+    **dict.fromkeys(("mass_matrix", "mass_matrix_inverse", "coriolis_matrix"), lambda x: x),
     _STACKED: lambda x: x.reshape(*x.shape[:-1], 3, x.shape[-1] // 3).swapaxes(-2, -3),
     **dict.fromkeys(
         ("coriolis_force", "gravity", "nle", "passive", "inverse_dynamics", "forward_dynamics"), lambda x: x[..., 0]
@@ -53,16 +64,19 @@ def _quick(checked: _Function) -> _Function:
 
     A common one with *arguments would cost 0.2 µs a call.
     """
-    name, arguments = checked.__name__, ", ".join([*signature(checked).parameters][1:])
+    name, given = checked.__name__, [*signature(checked).parameters.values()][1:]
+    arguments = ", ".join(x.name for x in given if x.default is x.empty)
+    loads = "".join(f", {x.name}={x.default!r}" for x in given if x.default is not x.empty)
+    rest = "".join(f", {x.name}" for x in given if x.default is not x.empty)
     text = f"""
-def {name}(self, {arguments}):
-    short = self._short.get(("{name}",))
+def {name}(self, {arguments}{loads}):
+    short = self._short.get(("{name}",)){" if wrenches is None else None" if loads else ""}
     if short is not None and not self._parametric:
         single, shape, batch, _ = short
         out = empty(shape)
         if single({arguments}, out) or (out := batch({arguments})) is not None:
             return {"scalar(out)" if name.endswith("energy") else "out"}
-    return checked(self, {arguments})
+    return checked(self, {arguments}{rest})
 """
     scope: dict[str, Any] = {"checked": checked, "empty": np.empty, "scalar": scalar, "__name__": __name__}
     exec(text, scope)
@@ -72,6 +86,22 @@ def {name}(self, {arguments}):
 def _term(name: str) -> Callable[..., Any]:
     def evaluate(self: LagrangianDynamics, *arguments: Array) -> Array:
         return self._trimmed(name, *arguments)
+
+    return evaluate
+
+
+def _names(value: Any) -> Any:
+    """Return the names of frames or joints, and anything else as it is."""
+    return tuple(x.name for x in value) if type(value) is tuple else value
+
+
+def _body_term(name: str) -> Callable[..., Any]:
+    states = BODY_QUANTITIES[name].arguments
+
+    def evaluate(self: LagrangianDynamics, *given: Any) -> Array:
+        # Without frames to act on there is no argument of wrenches.
+        n = sum(isinstance(x, np.ndarray) for x in given[: len(states)])
+        return _TRIM[name](self._machine(name, *map(_names, given[n:]))(*given[:n])[0])
 
     return evaluate
 
@@ -150,7 +180,7 @@ class LagrangianDynamics(Dynamics):
         chosen = self._chosen or self.model.parameters
         return f"{digest} by {self.elimination}" if chosen else digest
 
-    def code(self, name: str, *extra: str, make: Callable[[], Any] | None = None) -> Any:
+    def code(self, name: str, *extra: Any, make: Callable[[], Any] | None = None) -> Any:
         """Return a `Compiled` or `Machine` of a quantity, or of what `make` derives from this model.
 
         Its arguments are not checked.
@@ -161,12 +191,14 @@ class LagrangianDynamics(Dynamics):
             def derive() -> Any:
                 if make is not None:
                     return make()
-                if name in ("pose", "jacobian", _STACKED):
-                    return getattr(self.equations, name)(*extra)
+                if name in BODY_QUANTITIES:
+                    return self.equations.body_quantity(name, *extra)
+                if name == _STACKED:
+                    return self.equations.stacked(*extra)
                 return self.equations.function(name)
 
             with DERIVING:
-                code = executable((self.form, *key), derive, compile=self.compile)
+                code = executable((self.form, *map(str, key)), derive, compile=self.compile)
             if name in _TRIM and not isinstance(code, Machine):
                 # Loads LLVM, which interpreting never needs.
                 from mbkit.engines.compiled_calls import quantity_call
@@ -176,7 +208,7 @@ class LagrangianDynamics(Dynamics):
             self._machines[key] = code
         return self._machines[key]
 
-    def _machine(self, name: str, *extra: str) -> Callable[..., list[Array]]:
+    def _machine(self, name: str, *extra: Any) -> Callable[..., list[Array]]:
         code = self.code(name, *extra)
         return lambda *arguments: code(*arguments, *self._trailing(arguments[0]), threads=self.threads)
 
@@ -258,7 +290,7 @@ class LagrangianDynamics(Dynamics):
         return super()._states(arguments)
 
     def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
-        short = self._short.get((quantity, more[0].name, *more[1:]) if more else (quantity,))
+        short = self._short.get((quantity, *map(_names, more)))
         if short is not None:
             own = (*arguments.values(), *self._trailing(arguments["q"])) if self._parametric else arguments.values()
             one = np.empty(short.shape)
@@ -281,6 +313,8 @@ class LagrangianDynamics(Dynamics):
     _mass_matrix, _coriolis_matrix, _coriolis_force = map(_term, ("mass_matrix", "coriolis_matrix", "coriolis_force"))
     _gravity, _nle, _passive, _inverse_dynamics = map(_term, ("gravity", "nle", "passive", "inverse_dynamics"))
     _kinetic_energy, _potential_energy, _energy_rate = map(_term, ("kinetic_energy", "potential_energy", "energy_rate"))
+
+    _mass_matrix_inverse = _term("mass_matrix_inverse")
 
     def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
         """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
@@ -350,17 +384,15 @@ class LagrangianDynamics(Dynamics):
             held = self._steps[method.name] = method, step
         return held[1].run(q, v, tau, dt, *self._trailing(q), threads=self.threads)[:2]
 
-    def _pose(self, q: Array, frame: Frame) -> Array:
-        return self._machine("pose", frame.name)(q)[0]
-
-    def _jacobian(self, q: Array, frame: Frame, axes: str) -> Array:
-        return self._machine("jacobian", frame.name, axes)(q)[0]
-
     def _function(self, name: str) -> Any:
         f = self.equations.function(name)
         given = f.sx_in()
         # Users inline and differentiate it: small is worth a search.
         return ca.Function(name, given, f.call(given), f.name_in(), f.name_out(), {"cse": True})
+
+
+for _name in BODY_QUANTITIES:
+    setattr(LagrangianDynamics, f"_{_name}", _body_term(_name))
 
 
 def _restore(

@@ -22,12 +22,16 @@ from mbkit._check import Array
 from mbkit.codegen.extended_precision import Backend, Extended, arithmetic, digits, product, solve
 from mbkit.codegen.program import program
 from mbkit.derivation import FUNCTIONS, equations_of
+from mbkit.derivation.body_motion import BODY_QUANTITIES
 from mbkit.engines.base import Dynamics, scalar
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.model import Frame, Model
+from mbkit.model import Model
 
 #: Quantity -> its arguments, as in `Dynamics`.
-_ARGUMENTS: Final = {**FUNCTIONS, "pose": ("q",), "jacobian": ("q",)}
+_ARGUMENTS: Final = {
+    **FUNCTIONS,
+    **{name: tuple(x for x in of.arguments if x != "wrenches") for name, of in BODY_QUANTITIES.items()},
+}
 #: What one function gives together, in this order.
 _TERMS: Final = ("mass_matrix", "coriolis_force", "gravity", "passive", "nle")
 
@@ -46,6 +50,22 @@ def _term(name: str) -> Callable[..., Any]:
 
 def _single(name: str) -> Callable[..., Any]:
     return lambda self, *states: self._run((name,), *states)[0][:, 0, 0]
+
+
+def _body_term(name: str) -> Callable[..., Any]:
+    quantity = BODY_QUANTITIES[name]
+
+    def evaluate(self: OracleDynamics, *given: Any) -> Any:
+        n = sum(isinstance(x, np.ndarray) for x in given[: len(quantity.arguments)])
+        extra = (tuple(x.name for x in e) if isinstance(e, tuple) else e for e in given[n:])
+        out = self._run((name, *extra), *given[:n])[0]
+        if quantity.axes == 1:
+            return out[:, :, 0]
+        if quantity.axes == 2:
+            return out
+        return out.reshape(len(out), out.shape[1] // quantity.rows, quantity.rows, out.shape[2])
+
+    return evaluate
 
 
 def _stack(name: str) -> Callable[..., Any]:
@@ -97,7 +117,9 @@ class OracleDynamics(Dynamics):
             )
         #: One row, the same for all states; nothing where no number is a symbol.
         self._constants = [values[None]] if values.size else []
-        self._programs: dict[tuple[str, ...], Extended] = {}
+        self._programs: dict[tuple[Any, ...], Extended] = {}
+        #: The last value, in all its digits.
+        self._last: Any = None
         self._held: tuple[_Key, _Key, dict[str, Any]] | None = None
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
@@ -145,25 +167,22 @@ class OracleDynamics(Dynamics):
     # The methods of quantities take batches, and return 113-bit numbers.
 
     def _value(self, method: Callable[..., Any], states: list[Array], more: tuple[Any, ...], size: int | None) -> Any:
-        high, _ = self._arithmetic.pair(method(*(np.atleast_2d(x) for x in states), *more))
+        self._last = method(*(np.atleast_2d(x) for x in states), *more)
+        high, _ = self._arithmetic.pair(self._last)
         return high[0] if size is None else high
 
     def _exact(self, quantity: str, arguments: tuple[Any, ...]) -> Any:
-        if quantity not in _ARGUMENTS:
+        names = _ARGUMENTS.get(quantity)
+        if names is None:
             raise UnknownNameError("quantity", str(quantity), _ARGUMENTS)
-        names, model = _ARGUMENTS[quantity], self.model
-        more: list[Any] = list(arguments[len(names) :])
-        if len(arguments) < len(names) or (more and quantity not in ("pose", "jacobian")):
+        if len(arguments) < len(names) or (len(arguments) > len(names) and quantity not in BODY_QUANTITIES):
             raise InputError(f"{quantity}: expected {', '.join(names)}, got {len(arguments)} arguments")
-        if quantity in ("pose", "jacobian"):
-            getattr(self, quantity)(*arguments)  # for its checks
-            more[0] = model.frame(more[0])
-        states, size = self._states(dict(zip(names, arguments, strict=False)))
-        value = self._method(quantity)(*(np.atleast_2d(x) for x in states.values()), *more)
-        value = value[0] if size is None else value
-        high, _ = self._arithmetic.pair(value)
-        self._require_finite(quantity, high, states)
-        return value
+        if quantity.endswith("derivatives"):
+            out = self._evaluate(quantity, **dict(zip(names, arguments, strict=True)))
+        else:
+            out = np.asarray(getattr(self, quantity)(*arguments))
+        # The method has checked all, and gave its value the shape.
+        return self._last.reshape(out.shape)
 
     def _normalized(self, q: Array) -> Any:
         """Return q with quaternions of unit length."""
@@ -175,15 +194,15 @@ class OracleDynamics(Dynamics):
             out[:, start : start + 4] = own.divide(part, length[:, None])
         return out
 
-    def _run(self, name: tuple[str, ...], q: Array, *arguments: Any) -> list[Any]:
+    def _run(self, name: tuple[Any, ...], q: Array, *arguments: Any) -> list[Any]:
         if name not in self._programs:
             self._programs[name] = Extended(program(self._function_of(*name)), self._arithmetic)
         return self._programs[name](self._normalized(q), *arguments, *self._constants)
 
-    def _function_of(self, name: str, *extra: str) -> ca.Function:
+    def _function_of(self, name: str, *extra: Any) -> ca.Function:
         eq = self.equations
         if name != "terms":
-            return getattr(eq, name)(*extra) if name in ("pose", "jacobian") else eq.function(name)
+            return eq.body_quantity(name, *extra) if name in BODY_QUANTITIES else eq.function(name)
         outs = [ca.densify(getattr(eq, x)) for x in _TERMS]
         return ca.Function("terms", [eq.q, eq.v, *eq.extra_arguments.values()], outs)
 
@@ -219,14 +238,15 @@ class OracleDynamics(Dynamics):
     def _coriolis_matrix(self, q: Array, v: Array) -> Any:
         return self._run(("coriolis_matrix",), q, v)[0]
 
+    def _mass_matrix_inverse(self, q: Array) -> Any:
+        return self._run(("mass_matrix_inverse",), q)[0]
+
     _inverse_dynamics_derivatives = _stack("inverse_dynamics_derivatives")
     _forward_dynamics_derivatives = _stack("forward_dynamics_derivatives")
     _kinetic_energy, _potential_energy, _energy_rate = map(
         _single, ("kinetic_energy", "potential_energy", "energy_rate")
     )
 
-    def _pose(self, q: Array, frame: Frame) -> Any:
-        return self._run(("pose", frame.name), q)[0]
 
-    def _jacobian(self, q: Array, frame: Frame, axes: str = "world") -> Any:
-        return self._run(("jacobian", frame.name, axes), q)[0]
+for _name in BODY_QUANTITIES:
+    setattr(OracleDynamics, f"_{_name}", _body_term(_name))

@@ -26,6 +26,7 @@ from mbkit._check import Array
 from mbkit._fork import fork_safe
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.drake.model import DrakeModel, build
+from mbkit.engines.frames_and_momenta import seen_from
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Frame, Model
 
@@ -178,14 +179,15 @@ class DrakeDynamics(MappedDynamics):
         X_WB = self.plant.EvalBodyPoseInWorld(self._context, self.maps.bodies[frame.body])
         return X_WB.rotation().matrix() @ frame.rotation, X_WB.multiply(np.array(frame.translation))
 
-    def _jacobian(self, q: Array, frame: Frame, axes: str) -> Array:
-        R, _ = self._placement(q, frame)
-        body, world = self.maps.bodies[frame.body].body_frame(), self.plant.world_frame()
-        arguments = self._context, JacobianWrtVariable.kV, body, np.array(frame.translation)
-        angular, linear = np.split(self._columns(self.plant.CalcJacobianSpatialVelocity(*arguments, world, world)), 2)
-        if axes == "body":
-            linear, angular = R.T @ linear, R.T @ angular
-        return np.vstack([linear, angular])
+    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
+        out, world = [], self.plant.world_frame()
+        for frame in frames:
+            R, p = self._placement(q, frame)
+            body = self.maps.bodies[frame.body].body_frame()
+            arguments = self._context, JacobianWrtVariable.kV, body, np.array(frame.translation), world, world
+            angular, linear = np.split(self.plant.CalcJacobianSpatialVelocity(*arguments), 2)
+            out.append(self._columns(seen_from(R, p, linear, angular, axes)))
+        return np.array(out)
 
 
 # Drake's own integrators on the plant that was built.

@@ -22,6 +22,7 @@ from mbkit._check import Array, batch_of, count, real
 from mbkit._fork import fork_safe
 from mbkit.engines import known_defects
 from mbkit.engines.base import MappedDynamics
+from mbkit.engines.frames_and_momenta import seen_from
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import InputError, NumericalError, UnsupportedError
@@ -238,13 +239,14 @@ class MujocoDynamics(MappedDynamics):
         R = self._d.xmat[body].reshape(3, 3)
         return R @ frame.rotation, self._d.xpos[body] + R @ frame.translation
 
-    def _jacobian(self, q: Array, frame: Frame, axes: str) -> Array:
-        R, p = self._placement(q, frame)
-        linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
-        mujoco.mj_jac(self._m, self._d, linear, angular, p, self._maps.bodies[frame.body])
-        if axes == "body":
-            linear, angular = R.T @ linear, R.T @ angular
-        return self._columns(np.vstack([linear, angular]))
+    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
+        out = []
+        for frame in frames:
+            R, p = self._placement(q, frame)
+            linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
+            mujoco.mj_jac(self._m, self._d, linear, angular, p, self._maps.bodies[frame.body])
+            out.append(self._columns(seen_from(R, p, linear, angular, axes)))
+        return np.array(out)
 
     # Native integration.
 

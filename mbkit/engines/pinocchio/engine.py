@@ -18,6 +18,7 @@ import pinocchio as pin
 from mbkit._check import Array
 from mbkit.engines import known_defects
 from mbkit.engines.base import Dynamics, first_names, unit_quaternions
+from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, WORLD
 from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
 from mbkit.model import Frame, Model
 from mbkit.model.manifold import NEAR_UNIT
@@ -43,13 +44,15 @@ _DIRECT: Final[dict[str, tuple[str, Call]]] = {
 
 def _factory(name: str, arguments: str) -> Callable[[Call, Call, Sound], Call]:
     """Return a function (bare, checked, sound) -> call; a common one with *arguments would cost 0.3 µs a call."""
-    plain = " and ".join(
+    # Wrenches on frames go the checked way.
+    loads = arguments.count(",") == 2
+    plain = "wrenches is None and " * loads + " and ".join(
         f"type({x}) is ndarray and {x}.dtype == double and {x}.ndim == 1" for x in arguments.split(", ")
     )
     finite = "(x := out.ravel('K')).dot(x) < inf" if name == "mass_matrix" else "isfinite(sum(out.tolist()))"
     text = f"""
 def factory(bare, checked, sound):
-    def {name}({arguments}):
+    def {name}({arguments}{", wrenches=None, axes=" + repr(LOCAL) if loads else ""}):
         try:
             if {plain}:
                 out = bare({arguments})
@@ -57,7 +60,7 @@ def factory(bare, checked, sound):
                     return out
         except Exception:  # Pinocchio's own errors vary; the checked way words them
             pass
-        return checked({arguments})
+        return checked({arguments}{", wrenches, axes" if loads else ""})
     return {name}
 """
     scope: dict[str, Any] = {"ndarray": np.ndarray, "double": np.dtype(float), "inf": np.inf, "isfinite": isfinite}
@@ -96,6 +99,21 @@ def _sound(model: Model, unread: set[int]) -> Sound:
 
         return floating
     return lambda q: unit_quaternions(q, starts) and isfinite(sum(q.tolist()))
+
+
+_REFERENCE_FRAMES: Final = {
+    LOCAL: pin.ReferenceFrame.LOCAL,
+    WORLD: pin.ReferenceFrame.WORLD,
+    ALIGNED: pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
+}
+
+
+def _change(X_WF: Any, reference: Any) -> Array:
+    """Return the matrix that takes twists from a frame's own axes."""
+    if reference == pin.ReferenceFrame.WORLD:
+        return np.asarray(X_WF.toActionMatrix())
+    R = X_WF.rotation if reference == pin.ReferenceFrame.LOCAL_WORLD_ALIGNED else np.eye(3)
+    return np.kron(np.eye(2), R)
 
 
 #: Joint types of which computeRNEADerivatives and computeABADerivatives of 4.1.0 are wrong (pinocchio#2053).
@@ -282,24 +300,24 @@ class PinocchioDynamics(Dynamics):
             self._placements[frame.name] = carrier, pin.SE3(R @ frame.rotation, p + R @ frame.translation)
         return self._placements[frame.name]
 
-    def _pose(self, q: Array, frame: Frame) -> Array:
-        carrier, X_JF = self._in_joint(frame)
+    def _pose(self, q: Array, frames: tuple[Frame, ...]) -> Array:
         pin.forwardKinematics(self._m, self._d, self._full_q(q))
-        return np.array((self._d.oMi[carrier] * X_JF).homogeneous)
+        placed = (self._d.oMi[carrier] * X_JF for carrier, X_JF in map(self._in_joint, frames))
+        return np.array([X.homogeneous for X in placed])
 
-    def _jacobian(self, q: Array, frame: Frame, axes: str) -> Array:
-        carrier, X_JF = self._in_joint(frame)
-        q = self._full_q(q)
-        J = np.zeros((6, self._m.nv))
-        if carrier:
-            # One column comes back as a vector.
-            own = pin.computeJointJacobian(self._m, self._d, q, carrier).reshape(6, self._m.nv)
-            J = X_JF.toActionMatrixInverse() @ own
-        if axes == "world":
-            pin.forwardKinematics(self._m, self._d, q)
-            R = (self._d.oMi[carrier] * X_JF).rotation
-            J = np.vstack([R @ J[:3], R @ J[3:]])
-        return J if self._direct else J @ self._G
+    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
+        m, d, reference = self._m, self._d, _REFERENCE_FRAMES[axes]
+        pin.computeJointJacobians(m, d, self._full_q(q))
+        out = np.zeros((len(frames), 6, m.nv))
+        for k, frame in enumerate(frames):
+            carrier, X_JF = self._in_joint(frame)
+            if carrier:
+                # One column comes back as a vector.
+                own = pin.getJointJacobian(m, d, carrier, pin.ReferenceFrame.LOCAL).reshape(6, m.nv)
+                X_WF = d.oMi[carrier] * X_JF
+                change = _change(X_WF, reference) @ X_JF.toActionMatrixInverse()
+                out[k] = change @ own
+        return out if self._direct else out @ self._G
 
     # Known defects, measured on this very model.
 

@@ -1,0 +1,338 @@
+"""Motion, momentum and loads of single bodies and of the whole, as CasADi expressions.
+
+Everything follows from twists (v, ω), each body's linear and angular velocity at its origin in its own axes, and from
+momenta; rates are exact derivatives along (D v, a), so that no acceleration is written down apart.
+
+**Loads**. Free all six directions of a joint. The momentum that belongs to them, ∂T/∂ν, is that of all that the joint
+carries: P linear and L angular about the child's origin, in the child's axes. Hamel's equations for the six velocities
+(Greenwood 2003, Advanced Dynamics, ch. 4.3) give the forces that hold them at zero, which are the joint's load::
+
+    f = dP/dt + ω × P - Σ f_ext            n = dL/dt + ω × L + v × P - Σ n_ext
+
+Gravity, point springs and applied wrenches are the external forces. Projected on the directions that the joint has,
+the load is τ + τ_passive of the joint, without the force that its rotor takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+import casadi as ca
+
+from mbkit.derivation.kinematics import (
+    Kinematics,
+    Vector,
+    add,
+    constant_times,
+    constant_transposed_times,
+    dot3,
+)
+from mbkit.derivation.links import Inertia
+from mbkit.derivation.rotations import SYMMETRIC, Matrix
+from mbkit.model.joint_types import cross3
+
+#: Linear and angular part.
+Pair = tuple[Vector, Vector]
+
+
+class BodyMotion:
+    """What bodies and frames do at q, v and a.
+
+    Parameters
+    ----------
+    kin : Kinematics
+    a : casadi.SX
+        Accelerations, v̇.
+    """
+
+    def __init__(self, kin: Kinematics, a: ca.SX) -> None:
+        self.kin, self.model, self.a = kin, kin.model, a
+
+    def rate(self, x: Any, a: Any) -> Any:
+        """Return dx/dt of an expression of q and v along (D v, a)."""
+        return ca.jtimes(x, ca.vertcat(self.kin.q, self.kin.v), ca.vertcat(self.kin.qdot, a))
+
+    # Frames
+
+    def _place(self, name: str) -> tuple[str, Any]:
+        frame = self.model.frame(name)
+        return frame.body, self.kin.values.frame(frame)
+
+    def _origin(self, name: str) -> Vector:
+        body, f = self._place(name)
+        return self.kin.to_world(body, f.translation)
+
+    def _in_world(self, name: str, pair: Pair) -> Pair:
+        """Return a frame's vectors in world axes."""
+        body, f = self._place(name)
+        linear, angular = (self.kin.to_world(body, constant_times(f.rotation, x), 0.0) for x in pair)
+        return linear, angular
+
+    def twist(self, name: str) -> Pair:
+        """Return the velocity of a frame's origin and its angular velocity, in its own axes."""
+        body, f = self._place(name)
+        linear, angular = self.kin.twists[body]
+        linear = add(linear, cross3(angular, f.translation))
+        return constant_transposed_times(f.rotation, linear), constant_transposed_times(f.rotation, angular)
+
+    def _seen(self, name: str, pair: Pair, axes: str) -> Pair:
+        """Return a twist, or a spatial acceleration, of a frame in these axes."""
+        if axes == "local":
+            return pair
+        linear, angular = self._in_world(name, pair)
+        if axes == "world":
+            linear = add(linear, cross3(self._origin(name), angular))
+        return linear, angular
+
+    def velocity(self, name: str, axes: str) -> Pair:
+        """Return a frame's velocity."""
+        return self._seen(name, self.twist(name), axes)
+
+    def acceleration(self, name: str, axes: str, kind: str, a: Any) -> Pair:
+        """Return a frame's acceleration: the rate of its twist, or, if classical, of the point's velocity."""
+        twist = self.twist(name)
+        rate = ca.vertsplit(self.rate(_column(*twist), a))
+        linear, angular = self._seen(name, (rate[:3], rate[3:]), axes)
+        if kind == "classical":
+            v, w = self._seen(name, twist, axes)
+            linear = add(linear, cross3(w, v))
+        return linear, angular
+
+    def jacobian_rate_times_v(self, name: str, axes: str) -> Pair:
+        """Return J̇ v, the acceleration without v̇."""
+        # The rate of velocities in world axes at a point that moves with the frame is the point's own acceleration.
+        kind = "classical" if axes == "local_world_aligned" else "spatial"
+        return self.acceleration(name, axes, kind, ca.SX(self.model.nv, 1))
+
+    def pose(self, name: str) -> Any:
+        """Return X_WF, 4 by 4."""
+        body, f = self._place(name)
+        columns = [self.kin.to_world(body, [row[k] for row in f.rotation], 0.0) for k in range(3)]
+        columns.append(self.kin.to_world(body, f.translation))
+        top = ca.horzcat(*(ca.vertcat(*c) for c in columns))
+        return ca.vertcat(ca.SX(top), ca.SX([[0.0, 0.0, 0.0, 1.0]]))
+
+    # Wrenches on frames
+
+    def _from_world(self, body: str, x: Vector) -> Vector:
+        """Return a vector in a body's axes."""
+        branch = []
+        while body != "world":
+            joint = self.kin.carrier(body)
+            branch.append(joint)
+            body = joint.parent
+        for joint in reversed(branch):
+            x = self.kin.from_parent(joint, x)
+        return x
+
+    def _on_body(self, name: str, wrench: Any, axes: str) -> tuple[str, Pair]:
+        """Return a frame's body, and a wrench on it about the body's origin, in its axes."""
+        body, f = self._place(name)
+        parts = ca.vertsplit(wrench)
+        force, moment = parts[:3], parts[3:]
+        if axes == "local":
+            force, moment = (constant_times(f.rotation, x) for x in (force, moment))
+        else:
+            if axes == "world":
+                moment = add(moment, cross3(force, self._origin(name)))
+            force, moment = (self._from_world(body, x) for x in (force, moment))
+        return body, (force, add(moment, cross3(f.translation, force)))
+
+    def generalized_force(self, names: Sequence[str], axes: str, wrenches: Any) -> Any:
+        """Return Σ Jᵀ w of wrenches on frames, (6 k, 1) for k of them."""
+        power: Any = ca.SX(0)
+        for i, name in enumerate(names):
+            body, (force, moment) = self._on_body(name, wrenches[6 * i : 6 * i + 6], axes)
+            linear, angular = self.kin.twists[body]
+            power += dot3(linear, force) + dot3(angular, moment)
+        return ca.gradient(power, self.kin.v)
+
+    # Matter of the whole
+
+    @cached_property
+    def _matter(self) -> dict[str, Inertia]:
+        """Mass, first moment and inertia of all that a body carries, about its origin."""
+        kin, out = self.kin, {"world": Inertia()}
+        for body in self.model.bodies:
+            values = kin.values.bodies[body.name]
+            central = Inertia(0.0, [0.0] * 3, [values.inertia[i][j] for i in range(3) for j in range(i, 3)])
+            out[body.name] = central + Inertia(values.mass).shifted(values.com)
+        for joint in reversed(self.model.tree):
+            R, _ = kin.placements[joint.name]
+            turned = out[joint.child].rotated([Matrix(kin.values.joints[joint.name].rotation), Matrix(R)])
+            out[joint.parent] = out[joint.parent] + turned.shifted(kin.to_parent(joint, [0.0] * 3))
+        return out
+
+    @cached_property
+    def _momenta(self) -> dict[str, Pair]:
+        """Linear and angular momentum of all that a body carries, about its origin, in its axes."""
+        kin = self.kin
+        out: dict[str, Pair] = {"world": ([0.0] * 3, [0.0] * 3)}
+        for body in self.model.bodies:
+            values, (linear, angular) = kin.values.bodies[body.name], kin.twists[body.name]
+            P = [values.mass * x for x in add(linear, cross3(angular, values.com))]
+            out[body.name] = P, add(cross3(values.com, P), constant_times(values.inertia, angular))
+        for joint in reversed(self.model.tree):
+            P, L = (kin.to_parent(joint, x, 0.0) for x in out[joint.child])
+            L = add(L, cross3(kin.to_parent(joint, [0.0] * 3), P))
+            above = out[joint.parent]
+            out[joint.parent] = add(above[0], P), add(above[1], L)
+        return out
+
+    @cached_property
+    def center_of_mass(self) -> Any:
+        """p_G in the world."""
+        whole = self._matter["world"]
+        return ca.vertcat(*(ca.SX(x) / whole.mass for x in whole.moment))
+
+    @cached_property
+    def center_of_mass_velocity(self) -> Any:
+        """Rate of p_G."""
+        return ca.vertcat(*(ca.SX(x) / self._matter["world"].mass for x in self._momenta["world"][0]))
+
+    @cached_property
+    def centroidal_momentum(self) -> Any:
+        """Linear momentum, and angular momentum about p_G, in world axes."""
+        P, L = self._momenta["world"]
+        center = ca.vertsplit(self.center_of_mass)
+        return _column(P, add(L, cross3(P, center)))
+
+    @cached_property
+    def locked_inertia(self) -> Any:
+        """Inertia of the whole about p_G as if its joints were locked, 6 by 6 in world axes."""
+        whole, center = self._matter["world"], ca.vertsplit(self.center_of_mass)
+        central = whole.shifted([-1.0 * x for x in center]).inertia
+        out: Any = ca.SX(6, 6)
+        for i in range(3):
+            out[i, i] = whole.mass
+            for j in range(3):
+                out[3 + i, 3 + j] = central[SYMMETRIC[i][j]]
+        return out
+
+    # Loads
+
+    def joint_wrenches(self, joints: Sequence[str], frames: Sequence[str], axes: str, wrenches: Any) -> Any:
+        """Return the load of each joint about its child's origin, in the child's axes: one row each, (n, 6)."""
+        kin = self.kin
+        outside = self._external(frames, axes, wrenches)
+        gravity = {"world": list(kin.values.gravity)}
+        for joint in self.model.tree:
+            gravity[joint.child] = kin.from_parent(joint, gravity[joint.parent])
+        bodies = [next(j.child for j in self.model.joints if j.name == name) for name in joints]
+        rates = ca.vertsplit(self.rate(ca.vertcat(ca.SX(0, 1), *(_column(*self._momenta[b]) for b in bodies)), self.a))
+        rows = []
+        for k, body in enumerate(bodies):
+            (v, w), (P, L), matter = kin.twists[body], self._momenta[body], self._matter[body]
+            force = add(rates[6 * k : 6 * k + 3], cross3(w, P))
+            moment = add(rates[6 * k + 3 : 6 * k + 6], add(cross3(w, L), cross3(v, P)))
+            weight = [matter.mass * x for x in gravity[body]]
+            push = add(weight, outside[body][0])
+            turn = add(cross3(matter.moment, gravity[body]), outside[body][1])
+            rows.append(ca.horzcat(*(ca.SX(x) - y for x, y in zip((*force, *moment), (*push, *turn), strict=True))))
+        return ca.vertcat(ca.SX(0, 6), *rows)
+
+    def _external(self, frames: Sequence[str], axes: str, wrenches: Any) -> dict[str, Pair]:
+        """Return the wrench of springs and applied ones on all that a body carries, about its origin."""
+        kin = self.kin
+        out: dict[str, Pair] = {
+            name: ([0.0] * 3, [0.0] * 3) for name in ("world", *(b.name for b in self.model.bodies))
+        }
+
+        def push(body: str, force: Vector, moment: Vector) -> None:
+            out[body] = add(out[body][0], force), add(out[body][1], moment)
+
+        for i, name in enumerate(frames):
+            body, (force, moment) = self._on_body(name, wrenches[6 * i : 6 * i + 6], axes)
+            push(body, force, moment)
+        for spring in self.model.springs:
+            values = kin.values.springs[spring.name]
+            ends = (spring.body_a, values.point_a), (spring.body_b, values.point_b)
+            a, b = (kin.to_world(body, point) for body, point in ends)
+            gap = [y - x for x, y in zip(a, b, strict=True)]
+            pull: Any = values.stiffness
+            if spring.needs_direction:
+                square = kin.squared_length(spring)
+                length = kin.length(square)
+                tension = values.stiffness * (length - values.rest_length) + values.damping * kin.length_rate(square)
+                pull = tension / length
+            for sign, (body, point) in zip((1.0, -1.0), ends, strict=True):
+                if body != "world":
+                    force = self._from_world(body, [sign * pull * x for x in gap])
+                    push(body, force, cross3(point, force))
+        for joint in reversed(self.model.tree):
+            force, moment = (kin.to_parent(joint, x, 0.0) for x in out[joint.child])
+            push(joint.parent, force, add(moment, cross3(kin.to_parent(joint, [0.0] * 3), force)))
+        return out
+
+
+def _column(linear: Vector, angular: Vector) -> Any:
+    return ca.vertcat(*(ca.SX(x) for x in (*linear, *angular)))
+
+
+def _rows(pairs: Sequence[Pair]) -> Any:
+    return ca.vertcat(ca.SX(0, 6), *(_column(*pair).T for pair in pairs))
+
+
+class BodyQuantity(NamedTuple):
+    """A quantity that `BodyMotion` gives.
+
+    Attributes
+    ----------
+    arguments : tuple of str
+        Of q, v, a, and "wrenches", whose six numbers a frame stand one behind the other.
+    make : callable
+        ``make(motion, *extra, wrenches)`` returns a matrix; `wrenches` is left out where it is no argument.
+    axes : int
+        Of one state's value: 1 where the matrix is a column, 2 where it is the value, 3 where `rows` of its rows
+        make one of several values.
+    rows : int
+    """
+
+    arguments: tuple[str, ...]
+    make: Callable[..., Any]
+    axes: int = 2
+    rows: int = 1
+
+
+def _frame_jacobians(motion: BodyMotion, frames: tuple[str, ...], axes: str) -> Any:
+    return ca.vertcat(*(ca.jacobian(_column(*motion.velocity(name, axes)), motion.kin.v) for name in frames))
+
+
+def _by_v(name: str) -> Callable[[BodyMotion], Any]:
+    return lambda motion: ca.jacobian(getattr(motion, name), motion.kin.v)
+
+
+def _rate(name: str, *, moved: bool) -> Callable[[BodyMotion], Any]:
+    return lambda motion: motion.rate(getattr(motion, name), motion.a if moved else ca.SX(motion.model.nv, 1))
+
+
+#: Name of each quantity -> how it is derived. Those of frames take their names and axes, and return one value a frame.
+BODY_QUANTITIES: Final[dict[str, BodyQuantity]] = {
+    "pose": BodyQuantity(("q",), lambda m, frames: ca.vertcat(*(m.pose(name) for name in frames)), 3, 4),
+    "jacobian": BodyQuantity(("q",), _frame_jacobians, 3, 6),
+    "velocity": BodyQuantity(("q", "v"), lambda m, frames, axes: _rows([m.velocity(name, axes) for name in frames])),
+    "acceleration": BodyQuantity(
+        ("q", "v", "a"),
+        lambda m, frames, axes, kind: _rows([m.acceleration(name, axes, kind, m.a) for name in frames]),
+    ),
+    "jacobian_dot_v": BodyQuantity(
+        ("q", "v"), lambda m, frames, axes: _rows([m.jacobian_rate_times_v(name, axes) for name in frames])
+    ),
+    "center_of_mass": BodyQuantity(("q",), lambda m: m.center_of_mass, 1),
+    "center_of_mass_velocity": BodyQuantity(("q", "v"), lambda m: m.center_of_mass_velocity, 1),
+    "center_of_mass_acceleration": BodyQuantity(("q", "v", "a"), _rate("center_of_mass_velocity", moved=True), 1),
+    "center_of_mass_jacobian": BodyQuantity(("q",), _by_v("center_of_mass_velocity")),
+    "centroidal_momentum": BodyQuantity(("q", "v"), lambda m: m.centroidal_momentum, 1),
+    "centroidal_momentum_matrix": BodyQuantity(("q",), _by_v("centroidal_momentum")),
+    "centroidal_momentum_bias": BodyQuantity(("q", "v"), _rate("centroidal_momentum", moved=False), 1),
+    "locked_inertia": BodyQuantity(("q",), lambda m: m.locked_inertia),
+    "generalized_force": BodyQuantity(
+        ("q", "wrenches"), lambda m, frames, axes, wrenches: m.generalized_force(frames, axes, wrenches), 1
+    ),
+    "joint_wrenches": BodyQuantity(
+        ("q", "v", "a", "wrenches"),
+        lambda m, joints, frames, axes, wrenches: m.joint_wrenches(joints, frames, axes, wrenches),
+    ),
+}

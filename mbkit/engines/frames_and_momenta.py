@@ -1,0 +1,233 @@
+"""What scripts ask of the bodies: motion of frames, centre of mass, momentum. A part of `Dynamics`.
+
+**Axes** name the point and the axes of a six-vector, linear then angular. ``"local"``: the frame's origin, in the
+frame's axes. ``"local_world_aligned"``: the frame's origin, in the world's axes. ``"world"``: the point of the frame's
+body that is at the world's origin, in the world's axes, as in spatial algebra (Featherstone 2008, ch. 2). These are
+Pinocchio's names and meanings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array
+from mbkit.errors import InputError
+from mbkit.model import Frame, Model
+
+LOCAL: Final = "local"
+WORLD: Final = "world"
+ALIGNED: Final = "local_world_aligned"
+AXES: Final = (LOCAL, WORLD, ALIGNED)
+SPATIAL: Final = "spatial"
+CLASSICAL: Final = "classical"
+#: Quantities of this part of the protocol.
+QUANTITIES: Final = (
+    *("pose", "jacobian", "velocity", "acceleration", "jacobian_dot_v"),
+    *("center_of_mass", "center_of_mass_velocity", "center_of_mass_acceleration", "center_of_mass_jacobian"),
+    *("centroidal_momentum", "centroidal_momentum_matrix", "centroidal_momentum_bias", "locked_inertia"),
+)
+
+
+def axes_named(axes: str) -> str:
+    """Return these axes, checked."""
+    # The name that jacobian() had for them before there were three.
+    axes = LOCAL if axes == "body" else axes
+    if axes not in AXES:
+        raise InputError(f"axes: expected one of {', '.join(map(repr, AXES))}, got {axes!r}")
+    return axes
+
+
+def seen_from(R: Array, p: Array, linear: Array, angular: Array, axes: str) -> Array:
+    """Return a six-vector, or the rows of a Jacobian, in these axes.
+
+    `linear` and `angular`, (3,) or (3, nv), are those of a frame's origin in world axes; R_WF and p_WF are its pose.
+    """
+    if axes == LOCAL:
+        linear, angular = R.T @ linear, R.T @ angular
+    elif axes == WORLD:
+        linear = linear + np.cross(p, angular, axisb=0, axisc=0)
+    return np.concatenate([linear, angular])
+
+
+def accelerated(R: Array, p: Array, velocity: Array, classical: Array, axes: str, kind: str) -> Array:
+    """Return an acceleration, (6,), in these axes.
+
+    `velocity` and `classical`, (6,), are velocity and acceleration of a frame's origin in world axes, and angular
+    ones.
+    """
+    v, w = velocity[:3], velocity[3:]
+    spatial = seen_from(R, p, classical[:3] - np.cross(w, v), classical[3:], axes)
+    if kind == CLASSICAL:
+        seen = seen_from(R, p, v, w, axes)
+        spatial[:3] += np.cross(seen[3:], seen[:3])
+    return spatial
+
+
+class FramesAndMomenta:
+    """Motion of frames, centre of mass and momentum; `Dynamics` inherits it.
+
+    Frames are named: those of the description, and bodies. A list of names gives one value for each, on an axis before
+    the value's own: (k, 6) or (N, k, 6). The rates are exact derivatives along the motion, and zero motion of the
+    world's frame is a value like any other.
+    """
+
+    model: Model
+    samples: Any
+    _evaluate: Callable[..., Array]
+    _frames_held: dict[Any, tuple[Frame, ...]]
+
+    def _frames(self, frame: str | Sequence[str]) -> tuple[tuple[Frame, ...], bool]:
+        """Return the frames, and whether it is one alone."""
+        single = isinstance(frame, str)
+        key = frame if single else tuple(frame)
+        held = self.__dict__.setdefault("_frames_held", {})
+        if key not in held:
+            if not single and not key:
+                raise InputError("frame: expected a name or a list of names, got an empty list")
+            held[key] = (self.model.frame(frame),) if single else tuple(map(self.model.frame, frame))  # type: ignore[arg-type]  # a str
+        return held[key], single
+
+    def _of_frames(self, quantity: str, frame: str | Sequence[str], *more: str, **states: ArrayLike) -> Array:
+        frames, single = self._frames(frame)
+        out = self._evaluate(quantity, frames, *more, **states)
+        if not single:
+            return out
+        batch = any(np.ndim(x) == 2 for x in states.values()) or self.samples is not None
+        return out[:, 0] if batch else out[0]
+
+    def pose(self, q: ArrayLike, frame: str | Sequence[str]) -> Array:
+        """Return X_WF of a frame or body, shape (4, 4) or (N, 4, 4).
+
+        X_WF has the rotation R_WF and the origin p_WF, m: it takes a point from the frame's axes to the world's.
+        """
+        return self._of_frames("pose", frame, q=q)
+
+    def body_poses(self, q: ArrayLike) -> Array:
+        """Return X_WB of all bodies in the order of ``model.bodies``, shape (n, 4, 4) or (N, n, 4, 4)."""
+        return self._of_frames("pose", [b.name for b in self.model.bodies], q=q)
+
+    def jacobian(self, q: ArrayLike, frame: str | Sequence[str], axes: str = ALIGNED) -> Array:
+        """Return J with velocity(q, v, frame, axes) = J v, shape (6, nv) or (N, 6, nv).
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        frame : str or sequence of str
+        axes : {"local", "world", "local_world_aligned"}
+            As in `velocity`; ``"body"`` is another name for ``"local"``.
+        """
+        return self._of_frames("jacobian", frame, axes_named(axes), q=q)
+
+    def velocity(self, q: ArrayLike, v: ArrayLike, frame: str | Sequence[str], axes: str = ALIGNED) -> Array:
+        """Return the velocity of a frame relative to the world, m/s and rad/s, linear then angular.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        v : (nv,) or (N, nv) array_like
+        frame : str or sequence of str
+        axes : {"local", "world", "local_world_aligned"}
+            ``"local_world_aligned"``: of the frame's origin, in the world's axes. ``"local"``: of the frame's origin,
+            in the frame's axes. ``"world"``: of the body's point at the world's origin, in the world's axes.
+
+        Returns
+        -------
+        (6,) or (N, 6) array
+            With a list of frames (k, 6) or (N, k, 6).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0))
+        >>> dyn.velocity([0.0], [3.0], dyn.model.bodies[0].name, axes="local")[3:].round(12)
+        array([0., 3., 0.])
+        """
+        return self._of_frames("velocity", frame, axes_named(axes), q=q, v=v)
+
+    def acceleration(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        a: ArrayLike,
+        frame: str | Sequence[str],
+        axes: str = ALIGNED,
+        kind: str = CLASSICAL,
+    ) -> Array:
+        """Return the acceleration of a frame, m/s² and rad/s², linear then angular, without gravity.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        v, a : (nv,) or (N, nv) array_like
+            Velocity and acceleration, v̇.
+        frame : str or sequence of str
+        axes : {"local", "world", "local_world_aligned"}
+            As in `velocity`.
+        kind : {"classical", "spatial"}
+            ``"classical"``: of the point, the second derivative of its position. ``"spatial"``: the rate of the twist
+            in the frame's own axes, which differs by ω × v (Featherstone 2008, ch. 2.11).
+
+        Returns
+        -------
+        (6,) or (N, 6) array
+            With a list of frames (k, 6) or (N, k, 6).
+        """
+        if kind not in (SPATIAL, CLASSICAL):
+            raise InputError(f"kind: expected {SPATIAL!r} or {CLASSICAL!r}, got {kind!r}")
+        return self._of_frames("acceleration", frame, axes_named(axes), kind, q=q, v=v, a=a)
+
+    def jacobian_dot_v(self, q: ArrayLike, v: ArrayLike, frame: str | Sequence[str], axes: str = ALIGNED) -> Array:
+        """Return J̇ v with the J of `jacobian`: the rate of the velocity at v̇ = 0, shape (6,) or (N, 6).
+
+        So J a + J̇ v is the rate of the velocity's six numbers: the classical acceleration in
+        ``"local_world_aligned"`` axes, the spatial one in the others.
+        """
+        return self._of_frames("jacobian_dot_v", frame, axes_named(axes), q=q, v=v)
+
+    # The whole
+
+    def center_of_mass(self, q: ArrayLike) -> Array:
+        """Return p_G, the centre of mass of all bodies in the world, m, shape (3,) or (N, 3).
+
+        Bodies that are welded to the world count, as they do in ``model.mass`` and in the potential energy.
+        """
+        return self._evaluate("center_of_mass", q=q)
+
+    def center_of_mass_velocity(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return ṗ_G in world axes, m/s, shape (3,) or (N, 3)."""
+        return self._evaluate("center_of_mass_velocity", q=q, v=v)
+
+    def center_of_mass_acceleration(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
+        """Return p̈_G in world axes, m/s², shape (3,) or (N, 3)."""
+        return self._evaluate("center_of_mass_acceleration", q=q, v=v, a=a)
+
+    def center_of_mass_jacobian(self, q: ArrayLike) -> Array:
+        """Return J_G with ṗ_G = J_G v, shape (3, nv) or (N, 3, nv)."""
+        return self._evaluate("center_of_mass_jacobian", q=q)
+
+    def centroidal_momentum(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the linear momentum, kg m/s, then the angular one about p_G, kg m²/s, in world axes.
+
+        Shape (6,) or (N, 6). p_G is that of `center_of_mass`. Orin, Goswami and Lee 2013, Centroidal dynamics of a
+        humanoid robot, Autonomous Robots 35.
+        """
+        return self._evaluate("centroidal_momentum", q=q, v=v)
+
+    def centroidal_momentum_matrix(self, q: ArrayLike) -> Array:
+        """Return A_G with the centroidal momentum A_G v, shape (6, nv) or (N, 6, nv)."""
+        return self._evaluate("centroidal_momentum_matrix", q=q)
+
+    def centroidal_momentum_bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return Ȧ_G v: the rate of the centroidal momentum is A_G a + Ȧ_G v; shape (6,) or (N, 6)."""
+        return self._evaluate("centroidal_momentum_bias", q=q, v=v)
+
+    def locked_inertia(self, q: ArrayLike) -> Array:
+        """Return the inertia of the whole with its joints locked, about p_G in world axes, shape (6, 6) or (N, 6, 6).
+
+        The first block is the mass, the second the rotational inertia, kg m².
+        """
+        return self._evaluate("locked_inertia", q=q)

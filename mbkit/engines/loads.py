@@ -1,0 +1,284 @@
+"""Wrenches on bodies, the loads in joints, and the balance of each body. A part of `Dynamics`.
+
+The balance of a body, with everything that acts on it::
+
+    Σ F = m a_G            Σ M_G = d/dt (I ω)
+
+A wrench is six numbers, force then moment about the origin of a frame, N and Nm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, batch_of, rows
+from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, axes_named
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.model import Frame, Joint, Model, PointSpring
+
+#: Wrenches by the names of the frames on which they act.
+Wrenches = Mapping[str, ArrayLike]
+QUANTITIES: Final = ("mass_matrix_inverse", "generalized_force", "joint_wrenches", "newton_euler_residual")
+#: Quantity -> the one that it follows from.
+FOLLOWING: Final = {"newton_euler_residual": "joint_wrenches"}
+
+
+class Loads:
+    """Wrenches on bodies and in joints; `Dynamics` inherits it."""
+
+    model: Model
+    _evaluate: Callable[..., Array]
+    # Of the other parts of `Dynamics`.
+    _inverse_dynamics: Callable[..., Any]
+    _forward_dynamics: Callable[..., Any]
+    _frames: Callable[..., tuple[tuple[Frame, ...], bool]]
+    forward_dynamics: Callable[..., Array]
+    acceleration: Callable[..., Array]
+    velocity: Callable[..., Array]
+    pose: Callable[..., Array]
+    body_poses: Callable[[ArrayLike], Array]
+
+    def _stacked_wrenches(self, wrenches: Wrenches) -> tuple[tuple[Frame, ...], Array]:
+        """Return the frames, and the wrenches one behind the other, (6 k,) or (N, 6 k)."""
+        if not isinstance(wrenches, Mapping):
+            raise InputError(
+                f"wrenches: expected a dict of frame names to arrays (6,) or (N, 6), got {type(wrenches).__name__}"
+            )
+        given = {
+            name: rows(f"wrench on {name!r}", x, 6, "a wrench", "force and moment") for name, x in wrenches.items()
+        }
+        frames, _ = self._frames(list(given))
+        if (size := batch_of(**given)) is not None:
+            given = {name: np.broadcast_to(x, (size, 6)) for name, x in given.items()}
+        return frames, np.concatenate(list(given.values()), axis=-1)
+
+    def generalized_force(self, q: ArrayLike, wrenches: Wrenches, axes: str = LOCAL) -> Array:
+        """Return Σ Jᵀ w of wrenches on frames, shape (nv,) or (N, nv).
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        wrenches : dict of str to (6,) or (N, 6) array_like
+            Frame or body -> force, N, then moment, Nm, about the frame's origin.
+        axes : {"local", "local_world_aligned", "world"}
+            Axes in which they are written: the frame's own, or the world's. ``"world"`` has the moment about the
+            world's origin.
+        """
+        if isinstance(wrenches, Mapping) and not wrenches:
+            q = self.model.check_q(q)
+            return np.zeros((*q.shape[:-1], self.model.nv))
+        frames, stacked = self._stacked_wrenches(wrenches)
+        return self._evaluate("generalized_force", frames, axes_named(axes), q=q, wrenches=stacked)
+
+    def _inverse_dynamics_with_wrenches(
+        self, q: Array, v: Array, a: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str
+    ) -> Any:
+        return self._inverse_dynamics(q, v, a) - self._generalized_force(q, wrenches, frames, axes)
+
+    def _forward_dynamics_with_wrenches(
+        self, q: Array, v: Array, tau: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str
+    ) -> Any:
+        return self._forward_dynamics(q, v, tau + self._generalized_force(q, wrenches, frames, axes))
+
+    _generalized_force: Callable[..., Any]
+
+    def mass_matrix_inverse(self, q: ArrayLike) -> Array:
+        """Return M⁻¹(q), shape (nv, nv) or (N, nv, nv)."""
+        return self._evaluate("mass_matrix_inverse", q=q)
+
+    def joint_wrenches(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        a: ArrayLike,
+        wrenches: Wrenches | None = None,
+        axes: str = LOCAL,
+        joints: Sequence[str] | None = None,
+    ) -> Array:
+        """Return the load of each joint: what the parent's side exerts on the child through the joint.
+
+        Force, N, then moment, Nm, about the child's origin, in the child's axes. The load is that of the motion
+        (q, v, a): with accelerations of `forward_dynamics` it is the load under a force τ. Its part in the joint's own
+        directions is τ + τ_passive of the joint, less what its rotor takes.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        v, a : (nv,) or (N, nv) array_like
+        wrenches : dict of str to (6,) or (N, 6) array_like, optional
+            That act on frames, as in `generalized_force`.
+        axes : {"local", "local_world_aligned", "world"}
+            Axes of the applied wrenches.
+        joints : sequence of str, optional
+            By default all that move, in the order of ``model.joints``. Fixed joints may be named.
+
+        Returns
+        -------
+        (n, 6) or (N, n, 6) array
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(mass=2.0, length=1.0))
+        >>> dyn.joint_wrenches([0.0], [0.0], [0.0]).round(6) + 0.0
+        array([[[ 0.  ,  0.  , 19.62,  0.  ,  0.  ,  0.  ]]])
+        """
+        loaded = self._joints(joints)
+        states: dict[str, Any] = {"q": q, "v": v, "a": a}
+        frames: tuple[Frame, ...] = ()
+        if wrenches:
+            frames, states["wrenches"] = self._stacked_wrenches(wrenches)
+        return self._evaluate("joint_wrenches", loaded, frames, axes_named(axes), **states)
+
+    def _joints(self, names: Sequence[str] | None) -> tuple[Joint, ...]:
+        known = {joint.name: joint for joint in self.model.joints}
+        if names is None:
+            return tuple(joint for joint in known.values() if joint.type.nv)
+        if isinstance(names, str):
+            raise InputError(f"joints: expected a list of names, got {names!r}")
+        for name in names:
+            if name not in known:
+                raise UnknownNameError("joint", str(name), known)
+        return tuple(known[name] for name in names)
+
+    def newton_euler_residual(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        a: ArrayLike,
+        tau: ArrayLike,
+        wrenches: Wrenches | None = None,
+        axes: str = LOCAL,
+    ) -> Array:
+        """Return Σ F - m a_G and Σ M_G - d/dt (I ω) of every body: how far a motion is from the laws of mechanics.
+
+        Forces and loads are those that act at (q, v) under τ; a is the acceleration in question. The residual vanishes,
+        up to rounding, where a is ``forward_dynamics(q, v, tau)``.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        v, a, tau : (nv,) or (N, nv) array_like
+        wrenches, axes
+            As in `generalized_force`.
+
+        Returns
+        -------
+        (n, 6) or (N, n, 6) array
+            In the order of ``model.bodies``, force, N, then moment about the body's centre of mass, Nm, in its axes.
+
+        Raises
+        ------
+        UnsupportedError
+            The engine cannot tell the load of a joint; mostly of a fixed one, where it merges bodies.
+        """
+        model = self.model
+        states = {"q": model.check_q(q), "v": model.check_v(v), "a": model.check_v(a, "a")}
+        states["tau"] = model.check_v(tau, "tau")
+        single = batch_of(**states) is None and not any(np.ndim(w) == 2 for w in (wrenches or {}).values())
+        q, v, a, tau = (np.atleast_2d(x) for x in states.values())
+        q, v, a, tau = (np.broadcast_to(x, (max(map(len, (q, v, a, tau))), x.shape[1])) for x in (q, v, a, tau))
+        names = [joint.name for joint in model.tree]
+        acting = self.forward_dynamics(q, v, tau, wrenches, axes)
+        loads = self.joint_wrenches(q, v, acting, wrenches, axes, names)
+        balance = _Balance(self, q, v, a)
+        for k, joint in enumerate(model.tree):
+            balance.load(joint, loads[:, k])
+        for name, wrench in (wrenches or {}).items():
+            balance.apply(name, np.asarray(wrench, dtype=float), axes_named(axes))
+        for spring in model.springs:
+            balance.stretch(spring)
+        out = balance.residual()
+        return out[0] if single else out
+
+
+def _times(R: Array, x: Array) -> Array:
+    return np.asarray(np.einsum("...ij,...j->...i", R, x))
+
+
+class _Balance:
+    """Forces and moments about the origin of each body, gathered in its axes, at a batch of states."""
+
+    def __init__(self, dyn: Loads, q: Array, v: Array, a: Array) -> None:
+        self._dyn, self._model, self._q, self._v, self._a = dyn, dyn.model, q, v, a
+        self._index = {body.name: k for k, body in enumerate(self._model.bodies)}
+        self._X = dyn.body_poses(q)
+        self._names = list(self._index)
+        shape = (len(q), len(self._names), 3)
+        self._force, self._moment = np.zeros(shape), np.zeros(shape)
+
+    def _rotation(self, body: str) -> Array:
+        return self._X[:, self._index[body], :3, :3]
+
+    def _add(self, body: str, force: Array, moment: Array) -> None:
+        if body in self._index:
+            self._force[:, self._index[body]] += force
+            self._moment[:, self._index[body]] += moment
+
+    def load(self, joint: Joint, wrench: Array) -> None:
+        """Add a joint's load to its child, and the opposite to its parent."""
+        force, moment = wrench[:, :3], wrench[:, 3:]
+        self._add(joint.child, force, moment)
+        if joint.parent in self._index:
+            R, R_P = self._rotation(joint.child), self._rotation(joint.parent)
+            p = self._X[:, self._index[joint.child], :3, 3] - self._X[:, self._index[joint.parent], :3, 3]
+            force = _times(R, force)
+            moment = _times(R, moment) + np.cross(p, force)
+            self._add(joint.parent, -_times(R_P.swapaxes(1, 2), force), -_times(R_P.swapaxes(1, 2), moment))
+
+    def apply(self, name: str, wrench: Array, axes: str) -> None:
+        """Add a wrench on a frame."""
+        frame = self._model.frame(name)
+        if frame.body not in self._index:
+            return
+        force, moment = wrench[..., :3], wrench[..., 3:]
+        if axes == LOCAL:
+            force, moment = _times(frame.rotation, force), _times(frame.rotation, moment)
+        else:
+            X, R_B = self._dyn.pose(self._q, name), self._rotation(frame.body).swapaxes(1, 2)
+            if axes != ALIGNED:
+                moment = moment - np.cross(X[:, :3, 3], force)
+            force, moment = _times(R_B, force), _times(R_B, moment)
+        self._add(frame.body, force, moment + np.cross(frame.translation, force))
+
+    def stretch(self, spring: PointSpring) -> None:
+        """Add the pull of a spring to the bodies at its ends."""
+        ends, speeds = [], []
+        for body, point in ((spring.body_a, spring.point_a), (spring.body_b, spring.point_b)):
+            if body not in self._index:
+                ends.append(np.broadcast_to(point, (len(self._q), 3)))
+                speeds.append(np.zeros((len(self._q), 3)))
+                continue
+            X, V = self._X[:, self._index[body]], self._dyn.velocity(self._q, self._v, body)
+            arm = _times(X[:, :3, :3], point)
+            ends.append(X[:, :3, 3] + arm)
+            speeds.append(V[:, :3] + np.cross(V[:, 3:], arm))
+        gap, rate = ends[1] - ends[0], speeds[1] - speeds[0]
+        pull = spring.stiffness * gap
+        if spring.needs_direction:
+            length = np.linalg.norm(gap, axis=1, keepdims=True)
+            along = np.sum(gap * rate, axis=1, keepdims=True) / length
+            pull = (spring.stiffness * (length - spring.rest_length) + spring.damping * along) * gap / length
+        for sign, body, point in ((1, spring.body_a, spring.point_a), (-1, spring.body_b, spring.point_b)):
+            if body in self._index:
+                force = sign * _times(self._rotation(body).swapaxes(1, 2), pull)
+                self._add(body, force, np.cross(point, force))
+
+    def residual(self) -> Array:
+        """Return what is left of the forces and moments once the rates of momentum are taken off."""
+        dyn, bodies = self._dyn, self._model.bodies
+        mass = np.array([b.mass for b in bodies])[:, None]
+        com, inertia = np.array([b.com for b in bodies]), np.array([b.inertia for b in bodies])
+        R = self._X[:, :, :3, :3].swapaxes(2, 3)
+        local = dyn.acceleration(self._q, self._v, self._a, self._names, LOCAL, CLASSICAL)
+        linear, angular = local[..., :3], local[..., 3:]
+        w = dyn.velocity(self._q, self._v, self._names, LOCAL)[..., 3:]
+        central = linear + np.cross(angular, com) + np.cross(w, np.cross(w, com))
+        force = self._force + mass * _times(R, self._model.gravity) - mass * central
+        # Gravity acts at the centre of mass.
+        moment = self._moment - np.cross(com, self._force)
+        return np.concatenate([force, moment - _times(inertia, angular) - np.cross(w, _times(inertia, w))], axis=-1)
