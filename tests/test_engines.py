@@ -421,7 +421,7 @@ def test_overflow_is_an_error_in_every_quantity(way):
     q, one = np.array([0.3, 1e200]), np.ones(2)
     for name, call, given in calls(made_by(model, way), q, one, one, one):
         # The oracle's numbers have a larger exponent, and its accelerations here are small.
-        if name not in ("passive", "pose", "jacobian") and (way, name) != ("oracle", "forward_dynamics"):
+        if name in {*VECTORS, "coriolis_force"} - {"passive"} and (way, name) != ("oracle", "forward_dynamics"):
             assert isinstance(refusal(call, given), NumericalError), name
 
 
@@ -449,7 +449,7 @@ def test_unknown_names_suggest_near_ones():
         mb.dynamics(model, "pinochio")
     with pytest.raises(UnknownNameError, match="wrist_3_link"):
         mb.dynamics(model).pose(model.neutral(), "wrist3_link")
-    with pytest.raises(InputError, match="frame: expected a name"):
+    with pytest.raises(InputError, match="frame: expected a name or a list"):
         mb.dynamics(model).pose(model.neutral(), 3)
     for engine in ENGINES:
         assert np.array_equal(mb.dynamics(model, engine).pose(model.neutral(), "world"), np.eye(4))

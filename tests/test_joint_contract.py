@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 
 import numpy as np
@@ -16,12 +17,6 @@ from tests.random_trees import off, random_tree, states
 
 BUILT_IN = tuple(name for name, joint_type in KINDS.items() if joint_type.built_in and joint_type.nv)
 DERIVATIVES = ("inverse_dynamics_derivatives", "forward_dynamics_derivatives")
-ARGUMENTS = {
-    **dict.fromkeys(("mass_matrix", "gravity", "potential_energy"), "q"),
-    **dict.fromkeys(("coriolis_matrix", "coriolis_force", "nle", "passive", "kinetic_energy"), "qv"),
-    **dict.fromkeys(("inverse_dynamics", "inverse_dynamics_derivatives"), "qva"),
-    **dict.fromkeys(("forward_dynamics", "forward_dynamics_derivatives"), "qvt"),
-}
 EPS = np.finfo(float).eps
 
 
@@ -55,9 +50,11 @@ def state(model: Model) -> dict[str, np.ndarray]:
 
 
 def value(dyn, quantity: str, at: dict[str, np.ndarray]) -> np.ndarray:
-    if quantity in ("pose", "jacobian"):
-        return np.asarray(getattr(dyn, quantity)(at["q"], dyn.model.bodies[-1].name))
-    return np.asarray(getattr(dyn, quantity)(*(at[name] for name in ARGUMENTS[quantity])))
+    method, frame = getattr(dyn, quantity), dyn.model.bodies[-1].name
+    takes = inspect.signature(method).parameters
+    more = {"frame": frame} if "frame" in takes else {}
+    more |= {"wrenches": {frame: [1.0, -2.0, 3.0, 0.5, 0.1, -0.4]}} if "wrenches" in takes else {}
+    return np.asarray(method(*(at[name[0]] for name in takes if name in ("q", "v", "a", "tau")), **more))
 
 
 @pytest.mark.parametrize("kind", [*BUILT_IN, *OWN])

@@ -83,12 +83,14 @@ class FramesAndMomenta:
     def _frames(self, frame: str | Sequence[str]) -> tuple[tuple[Frame, ...], bool]:
         """Return the frames, and whether it is one alone."""
         single = isinstance(frame, str)
-        key = frame if single else tuple(frame)
+        if not single and not isinstance(frame, Sequence):
+            raise InputError(f"frame: expected a name or a list of names, got {type(frame).__name__}")
+        key: tuple[str, ...] = (frame,) if isinstance(frame, str) else tuple(frame)
         held = self.__dict__.setdefault("_frames_held", {})
         if key not in held:
-            if not single and not key:
+            if not key:
                 raise InputError("frame: expected a name or a list of names, got an empty list")
-            held[key] = (self.model.frame(frame),) if single else tuple(map(self.model.frame, frame))  # type: ignore[arg-type]  # a str
+            held[key] = tuple(map(self.model.frame, key))
         return held[key], single
 
     def _of_frames(self, quantity: str, frame: str | Sequence[str], *more: str, **states: ArrayLike) -> Array:
@@ -142,9 +144,9 @@ class FramesAndMomenta:
         Examples
         --------
         >>> import mbkit as mb
-        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0))
-        >>> dyn.velocity([0.0], [3.0], dyn.model.bodies[0].name, axes="local")[3:].round(12)
-        array([0., 3., 0.])
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0), "lagrangian")
+        >>> dyn.velocity([0.0], [3.0], "tip", axes="local") + 0.0
+        array([ 6.,  0.,  0.,  0., -3.,  0.])
         """
         return self._of_frames("velocity", frame, axes_named(axes), q=q, v=v)
 

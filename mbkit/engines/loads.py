@@ -35,6 +35,7 @@ class Loads:
     # Of the other parts of `Dynamics`.
     _inverse_dynamics: Callable[..., Any]
     _forward_dynamics: Callable[..., Any]
+    _jacobian: Callable[..., Array]
     _frames: Callable[..., tuple[tuple[Frame, ...], bool]]
     forward_dynamics: Callable[..., Array]
     acceleration: Callable[..., Array]
@@ -84,7 +85,9 @@ class Loads:
     ) -> Any:
         return self._forward_dynamics(q, v, tau + self._generalized_force(q, wrenches, frames, axes))
 
-    _generalized_force: Callable[..., Any]
+    def _generalized_force(self, q: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str) -> Any:
+        """Return Σ Jᵀ w at one state, with the engine's own Jacobians."""
+        return np.einsum("kij,ki->j", self._jacobian(q, frames, axes), wrenches.reshape(-1, 6))
 
     def mass_matrix_inverse(self, q: ArrayLike) -> Array:
         """Return M⁻¹(q), shape (nv, nv) or (N, nv, nv)."""
@@ -123,9 +126,9 @@ class Loads:
         Examples
         --------
         >>> import mbkit as mb
-        >>> dyn = mb.dynamics(mb.catalog.pendulum(mass=2.0, length=1.0))
-        >>> dyn.joint_wrenches([0.0], [0.0], [0.0]).round(6) + 0.0
-        array([[[ 0.  ,  0.  , 19.62,  0.  ,  0.  ,  0.  ]]])
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(mass=2.0, length=1.0), "lagrangian")
+        >>> dyn.joint_wrenches([0.0], [0.0], [0.0]) + 0.0
+        array([[ 0.  ,  0.  , 19.62,  0.  ,  0.  ,  0.  ]])
         """
         loaded = self._joints(joints)
         states: dict[str, Any] = {"q": q, "v": v, "a": a}

@@ -55,7 +55,7 @@ class DrakeDynamics(MappedDynamics):
     def _hold(self, compiled: DrakeModel) -> None:
         self.maps, self.plant, self._v_index = compiled, compiled.plant, compiled.v_index
         self._applied = self.plant.get_applied_generalized_force_input_port()
-        self._acceleration = self.plant.get_generalized_acceleration_output_port()
+        self._acceleration_port = self.plant.get_generalized_acceleration_output_port()
         self._context = self.plant.CreateDefaultContext()
         self._lock = fork_safe(threading.RLock())
 
@@ -154,7 +154,7 @@ class DrakeDynamics(MappedDynamics):
             return np.asarray(np.linalg.solve(self._mass_matrix(q), tau - self._inverse_dynamics(q, v, zero)))
         b = self._set(q, v)
         self._applied.FixValue(self._context, self._to_engine(tau))
-        return self._force(self._acceleration.Eval(self._context) - b)
+        return self._force(self._acceleration_port.Eval(self._context) - b)
 
     def _kinetic_energy(self, q: Array, v: Array) -> Any:
         self._set(q, v)
