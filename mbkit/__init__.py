@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from mbkit.model import ModelBuilder as ModelBuilder
     from mbkit.model import Parameter as Parameter
     from mbkit.simulate import Trajectory as Trajectory
+    from mbkit.simulate import sensitivities as sensitivities
     from mbkit.simulate import simulate as simulate
     from mbkit.studies import baseline as baseline
     from mbkit.studies.compare.study import compare as compare
@@ -64,6 +65,7 @@ _HOME = {
     "explain": "mbkit.studies.explain",
     "load": "mbkit.load",
     "robots": "mbkit.load",
+    "sensitivities": "mbkit.simulate",
     "stress": "mbkit.studies",
     "work_precision": "mbkit.studies",
 }

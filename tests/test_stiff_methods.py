@@ -16,7 +16,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, NumericalError, TorqueError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import simulate
-from mbkit.simulate.diagnostics.linearization import Linearization
+from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.solvers.vector_field import Rates
 from tests.random_trees import ALL, random_tree
 from validation import closed_forms
@@ -87,7 +87,7 @@ def test_the_jacobian_is_that_of_the_rates(seed: int, engine: str) -> None:
     model = random_tree(seed, 11, kinds)
     dyn = dynamics(model, engine)
     y, tau = state(model, seed), np.random.default_rng(seed).standard_normal(model.nv)
-    exact = Linearization(dyn)
+    exact = RateJacobian(dyn)
     # The differences are good to h⁶ of a seventh derivative beside 2e-16 / h of the rates.
     close(exact(0.3, y, tau), differences(Rates(dyn), y, tau), 1e-10)
     assert exact.evaluations == 1
@@ -103,24 +103,24 @@ def test_the_jacobian_has_the_parameters_values() -> None:
     model = catalog.double_pendulum(mass1=mb.Parameter("m", 2.0))
     dyn = dynamics(model, "lagrangian")
     y, tau = np.array([0.3, -0.5, 1.0, 2.0]), np.zeros(2)
-    plain = Linearization(dynamics(catalog.double_pendulum(mass1=3.0), "lagrangian"))(0.0, y, tau)
-    assert Linearization(dyn.at(m=3.0))(0.0, y, tau) == pytest.approx(plain, abs=1e-12)
-    assert Linearization(dynamics(model).at(m=3.0))(0.0, y, tau) == pytest.approx(plain, abs=1e-12)
-    many = Linearization(dyn.at(m=[1.0, 3.0]))
+    plain = RateJacobian(dynamics(catalog.double_pendulum(mass1=3.0), "lagrangian"))(0.0, y, tau)
+    assert RateJacobian(dyn.at(m=3.0))(0.0, y, tau) == pytest.approx(plain, abs=1e-12)
+    assert RateJacobian(dynamics(model).at(m=3.0))(0.0, y, tau) == pytest.approx(plain, abs=1e-12)
+    many = RateJacobian(dyn.at(m=[1.0, 3.0]))
     many.only(1)
     assert many(0.0, y, tau) == pytest.approx(plain, abs=1e-12)
 
 
 def test_another_engine_is_derived_once() -> None:
     dyn = dynamics(catalog.pendulum())
-    assert Linearization(dyn)._twin is Linearization(dyn)._twin
+    assert RateJacobian(dyn)._twin is RateJacobian(dyn)._twin
     own = dynamics(catalog.pendulum(), "lagrangian")
-    assert Linearization(own)._twin is own
+    assert RateJacobian(own)._twin is own
 
 
 def test_where_there_is_no_jacobian_the_last_one_stays() -> None:
     model = catalog.pendulum()
-    exact = Linearization(dynamics(model, "lagrangian"))
+    exact = RateJacobian(dynamics(model, "lagrangian"))
     assert not exact(0.0, np.array([np.nan, 0.0]), np.zeros(1)).any()
     known = exact(0.0, np.array([0.3, 0.0]), np.zeros(1))
     assert np.array_equal(exact(0.0, np.array([0.3, np.inf]), np.zeros(1)), known)

@@ -248,6 +248,30 @@ class Equations:
         by_q, by_v, by_tau = ca.horzsplit(out, [0, n, 2 * n, 3 * n])
         return by_q, by_v, by_tau
 
+    def inverse_dynamics_second_derivatives(self) -> ca.Function:
+        """Return (q, v, a) -> derivatives of ∂ID/∂q by q and by v, of ∂ID/∂v by v, and of M by q, side by side.
+
+        (nv², 4 nv): row i + nv j has those of entry (i, j). That by q is the directional derivative along q̇ = D(q) e_k.
+        """
+        by_q, by_v, M = (ca.vec(x) for x in self.inverse_dynamics_derivatives)
+        tangent = ca.jacobian(self.kin.qdot, self.v)
+        qq, Mq = (ca.mtimes(ca.jacobian(x, self.q), tangent) for x in (by_q, M))
+        out = ca.horzcat(qq, ca.jacobian(by_q, self.v), ca.jacobian(by_v, self.v), Mq)
+        return self.named("inverse_dynamics_second_derivatives", ("q", "v", "a"), [self.q, self.v, self.a], out)
+
+    def parameter_derivatives(self, name: str) -> ca.Function:
+        """Return the derivatives of a quantity by the named parameters, (entries, p), with entries in column order."""
+        names = FUNCTIONS[name]
+        p = self.parameters if self.parameters.numel() else self.constants[: len(self.model.parameters)]
+        if name == "forward_dynamics" and not self.model.constrained:
+            # From ID(q, v, FD) = τ, as with the state: never through a factorization.
+            (by_p,) = ca.substitute([ca.jacobian(self.inverse_dynamics, p)], [self.a], [self.forward_dynamics])
+            out = self.over_mass(-by_p)
+        else:
+            out = ca.jacobian(ca.vec(getattr(self, name)), p)
+        arguments = {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau}
+        return self.named(f"{name}_by_parameters", names, [arguments[n] for n in names], out)
+
     def function(self, name: str) -> ca.Function:
         """Return a quantity as a function of its arguments, with repeated operations as they came."""
         if name not in FUNCTIONS:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, all_finite, batch_of, real
 from mbkit.engines import frames_and_momenta, loads
 from mbkit.engines.frames_and_momenta import LOCAL, FramesAndMomenta, axes_named
+from mbkit.engines.linearization import LinearizationQuantities
 from mbkit.engines.loads import Loads, Wrenches
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
@@ -102,7 +103,7 @@ def scalar(value: Array) -> Any:
     return value if value.ndim else float(value)
 
 
-class Dynamics(FramesAndMomenta, Loads):
+class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities):
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
     Every method takes one state or a batch with one leading axis, checks shapes, finite numbers and unit quaternions,

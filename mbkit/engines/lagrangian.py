@@ -18,6 +18,8 @@ from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_o
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity
 from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import Dynamics, scalar
+from mbkit.engines.linearization import of_parameters, of_second_order
+from mbkit.engines.step_derivatives import momentum_step_slopes
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Model
@@ -329,6 +331,16 @@ class LagrangianDynamics(Dynamics):
     def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
         return self._stacked("forward_dynamics_derivatives", q, v, tau)
 
+    def _inverse_dynamics_second_derivatives(self, q: Array, v: Array, a: Array) -> Array:
+        name = "inverse_dynamics_second_derivatives"
+        code = self.code(name, make=lambda: self.equations.inverse_dynamics_second_derivatives())
+        return np.asarray(of_second_order(code(q, v, a, *self._trailing(q), threads=self.threads)[0]))
+
+    def _parameter_derivatives(self, quantity: str, *states: Array) -> Array:
+        code = self.code(f"{quantity}_by_parameters", make=lambda: self.equations.parameter_derivatives(quantity))
+        out = code(*states, *self._trailing(states[0]), threads=self.threads)[0]
+        return np.asarray(of_parameters(self.model, quantity, out))
+
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         if self.model.constrained:
             self.model.require_independent(q, once=True)
@@ -383,6 +395,21 @@ class LagrangianDynamics(Dynamics):
             step = CompiledStep(self.model, self.equations, self.step_plan(method.name), self._part)
             held = self._steps[method.name] = method, step
         return held[1].run(q, v, tau, dt, *self._trailing(q), threads=self.threads)[:2]
+
+    def _momentum_step_slopes(
+        self, dt: float, q: Array, v: Array, tau: Array, *, parameters: bool
+    ) -> tuple[Array, Array, Array]:
+        from mbkit.derivation.steps.midpoint import Midpoint
+
+        part = Midpoint(self.equations).slopes
+        code = self.code(part.name, make=part.make)
+
+        def equations(q: Array, w: Array, v1: Array) -> list[Array]:
+            h = np.full((*q.shape[:-1], 1), dt)
+            return list(code(q, v, w, v1, tau, h, *self._trailing(q), threads=self.threads))
+
+        q1, v1, slopes = momentum_step_slopes(self.model, equations, q, v)
+        return q1, v1, slopes if parameters else slopes[..., : 3 * self.model.nv]
 
     def _function(self, name: str) -> Any:
         f = self.equations.function(name)

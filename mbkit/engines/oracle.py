@@ -24,6 +24,7 @@ from mbkit.codegen.program import program
 from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
 from mbkit.engines.base import Dynamics, scalar
+from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
 
@@ -202,7 +203,9 @@ class OracleDynamics(Dynamics):
     def _function_of(self, name: str, *extra: Any) -> ca.Function:
         eq = self.equations
         if name != "terms":
-            return eq.body_quantity(name, *extra) if name in BODY_QUANTITIES else eq.function(name)
+            if name in BODY_QUANTITIES:
+                return eq.body_quantity(name, *extra)
+            return eq.function(name) if name in FUNCTIONS else getattr(eq, name)(*extra)
         outs = [ca.densify(getattr(eq, x)) for x in _TERMS]
         return ca.Function("terms", [eq.q, eq.v, *eq.extra_arguments.values()], outs)
 
@@ -243,6 +246,13 @@ class OracleDynamics(Dynamics):
 
     _inverse_dynamics_derivatives = _stack("inverse_dynamics_derivatives")
     _forward_dynamics_derivatives = _stack("forward_dynamics_derivatives")
+
+    def _inverse_dynamics_second_derivatives(self, *states: Array) -> Any:
+        return of_second_order(self._run(("inverse_dynamics_second_derivatives",), *states)[0])
+
+    def _parameter_derivatives(self, quantity: str, *states: Array) -> Any:
+        return of_parameters(self.model, quantity, self._run(("parameter_derivatives", quantity), *states)[0])
+
     _kinetic_energy, _potential_energy, _energy_rate = map(
         _single, ("kinetic_energy", "potential_energy", "energy_rate")
     )

@@ -144,6 +144,11 @@ class Method:
         return self.kind == "fixed" and isinstance(self.formula, (Tableau, SemiImplicitEuler)) and self.formula.explicit
 
     @property
+    def in_momenta(self) -> bool:
+        """Whether its fixed step is one of (q, p), and no formula of velocities and accelerations."""
+        return self.kind == "fixed" and self.formula is None
+
+    @property
     def code_name(self) -> str:
         """Prefix of the names of compiled functions; it tells a tableau's coefficients."""
         return f"{self.name}_{self.formula.digest}" if isinstance(self.formula, Tableau) else self.name

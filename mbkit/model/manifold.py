@@ -109,6 +109,28 @@ def difference(model: Description, q0: Array, q1: Array) -> Array:
     return out
 
 
+def tangent_maps(model: Description, q: Array) -> tuple[Array, Array]:
+    """Return D of q̇ = D(q) v and its left inverse at unit quaternions, (..., nq, nv) and (..., nv, nq)."""
+    lead = q.shape[:-1]
+    if not model.quaternions:
+        unit = np.broadcast_to(np.eye(model.nv), (*lead, model.nv, model.nv))
+        return unit, unit
+    D, inverse = np.zeros((*lead, model.nq, model.nv)), np.zeros((*lead, model.nv, model.nq))
+    for joint in model.independent_joints:
+        a, b, start = model.layout.q[joint.name], model.layout.v[joint.name], joint.type.quaternion
+        if start is None:
+            D[..., a, b] = inverse[..., b, a] = np.eye(joint.type.nv)
+            continue
+        x = q[a].tolist() if q.ndim == 1 else list(q[..., a].T)
+        for k, e in enumerate(np.eye(joint.type.nv).tolist(), b.start):
+            for i, rate in enumerate(joint.type.qdot(x, e), a.start):
+                D[..., i, k] = rate
+        inverse[..., b, a] = np.swapaxes(D[..., a, b], -1, -2)
+        # Columns of a quaternion's rate have the length ½.
+        inverse[..., b, a.start + start : a.stop] *= 4.0
+    return D, inverse
+
+
 def unit_quaternions(model: Description, q: Array) -> tuple[Array, Array]:
     """Return q, (..., nq), with unit quaternions, and the lengths that they had, (..., number of quaternions)."""
     lengths = np.empty((*q.shape[:-1], len(model.quaternions)))

@@ -3,10 +3,11 @@
 from mbkit._callable import make_callable
 from mbkit.methods.registry import METHODS, Method, register_method
 from mbkit.methods.tableaus import RK4, ImplicitTableau, Tableau
-from mbkit.simulate.diagnostics.linearization import Stiffness, stiffness
+from mbkit.simulate.diagnostics.stiffness import Stiffness, stiffness
 from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
 from mbkit.simulate.result import Stats
 from mbkit.simulate.run import simulate
+from mbkit.simulate.sensitivity import Sensitivities, sensitivities
 from mbkit.simulate.trajectory import RunCheck, Trajectory
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "ImplicitTableau",
     "Method",
     "RunCheck",
+    "Sensitivities",
     "Stats",
     "Stiffness",
     "Tableau",
@@ -25,6 +27,7 @@ __all__ = [
     "at_limits",
     "at_section",
     "register_method",
+    "sensitivities",
     "simulate",
     "stiffness",
 ]

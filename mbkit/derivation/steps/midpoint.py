@@ -112,7 +112,7 @@ class Midpoint:
     def __init__(self, equations: Equations) -> None:
         self._equations, self._space = equations, _MomentumSpace(equations.model)
         nq, nv = equations.model.nq, equations.model.nv
-        sizes = {"q": nq, **dict.fromkeys(("v", "pi", "w", "w_1", "w_2", "tau"), nv)}
+        sizes = {"q": nq, **dict.fromkeys(("v", "v1", "pi", "w", "w_1", "w_2", "tau"), nv)}
         sizes |= dict.fromkeys(("dt", "miss", "misses"), 1)
         self._s = {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
         step = ("q", "pi", "w", "tau", "dt")
@@ -129,6 +129,11 @@ class Midpoint:
         self.velocity = self._part("velocity", ("q", "pi"), ("v",), self._velocity)
         #: M and M v, the momentum less what it is at rest, in mbkit's velocity, to be solved elsewhere.
         self.velocity_system = self._part("velocity_system", ("q", "pi"), ("M", "p"), self._velocity_system)
+        #: Both equations of a step from (q, v) to v1, by its velocity w and by v1, and the new configuration; with
+        #: the derivatives of the equations by the unknowns, and of all by q along the manifold, v, τ and parameters.
+        whole = ("q", "v", "w", "v1", "tau", "dt")
+        slopes = ("residual", "by_unknowns", "by_state", "q1", "q1_by_unknowns", "q1_by_state")
+        self.slopes = self._part("slopes", whole, slopes, self._slopes)
 
     def _part(self, name: str, own: tuple[str, ...], writes: tuple[str, ...], make: Any) -> Part:
         name, reads = f"midpoint_{name}", (*own, *self._equations.extra_arguments)
@@ -193,6 +198,28 @@ class Midpoint:
         eq, s = self._equations, self._s
         p = ca.substitute(eq.momentum, ca.vertcat(eq.q, eq.v), ca.vertcat(s["q"], s["v"]))
         return (self._space.to_fixed(s["q"], self._space.to_integrator_force(s["q"], p)),)
+
+    def _slopes(self) -> tuple[Any, ...]:
+        eq, s, space = self._equations, self._s, self._space
+        w, v1, h = s["w"], s["v1"], s["dt"]
+        q_m, mu, f = self._at_midpoint(w)
+        momentum = ca.Function("momentum", [s["q"], s["v"], *eq.extra_arguments.values()], [*self._momentum()])
+        pi0 = momentum(s["q"], s["v"], *eq.extra_arguments.values())
+        q1 = space.retract(s["q"], h * w)
+        pi1 = momentum(q1, v1, *eq.extra_arguments.values())
+        first = space.discrete(h * w, mu, f, h) - space.to_body(s["q"], pi0)
+        residual = ca.vertcat(first, pi1 - pi0 - h * space.to_fixed(q_m, f))
+        tangent = ca.substitute(ca.jacobian(eq.kin.qdot, eq.v), eq.q, s["q"])
+        rest = ca.vertcat(s["v"], s["tau"], eq.parameters)
+
+        def by_state(x: Any) -> Any:
+            return ca.horzcat(ca.mtimes(ca.jacobian(x, s["q"]), tangent), ca.jacobian(x, rest))
+
+        unknowns = ca.vertcat(w, v1)
+        return (
+            *(residual, ca.jacobian(residual, unknowns), by_state(residual)),
+            *(q1, ca.jacobian(q1, unknowns), by_state(q1)),
+        )
 
     def _velocity_system(self) -> tuple[Any, Any]:
         eq, s = self._equations, self._s

@@ -16,8 +16,9 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.math import RollPitchYaw, RotationMatrix
-from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces
+from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces, MultibodyForces_
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import EventStatus
 
@@ -43,6 +44,7 @@ class DrakeDynamics(MappedDynamics):
     """
 
     engine = "drake"
+    lacks_derivatives = ""
     refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "Drake forms C v without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no CasADi form; mbkit.dynamics(model, 'lagrangian') has",
@@ -147,6 +149,45 @@ class DrakeDynamics(MappedDynamics):
         forces = MultibodyForces(self.plant)
         self.plant.CalcForceElementsContribution(self._context, forces)
         return self._force(self.plant.CalcInverseDynamics(self._context, self._to_engine(a) + b, forces))
+
+    def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the derivatives by Drake's automatic differentiation: exact, of numbers with 3 nv directions."""
+        plant, context = self._on_duals
+        x, u, b = self.to_drake(q, v)
+        n, start = len(u), self._to_engine(a)
+        by_q, by_v, by_a = np.split(np.eye(3 * n), 3)
+        moved, pushed = np.array(by_v), np.array(by_a)
+        # Directions are in Drake's axes, in which a turn θ of a body turns v and a of mbkit's axes too.
+        blocks = [
+            (slice(iv, iv + 3), slice(k, k + 3))
+            for joint, _, iv in self.maps.turning
+            for k in range(iv, iv + joint.type.nv, 3)
+        ]
+        for turn, part in blocks:
+            moved[part] -= spatial.skew(u[part]) @ by_q[turn]
+            pushed[part] -= spatial.skew(start[part] + b[part]) @ by_q[turn]
+            if part != turn:
+                # b = ω × v, of which so far only the turn is counted.
+                pushed[part] += spatial.skew(u[turn]) @ by_v[part] - spatial.skew(u[part]) @ by_v[turn]
+        self.put(self.plant, self._context, x, u)
+        rates = [self.plant.MapVelocityToQDot(self._context, e) for e in np.eye(n)]
+        places = np.array(rates).reshape(n, len(x)).T @ by_q
+        plant.SetPositions(context, InitializeAutoDiff(x, places)[:, 0])
+        plant.SetVelocities(context, InitializeAutoDiff(u, moved)[:, 0])
+        forces = MultibodyForces_[AutoDiffXd](plant)
+        plant.CalcForceElementsContribution(context, forces)
+        f = plant.CalcInverseDynamics(context, InitializeAutoDiff(start + b, pushed)[:, 0], forces)
+        value, slope = ExtractValue(f)[:, 0], ExtractGradient(f)
+        for turn, part in blocks:
+            # Forces in mbkit's axes are Tᵀ f.
+            slope[part] += spatial.skew(value[part]) @ by_q[turn]
+        return np.stack([self._columns(self._columns(X).T).T for X in np.split(slope, 3, axis=1)])
+
+    @cached_property
+    def _on_duals(self) -> tuple[Any, Any]:
+        """The plant on numbers with derivatives, and its context."""
+        plant = self.plant.ToAutoDiffXd()
+        return plant, plant.CreateDefaultContext()
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         if self.model.layout.reduced:

@@ -44,6 +44,10 @@ class MujocoDynamics(MappedDynamics):
     """
 
     engine = "mujoco"
+    lacks_derivatives = (
+        "MuJoCo differentiates by finite differences alone (mjd_inverseFD, mjd_transitionFD), which lose half of the "
+        "digits; mbkit.dynamics(model, 'lagrangian') has exact ones"
+    )
     refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "MuJoCo forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",

@@ -21,7 +21,7 @@ from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_MET
 from mbkit.methods.stability import companion
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import magnitude, unit_quaternions
-from mbkit.simulate.diagnostics.linearization import linearized
+from mbkit.simulate.diagnostics.stiffness import linearized
 
 _EPS: Final = sys.float_info.epsilon
 #: Times and trajectories of a batch at which the mass matrix and the energy are evaluated, at most.

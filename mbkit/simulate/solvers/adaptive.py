@@ -34,7 +34,7 @@ from mbkit.methods.tableaus import RosenbrockTableau, dormand_prince_853, rodas5
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.constraint_projection import LOOSEST
-from mbkit.simulate.diagnostics.linearization import Linearization
+from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.trajectory_record import (
@@ -251,7 +251,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
     def __init__(self, problem: IntegrationProblem, space: Space, tolerances: Tolerances) -> None:
         super().__init__(problem, space, tolerances)
         self._model = model = problem.dyn.model
-        self._own_rates, self._exact = Rates(problem.dyn), Linearization(problem.dyn)
+        self._own_rates, self._exact = Rates(problem.dyn), RateJacobian(problem.dyn)
         self._own = rodas5p()
         self._ends, self._d = self._own.c.tolist(), self._own.d
         self._timed = problem.torque.callable or model.time_parameter is not None

@@ -21,7 +21,7 @@ from mbkit._check import Array
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.methods.registry import ADAPTIVE_METHOD, SERIES_METHOD, STIFF_METHOD, Tolerances
 from mbkit.model.integration_space import Space
-from mbkit.simulate.diagnostics.linearization import Stiffness, linearized, stiffness_of
+from mbkit.simulate.diagnostics.stiffness import Stiffness, linearized, stiffness_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.adaptive import StepAttempts, make_attempts, march, run_groups

@@ -51,9 +51,9 @@ class _Solve:
         self.rates = Rates(problem.dyn, explicit=not self._method.jacobian)
         self.jacobian: Any = None
         if self._method.jacobian:
-            from mbkit.simulate.diagnostics.linearization import Linearization
+            from mbkit.simulate.diagnostics.stiffness import RateJacobian
 
-            self.jacobian = Linearization(problem.dyn)
+            self.jacobian = RateJacobian(problem.dyn)
         self._stops = problem.stops
         if problem.save is not None and not self._method.multistep:
             self._stops = sorted({*problem.save.tolist(), problem.end} - {problem.start})

@@ -25,8 +25,7 @@ from mbkit.engines.registry import DERIVED
 from mbkit.errors import InputError, NumericalError
 from mbkit.model import Model
 from mbkit.model.integration_space import Space
-from mbkit.model.joint_types import JointType
-from mbkit.model.manifold import unit_quaternions
+from mbkit.model.manifold import tangent_maps, unit_quaternions
 from mbkit.simulate.torque import Force, TorqueCallback, TorqueFunction
 
 _TWIN: Final = "_derived_twin"
@@ -43,7 +42,7 @@ _SHARE: Final = 1e-3
 _SMALL: Final = 20
 
 
-class Linearization:
+class RateJacobian:
     """∂ẏ/∂y of one state, for the right-hand side `Rates`; `evaluations` counts Jacobians."""
 
     def __init__(self, dyn: Dynamics) -> None:
@@ -90,38 +89,27 @@ class Linearization:
 
     def _kinematics(self, q: Array, v: Array, lengths: Array) -> tuple[Array, Array, Array]:
         """Return ∂(D v)/∂q, D, and the tangent of a change of q, (nv, nq)."""
-        nq, nv = self._model.nq, self._model.nv
         if self._model.velocity_map is not None:
             return cast("tuple[Array, Array, Array]", tuple(self._model.velocity_map.linear(q, v)))
-        rate, D, tangent = np.zeros((nq, nq)), np.zeros((nq, nv)), np.zeros((nv, nq))
+        rate = np.zeros((len(q), len(q)))
+        D, tangent = (x.copy() for x in tangent_maps(self._model, q))
         left = iter(lengths.tolist())
         for kind, a, b in self._joints:
-            if kind.quaternion is None:
-                D[a, b] = tangent[b, a] = np.eye(kind.nv)
+            start = kind.quaternion
+            if start is None:
                 continue
-            length = next(left)
-            rate[a, a], D[a, b], tangent[b, a] = _of_rotation(kind, q[a], v[b], length)
+            # The quaternion's own rate is linear in it.
+            for i, e in enumerate(np.eye(kind.nq)[start:].tolist()):
+                rate[a.start + start : a.stop, a.start + start + i] = kind.qdot(e, v[b].tolist())[start:]
+            length, turn = next(left), slice(a.start + start, a.stop)
+            tangent[b, turn] /= length
+            if kind.floating:
+                # d(R v) = -R (v × dθ)
+                linear, angular = slice(b.start, b.start + start), slice(b.start + start, b.stop)
+                change = np.cross(v[linear], tangent[angular, turn], axisb=0, axisc=0)
+                rate[a.start : a.start + start, turn] = -D[a.start : a.start + start, linear] @ change
+            D[turn, b] *= length
         return rate, D, tangent
-
-
-def _of_rotation(kind: JointType, q: Array, v: Array, length: float) -> tuple[Array, Array, Array]:
-    start = kind.quaternion
-    assert start is not None
-    x = q.tolist()
-    D = np.array([kind.qdot(x, e) for e in np.eye(kind.nv).tolist()]).T
-    tangent = D.T.copy()
-    tangent[:, start:] *= 4 / length
-    rate = np.zeros((kind.nq, kind.nq))
-    # The quaternion's own rate is linear in it.
-    for i, e in enumerate(np.eye(kind.nq)[start:].tolist()):
-        rate[start:, start + i] = kind.qdot(e, v.tolist())[start:]
-    if kind.floating:
-        # d(R v) = -R (v × dθ)
-        linear = v[:start]
-        change = np.cross(linear, tangent[start:, start:], axisb=0, axisc=0)
-        rate[:start, start:] = -D[:start, :start] @ change
-    D[start:] *= length
-    return rate, D, tangent
 
 
 def _differences(
@@ -289,7 +277,7 @@ def _of_one(
     if not model.nv:
         return Stiffness(np.zeros(0, dtype=complex), 0.0, member=member)
     if dyn.derived:
-        exact = Linearization(dyn)
+        exact = RateJacobian(dyn)
         J = exact(t, np.concatenate([q, v]), force)
         if not exact.evaluations:
             raise NumericalError(f"stiffness: {model.name} has no derivative of its acceleration at q = {q.tolist()}")

@@ -1,0 +1,312 @@
+"""The exact derivative of one step of a method, by the chain rule through its own formula.
+
+The formulas of `mbkit.methods` run on any arithmetic; here on values with their derivatives (forward-mode automatic
+differentiation; Griewank and Walther 2008, Evaluating Derivatives, ch. 3), side by side for a batch. Stages that are
+solved for are differentiated by the implicit function theorem.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.methods.one_step import SemiImplicitEuler
+from mbkit.methods.registry import METHODS, Method, method_of
+from mbkit.methods.tableaus import ImplicitTableau, Tableau
+from mbkit.model import Model
+from mbkit.model.integration_space import Space
+from mbkit.model.manifold import tangent_maps
+from mbkit.model.quaternions import Arithmetic
+
+_EPS: Final = float(np.finfo(float).eps)
+#: Newton's iterations for the stages of an implicit method, at most, and the part of the numbers' size below which
+#: corrections that stop shrinking are rounding.
+_MOST: Final = 25
+_ROUNDING: Final = 1e-11
+
+
+class Slopes(NamedTuple):
+    """Accelerations, (..., nv), and their derivatives by q, v and τ, (..., nv, nv), and by parameters, (..., nv, p)."""
+
+    a: Array
+    q: Array
+    v: Array
+    tau: Array
+    parameters: Array
+
+
+class Dual:
+    """Numbers with derivatives: the value has any shape, the slope the same one and a last axis of directions."""
+
+    __slots__ = ("slope", "value")
+    # NumPy's own numbers leave operations with these to them.
+    __array_ufunc__ = None
+
+    def __init__(self, value: Array, slope: Array) -> None:
+        self.value, self.slope = value, slope
+
+    def _to(self, value: Array, factor: Array) -> Dual:
+        """Return a function's value, from its derivative by this number."""
+        return Dual(value, factor[..., None] * self.slope)
+
+    def __add__(self, other: Any) -> Dual:
+        if isinstance(other, Dual):
+            return Dual(self.value + other.value, self.slope + other.slope)
+        return Dual(self.value + other, self.slope)
+
+    def __sub__(self, other: Any) -> Dual:
+        return self.__add__(-other)
+
+    def __rsub__(self, other: float) -> Dual:
+        return -self + other
+
+    def __neg__(self) -> Dual:
+        return Dual(-self.value, -self.slope)
+
+    def __mul__(self, other: Any) -> Dual:
+        if isinstance(other, Dual):
+            slope = self.value[..., None] * other.slope + other.value[..., None] * self.slope
+            return Dual(self.value * other.value, slope)
+        return Dual(self.value * other, self.slope * other)
+
+    def __truediv__(self, other: Any) -> Dual:
+        if not isinstance(other, Dual):
+            return Dual(self.value / other, self.slope / other)
+        out = self.value / other.value
+        return Dual(out, (self.slope - out[..., None] * other.slope) / other.value[..., None])
+
+    def __rtruediv__(self, other: float) -> Dual:
+        out = other / self.value
+        return self._to(out, -out / self.value)
+
+    def __lt__(self, other: float) -> Any:
+        return self.value < other
+
+    __radd__, __rmul__ = __add__, __mul__
+
+
+def _choose(condition: Array, yes: Any, no: Any) -> Dual:
+    a, b = (x if isinstance(x, Dual) else Dual(np.asarray(x), np.zeros(1)) for x in (yes, no))
+    return Dual(np.where(condition, a.value, b.value), np.where(condition[..., None], a.slope, b.slope))
+
+
+_DUALS: Final = Arithmetic(
+    lambda x: x._to(np.sqrt(x.value), 0.5 / np.sqrt(x.value)),
+    lambda x: x._to(np.sin(x.value), np.cos(x.value)),
+    lambda x: x._to(np.cos(x.value), -np.sin(x.value)),
+    _choose,
+)
+
+
+class DualSpace(Space):
+    """The integrators' space on `Dual` vectors: components first, then the states of a batch."""
+
+    arithmetic = staticmethod(lambda x: _DUALS)  # noqa: ARG005  # of these numbers there is one kind
+    part = staticmethod(lambda x, part: Dual(x.value[part], x.slope[part]))
+    copied = staticmethod(lambda x: Dual(x.value.copy(), x.slope.copy()))
+
+    @staticmethod
+    def components(x: Any, part: slice) -> list[Any]:
+        """Return the components of a part of a vector."""
+        return [Dual(*pair) for pair in zip(x.value[part], x.slope[part], strict=True)]
+
+    @staticmethod
+    def put(x: Any, part: slice, components: Any) -> None:
+        """Write components, or a vector, into a part of a vector."""
+        if isinstance(components, Dual):
+            x.value[part], x.slope[part] = components.value, components.slope
+            return
+        for i, one in enumerate(components, part.start):
+            x.value[i], x.slope[i] = one.value, one.slope
+
+
+class _DualStages:
+    """Rates of the stages so far, as `mbkit.methods.one_step.Stages`."""
+
+    def __init__(self) -> None:
+        self._rates = list[tuple[Any, Any]]()
+
+    def __len__(self) -> int:
+        return len(self._rates)
+
+    def append(self, u_rate: Any, w_rate: Any) -> None:
+        """Add a stage."""
+        self._rates.append((u_rate, w_rate))
+
+    def moved(self, h: Any, weights: Array) -> tuple[Any, Any]:
+        """Return h times the weighted sums of u̇ and ẇ."""
+        u, w = (
+            sum(weight * rates[kind] for weight, rates in zip(weights.tolist(), self._rates, strict=True))
+            for kind in (0, 1)
+        )
+        return h * u, h * w
+
+    def squares(self, weights: Array, scales: tuple[Any, Any]) -> Any:
+        """Refuse: errors of steps choose their length, which here is fixed."""
+        raise NotImplementedError
+
+
+def differentiable_method(engine: str, name: object) -> Method:
+    """Return the method of this name, if the derivative of its step is known."""
+    method = method_of(name)
+    known = [m.name for m in METHODS.values() if m.kind == "fixed" and (not m.engines or engine in m.engines)]
+    if method.name not in known:
+        why = method.lacks and f"{engine} {method.lacks}"
+        why = why or "it has no fixed step in mbkit's own code"
+        raise UnsupportedError(f"method {method.name!r}: the derivative of its step is not known: {why}; use {known}")
+    return method
+
+
+class _Rates:
+    """u̇ and ẇ of states with their derivatives, from the engine's accelerations and theirs."""
+
+    def __init__(self, space: DualSpace, model: Model, slopes: Callable[..., Slopes]) -> None:
+        self._space, self._model, self._slopes = space, model, slopes
+
+    def __call__(self, t: Any, q: Any, u: Any, w: Any) -> tuple[Any, Any]:  # noqa: ARG002  # no time
+        space = self._space
+        v = space.to_body_velocity(q, w)
+        here, speed = q.value.T, v.value.T
+        if not (np.isfinite(here).all() and np.isfinite(speed).all()):
+            raise NumericalError("the state within a step is not finite; take shorter steps")
+        at = self._slopes(here, speed)
+        inverse = tangent_maps(self._model, here)[1]
+        slope = at.q @ (inverse @ q.slope.swapaxes(0, 1)) + at.v @ v.slope.swapaxes(0, 1)
+        n = self._model.nv
+        # Behind δq and δv stand the columns of τ and the parameters.
+        slope[..., 2 * n : 3 * n] += at.tau
+        slope[..., 3 * n : 3 * n + at.parameters.shape[-1]] += at.parameters
+        a = Dual(at.a.T, slope.swapaxes(0, 1))
+        return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
+
+
+def step_derivatives(
+    model: Model,
+    method: Method,
+    slopes: Callable[..., Slopes],
+    dt: float,
+    q: Array,
+    v: Array,
+    parameters: int = 0,
+) -> tuple[Array, Array, Array]:
+    """Return q and v after a step, and their derivatives by δq, δv, τ and the parameters.
+
+    Parameters
+    ----------
+    model : Model
+    method : Method
+        With a formula of its own and a fixed step.
+    slopes : callable
+        (q, v) of a batch -> `Slopes`.
+    dt : float
+        s.
+    q, v : (nq,) and (nv,), or (N, nq) and (N, nv) arrays
+    parameters : int
+        The number p of parameters in what `slopes` returns.
+
+    Returns
+    -------
+    q, v, slopes
+        The last of shape (2nv, 3nv + p) or (N, 2nv, 3nv + p), on the tangent spaces before and after.
+    """
+    if q.ndim == 1:
+        q1, v1, out = step_derivatives(model, method, slopes, dt, q[None], v[None], parameters)
+        return q1[0], v1[0], out[0]
+    n, formula, space = model.nv, method.formula, DualSpace(model)
+    columns, rates = 3 * n + parameters, _Rates(space, model, slopes)
+    start_q, start_v = (Dual(x.T, np.zeros((*x.T.shape, columns))) for x in (q, v))
+    start_q.slope[..., :n] = tangent_maps(model, q)[0].swapaxes(0, 1)
+    start_v.slope[range(n), :, range(n, 2 * n)] = 1.0
+    w = space.to_integrator_velocity(start_q, start_v)
+    if isinstance(formula, ImplicitTableau):
+        end_q, end_w = _implicit_step(formula, space, rates, dt, start_q, w)
+    else:
+        assert isinstance(formula, (Tableau, SemiImplicitEuler))
+        end_q, end_w, _ = formula.step(space, rates, _DualStages(), 0.0, dt, start_q, w)
+    end_v = space.to_body_velocity(end_q, end_w)
+    q1, v1 = end_q.value.T, end_v.value.T
+    moved = tangent_maps(model, q1)[1] @ end_q.slope.swapaxes(0, 1)
+    return q1, v1, np.concatenate([moved, end_v.slope.swapaxes(0, 1)], axis=-2)
+
+
+def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h: float, q: Dual, w: Dual) -> Any:
+    """Return q and w after a step whose stages k = (u̇, ẇ) depend on each other.
+
+    Newton's iteration solves G(k, x) = k - F(u(k), w + ..., x) = 0 to rounding; then dk = -G_k⁻¹ G_x dx.
+    """
+    n, size, columns = space.nv, q.value.shape[1], q.slope.shape[-1]
+    s, A = tableau.stages, tableau.A
+    # Directions of one stage's u and w stand behind the columns of the result.
+    q_wide, w0 = _padded(q, 2 * n), w
+    seed_u, seed_w = (np.zeros((n, size, columns + 2 * n)) for _ in range(2))
+    seed_u[range(n), :, range(columns, columns + n)] = 1.0
+    seed_w[range(n), :, range(columns + n, columns + 2 * n)] = 1.0
+    k = np.zeros((s, size, 2 * n))
+    k[..., :n] = w.value.T
+    last = np.full(size, np.inf)
+    for _ in range(_MOST):
+        stages = h * np.einsum("ij,jbm->ibm", A, k)
+        J, by_x, miss = np.empty((s, size, 2 * n, 2 * n)), np.empty((s, size, 2 * n, columns)), np.empty(k.shape)
+        for i in range(s):
+            u, speed = Dual(stages[i, :, :n].T, seed_u), Dual(w0.value + stages[i, :, n:].T, seed_w)
+            pair = rates(0.0, space.retract(q_wide, u), u, speed)
+            slope = np.concatenate([x.slope.swapaxes(0, 1) for x in pair], axis=-2)
+            miss[i] = k[i] - np.concatenate([x.value.T for x in pair], axis=-1)
+            by_x[i], J[i] = slope[..., :columns], slope[..., columns:]
+        coupled = -h * np.einsum("ij,ibkl->bikjl", A, J).reshape(size, s * 2 * n, s * 2 * n)
+        coupled += np.eye(s * 2 * n)
+        change = np.asarray(np.linalg.solve(coupled, miss.swapaxes(0, 1).reshape(size, s * 2 * n, 1))[..., 0])
+        k = k - change.reshape(size, s, 2 * n).swapaxes(0, 1)
+        done, last = _settled(change, last, k.swapaxes(0, 1).reshape(size, s * 2 * n))
+        if done:
+            break
+    else:
+        raise NumericalError(f"{tableau.name}: the iteration does not solve the stages; take shorter steps")
+    # Of w itself the stages depend through their own w.
+    by_w = np.einsum("ibkl,blm->ibkm", J[..., n:], w0.slope.swapaxes(0, 1))
+    right = (by_x + by_w).swapaxes(0, 1).reshape(size, s * 2 * n, columns)
+    slopes = np.linalg.solve(coupled, right).reshape(size, s, 2 * n, columns)
+    value, slope = h * np.einsum("i,ibm->bm", tableau.b, k), h * np.einsum("i,bimc->mbc", tableau.b, slopes)
+    end = Dual(value.T, slope)
+    u, dw = (Dual(end.value[part], end.slope[part]) for part in (slice(n), slice(n, None)))
+    return space.retract(q, u), w + dw
+
+
+def _settled(change: Array, last: Array, numbers: Array) -> tuple[bool, Array]:
+    """Return whether Newton's corrections, one row per state, are rounding of these numbers, and their sizes."""
+    far, limit = np.abs(change).max(axis=-1, initial=0.0), np.abs(numbers).max(axis=-1, initial=1.0)
+    done = (far <= 4 * _EPS * limit) | ((far >= last / 2) & (far <= _ROUNDING * limit))
+    return bool(done.all()), far
+
+
+def momentum_step_slopes(
+    model: Model, equations: Callable[..., list[Array]], q: Array, v: Array
+) -> tuple[Array, Array, Array]:
+    """Return what `step_derivatives` does, of a step whose velocity w and new v solve `equations`(q, w, v1).
+
+    These are those of `mbkit.derivation.steps.midpoint.Midpoint.slopes`.
+    """
+    n = model.nv
+    y = np.concatenate([Space(model).to_integrator_velocity(q, v), v], axis=-1)
+    last = np.full(y.shape[:-1], np.inf)
+    for _ in range(_MOST):
+        residual, by_y, by_x, q1, q1_by_y, q1_by_x = equations(q, y[..., :n], y[..., n:])
+        change = np.asarray(np.linalg.solve(by_y, residual)[..., 0])
+        y = y - change
+        done, last = _settled(change, last, y)
+        if done:
+            break
+    else:
+        raise NumericalError("the iteration does not solve the step's equations; take shorter steps")
+    slopes = -np.linalg.solve(by_y, by_x)
+    q1 = q1[..., 0]
+    moved = tangent_maps(model, q1)[1] @ (q1_by_y @ slopes + q1_by_x)
+    return q1, y[..., n:], np.concatenate([moved, slopes[..., n:, :]], axis=-2)
+
+
+def _padded(x: Dual, more: int) -> Dual:
+    return Dual(x.value, np.concatenate([x.slope, np.zeros((*x.slope.shape[:-1], more))], axis=-1))
