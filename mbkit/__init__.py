@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from mbkit.model import Model as Model
     from mbkit.model import ModelBuilder as ModelBuilder
     from mbkit.model import Parameter as Parameter
+    from mbkit.show import show as show
     from mbkit.simulate import Trajectory as Trajectory
     from mbkit.simulate import sensitivities as sensitivities
     from mbkit.simulate import simulate as simulate
@@ -69,7 +70,7 @@ _HOME = {
     "stress": "mbkit.studies",
     "work_precision": "mbkit.studies",
 }
-# `simulate` is called too, and its methods and events are in it.
+# `show` and `simulate` are called too; methods and events are in the second.
 _MODULES = {
     "baseline": "mbkit.studies.baseline",
     "catalog": "mbkit.catalog",
@@ -77,6 +78,7 @@ _MODULES = {
     "errors": "mbkit.errors",
     "lagrangian": "mbkit.lagrangian",
     "model": "mbkit.model",
+    "show": "mbkit.show",
     "simulate": "mbkit.simulate",
     "spatial": "mbkit.spatial",
     "studies": "mbkit.studies",

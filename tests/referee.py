@@ -35,6 +35,7 @@ PACKAGES = (
     "mbkit.lagrangian.systems",
     "mbkit.load",
     "mbkit.model",
+    "mbkit.show",
     "mbkit.simulate",
     "mbkit.spatial",
     "mbkit.studies",

@@ -7,7 +7,7 @@ quantities that follow from others are here.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, ClassVar, Final, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +24,9 @@ from mbkit.methods.tableaus import Tableau
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import NEAR_UNIT
+
+if TYPE_CHECKING:
+    from mbkit.show import Kind
 
 QUANTITIES: Final = (
     *("mass_matrix", "coriolis_matrix", "coriolis_force", "gravity", "nle", "passive"),
@@ -281,6 +284,21 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities):
         with MX or SX and differentiated. `mbkit.lagrangian.export_c` writes it as C.
         """
         return self._method("function")(name)
+
+    def visual_model(self, shapes: Kind = "visual") -> Any:
+        """Return the engine's own model of what there is to draw, for its viewers; nothing of it acts on the motion.
+
+        Parameters
+        ----------
+        shapes : {"visual", "collision", "sticks"}
+            As in `mbkit.show`.
+
+        Raises
+        ------
+        UnsupportedError
+            An engine without viewers, or a model written as energies.
+        """
+        raise UnsupportedError(f"{self.engine}: no viewer that takes a model with {shapes} shapes; mbkit.show has one")
 
     # Derivatives
 

@@ -20,6 +20,12 @@ from mbkit.model import Body, Joint, Model
 from mbkit.model.joint_types import kind_of
 
 
+def reserved(name: str, names: set[str]) -> str:
+    """Return this name, or a longer one that is not among `names`, and add it to them."""
+    names.add(name := unused(name, names))
+    return name
+
+
 class Importer(NamedTuple):
     """Where an engine's importer is."""
 
@@ -90,9 +96,7 @@ class Parts:
 
     def name(self, what: str, name: str) -> str:
         """Return a name that no "body", say, has yet: an importer may take what mbkit's loader refuses."""
-        names = self._names.setdefault(what, set())
-        names.add(name := unused(name, names))
-        return name
+        return reserved(name, self._names.setdefault(what, set()))
 
     def joint(self, *place: Any, **numbers: Any) -> None:
         """Add a joint; arguments as of `joint_of`."""

@@ -150,7 +150,7 @@ def load(
     doubts = scale_doubts(model)
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)
-    return replace(model, notes=(*root.notes, *model.notes)) if root.notes else model
+    return replace(model, notes=(*root.notes, *model.notes), source=str(path.absolute()))
 
 
 def _locate(source: str | os.PathLike[str]) -> tuple[Path, bool]:

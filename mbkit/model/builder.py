@@ -572,7 +572,7 @@ class ModelBuilder:
         ]
 
     def _assemble(self, joints: Iterable[Joint], bindings: Iterable[Binding]) -> Model:
-        parts = {kind: tuple(parts) for kind, parts in self._parts.items()} | {"joints": tuple(joints)}
+        parts: dict[str, Any] = {kind: tuple(parts) for kind, parts in self._parts.items()} | {"joints": tuple(joints)}
         return Model(
             name=self._name, gravity=self._gravity, notes=tuple(self._notes), bindings=tuple(bindings), **parts
         )

@@ -222,6 +222,9 @@ class Description:
     bindings : tuple of Binding
         The numbers that are expressions of parameters. The parts hold their nominal
         values, and NaN without one.
+    source : str
+        Path of the file that the loader read, with the shapes to draw; empty without one. Like the notes, it does not
+        count for equality.
     """
 
     name: str
@@ -236,6 +239,7 @@ class Description:
     notes: tuple[str, ...] = ()
     nonphysical: tuple[tuple[str, str], ...] = ()
     bindings: tuple[Binding, ...] = ()
+    source: str = ""
     layout: Layout = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

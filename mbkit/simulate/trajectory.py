@@ -19,6 +19,7 @@ from mbkit._escape import csv_text, html, one_line
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError, MbkitWarning, OutputError
 from mbkit.methods.registry import AUTOMATIC_METHOD, METHODS, Method
+from mbkit.model import Model
 from mbkit.simulate.diagnostics.checks import CHECKED_TIMES, diagnostics
 from mbkit.simulate.integrate import integrate
 from mbkit.simulate.run_data import RunData, RunSettings, dynamics_of_trajectory
@@ -26,6 +27,8 @@ from mbkit.simulate.run_data import RunData, RunSettings, dynamics_of_trajectory
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
+
+    from mbkit.show import Kind, View
 
 #: Times of an event that `repr` shows.
 _SHOWN: Final = 4
@@ -144,13 +147,63 @@ class Trajectory(RunData):
         """
         from mbkit.simulate.plotting.motion_strip import picture
 
+        member, model = self._member(member)
+        return picture(self, model, count, view, member, ax)
+
+    def animate(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        member: int = 0,
+        shapes: Kind = "visual",
+        triangles: int = 250_000,
+        fps: float = 25.0,
+    ) -> View:
+        """Show the motion with the robot's shapes, in a notebook, a browser window or a file.
+
+        The page has a time slider, play and pause, speeds, and a turntable camera. It is one HTML file that loads
+        nothing, of up to 2,000 of the saved states, and moves smoothly from one to the next. A constrained model is
+        drawn at its coordinates, loops as far as they are closed there.
+
+        Parameters
+        ----------
+        path : str or path, optional
+            A file to write: ``.html``, ``.gif`` or ``.mp4``, or ``.png`` for the first state. Without one see
+            `mbkit.show`.
+        member : int
+            Index of the trajectory in a batch.
+        shapes : {"visual", "collision", "sticks"}
+        triangles : int
+            See `mbkit.show`.
+        fps : float
+            Frames a second of a film, in the time of the motion.
+
+        Returns
+        -------
+        mbkit.show.View
+
+        Raises
+        ------
+        InputError
+            No finite state, or a path of another kind.
+        UnsupportedError
+            A model written as energies, or a format whose writer is not installed.
+        OutputError
+            The file cannot be written.
+        """
+        from mbkit.show.view import animate
+
+        member, model = self._member(member)
+        q = self.q[member] if self.q.ndim == 3 else self.q
+        return animate(model, q, self.t, path, shapes=shapes, triangles=triangles, fps=fps)
+
+    def _member(self, member: int) -> tuple[int, Model]:
+        """Return the checked index of a trajectory, and its description, for which no engine is built."""
         member = _check.count("member", member)
         members = len(self.q) if self.q.ndim == 3 else 1
         if member >= members:
             raise InputError(f"member: expected less than {members}, the number of trajectories, got {member}")
-        # The description is enough; no engine is built.
-        model = self.model if self._dyn is None else dynamics_of_trajectory(self._dyn, member).model
-        return picture(self, model, count, view, member, ax)
+        return member, self.model if self._dyn is None else dynamics_of_trajectory(self._dyn, member).model
 
     def to_csv(self, path: str | os.PathLike[str] | None = None) -> str:
         """Return t, q and v with all their digits, one line per state; with `path`, write it there too.

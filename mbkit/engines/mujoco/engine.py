@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import mujoco
 import numpy as np
@@ -27,6 +27,9 @@ from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, hea
 from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Frame, Model
+
+if TYPE_CHECKING:
+    from mbkit.show import Kind
 
 #: Quantities that M is part of.
 _OF_MASS: Final = ("mass_matrix", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
@@ -93,6 +96,17 @@ class MujocoDynamics(MappedDynamics):
         root = np.sqrt(np.abs(np.diag(M)))
         lost = missing > 1e-9 * np.outer(root, root)
         return tuple(name for name, x in rows.items() if lost[np.ix_(x != 0, x != 0)].any())
+
+    def visual_model(self, shapes: Kind = "visual") -> mujoco.MjModel:
+        """Return `mj_model` with sites of the frames and shapes to draw: geoms of group 2, massless and contact-free.
+
+        Frames and shapes on massless bodies between the joints of a stack are left out, since MuJoCo has no body
+        there. `mj_model` has neither sites nor geoms, which take a few per cent of its time.
+        """
+        # Imported late: few scripts draw.
+        from mbkit.show import shapes_of
+
+        return build(self.model, shapes=shapes_of(self.model, shapes)).model
 
     # Between the description's numbers and MuJoCo's.
 

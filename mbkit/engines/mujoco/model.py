@@ -11,7 +11,7 @@ import contextlib
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
 import numpy as np
@@ -23,6 +23,9 @@ from mbkit.engines.imported import unused
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.validation import static_bodies
+
+if TYPE_CHECKING:
+    from mbkit.show import Shape
 
 # What is global in MuJoCo. 4.0, the lower bound, is the first whose Runge–Kutta on rotations is of fourth order.
 
@@ -85,8 +88,10 @@ class MujocoModel:
     disabled: tuple[str, ...]
 
 
-def build(description: Model, *, spheres: bool = False) -> MujocoModel:
-    """Compile the description; `spheres` gives every body a sphere of 1 µm, to measure the cost of geometry.
+def build(description: Model, *, spheres: bool = False, shapes: Sequence[Shape] | None = None) -> MujocoModel:
+    """Compile the description, with shapes to draw and sites of its frames where shapes are given, if only none.
+
+    `spheres` gives every body a sphere of 1 µm, to measure the cost of geometry.
 
     Raises `UnsupportedError` for a joint or a body that MuJoCo cannot hold, and names it.
     """
@@ -95,6 +100,11 @@ def build(description: Model, *, spheres: bool = False) -> MujocoModel:
         for name, body in placed.bodies.items():
             if name != "world":
                 body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-6, 0, 0], pos=body.ipos, mass=0.0)
+    if shapes is not None:
+        # Imported late: few scripts draw.
+        from mbkit.engines.mujoco.visuals import add_shapes
+
+        add_shapes(spec, placed.bodies, description, shapes)
     # A singular M at the zero configuration is an error only where it is solved with.
     with heard_warnings(), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)

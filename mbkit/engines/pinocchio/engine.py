@@ -10,7 +10,7 @@ import functools
 from collections.abc import Callable
 from functools import cached_property
 from math import isfinite
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 import pinocchio as pin
@@ -22,6 +22,9 @@ from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, WORLD
 from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
 from mbkit.model import Frame, Model
 from mbkit.model.manifold import NEAR_UNIT
+
+if TYPE_CHECKING:
+    from mbkit.show import Kind
 
 # Calls for one state, with the fewest checks that are safe
 #
@@ -126,7 +129,7 @@ class PinocchioDynamics(Dynamics):
     Attributes
     ----------
     pin_model : pinocchio.Model
-        The model that was built; free to read.
+        The model that was built, with a frame for each body and each frame of the description; free to read.
     """
 
     engine = "pinocchio"
@@ -188,6 +191,14 @@ class PinocchioDynamics(Dynamics):
         if quantity == "kinetic_energy" and self._kinetic_fault:
             known_defects.announce(known_defects.KINETIC_ENERGY, self._kinetic_fault)
         return super()._method(quantity)
+
+    def visual_model(self, shapes: Kind = "visual") -> pin.GeometryModel:
+        """Return Pinocchio's model of the shapes to draw, for `pin_model` and its viewers; no pair of them collides."""
+        # Imported late: few scripts draw.
+        from mbkit.engines.pinocchio.visuals import geometry
+        from mbkit.show import shapes_of
+
+        return geometry(self._pin, shapes_of(self.model, shapes))
 
     # Between the description's coordinates and Pinocchio's.
 

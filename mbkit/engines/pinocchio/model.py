@@ -68,6 +68,14 @@ def build(description: Model) -> PinModel:
             ground += body.mass * (p + R @ body.com)
         q_order.extend(range(layout.full_q[joint.name].start, layout.full_q[joint.name].stop))
         v_order.extend(range(layout.full_v[joint.name].start, layout.full_v[joint.name].stop))
+    for frame in (*(description.frame(body.name) for body in description.bodies), *description.frames):
+        if model.existFrame(frame.name):
+            continue
+        carrier, R, p = bodies[frame.body]
+        kind = pin.FrameType.BODY if frame.body == frame.name else pin.FrameType.OP_FRAME
+        placement = pin.SE3(R @ frame.rotation, p + R @ frame.translation)
+        # Without inertia: the bodies' own is in already.
+        model.addFrame(pin.Frame(frame.name, carrier, 0, placement, kind), False)
     ordered = q_order == list(range(len(q_order)))
     return PinModel(model, bodies, np.array(q_order, int), np.array(v_order, int), ordered, ground)
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, finite_array
 from mbkit.errors import InputError
 from mbkit.model import Joint, Model
+from mbkit.model.poses import body_poses, inertia_box
 
 
 @dataclass(frozen=True)
@@ -88,9 +89,8 @@ class _Tree:
     """The poses of all bodies, and what link each belongs to: it goes by the name of its first body."""
 
     def __init__(self, model: Model, q: Array) -> None:
-        n, full = len(q), model.layout.expand_q(q)
         self._model = model
-        self._poses = {"world": (np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)))}
+        self._poses = body_poses(model, q)
         #: Places of the joints on their parents.
         self.bases: dict[str, Array] = {}
         self.link, self.depth = {"world": "world"}, {"world": 0}
@@ -99,12 +99,7 @@ class _Tree:
         self.moving = [joint for joint in model.tree if joint.type.nv]
         for joint in model.tree:
             parent, child = joint.parent, joint.child
-            R_WJ = self._poses[parent][0] @ joint.rotation
-            R, p = joint.type.placement(np, joint, list(full[:, model.layout.full_q[joint.name]].T))
-            R_JC = np.array([[np.broadcast_to(x, n) for x in row] for row in R]).transpose(2, 0, 1)
-            p_JC = np.array([np.broadcast_to(x, n) for x in p]).T
             self.bases[joint.name] = self.at(parent, joint.translation)
-            self._poses[child] = R_WJ @ R_JC, self.bases[joint.name] + np.einsum("nij,nj->ni", R_WJ, p_JC)
             self.link[child] = child if joint.type.nv else self.link[parent]
             self.ground[child] = self.ground.get(parent, child)
             if joint.type.nv:
@@ -137,10 +132,7 @@ class _Tree:
     def box(self, name: str) -> Array:
         """Return the corners of the uniform box with a body's mass and inertia, (8, n, 3)."""
         body = self._model.body(name)
-        moments, axes = np.linalg.eigh(body.inertia)
-        # ∫ x² dm of each principal axis; of a box it is m/3 times the half length squared.
-        squares = np.maximum(moments.sum() / 2 - moments, 0.0)
-        half = np.sqrt(3 * squares / body.mass) if body.mass else np.zeros(3)
+        axes, half = inertia_box(body)
         return np.array([self.at(name, body.com + axes @ (half * s)) for s in product((-1, 1), repeat=3)])
 
 

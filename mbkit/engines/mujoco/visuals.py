@@ -1,0 +1,61 @@
+"""Sites and shapes on the bodies of a MuJoCo specification: neither has mass, and nothing collides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from mbkit import spatial
+from mbkit._check import Array
+from mbkit.engines.imported import reserved
+from mbkit.model import Model
+from mbkit.show import Shape
+
+_TYPES: Final = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+}
+#: The group that viewers show, and that menageries use for what only looks.
+_GROUP: Final = 2
+
+
+def _wxyz(R: Array) -> Array:
+    return np.roll(spatial.quaternion_from_matrix(R), 1)
+
+
+def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes: Sequence[Shape]) -> None:
+    """Add a site for each frame and geoms for the shapes; those on bodies that MuJoCo does not have are left out."""
+    taken = {site.name for site in spec.sites}
+    for frame in description.frames:
+        if frame.body in bodies:
+            name = reserved(frame.name, taken)
+            bodies[frame.body].add_site(name=name, pos=frame.translation, quat=_wxyz(frame.rotation))
+    meshes: dict[int, str] = {}
+    names: set[str] = set()
+    for shape in shapes:
+        if shape.body not in bodies:
+            continue
+        look: dict[str, Any] = {"pos": shape.translation, "quat": _wxyz(shape.rotation), "group": _GROUP}
+        look |= {"mass": 0.0, "contype": 0, "conaffinity": 0}
+        body = bodies[shape.body]
+        if shape.kind != "mesh":
+            size = [*shape.size, 0.0, 0.0][:3]
+            name = reserved(shape.name, names)
+            body.add_geom(name=name, type=_TYPES[shape.kind], size=size, rgba=shape.color, **look)
+            continue
+        for surface in shape.meshes:
+            if id(surface) not in meshes:
+                meshes[id(surface)] = f"mesh{len(meshes)}"
+                mesh = spec.add_mesh(name=meshes[id(surface)])
+                mesh.uservert, mesh.userface = surface.vertices.ravel(), surface.triangles.ravel()
+                # Of surfaces with holes there is no volume.
+                mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            name, rgba = reserved(shape.name, names), surface.color or shape.color
+            mesh_type = mujoco.mjtGeom.mjGEOM_MESH
+            body.add_geom(name=name, type=mesh_type, meshname=meshes[id(surface)], rgba=rgba, **look)

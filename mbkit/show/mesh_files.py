@@ -1,0 +1,278 @@
+"""Meshes from files: OBJ and COLLADA with the colours of their materials, all else by Assimp in Pinocchio's coal.
+
+coal makes one surface of a file and drops its materials, so the two formats that have any are read here. Files are
+those of strangers: whatever is wrong with one is a ValueError.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.errors import LoadError
+from mbkit.load import xml_reader
+from mbkit.load.mjcf_attributes import about, read_mesh
+from mbkit.load.xml_reader import Element
+from mbkit.show.surfaces import Color, Indices, Surface, cleaned
+
+#: Nodes in nodes, and surfaces of a file: a node may be there many times.
+_DEEPEST: Final = 50
+_MOST: Final = 5000
+_MOST_TRIANGLES: Final = 10_000_000
+
+
+def read_surfaces(path: Path) -> tuple[Surface, ...]:
+    """Return the surfaces in a mesh file, one a colour, in the file's units; ValueError where there is none."""
+    content, why = read_mesh(path)
+    if why:
+        raise ValueError(why)
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".dae":
+            surfaces = list(_Collada(content, path).surfaces())
+        elif suffix == ".obj":
+            surfaces = _wavefront(content.decode("utf-8", "replace"), path)
+        else:
+            surfaces = [_by_coal(path)]
+    except (LoadError, ArithmeticError, LookupError, TypeError) as error:
+        raise ValueError(f"not readable: {error}") from None
+    if not surfaces:
+        raise ValueError("no triangles in it")
+    return tuple(
+        _joined([s for s in surfaces if s.color == color]) for color in dict.fromkeys(s.color for s in surfaces)
+    )
+
+
+def _joined(surfaces: list[Surface]) -> Surface:
+    """Return surfaces of one colour as one."""
+    firsts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
+    triangles = [s.triangles + first for s, first in zip(surfaces, firsts, strict=False)]
+    return Surface(np.concatenate([s.vertices for s in surfaces]), np.concatenate(triangles), surfaces[0].color)
+
+
+def _by_coal(path: Path) -> Surface:
+    # Pinocchio brings it; only meshes need it.
+    import coal
+
+    try:
+        mesh = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
+    except Exception as error:
+        raise ValueError(str(error).partition("message:")[2].strip() or str(error)) from None
+    triangles = [[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))]
+    return cleaned(mesh.vertices(), triangles)
+
+
+# Wavefront OBJ (Alias 1993, Object Files)
+
+
+def _wavefront(text: str, path: Path) -> list[Surface]:
+    points: list[list[float]] = []
+    faces: dict[str, list[tuple[int, int, int]]] = {}
+    colors: dict[str, Color] = {}
+    own = faces.setdefault("", [])
+    for line in text.splitlines():
+        kind, _, rest = line.strip().partition(" ")
+        if kind == "v":
+            points.append([float(x) for x in rest.split()[:3]])
+        elif kind == "f":
+            corners = [int(word.partition("/")[0]) for word in rest.split()]
+            corners = [c - 1 if c > 0 else len(points) + c for c in corners]
+            own += [(corners[0], a, b) for a, b in pairwise(corners[1:])]
+        elif kind == "usemtl":
+            own = faces.setdefault(rest.strip(), [])
+        elif kind == "mtllib":
+            colors |= _materials(path.parent / Path(rest.strip()).name)
+    if any(len(p) != 3 for p in points):
+        raise ValueError("a vertex without three coordinates")
+    return [cleaned(points, triangles, colors.get(name)) for name, triangles in faces.items() if triangles]
+
+
+def _materials(path: Path) -> dict[str, Color]:
+    content, _ = read_mesh(path)
+    out: dict[str, Color] = {}
+    name = ""
+    for line in content.decode("utf-8", "replace").splitlines():
+        kind, *words = line.split() or [""]
+        if kind == "newmtl":
+            name = " ".join(words)
+        elif kind == "Kd" and len(words) >= 3 and name not in out:
+            out[name] = (*(float(w) for w in words[:3]), 1.0)  # type: ignore[assignment]
+        elif kind == "map_Kd" and (mean := _mean_color(path.parent / Path(words[-1]).name)):
+            out[name] = mean
+    return out
+
+
+def _mean_color(image: Path) -> Color | None:
+    """Return the mean colour of a picture, in place of a texture."""
+    content, _ = read_mesh(image)
+    try:
+        from PIL import Image
+
+        with Image.open(image) as picture:
+            r, g, b = np.asarray(picture.convert("RGB").resize((16, 16))).reshape(-1, 3).mean(axis=0) / 255
+    except Exception:
+        # Any: a texture is not worth an error.
+        return None
+    return (float(r), float(g), float(b), 1.0) if content else None
+
+
+# COLLADA (Barnes and Finch 2008, COLLADA Digital Asset Schema 1.4.1)
+
+
+class _Collada:
+    """The triangles below the nodes of a file, in metres; like RViz and Assimp in coal, it ignores which way is up."""
+
+    def __init__(self, content: bytes, path: Path) -> None:
+        self.folder = path.parent
+        self.root = xml_reader.parse(content, path.name)
+        self.by_id = {e.attributes["id"]: e for e in self.root.walk() if "id" in e.attributes}
+        units = [u for asset in self.root.all("asset") for u in asset.all("unit")]
+        self.unit = float(units[0].attributes.get("meter", 1)) if units else 1.0
+        self.colors: dict[str, Color | None] = {}
+        self.nodes = self.count = 0
+
+    def surfaces(self) -> Iterator[Surface]:
+        for library in self.root.all("library_visual_scenes"):
+            for scene in library.all("visual_scene"):
+                for node in scene.all("node"):
+                    yield from self._below(node, self.unit * np.eye(4), 0)
+
+    def _target(self, url: str) -> Element | None:
+        return self.by_id.get(url.removeprefix("#"))
+
+    def _below(self, node: Element, above: Array, depth: int) -> Iterator[Surface]:
+        self.nodes += 1
+        if depth > _DEEPEST or self.nodes > _MOST:
+            raise ValueError(f"more than {_MOST} nodes, or nested more than {_DEEPEST} deep")
+        X = above
+        for child in node.children:
+            if child.tag in ("matrix", "translate", "rotate", "scale"):
+                X = X @ _transform(child)
+        for child in node.children:
+            target = self._target(child.attributes.get("url", ""))
+            if child.tag == "node":
+                yield from self._below(child, X, depth + 1)
+            elif child.tag == "instance_node" and target:
+                yield from self._below(target, X, depth + 1)
+            elif child.tag == "instance_geometry" and target:
+                bound = {
+                    e.attributes.get("symbol", ""): e.attributes.get("target", "")
+                    for e in child.walk()
+                    if e.tag == "instance_material"
+                }
+                yield from self._geometry(target, X, bound)
+
+    def _geometry(self, geometry: Element, X: Array, bound: dict[str, str]) -> Iterator[Surface]:
+        for mesh in geometry.all("mesh"):
+            for part in mesh.children:
+                if part.tag not in ("triangles", "polylist", "polygons"):
+                    continue
+                stride = 1 + max((int(i.attributes.get("offset", 0)) for i in part.all("input")), default=0)
+                start, positions = self._positions(part)
+                triangles = _triangles(part, stride)[:, start::stride] if positions.size else np.empty((0, 3), int)
+                self.count += len(triangles)
+                if self.count > _MOST_TRIANGLES:
+                    raise ValueError(f"more than {_MOST_TRIANGLES} triangles")
+                if len(triangles):
+                    symbol = part.attributes.get("material", "")
+                    V = positions @ X[:3, :3].T + X[:3, 3]
+                    yield cleaned(V, triangles, self._color(bound.get(symbol, symbol)))
+
+    def _positions(self, part: Element) -> tuple[int, Array]:
+        for given in part.all("input"):
+            vertices = self._target(given.attributes.get("source", ""))
+            if given.attributes.get("semantic") != "VERTEX" or vertices is None:
+                continue
+            for own in vertices.all("input"):
+                source = self._target(own.attributes.get("source", ""))
+                if own.attributes.get("semantic") == "POSITION" and source and (array := source.first("float_array")):
+                    return int(given.attributes.get("offset", 0)), _numbers(array.text, float).reshape(-1, 3)
+        return 0, np.empty((0, 3))
+
+    def _color(self, material: str) -> Color | None:
+        if material not in self.colors:
+            self.colors[material] = self._diffuse(material)
+        return self.colors[material]
+
+    def _diffuse(self, material: str) -> Color | None:
+        found = self._target(material)
+        instance = found.first("instance_effect") if found else None
+        effect = self._target(instance.attributes.get("url", "")) if instance else None
+        diffuse = next((e for e in effect.walk() if e.tag == "diffuse"), None) if effect else None
+        if effect is None or diffuse is None:
+            return None
+        if color := diffuse.first("color"):
+            r, g, b, *_ = (float(x) for x in color.text.split())
+            return (r, g, b, 1.0)
+        # A texture names a sampler, which names a surface, which names an image.
+        name = next((t.attributes.get("texture", "") for t in diffuse.all("texture")), "")
+        parameters = {e.attributes.get("sid", ""): e for e in effect.walk() if e.tag == "newparam"}
+        for tag in ("source", "init_from"):
+            if name in parameters:
+                name = next((e.text.strip() for e in parameters[name].walk() if e.tag == tag), "")
+        image = self._target(name)
+        file = next((e.text.strip() for e in image.walk() if e.tag == "init_from"), "") if image else ""
+        return _mean_color(self.folder / file) if file and ":" not in file and not file.startswith("/") else None
+
+
+def _numbers(text: str, kind: type) -> np.ndarray:
+    return np.array(text.split(), dtype=kind)
+
+
+def _transform(element: Element) -> Array:
+    x, X = _numbers(element.text, float), np.eye(4)
+    if element.tag == "matrix":
+        return np.asarray(x.reshape(4, 4))
+    if element.tag == "translate":
+        X[:3, 3] = x
+    elif element.tag == "rotate":
+        X[:3, :3] = about(x[:3], np.deg2rad(x[3])) if x[:3].any() else np.eye(3)
+    else:
+        X[:3, :3] = np.diag(x)
+    return X
+
+
+def _triangles(part: Element, stride: int) -> Indices:
+    """Return the entries of <p> of each triangle's three corners, (m, 3 stride); polygons become fans."""
+    lists = [_numbers(p.text, int).reshape(-1, stride) for p in part.all("p")]
+    if part.tag == "triangles" or not lists:
+        return np.concatenate(lists).reshape(-1, 3 * stride) if lists else np.empty((0, 3 * stride), int)
+    entries = np.concatenate(lists)
+    vcount = part.first("vcount")
+    counts = np.array([len(x) for x in lists]) if vcount is None else _numbers(vcount.text, int)
+    if counts.size and (counts.min() < 0 or counts.sum() > len(entries)):
+        raise ValueError("more corners than there are in <p>")
+    starts = np.cumsum(counts) - counts
+    fans = np.maximum(counts - 2, 0)
+    first = np.repeat(starts, fans)
+    k = np.arange(fans.sum()) - np.repeat(np.cumsum(fans) - fans, fans) + 1
+    return np.concatenate([entries[first], entries[first + k], entries[first + k + 1]], axis=1)
+
+
+def file_of(reference: str, description: Path, folders: list[Path]) -> Path | None:
+    """Return the file that a URDF's ``package://``, ``file://`` or relative reference means, or None.
+
+    A package is a folder of that name, above the description or in one of the folders.
+    """
+    scheme = re.match(r"([a-z]+)://", reference)
+    rest = reference[scheme.end() :] if scheme else reference
+    if scheme and scheme[1] not in ("package", "model", "file"):
+        return None
+    if not scheme or scheme[1] == "file":
+        candidates = [description.parent / rest]
+    else:
+        rest = rest.lstrip("/")
+        package, _, inside = rest.partition("/")
+        above = list(description.resolve().parents)
+        candidates = [folder / rest for folder in (*above, *folders)]
+        candidates += [folder / inside for folder in above if folder.name == package]
+    try:
+        return next((c for c in candidates if c.is_file()), None)
+    except (OSError, ValueError):
+        return None
