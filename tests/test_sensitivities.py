@@ -46,24 +46,24 @@ def test_a_pendulum_by_elliptic_functions():
 
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4", "implicit_midpoint"])
 def test_they_are_differences_of_runs(arm, method):
-    model, torque = arm.model, np.random.default_rng(0).standard_normal((50, 2))
+    model, torque = arm.model, np.random.default_rng(0).standard_normal((20, 2))
     start = np.concatenate([[0.5, -0.4, 1.0, 0.3, 0.0, 0.0], [*model.parameters.values()]])
 
     def end(x):
         own = arm.at(**dict(zip(model.parameters, x[6:], strict=True)))
         # The last of the steps is shorter than the others.
-        run = mb.simulate(own, x[:2], x[2:4], 0.987, method, 0.02, torque=torque + x[4:6], doubt=False)
+        run = mb.simulate(own, x[:2], x[2:4], 0.987, method, 0.05, torque=torque + x[4:6], doubt=False)
         return np.concatenate([run.q[-1], run.v[-1]])
 
-    out = mb.sensitivities(arm, start[:2], start[2:4], 0.987, dt=0.02, method=method, torque=torque)
+    out = mb.sensitivities(arm, start[:2], start[2:4], 0.987, dt=0.05, method=method, torque=torque)
     got = np.concatenate([out.state[-1], out.tau[-1], out.parameters[-1]], axis=-1)
     # Richardson's extrapolation of central differences: h⁶, and eps / h.
     e = 4e-3
-    for k, direction in enumerate(np.eye(8)):
+    for direction in np.random.default_rng(1).standard_normal((2, 8)):
         rules = [(end(start + h * direction) - end(start - h * direction)) / (2 * h) for h in (e, e / 2, e / 4)]
         second = [(4 * b - a) / 3 for a, b in pairwise(rules)]
-        close(got[:, k], (16 * second[1] - second[0]) / 15, 1e-10)
-    run = mb.simulate(arm, start[:2], start[2:4], 0.987, method, 0.02, torque=torque, doubt=False)
+        close(got @ direction, (16 * second[1] - second[0]) / 15, 1e-10)
+    run = mb.simulate(arm, start[:2], start[2:4], 0.987, method, 0.05, torque=torque, doubt=False)
     np.testing.assert_array_equal(out.run.q, run.q)
 
 

@@ -139,11 +139,11 @@ class _DualStages:
 
     def moved(self, h: Any, weights: Array) -> tuple[Any, Any]:
         """Return h times the weighted sums of u̇ and ẇ."""
-        u, w = (
-            sum(weight * rates[kind] for weight, rates in zip(weights.tolist(), self._rates, strict=True))
-            for kind in (0, 1)
-        )
-        return h * u, h * w
+        u, w = (0.0 * x for x in self._rates[0])
+        for weight, (u_rate, w_rate) in zip(weights.tolist(), self._rates, strict=True):
+            if weight:
+                u, w = u + (h * weight) * u_rate, w + (h * weight) * w_rate
+        return u, w
 
     def squares(self, weights: Array, scales: tuple[Any, Any]) -> Any:
         """Refuse: errors of steps choose their length, which here is fixed."""
@@ -155,9 +155,11 @@ def differentiable_method(engine: str, name: object) -> Method:
     method = method_of(name)
     known = [m.name for m in METHODS.values() if m.kind == "fixed" and (not m.engines or engine in m.engines)]
     if method.name not in known:
-        why = method.lacks and f"{engine} {method.lacks}"
-        why = why or "it has no fixed step in mbkit's own code"
-        raise UnsupportedError(f"method {method.name!r}: the derivative of its step is not known: {why}; use {known}")
+        lacks = method.kind == "fixed" and f"{engine} {method.lacks}"
+        raise UnsupportedError(
+            f"method {method.name!r}: the derivative of its step is not known: "
+            f"{lacks or 'it has no fixed step of mbkit'}; use {', '.join(map(repr, known))}"
+        )
     return method
 
 
@@ -174,8 +176,10 @@ class _Rates:
         if not (np.isfinite(here).all() and np.isfinite(speed).all()):
             raise NumericalError("the state within a step is not finite; take shorter steps")
         at = self._slopes(here, speed)
-        inverse = tangent_maps(self._model, here)[1]
-        slope = at.q @ (inverse @ q.slope.swapaxes(0, 1)) + at.v @ v.slope.swapaxes(0, 1)
+        turn = q.slope.swapaxes(0, 1)
+        if self._model.quaternions:
+            turn = tangent_maps(self._model, here)[1] @ turn
+        slope = at.q @ turn + at.v @ v.slope.swapaxes(0, 1)
         n = self._model.nv
         # Behind δq and δv stand the columns of τ and the parameters.
         slope[..., 2 * n : 3 * n] += at.tau

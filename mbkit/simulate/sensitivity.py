@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,12 +24,14 @@ from mbkit.engines.step_derivatives import differentiable_method
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.simulate.run import simulate
-from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, check_room
+from mbkit.simulate.time_grid import DEFAULT_STEP, Grid
 from mbkit.simulate.torque import Torque
 from mbkit.simulate.trajectory import Trajectory
 
 #: Numbers of derivatives that are computed at a time.
-_SLICE = 2**21
+_SLICE: Final = 2**18
+#: Numbers of derivatives of a run, at most: 8 GiB of float64.
+_ROOM: Final = 2**30
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -165,7 +168,12 @@ def sensitivities(
     batch = None if run.q.ndim == 2 else len(run.q)
     grid = Grid.of(float(run.t[0]), real("duration", duration), h)
     columns = 3 * n + (len(model.parameters) if by_parameters else 0)
-    check_room(len(run.t) * (batch or 1), 4 * n * columns)
+    numbers = 4 * n * columns * len(run.t) * (batch or 1)
+    if numbers > _ROOM:
+        raise InputError(
+            f"duration, dt: the derivatives of {grid.steps} steps would take {numbers * 8 / 2**30:.3g} GiB; "
+            "take longer steps, or a shorter run at a time: transition matrices multiply"
+        )
     force = Torque(torque, model, batch, grid.steps)
     members, steps = batch or 1, grid.steps
     q, v = (x.reshape(members, steps + 1, -1)[:, :-1] for x in (run.q, run.v))
