@@ -137,6 +137,18 @@ def test_batches_are_their_samples(tree):
         assert [x.shape for x in f(q[:0], v[:0], tau[:0])] == [(0, *x.shape[1:]) for x in many]
 
 
+def test_a_large_batch_is_computed_in_slices():
+    model = mb.catalog.double_pendulum(mass1=mb.Parameter("m", 2.0))
+    dyn, n = mb.dynamics(model, "lagrangian"), 12_000
+    q, v, _, tau = states(model, n, 2)
+    own = dyn.at(m=np.linspace(1.0, 2.0, n))
+    many = own.discretize(q, v, tau, 0.01)
+    for k in (0, n // 2, n - 1):
+        one = own.of_samples([k]).discretize(q[k : k + 1], v[k : k + 1], tau[k : k + 1], 0.01)
+        for x, y in zip(many, one, strict=True):
+            close(x[k], y[0], 1e-13)
+
+
 # Zero-order hold
 
 

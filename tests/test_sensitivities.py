@@ -100,8 +100,9 @@ def test_transitions_multiply(arm):
 
 def test_a_batch_has_each_ones_parameters(arm):
     many = arm.at(l=np.array([1.0, 1.2, 1.3]))
-    out = mb.sensitivities(many, [0.5, -0.4], [1.0, 0.3], 0.25, dt=0.01)
-    one = mb.sensitivities(arm.at(l=1.2), [0.5, -0.4], [1.0, 0.3], 0.25, dt=0.01)
+    torque = np.random.default_rng(0).standard_normal((3, 25, 2))
+    out = mb.sensitivities(many, [0.5, -0.4], [1.0, 0.3], 0.25, dt=0.01, torque=torque)
+    one = mb.sensitivities(arm.at(l=1.2), [0.5, -0.4], [1.0, 0.3], 0.25, dt=0.01, torque=torque[1])
     assert out.parameters.shape == (3, 26, 4, 2)
     for name in ("A", "B", "state", "tau", "parameters"):
         close(getattr(out, name)[1], getattr(one, name), 100 * EPS)
@@ -113,7 +114,19 @@ def test_without_parameters_and_without_duration(arm):
     assert out.state.shape == (1, 4, 4)
     assert out.A.shape == (0, 4, 4)
     assert out.parameters.shape == (1, 4, 0)
-    assert "K" not in repr(out)
+    assert repr(out) == "<Sensitivities of 'double_pendulum': states (1,), 2nv = 4, p = 0>"
+    none = mb.sensitivities(arm, np.empty((0, 2)), np.empty((0, 2)), 0.1, dt=0.05)
+    assert none.state.shape == (0, 3, 4, 4)
+
+
+def test_of_a_model_that_cannot_move():
+    b = mb.ModelBuilder("wall")
+    b.add_body("brick", mass=1.0)
+    b.add_joint("mortar", "fixed", parent="world", child="brick")
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    assert mb.sensitivities(dyn, [], [], 0.1, dt=0.05).state.shape == (3, 0, 0)
+    assert dyn.linearize([], [], []).discretize(0.1).A.shape == (0, 0)
+    assert dyn.discretize([], [], [], 0.1, "implicit_midpoint").A.shape == (0, 0)
 
 
 def test_what_cannot_be_differentiated_is_refused(arm):

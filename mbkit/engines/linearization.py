@@ -37,6 +37,8 @@ DIFFERENTIABLE: Final = (
     *("mass_matrix", "coriolis_matrix", "coriolis_force", "gravity", "nle", "passive"),
     *("inverse_dynamics", "forward_dynamics", "kinetic_energy", "potential_energy"),
 )
+#: Numbers of derivatives of a batch that are computed at a time, which fit into a processor's cache.
+_SLICE: Final = 2**18
 
 
 class DiscreteLinearization(NamedTuple):
@@ -184,6 +186,7 @@ class LinearizationQuantities:
     engine: ClassVar[str]
     model: Model
     samples: Any
+    of_samples: Callable[..., Any]
     _states: Callable[..., Any]
     _value: Callable[..., Any]
     _require_finite: Callable[..., None]
@@ -308,8 +311,17 @@ class LinearizationQuantities:
                     f"{self.engine}: the derivative of a step of {self.model.name}, which has {feature}, is not known; "
                     "linearize(q, v, tau).discretize(dt) holds the linear system's force"
                 )
-        rates = partial(self._forward_slopes, tau=np.atleast_2d(tau), parameters=parameters)
         count = len(self.model.parameters) if parameters else 0
+        size = max(1, _SLICE // max(1, 2 * self.model.nv * (3 * self.model.nv + count)))
+        if q.ndim == 2 and len(q) > size:
+            slices = [np.arange(k, min(k + size, len(q))) for k in range(0, len(q), size)]
+            each = [
+                self.of_samples(at)._step_slopes(method, dt, q[at], v[at], tau[at], parameters=parameters)
+                for at in slices
+            ]
+            q1, v1, slopes = (np.concatenate(x) for x in zip(*each, strict=True))
+            return q1, v1, slopes
+        rates = partial(self._forward_slopes, tau=np.atleast_2d(tau), parameters=parameters)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             try:
                 if method.in_momenta:

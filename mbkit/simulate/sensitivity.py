@@ -28,8 +28,6 @@ from mbkit.simulate.time_grid import DEFAULT_STEP, Grid
 from mbkit.simulate.torque import Torque
 from mbkit.simulate.trajectory import Trajectory
 
-#: Numbers of derivatives that are computed at a time.
-_SLICE: Final = 2**18
 #: Numbers of derivatives of a run, at most: 8 GiB of float64.
 _ROOM: Final = 2**30
 
@@ -175,21 +173,18 @@ def sensitivities(
             "take longer steps, or a shorter run at a time: transition matrices multiply"
         )
     force = Torque(torque, model, batch, grid.steps)
-    members, steps = batch or 1, grid.steps
-    q, v = (x.reshape(members, steps + 1, -1)[:, :-1] for x in (run.q, run.v))
+    members, steps = 1 if batch is None else batch, grid.steps
+    q, v = (x.reshape(members, steps + 1, x.shape[-1])[:, :-1] for x in (run.q, run.v))
     tau = np.broadcast_to(np.moveaxis(force.columns(slice(None), 0, steps), -1, 0), (members, steps, n))
     slopes = np.empty((members, steps, 2 * n, columns))
-    size = max(1, _SLICE // max(1, members * 2 * n * columns))
     # The last step may be shorter.
-    parts = [range(a, min(a + size, steps - 1)) for a in range(0, steps - 1, size)]
-    for part in (*parts, range(max(steps - 1, 0), steps)):
-        if not len(part):
-            continue
-        at = slice(part.start, part.stop)
-        own = dyn.of_samples(np.repeat(np.arange(members), len(part))) if dyn.samples is not None else dyn
-        rows = ((x[:, at].reshape(members * len(part), -1)) for x in (q, v, tau))
-        out = own._step_slopes(chosen, grid.step(part.start), *rows, parameters=by_parameters)[2]
-        slopes[:, at] = out.reshape(members, len(part), 2 * n, columns)
+    for at in (slice(0, steps - 1), slice(steps - 1, steps)) if steps else ():
+        many = at.stop - at.start
+        rows = [x[:, at].reshape(members * many, x.shape[-1]) for x in (q, v, tau)]
+        if many and members:
+            own = dyn.of_samples(np.repeat(np.arange(members), many))
+            out = own._step_slopes(chosen, grid.step(at.start), *rows, parameters=by_parameters)[2]
+            slopes[:, at] = out.reshape(members, many, 2 * n, columns)
     change = np.zeros((members, steps + 1, 2 * n, columns))
     change[:, 0, range(2 * n), range(2 * n)] = 1.0
     with np.errstate(over="ignore", invalid="ignore"):
