@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
     from mbkit.errors import MbkitError as MbkitError
+    from mbkit.identify import excitation as excitation
+    from mbkit.identify import identify as identify
     from mbkit.lagrangian.statics.equilibrium import equilibrium as equilibrium
     from mbkit.load import load as load
     from mbkit.load import robots as robots
@@ -63,7 +65,9 @@ _HOME = {
     "convert": "mbkit.studies.convert",
     "dynamics": "mbkit.engines",
     "equilibrium": "mbkit.lagrangian.statics.equilibrium",
+    "excitation": "mbkit.identify",
     "explain": "mbkit.studies.explain",
+    "identify": "mbkit.identify",
     "load": "mbkit.load",
     "robots": "mbkit.load",
     "sensitivities": "mbkit.simulate",

@@ -29,6 +29,9 @@ PARTS = {
     "accuracy": Part(20, ("accuracy.json",), "terms against 34 digits: robots, floating robots, random trees"),
     "readme_figure": Part(2, ("check_all.json",), "every robot of example-robot-data in three engines"),
     "published": Part(2, ("published_checks.json",), "published problems, to their printed digits"),
+    "identification": Part(
+        3, ("identification.json",), "identified parameters of two arms, and regressors beside Pinocchio"
+    ),
     "energy_drift": Part(1, ("energy_drift.json",), "a million steps of a symplectic method"),
     "importers": Part(1, ("importers.json", "importers_floating.json"), "one file through three importers"),
     "fuzz": Part(10, ("fuzz.json",), "random and damaged files, random trees"),

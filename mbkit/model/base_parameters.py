@@ -21,12 +21,12 @@ with the body's velocities ω and v in its axes. Two linear maps lead from them 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array, real
+from mbkit._check import Array, real, shown
 from mbkit._escape import html, terminal
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import manifold
@@ -34,11 +34,15 @@ from mbkit.model.description import Description
 from mbkit.model.parts import Body, Joint, _Frozen
 from mbkit.spatial import skew
 
-#: The ten standard parameters of a body, in the order of Khalil and Dombre.
-_STANDARD: Final = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "hx", "hy", "hz", "m")
-_PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+#: The ten standard parameters of a body, in the order of Khalil and Dombre, and the places of its inertia.
+STANDARD: Final = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "hx", "hy", "hz", "m")
+PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+#: What `Dynamics.regressor` may be linear in.
+PARAMETER_SETS: Final = ("standard", "base")
 #: Power of a length in the energy of each.
-_POWERS: Final = np.array([0] * 6 + [1] * 3 + [2])
+POWERS: Final = np.array([0] * 6 + [1] * 3 + [2])
+#: What is smaller than this beside the largest is taken as not there, where nobody says otherwise.
+TOLERANCE: Final = 1e-7
 #: Rounding of a coefficient, and of right angles in a file: π is often written with eleven digits.
 _ROUNDING: Final = 1e-10
 #: How much smaller than the least kept singular value the largest dropped one has to be.
@@ -52,7 +56,7 @@ _POSES: Final = 4
 def _units() -> tuple[Array, Array]:
     """Return J of a unit of each parameter, (10, 4, 4), and the matrices F with parameter = tr(F J)."""
     J, F = np.zeros((2, 10, 4, 4))
-    for k, (i, j) in enumerate(_PAIRS):
+    for k, (i, j) in enumerate(PAIRS):
         if i == j:
             J[k, :3, :3], F[k, :3, :3] = 0.5 * np.eye(3), np.eye(3)
             J[k, i, i], F[k, i, i] = -0.5, 0.0
@@ -159,11 +163,55 @@ class BaseParameters(_Frozen):
         }
 
 
+def standard_names(model: Description) -> tuple[str, ...]:
+    """Return the names of the standard parameters, body by body in the order of the tree."""
+    return tuple(f"{joint.child}.{kind}" for joint in model.tree for kind in STANDARD)
+
+
+@dataclass(frozen=True)
+class RegressorColumns:
+    """The columns of a regressor: indices of standard parameters, velocities with losses, and those with rotors."""
+
+    bodies: tuple[int, ...]
+    friction: tuple[int, ...] = ()
+    rotors: tuple[int, ...] = ()
+
+    def names(self, model: Description) -> tuple[str, ...]:
+        """Return the names of the columns."""
+        standard, velocities = standard_names(model), model.velocity_names
+        losses = (f"{velocities[k]}.{kind}" for kind in ("damping", "friction") for k in self.friction)
+        return (*(standard[k] for k in self.bodies), *losses, *(f"{velocities[k]}.armature" for k in self.rotors))
+
+
+def regressor_columns(model: Description, parameters: str, friction: bool, armature: bool) -> RegressorColumns:
+    """Return the columns for a set of parameters; see `Model.regressor_columns`."""
+    if parameters not in PARAMETER_SETS:
+        raise InputError(f"parameters: expected 'standard' or 'base', got {shown(parameters)}")
+    bodies = tuple(range(len(STANDARD) * len(model.tree)))
+    if parameters == PARAMETER_SETS[1]:
+        index = {name: k for k, name in enumerate(standard_names(model))}
+        bodies = tuple(index[name] for name in base_parameters(model, TOLERANCE).names)
+    rotors = (model.layout.v[j.name].start for j in model.independent_joints if j.type.nv == 1)
+    return RegressorColumns(bodies, tuple(range(model.nv)) if friction else (), tuple(rotors) if armature else ())
+
+
 def standard_parameters(body: Body) -> Array:
     """Return the ten standard parameters of a body."""
     c = skew(body.com)
     about_origin = body.inertia - body.mass * c @ c
-    return np.array([*(about_origin[i, j] for i, j in _PAIRS), *(body.mass * body.com), body.mass])
+    return np.array([*(about_origin[i, j] for i, j in PAIRS), *(body.mass * body.com), body.mass])
+
+
+def body_of(before: Body, parameters: Array) -> Body | None:
+    """Return a body with these standard parameters; None where it has no mass but a moment or an inertia."""
+    mass, moment = float(parameters[-1]), parameters[-4:-1]
+    if not mass:
+        return replace(before, mass=0.0, inertia=np.zeros((3, 3))) if not parameters.any() else None
+    about_origin, com = np.empty((3, 3)), moment / mass
+    for x, (i, j) in zip(parameters, PAIRS, strict=False):
+        about_origin[i, j] = about_origin[j, i] = x
+    c = skew(com)
+    return replace(before, mass=mass, com=com, inertia=about_origin + mass * c @ c)
 
 
 def energy_regressor(model: Description, q: Array, v: Array, gravity: Array) -> tuple[Array, Array]:
@@ -212,18 +260,18 @@ def base_parameters(model: Description, tolerance: float) -> BaseParameters:
             )
     model.require_values("base parameters")
     bodies = [model.body(joint.child) for joint in model.tree]
-    names = tuple(f"{body.name}.{kind}" for body in bodies for kind in _STANDARD)
+    names = standard_names(model)
     standard = np.concatenate([np.zeros(0), *map(standard_parameters, bodies)])
-    length = _length(model)
+    length = length_of(model)
     matrix, kept = _regrouped(model, length, tolerance)
     if kept:
         matrix, kept = _reduced(model, length, tolerance, matrix, kept)
-    scale = np.tile(length**_POWERS, len(bodies))
+    scale = np.tile(length**POWERS, len(bodies))
     matrix[np.abs(matrix) * scale[kept, None] < _ROUNDING * scale] = 0.0
     return BaseParameters(model.name, tuple(names[k] for k in kept), names, standard, matrix)
 
 
-def _length(model: Description) -> float:
+def length_of(model: Description) -> float:
     """Return a length of the mechanism, in which its numbers are comparable."""
     offsets = [float(np.linalg.norm(j.translation)) for j in model.joints if j.parent != "world"]
     return max([*offsets, *(abs(j.pitch) for j in model.joints)], default=0.0) or 1.0
@@ -241,14 +289,14 @@ def _regrouped(model: Description, length: float, tolerance: float) -> tuple[Arr
         k = index[joint.child]
         points, place = _points_at_rest(joint, length, tolerance)
         pairs = [np.outer(a, b) + np.outer(b, a) for i, a in enumerate(points) for b in points[i:]]
-        movable = _parameters(np.array(pairs).reshape(-1, 4, 4))
-        gone, unit = _eliminated(movable)
+        movable = parameters_of(np.array(pairs).reshape(-1, 4, 4))
+        gone, unit = eliminated(movable)
         moved = left[k, gone]
         left[k] -= unit.T @ moved
         kept += [10 * k + i for i in range(10) if i not in gone]
         if joint.parent != "world":
             J = np.einsum("ki,iab->kab", unit, _J)
-            left[index[joint.parent]] += _parameters(place @ J @ place.T).T @ moved
+            left[index[joint.parent]] += parameters_of(place @ J @ place.T).T @ moved
     kept.sort()
     return left.reshape(10 * len(index), -1)[kept], kept
 
@@ -288,7 +336,7 @@ def _reduced(
     weight = float(np.linalg.norm(model.gravity)) / length or 1.0
     kinetic, potential = energy_regressor(model, q, v, model.gravity / weight)
     Y = np.concatenate([kinetic, potential - potential.mean(axis=0)])[:, kept] / np.sqrt(size)
-    scale = (length ** np.tile(_POWERS, len(model.tree)))[kept]
+    scale = (length ** np.tile(POWERS, len(model.tree)))[kept]
     columns = np.linalg.norm(Y / scale, axis=0)
     # A column of nothing but rounding stays as small as it is.
     scale = scale * np.where(columns > tolerance, columns, 1.0)
@@ -301,13 +349,13 @@ def _reduced(
             f"{sizes[count] / sizes[0]:.1e} below {tolerance:g}; choose another tolerance, "
             "or look for axes that are almost parallel"
         )
-    gone, unit = _eliminated(axes[count:])
+    gone, unit = eliminated(axes[count:])
     matrix = matrix - (unit * scale[gone, None] / scale).T @ matrix[gone]
     stays = [k for k in range(len(kept)) if k not in gone]
     return matrix[stays], [kept[k] for k in stays]
 
 
-def _eliminated(null: Array) -> tuple[list[int], Array]:
+def eliminated(null: Array) -> tuple[list[int], Array]:
     """Return as many columns as a null space (k, n) has rows, and its basis with an identity matrix there.
 
     The columns are as far behind as they can be where their independent part is not much smaller than others'.
@@ -327,7 +375,12 @@ def _eliminated(null: Array) -> tuple[list[int], Array]:
 # Poses and velocities as 4 x 4 matrices.
 
 
-def _parameters(J: Array) -> Array:
+def pseudo_inertia(parameters: Array) -> Array:
+    """Return J, (..., 4, 4), of ten standard parameters."""
+    return np.asarray(np.einsum("...k,kij->...ij", parameters, _J))
+
+
+def parameters_of(J: Array) -> Array:
     """Return the ten parameters, (..., 10), of pseudo-inertias."""
     return np.asarray(np.einsum("kij,...ij->...k", _F, J))
 

@@ -13,7 +13,7 @@ from mbkit._check import Array, batch_of, count, generator, real, rows
 from mbkit._escape import html
 from mbkit.errors import UnknownNameError, UnsupportedError
 from mbkit.model import manifold
-from mbkit.model.base_parameters import BaseParameters, base_parameters
+from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
 from mbkit.model.description import Description, expect_name
 from mbkit.model.parameters import Parameter
 from mbkit.model.parts import Joint
@@ -135,7 +135,7 @@ class Model(Description):
 
     # Inertia
 
-    def base_parameters(self, *, tolerance: float = 1e-7) -> BaseParameters:
+    def base_parameters(self, *, tolerance: float = TOLERANCE) -> BaseParameters:
         """Return the smallest set of inertial parameters that decides the motion.
 
         Each is a combination of the masses, first moments and inertias of bodies, such as ``link3.Ixx - link3.Iyy``.
@@ -175,9 +175,49 @@ class Model(Description):
                    0  rod2.hx
                   -1  rod2.hz
         """
-        if not self.has_bodies:
-            raise UnsupportedError(f"base parameters: {self.name} was written as energies and has no bodies")
+        self.require_bodies("base parameters")
         return base_parameters(self, tolerance)
+
+    def regressor_columns(
+        self, parameters: str = "standard", *, friction: bool = False, armature: bool = False
+    ) -> tuple[str, ...]:
+        """Return the names of the columns of `Dynamics.regressor`.
+
+        Parameters
+        ----------
+        parameters : {"standard", "base"}
+            The ten standard parameters of each body, in the order of ``base_parameters().standard_names``, or the base
+            parameters, each named after the standard parameter that leads it.
+        friction : bool
+            Whether columns of viscous and of dry friction follow: ``"joint.damping"`` for every velocity, then
+            ``"joint.friction"``.
+        armature : bool
+            Whether columns of rotors follow: ``"joint.armature"`` for every joint with one velocity.
+
+        Returns
+        -------
+        tuple of str
+
+        Raises
+        ------
+        InputError
+            Another set of parameters.
+        UnsupportedError
+            A model without bodies; for base parameters also one with loops or prescribed motions.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> mb.catalog.pendulum().regressor_columns("base", friction=True)
+        ('bob.Iyy', 'bob.hx', 'bob.hz', 'theta.damping', 'theta.friction')
+        """
+        self.require_bodies("regressor")
+        return regressor_columns(self, parameters, friction, armature).names(self)
+
+    def require_bodies(self, what: str) -> None:
+        """Raise `UnsupportedError` for a model that was written as energies."""
+        if not self.has_bodies:
+            raise UnsupportedError(f"{what}: {self.name} was written as energies and has no bodies")
 
     # Variants
 

@@ -20,7 +20,10 @@ from mbkit.engines import known_defects
 from mbkit.engines.base import Dynamics, first_names, unit_quaternions
 from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, WORLD
 from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
+from mbkit.engines.pinocchio.regressors import PinRegressors
+from mbkit.engines.regressors import with_losses
 from mbkit.model import Frame, Model
+from mbkit.model.base_parameters import RegressorColumns
 from mbkit.model.manifold import NEAR_UNIT
 
 if TYPE_CHECKING:
@@ -303,6 +306,26 @@ class PinocchioDynamics(Dynamics):
             stored += self._springs.energy(self._m, self._d, q)
         ground = -float(self.model.gravity @ self._pin.ground_moment)
         return pin.computePotentialEnergy(self._m, self._d, q) + stored + ground
+
+    @cached_property
+    def _regressors(self) -> PinRegressors:
+        return PinRegressors(self.model, self._pin, self._d)
+
+    def _regressor(self, q: Array, v: Array, a: Array, columns: RegressorColumns) -> Array:
+        Y = self._regressors.torques(self._full_q(q), self._full_v(v), self._full_v(a))
+        return with_losses(self._reduced_rows(Y), columns, v, a)
+
+    def _momentum_regressor(self, q: Array, v: Array, columns: RegressorColumns) -> Array:
+        Y = self._regressors.momentum(self._full_q(q), self._full_v(v))
+        return with_losses(self._reduced_rows(Y), columns, v, v)
+
+    def _energy_regressor(self, q: Array, v: Array, columns: RegressorColumns) -> Array:
+        Y = self._regressors.energies(self._full_q(q), self._full_v(v))[:, list(columns.bodies)]
+        rotors = 0.5 * v[list(columns.rotors)] ** 2
+        return np.hstack([Y, np.vstack([rotors, 0.0 * rotors])])
+
+    def _reduced_rows(self, Y: Array) -> Array:
+        return Y if self._direct else self._Gt @ Y
 
     def _in_joint(self, frame: Frame) -> tuple[int, pin.SE3]:
         """Return the joint that carries a frame, and X_JF."""

@@ -1,0 +1,18 @@
+"""Identification: inertial parameters from measured motions, and motions that show them."""
+
+from mbkit._callable import make_callable
+from mbkit.identify.fourier_series import Excitation, excitation
+from mbkit.identify.result import Identification, IdentifiedParameter, Residual, Undetermined
+from mbkit.identify.study import identify
+
+__all__ = [
+    "Excitation",
+    "Identification",
+    "IdentifiedParameter",
+    "Residual",
+    "Undetermined",
+    "excitation",
+    "identify",
+]
+
+make_callable(__name__, identify)

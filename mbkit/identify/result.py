@@ -1,0 +1,212 @@
+"""What an identification returns: the parameters with their standard deviations, and the model with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Any, ClassVar, Final
+
+import numpy as np
+
+from mbkit.errors import InputError, ModelError
+from mbkit.identify.measurements import of_velocities
+from mbkit.model import Joint, Model
+from mbkit.model.base_parameters import STANDARD, body_of, standard_names
+from mbkit.model.validation import check_substituted, suspects
+from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
+
+_SIZE: Final = len(STANDARD)
+
+
+@dataclass(frozen=True)
+class IdentifiedParameter:
+    """One parameter: a base parameter, friction or armature.
+
+    `combination` is the sum of standard parameters that it is. `before` is its value in the model, `value` the estimate
+    and `deviation` its standard deviation (Cramér and Rao's bound for the noise found), infinite where the data cannot
+    tell it; SI units.
+    """
+
+    name: str
+    combination: str
+    before: float
+    value: float
+    deviation: float
+
+    _derived: ClassVar = ("determined", "relative")
+
+    @property
+    def determined(self) -> bool:
+        """Whether the data tell it."""
+        return bool(np.isfinite(self.deviation))
+
+    @property
+    def relative(self) -> float:
+        """The standard deviation over the size of the value, infinite of zero."""
+        return self.deviation / abs(self.value) if self.value else float("inf")
+
+
+@dataclass(frozen=True)
+class Undetermined:
+    """A direction that changes no torque of the data: these parameters may change together in these ratios."""
+
+    names: tuple[str, ...]
+    ratios: tuple[float, ...]
+
+    @property
+    def text(self) -> str:
+        """The direction as a sum, such as ``"link1.Izz - joint1.armature"``; of a single one its name."""
+        out = ""
+        for name, x in zip(self.names, self.ratios, strict=True):
+            size = f"{abs(x):.4g}"
+            sign = (" - " if x < 0 else " + ") if out else ("-" if x < 0 else "")
+            out += f"{sign}{'' if size == '1' else f'{size} '}{name}"
+        return out
+
+
+@dataclass(frozen=True)
+class Residual:
+    """What is left of a velocity's torque: `noise` is its standard deviation, `torque` the torque's root mean square.
+
+    N m or N.
+    """
+
+    velocity: str
+    samples: int
+    torque: float
+    noise: float
+
+
+_COLUMNS: Final = (
+    Column("parameter", attrgetter("name")),
+    Column("before", attrgetter("before"), ".6g", right=True),
+    Column("identified", attrgetter("value"), ".6g", right=True),
+    Column("standard deviation", attrgetter("deviation"), ".2g", right=True),
+    Column("is", attrgetter("combination")),
+)
+_RESIDUALS: Final = (
+    Column("torque of", attrgetter("velocity")),
+    Column("samples", attrgetter("samples"), "d", right=True),
+    Column("root mean square", attrgetter("torque"), ".4g", right=True),
+    Column("noise", attrgetter("noise"), ".2g", right=True),
+)
+
+
+@dataclass(frozen=True)
+class Identification(ResultTable):
+    """Identified parameters of a model.
+
+    Attributes
+    ----------
+    model_name : str
+    parameters : tuple of IdentifiedParameter
+        Base parameters, then friction and armature where they were asked for.
+    undetermined : tuple of Undetermined
+        What the data cannot tell. Along these directions the estimates are as near to the model as can be.
+    residuals : tuple of Residual
+        One for each velocity.
+    condition : float
+        Condition number of the equations with columns of equal length, without the undetermined directions.
+    samples : int
+    physical : bool
+        Whether the parameters are those of matter, by constraints.
+    prior : str
+        What they were held to, empty without.
+    standard_names : tuple of str
+    standard : tuple of float
+        Standard parameters of all bodies that have these base parameters; without `physical` the nearest to the model.
+    friction, armature : bool
+        Whether these were identified.
+    source : Model or None
+        The model before; None in a result that was read from JSON.
+    """
+
+    model_name: str
+    parameters: tuple[IdentifiedParameter, ...]
+    undetermined: tuple[Undetermined, ...]
+    residuals: tuple[Residual, ...]
+    condition: float
+    samples: int
+    physical: bool
+    prior: str
+    standard_names: tuple[str, ...]
+    standard: tuple[float, ...]
+    friction: bool
+    armature: bool
+    source: Model | None = None
+
+    _csv_columns: ClassVar = (*columns_of(IdentifiedParameter), Column("determined", attrgetter("determined")))
+
+    @property
+    def model(self) -> Model:
+        """The model with the identified parameters; see `applied_to`."""
+        if self.source is None:
+            raise InputError("model: a result that was read from JSON holds no model; use result.applied_to(model)")
+        return self.applied_to(self.source)
+
+    def applied_to(self, model: Model) -> Model:
+        """Return a description with the identified masses, centres of mass and inertias, friction and armature.
+
+        `mbkit.convert` writes it as URDF or MJCF. A joint that others mimic gets the friction that is not theirs.
+
+        Raises
+        ------
+        InputError
+            A model with other bodies.
+        ModelError
+            The estimates are not those of matter, with the bodies; ``identify(..., physical=True)`` finds others.
+        """
+        if standard_names(model) != self.standard_names:
+            raise InputError(f"model: expected one with the bodies of {self.model_name}, got {model.name}")
+        plain = model.with_parameters(**{name: x for name, x in model.parameters.items() if x is not None})
+        parts = np.reshape(self.standard, (-1, _SIZE))
+        bodies = {j.child: body_of(plain.body(j.child), x) for j, x in zip(plain.tree, parts, strict=True)}
+        faults = [f"body {name!r}: no mass, but a moment or an inertia" for name, x in bodies.items() if x is None]
+        if not faults:
+            new = tuple(x for b in plain.bodies if (x := bodies[b.name]) is not None)
+            try:
+                after = check_substituted(plain, replace(plain, bodies=new, joints=self._joints(plain)))
+                return replace(after, nonphysical=suspects(after, point_masses=True))
+            except ModelError as error:
+                faults = [*error.faults]
+        hint = "identify(..., physical=True) finds parameters of matter"
+        raise ModelError(model.name, [*faults, hint])
+
+    def _joints(self, model: Model) -> tuple[Joint, ...]:
+        values = {p.name: p.value for p in self.parameters}
+        out = []
+        for joint in model.joints:
+            changes: dict[str, Any] = {}
+            for field in ("damping", "friction", "armature"):
+                names = [f"{n}.{field}" for n in _velocities(model, joint)]
+                if names and names[0] in values:
+                    before = of_velocities(model, field)[model.layout.v[joint.name]]
+                    changes[field] = getattr(joint, field) + np.array([values[n] for n in names]) - before
+            out.append(replace(joint, **changes) if changes else joint)
+        return tuple(out)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the model as plain data."""
+        data = ResultTable.to_dict(replace(self, source=None))
+        return {name: x for name, x in data.items() if name != "source"}
+
+    def __repr__(self) -> str:
+        lost = f", {len(self.undetermined)} directions undetermined" if self.undetermined else ""
+        size = f"{len(self.parameters)} parameters of {self.samples} samples"
+        return f"<Identification of {self.model_name!r}: {size}{lost}>"
+
+    def _blocks(self) -> Iterator[Block]:
+        how = f", physically consistent, {self.prior} prior" if self.physical else ""
+        text = f": {len(self.parameters)} parameters of {self.samples} samples, condition {self.condition:.3g}{how}"
+        yield Title(self.model_name, text)
+        yield Table(_COLUMNS, self.parameters)
+        yield Table(_RESIDUALS, self.residuals)
+        yield Items(f"the data cannot tell {x.text}" for x in self.undetermined)
+
+    def _csv_rows(self) -> tuple[IdentifiedParameter, ...]:
+        return self.parameters
+
+
+def _velocities(model: Model, joint: Joint) -> tuple[str, ...]:
+    return model.velocity_names[model.layout.v[joint.name]]

@@ -1,0 +1,403 @@
+"""Identification: exact from exact data, honest deviations from noise, and what the data cannot tell."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.errors import InputError, ModelError, UnsupportedError
+from mbkit.identify import Excitation, Identification
+from mbkit.model import Model
+from mbkit.model.base_parameters import pseudo_inertia
+
+ENGINES = ("pinocchio", "lagrangian", "mujoco")
+
+
+def other_masses(model: Model, seed: int = 0) -> Model:
+    """Return the geometry with other masses, centres of mass and inertias, as a worker knows them before."""
+    rng = np.random.default_rng(seed)
+    bodies = []
+    for b in model.bodies:
+        f, g = rng.uniform(0.7, 1.3, 2)
+        shift = 0.02 * rng.standard_normal(3) if b.mass else np.zeros(3)
+        bodies.append(replace(b, mass=f * b.mass, com=b.com + shift, inertia=g * b.inertia))
+    return replace(model, bodies=tuple(bodies))
+
+
+@cache
+def robot(name: str) -> tuple[Model, Excitation]:
+    """Return a robot and a motion that shows its parameters, from a few steps of the search."""
+    model = mb.load(name)
+    return model, mb.excitation(model, duration=8.0, rate=40.0, iterations=4, seed=3)
+
+
+def values(found: Identification) -> np.ndarray:
+    return np.array([p.value for p in found.parameters])
+
+
+def deviations(found: Identification) -> np.ndarray:
+    return np.array([p.deviation for p in found.parameters])
+
+
+def arm() -> Model:
+    """Return a small arm with dampers, dry friction, rotors and a spring."""
+    b = mb.ModelBuilder("arm")
+    parent = "world"
+    for k, axis in enumerate(((0, 0, 1), (0, 1, 0), (0, 1, 0))):
+        b.add_body(f"link{k}", mass=2.0 - 0.5 * k, com=(0.1, 0.02, -0.2), inertia=np.diag([0.03, 0.04, 0.02]))
+        b.add_joint(
+            f"j{k}",
+            "revolute",
+            parent=parent,
+            child=f"link{k}",
+            axis=axis,
+            translation=(0.0, 0.0, -0.4 * (k > 0)),
+            damping=0.3 + 0.1 * k,
+            friction=0.5 - 0.1 * k,
+            armature=0.02 * (k + 1),
+            stiffness=2.0 * (k == 1),
+            rest=0.2,
+        )
+        parent = f"link{k}"
+    return b.build()
+
+
+def motion(model: Model, n: int = 200, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    q, v = model.random_state(rng, n)
+    return q, v, rng.standard_normal((n, model.nv))
+
+
+def torques(model: Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return inverse dynamics with the dry friction that the terms leave out."""
+    dry = np.concatenate([j.friction for j in model.independent_joints])
+    return mb.dynamics(model, "pinocchio").inverse_dynamics(q, v, a) + dry * np.sign(v)
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_exact_from_exact_torques(name: str, engine: str) -> None:
+    model, x = robot(name)
+    tau = mb.dynamics(model, engine).inverse_dynamics(x.q, x.v, x.a)
+    found = mb.identify(other_masses(model), x.q, x.v, x.a, tau)
+    true = model.base_parameters().values
+    assert np.abs(values(found) - true).max() <= 1e-10 * np.abs(true).max()
+    assert found.undetermined == ()
+    assert max(r.noise / r.torque for r in found.residuals) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+def test_errors_are_within_three_of_the_deviations_told(name: str) -> None:
+    model, x = robot(name)
+    tau = mb.dynamics(model, "pinocchio").inverse_dynamics(x.q, x.v, x.a)
+    size = np.sqrt((tau**2).mean(axis=0)) * np.geomspace(0.003, 0.03, model.nv)
+    true, rng, off = model.base_parameters().values, np.random.default_rng(0), []
+    for _ in range(12):
+        found = mb.identify(model, x.q, x.v, x.a, tau + size * rng.standard_normal(tau.shape))
+        off.append((values(found) - true) / deviations(found))
+        noise = np.array([r.noise for r in found.residuals])
+        # The standard deviation of an estimate of a standard deviation is 1/√(2 N).
+        assert (np.abs(noise / size - 1) < 5 / np.sqrt(2 * len(tau))).all()
+    assert (np.abs(off) < 3).mean() >= 0.99
+    # Neither too wide: they are normal of variance 1, independent trials of correlated parameters.
+    assert 0.8 < np.std(off) < 1.2
+
+
+def test_weights_by_the_residuals_beat_equal_ones() -> None:
+    model, x = robot("ur5")
+    tau = mb.dynamics(model, "pinocchio").inverse_dynamics(x.q, x.v, x.a)
+    size = np.array([10.0, 10.0, 1.0, 0.01, 0.01, 0.01])
+    noisy = tau + size * np.random.default_rng(0).standard_normal(tau.shape)
+    own, known, equal = (
+        mb.identify(model, x.q, x.v, x.a, noisy, weights=w) for w in (None, 1 / size, np.ones(model.nv))
+    )
+    assert np.allclose(deviations(own), deviations(known), rtol=0.05)
+    assert np.median(deviations(equal) / deviations(own)) > 3
+    true = model.base_parameters().values
+    # Deviations stay honest with weights that are wrong.
+    assert (np.abs(values(equal) - true) < 4 * deviations(equal)).all()
+
+
+def test_a_weight_of_zero_leaves_a_torque_out() -> None:
+    model = arm()
+    q, v, a = motion(model)
+    tau = torques(model, q, v, a)
+    weights = np.ones(tau.shape)
+    tau[::7, 1] += 100.0
+    weights[::7, 1] = 0.0
+    found = mb.identify(other_masses(model), q, v, a, tau, weights=weights, friction=True)
+    assert np.allclose(values(found)[: model.base_parameters().count], model.base_parameters().values, atol=1e-10)
+    assert found.residuals[1].samples == len(tau) - len(tau[::7])
+
+
+@pytest.mark.parametrize("physical", [False, True])
+def test_friction_and_armature_are_found_and_written_back(physical: bool) -> None:
+    true = arm()
+    before = other_masses(true.without("damping", "friction", "armature"))
+    q, v, a = motion(true)
+    tau = torques(true, q, v, a)
+    found = mb.identify(before, q, v, a, tau, friction=True, armature=True, physical=physical)
+    # The first two rotors turn as their links do.
+    assert {x.text for x in found.undetermined} == {"-link0.Izz + j0.armature", "-link1.Iyy + j1.armature"}
+    told = {p.name: p.value for p in found.parameters if p.determined}
+    assert [told[f"j{k}.damping"] for k in range(3)] == pytest.approx([0.3, 0.4, 0.5], rel=1e-6)
+    assert [told[f"j{k}.friction"] for k in range(3)] == pytest.approx([0.5, 0.4, 0.3], rel=1e-6)
+    assert told["j2.armature"] == pytest.approx(0.06, rel=1e-5)
+    if not physical:
+        # Where nothing tells them from the links' inertias, rotors may come out negative.
+        with pytest.raises(ModelError, match=r"armature(?s:.)*physical=True"):
+            _ = found.model
+        return
+    after = found.model
+    assert np.abs(torques(after, q, v, a) - tau).max() < 1e-6 * np.abs(tau).max()
+    assert [after.joint(f"j{k}").friction[0] for k in range(3)] == pytest.approx([0.5, 0.4, 0.3], rel=1e-6)
+
+
+def test_what_is_not_asked_for_is_taken_from_the_model() -> None:
+    true = arm().without("friction")
+    q, v, a = motion(true)
+    found = mb.identify(other_masses(true), q, v, a, torques(true, q, v, a))
+    assert np.allclose(values(found), true.base_parameters().values, rtol=0, atol=1e-11)
+
+
+def test_joints_that_mimic_keep_their_own_friction() -> None:
+    b = mb.ModelBuilder("gripper")
+    for k, mimic in enumerate((None, ("j0", -2.0, 0.0))):
+        b.add_body(f"finger{k}", mass=1.0, com=(0.1, 0, 0.2), inertia=0.02 * np.eye(3))
+        b.add_joint(
+            f"j{k}",
+            "revolute",
+            parent="world",
+            child=f"finger{k}",
+            axis=(0, 1, 0),
+            damping=0.1,
+            friction=0.2,
+            mimic=mimic,
+        )
+    model = b.build()
+    q, v, a = motion(model)
+    # Damping 0.5 + 4 · 0.1 and friction 0.7 + 2 · 0.2 as the leader feels them.
+    bodies = mb.dynamics(model.without("damping"), "pinocchio").inverse_dynamics(q, v, a)
+    found = mb.identify(model, q, v, a, bodies + 0.9 * v + 1.1 * np.sign(v), friction=True)
+    leader, follower = (found.model.joint(name) for name in ("j0", "j1"))
+    assert (leader.damping[0], leader.friction[0]) == pytest.approx((0.5, 0.7))
+    assert (follower.damping[0], follower.friction[0]) == (0.1, 0.2)
+
+
+def test_directions_that_the_data_cannot_tell_are_named() -> None:
+    model = arm().without("damping", "friction", "armature", "springs")
+    q, v, a = motion(model)
+    q[:, 1:], v[:, 1:], a[:, 1:] = 0.3, 0.0, 0.0
+    tau = mb.dynamics(model, "pinocchio").inverse_dynamics(q, v, a)
+    found = mb.identify(other_masses(model), q, v, a, tau)
+    assert len(found.undetermined) == model.base_parameters().count - len({*found_rank(model, q, v, a)})
+    lost = {name for x in found.undetermined for name in x.names}
+    assert lost == {p.name for p in found.parameters if not p.determined}
+    dyn = mb.dynamics(model, "lagrangian")
+    names = model.regressor_columns("base")
+    Y = dyn.regressor(q, v, a, "base")
+    for x in found.undetermined:
+        direction = np.zeros(len(names))
+        direction[[names.index(n) for n in x.names]] = x.ratios
+        assert np.abs(Y @ direction).max() < 1e-9 * np.abs(direction).max()
+    # What is told is right: the torques are explained.
+    assert max(r.noise for r in found.residuals) < 1e-11
+
+
+def found_rank(model: Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> range:
+    Y = mb.dynamics(model, "lagrangian").regressor(q, v, a, "base")
+    return range(np.linalg.matrix_rank(Y.reshape(-1, Y.shape[-1]), tol=1e-8))
+
+
+def test_at_rest_only_gravity_is_told() -> None:
+    model = mb.catalog.pendulum()
+    still = np.zeros((20, 1))
+    q = np.linspace(-2, 2, 20)[:, None]
+    tau = mb.dynamics(model).inverse_dynamics(q, still, still)
+    found = mb.identify(model, q, still, still, tau, friction=True)
+    lost = [x.text for x in found.undetermined]
+    assert lost == ["bob.Iyy", "theta.damping", "theta.friction"]
+    # Nothing moves, nothing falls: not one parameter is told, and nothing fails.
+    none = mb.identify(model.without("gravity"), q, still, still, 0 * tau)
+    assert all(not p.determined and p.value == p.before for p in none.parameters)
+    assert np.isnan(none.condition)
+
+
+@pytest.mark.parametrize("prior", ["entropic", "euclidean"])
+def test_consistent_parameters_are_matter(prior: str) -> None:
+    model, x = robot("panda")
+    tau = mb.dynamics(model, "pinocchio").inverse_dynamics(x.q, x.v, x.a)
+    noisy = tau + 0.05 * np.sqrt((tau**2).mean(axis=0)) * np.random.default_rng(1).standard_normal(tau.shape)
+    free = mb.identify(other_masses(model), x.q, x.v, x.a, noisy)
+    found = mb.identify(other_masses(model), x.q, x.v, x.a, noisy, physical=True, prior=prior)
+    assert found.prior == prior
+    J = pseudo_inertia(np.reshape(found.standard, (-1, 10)))
+    masses = np.array([model.body(j.child).mass for j in model.tree])
+    assert np.linalg.eigvalsh(J[masses > 0]).min() > 0
+    assert not J[masses == 0].any()
+    # The free estimates are not: constraints are what makes it so.
+    assert np.linalg.eigvalsh(pseudo_inertia(np.reshape(free.standard, (-1, 10)))).min() < 0
+    with pytest.raises(ModelError, match="physical=True"):
+        _ = free.model
+    after = mb.dynamics(found.model, "pinocchio").inverse_dynamics(x.q, x.v, x.a)
+    assert np.sqrt(((after - tau) ** 2).mean(axis=0) / (tau**2).mean(axis=0)).max() < 0.05
+    for form in ("urdf", "mjcf"):
+        assert mb.convert(found.model, form).worst < 1e-10
+
+
+def test_consistency_costs_exact_data_nothing() -> None:
+    model, x = robot("ur5")
+    tau = mb.dynamics(model, "mujoco").inverse_dynamics(x.q, x.v, x.a)
+    found = mb.identify(other_masses(model), x.q, x.v, x.a, tau, physical=True)
+    true = model.base_parameters().values
+    assert np.abs(values(found) - true).max() < 1e-8 * np.abs(true).max()
+
+
+@pytest.mark.parametrize("prior", ["entropic", "euclidean"])
+def test_a_heavy_prior_holds_the_model(prior: str) -> None:
+    model, x = robot("ur5")
+    tau = mb.dynamics(model, "pinocchio").inverse_dynamics(x.q, x.v, x.a)
+    noisy = tau + np.random.default_rng(0).standard_normal(tau.shape)
+    before = other_masses(model)
+    light, heavy = (
+        mb.identify(before, x.q, x.v, x.a, noisy, physical=True, prior=prior, prior_weight=w) for w in (1.0, 1e9)
+    )
+    nominal, true = before.base_parameters().values, model.base_parameters().values
+    assert np.abs(values(heavy) - nominal).max() < 1e-3 * np.abs(nominal).max()
+    assert np.abs(values(light) - true).max() < 0.05 * np.abs(true).max()
+
+
+def test_without_the_solver_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = mb.catalog.pendulum()
+    q, v, a = motion(model)
+    tau = mb.dynamics(model).inverse_dynamics(q, v, a)
+    monkeypatch.setitem(__import__("sys").modules, "cvxpy", None)
+    with pytest.raises(UnsupportedError, match=r"mbkit\[identify\]"):
+        mb.identify(model, q, v, a, tau, physical=True)
+    assert mb.identify(model, q, v, a, tau).parameters
+
+
+def test_points_and_masses_of_zero_are_taken() -> None:
+    """A bob is a point, and its pseudo-inertia has no inverse."""
+    true = mb.catalog.double_pendulum(mass2=2.0)
+    q, v, a = motion(true)
+    tau = mb.dynamics(true).inverse_dynamics(q, v, a)
+    found = mb.identify(mb.catalog.double_pendulum(), q, v, a, tau, physical=True)
+    assert np.abs(mb.dynamics(found.model).inverse_dynamics(q, v, a) - tau).max() < 1e-3 * np.abs(tau).max()
+
+
+def test_the_result_reads_and_writes() -> None:
+    model = arm()
+    q, v, a = motion(model)
+    found = mb.identify(model, q, v, a, torques(model, q, v, a), friction=True)
+    back = Identification.from_json(found.to_json())
+    assert back == replace(found, source=None)
+    assert back.applied_to(model) == found.model
+    with pytest.raises(InputError, match="applied_to"):
+        _ = back.model
+    with pytest.raises(InputError, match="bodies"):
+        back.applied_to(mb.catalog.pendulum())
+    data = json.loads(found.to_json())
+    assert data["parameters"][0]["name"] == found.parameters[0].name
+    assert "link2.Iyy" in found._repr_html_()
+    assert found.to_csv().count("\n") == len(found.parameters) + 1
+    assert "j2.friction" in found.to_markdown()
+
+
+def test_large_data_are_read_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = arm()
+    q, v, a = motion(model, 500)
+    tau = torques(model, q, v, a)
+    whole = mb.identify(model, q, v, a, tau, friction=True)
+    reports: list[float] = []
+    monkeypatch.setattr("mbkit.identify.measurements._BLOCK", 1)
+    parts = mb.identify(model, q, v, a, tau, friction=True, progress=reports.append)
+    assert np.allclose(values(whole), values(parts), rtol=0, atol=1e-12)
+    assert reports[-1] == 1.0
+
+
+def test_bad_input() -> None:
+    model = arm()
+    q, v, a = motion(model, 50)
+    tau = torques(model, q, v, a)
+    for wrong, text in (
+        ({"q": q[:, :2]}, "q: expected shape"),
+        ({"tau": tau[:40]}, "as many of each"),
+        ({"tau": tau[0], "q": q[0], "v": v[0], "a": a[0]}, "one row per sample"),
+        ({"a": np.where(a == a[3, 1], np.nan, a)}, "nan"),
+        ({"weights": np.ones(2)}, "weights: expected shape"),
+        ({"weights": -np.ones(3)}, "at least 0"),
+        ({"weights": np.full(3, np.inf)}, "finite"),
+        ({"prior": "entropic"}, "physical=True"),
+        ({"prior": "bayes", "physical": True}, "euclidean"),
+        ({"physical": 1}, "True or False"),
+        ({"prior_weight": 0.0}, "above 0"),
+    ):
+        with pytest.raises(InputError, match=text):
+            mb.identify(model, **{"q": q, "v": v, "a": a, "tau": tau} | wrong)
+    with pytest.raises(InputError, match=r"at least \d+"):
+        mb.identify(model, q[:3], v[:3], a[:3], tau[:3])
+    with pytest.raises(UnsupportedError, match="no bodies"):
+        mb.identify(mb.lagrangian.systems.pendulum().model, q, v, a, tau)
+
+
+# Excitation
+
+
+def test_the_motion_is_within_limits_and_consistent() -> None:
+    model, x = robot("panda")
+    assert (x.q >= model.lower).all()
+    assert (x.q <= model.upper).all()
+    fast = np.concatenate([j.velocity_limit for j in model.independent_joints])
+    assert (np.abs(x.v) <= fast).all()
+    # Fourier's series: the last sample is the first, and the rates are those of q.
+    assert np.allclose(x.q[0], x.q[-1])
+    h = 1e-5
+    later, earlier = x.at(x.t + h), x.at(x.t - h)
+    assert np.allclose((later[0] - earlier[0]) / (2 * h), x.v, atol=1e-7)
+    assert np.allclose((later[1] - earlier[1]) / (2 * h), x.a, atol=1e-6)
+    assert all(part.shape == (model.nv,) for part in x.at(0.3))
+
+
+def test_the_search_lowers_the_condition_number() -> None:
+    model = mb.load("ur5")
+    start, end = (mb.excitation(model, duration=8.0, iterations=n, rate=40.0) for n in (0, 15))
+    assert end.condition < 0.8 * start.condition
+    again = mb.excitation(model, duration=8.0, iterations=15, rate=40.0)
+    assert np.array_equal(again.q, end.q)
+    Y = mb.dynamics(model, "lagrangian").regressor(end.q, end.v, end.a, "base").reshape(-1, 36)
+    assert np.linalg.cond(Y / np.linalg.norm(Y, axis=0)) == pytest.approx(end.condition, rel=1e-6)
+
+
+def test_the_gradient_is_that_of_the_value() -> None:
+    from mbkit.identify.fourier_series import _Search
+
+    search = _Search(mb.catalog.double_pendulum(), 5.0, 2, 0.05, True)
+    x = np.random.default_rng(0).standard_normal(10)
+    _, gradient = search.gradient(x)
+    for k in range(10):
+        step = 1e-5 * np.eye(10)[k]
+        slope = (search.gradient(x + step)[0] - search.gradient(x - step)[0]) / 2e-5
+        assert gradient[k] == pytest.approx(slope, rel=1e-3, abs=1e-4)
+
+
+def test_bad_excitation() -> None:
+    model = mb.catalog.pendulum()
+    for wrong, text in (
+        ({"duration": 0.0}, "duration"),
+        ({"harmonics": 0}, "harmonics"),
+        ({"rate": 1.0, "duration": 1.0}, "rate"),
+        ({"margin": 1.0}, "margin"),
+        ({"seed": "x"}, "seed"),
+    ):
+        with pytest.raises(InputError, match=text):
+            mb.excitation(model, **wrong)
+    with pytest.raises(UnsupportedError, match="quaternion"):
+        mb.excitation(mb.load("ur5", floating_base=True))
+    with pytest.raises(UnsupportedError, match="no bodies"):
+        mb.excitation(mb.lagrangian.systems.pendulum().model)
