@@ -22,6 +22,7 @@ with the body's velocities ω and v in its axes. Two linear maps lead from them 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -183,6 +184,7 @@ class RegressorColumns:
         return (*(standard[k] for k in self.bodies), *losses, *(f"{velocities[k]}.armature" for k in self.rotors))
 
 
+@lru_cache(maxsize=64)
 def regressor_columns(model: Description, parameters: str, friction: bool, armature: bool) -> RegressorColumns:
     """Return the columns for a set of parameters; see `Model.regressor_columns`."""
     if parameters not in PARAMETER_SETS:
