@@ -30,6 +30,7 @@ from mbkit.derivation.kinematics import (
     dot3,
 )
 from mbkit.derivation.links import Inertia
+from mbkit.derivation.regressor import energy_regressor, momentum_regressor, torque_regressor
 from mbkit.derivation.rotations import SYMMETRIC, Matrix
 from mbkit.model.joint_types import cross3
 
@@ -335,4 +336,7 @@ BODY_QUANTITIES: Final[dict[str, BodyQuantity]] = {
         ("q", "v", "a", "wrenches"),
         lambda m, joints, frames, axes, wrenches: m.joint_wrenches(joints, frames, axes, wrenches),
     ),
+    "regressor": BodyQuantity(("q", "v", "a"), lambda m, columns: torque_regressor(m.kin, m.a, columns)),
+    "momentum_regressor": BodyQuantity(("q", "v"), lambda m, columns: momentum_regressor(m.kin, columns)),
+    "energy_regressor": BodyQuantity(("q", "v"), lambda m, columns: energy_regressor(m.kin, columns)),
 }

@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, all_finite, batch_of, real
-from mbkit.engines import frames_and_momenta, loads
+from mbkit.engines import frames_and_momenta, loads, regressors
 from mbkit.engines.frames_and_momenta import LOCAL, FramesAndMomenta, axes_named
 from mbkit.engines.linearization import LinearizationQuantities
 from mbkit.engines.loads import Loads, Wrenches
+from mbkit.engines.regressors import Regressors
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import DEFAULT_METHOD, Method, explicit_method
@@ -33,6 +34,7 @@ QUANTITIES: Final = (
     *("inverse_dynamics", "forward_dynamics", "kinetic_energy", "potential_energy", "function"),
     *frames_and_momenta.QUANTITIES,
     *loads.QUANTITIES,
+    *regressors.QUANTITIES,
 )
 
 #: Bits of a double's significand.
@@ -106,7 +108,7 @@ def scalar(value: Array) -> Any:
     return value if value.ndim else float(value)
 
 
-class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities):
+class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
     Every method takes one state or a batch with one leading axis, checks shapes, finite numbers and unit quaternions,

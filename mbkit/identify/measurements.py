@@ -23,7 +23,7 @@ from mbkit.simulate.progress import Progress
 
 _BASE: Final = PARAMETER_SETS[1]
 #: Numbers of a regressor that are held at once.
-_BLOCK: Final = 1_000_000
+_BLOCK: Final = 250_000
 #: Columns that no state moves are found at so many.
 _PROBES: Final = 4
 

@@ -25,6 +25,7 @@ from pydrake.systems.framework import EventStatus
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._fork import fork_safe
+from mbkit.engines import regressors
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.drake.model import DrakeModel, build
 from mbkit.engines.frames_and_momenta import seen_from
@@ -48,6 +49,7 @@ class DrakeDynamics(MappedDynamics):
     refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "Drake forms C v without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no CasADi form; mbkit.dynamics(model, 'lagrangian') has",
+        **dict.fromkeys(regressors.QUANTITIES, "Drake has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
     }
 
     def __init__(self, model: Model) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, real
 from mbkit._fork import fork_safe
-from mbkit.engines import known_defects
+from mbkit.engines import known_defects, regressors
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.frames_and_momenta import seen_from
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
@@ -54,6 +54,7 @@ class MujocoDynamics(MappedDynamics):
     refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "MuJoCo forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
+        **dict.fromkeys(regressors.QUANTITIES, "MuJoCo has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
     }
 
     def __init__(self, model: Model) -> None:
