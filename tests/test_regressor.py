@@ -104,6 +104,11 @@ def test_pinocchio_has_the_same(seed: int, parameters: str) -> None:
         assert close(x, y, np.abs(x))
 
 
+def test_pinocchio_with_one_velocity() -> None:
+    model, state = mb.catalog.pendulum(), ([0.4], [0.5], [0.6])
+    assert np.allclose(mb.dynamics(model).regressor(*state), derived(model).regressor(*state), rtol=0, atol=1e-15)
+
+
 def exact_parameters(model: Model) -> list[mpmath.mpf]:
     """Return the standard parameters in 34 digits."""
     out = []

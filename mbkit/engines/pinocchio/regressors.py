@@ -50,7 +50,9 @@ class PinRegressors:
 
     def torques(self, q: Array, v: Array, a: Array) -> Array:
         """Return Y(q, v, a)."""
-        return np.asarray(pin.computeJointTorqueRegressor(self._m, self._d, q, v, a) @ self._map[_SIZE:])
+        # One row comes back as a vector.
+        own = pin.computeJointTorqueRegressor(self._m, self._d, q, v, a).reshape(self._m.nv, -1)
+        return np.asarray(own @ self._map[_SIZE:])
 
     def momentum(self, q: Array, v: Array) -> Array:
         """Return Y(q, v) of the momentum: the forces of accelerations v at rest, without gravity."""
