@@ -123,6 +123,17 @@ def test_weights_by_the_residuals_beat_equal_ones() -> None:
     assert (np.abs(values(equal) - true) < 4 * deviations(equal)).all()
 
 
+@pytest.mark.parametrize("exact", [0, 5])
+def test_an_exact_torque_does_not_hide_the_others(exact: int) -> None:
+    model, x = robot("ur5")
+    tau = mb.dynamics(model, "pinocchio").inverse_dynamics(x.q, x.v, x.a)
+    size = np.where(np.arange(model.nv) == exact, 0.0, 0.1)
+    noisy = tau + size * np.random.default_rng(0).standard_normal(tau.shape)
+    found = mb.identify(other_masses(model), x.q, x.v, x.a, noisy)
+    assert found.undetermined == ()
+    assert (np.abs(values(found) - model.base_parameters().values) < 5 * deviations(found) + 1e-9).all()
+
+
 def test_a_weight_of_zero_leaves_a_torque_out() -> None:
     model = arm()
     q, v, a = motion(model)
@@ -207,6 +218,21 @@ def test_directions_that_the_data_cannot_tell_are_named() -> None:
         assert np.abs(Y @ direction).max() < 1e-9 * np.abs(direction).max()
     # What is told is right: the torques are explained.
     assert max(r.noise for r in found.residuals) < 1e-11
+    # Links that move as one share their inertia about the first axis, and torques of rounding do not hide it.
+    assert "link0.Izz" in lost
+    assert all(len(x.names) > 1 for x in found.undetermined if "link0.Izz" in x.names)
+
+
+def test_motions_of_rounding_tell_nothing() -> None:
+    """Joints that are held rest to some 1e-11: no use to call their parameters told, with huge deviations."""
+    model = arm().without("damping", "friction", "armature", "springs")
+    q, v, a = motion(model)
+    for x, centre in ((q, 0.3), (v, 0.0), (a, 0.0)):
+        x[:, 1:] = centre + 1e-11 * x[:, 1:]
+    tau = mb.dynamics(model, "pinocchio").inverse_dynamics(q, v, a)
+    found = mb.identify(other_masses(model), q, v, a, tau)
+    assert len(found.undetermined) >= 5
+    assert found.condition < 1e6
 
 
 def found_rank(model: Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> range:

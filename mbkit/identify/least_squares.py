@@ -24,6 +24,8 @@ TOLERANCE: Final = 1e-8
 #: What is smaller than this part of a direction is rounding.
 _ROUNDING: Final = 1e-6
 _ROUNDS: Final = 10
+#: Part of the largest noise that the others are weighed with at least; a torque may be exact, or always zero.
+_LEAST: Final = 1e-6
 #: Change of variances between two rounds at which they are taken as settled.
 _SETTLED: Final = 1e-3
 _EPS: Final = float(np.finfo(float).eps)
@@ -68,14 +70,15 @@ def fit(given: Sequence[Equations], start: Array, units: Array, *, weighted: boo
     weighted : bool
         Whether the equations have their weights already; else those of their noise are found.
     """
-    floors = _floors(given)
-    noise = np.ones(len(given)) if weighted else np.array([x.size for x in given]) + floors
+    noise = np.ones(len(given))
     for _ in range(_ROUNDS):
         solution = _Solution(given, noise, start, units)
-        found = np.maximum(solution.residual_noise(), floors)
-        if weighted or np.abs(found / noise - 1).max(initial=0.0) < _SETTLED:
+        found = solution.residual_noise()
+        if weighted:
             break
-        noise = found
+        before, noise = noise, _weighing(found, given)
+        if np.abs(noise / before - 1).max(initial=0.0) < _SETTLED:
+            break
     null = solution.null
     deviations = np.where(null.any(axis=0), np.inf, solution.deviations(found))
     return Fit(solution.values, deviations, null, solution.condition, found)
@@ -87,11 +90,10 @@ def stacked(given: Sequence[Equations], noise: Array) -> Array:
     return np.asarray(np.linalg.qr(out, mode="r")) if len(out) > out.shape[1] else out
 
 
-def _floors(given: Sequence[Equations]) -> Array:
-    """Return the rounding of each velocity's torques, above 0."""
-    sizes = np.array([x.size for x in given])
-    # A torque that is always zero is as exact as the others.
-    return _EPS * np.where(sizes > 0, sizes, sizes.max(initial=0.0) or 1.0)
+def _weighing(noise: Array, given: Sequence[Equations]) -> Array:
+    """Return the noise that weighs: no less than rounding, nor so small that the other equations would not count."""
+    rounding = _EPS * (max((x.size for x in given), default=0.0) or 1.0)
+    return np.maximum(noise, max(rounding, _LEAST * float(noise.max(initial=0.0))))
 
 
 class _Solution:

@@ -119,7 +119,7 @@ def identify(
     fitted = fit(given, unknowns.nominal, _units(model, unknowns, length), weighted=weights is not None)
     values = fitted.values
     if physical:
-        noise = np.maximum(fitted.noise, NEGLIGIBLE * np.array([x.size for x in given]))
+        noise = np.maximum(fitted.noise, NEGLIGIBLE * (max(x.size for x in given) or 1.0))
         if weights is not None:
             noise = np.sqrt(np.mean(noise**2)) * np.ones(len(noise))
         values, standard = consistent(stacked(given, noise), unknowns, length, prior or ENTROPIC, prior_weight)
