@@ -329,10 +329,38 @@ def test_a_motion_has_its_states_on_the_page_and_its_frames_in_a_film(tmp_path: 
         view.animate(model, broken[100:], run.t[100:], None, shapes="sticks", triangles=99, fps=1)
 
 
-def test_constrained_models_are_drawn_along_their_tree(tmp_path: Path) -> None:
+def test_runs_with_loops_are_drawn_with_their_description(tmp_path: Path) -> None:
     model = mb.catalog.slider_crank()
-    assert model.needs.loops
-    assert len(mb.show(model, path=tmp_path / "a.html").scene.shapes) >= len(model.bodies)
+    lag = mb.lagrangian.from_model(model)
+    run = mb.simulate(lag.dynamics(), *lag.project([0.5, -0.2, 1.3], [1.0, 0.0, 0.0]), 0.2, "rk4", dt=1e-2)
+    with pytest.raises(UnsupportedError, match=r"has no bodies to draw; .*animate\(model=\.\.\.\)"):
+        run.animate(tmp_path / "a.html")
+    with pytest.raises(UnsupportedError, match="written as energies"):
+        mb.show(lag.model)
+    scene = run.animate(tmp_path / "a.html", model=model).scene
+    (loop,) = model.loops
+    a, b = (scene.bodies.index(body) for body in (loop.body_a, loop.body_b))
+    ends = [
+        scene.translations[:, k] + scene.rotations[:, k] @ p
+        for k, p in ((a, loop.translation_a), (b, loop.translation_b))
+    ]
+    # Closed as far as the run keeps its constraints.
+    np.testing.assert_allclose(*ends, atol=1e-9)
+
+
+def test_prescribed_coordinates_are_those_of_the_time(tmp_path: Path) -> None:
+    b = mb.ModelBuilder("driven")
+    for name, parent in (("crank", "world"), ("rod", "crank")):
+        b.add_body(name, mass=1.0, com=(0, 0, 0.5), inertia=(0.1, 0.1, 0.01))
+        b.add_joint(f"{name}_joint", "revolute", parent=parent, child=name, axis=(0, 1, 0), translation=(0, 0, 1))
+    b.prescribe("crank_joint", offset=0.1, rate=2.0, amplitude=0.5, frequency=3.0, phase=0.2)
+    model, t = b.build(), np.array([0.0, 0.7])
+    q = np.column_stack([0.1 + 2.0 * t + 0.5 * np.sin(3.0 * t + 0.2), [0.3, 0.4]])
+    given = {"shapes": "sticks", "triangles": 99, "fps": 1.0}
+    whole, part = (view.animate(model, x, t, tmp_path / "a.html", **given).scene for x in (q, q[:, 1:]))
+    np.testing.assert_array_equal(whole.rotations, part.rotations)
+    with pytest.raises(InputError, match="q: expected shape"):
+        view.animate(model, q[:, :0], t, tmp_path / "a.html", **given)
 
 
 def test_bad_input_is_named(tmp_path: Path, monkeypatch) -> None:
@@ -350,8 +378,6 @@ def test_bad_input_is_named(tmp_path: Path, monkeypatch) -> None:
     for name in ("a.html", "a.png"):
         with pytest.raises(OutputError, match="choose a folder that exists"):
             mb.show(model, path=tmp_path / "nowhere" / name)
-    with pytest.raises(UnsupportedError, match="written as energies and has no bodies"):
-        mb.show(mb.lagrangian.systems.pendulum().model)
     with pytest.raises(InputError, match="no value for parameter"):
         mb.show(mb.catalog.pendulum(length=mb.Parameter("l")))
     monkeypatch.setattr("matplotlib.animation.writers.is_available", lambda _: False)

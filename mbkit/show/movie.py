@@ -13,7 +13,7 @@ import numpy as np
 
 from mbkit._check import Array, needed
 from mbkit.errors import OutputError, UnsupportedError
-from mbkit.show.scene import Scene
+from mbkit.show.scene import HALF_ANGLE, Scene, camera_axes
 
 #: Suffix -> Matplotlib's writer, and what to install where it is missing.
 FILMS: Final = {".gif": ("pillow", "pip install pillow"), ".mp4": ("ffmpeg", "install ffmpeg")}
@@ -59,9 +59,8 @@ class _Drawing:
         from matplotlib.collections import PolyCollection
 
         self.scene, camera = scene, scene.camera
-        ca, sa, ce, se = (f(camera[k]) for k in ("azimuth", "elevation") for f in (np.cos, np.sin))
-        self.axes = np.array([[-sa, ca, 0], [-ca * se, -sa * se, ce], [ca * ce, sa * ce, se]])
-        self.target, self.distance = np.array(camera["target"]), float(np.asarray(camera["distance"]))
+        self.axes = camera_axes(camera["azimuth"], camera["elevation"])
+        self.target, self.distance = np.array(camera["target"]), float(camera["distance"])
         self.owner, self.corners, colors = [], [], []
         for k, shape in enumerate(scene.shapes):
             for surface in shape.surfaces:
@@ -72,10 +71,10 @@ class _Drawing:
         self.which = np.concatenate(self.owner)
         self.local = np.concatenate(self.corners)
         axis.set_axis_off()
-        reach, wide = np.tan(np.deg2rad(17.5)), _INCHES[0] / _INCHES[1]
+        reach, wide = np.tan(np.deg2rad(HALF_ANGLE)), _INCHES[0] / _INCHES[1]
         axis.set_xlim(-reach * wide, reach * wide)
         axis.set_ylim(-reach, reach)
-        self._grid(axis, float(np.asarray(camera["reach"])))
+        self._grid(axis, float(camera["reach"]))
         self.shadow = axis.add_collection(
             PolyCollection([], facecolors="#c9ced6", edgecolors="#c9ced6", linewidths=0.4, zorder=1)
         )
@@ -119,6 +118,7 @@ class _Drawing:
         order = np.argsort(depth.mean(axis=1))
         self.solids.set_verts(seen[order])
         self.solids.set_facecolor(colors[order])
-        self.solids.set_edgecolor(colors[order])
+        # The edge closes the gap between neighbours, and would show on what is transparent.
+        self.solids.set_edgecolor(colors[order] * np.where(colors[order, 3:] < 1, [1, 1, 1, 0], 1))
         if len(self.scene.t) > 1:
             self.clock.set_text(f"{self.scene.t[k]:.2f} s")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -35,6 +36,10 @@ _JOINT: Final[Color] = (0.30, 0.32, 0.35, 1.0)
 _THICK: Final = 0.06
 #: Frames at which the extent is measured.
 _MEASURED: Final = 40
+#: Of the camera: half its angle in degrees, its elevation in rad, and the width of a picture by its height.
+HALF_ANGLE: Final = 17.5
+_ELEVATION: Final = 0.3
+_ASPECT: Final = 1.2
 
 
 def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
@@ -63,9 +68,7 @@ def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
     """
     if kind not in SHAPES:
         raise InputError(f"shapes: expected one of {', '.join(SHAPES)}, got {shown(kind)}")
-    if not model.has_bodies:
-        raise UnsupportedError(f"show: {model.name} was written as energies and has no bodies to draw")
-    model.require_values("show")
+    require_bodies(model)
     found = Visuals()
     try:
         for which in () if kind == "sticks" or not model.source else (kind, *(s for s in SHAPES[:2] if s != kind)):
@@ -86,6 +89,16 @@ def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
     return stand_ins(model, {body.name for body in model.bodies})
 
 
+def require_bodies(model: Model) -> None:
+    """Raise unless the model has bodies, and all numbers have values."""
+    if not model.has_bodies:
+        raise UnsupportedError(
+            f"show: {model.name} was written as energies and has no bodies to draw; "
+            "a run of it is shown by animate(model=...) with a description of the same coordinates"
+        )
+    model.require_values("show")
+
+
 def stand_ins(model: Model, bodies: set[str]) -> list[Shape]:
     """Return capsules from joint to joint and boxes with the inertia of some bodies."""
     if not bodies:
@@ -93,6 +106,9 @@ def stand_ins(model: Model, bodies: set[str]) -> list[Shape]:
     ends: dict[str, list[Array]] = {}
     for joint in model.joints:
         ends.setdefault(joint.parent, []).append(joint.translation)
+    for loop in model.loops:
+        ends.setdefault(loop.body_a, []).append(loop.translation_a)
+        ends.setdefault(loop.body_b, []).append(loop.translation_b)
     for body in model.bodies:
         if body.name not in ends:
             places = [f.translation for f in model.frames if f.body == body.name] + [body.com]
@@ -112,9 +128,7 @@ def stand_ins(model: Model, bodies: set[str]) -> list[Shape]:
         slides = body.name in moving and bool(moving[body.name].type.lengths)
         out += [box] if box is not None and (boxes[body.name][1].any() or not slides) else []
         if slides and not boxes[body.name][1].any():
-            out.append(
-                Shape(f"{body.name}.box", body.name, np.eye(3), np.zeros(3), "box", (2 * radius,) * 3, (), color)
-            )
+            out.append(Shape(f"{body.name}.box", body.name, np.eye(3), body.com, "box", (2 * radius,) * 3, (), color))
         if body.name in moving and not moving[body.name].type.floating and not slides:
             name = f"{body.name}.joint"
             out.append(Shape(name, body.name, np.eye(3), np.zeros(3), "sphere", (1.4 * radius,), (), _JOINT))
@@ -134,7 +148,7 @@ def _box(body: Body, axes: Array, half: Array, radius: float, longest: float, co
     if not half.any():
         return Shape(f"{body.name}.mass", body.name, np.eye(3), body.com, "sphere", (2.2 * radius,), (), color)
     size = tuple(float(x) for x in np.clip(half, 0.5 * radius, longest))
-    return Shape(f"{body.name}.inertia", body.name, axes, body.com, "box", size, (), (*color[:3], 0.45))
+    return Shape(f"{body.name}.inertia", body.name, axes, body.com, "box", size, (), (*color[:3], 0.4))
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,10 +198,7 @@ class Scene:
         corners = []
         for shape in self.shapes:
             V = np.concatenate([s.vertices for s in shape.surfaces])
-            low, high = V.min(axis=0), V.max(axis=0)
-            corners.append(
-                [[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i, j, k in np.ndindex(2, 2, 2)]
-            )
+            corners.append(list(product(*zip(V.min(axis=0), V.max(axis=0), strict=True))))
         points = [self.translations[:, 0]] if not corners else []
         for frame in np.unique(np.linspace(0, len(self.t) - 1, _MEASURED).astype(int)) if corners else ():
             R, p = self.placements(frame)
@@ -201,21 +212,29 @@ class Scene:
         low, high = self.bounds[:, 2]
         return 0.0 if abs(low) < 0.03 * (high - low) else float(low)
 
-    @property
-    def camera(self) -> dict[str, float | list[float]]:
+    @cached_property
+    def camera(self) -> dict[str, Any]:
         """Where a camera of 35° sees everything, by target and distance in m, azimuth and elevation in rad."""
         low, high = self.bounds
         wide, deep = (high - low)[:2]
-        reach = max(float(np.linalg.norm(high - low)) / 2, 1e-6)
         # A motion in a plane is seen from its side, and a robot that looks along x from the front.
         azimuth = -np.pi / 2 + 0.5 if wide >= deep else 0.5
+        right, up, back = camera_axes(azimuth, _ELEVATION)
+        corners = np.array(list(product(*zip(low, high, strict=True)))) - (low + high) / 2
+        needed = np.maximum(np.abs(corners @ up), np.abs(corners @ right) / _ASPECT) / np.tan(np.deg2rad(HALF_ANGLE))
         return {
-            "target": [float(x) for x in (low + high) / 2],
-            "distance": reach / float(np.sin(np.deg2rad(17.5))) * 0.9,
-            "azimuth": float(azimuth),
-            "elevation": 0.3,
-            "reach": reach,
+            "target": ((low + high) / 2).tolist(),
+            "distance": 1.12 * max(float((corners @ back + needed).max()), 1e-6),
+            "azimuth": azimuth,
+            "elevation": _ELEVATION,
+            "reach": max(float(np.linalg.norm(high - low)) / 2, 1e-6),
         }
+
+
+def camera_axes(azimuth: float, elevation: float) -> Array:
+    """Return the directions to the right, upwards and towards the camera, (3, 3)."""
+    (ca, ce), (sa, se) = np.cos([azimuth, elevation]), np.sin([azimuth, elevation])
+    return np.array([[-sa, ca, 0], [-ca * se, -sa * se, ce], [ca * ce, sa * ce, se]])
 
 
 def _fewer(shapes: list[Shape], triangles: int) -> tuple[Shape, ...]:

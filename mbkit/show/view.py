@@ -20,7 +20,7 @@ from mbkit._escape import one_line
 from mbkit.errors import InputError, OutputError
 from mbkit.model import Model
 from mbkit.show import movie, page
-from mbkit.show.scene import Kind, Scene
+from mbkit.show.scene import Kind, Scene, require_bodies
 
 #: Frames that a page holds at most.
 _FRAMES: Final = 2000
@@ -130,9 +130,7 @@ def show(
     """
     if not isinstance(model, Model):
         raise InputError(f"model: expected a Model, got {shown(model)}; a trajectory has animate()")
-    if not model.has_bodies:
-        # Says so, whatever q is.
-        Scene.of(model, np.zeros((1, model.nq)), np.zeros(1), "sticks", 1)
+    require_bodies(model)
     configurations = np.atleast_2d(model.neutral() if q is None else model.check_q(q))
     return view_of(model, configurations, np.arange(float(len(configurations))), path, shapes, triangles)
 
@@ -148,10 +146,13 @@ def animate(
     fps: float,
 ) -> View:
     """Show a motion: configurations (K, nq) at times (K,) in s; for the arguments see `Trajectory.animate`."""
+    if not isinstance(model, Model):
+        raise InputError(f"model: expected a Model, got {shown(model)}")
+    require_bodies(model)
     good = np.flatnonzero(np.isfinite(q).all(axis=1))
     if not len(good):
         raise InputError(f"{model.name}: the trajectory has no state with finite numbers, so nothing can be shown")
-    t, q = t[good], q[good]
+    t, q = t[good], model.check_q(_with_prescribed(model, q[good], t[good]))
     filmed = path is not None and Path(path).suffix.lower() in movie.FILMS
     rate = real("fps", fps, positive=True) if filmed else _PAGE_RATE
     frames = int((t[-1] - t[0]) * rate) + 1
@@ -164,6 +165,18 @@ def animate(
     if not filmed:
         which = np.unique(which)
     return view_of(model, q[which], t[which], path, shapes, triangles, fps=rate)
+
+
+def _with_prescribed(model: Model, q: Array, t: Array) -> Array:
+    """Return coordinates with those that move in time, where only the others are given."""
+    if q.shape[1] != model.nq - len(model.prescribed):
+        return q
+    moved = {model.layout.q[x.joint].start: x for x in model.prescribed}
+    out = np.empty((len(q), model.nq))
+    out[:, [i for i in range(model.nq) if i not in moved]] = q
+    for i, x in moved.items():
+        out[:, i] = x.offset + x.rate * t + x.amplitude * np.sin(x.frequency * t + x.phase)
+    return out
 
 
 def view_of(

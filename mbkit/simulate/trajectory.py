@@ -154,6 +154,7 @@ class Trajectory(RunData):
         self,
         path: str | os.PathLike[str] | None = None,
         *,
+        model: Model | None = None,
         member: int = 0,
         shapes: Kind = "visual",
         triangles: int = 250_000,
@@ -162,14 +163,17 @@ class Trajectory(RunData):
         """Show the motion with the robot's shapes, in a notebook, a browser window or a file.
 
         The page has a time slider, play and pause, speeds, and a turntable camera. It is one HTML file that loads
-        nothing, of up to 2,000 of the saved states, and moves smoothly from one to the next. A constrained model is
-        drawn at its coordinates, loops as far as they are closed there.
+        nothing, of up to 2,000 of the saved states, and moves smoothly from one to the next.
 
         Parameters
         ----------
         path : str or path, optional
             A file to write: ``.html``, ``.gif`` or ``.mp4``, or ``.png`` for the first state. Without one see
             `mbkit.show`.
+        model : Model, optional
+            The description with the bodies, of the same coordinates in the same order; prescribed ones may be left
+            out of the states. By default the run's own. A run of `mbkit.lagrangian.from_model`, such as one with
+            loops, has energies without bodies, and needs the description that these came from.
         member : int
             Index of the trajectory in a batch.
         shapes : {"visual", "collision", "sticks"}
@@ -185,15 +189,16 @@ class Trajectory(RunData):
         Raises
         ------
         InputError
-            No finite state, or a path of another kind.
+            No finite state, a description of other coordinates, or a path of another kind.
         UnsupportedError
-            A model written as energies, or a format whose writer is not installed.
+            A model written as energies, without `model`, or a format whose writer is not installed.
         OutputError
             The file cannot be written.
         """
         from mbkit.show.view import animate
 
-        member, model = self._member(member)
+        member, own = self._member(member)
+        model = own if model is None else model
         q = self.q[member] if self.q.ndim == 3 else self.q
         return animate(model, q, self.t, path, shapes=shapes, triangles=triangles, fps=fps)
 
