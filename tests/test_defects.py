@@ -63,6 +63,32 @@ def test_a_comparison_fails_the_coriolis_defect_by_name(kind):
 
 
 @in_this_version
+@pytest.mark.parametrize("kind", list(CORIOLIS))
+def test_pinocchios_rates_of_jacobians_are_returned_with_a_warning_that_names_the_joint(kind):
+    model = one_joint(kind, **CORIOLIS[kind])
+    q, v, _, _ = (x[0] for x in states(model, 1))
+    dyn, own = mb.dynamics(model), mb.dynamics(model, "lagrangian")
+    for quantity, more in (("jacobian_dot_v", ("a",)), ("centroidal_momentum_bias", ())):
+        with pytest.warns(KnownDefectWarning, match=f"{quantity}.*'odd'"):
+            wrong = getattr(dyn, quantity)(q, v, *more)
+        assert off(wrong, getattr(own, quantity)(q, v, *more)) > 1e-3
+    right = dyn.acceleration(q, v, np.zeros(model.nv), "a")
+    assert off(right, own.jacobian_dot_v(q, v, "a")) < 1e-14
+
+
+@in_this_version
+def test_pinocchios_centroidal_map_variation_reads_the_velocity_of_an_earlier_call():
+    """It is why mbkit calls `dccrba`."""
+    pin = pytest.importorskip("pinocchio")
+    model = mb.dynamics(one_joint("revolute", axis=(0, 1, 0))).pin_model
+    data, q, v = model.createData(), np.array([0.3, 0.4]), np.array([1.0, -2.0])
+    right = pin.dccrba(model, data, q, v).copy()
+    pin.centerOfMass(model, data, q, np.array([3.0, 1.0]))
+    assert off(pin.computeCentroidalMapTimeVariation(model, data, q, v), right) > 1e-2
+    assert off(pin.dccrba(model, data, q, v), right) == 0.0
+
+
+@in_this_version
 @pytest.mark.parametrize("axis", [(0, 0, -1), (1, 1, 0)])
 def test_pinocchios_kinetic_energy_without_armature_is_failed_by_name(axis):
     model = one_joint("revolute", armature=0.8, axis=axis)

@@ -10,6 +10,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.engines import ENGINES, QUANTITIES
+from mbkit.engines.frames_and_momenta import AXES, CLASSICAL, SPATIAL
 from mbkit.errors import KnownDefectWarning, UnsupportedError
 from mbkit.model import KINDS, Model, kind_of
 from tests.joint_of_ones_own import OWN
@@ -49,12 +50,19 @@ def state(model: Model) -> dict[str, np.ndarray]:
     return {"q": q, "v": v, "a": a, "t": tau}
 
 
-def value(dyn, quantity: str, at: dict[str, np.ndarray]) -> np.ndarray:
+WRENCH = (1.0, -2.0, 3.0, 0.5, 0.1, -0.4)
+
+
+def value(dyn, quantity: str, at: dict[str, np.ndarray], axes: tuple[str, ...] = AXES) -> np.ndarray:
+    """Return a quantity of the last body in these axes and of all kinds, on a last axis."""
     method, frame = getattr(dyn, quantity), dyn.model.bodies[-1].name
     takes = inspect.signature(method).parameters
     more = {"frame": frame} if "frame" in takes else {}
-    more |= {"wrenches": {frame: [1.0, -2.0, 3.0, 0.5, 0.1, -0.4]}} if "wrenches" in takes else {}
-    return np.asarray(method(*(at[name[0]] for name in takes if name in ("q", "v", "a", "tau")), **more))
+    more |= {"wrenches": {frame: WRENCH}} if "wrenches" in takes else {}
+    options = [{"axes": x} for x in axes] if "axes" in takes else [{}]
+    options = [x | {"kind": kind} for x in options for kind in (SPATIAL, CLASSICAL)] if "kind" in takes else options
+    given = [at[name[0]] for name in takes if name in ("q", "v", "a", "tau")]
+    return np.stack([np.asarray(method(*given, **more, **x)) for x in options], axis=-1)
 
 
 @pytest.mark.parametrize("kind", [*BUILT_IN, *OWN])
@@ -67,15 +75,15 @@ def test_each_quantity_is_right_or_refused(kind):
     size = 1.0 + np.abs(M).max() * max(1.0, float(at["v"] @ at["v"])) + np.abs(oracle.nle(at["q"], at["v"])).max()
     tolerance = 2000 * EPS * size
     refused: dict = {}
+    quantities = [x for x in (*QUANTITIES, *DERIVATIVES) if x not in ("function", "coriolis_matrix")]
+    right = {quantity: value(oracle, quantity, at) for quantity in quantities}
     for engine in ENGINES:
         try:
             dyn = mb.dynamics(model, engine)
         except UnsupportedError as error:
             refused[engine] = str(error)
             continue
-        for quantity in (*QUANTITIES, *DERIVATIVES):
-            if quantity in ("function", "coriolis_matrix"):
-                continue
+        for quantity in quantities:
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", KnownDefectWarning)
                 try:
@@ -86,7 +94,7 @@ def test_each_quantity_is_right_or_refused(kind):
             if any(issubclass(w.category, KnownDefectWarning) for w in caught):
                 continue
             factor = condition if quantity.startswith("forward") else 1.0
-            off = np.abs(found - value(oracle, quantity, at)).max()
+            off = np.abs(found - right[quantity]).max()
             assert off < tolerance * factor, (engine, quantity, off)
     assert not {"lagrangian", "oracle"} & {*refused}
     assert all(kind in text for key, text in refused.items() if isinstance(key, str)), refused
@@ -123,10 +131,10 @@ def test_one_state_has_the_values_of_its_row_in_a_batch(engine, feature):
         if quantity == "function":
             continue
         try:
-            whole = value(dyn, quantity, batch)
+            whole = value(dyn, quantity, batch, AXES[:1])
         except UnsupportedError:
             continue
-        rows = [value(dyn, quantity, {name: x[i] for name, x in batch.items()}) for i in range(3)]
+        rows = [value(dyn, quantity, {name: x[i] for name, x in batch.items()}, AXES[:1]) for i in range(3)]
         if quantity in DERIVATIVES:
             whole = np.moveaxis(whole, 1, 0)
         tolerance = 1e-13 * (np.linalg.cond(M).max() if quantity.startswith("forward") else 1.0)

@@ -20,6 +20,11 @@ KINETIC_ENERGY: Final = (
     "known defect of pinocchio 4.1.0, kinetic_energy: computeKineticEnergy leaves out the armature of some joint "
     "types; half vᵀ M v is right"
 )
+JACOBIAN_RATE: Final = (
+    "known defect of pinocchio 4.1.0, jacobian_dot_v and centroidal_momentum_bias: computeJointJacobiansTimeVariation "
+    "and dccrba take the axes of a joint for fixed in its child (pinocchio#2053); "
+    "acceleration at a = 0 is right"
+)
 TINY_MASS: Final = (
     "known defect of pinocchio 4.1.0, mass_matrix: the sum of two inertias has a wrong centre of mass where they weigh "
     "less than 2.2e-16 kg together, and with it M, nle and accelerations; the lagrangian engine is right; or take a "

@@ -18,11 +18,12 @@ import pinocchio as pin
 from mbkit._check import Array
 from mbkit.engines import known_defects
 from mbkit.engines.base import Dynamics, first_names, unit_quaternions
-from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, WORLD
+from mbkit.engines.frames_and_momenta import LOCAL
+from mbkit.engines.pinocchio.bodies import PinocchioBodies
 from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
 from mbkit.engines.pinocchio.regressors import PinRegressors
 from mbkit.engines.regressors import with_losses
-from mbkit.model import Frame, Model
+from mbkit.model import Model
 from mbkit.model.base_parameters import RegressorColumns
 from mbkit.model.manifold import NEAR_UNIT
 
@@ -107,26 +108,11 @@ def _sound(model: Model, unread: set[int]) -> Sound:
     return lambda q: unit_quaternions(q, starts) and isfinite(sum(q.tolist()))
 
 
-_REFERENCE_FRAMES: Final = {
-    LOCAL: pin.ReferenceFrame.LOCAL,
-    WORLD: pin.ReferenceFrame.WORLD,
-    ALIGNED: pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
-}
-
-
-def _change(X_WF: Any, reference: Any) -> Array:
-    """Return the matrix that takes twists from a frame's own axes."""
-    if reference == pin.ReferenceFrame.WORLD:
-        return np.asarray(X_WF.toActionMatrix())
-    R = X_WF.rotation if reference == pin.ReferenceFrame.LOCAL_WORLD_ALIGNED else np.eye(3)
-    return np.kron(np.eye(2), R)
-
-
 #: Joint types of which computeRNEADerivatives and computeABADerivatives of 4.1.0 are wrong (pinocchio#2053).
 _WRONG_DERIVATIVES: Final = ("universal", "spherical_zyx")
 
 
-class PinocchioDynamics(Dynamics):
+class PinocchioDynamics(PinocchioBodies, Dynamics):
     """Pinocchio's algorithms on a description.
 
     Attributes
@@ -193,6 +179,8 @@ class PinocchioDynamics(Dynamics):
             known_defects.announce(known_defects.CORIOLIS, self._coriolis_fault)
         if quantity == "kinetic_energy" and self._kinetic_fault:
             known_defects.announce(known_defects.KINETIC_ENERGY, self._kinetic_fault)
+        if quantity in ("jacobian_dot_v", "centroidal_momentum_bias") and self._rate_fault:
+            known_defects.announce(known_defects.JACOBIAN_RATE, self._rate_fault)
         return super()._method(quantity)
 
     def visual_model(self, shapes: Kind = "visual") -> pin.GeometryModel:
@@ -227,29 +215,34 @@ class PinocchioDynamics(Dynamics):
         rotors = self._joint_passive.armature
         return M if rotors is None else M + rotors
 
+    def _mass_matrix_inverse(self, q: Array) -> Array:
+        if self._reduced or self._joint_passive.armature is not None:
+            return np.asarray(np.linalg.inv(self._mass_matrix(q)))
+        return self._matrix(pin.computeMinverse(self._m, self._d, self._full_q(q)))
+
     def _gravity(self, q: Array) -> Array:
         return self._force(pin.computeGeneralizedGravity(self._m, self._d, self._full_q(q)))
 
     def _nle(self, q: Array, v: Array) -> Array:
         return self._force(pin.nonLinearEffects(self._m, self._d, self._full_q(q), self._full_v(v)))
 
-    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array, *outside: Any) -> Array:
         q, v = self._full_q(q), self._full_v(v)
         a, rotors = self._full_v(a), self._joint_passive.armature
-        out: Array = pin.rnea(self._m, self._d, q, v, a)
+        out: Array = pin.rnea(self._m, self._d, q, v, a, *outside)
         out -= self._full_passive(q, v)
         if rotors is not None:
             out += rotors @ a
         return self._force(out)
 
-    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array, *outside: Any) -> Array:
         q, v = self._full_q(q), self._full_v(v)
         m, d, passive = self._m, self._d, self._full_passive(q, v)
         if not self._reduced and self._joint_passive.armature is None:
             # G only puts the joints in order, so its transpose puts them back.
-            return self._force(pin.aba(m, d, q, v, self._full_v(tau) + passive))
+            return self._force(pin.aba(m, d, q, v, self._full_v(tau) + passive, *outside))
         # ABA knows neither mimic joints nor rotors between joints: solve GᵀMG a = τ + Gᵀ(passive - nle).
-        M, h = self._matrix(self._full_mass_matrix(q)), pin.nonLinearEffects(m, d, q, v)
+        M, h = self._matrix(self._full_mass_matrix(q)), pin.rnea(m, d, q, v, np.zeros(m.nv), *outside)
         return np.asarray(np.linalg.solve(M, tau + self._force(passive - h)))
 
     def _full_passive(self, q: Array, v: Array) -> Array:
@@ -326,32 +319,6 @@ class PinocchioDynamics(Dynamics):
 
     def _reduced_rows(self, Y: Array) -> Array:
         return Y if self._direct else self._Gt @ Y
-
-    def _in_joint(self, frame: Frame) -> tuple[int, pin.SE3]:
-        """Return the joint that carries a frame, and X_JF."""
-        if frame.name not in self._placements:
-            carrier, R, p = self._pin.bodies[frame.body]
-            self._placements[frame.name] = carrier, pin.SE3(R @ frame.rotation, p + R @ frame.translation)
-        return self._placements[frame.name]
-
-    def _pose(self, q: Array, frames: tuple[Frame, ...]) -> Array:
-        pin.forwardKinematics(self._m, self._d, self._full_q(q))
-        placed = (self._d.oMi[carrier] * X_JF for carrier, X_JF in map(self._in_joint, frames))
-        return np.array([X.homogeneous for X in placed])
-
-    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
-        m, d, reference = self._m, self._d, _REFERENCE_FRAMES[axes]
-        pin.computeJointJacobians(m, d, self._full_q(q))
-        out = np.zeros((len(frames), 6, m.nv))
-        for k, frame in enumerate(frames):
-            carrier, X_JF = self._in_joint(frame)
-            if carrier:
-                # One column comes back as a vector.
-                own = pin.getJointJacobian(m, d, carrier, pin.ReferenceFrame.LOCAL).reshape(6, m.nv)
-                X_WF = d.oMi[carrier] * X_JF
-                change = _change(X_WF, reference) @ X_JF.toActionMatrixInverse()
-                out[k] = change @ own
-        return out if self._direct else out @ self._G
 
     # Known defects, measured on this very model.
 

@@ -7,7 +7,7 @@ its coordinates (Pinocchio's own planar joint has four numbers and body velociti
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -33,8 +33,10 @@ class PinModel:
     v_order: np.ndarray
     #: Whether both orders are the identity.
     ordered: bool
-    #: Σ m p over bodies fixed to the world, which Pinocchio's energy leaves out.
+    #: Σ m p over bodies fixed to the world, which Pinocchio's energy and centre of mass leave out.
     ground_moment: Array
+    #: Their inertia, in the world.
+    ground: pin.Inertia
 
 
 def build(description: Model) -> PinModel:
@@ -46,7 +48,7 @@ def build(description: Model) -> PinModel:
     bodies: dict[str, tuple[int, Array, Array]] = {"world": (0, np.eye(3), np.zeros(3))}
     q_order: list[int] = []
     v_order: list[int] = []
-    ground = np.zeros(3)
+    moment, ground = np.zeros(3), pin.Inertia.Zero()
     for joint in description.tree:
         carrier, R, p = bodies[joint.parent]
         R, p = R @ joint.rotation, p + R @ joint.translation
@@ -63,9 +65,10 @@ def build(description: Model) -> PinModel:
         bodies[joint.child] = (carrier, R, p)
         body = description.body(joint.child)
         if carrier:
-            model.appendBodyToJoint(carrier, _inertia(body), pin.SE3(R, p))
+            model.appendBodyToJoint(carrier, inertia_of(body), pin.SE3(R, p))
         else:
-            ground += body.mass * (p + R @ body.com)
+            moment += body.mass * (p + R @ body.com)
+            ground = ground + pin.SE3(R, p).act(inertia_of(body))
         q_order.extend(range(layout.full_q[joint.name].start, layout.full_q[joint.name].stop))
         v_order.extend(range(layout.full_v[joint.name].start, layout.full_v[joint.name].stop))
     for frame in (*(description.frame(body.name) for body in description.bodies), *description.frames):
@@ -77,10 +80,11 @@ def build(description: Model) -> PinModel:
         # Without inertia: the bodies' own is in already.
         model.addFrame(pin.Frame(frame.name, carrier, 0, placement, kind), False)
     ordered = q_order == list(range(len(q_order)))
-    return PinModel(model, bodies, np.array(q_order, int), np.array(v_order, int), ordered, ground)
+    return PinModel(model, bodies, np.array(q_order, int), np.array(v_order, int), ordered, moment, ground)
 
 
-def _inertia(body: Body) -> pin.Inertia:
+def inertia_of(body: Body) -> pin.Inertia:
+    """Return a body's inertia about its origin."""
     # Set part by part: the constructor refuses an inertia that is not positive, which a description may hold.
     out = pin.Inertia.Zero()
     out.mass, out.lever, out.inertia = body.mass, np.array(body.com), np.array(body.inertia)
@@ -113,6 +117,10 @@ _STEPS: Final[dict[str, Callable[[Joint], list[tuple[str, object]]]]] = {
 # Point-to-point springs and dampers on Pinocchio's kinematics.
 
 
+#: A body, and a force on it in the axes and about the origin of the joint that carries it.
+OnBody = tuple[str, Any]
+
+
 class PointSprings:
     """Forces and energy of all point springs of a model, in Pinocchio's coordinates."""
 
@@ -136,8 +144,23 @@ class PointSprings:
 
     def force(self, m: Any, d: Any, q: Array, v: Array) -> Array:
         """Return the generalized force, by the points' Jacobians."""
-        pin.computeJointJacobians(m, d, q)
         out = np.zeros(m.nv)
+        for J, pull in self._pulls(m, d, q, v):
+            out -= J.T @ pull
+        return out
+
+    def forces(self, m: Any, d: Any, q: Array, v: Array) -> list[OnBody]:
+        """Return the pulls on the bodies at the ends."""
+        out = []
+        for (spring, *ends), (_, pull) in zip(self._ends, self._pulls(m, d, q, v), strict=True):
+            for sign, body, (joint, point) in zip((1, -1), (spring.body_a, spring.body_b), ends, strict=True):
+                force = sign * d.oMi[joint].rotation.T @ pull
+                out.append((body, pin.Force(force, np.cross(point, force))))
+        return out
+
+    def _pulls(self, m: Any, d: Any, q: Array, v: Array) -> Iterator[tuple[Array, Array]]:
+        """Yield the Jacobian of the gap of each spring, and the pull on its first end in world axes."""
+        pin.computeJointJacobians(m, d, q)
         for spring, (i, a), (j, b) in self._ends:
             gap = d.oMi[j].act(b) - d.oMi[i].act(a)
             J = self._point_jacobian(m, d, j, b) - self._point_jacobian(m, d, i, a)
@@ -150,8 +173,7 @@ class PointSprings:
                     pull = pull - spring.stiffness * spring.rest_length * (gap / length)
                 if spring.damping:
                     pull = pull + spring.damping * (gap / length) * float(gap @ (J @ v)) / np.float64(length)
-            out -= J.T @ pull
-        return out
+            yield J, pull
 
     @staticmethod
     def _point_jacobian(m: Any, d: Any, joint: int, point: Array) -> Array:

@@ -1,0 +1,281 @@
+"""Motion of frames, centre of mass, momenta and loads: the engines against 34 digits, and all against mechanics."""
+
+from __future__ import annotations
+
+import warnings
+from functools import cache
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.engines import ENGINES, frames_and_momenta, loads
+from mbkit.engines.frames_and_momenta import ALIGNED, AXES, CLASSICAL, LOCAL, SPATIAL
+from mbkit.errors import KnownDefectWarning, UnsupportedError
+from mbkit.model import Model
+from mbkit.simulate import simulate
+from tests.random_trees import ALL, IN_MUJOCO, SOUND, off, random_tree, states
+
+EPS = np.finfo(float).eps
+#: Normwise, of trees of ten bodies: what large terms leave of their rounding where they cancel.
+CLOSE = 5000 * EPS
+NOTHING = {"springs": False, "damping": False, "armature": False}
+TREES = {
+    "all joint types": lambda: random_tree(11, 11, ALL, mimic=True),
+    "fixed to the world": lambda: random_tree(14, 8, ("fixed", "revolute", "prismatic"), nearest=6),
+    "floating": lambda: random_tree(3, 8, ("free", "ball", "revolute", "fixed", "planar"), nearest=3),
+    "without springs": lambda: random_tree(4, 7, IN_MUJOCO, springs=False, damping=False, nearest=4),
+    "sound": lambda: random_tree(5, 8, [k for k in SOUND if k != "helical"], **NOTHING, mimic=True),
+}
+#: Engines that tell joint loads.
+LOADED = [x for x in ENGINES if "joint_wrenches" in mb.dynamics(mb.catalog.pendulum(), x).supports]
+QUANTITIES = (*frames_and_momenta.QUANTITIES, *loads.QUANTITIES)
+
+
+#: Quantities with a defect, or that MuJoCo has of some trees only.
+MAY_LACK = {"jacobian_dot_v", "centroidal_momentum_bias", "joint_wrenches"}
+
+
+@cache
+def tree(name: str) -> Model:
+    return TREES[name]()
+
+
+@cache
+def at(name: str) -> dict[str, np.ndarray]:
+    return dict(zip(("q", "v", "a", "tau"), states(tree(name), 2), strict=True))
+
+
+def wrenches(model: Model) -> dict[str, np.ndarray]:
+    """Return wrenches on a frame, on a body, and on what does not move."""
+    w = np.random.default_rng(7).standard_normal((3, 2, 6))
+    return dict(zip(("tip", model.bodies[1].name, "world"), w, strict=True))
+
+
+def calls(model: Model, state: dict[str, np.ndarray]):
+    """Yield the name, method, arguments and options of each quantity in all axes and of all kinds."""
+    q, v, a, tau = state.values()
+    frames, on = ["tip", model.bodies[2].name, "world"], wrenches(model)
+    every = [j.name for j in model.joints]
+    for name in ("pose",):
+        yield name, name, (q, frames), {}
+    for axes in AXES:
+        yield "jacobian", "jacobian", (q, frames, axes), {}
+        yield "velocity", "velocity", (q, v, frames, axes), {}
+        yield "jacobian_dot_v", "jacobian_dot_v", (q, v, frames, axes), {}
+        for kind in (SPATIAL, CLASSICAL):
+            yield "acceleration", "acceleration", (q, v, a, frames, axes, kind), {}
+        yield "generalized_force", "generalized_force", (q, on, axes), {}
+        yield "inverse dynamics", "inverse_dynamics", (q, v, a, on, axes), {}
+        yield "forward dynamics", "forward_dynamics", (q, v, tau, on, axes), {}
+        yield "joint_wrenches", "joint_wrenches", (q, v, a, on, axes, every), {}
+    yield "joint_wrenches", "joint_wrenches", (q, v, a), {"joints": every}
+    for name in QUANTITIES:
+        if name.startswith(("center", "centroidal", "locked", "mass")):
+            takes_v = name.endswith(("velocity", "momentum", "bias", "acceleration"))
+            yield name, name, (q, v, a)[: 1 + takes_v + name.endswith("acceleration")], {}
+
+
+@cache
+def right(name: str) -> list[np.ndarray]:
+    oracle = mb.dynamics(tree(name), "oracle")
+    return [getattr(oracle, method)(*given, **more) for _, method, given, more in calls(tree(name), at(name))]
+
+
+@pytest.mark.parametrize("name", TREES)
+@pytest.mark.parametrize("engine", [x for x, info in ENGINES.items() if not info.reference])
+def test_engines_have_the_values_of_34_digits(engine, name):
+    model, state = tree(name), at(name)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", KnownDefectWarning)
+            dyn = mb.dynamics(model, engine)
+    except UnsupportedError:
+        pytest.skip(f"{engine} does not take this tree")
+    condition = np.linalg.cond(dyn.mass_matrix(state["q"])).max()
+    compared = set()
+    for (quantity, method, given, more), expected in zip(calls(model, state), right(name), strict=True):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", KnownDefectWarning)
+            try:
+                found = getattr(dyn, method)(*given, **more)
+            except UnsupportedError:
+                continue
+        if any(issubclass(w.category, KnownDefectWarning) for w in caught):
+            continue
+        factor = condition if quantity in ("forward dynamics", "mass_matrix_inverse") else 1.0
+        assert found.shape == expected.shape, (quantity, more)
+        assert off(found, expected) < CLOSE * factor, (quantity, given[3:], more)
+        compared.add(quantity)
+    wanted = {quantity for quantity, method, _, _ in calls(model, state) if method in dyn.supports}
+    assert wanted - MAY_LACK <= compared, wanted - compared
+
+
+def rate(f, h: float = 2e-3):
+    """Return df/dt at 0 with an error of h⁴."""
+    return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
+
+
+@pytest.mark.parametrize("name", ["floating", "all joint types"])
+def test_rates_are_the_derivatives_along_a_motion(name):
+    model = tree(name)
+    dyn = mb.dynamics(model, "lagrangian")
+    q, v, a, _ = (0.3 * x[0] if x.shape[1] == model.nv else x[0] for x in at(name).values())
+    zero = np.zeros(model.nv)
+
+    def along(method, *more, moved):
+        """Return the rate of a quantity of q, or of q and v, at this v̇."""
+
+        def value(t):
+            velocity = () if moved is None else (v + t * moved,)
+            return getattr(dyn, method)(model.integrate(q, t * v), *velocity, *more)
+
+        return rate(value)
+
+    for axes in AXES:
+        # Six numbers in axes that stay are those of a point; the others turn with the frame.
+        kind = CLASSICAL if axes == ALIGNED else SPATIAL
+        pairs = [
+            (along("velocity", "tip", axes, moved=a), dyn.acceleration(q, v, a, "tip", axes, kind)),
+            (along("velocity", "tip", axes, moved=zero), dyn.jacobian_dot_v(q, v, "tip", axes)),
+            (along("jacobian", "tip", axes, moved=None) @ v, dyn.jacobian_dot_v(q, v, "tip", axes)),
+            (dyn.jacobian(q, "tip", axes) @ v, dyn.velocity(q, v, "tip", axes)),
+        ]
+        for found, expected in pairs:
+            assert off(found, expected) < 1e-8, axes
+    momentum = dyn.centroidal_momentum_matrix(q) @ a + dyn.centroidal_momentum_bias(q, v)
+    pairs = [
+        (along("pose", "tip", moved=None)[:3, 3], dyn.velocity(q, v, "tip")[:3]),
+        (along("center_of_mass", moved=None), dyn.center_of_mass_velocity(q, v)),
+        (along("center_of_mass_velocity", moved=a), dyn.center_of_mass_acceleration(q, v, a)),
+        (along("centroidal_momentum", moved=a), momentum),
+        (along("centroidal_momentum_matrix", moved=None) @ v, dyn.centroidal_momentum_bias(q, v)),
+    ]
+    for found, expected in pairs:
+        assert off(found, expected) < 1e-8
+
+
+@pytest.mark.parametrize("name", ["without springs", "sound"])
+def test_momentum_changes_by_weight_wrenches_and_the_loads_of_the_ground(name):
+    model, (q, v, a, _) = tree(name), at(name).values()
+    on = wrenches(model)
+    dyn = mb.dynamics(model, "lagrangian")
+    center = dyn.center_of_mass(q)
+    out = np.zeros((2, 6))
+    out[:, :3] += model.mass * model.gravity
+
+    def add(point, force, moment):
+        out[:, :3] += force
+        out[:, 3:] += moment + np.cross(point - center, force)
+
+    for frame, w in on.items():
+        if frame != "world":
+            add(dyn.pose(q, frame)[:, :3, 3], w[:, :3], w[:, 3:])
+    roots = [j for j in model.joints if j.parent == "world"]
+    carried = dyn.joint_wrenches(q, v, a, on, ALIGNED, [j.name for j in roots])
+    for k, joint in enumerate(roots):
+        X = dyn.pose(q, joint.child)
+        force, moment = (np.einsum("nij,nj->ni", X[:, :3, :3], carried[:, k, i : i + 3]) for i in (0, 3))
+        add(X[:, :3, 3], force, moment)
+    change = np.einsum("nij,nj->ni", dyn.centroidal_momentum_matrix(q), a) + dyn.centroidal_momentum_bias(q, v)
+    assert off(change, out) < CLOSE
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_the_whole_has_the_mass_weight_and_momentum_of_its_parts(name):
+    model, (q, v, _, _) = tree(name), at(name).values()
+    dyn = mb.dynamics(model, "lagrangian")
+    weight = model.mass * model.gravity
+    J, A = dyn.center_of_mass_jacobian(q), dyn.centroidal_momentum_matrix(q)
+    still = mb.dynamics(model.without("springs"), "lagrangian") if model.needs.springs else dyn
+    assert off(still.potential_energy(q), -dyn.center_of_mass(q) @ weight) < CLOSE
+    assert off(dyn.gravity(q), -np.einsum("nij,i->nj", J, weight)) < CLOSE
+    assert off(A[:, :3], model.mass * J) < CLOSE
+    assert off(np.einsum("nij,nj->ni", A, v), dyn.centroidal_momentum(q, v)) < CLOSE
+    assert off(np.einsum("nij,nj->ni", J, v), dyn.center_of_mass_velocity(q, v)) < CLOSE
+    locked = dyn.locked_inertia(q)
+    assert np.array_equal(locked[0, :3, :3], locked[0, 0, 0] * np.eye(3))
+    assert locked[0, 0, 0] == pytest.approx(model.mass, rel=1e-14)
+    assert np.linalg.eigvalsh(locked).min() > 0
+
+
+@pytest.mark.parametrize("name", ["all joint types", "floating"])
+def test_wrenches_do_the_work_of_their_generalized_force(name):
+    model, (q, v, _, _) = tree(name), at(name).values()
+    dyn, on = mb.dynamics(model, "lagrangian"), wrenches(tree(name))
+    for axes in AXES:
+        power = sum(np.sum(w * dyn.velocity(q, v, frame, axes), axis=1) for frame, w in on.items())
+        assert off(np.sum(dyn.generalized_force(q, on, axes) * v, axis=1), power) < CLOSE
+
+
+def test_a_load_along_the_joint_is_its_force():
+    """Less what the rotor takes; springs between points are no part of a joint."""
+    model = random_tree(6, 9, ALL, springs=False, damping=False)
+    q, v, a, _ = states(model, 2)
+    for engine in ("oracle", "pinocchio"):
+        dyn = mb.dynamics(model, engine)
+        force = dyn.inverse_dynamics(q, v, a)
+        carried = dyn.joint_wrenches(q, v, a)
+        for joint, load in zip([j for j in model.joints if j.type.nv], carried.swapaxes(0, 1), strict=True):
+            own = model.layout.full_v[joint.name]
+            along = dyn.jacobian(q, joint.child, LOCAL)[:, :, own]
+            expected = force[:, own] - joint.armature * a[:, own]
+            assert off(np.einsum("nij,ni->nj", along, load), expected) < CLOSE, joint.name
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize("name", ["all joint types", "fixed to the world", "floating"])
+@pytest.mark.filterwarnings("ignore::mbkit.errors.KnownDefectWarning")
+def test_bodies_are_in_balance_at_forward_dynamics_and_nowhere_else(engine, name):
+    model, (q, v, _, tau) = tree(name), at(name).values()
+    dyn, on = mb.dynamics(model, engine), wrenches(model)
+    acting = dyn.forward_dynamics(q, v, tau, on, LOCAL)
+    scale = np.abs(dyn.joint_wrenches(q, v, acting, on)).max()
+    assert np.abs(dyn.newton_euler_residual(q, v, acting, tau, on, LOCAL)).max() < 1000 * EPS * scale
+    off_by = np.random.default_rng(1).standard_normal(model.nv)
+    found = dyn.newton_euler_residual(q, v, acting + off_by, tau, on, LOCAL)
+    J = dyn.jacobian(q, [b.name for b in model.bodies], LOCAL)
+    for k, body in enumerate(model.bodies):
+        linear, angular = np.split(J[:, k] @ off_by, 2, axis=1)
+        expected = -np.hstack([body.mass * (linear + np.cross(angular, body.com)), angular @ body.inertia])
+        assert np.abs(found[:, k] - expected).max() < 1000 * EPS * scale
+
+
+def test_a_pendulums_pivot_carries_weight_and_centripetal_force():
+    m, L, g = 2.0, 1.5, 9.81
+    model = mb.catalog.pendulum(mass=m, length=L)
+    angle, speed = 0.7, 3.0
+    for engine in LOADED:
+        dyn = mb.dynamics(model, engine)
+        a = dyn.forward_dynamics([angle], [speed], [0.0])
+        assert a[0] == pytest.approx(-g / L * np.sin(angle), rel=1e-13)
+        (load,) = dyn.joint_wrenches([angle], [speed], a)
+        down = dyn.pose([angle], "tip")[:3, :3].T @ np.array([0.0, 0.0, -1.0])
+        out = np.array(model.frame("tip").translation) / L
+        # The tension holds the weight's part along the rod, and turns the mass; across it nothing is left.
+        tension = m * (g * np.cos(angle) + L * speed**2)
+        assert down @ out == pytest.approx(np.cos(angle), rel=1e-13)
+        assert np.allclose(load[:3], -tension * out, atol=1e-13 * tension), engine
+        assert np.allclose(load[3:], 0.0, atol=1e-13 * tension * L), engine
+
+
+def test_nothing_outside_means_no_change_of_momentum():
+    model = random_tree(21, 5, ("revolute", "ball", "prismatic"), **NOTHING, gravity=False)
+    b = mb.ModelBuilder("adrift", gravity=(0, 0, 0))
+    b.add_body("base", mass=1.0, inertia=(0.2, 0.3, 0.4))
+    b.add_joint("float", "free", parent="world", child="base")
+    for body in model.bodies:
+        b.add_body(body.name, mass=body.mass, com=body.com, inertia=body.inertia)
+    for joint in model.joints:
+        axis = {"axis": joint.axes[0]} if joint.type.n_axes else {}
+        parent = "base" if joint.parent == "world" else joint.parent
+        place = {"translation": joint.translation, "rotation": joint.rotation}
+        b.add_joint(joint.name, joint.kind, parent=parent, child=joint.child, **place, **axis)
+    adrift = b.build()
+    dyn = mb.dynamics(adrift, "lagrangian")
+    q, v = adrift.random_state(np.random.default_rng(2))
+    run = simulate(dyn, q, 0.3 * v, 0.3, method="rk853", rtol=1e-11)
+    h = dyn.centroidal_momentum(run.q, run.v)
+    assert np.abs(h - h[0]).max() < 1e-9 * np.abs(h[0]).max()
+    straight = dyn.center_of_mass(run.q) - run.t[:, None] * h[0, :3] / adrift.mass
+    assert np.abs(straight - straight[0]).max() < 1e-9
