@@ -279,3 +279,25 @@ def test_nothing_outside_means_no_change_of_momentum():
     assert np.abs(h - h[0]).max() < 1e-9 * np.abs(h[0]).max()
     straight = dyn.center_of_mass(run.q) - run.t[:, None] * h[0, :3] / adrift.mass
     assert np.abs(straight - straight[0]).max() < 1e-9
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_model_without_velocities_has_a_mass_and_loads(engine):
+    b = mb.ModelBuilder("rock")
+    b.add_body("a", mass=2.0, com=(1, 2, 3), inertia=(1, 1, 1))
+    b.add_joint("f", "fixed", parent="world", child="a")
+    dyn, none = mb.dynamics(b.build(), engine), np.zeros(0)
+    for quantity in dyn.supports & {*QUANTITIES}:
+        if quantity.endswith(("jacobian", "matrix", "inverse", "force")):
+            more = {"frame": "a"} if quantity == "jacobian" else {}
+            more |= {"wrenches": {"a": np.ones(6)}} if quantity == "generalized_force" else {}
+            assert getattr(dyn, quantity)(none, **more).shape[-1] == 0, quantity
+    if {*frames_and_momenta.QUANTITIES} <= dyn.supports:
+        assert np.array_equal(dyn.velocity(none, none, "a"), np.zeros(6))
+        assert np.array_equal(dyn.center_of_mass(none), [1, 2, 3])
+        assert np.array_equal(dyn.centroidal_momentum(none, none), np.zeros(6))
+        assert dyn.locked_inertia(none) == pytest.approx(np.diag([2, 2, 2, 1, 1, 1]), abs=1e-14)
+    if engine in LOADED:
+        load = dyn.joint_wrenches(none, none, none, joints=["f"])[0]
+        weight = 2.0 * 9.81
+        assert load == pytest.approx([0, 0, weight, 2 * weight, -weight, 0])

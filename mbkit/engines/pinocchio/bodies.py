@@ -47,7 +47,7 @@ class PinocchioBodies:
     def _columns(self, J: Any) -> Array:
         """Return a Jacobian of Pinocchio's in the description's velocities."""
         # One column comes back as a vector.
-        J = np.reshape(J, (-1, self._m.nv))
+        J = np.reshape(J, (len(J), self._m.nv))
         return np.asarray(J) if self._direct else J @ self._G
 
     # Frames
@@ -67,7 +67,12 @@ class PinocchioBodies:
     def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
         m, d, reference = self._m, self._d, _REFERENCE_FRAMES[axes]
         pin.computeJointJacobians(m, d, self._full_q(q))
-        return np.array([self._columns(pin.getFrameJacobian(m, d, *self._in_joint(f), reference)) for f in frames])
+        out = np.zeros((len(frames), 6, self.model.nv))
+        for k, (carrier, X_JF) in enumerate(map(self._in_joint, frames)):
+            # Of the world's joint in a model without others, Pinocchio would read beyond an array.
+            if carrier:
+                out[k] = self._columns(pin.getFrameJacobian(m, d, carrier, X_JF, reference))
+        return out
 
     def _velocity(self, q: Array, v: Array, frames: tuple[Frame, ...], axes: str) -> Array:
         m, d, reference = self._m, self._d, _REFERENCE_FRAMES[axes]
