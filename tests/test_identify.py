@@ -313,8 +313,12 @@ def test_points_and_masses_of_zero_are_taken() -> None:
     true = mb.catalog.double_pendulum(mass2=2.0)
     q, v, a = motion(true)
     tau = mb.dynamics(true).inverse_dynamics(q, v, a)
-    found = mb.identify(mb.catalog.double_pendulum(), q, v, a, tau, physical=True)
-    assert np.abs(mb.dynamics(found.model).inverse_dynamics(q, v, a) - tau).max() < 1e-3 * np.abs(tau).max()
+    for physical, most in ((False, 1e-8), (True, 1e-3)):
+        found = mb.identify(mb.catalog.double_pendulum(), q, v, a, tau, physical=physical)
+        assert np.abs(mb.dynamics(found.model).inverse_dynamics(q, v, a) - tau).max() < most * np.abs(tau).max()
+    # A named parameter is a number in the model that is returned.
+    named = mb.catalog.double_pendulum(mass2=mb.Parameter("m", 1.0))
+    assert mb.identify(named, q, v, a, tau).model.mass == pytest.approx(3.0)
 
 
 def test_the_result_reads_and_writes() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from mbkit.errors import InputError, ModelError
 from mbkit.identify.measurements import of_velocities
 from mbkit.model import Joint, Model
-from mbkit.model.base_parameters import STANDARD, body_of, standard_names
+from mbkit.model.base_parameters import STANDARD, body_of, length_of, standard_names
 from mbkit.model.validation import check_substituted, suspects
 from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
 
@@ -161,7 +161,8 @@ class Identification(ResultTable):
             raise InputError(f"model: expected one with the bodies of {self.model_name}, got {model.name}")
         plain = model.with_parameters(**{name: x for name, x in model.parameters.items() if x is not None})
         parts = np.reshape(self.standard, (-1, _SIZE))
-        bodies = {j.child: body_of(plain.body(j.child), x) for j, x in zip(plain.tree, parts, strict=True)}
+        length = length_of(plain)
+        bodies = {j.child: body_of(plain.body(j.child), x, length) for j, x in zip(plain.tree, parts, strict=True)}
         faults = [f"body {name!r}: no mass, but a moment or an inertia" for name, x in bodies.items() if x is None]
         if not faults:
             new = tuple(x for b in plain.bodies if (x := bodies[b.name]) is not None)

@@ -46,6 +46,8 @@ POWERS: Final = np.array([0] * 6 + [1] * 3 + [2])
 TOLERANCE: Final = 1e-7
 #: Rounding of a coefficient, and of right angles in a file: π is often written with eleven digits.
 _ROUNDING: Final = 1e-10
+#: Spread of a body's mass, beside the square of the mechanism's length, that counts as none.
+_FLAT: Final = 1e-9
 #: How much smaller than the least kept singular value the largest dropped one has to be.
 _GAP: Final = 100.0
 #: A column whose independent part is this part of the largest one may be eliminated.
@@ -204,8 +206,11 @@ def standard_parameters(body: Body) -> Array:
     return np.array([*(about_origin[i, j] for i, j in PAIRS), *(body.mass * body.com), body.mass])
 
 
-def body_of(before: Body, parameters: Array) -> Body | None:
-    """Return a body with these standard parameters; None where it has no mass but a moment or an inertia."""
+def body_of(before: Body, parameters: Array, length: float) -> Body | None:
+    """Return a body with these standard parameters; None where it has no mass but a moment or an inertia.
+
+    Of a body without extent, beside the length of its mechanism, what rounding takes from its inertia is put back.
+    """
     mass, moment = float(parameters[-1]), parameters[-4:-1]
     if not mass:
         return replace(before, mass=0.0, inertia=np.zeros((3, 3))) if not parameters.any() else None
@@ -213,7 +218,12 @@ def body_of(before: Body, parameters: Array) -> Body | None:
     for x, (i, j) in zip(parameters, PAIRS, strict=False):
         about_origin[i, j] = about_origin[j, i] = x
     c = skew(com)
-    return replace(before, mass=mass, com=com, inertia=about_origin + mass * c @ c)
+    inertia = about_origin + mass * c @ c
+    spread, axes = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
+    if -_FLAT * mass * length**2 < spread[0] < 0:
+        spread = np.maximum(spread, 0.0)
+        inertia = np.sum(spread) * np.eye(3) - (axes * spread) @ axes.T
+    return replace(before, mass=mass, com=com, inertia=inertia)
 
 
 def energy_regressor(model: Description, q: Array, v: Array, gravity: Array) -> tuple[Array, Array]:
