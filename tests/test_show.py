@@ -23,22 +23,26 @@ from mbkit.errors import InputError, MbkitWarning, OutputError, UnsupportedError
 from mbkit.load import shapes as solids
 from mbkit.model.poses import body_poses, inertia_box
 from mbkit.show import Scene, shapes_of, view
-from mbkit.show.mesh_files import read_surfaces
+from mbkit.show.mesh_files import _by_coal, read_surfaces
 from mbkit.show.surfaces import solid, thinned
 from tests.random_trees import IN_MUJOCO, random_tree
 
 EPS = np.finfo(float).eps
-DAE = """<COLLADA xmlns="x"><asset><unit meter="0.01"/></asset>
+DAE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="0.01"/></asset>
 <library_effects><effect id="e"><profile_COMMON><technique sid="c"><phong><diffuse><color>1 0.5 0 1</color></diffuse>
 </phong></technique></profile_COMMON></effect></library_effects>
 <library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
 <library_geometries><geometry id="g"><mesh><source id="s"><float_array id="f" count="12">
-0 0 0 1 0 0 0 1 0 0 0 1</float_array></source><vertices id="v"><input semantic="POSITION" source="#s"/></vertices>
-<polylist count="2" material="k"><input semantic="VERTEX" source="#v" offset="0"/><input semantic="NORMAL" offset="1"/>
+0 0 0 1 0 0 0 1 0 0 0 1</float_array>
+<technique_common><accessor source="#f" count="4" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#s"/></vertices>
+<polylist count="2" material="k"><input semantic="VERTEX" source="#v" offset="0"/><input semantic="NORMAL" source="#s" offset="1"/>
 <vcount>3 4</vcount><p>0 0 1 0 2 0 0 0 1 0 3 0 2 0</p></polylist></mesh></geometry></library_geometries>
 <library_visual_scenes><visual_scene id="w"><node><translate>100 0 0</translate><scale>2 2 2</scale>
 <instance_geometry url="#g"><bind_material><instance_material symbol="k" target="#m"/></bind_material>
-</instance_geometry></node></visual_scene></library_visual_scenes></COLLADA>"""
+</instance_geometry></node></visual_scene></library_visual_scenes><scene><instance_visual_scene url="#w"/></scene></COLLADA>"""
 OBJ = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nusemtl red\nf 1 2 3\nusemtl none\nf 1/1 2/2 -1/3 3\n"
 ARM = """<robot name="arm"><material name="blue"><color rgba="0 0 1 1"/></material><link name="base"><visual>
 <geometry><box size="0.2 0.2 0.1"/></geometry><material name="blue"/></visual></link><link name="link">
@@ -187,6 +191,21 @@ def test_meshes_have_units_places_and_colours(tmp_path: Path) -> None:
     np.testing.assert_allclose(orange.vertices[orange.triangles[0]], [[1, 0, 0], [1.02, 0, 0], [1, 0.02, 0]], atol=EPS)
     (tetrahedron,) = read_surfaces(tmp_path / "a.stl")
     np.testing.assert_allclose(volume(tetrahedron), 1 / 6, rtol=1e-6)
+
+
+def test_meshes_that_share_a_node_keep_their_vertices(tmp_path: Path) -> None:
+    """coal 3.0.3 gives the triangles of a node's second mesh the vertices of the first one."""
+    two = DAE.replace("<instance_geometry", '<instance_geometry url="#g2"/><instance_geometry')
+    second = re.search(r"<geometry id.*</geometry>", DAE, re.DOTALL)[0].replace(
+        "1 0 0 0 1 0 0 0 1", "1 0 0 0 1 0 0 0 9"
+    )
+    second = re.sub(r'(id="|"#)([gsfv])"', r'\g<1>\g<2>2"', second)
+    (tmp_path / "a.dae").write_text(two.replace("<library_geometries>", f"<library_geometries>{second}"))
+    tall, low = read_surfaces(tmp_path / "a.dae")
+    np.testing.assert_allclose([np.ptp(s.vertices[:, 2]) for s in (tall, low)], [0.18, 0.02], rtol=1e-12)
+    assert (tall.color, low.color) == (None, (1, 0.5, 0, 1))
+    with pytest.raises(ValueError, match="coal mixes up the meshes of a node"):
+        _by_coal(tmp_path / "a.dae")
 
 
 @pytest.mark.parametrize("suffix", ["dae", "obj", "stl"])

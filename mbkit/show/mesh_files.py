@@ -1,7 +1,8 @@
 """Meshes from files: OBJ and COLLADA with the colours of their materials, all else by Assimp in Pinocchio's coal.
 
-coal makes one surface of a file and drops its materials, so the two formats that have any are read here. Files are
-those of strangers: whatever is wrong with one is a ValueError.
+coal makes one surface of a file and drops its materials, so the two formats that have any are read here. coal 3.0.3
+also gives the triangles of a node's second mesh the vertices of the first one, and each material is a mesh there. Files
+are those of strangers: whatever is wrong with one is a ValueError.
 """
 
 from __future__ import annotations
@@ -65,6 +66,8 @@ def _by_coal(path: Path) -> Surface:
     except Exception as error:
         raise ValueError(str(error).partition("message:")[2].strip() or str(error)) from None
     triangles = [[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))]
+    if len(np.unique(triangles)) < len(mesh.vertices()):
+        raise ValueError("coal mixes up the meshes of a node; save it as OBJ or COLLADA")
     return cleaned(mesh.vertices(), triangles)
 
 

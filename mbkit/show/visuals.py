@@ -132,11 +132,11 @@ class _Urdf:
                 # A colour of the URDF is meant for meshes without one.
                 yield Shape(*placed, "mesh", meshes=own, color=color)
             elif element.tag == "box":
-                yield Shape(*placed, "box", tuple(x / 2 for x in _numbers(element, "size", 3)), color=color)
+                yield Shape(*placed, "box", tuple(x / 2 for x in _sizes(element, "size", 3)), color=color)
             elif element.tag == "sphere":
-                yield Shape(*placed, "sphere", _numbers(element, "radius", 1), color=color)
+                yield Shape(*placed, "sphere", _sizes(element, "radius", 1), color=color)
             elif element.tag in ("cylinder", "capsule"):
-                size = (*_numbers(element, "radius", 1), _numbers(element, "length", 1)[0] / 2)
+                size = (*_sizes(element, "radius", 1), _sizes(element, "length", 1)[0] / 2)
                 yield Shape(*placed, element.tag, size, color=color)
 
     def _meshes(self, reference: str, scale: tuple[float, ...]) -> tuple[Surface, ...]:
@@ -159,6 +159,13 @@ def _numbers(element: Element, name: str, count: int, default: tuple[float, ...]
     out = read.numbers(element, name, element.tag, count=count, default=default)
     if read.faults:
         raise ValueError(read.faults[0])
+    return out
+
+
+def _sizes(element: Element, name: str, count: int) -> tuple[float, ...]:
+    out = _numbers(element, name, count)
+    if min(out) <= 0:
+        raise ValueError(f"{element.tag} {name}: expected numbers above 0")
     return out
 
 
