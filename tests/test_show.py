@@ -38,11 +38,13 @@ DAE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="
 <technique_common><accessor source="#f" count="4" stride="3"><param name="X" type="float"/>
 <param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
 <vertices id="v"><input semantic="POSITION" source="#s"/></vertices>
-<polylist count="2" material="k"><input semantic="VERTEX" source="#v" offset="0"/><input semantic="NORMAL" source="#s" offset="1"/>
+<polylist count="2" material="k"><input semantic="VERTEX" source="#v" offset="0"/>
+<input semantic="NORMAL" source="#s" offset="1"/>
 <vcount>3 4</vcount><p>0 0 1 0 2 0 0 0 1 0 3 0 2 0</p></polylist></mesh></geometry></library_geometries>
 <library_visual_scenes><visual_scene id="w"><node><translate>100 0 0</translate><scale>2 2 2</scale>
 <instance_geometry url="#g"><bind_material><instance_material symbol="k" target="#m"/></bind_material>
-</instance_geometry></node></visual_scene></library_visual_scenes><scene><instance_visual_scene url="#w"/></scene></COLLADA>"""
+</instance_geometry></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#w"/></scene></COLLADA>"""
 OBJ = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nusemtl red\nf 1 2 3\nusemtl none\nf 1/1 2/2 -1/3 3\n"
 ARM = """<robot name="arm"><material name="blue"><color rgba="0 0 1 1"/></material><link name="base"><visual>
 <geometry><box size="0.2 0.2 0.1"/></geometry><material name="blue"/></visual></link><link name="link">
