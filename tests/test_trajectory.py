@@ -448,6 +448,6 @@ def test_skeletons_stand_where_engines_put_them(seed: int) -> None:
 def test_dir_holds_what_a_reader_looks_for() -> None:
     assert {name for name in dir(swing()) if not name.startswith("_")} == {
         *("t", "q", "v", "model", "method", "engine", "stats", "events"),
-        *("energy", "kinetic_energy", "potential_energy", "tau", "work", "power_balance"),
+        *("energy", "kinetic_energy", "potential_energy", "tau", "wrenches", "work", "power_balance"),
         *("momentum", "canonical_momentum", "plot", "picture", "to_csv", "check"),
     }

@@ -117,8 +117,8 @@ def rates(equations: Equations) -> ca.Function:
         part = eq.q[start : start + 4]
         q[start : start + 4] = part / ca.sqrt(ca.sumsqr(part))
     forward = eq.function("forward_dynamics")
-    a = forward(q, eq.v, eq.tau, *eq.extra_arguments.values())
-    inputs = {"q": eq.q, "v": eq.v, "tau": eq.tau, **eq.extra_arguments}
+    a = forward(q, eq.v, eq.force, *eq.extra_arguments.values())
+    inputs = {"q": eq.q, "v": eq.v, "tau": eq.force, **eq.extra_arguments}
     outs = [ca.densify(eq.kin.qdot), ca.densify(a)]
     return ca.Function("rates", list(inputs.values()), outs, list(inputs), ["qdot", "a"])
 

@@ -31,6 +31,9 @@ from mbkit.model import Model
 
 Elimination = Literal["links", "mass matrix", "least constraint"]
 ELIMINATIONS: Final[tuple[Elimination, ...]] = get_args(Elimination)
+#: Names of frames on which wrenches act, and the axes of these.
+Acting = tuple[tuple[str, ...], str]
+NOTHING: Final[Acting] = ((), "")
 
 #: Name of each quantity -> the arguments of its function.
 FUNCTIONS: Final = {
@@ -63,10 +66,16 @@ class Equations:
 
     elimination : {"mass matrix", "least constraint", "links"}
         What forward dynamics comes from; ``"links"`` is that of `LinkEquations`.
+    acting : (tuple of str, str)
+        Frames on which wrenches act, and their axes: those of `BodyMotion.generalized_force`.
 
     Attributes
     ----------
     q, v, a, tau : casadi.SX
+        tau is the whole applied generalized force.
+    force : (nv + 6 k, 1) casadi.SX
+        The argument ``"tau"`` of functions: the generalized force, and behind it six numbers for each of the k frames
+        on which wrenches act. Without such frames it is `tau`.
     parameters : (p, 1) casadi.SX
         The model's named parameters in the order of `model.parameters`, the last argument, ``"parameters"``, of every
         function if there are any. With constants as symbols they are among those, at their nominal values.
@@ -77,7 +86,11 @@ class Equations:
     """
 
     def __init__(
-        self, model: Model, constants: Constants = "literal", elimination: Elimination = "mass matrix"
+        self,
+        model: Model,
+        constants: Constants = "literal",
+        elimination: Elimination = "mass matrix",
+        acting: Acting = NOTHING,
     ) -> None:
         self.model = model
         self.elimination: Elimination = elimination
@@ -86,7 +99,15 @@ class Equations:
         self.constants, self.constant_values = self.kin.values.constants, self.kin.values.constant_values
         self.q, self.v = self.kin.q, self.kin.v
         self.a = ca.SX.sym("a", model.nv)
-        self.tau = ca.SX.sym("tau", model.nv)
+        frames, axes = acting
+        self.force = self.tau = ca.SX.sym("tau", model.nv + 6 * len(frames))
+        if frames:
+            wrenches = self.force[model.nv :]
+            self.tau = self.force[: model.nv] + self.motion.generalized_force(frames, axes, wrenches)
+
+    def applied(self, q: Any, force: Any) -> Any:
+        """Return `tau` of other expressions for the configuration and `force`."""
+        return ca.substitute(self.tau, ca.vertcat(self.q, self.force), ca.vertcat(q, force))
 
     @cached_property
     def kept(self) -> dict[str, Any]:
@@ -276,7 +297,7 @@ class Equations:
         """Return a quantity as a function of its arguments, with repeated operations as they came."""
         if name not in FUNCTIONS:
             raise UnknownNameError("quantity", name, FUNCTIONS)
-        symbols = {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau}
+        symbols = {"q": self.q, "v": self.v, "a": self.a, "tau": self.force}
         names = FUNCTIONS[name]
         return self.named(name, names, [symbols[n] for n in names], getattr(self, name))
 

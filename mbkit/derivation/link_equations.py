@@ -19,7 +19,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.derivation.composite_bodies import mass_matrix
-from mbkit.derivation.equations import Elimination, Equations
+from mbkit.derivation.equations import NOTHING, Acting, Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
 from mbkit.derivation.least_constraint import hard_poses, has_squares, loses_digits, mass_matrices
 from mbkit.derivation.link_derivatives import Entries, LinkDerivatives, has_constant_columns
@@ -48,7 +48,12 @@ def elimination_of(model: Model) -> Elimination:
     return "least constraint" if loses_digits(model) else "links"
 
 
-def equations_of(model: Model, constants: Constants = "literal", elimination: Elimination | None = None) -> Equations:
+def equations_of(
+    model: Model,
+    constants: Constants = "literal",
+    elimination: Elimination | None = None,
+    acting: Acting = NOTHING,
+) -> Equations:
     """Return a model's equations: from the energies that it was written as, or from its bodies.
 
     With constants as symbols, and with the elimination ``"mass matrix"``, all comes from derivatives of the bodies'
@@ -59,8 +64,8 @@ def equations_of(model: Model, constants: Constants = "literal", elimination: El
         written: Equations = of_energies(constants)
         return written
     if constants == "symbols" or elimination == "mass matrix":
-        return Equations(model, constants)
-    return LinkEquations(model, elimination=elimination or elimination_of(model))
+        return Equations(model, constants, acting=acting)
+    return LinkEquations(model, elimination=elimination or elimination_of(model), acting=acting)
 
 
 class LinkEquations(Equations):
@@ -155,7 +160,7 @@ class LinkEquations(Equations):
         model, rng = self.model, np.random.default_rng(0)
         if model.parameters:
             return np.inf
-        given = [self.q, self.v, self.tau]
+        given, idle = [self.q, self.v, self.force], np.zeros(self.force.numel() - model.nv)
         forms = ca.Function("forms", given, [ca.densify(x) for x in (form, exact, self.nle, self.passive)])
         worst = 0.0
         with np.errstate(all="ignore"):
@@ -167,7 +172,7 @@ class LinkEquations(Equations):
                     return np.inf
                 condition, norm = np.linalg.cond(scaled), np.linalg.norm(scaled, 2)
                 for v, tau in rng.standard_normal((_STATES, 2, model.nv)):
-                    one, two, nle, passive = (np.array(x)[:, 0] for x in forms(pose, v, tau))
+                    one, two, nle, passive = (np.array(x)[:, 0] for x in forms(pose, v, np.append(tau, idle)))
                     acting = (np.abs(tau) + np.abs(nle) + np.abs(passive)) / root
                     size = max(np.linalg.norm(root * two), np.linalg.norm(acting))
                     gap = root * (one - two)

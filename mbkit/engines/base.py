@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self, TypeVa
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, all_finite, batch_of, real
+from mbkit._check import Array, all_finite, batch_of, real, rows
 from mbkit.engines import frames_and_momenta, loads, regressors
 from mbkit.engines.frames_and_momenta import LOCAL, FramesAndMomenta, axes_named
 from mbkit.engines.linearization import LinearizationQuantities
@@ -141,6 +141,10 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
     bits: ClassVar[int] = DOUBLE_BITS
     #: Whether the adapter's methods take batches too, all of one size, and not single states alone.
     _batches: ClassVar[bool] = True
+    #: Frames whose wrenches stand behind τ in that argument, six numbers each, and their axes.
+    _acting: tuple[tuple[Frame, ...], str] = ((), LOCAL)
+    #: The same dynamics without these wrenches, where there are some.
+    _bare: Dynamics | None = None
     # Of the adapter's methods those that others here use.
     _coriolis_matrix: Callable[..., Any]
     _forward_dynamics: Callable[..., Any]
@@ -340,7 +344,14 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
     # Steps
 
     def step(
-        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, dt: float, method: str = DEFAULT_METHOD
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        tau: ArrayLike,
+        dt: float,
+        method: str = DEFAULT_METHOD,
+        wrenches: Wrenches | None = None,
+        axes: str = LOCAL,
     ) -> tuple[Array, Array]:
         """Return (q, v) after one step of length dt, with the force τ held: for control loops and environments.
 
@@ -357,6 +368,11 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
         method : str
             An explicit one with a fixed step: ``"rk4"``, ``"semi_implicit_euler"``, or an explicit tableau of
             `mbkit.simulate.register_method`.
+        wrenches : dict of str to (6,) or (N, 6) array_like, optional
+            That act on frames, as in `generalized_force`. The wrench is held over the step, and Σ Jᵀ w follows the
+            configuration from stage to stage.
+        axes : {"local", "local_world_aligned", "world"}
+            Axes of the wrenches.
 
         Returns
         -------
@@ -392,6 +408,11 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
         >>> bool(q == run.q[-1])
         True
         """
+        if wrenches:
+            frames, w = self._stacked_wrenches(wrenches)
+            return self._under(frames, axes_named(axes)).step(
+                q, v, _beside(self.model.check_v(tau, "tau"), w), dt, method
+            )
         chosen, h = explicit_method(method), real("dt", dt, positive=True)
         for has, feature in (
             (self.model.constrained, "constraints"),
@@ -438,6 +459,14 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
         q1, w1, _ = formula.step(space, rates, ArrayStages(method.stages, v.shape), 0.0, dt, q, w)
         return q1, space.to_body_velocity(q1, w1)
 
+    def _under(self, frames: tuple[Frame, ...], axes: str) -> Dynamics:
+        """Return the same dynamics with wrenches on frames behind τ in that argument: nv + 6 k numbers.
+
+        So whatever holds τ, or asks a function for it, holds the wrenches, while Σ Jᵀ w follows the configuration. For
+        `forward_dynamics` and `step` only.
+        """
+        return WrenchedDynamics(self, frames, axes)
+
     # Quantities that follow from others
 
     def _coriolis_force(self, q: Array, v: Array) -> Array:
@@ -477,13 +506,21 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
     def _states(self, arguments: dict[str, ArrayLike]) -> tuple[dict[str, Array], int | None]:
         """Return arguments as checked arrays, all single states or all batches, and the size of the batch."""
         wrenches = arguments.pop("wrenches", None)
-        checked = {k: self.model.check_q(x) if k == "q" else self.model.check_v(x, k) for k, x in arguments.items()}
+        checked = {k: self._checked(k, x) for k, x in arguments.items()}
         if wrenches is not None:
             checked["wrenches"] = np.asarray(wrenches)
         size = batch_of(**checked)
         if size is not None:
             checked = {k: np.broadcast_to(x, (size, x.shape[-1])) for k, x in checked.items()}
         return checked, size
+
+    def _checked(self, name: str, x: ArrayLike) -> Array:
+        if name == "q":
+            return self.model.check_q(x)
+        if name == "tau" and self._acting[0]:
+            n = self.model.nv + 6 * len(self._acting[0])
+            return rows(name, x, n, "the force with its wrenches", "its size")
+        return self.model.check_v(x, name)
 
     def _value(self, method: Callable[..., Any], states: list[Array], more: tuple[Any, ...], size: int | None) -> Any:
         if self._batches or size is None:
@@ -524,6 +561,44 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
                 f"its length is zero: {', '.join(springs[:_MAX_NAMES])}"
             )
         return "; perhaps links without mass, or numbers so large that they overflow"
+
+
+def _beside(tau: Array, wrenches: Array) -> Array:
+    """Return τ with wrenches behind it, (nv + 6 k,) or (N, nv + 6 k)."""
+    size = batch_of(tau=tau, wrenches=wrenches)
+    parts = (x if size is None or x.ndim == 2 else np.broadcast_to(x, (size, len(x))) for x in (tau, wrenches))
+    return np.concatenate(tuple(parts), axis=-1)
+
+
+class WrenchedDynamics(Dynamics):
+    """`Dynamics._under` of an engine, by its own Jacobians."""
+
+    takes_parameters = True
+    _bare: Dynamics
+
+    def __init__(self, dyn: Dynamics, frames: tuple[Frame, ...], axes: str) -> None:
+        self._bare, self._acting = dyn, (frames, axes)
+        super().__init__(dyn.model)
+        self._forward_dynamics = dyn._method("forward_dynamics")
+        dyn._method("jacobian")
+
+    @property
+    def engine(self) -> str:  # type: ignore[override]  # that of another
+        """Name of the engine."""
+        return self._bare.engine
+
+    def forward_dynamics(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        tau: ArrayLike,
+        wrenches: Wrenches | None = None,
+        axes: str = LOCAL,  # noqa: ARG002  # the wrenches are in tau
+    ) -> Array:
+        assert not wrenches
+        force, n = np.asarray(tau), self.model.nv
+        states = {"q": q, "v": v, "tau": force[..., :n], "wrenches": force[..., n:]}
+        return self._bare._evaluate("forward_dynamics_with_wrenches", *self._acting, **states)
 
 
 class MappedDynamics(Dynamics):

@@ -111,7 +111,7 @@ class CompiledStep:
             for part, own in zip((*before, *plan.parts, *behind), codes, strict=True)
         ]
         nq, nv, empty = model.nq, model.nv, np.empty
-        inputs = {"q": nq, "v": nv, "tau": nv, "dt": -1, "squares": -1}
+        inputs = {"q": nq, "v": nv, "tau": equations.force.numel(), "dt": -1, "squares": -1}
         inputs |= {name: x.numel() for name, x in equations.extra_arguments.items()}
         self._starts = tuple(start for start, _ in model.quaternions)
         run = python_call(self._steps, inputs, ["q1", "v1"], self._starts)
@@ -122,7 +122,7 @@ class CompiledStep:
 
         self.single: Call = single
         self._extra = [*equations.extra_arguments]
-        self._sizes = [nq, nv, nv, *(inputs[name] for name in self._extra)]
+        self._sizes = [inputs[name] for name in ("q", "v", "tau", *self._extra)]
 
     def batch(self, q: Any, v: Any, tau: Any, dt: float, *behind: Any, threads: int | None) -> Any:
         """Return q and v after the step from a batch, or None."""

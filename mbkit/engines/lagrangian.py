@@ -18,11 +18,13 @@ from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_o
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity
 from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import Dynamics, scalar
+from mbkit.engines.frames_and_momenta import LOCAL
 from mbkit.engines.linearization import of_parameters, of_second_order
+from mbkit.engines.loads import Wrenches
 from mbkit.engines.step_derivatives import momentum_step_slopes
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
-from mbkit.model import Model
+from mbkit.model import Frame, Model
 
 if TYPE_CHECKING:
     from mbkit.derivation.steps.fixed import Part
@@ -163,6 +165,7 @@ class LagrangianDynamics(Dynamics):
         self._machines: dict[tuple[str, ...], Any] = {}
         self._short: dict[tuple[str, ...], QuantityCall] = {}
         self._steps: dict[str, tuple[Method, CompiledStep]] = {}
+        self._wrenched: dict[Any, LagrangianDynamics] = {}
         self._parametric = bool(model.parameters)
 
     @cached_property
@@ -274,7 +277,7 @@ class LagrangianDynamics(Dynamics):
         # Both share derived and compiled functions, now and later.
         out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
         out.__dict__.pop("parameter_values", None)
-        out.model, out._batched = model, batched
+        out.model, out._batched, out._wrenched = model, batched, {}
         return out
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -348,6 +351,20 @@ class LagrangianDynamics(Dynamics):
 
     # Steps
 
+    def _under(self, frames: tuple[Frame, ...], axes: str) -> LagrangianDynamics:
+        key = _names(frames), axes
+        if key in self._wrenched:
+            return self._wrenched[key]
+        kept: dict[Any, LagrangianDynamics] = self.equations.kept.setdefault("under", {})
+        if key not in kept:
+            own = LagrangianDynamics(self.model, compile=self.compile, threads=self.threads)
+            own.elimination, own.form, own._acting = self.elimination, f"{self.form} under {key}", (frames, axes)
+            own.equations = equations_of(self.model, elimination=self.elimination, acting=key)
+            kept[key] = own
+        out = self._wrenched[key] = kept[key]._with(self.model, self._batched)
+        out._bare = self
+        return out
+
     @property
     def compiles_steps(self) -> bool:
         """Whether whole steps are machine code: with a compiler, without constraints or a time."""
@@ -371,10 +388,17 @@ class LagrangianDynamics(Dynamics):
         return self.code(part.name, make=part.make)
 
     def step(
-        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, dt: float, method: str = DEFAULT_METHOD
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        tau: ArrayLike,
+        dt: float,
+        method: str = DEFAULT_METHOD,
+        wrenches: Wrenches | None = None,
+        axes: str = LOCAL,
     ) -> tuple[Array, Array]:
         """Return (q, v) after one step, as `Dynamics.step` does; as machine code where `simulate` compiles the step."""
-        held = self._steps.get(method) if type(method) is str else None
+        held = self._steps.get(method) if type(method) is str and not wrenches else None
         if type(dt) is not float:
             dt = real("dt", dt)
         # Another method may have been registered by this name.
@@ -383,7 +407,7 @@ class LagrangianDynamics(Dynamics):
             out: tuple[Array, Array] | None = held[1].single(q, v, tau, dt, *behind)
             if out is not None or (out := held[1].batch(q, v, tau, dt, *behind, threads=self.threads)) is not None:
                 return out
-        return super().step(q, v, tau, dt, method)
+        return super().step(q, v, tau, dt, method, wrenches, axes)
 
     def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
         if not self.compiles_steps:

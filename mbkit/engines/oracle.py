@@ -11,6 +11,7 @@ eps as error. Rotation matrices and axes, orthonormal to rounding only, enter th
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from functools import cached_property
 from typing import Any, ClassVar, Final
 
@@ -26,7 +27,7 @@ from mbkit.derivation.body_motion import BODY_QUANTITIES
 from mbkit.engines.base import Dynamics, scalar
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.model import Model
+from mbkit.model import Frame, Model
 
 #: Quantity -> its arguments, as in `Dynamics`.
 _ARGUMENTS: Final = {
@@ -165,6 +166,15 @@ class OracleDynamics(Dynamics):
             raise InputError("at: this oracle already has its constants; put the parameters' values among them")
         return type(self)(self.model.with_nominal(values), backend=self._arithmetic.name)
 
+    def _under(self, frames: tuple[Frame, ...], axes: str) -> OracleDynamics:
+        key = tuple(frame.name for frame in frames), axes
+        kept: dict[Any, OracleDynamics] = self.equations.kept.setdefault("under", {})
+        if key not in kept:
+            own = kept[key] = copy(self)
+            own.equations = equations_of(self.model, constants="symbols", acting=key)
+            own._acting, own._bare, own._programs, own._held = (frames, axes), self, {}, None
+        return kept[key]
+
     # The methods of quantities take batches, and return 113-bit numbers.
 
     def _value(self, method: Callable[..., Any], states: list[Array], more: tuple[Any, ...], size: int | None) -> Any:
@@ -227,7 +237,7 @@ class OracleDynamics(Dynamics):
         return product(terms["mass_matrix"], self._arithmetic.array(a)) + terms["nle"] - terms["passive"]
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Any:
-        if self.model.constrained:
+        if self.model.constrained or self._acting[0]:
             self.model.require_independent(q, once=True)
             return self._run(("forward_dynamics",), q, v, tau)[0][:, :, 0]
         terms = self._terms(q, v)

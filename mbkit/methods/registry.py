@@ -103,6 +103,8 @@ class Method:
         often slows it.
     own : str
         Of an engine's integrator: the method of mbkit with the same formula.
+    wrenches : bool
+        Whether wrenches may act on frames.
     """
 
     name: str
@@ -127,6 +129,7 @@ class Method:
     extended: bool = False
     multistep: bool = False
     own: str = ""
+    wrenches: bool = True
 
     @cached_property
     def formula(self) -> Formula | None:
@@ -210,11 +213,13 @@ def _scipy(name: str, scheme: str, order: int | None, **more: Any) -> Method:
 def _mujoco(scheme: str, stability: Stability, own: str = "") -> Method:
     order, name = 4 if isinstance(stability, TableauStability) else 1, f"mujoco_{scheme}"
     more: dict[str, Any] = {"solver": "native:run_native", "scheme": scheme, "stability": stability, "own": own}
-    return Method(name, "native", order, order, _ABOUT[name], engines=("mujoco",), callables=False, **more)
+    return Method(
+        name, "native", order, order, _ABOUT[name], engines=("mujoco",), callables=False, wrenches=False, **more
+    )
 
 
 def _drake(scheme: str, order: int) -> Method:
-    more: dict[str, Any] = {"engines": ("drake",), "events": False, "callables": False}
+    more: dict[str, Any] = {"engines": ("drake",), "events": False, "callables": False, "wrenches": False}
     return _adaptive(f"drake_{scheme}", order, "native:run_drake", scheme=scheme, least=1e-15, **more)
 
 

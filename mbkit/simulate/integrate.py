@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Final, Protocol, runtime_checkable
 
@@ -14,6 +14,7 @@ from mbkit._check import Array, batch_of, real
 from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
+from mbkit.engines.frames_and_momenta import LOCAL, axes_named
 from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
@@ -23,9 +24,9 @@ from mbkit.simulate.events import Event, as_events
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.result import SolverResult, Stats
-from mbkit.simulate.run_data import RunData, RunSettings
+from mbkit.simulate.run_data import Acting, RunData, RunSettings
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
-from mbkit.simulate.torque import Torque, TorqueFunction
+from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
 #: Smallest rtol of Taylor's method on the oracle, which computes with 113 bits.
 _LEAST_EXTENDED: Final = 1e-32
@@ -50,6 +51,8 @@ def integrate(
     events: Event | Sequence[Event] | None = None,
     doubt: bool = False,
     t0: float | None = None,
+    wrenches: RunWrenches | None = None,
+    wrench_axes: str = LOCAL,
 ) -> tuple[RunData, FunctionError | None]:
     """Return a run's data, and the error of the torque or event function that ended it.
 
@@ -69,9 +72,14 @@ def integrate(
     wanted = as_events(events)
     if wanted and not chosen.events:
         _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
-    if callable(torque) and not chosen.callables:
+    acting = _acting(dyn, wrenches, wrench_axes)
+    if acting and not chosen.wrenches:
+        _refuse("wrenches on frames", chosen, [m.name for m in METHODS.values() if m.wrenches])
+    given = [torque, *(wrenches or {}).values()]
+    if any(map(callable, given)) and not chosen.callables:
         _refuse("torque functions", chosen, [m.name for m in METHODS.values() if m.callables])
     _warn_beyond_limits(model, q)
+    own = dyn._under(*acting) if acting else dyn
     bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
     started = time.perf_counter()
     setting: float | Tolerances
@@ -82,25 +90,25 @@ def integrate(
                 raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
             times = None if save is None else save_times(save, start, start + duration)
             whole = times is not None and times[0] == start and times[-1] == start + duration
-            read = Torque(torque, model, batch, len(times) - 1 if whole and times is not None else None)
-            problem = IntegrationProblem(dyn, method, q, v, start, duration, setting, read, times, wanted, bar)
+            read = Torque(torque, model, batch, len(times) - 1 if whole and times is not None else None, wrenches)
+            problem = IntegrationProblem(own, method, q, v, start, duration, setting, read, times, wanted, bar)
             applied = read.applied(times)
         else:
             setting = dt
             _refuse_tolerances(chosen, rtol, atol)
             grid = Grid.of(start, duration, dt)
             indices = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
-            read = Torque(torque, model, batch, grid.steps)
-            problem = IntegrationProblem.on_grid(dyn, method, q, v, grid, indices, read, bar)
+            read = Torque(torque, model, batch, grid.steps, wrenches)
+            problem = IntegrationProblem.on_grid(own, method, q, v, grid, indices, read, bar)
             applied = read.applied(grid.times)
-        outcome = _solver(dyn, chosen, read)(problem)
+        outcome = _solver(own, chosen, read)(problem)
     seconds = time.perf_counter() - started
     outcome = along_constraints(dyn, outcome)
     settings = RunSettings(start, q.copy(), v.copy(), setting, outcome.doubts)
     doubts = outcome.doubts
     if doubt and outcome.ended in ("finished", "event"):
         states = settings.with_start(outcome.t, outcome.q, outcome.v)
-        compiled = chosen.kind == "native" or (_compiles(dyn) and not callable(torque))
+        compiled = chosen.kind == "native" or (_compiles(own) and not read.callable)
         work = max(outcome.steps, outcome.evaluations)
         work = work // min(batch or 1, _SIDE_BY_SIDE) if compiled else work * _IN_PYTHON
         driven = applied is not None
@@ -118,8 +126,19 @@ def integrate(
         doubts=doubts,
     )
     kept = outcome.t, outcome.q, outcome.v
-    data = RunData(*kept, model, chosen.name, dyn.engine, stats, dyn, outcome.events, applied, settings)
+    data = RunData(*kept, model, chosen.name, dyn.engine, stats, dyn, outcome.events, applied, settings, acting)
     return data, outcome.error
+
+
+def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | None:
+    """Return the frames on which wrenches act, and the axes of these; None where there are none."""
+    axes = axes_named(axes)
+    if wrenches is not None and not isinstance(wrenches, Mapping):
+        raise InputError(
+            "wrenches: expected a dict of frame names to arrays or functions of (t, q, v), "
+            f"got {type(wrenches).__name__}"
+        )
+    return (tuple(map(dyn.model.frame, wrenches)), axes) if wrenches else None
 
 
 def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Callable[[IntegrationProblem], SolverResult]:

@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike
 from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import no_dynamics
-from mbkit.errors import DoubtfulRunWarning, MbkitWarning
+from mbkit.engines.frames_and_momenta import LOCAL
+from mbkit.errors import DoubtfulRunWarning, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.simulate.events import Event
 from mbkit.simulate.integrate import integrate
 from mbkit.simulate.progress import ProgressFunction
-from mbkit.simulate.torque import TorqueFunction
+from mbkit.simulate.torque import RunWrenches, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ def simulate(
     events: Event | Sequence[Event] | None = None,
     doubt: bool = True,
     t0: float | None = None,
+    wrenches: RunWrenches | None = None,
+    wrench_axes: str = LOCAL,
 ) -> Trajectory:
     """Integrate v̇ = forward_dynamics(q, v, τ), q̇ = D(q) v from one state or a batch.
 
@@ -87,6 +90,13 @@ def simulate(
         Time of the first state, s; by default the time that `dyn` holds where time enters the equation of motion
         (``dyn.at(t=3.0)``), else 0. `save`, torque and event functions and ``Trajectory.t`` count from the same zero.
 
+    wrenches : dict of str to array_like or callable, optional
+        Frame or body -> force, N, then moment, Nm, about the frame's origin: (6,) all the time; (N, 6), one for each
+        trajectory; (steps, 6) or (N, steps, 6), held over each step as `torque` is; or a function of (t, q, v) that
+        returns (6,). What is held is the wrench: its generalized force Jᵀ w follows the configuration at every stage.
+    wrench_axes : {"local", "local_world_aligned", "world"}
+        Axes of the wrenches: the frame's own, or the world's. ``"world"`` has moments about the world's origin.
+
     Returns
     -------
     Trajectory
@@ -96,12 +106,12 @@ def simulate(
     Raises
     ------
     InputError
-        A wrong shape, state, time, tolerance or torque.
+        A wrong shape, state, time, tolerance, torque or wrench.
     TorqueError, EventError
-        The torque function or an event's raised, or returned something else than (nv,) finite numbers or one; the
-        error's `trajectory` is the run up to then.
+        The function of the torque, of a wrench or of an event raised, or returned something else than (nv,) or (6,)
+        finite numbers or one; the error's `trajectory` is the run up to then.
     UnknownNameError
-        No method of this name.
+        No method or frame of this name.
     UnsupportedError
         The engine does not have this method, or not for this model.
 
@@ -110,8 +120,9 @@ def simulate(
     On the lagrangian engine, ``"rk4"`` and ``"semi_implicit_euler"`` with no torque or an array run as machine code:
     the whole step is one function, or, beyond 20,000 operations, parts around the forward dynamics. Chunks of a batch
     are shared among the cores, and no number depends on how. ``"implicit_midpoint"``, and ``"rk853"`` with the choice
-    of its steps, are machine code too. The first run of a model compiles its step, which is kept on disk. A callable
-    torque and an engine with ``compile=False`` are stepped stage by stage, by the same formulas.
+    of its steps, are machine code too. The first run of a model compiles its step, which is kept on disk; so does the
+    first run with wrenches on other frames or in other axes. A callable torque or wrench and an engine with
+    ``compile=False`` are stepped stage by stage, by the same formulas.
 
     Examples
     --------
@@ -123,10 +134,15 @@ def simulate(
     >>> bool(abs(run.energy() - run.energy()[0]).max() < 1e-12)
     True
     """
+    loads = (wrenches, wrench_axes)
     arguments = (q0, v0, duration, method, dt, rtol, atol, torque, save, progress, events)
     if isinstance(dyn, Dynamics):
-        data, error = integrate(dyn, *arguments, doubt, t0)
+        data, error = integrate(dyn, *arguments, doubt, t0, *loads)
     elif hasattr(dyn, "chart"):
+        if wrenches:
+            raise UnsupportedError(
+                "wrenches: a system written as energies has no frames; give the generalized force, torque="
+            )
         # Only where SymPy and CasADi are loaded already.
         from mbkit.simulate.independent_coordinates import integrate_on_charts
 

@@ -16,12 +16,15 @@ from mbkit.methods.registry import Tolerances
 from mbkit.model import Body, Frame, Model
 from mbkit.simulate.events import Hit
 from mbkit.simulate.result import Stats
-from mbkit.simulate.torque import Applied, PiecewiseConstantTorque, SampledTorque, TorqueCallback
+from mbkit.simulate.torque import Applied, ForceFunctions, PiecewiseConstantTorque, SampledTorque
 
 # States at once: the matrices of a long run would fill the memory.
 _MANY: Final = 4096
 # Part of an interval for differences: they lose a third of the digits of a term that is h/12 of the whole.
 _NEAR: Final = 1e-4
+
+#: Frames on which wrenches acted, and the axes of these.
+Acting = tuple[tuple[Frame, ...], str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +62,7 @@ class RunData:
     events: tuple[Hit, ...] = ()
     _applied: Applied | None = None
     _settings: RunSettings | None = None
+    _acting: Acting | None = None
 
     def __post_init__(self) -> None:
         for name in ("t", "q", "v"):
@@ -72,13 +76,13 @@ class RunData:
         # A process pool would derive an engine that is sent along for every trajectory.
         known = self.engine in ENGINES and (self._dyn is None or self._dyn.samples is None)
         applied = self._applied
-        if isinstance(applied, TorqueCallback):
+        if isinstance(applied, ForceFunctions):
             # Functions can seldom be pickled; their values can.
             applied = applied.sampled(self.t, self.q, self.v, strict=False)
         dyn = None if known else self._dyn
         return type(self), (
             *(self.t, self.q, self.v, self.model, self.method, self.engine, self.stats),
-            *(dyn, self.events, applied, self._settings),
+            *(dyn, self.events, applied, self._settings, self._acting),
         )
 
     # Energies, work and momenta
@@ -105,28 +109,46 @@ class RunData:
         saved states (when the trajectory is pickled, then); TorqueError where it fails now and did not before. Where
         the function ended the run, the last state has NaN.
         """
-        acted = self._acted()
-        if acted is None:
-            return np.zeros(self.v.shape)
+        return self._force()[..., : self.v.shape[-1]]
+
+    def wrenches(self) -> dict[str, Array]:
+        """Return the wrench on each frame at each state, (K, 6) or (N, K, 6), in the run's axes, as `tau` does.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> push = {"tip": lambda t, q, v: [t, 0, 0, 0, 0, 0]}
+        >>> run = mb.simulate(mb.dynamics(mb.catalog.pendulum()), [0.0], [0.0], 0.2, dt=0.1, wrenches=push)
+        >>> run.wrenches()["tip"][:, 0]
+        array([0. , 0.1, 0.2])
+        """
+        frames, nv = () if self._acting is None else self._acting[0], self.v.shape[-1]
+        whole = self._force()
+        return {frame.name: whole[..., nv + 6 * k : nv + 6 * k + 6] for k, frame in enumerate(frames)}
+
+    def _force(self) -> Array:
+        """Return τ and wrenches at each state."""
+        acted, size = self._acted(), self.v.shape[-1] + (6 * len(self._acting[0]) if self._acting else 0)
         if isinstance(acted, SampledTorque):
             return acted.values.copy()
-        rows = np.broadcast_to(acted.at(self.t), self.v.shape)
-        return np.where(np.isfinite(self.v).all(-1, keepdims=True), rows, np.nan)
+        rows = np.broadcast_to(np.zeros(size) if acted is None else acted.at(self.t), (*self.v.shape[:-1], size))
+        return rows.copy() if acted is None else np.where(np.isfinite(self.v).all(-1, keepdims=True), rows, np.nan)
 
     def work(self, engine: str | Dynamics | None = None) -> Array:
-        """Return ∫ (τ + τ_damping)·v dt since the first state in J, shape (K,) or (N, K).
+        """Return ∫ (τ + τ_damping + Σ Jᵀ w)·v dt since the first state in J, shape (K,) or (N, K).
 
         The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇; UnsupportedError
-        where its rows change between two saved states. On quasi-velocities, for dampers and for a torque function it
+        where its rows change between two saved states. On quasi-velocities, for dampers, wrenches and functions it
         is a quadrature of fourth order in the distance of the saved states; a function that jumps makes it first
-        order.
+        order, and so do rows that jump beside a function.
         """
         dyn, force, t, q, v = self._by(engine), self._acted(), self.t, self.q, self.v
         if isinstance(force, SampledTorque):
-            steps = _by_cubics(t, np.sum((force.values + _damping(dyn, q, v)) * v, axis=-1))
+            whole = _generalized(dyn, q, force.values, self._acting)
+            steps = _by_cubics(t, np.sum((whole + _damping(dyn, q, v)) * v, axis=-1))
         else:
-            tau = np.zeros(v.shape[-1]) if force is None else force.between(t)
-            steps = _of_held(dyn, np.diff(t), q, v, tau)
+            held = np.zeros(v.shape[-1]) if force is None else force.between(t)
+            steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
         out = np.zeros(q.shape[:-1])
         np.cumsum(steps, axis=-1, out=out[..., 1:])
         return out
@@ -135,7 +157,8 @@ class RunData:
         """Return E(t) - E(0) - work(t) in J: zero for a run without error, shape (K,) or (N, K).
 
         It holds the error of the run and that of `work`: save every step to make the second small. Without torque or
-        with a constant or held one, on coordinates with v = q̇ and no dampers, only the error of the run is left.
+        with a constant or held one, on coordinates with v = q̇, no dampers and no wrenches, only the error of the run
+        is left.
         """
         energy = self.energy(engine)
         return np.asarray(energy - energy[..., :1] - self.work(engine))
@@ -180,12 +203,12 @@ class RunData:
         return self._dyn
 
     def _acted(self) -> PiecewiseConstantTorque | SampledTorque | None:
-        if isinstance(self._applied, TorqueCallback):
+        if isinstance(self._applied, ForceFunctions):
             strict = self.stats.ended != "function_failed"
             answers = self._applied.sampled(self.t, self.q, self.v, strict=strict)
             object.__setattr__(self, "_applied", answers)
         acted = self._applied
-        assert not isinstance(acted, TorqueCallback)
+        assert not isinstance(acted, ForceFunctions)
         return acted
 
 
@@ -224,23 +247,34 @@ def _quadratic(dyn: Dynamics, q: Array, v: Array) -> Array:
 # at the states alone is integrated by the cubic through four of them.
 
 
-def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, tau: Array) -> Array:
-    """Return the work in each interval, of a force that is constant there."""
+def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: Acting | None) -> Array:
+    """Return the work in each interval, of a force and wrenches that are constant there."""
     nv = v.shape[-1]
-    pushed = np.broadcast_to(tau, (*v.shape[:-2], len(h), nv))
+    held = np.broadcast_to(held, (*v.shape[:-2], len(h), held.shape[-1]))
+    pushed, wrenches = held[..., :nv], held[..., nv:]
     coordinates, plain = np.array(_plain(dyn.model), dtype=int).reshape(-1, 2).T
-    damped, turned = dyn.model.needs.damping, len(plain) < nv and bool(pushed.any())
+    damped, turned = dyn.model.needs.damping or wrenches.any(), len(plain) < nv and bool(pushed.any())
     ends = [(q[..., i : len(h) + i, :], v[..., i : len(h) + i, :]) for i in (0, 1)]
     a = [np.zeros(0)] * 2
     if damped or turned:
-        a = [along(dyn, (nv,), lambda own, *at: own.forward_dynamics(*at), *end, pushed) for end in ends]
+        forces = [_generalized(dyn, end[0], held, acting) for end in ends]
+        a = [
+            along(dyn, (nv,), lambda own, *at: own.forward_dynamics(*at), *end, force)
+            for end, force in zip(ends, forces, strict=True)
+        ]
     distance = np.zeros(pushed.shape)
     if turned:
         distance = _corrected(h[:, None], *((v, rate) for (_, v), rate in zip(ends, a, strict=True)))
     distance[..., plain] = np.diff(q, axis=-2)[..., coordinates]
     out = np.sum(pushed * distance, axis=-1)
     if damped:
-        out = out + _corrected(h, *(_damped(dyn, h[:, None], *end, rate) for end, rate in zip(ends, a, strict=True)))
+        alone = np.concatenate([np.zeros(pushed.shape), wrenches], axis=-1)
+
+        def acts(q: Array, v: Array) -> Array:
+            return _damping(dyn, q, v) + _generalized(dyn, q, alone, acting)
+
+        pairs = (_power(dyn.model, acts, h[:, None], *end, rate) for end, rate in zip(ends, a, strict=True))
+        out = out + _corrected(h, *pairs)
     return np.asarray(out)
 
 
@@ -249,12 +283,26 @@ def _corrected(h: Array, start: tuple[Array, Array], end: tuple[Array, Array]) -
     return np.asarray(h / 2 * (start[0] + end[0]) + h**2 / 12 * (start[1] - end[1]))
 
 
-def _damped(dyn: Dynamics, h: Array, q: Array, v: Array, a: Array) -> tuple[Array, Array]:
-    """Return the power of the dampers, and its rate along the motion."""
+def _generalized(dyn: Dynamics, q: Array, force: Array, acting: Acting | None) -> Array:
+    """Return τ + Σ Jᵀ w of τ with wrenches behind it."""
+    if acting is None:
+        return force
+    tau, wrenches = np.split(force, [force.shape[-1] - 6 * len(acting[0])], axis=-1)
+
+    def of_wrenches(own: Dynamics, q: Array, w: Array) -> Array:
+        return own._evaluate("generalized_force", *acting, q=q, wrenches=w)
+
+    return np.asarray(tau + along(dyn, tau.shape[-1:], of_wrenches, q, wrenches))
+
+
+def _power(
+    model: Model, force: Callable[[Array, Array], Array], h: Array, q: Array, v: Array, a: Array
+) -> tuple[Array, Array]:
+    """Return the power of a force of (q, v), and its rate along the motion."""
 
     def power(s: Array) -> Array:
-        there = (integrate_finite(dyn.model, q, s * v), v + s * a) if s.any() else (q, v)
-        return np.asarray(np.sum(_damping(dyn, *there) * there[1], axis=-1))
+        there = (integrate_finite(model, q, s * v), v + s * a) if s.any() else (q, v)
+        return np.asarray(np.sum(force(*there) * there[1], axis=-1))
 
     s = _NEAR * h
     return power(np.zeros(1)), (power(s) - power(-s)) / (2 * s[:, 0])

@@ -1,8 +1,12 @@
-"""The generalized force of a run: zero, an array held over each step, or a function of the state."""
+"""What acts in a run: the generalized force and wrenches on frames; zero, an array held over each step, or a function.
+
+A force in this module is τ, (nv,), and behind it six numbers for each frame with a wrench. A wrench is what is held:
+its generalized force Σ Jᵀ w follows the configuration within a step (`mbkit.engines.Dynamics._under`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -15,25 +19,27 @@ from mbkit.errors import InputError, TorqueError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.time_grid import Indices
 
-#: torque(t, q, v) -> (nv,), of one state
+#: torque(t, q, v) -> (nv,), of one state; of a wrench (6,)
 TorqueFunction = Callable[[float, Array, Array], ArrayLike]
+#: Wrenches by the names of the frames on which they act.
+RunWrenches = Mapping[str, ArrayLike | TorqueFunction]
 
 
 @dataclass(frozen=True, eq=False)
 class PiecewiseConstantTorque:
     """A generalized force that is constant, or jumps at known times."""
 
-    # (nv,), (R, nv) or (N, R, nv)
+    # (n,), (R, n) or (N, R, n); a constant (n,) or (N, 1, n)
     rows: Array
     # When each row begins to act, s; None for a constant.
     starts: Array | None
 
     def at(self, t: Array) -> Array:
-        """Return the force from each time on: (nv,), (K, nv) or (N, K, nv). The last row has no end."""
+        """Return the force from each time on: (n,), (K, n), (N, K, n) or (N, 1, n). The last row has no end."""
         return self.rows if self.starts is None else self.rows[..., self._row(t), :]
 
     def between(self, t: Array) -> Array:
-        """Return the force between neighbouring times: (nv,), (K - 1, nv) or (N, K - 1, nv); an error if it changes."""
+        """Return the force between neighbouring times, with K - 1 rows or one; an error if it changes."""
         if self.starts is None:
             return self.rows
         differ = np.diff(self.rows, axis=-2).any(axis=(0, 2) if self.rows.ndim == 3 else 1)
@@ -43,7 +49,7 @@ class PiecewiseConstantTorque:
         if broken.any():
             k = int(np.argmax(broken))
             raise UnsupportedError(
-                f"the torque changes between the saved states at {t[k]:.9g} and {t[k + 1]:.9g} s, where the motion is "
+                f"the force changes between the saved states at {t[k]:.9g} and {t[k + 1]:.9g} s, where the motion is "
                 "not known; keep every step (save=None) to have its work"
             )
         return self.rows[..., self._row(t[:-1]), :]
@@ -55,17 +61,18 @@ class PiecewiseConstantTorque:
 
 @dataclass(frozen=True, eq=False)
 class SampledTorque:
-    """Values of a torque function at the saved states, (K, nv) or (N, K, nv)."""
+    """Values at the saved states of a force with functions in it, (K, n) or (N, K, n)."""
 
     values: Array
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueCallback:
-    """A user's function of (t, q, v), which must return nv numbers."""
+    """A user's function of (t, q, v), which must return `size` numbers; `name` is what messages call it."""
 
     function: TorqueFunction
-    nv: int
+    size: int
+    name: str = "torque"
 
     def one(self, t: float, q: Array, v: Array, member: int | None = None) -> Array:
         """Return the force on one state; a `TorqueError` where the function raises or returns something else."""
@@ -74,37 +81,49 @@ class TorqueCallback:
             # Copies: the function may write into them.
             value: Any = self.function(t, q.copy(), v.copy())
         except Exception as error:
-            raise TorqueError(f"torque: the callable raised {type(error).__name__} {when}: {error}") from error
+            raise TorqueError(f"{self.name}: the callable raised {type(error).__name__} {when}: {error}") from error
         try:
-            return finite_array("torque", value, (self.nv,))
+            return finite_array(self.name, value, (self.size,))
         except InputError as error:
             raise TorqueError(f"{error}; it is what the callable returned {when}") from None
         except Exception as error:
             raise TorqueError(
-                f"torque: expected an array of numbers, got {type(value).__name__}; "
+                f"{self.name}: expected an array of numbers, got {type(value).__name__}; "
                 f"it is what the callable returned {when}"
             ) from error
 
-    def many(self, t: float, q: Array, v: Array, members: Indices) -> Array:
-        """Return the force on these members of a batch, (n, nv)."""
-        rows = [self.one(t, *state) for state in zip(q, v, members.tolist(), strict=True)]
-        return np.array(rows).reshape(-1, self.nv)
+
+@dataclass(frozen=True, eq=False)
+class ForceFunctions:
+    """A force of which some numbers are functions of the state; `held` has the others."""
+
+    held: PiecewiseConstantTorque
+    functions: tuple[tuple[slice, TorqueCallback], ...]
+
+    def one(self, row: Array, t: float, q: Array, v: Array, member: int | None = None) -> Array:
+        """Return the force on one state, with the held numbers of a row."""
+        out = row.copy()
+        for part, function in self.functions:
+            out[part] = function.one(t, q, v, member)
+        return out
 
     def sampled(self, t: Array, q: Array, v: Array, *, strict: bool) -> SampledTorque:
-        """Return the values at saved states; NaN where one is not finite or, unless strict, the function fails."""
-        out = np.full(v.shape, np.nan)
+        """Return the values at saved states; NaN where one is not finite or, unless strict, a function fails."""
+        held = self.held.at(t)
+        rows = np.broadcast_to(held, (*v.shape[:-1], held.shape[-1]))
+        out = np.full(rows.shape, np.nan)
         for index in np.ndindex(v.shape[:-1]):
             if np.isfinite(q[index]).all() and np.isfinite(v[index]).all():
                 member = index[0] if len(index) == 2 else None
                 try:
-                    out[index] = self.one(float(t[index[-1]]), q[index], v[index], member)
+                    out[index] = self.one(rows[index], float(t[index[-1]]), q[index], v[index], member)
                 except TorqueError:
                     if strict:
                         raise
         return SampledTorque(out)
 
 
-Applied = PiecewiseConstantTorque | TorqueCallback | SampledTorque
+Applied = PiecewiseConstantTorque | ForceFunctions | SampledTorque
 
 
 #: The force during one step: an array, or a function of (t, q, v) of one state or a batch. A function of a batch takes
@@ -113,25 +132,47 @@ Force = Array | Callable[..., Array]
 
 
 class Torque:
-    """The argument `torque` of a run, checked, and read step by step.
+    """The arguments `torque` and `wrenches` of a run, checked, and read step by step.
 
-    An array is (nv,), (steps, nv) or (batch, steps, nv); without `steps` only a constant (nv,) is possible.
+    As an array, τ is (nv,), (steps, nv) or (batch, steps, nv), and a wrench (6,), (batch, 6), (steps, 6) or
+    (batch, steps, 6); without `steps` nothing may change in time.
     """
 
     def __init__(
-        self, torque: ArrayLike | TorqueFunction | None, model: Model, batch: int | None, steps: int | None
+        self,
+        torque: ArrayLike | TorqueFunction | None,
+        model: Model,
+        batch: int | None,
+        steps: int | None,
+        wrenches: RunWrenches | None = None,
     ) -> None:
-        self._nv = model.nv
-        self._callback = TorqueCallback(torque, model.nv) if callable(torque) else None
-        self._constant = np.zeros(model.nv)
-        self._rows: Array | None = None
-        if torque is not None and not callable(torque):
-            array = _read(torque, model, batch, steps)
-            if array.ndim == 1:
-                self._constant = self._constant + array
+        parts: list[tuple[slice, Array]] = []
+        functions: list[tuple[slice, TorqueCallback]] = []
+        self._size = model.nv
+        if callable(torque):
+            functions.append((slice(0, model.nv), TorqueCallback(torque, model.nv)))
+        elif torque is not None:
+            parts.append((slice(0, model.nv), _read(torque, model, batch, steps)))
+        for frame, wrench in (wrenches or {}).items():
+            part, self._size = slice(self._size, self._size + 6), self._size + 6
+            if callable(wrench):
+                functions.append((part, TorqueCallback(wrench, 6, f"wrench on {frame!r}")))
             else:
-                self._rows = array
-        self._of_all = self._constant if batch is None else np.tile(self._constant, (batch, 1))
+                parts.append((part, _read_wrench(f"wrench on {frame!r}", wrench, batch, steps)))
+        shape = np.broadcast_shapes(*(x.shape[:-1] for _, x in parts))
+        # (n,) or (N, 1, n) all the time; or (steps, n) or (N, steps, n).
+        whole = np.zeros((*shape, self._size))
+        for part, x in parts:
+            whole[..., part] = x
+        constant = all(x.ndim == 1 or x.shape[:-1] == (batch, 1) != (batch, steps) for _, x in parts)
+        self._rows: Array | None = None if constant else whole
+        self._constant: Array = whole if constant else np.zeros(self._size)
+        self._of_all = self._constant
+        if batch is not None:
+            each = whole[:, 0] if constant and whole.ndim == 3 else self._constant
+            self._of_all = np.broadcast_to(each, (batch, self._size))
+        self._functions = tuple(functions)
+        self._with_functions = ForceFunctions(PiecewiseConstantTorque(self._constant, None), self._functions)
 
     @property
     def held(self) -> bool:
@@ -141,33 +182,42 @@ class Torque:
     @property
     def callable(self) -> bool:
         """Whether the force is a function of the state."""
-        return self._callback is not None
+        return bool(self._functions)
 
     def during(self, k: int, members: Indices | None) -> Force:
         """Return the force during step k on a single state, or on these members of a batch."""
-        if self._callback is not None:
-            callback = self._callback
-            if members is None:
-                return callback.one
-            return lambda t, q, v, part=slice(None): callback.many(t, q, v, members[part])
-        row = self._of_all if self._rows is None else self._rows[..., k, :]
+        row, one = self._of_all if self._rows is None else self._rows[..., k, :], self._with_functions.one
         if members is None:
-            return row
-        return row[members] if row.ndim == 2 else np.broadcast_to(row, (len(members), self._nv))
+            return partial(one, row) if self._functions else row
+        rows = row[members] if row.ndim == 2 else np.broadcast_to(row, (len(members), self._size))
+        if not self._functions:
+            return rows
+
+        def many(t: float, q: Array, v: Array, part: Any = slice(None)) -> Array:
+            each = zip(rows[part], q, v, members[part].tolist(), strict=True)
+            return np.array([one(held, t, *state) for held, *state in each]).reshape(-1, self._size)
+
+        return many
 
     def of_member(self, i: int | None) -> Callable[[int], Force]:
         """Return a function of the step that returns the force on one state (of a batch)."""
         if i is None:
             return lambda k: self.during(k, None)
-        if self._callback is not None:
-            force = partial(self._callback.one, member=i)
-            return lambda _: force
-        return lambda k: np.asarray(self.during(k, np.array([i])))[0]
+        arrays = self._of_all if self._rows is None else self._rows
+
+        def during(k: int) -> Force:
+            row = arrays if self._rows is None else arrays[..., k, :]
+            row = row[i] if row.ndim == 2 else row
+            return partial(self._with_functions.one, row, member=i) if self._functions else row
+
+        return during
 
     def columns(self, members: Indices | slice, start: int, stop: int) -> Array:
-        """Return an array's rows of steps start to stop for members of a batch: (steps, nv, members or 1)."""
+        """Return an array's rows of steps start to stop for members of a batch: (steps, n, members or 1)."""
         if self._rows is None:
-            return np.broadcast_to(self._constant[:, None], (stop - start, self._nv, 1))
+            constant = self._constant
+            columns: Array = constant[:, None] if constant.ndim == 1 else constant[members, 0].T
+            return np.broadcast_to(columns, (stop - start, *columns.shape))
         if self._rows.ndim == 2:
             return self._rows[start:stop, :, None]
         return np.ascontiguousarray(self._rows[members, start:stop].transpose(1, 2, 0))
@@ -176,31 +226,61 @@ class Torque:
         """Return the rows of steps start to stop, (steps, nv) or (N, steps, nv); None where all are zero."""
         if self._rows is not None:
             return self._rows[..., start:stop, :]
-        return np.tile(self._constant, (stop - start, 1)) if self._constant.any() else None
+        return np.asarray(np.tile(self._constant, (stop - start, 1))) if self._constant.any() else None
 
-    def applied(self, bounds: Array | None) -> PiecewiseConstantTorque | TorqueCallback | None:
+    def applied(self, bounds: Array | None) -> PiecewiseConstantTorque | ForceFunctions | None:
         """Return the force of a finished run, whose rows were held between `bounds`, s; None where it was zero."""
-        if self._callback is not None:
-            return self._callback
+        held = PiecewiseConstantTorque(self._constant, None)
         if self._rows is not None:
             assert bounds is not None  # rows are read only where there are intervals
-            return PiecewiseConstantTorque(self._rows, bounds[:-1])
-        return PiecewiseConstantTorque(self._constant, None) if self._constant.any() else None
+            held = PiecewiseConstantTorque(self._rows, bounds[:-1])
+        if self._functions:
+            return ForceFunctions(held, self._functions)
+        return held if held.rows.any() or self.held else None
 
 
 def _read(torque: ArrayLike, model: Model, batch: int | None, steps: int | None) -> Array:
     """Return an array of torques, checked."""
-    try:
-        shape = np.shape(torque)
-    except ValueError:
-        raise InputError("torque: expected an array or a callable, got rows of different lengths") from None
     allowed = [(model.nv,), (steps, model.nv), (batch, steps, model.nv)][
         : 1 if steps is None else 2 + (batch is not None)
     ]
+    shape = _shape("torque", torque)
     if shape not in allowed:
-        hint = "; one row per interval needs save=, times from 0 to the end of the run"
         raise InputError(
             f"torque: expected shape {' or '.join(map(str, allowed))}, got {shape}; {model.name} has nv = {model.nv}"
-            + (hint if steps is None else f" and the run has {steps} steps")
+            + _why(steps)
         )
     return finite_array("torque", torque, shape)
+
+
+def _read_wrench(name: str, wrench: ArrayLike, batch: int | None, steps: int | None) -> Array:
+    """Return an array of a wrench, checked, (6,), (steps, 6), (batch, steps, 6) or one row each, (batch, 1, 6)."""
+    shape, each, held = _shape(name, wrench), (batch, 6), (steps, 6)
+    allowed: list[tuple[int | None, ...]] = [(6,)]
+    allowed += [] if batch is None else [each]
+    allowed += [] if steps is None else [held]
+    allowed += [] if batch is None or steps is None else [(batch, steps, 6)]
+    if shape not in allowed:
+        raise InputError(
+            f"{name}: expected shape {' or '.join(map(str, allowed))}, got {shape}; force and moment are six numbers"
+            + _why(steps)
+        )
+    if shape == each == held and batch != 1:
+        raise InputError(
+            f"{name}: shape {shape} may be one row for each trajectory or for each step; give ({batch}, {steps}, 6)"
+        )
+    array = finite_array(name, wrench, shape)
+    return array[:, None] if shape == each else array
+
+
+def _shape(name: str, value: ArrayLike) -> tuple[int, ...]:
+    try:
+        return np.shape(value)
+    except ValueError:
+        raise InputError(f"{name}: expected an array or a callable, got rows of different lengths") from None
+
+
+def _why(steps: int | None) -> str:
+    if steps is None:
+        return "; one row per interval needs save=, times from 0 to the end of the run"
+    return f" and the run has {steps} steps"

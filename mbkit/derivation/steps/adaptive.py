@@ -60,7 +60,7 @@ class AttemptParts:
         self.parts: list[Part] = []
         self.equations, self.space = equations, SymbolicSpace(equations.model)
         nq, nv = equations.model.nq, equations.model.nv
-        sizes = {"q": nq, **dict.fromkeys(("w", "tau"), nv), **dict.fromkeys(STATE[2:], 1)}
+        sizes = {"q": nq, "w": nv, "tau": equations.force.numel(), **dict.fromkeys(STATE[2:], 1)}
         sizes.update(dict.fromkeys(("step", "t_new", "rtol", "atol", "least"), 1))
         self.symbols = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
         self.at = {"q_i": ca.SX.sym("q_i", nq), "w_i": ca.SX.sym("w_i", nv), "u_i": ca.SX.sym("u_i", nv)}

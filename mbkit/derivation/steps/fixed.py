@@ -205,7 +205,7 @@ def _stepped(
 
 def _symbols(equations: Equations) -> dict[str, Any]:
     nq, nv = equations.model.nq, equations.model.nv
-    sizes = {"q": nq, "v": nv, "w": nv, "tau": nv, "dt": 1, "squares": 1}
+    sizes = {"q": nq, "v": nv, "w": nv, "tau": equations.force.numel(), "dt": 1, "squares": 1}
     return {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
 
 

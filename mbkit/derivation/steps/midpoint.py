@@ -112,8 +112,8 @@ class Midpoint:
     def __init__(self, equations: Equations) -> None:
         self._equations, self._space = equations, _MomentumSpace(equations.model)
         nq, nv = equations.model.nq, equations.model.nv
-        sizes = {"q": nq, **dict.fromkeys(("v", "v1", "pi", "w", "w_1", "w_2", "tau"), nv)}
-        sizes |= dict.fromkeys(("dt", "miss", "misses"), 1)
+        sizes = {"q": nq, **dict.fromkeys(("v", "v1", "pi", "w", "w_1", "w_2"), nv)}
+        sizes |= {"tau": equations.force.numel(), **dict.fromkeys(("dt", "miss", "misses"), 1)}
         self._s = {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
         step = ("q", "pi", "w", "tau", "dt")
         #: One step of Newton's iteration, and 0 where it was the last one needed.
@@ -161,7 +161,7 @@ class Midpoint:
         f = space.pullback(eq.q, ca.gradient(kinetic - eq.potential_energy, eq.q)) + space.to_integrator_force(
             eq.q, applied
         )
-        arguments = [eq.q, w, eq.tau, *eq.extra_arguments.values()]
+        arguments = [eq.q, w, eq.force, *eq.extra_arguments.values()]
         return ca.Function("forces", arguments, [ca.gradient(kinetic, w), f], {"cse": True})
 
     def _residual(self) -> Any:

@@ -45,7 +45,7 @@ def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[P
 
     def system() -> tuple[Any, Any, Any]:
         if not linear:
-            linear.append(_linear_system(equations, space, s["q"], s["w"], s["k"]))
+            linear.append(_linear_system(equations, space, s["q"], s["w"], s["k"], s["tau"]))
         return linear[0]
 
     def matrix() -> ca.Function:
@@ -54,7 +54,9 @@ def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[P
         pull = g * ca.mtimes(K, space.spun(s["w"], g))
         factors = Factors.of(M + g * D + g * pull, equations.elimination_order)
         results = {"mass": _entries(M), "pull": _entries(pull), "factors": ca.vertcat(*factors.values)}
-        return function_of("matrix", {**parts.named("q", "w", "k", "step"), **equations.extra_arguments}, results)
+        return function_of(
+            "matrix", {**parts.named("q", "w", "k", "tau", "step"), **equations.extra_arguments}, results
+        )
 
     solved = ("w", "k", "r", "sum_u", "sum_w", "step")
 
@@ -85,7 +87,7 @@ def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[P
             go(f"stage_{i}", tableau.A[i, :i], {"sum_u": sum_u, "sum_w": sum_w})
         parts.add_field("k", "r")
         if not i:
-            reads = ("q", "w", "k", "step", *equations.extra_arguments)
+            reads = ("q", "w", "k", "tau", "step", *equations.extra_arguments)
             parts.parts.append(Part("matrix", reads, ("mass", "pull", "factors"), matrix))
         stage = {name: ca.SX.sym(name, nv) for name in (f"du_{i}", f"dw_{i}")}
         parts.parts.append(Part("solve", (*solved, "mass", "pull", "factors"), tuple(stage), solve))
@@ -119,7 +121,7 @@ class _Space(SymbolicSpace):
         return out
 
 
-def _linear_system(eq: Equations, space: SymbolicSpace, q: Any, w: Any, k: Any) -> tuple[Any, Any, Any]:
+def _linear_system(eq: Equations, space: SymbolicSpace, q: Any, w: Any, k: Any, force: Any) -> tuple[Any, Any, Any]:
     """Return M, D and K at a state, without entries that are zeros after all."""
     u, a = ca.SX.sym("u", eq.model.nv), ca.SX.sym("a", eq.model.nv)
     v, moved = space.to_body_velocity(q, w), space.retract(q, u)
@@ -128,11 +130,11 @@ def _linear_system(eq: Equations, space: SymbolicSpace, q: Any, w: Any, k: Any) 
     qdot = ca.substitute(eq.kin.qdot, ca.vertcat(eq.q, eq.v), ca.vertcat(q, v))
     rate = ca.mtimes(by_w, k) + ca.jtimes(v, q, qdot)
     there = space.to_body_velocity(moved, w)
-    force = eq.function("inverse_dynamics")(moved, there, a, *eq.extra_arguments.values())
+    rest = eq.function("inverse_dynamics")(moved, there, a, *eq.extra_arguments.values()) - eq.applied(moved, force)
     led = space.acceleration(moved, there, a)
     M = ca.mtimes(ca.substitute(eq.mass_matrix, eq.q, q), by_w)
-    K = ca.jacobian(force, u) - ca.mtimes(M, ca.jacobian(led, u))
-    D = ca.jacobian(force, w) - ca.mtimes(M, ca.jacobian(led, w))
+    K = ca.jacobian(rest, u) - ca.mtimes(M, ca.jacobian(led, u))
+    D = ca.jacobian(rest, w) - ca.mtimes(M, ca.jacobian(led, w))
     at = ca.vertcat(u, a), ca.vertcat(ca.SX.zeros(eq.model.nv), rate)
     K, D = (ca.sparsify(ca.substitute(x, *at)) for x in (K, D))
     return ca.sparsify(M), D, K

@@ -89,7 +89,8 @@ class EnergyEquations(Equations):
         values = Values(model, constants)
         self.model, self.form, self.elimination = model, form, "mass matrix"
         self.q, self.v = ca.SX.sym("q", model.nq), ca.SX.sym("v", model.nv)
-        self.a, self.tau = ca.SX.sym("a", model.nv), ca.SX.sym("tau", model.nv)
+        self.a = ca.SX.sym("a", model.nv)
+        self.force = self.tau = ca.SX.sym("tau", model.nv)
         names = {**{p: values.named[p.name] for p in form.parameters}}
         names |= {c: self.q[i] for i, c in enumerate(form.coordinates)}
         names |= {w: self.v[i] for i, w in enumerate(form.velocities)}

@@ -46,7 +46,7 @@ class RateJacobian:
     """∂ẏ/∂y of one state, for the right-hand side `Rates`; `evaluations` counts Jacobians."""
 
     def __init__(self, dyn: Dynamics) -> None:
-        self._twin, self._model = _twin(dyn), dyn.model
+        self._twin, self._model, self._acting = _twin(dyn._bare or dyn), dyn.model, dyn._acting
         self._own = self._twin
         layout = dyn.model.layout
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
@@ -68,8 +68,10 @@ class RateJacobian:
             return self._last
         q, lengths = unit_quaternions(self._model, y[:nq])
         v = y[nq:]
-        tau = force if isinstance(force, np.ndarray) else force(t, q, v)
         own = at_time(self._own, t)
+        if self._acting[0]:
+            force = self._with_wrenches(own, force)
+        tau = force if isinstance(force, np.ndarray) else force(t, q, v)
         try:
             by_q, by_v, by_tau = (x.reshape(nv, nv) for x in own.forward_dynamics_derivatives(q, v, tau))
         except NumericalError:
@@ -86,6 +88,17 @@ class RateJacobian:
             self._last[:nq, :nq], self._last[:nq, nq:], tangent = self._kinematics(q, v, lengths)
             self._last[nq:, :nq], self._last[nq:, nq:] = by_q @ tangent, by_v
         return self._last
+
+    def _with_wrenches(self, own: Dynamics, force: Force) -> Force:
+        """Return the generalized force of τ and wrenches, whose slope is that of a function."""
+        nv = self._model.nv
+
+        def whole(t: float, q: Array, v: Array) -> Array:
+            u = force if isinstance(force, np.ndarray) else force(t, q, v)
+            of_wrenches = own._evaluate("generalized_force", *self._acting, q=q, wrenches=u[nv:])
+            return np.asarray(u[:nv] + of_wrenches.reshape(nv))
+
+        return whole
 
     def _kinematics(self, q: Array, v: Array, lengths: Array) -> tuple[Array, Array, Array]:
         """Return ∂(D v)/∂q, D, and the tangent of a change of q, (nv, nq)."""

@@ -339,8 +339,9 @@ class MidpointChunk(BlockLoop):
         names, clock = list(dyn.model.parameters), dyn.model.time_parameter
         self._clock = None if clock is None else names.index(clock)
         # The velocity of each step behind those of the last ones before the block.
-        sizes = {"q": (n + 1, nq), "pi": (n + 1, nv), "misses": (n + 1, 1), "tau": (n if torques else 1, nv)}
+        sizes = {"q": (n + 1, nq), "pi": (n + 1, nv), "misses": (n + 1, 1)}
         sizes |= {"w": (n + back, nv), "guess": (2, nv), "trial": (2, nv), "miss": (1, 1), "dt": (1, 1)}
+        sizes["tau"] = n if torques else 1, dyn.equations.force.numel()
         sizes["parameters"] = 1 if clock is None else n, len(names)
         super().__init__(sizes, count)
         self._count, self._back = count, back

@@ -72,7 +72,7 @@ class _Solve:
         dyn, (self._rtol, atol) = problem.dyn, problem.tolerances
         assert isinstance(dyn, LagrangianDynamics)
         self._dyn, self._graph, clock = dyn, _graph(dyn), _clock(dyn.model)
-        self._clock = None if clock is None else dyn.model.nv + clock
+        self._clock = None if clock is None else dyn.equations.force.numel() + clock
         self._options = {
             "reltol": self._rtol,
             "abstol": atol,
@@ -157,7 +157,7 @@ def _derived(eq: Equations) -> ca.Function:
         rate = ca.substitute(rate, eq.parameters[clock], eq.parameters[clock] + length * s)
     # D is linear in the quaternion: with its length put back, the drift of that length never bends the rotation.
     rate[: model.nq] *= lengths
-    parameters = ca.vertcat(eq.tau, eq.parameters, length)
+    parameters = ca.vertcat(eq.force, eq.parameters, length)
     named = {"t": s, "x": ca.vertcat(q, v), "p": parameters, "ode": length * ca.densify(rate)}
     names_in, names_out = ca.dyn_in(), ca.dyn_out()
     ins, outs = ([named.get(name, ca.SX(0, 1)) for name in names] for names in (names_in, names_out))

@@ -167,7 +167,7 @@ class MidpointStepper(Stepper):
         With a torque function it goes on until corrections stop shrinking.
         """
         w, good = self._guess.copy(), np.full(len(q), False)
-        tau = np.empty(w.shape)
+        tau = np.empty((len(w), self._dyn.equations.force.numel()))
         if isinstance(force, np.ndarray):
             tau[:] = force
         last, todo = np.full(len(q), np.inf), np.arange(len(q))
