@@ -18,6 +18,7 @@ NEEDED = {
     "matplotlib": (
         "mb.simulate(mb.dynamics(model, 'pinocchio'), [0.1], [0.0], 0.01, 'rk4', 1e-3).plot()",
         "mb.simulate(mb.dynamics(model, 'pinocchio'), [0.1], [0.0], 0.01, 'rk4', 1e-3).picture()",
+        "mb.show(model, path='a.gif')",
         "mb.compare(model, samples=1, terms_only=True).plot()",
     ),
     "sympy": ("mb.lagrangian.Lagrangian", "mb.lagrangian.systems"),

@@ -449,5 +449,5 @@ def test_dir_holds_what_a_reader_looks_for() -> None:
     assert {name for name in dir(swing()) if not name.startswith("_")} == {
         *("t", "q", "v", "model", "method", "engine", "stats", "events"),
         *("energy", "kinetic_energy", "potential_energy", "tau", "wrenches", "work", "power_balance"),
-        *("momentum", "canonical_momentum", "plot", "picture", "to_csv", "check"),
+        *("momentum", "canonical_momentum", "plot", "picture", "animate", "to_csv", "check"),
     }
