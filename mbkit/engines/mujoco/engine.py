@@ -22,20 +22,20 @@ from mbkit._check import Array, batch_of, count, real
 from mbkit._fork import fork_safe
 from mbkit.engines import known_defects, regressors
 from mbkit.engines.base import MappedDynamics
-from mbkit.engines.frames_and_momenta import seen_from
+from mbkit.engines.mujoco.bodies import MujocoBodies
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.model import Frame, Model
+from mbkit.model import Model
 
 if TYPE_CHECKING:
     from mbkit.show import Kind
 
 #: Quantities that M is part of.
-_OF_MASS: Final = ("mass_matrix", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
+_OF_MASS: Final = ("mass_matrix", "mass_matrix_inverse", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
 
 
-class MujocoDynamics(MappedDynamics):
+class MujocoDynamics(MujocoBodies, MappedDynamics):
     """MuJoCo on a description.
 
     Attributes
@@ -71,7 +71,7 @@ class MujocoDynamics(MappedDynamics):
         self._lock = fork_safe(threading.RLock())
 
     def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
-        if quantity in _OF_MASS and self.model.couplings and self._torn_couplings:
+        if quantity.removesuffix("_with_wrenches") in _OF_MASS and self.model.couplings and self._torn_couplings:
             names = ", ".join(repr(name) for name in self._torn_couplings)
             known_defects.announce(known_defects.TENDON_ARMATURE, f"coupling {names}")
         # One MjData and one handler of warnings: two threads in here end the process.
@@ -195,12 +195,8 @@ class MujocoDynamics(MappedDynamics):
 
     def _coriolis_force(self, q: Array, v: Array) -> Array:
         # With gravity off, so that nothing cancels.
-        flags = self._m.opt.disableflags
-        self._m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-        try:
+        with self._without_forces():
             return self._nle(q, v)
-        finally:
-            self._m.opt.disableflags = flags
 
     def _times_mass(self, x: Array) -> Array:
         out = np.zeros(self._m.nv)
@@ -244,28 +240,6 @@ class MujocoDynamics(MappedDynamics):
         mujoco.mj_fwdPosition(self._m, self._d)
         mujoco.mj_energyPos(self._m, self._d)
         return self._d.energy[0]
-
-    def _placement(self, q: Array, frame: Frame) -> tuple[Array, Array]:
-        if frame.body in self._maps.absorbed:
-            raise UnsupportedError(
-                f"mujoco: frame {frame.name!r} rides on {frame.body!r}, a body without mass between two joints, "
-                "which MuJoCo holds as two joints of one body"
-            )
-        body = self._maps.bodies[frame.body]
-        self._set(q)
-        mujoco.mj_kinematics(self._m, self._d)
-        mujoco.mj_comPos(self._m, self._d)
-        R = self._d.xmat[body].reshape(3, 3)
-        return R @ frame.rotation, self._d.xpos[body] + R @ frame.translation
-
-    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
-        out = []
-        for frame in frames:
-            R, p = self._placement(q, frame)
-            linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
-            mujoco.mj_jac(self._m, self._d, linear, angular, p, self._maps.bodies[frame.body])
-            out.append(self._columns(seen_from(R, p, linear, angular, axes)))
-        return np.array(out)
 
     # Native integration.
 
