@@ -336,8 +336,10 @@ def test_a_motion_has_its_states_on_the_page_and_its_frames_in_a_film(tmp_path: 
     run.animate(tmp_path / "a.gif", fps=4)
     with Image.open(tmp_path / "a.gif") as film:
         assert film.n_frames == 3
-    run.animate(tmp_path / "a.png")
-    with Image.open(tmp_path / "a.png") as picture:
+    with pytest.raises(InputError, match="fps: expected a film of at most 20000 frames"):
+        run.animate(tmp_path / "a.mp4", fps=1e300)
+    run.animate(tmp_path / "a.PNG")
+    with Image.open(tmp_path / "a.PNG") as picture:
         assert np.asarray(picture.convert("RGB")).std() > 5
     with pytest.raises(InputError, match="member: expected less than 2"):
         run.animate(member=2)
@@ -391,6 +393,7 @@ def test_bad_input_is_named(tmp_path: Path, monkeypatch) -> None:
         ({"path": tmp_path / "a.html", "shapes": "meshes"}, "shapes: expected one of visual, collision, sticks"),
         ({"path": tmp_path / "a.html", "triangles": 0}, "triangles: expected a whole number of at least 1"),
         ({"q": [0.1, 0.2]}, "q: expected shape"),
+        ({"q": np.zeros((2001, 1))}, "q: expected at most 2000 configurations, got 2001"),
     ):
         with pytest.raises(InputError, match=match):
             mb.show(model, **wrong)

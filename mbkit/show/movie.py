@@ -7,6 +7,7 @@ triangles and those that pass through each other.
 from __future__ import annotations
 
 from pathlib import Path
+from subprocess import CalledProcessError
 from typing import Any, Final
 
 import numpy as np
@@ -27,7 +28,8 @@ _KEY: Final = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82]
 
 def write(scene: Scene, path: Path, fps: float) -> None:
     """Write a picture of the first frame, or a film of all, by the suffix of the path."""
-    with needed("matplotlib", path.suffix[1:].upper()):
+    suffix = path.suffix.lower()
+    with needed("matplotlib", suffix[1:].upper()):
         from matplotlib.animation import writers
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -36,13 +38,13 @@ def write(scene: Scene, path: Path, fps: float) -> None:
     axis = fig.add_axes((0, 0, 1, 1))
     drawing = _Drawing(scene, axis)
     try:
-        if path.suffix in PICTURES:
+        if suffix in PICTURES:
             drawing.frame(0)
             fig.savefig(path)
             return
-        name, install = FILMS[path.suffix]
+        name, install = FILMS[suffix]
         if not writers.is_available(name):
-            raise UnsupportedError(f"{path.suffix[1:].upper()} needs {name}, which is not installed; {install}")
+            raise UnsupportedError(f"{suffix[1:].upper()} needs {name}, which is not installed; {install}")
         writer = writers[name](fps=fps)  # type: ignore[arg-type]  # any number does
         with writer.saving(fig, str(path), _DPI):
             for k in range(len(scene.t)):
@@ -50,6 +52,8 @@ def write(scene: Scene, path: Path, fps: float) -> None:
                 writer.grab_frame()
     except OSError as error:
         raise OutputError(f"cannot write {path}: {error.strerror or error}; choose a folder that exists") from error
+    except CalledProcessError as error:
+        raise OutputError(f"cannot write {path}: the film's writer ended with code {error.returncode}") from error
 
 
 class _Drawing:

@@ -22,8 +22,9 @@ from mbkit.model import Model
 from mbkit.show import movie, page
 from mbkit.show.scene import Kind, Scene, require_bodies
 
-#: Frames that a page holds at most.
+#: Frames that a page and a film hold at most.
 _FRAMES: Final = 2000
+_FILM_FRAMES: Final = 20_000
 _PAGE_RATE: Final = 60.0
 _SUFFIXES: Final = (".html", *movie.PICTURES, *movie.FILMS)
 
@@ -132,6 +133,8 @@ def show(
         raise InputError(f"model: expected a Model, got {shown(model)}; a trajectory has animate()")
     require_bodies(model)
     configurations = np.atleast_2d(model.neutral() if q is None else model.check_q(q))
+    if len(configurations) > _FRAMES:
+        raise InputError(f"q: expected at most {_FRAMES} configurations, got {len(configurations)}")
     return view_of(model, configurations, np.arange(float(len(configurations))), path, shapes, triangles)
 
 
@@ -155,9 +158,10 @@ def animate(
     t, q = t[good], model.check_q(_with_prescribed(model, q[good], t[good]))
     filmed = path is not None and Path(path).suffix.lower() in movie.FILMS
     rate = real("fps", fps, positive=True) if filmed else _PAGE_RATE
-    frames = int((t[-1] - t[0]) * rate) + 1
-    if not filmed:
-        frames = min(frames, _FRAMES)
+    most = _FILM_FRAMES if filmed else _FRAMES
+    frames = int(min((t[-1] - t[0]) * rate, most)) + 1
+    if filmed and frames > most:
+        raise InputError(f"fps: expected a film of at most {most} frames, got {rate:g} a second for {t[-1] - t[0]:g} s")
     wanted = t[0] + np.arange(frames) / rate if filmed else np.linspace(t[0], t[-1], max(frames, 2))
     # Saved states only: the nearest in time.
     after = np.clip(np.searchsorted(t, wanted), 1, max(len(t) - 1, 1)) if len(t) > 1 else np.zeros(1, int)
