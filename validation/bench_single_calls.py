@@ -1,6 +1,7 @@
 """What a single call through mbkit costs beside the bare call of an engine, and a single step.
 
-Run ``python -m validation.bench_single_calls``. Both sides are timed in turn in one
+Run ``python -m validation.bench_single_calls``; with ``bodies`` behind it only the motion
+of frames, momenta and loads are timed, in fewer rounds. Both sides are timed in turn in one
 process, so that the machine's mood meets them alike; ratios are what to read. The
 budget of mbkit's Pinocchio engine: at most the bare call + 1 µs, and 1.5 times it for
 Panda's inverse dynamics, nle and forward dynamics. The budget of the own derivation:
@@ -15,6 +16,7 @@ import statistics
 import subprocess
 import sys
 import timeit
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -26,12 +28,12 @@ from validation.stamp import stamp
 ROUNDS, CALLS = 101, 500
 
 
-def pair(ours, bare):
+def pair(ours, bare, rounds=ROUNDS, number=CALLS):
     """Return the least µs of each in several rounds, and their ratio: what else runs only adds."""
     least = [float("inf")] * 2
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         for k, f in enumerate((ours, bare)):
-            least[k] = min(least[k], timeit.timeit(f, number=CALLS) / CALLS * 1e6)
+            least[k] = min(least[k], timeit.timeit(f, number=number) / number * 1e6)
     return *least, least[0] / least[1]
 
 
@@ -65,6 +67,93 @@ def calls(dyn, m, d, model, q, v, a):
     )
 
 
+def body_calls(model, m, d, q, v, a):
+    """Return (name, arguments, bare call of Pinocchio) of motion, momenta and loads; one frame, at its origin."""
+    name = model.bodies[-1].name
+    joint, frame = m.njoints - 1, pin.SE3.Identity()
+    world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    w = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    on, outside = {name: w}, pin.StdVec_Force(m.njoints, pin.Force.Zero())
+    outside[joint] = pin.Force(w)
+
+    def after(first, second):
+        def both():
+            first()
+            return second()
+
+        return both
+
+    jacobian = after(
+        lambda: pin.computeJointJacobians(m, d, q), lambda: pin.getFrameJacobian(m, d, joint, frame, world)
+    )
+    return (
+        ("pose", (q, name), after(lambda: pin.forwardKinematics(m, d, q), lambda: (d.oMi[joint] * frame).homogeneous)),
+        ("jacobian", (q, name), jacobian),
+        (
+            "velocity",
+            (q, v, name),
+            after(
+                lambda: pin.forwardKinematics(m, d, q, v),
+                lambda: pin.getFrameVelocity(m, d, joint, frame, world).vector,
+            ),
+        ),
+        (
+            "acceleration",
+            (q, v, a, name),
+            after(
+                lambda: pin.forwardKinematics(m, d, q, v, a),
+                lambda: pin.getFrameClassicalAcceleration(m, d, joint, frame, world).vector,
+            ),
+        ),
+        (
+            "jacobian_dot_v",
+            (q, v, name),
+            after(
+                lambda: pin.computeJointJacobiansTimeVariation(m, d, q, v),
+                lambda: pin.getJointJacobianTimeVariation(m, d, joint, world) @ v,
+            ),
+        ),
+        ("center_of_mass", (q,), lambda: pin.centerOfMass(m, d, q, False)),
+        ("center_of_mass_velocity", (q, v), lambda: pin.centerOfMass(m, d, q, v, False)),
+        ("center_of_mass_acceleration", (q, v, a), lambda: pin.centerOfMass(m, d, q, v, a, False)),
+        ("center_of_mass_jacobian", (q,), lambda: pin.jacobianCenterOfMass(m, d, q, False)),
+        ("centroidal_momentum", (q, v), lambda: pin.computeCentroidalMomentum(m, d, q, v)),
+        ("centroidal_momentum_matrix", (q,), lambda: pin.computeCentroidalMap(m, d, q)),
+        ("centroidal_momentum_bias", (q, v), lambda: pin.dccrba(m, d, q, v) @ v),
+        ("locked_inertia", (q,), after(lambda: pin.ccrba(m, d, q, v), lambda: d.Ig.matrix())),
+        ("mass_matrix_inverse", (q,), lambda: pin.computeMinverse(m, d, q)),
+        ("generalized_force", (q, on), lambda: jacobian().T @ w),
+        ("inverse_dynamics", (q, v, a, on), lambda: pin.rnea(m, d, q, v, a, outside)),
+        ("forward_dynamics", (q, v, a, on), lambda: pin.aba(m, d, q, v, a, outside)),
+        (
+            "joint_wrenches",
+            (q, v, a),
+            after(lambda: pin.rnea(m, d, q, v, a), lambda: [d.f[i].vector for i in range(1, m.njoints)]),
+        ),
+    )
+
+
+def body_rows():
+    """Return the rows of motion, momenta and loads of every engine, beside Pinocchio's bare call."""
+    rows = []
+    for label, model in (("ur5", mb.load("ur5")), ("anymal_b, floating", mb.load("anymal_b", floating_base=True))):
+        model = model.without("damping")
+        rng = np.random.default_rng(0)
+        q, v = model.random_state(rng)
+        a = rng.standard_normal(model.nv)
+        engines = [mb.dynamics(model, name) for name in ("lagrangian", "pinocchio", "mujoco", "drake")]
+        m = engines[1].pin_model
+        for name, given, bare in body_calls(model, m, m.createData(), q, v, a):
+            row = {"model": label, "call": f"{name}, a wrench" if name.endswith("dynamics") else name}
+            for dyn in engines:
+                method = getattr(dyn, name)
+                method(*given)
+                row[f"{dyn.engine}_us"], row["bare_us"], _ = pair(lambda f=method, x=given: f(*x), bare, 7, 30)
+            rows.append(row)
+            print(f"{label:20} {row['call']:28}", *(f"{k} {x:8.2f}" for k, x in row.items() if k.endswith("_us")))
+    return rows
+
+
 def step_row(label, model, q, v, tau):
     """Return the row of a step of 1 ms: of the own derivation, of mj_step, and of a run of one step, µs."""
     dyn, mj = mb.dynamics(model, "lagrangian"), mb.dynamics(model, "mujoco")
@@ -78,7 +167,12 @@ def step_row(label, model, q, v, tau):
     return {"model": label, "step_us": mine, "mj_step_us": theirs, "ratio": ratio, "simulate_us": run}
 
 
-def main():
+def main(only_bodies=False):
+    path = Path("validation/single_calls.json")
+    if only_bodies:
+        whole = json.loads(path.read_text(encoding="utf-8"))
+        path.write_text(json.dumps(whole | {"bodies": {"rows": body_rows(), **stamp()}}, indent=1), encoding="utf-8")
+        return
     rows, own_rows, steps = [], [], []
     cases = (
         ("ur5", mb.load("ur5")),
@@ -104,9 +198,10 @@ def main():
         steps.append(step_row(label, model, q, v, a))
     imports = import_seconds()
     print(f"import mbkit {imports['mbkit']:.3f} s (numpy alone {imports['numpy']:.3f} s)")
-    with open("validation/single_calls.json", "w", encoding="utf-8") as f:
-        json.dump({"rows": rows, "own": own_rows, "steps": steps, "import_s": imports, **stamp()}, f, indent=1)
+    bodies = {"rows": body_rows(), **stamp()}
+    whole = {"rows": rows, "own": own_rows, "steps": steps, "import_s": imports, "bodies": bodies, **stamp()}
+    path.write_text(json.dumps(whole, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:] == ["bodies"])

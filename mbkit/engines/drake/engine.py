@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.math import RollPitchYaw, RotationMatrix
-from pydrake.multibody.tree import JacobianWrtVariable, MultibodyForces, MultibodyForces_
+from pydrake.multibody.tree import MultibodyForces, MultibodyForces_
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import EventStatus
 
@@ -27,13 +27,13 @@ from mbkit._check import Array
 from mbkit._fork import fork_safe
 from mbkit.engines import regressors
 from mbkit.engines.base import MappedDynamics
+from mbkit.engines.drake.bodies import DrakeBodies
 from mbkit.engines.drake.model import DrakeModel, build
-from mbkit.engines.frames_and_momenta import seen_from
 from mbkit.errors import NumericalError, UnsupportedError
-from mbkit.model import Frame, Model
+from mbkit.model import Model
 
 
-class DrakeDynamics(MappedDynamics):
+class DrakeDynamics(DrakeBodies, MappedDynamics):
     """Drake on a description.
 
     Attributes
@@ -146,10 +146,12 @@ class DrakeDynamics(MappedDynamics):
         plant.CalcForceElementsContribution(context, forces)
         return self._force(plant.CalcGeneralizedForces(context, forces))
 
-    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array, *acting: Any) -> Array:
         b = self._set(q, v)
         forces = MultibodyForces(self.plant)
         self.plant.CalcForceElementsContribution(self._context, forces)
+        if acting:
+            forces = self._add_external(forces, *acting)
         return self._force(self.plant.CalcInverseDynamics(self._context, self._to_engine(a) + b, forces))
 
     def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
@@ -216,21 +218,6 @@ class DrakeDynamics(MappedDynamics):
         plant, context = self._without_bushings
         self.put(plant, context, x, u)
         return total + plant.CalcPotentialEnergy(context)
-
-    def _placement(self, q: Array, frame: Frame) -> tuple[Array, Array]:
-        self._set(q)
-        X_WB = self.plant.EvalBodyPoseInWorld(self._context, self.maps.bodies[frame.body])
-        return X_WB.rotation().matrix() @ frame.rotation, X_WB.multiply(np.array(frame.translation))
-
-    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
-        out, world = [], self.plant.world_frame()
-        for frame in frames:
-            R, p = self._placement(q, frame)
-            body = self.maps.bodies[frame.body].body_frame()
-            arguments = self._context, JacobianWrtVariable.kV, body, np.array(frame.translation), world, world
-            angular, linear = np.split(self.plant.CalcJacobianSpatialVelocity(*arguments), 2)
-            out.append(self._columns(seen_from(R, p, linear, angular, axes)))
-        return np.array(out)
 
 
 # Drake's own integrators on the plant that was built.

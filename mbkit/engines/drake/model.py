@@ -38,6 +38,8 @@ class DrakeModel:
     #: Ball and free joints, with their starts in Drake's positions and velocities.
     turning: tuple[tuple[Joint, int, int], ...]
     bodies: dict[str, Any]
+    #: The joint of the plant that has the child, the last one of a stack.
+    joints: dict[str, Any]
     #: Stiffness, body, point, body and point of the springs that are bushings, of which Drake has no energy.
     bushings: tuple[tuple[float, Any, Array, Any, Array], ...]
 
@@ -201,4 +203,5 @@ def mapped(
             q, v, nq, nv = one.position_start(), one.velocity_start(), one.num_positions(), one.num_velocities()
             q_index[q : q + nq], order_q = first_q + np.array(order_q[:nq]), order_q[nq:]
             v_index[v : v + nv], order_v = first_v + np.array(order_v[:nv]), order_v[nv:]
-    return DrakeModel(plant, q_index, v_index, tuple(turning), bodies, bushings)
+    last = {name: own[-1] for name, own in added.items()}
+    return DrakeModel(plant, q_index, v_index, tuple(turning), bodies, last, bushings)
