@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.model import Frame, Model
+from mbkit.spatial import skew
 
 LOCAL: Final = "local"
 WORLD: Final = "world"
@@ -49,7 +50,7 @@ def seen_from(R: Array, p: Array, linear: Array, angular: Array, axes: str) -> A
     if axes == LOCAL:
         linear, angular = R.T @ linear, R.T @ angular
     elif axes == WORLD:
-        linear = linear + np.cross(p, angular, axisb=0, axisc=0)
+        linear = linear + skew(p) @ angular
     return np.concatenate([linear, angular])
 
 
@@ -60,10 +61,10 @@ def accelerated(R: Array, p: Array, velocity: Array, classical: Array, axes: str
     ones.
     """
     v, w = velocity[:3], velocity[3:]
-    spatial = seen_from(R, p, classical[:3] - np.cross(w, v), classical[3:], axes)
+    spatial = seen_from(R, p, classical[:3] - skew(w) @ v, classical[3:], axes)
     if kind == CLASSICAL:
         seen = seen_from(R, p, v, w, axes)
-        spatial[:3] += np.cross(seen[3:], seen[:3])
+        spatial[:3] += skew(seen[3:]) @ seen[:3]
     return spatial
 
 

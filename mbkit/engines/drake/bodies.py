@@ -21,6 +21,7 @@ from mbkit.engines.drake.model import DrakeModel, build
 from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, SPATIAL, WORLD, accelerated, seen_from
 from mbkit.model import Frame, Model
 from mbkit.model.validation import static_bodies
+from mbkit.spatial import skew
 
 _BY_V = JacobianWrtVariable.kV
 
@@ -175,7 +176,7 @@ class DrakeBodies:
         for joint in roots:
             X_WC = plant.EvalBodyPoseInWorld(context, joint.child_body())
             load, R = _on_child(joint, reactions), X_WC.rotation().matrix()
-            out += np.concatenate([R @ load[:3], R @ load[3:] + np.cross(X_WC.translation() - center, R @ load[:3])])
+            out += np.concatenate([R @ load[:3], R @ load[3:] + skew(X_WC.translation() - center) @ R @ load[:3]])
         return out
 
     def _locked_inertia(self, q: Array) -> Array:

@@ -19,6 +19,7 @@ from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, SPATIAL,
 from mbkit.engines.mujoco.model import MujocoModel
 from mbkit.errors import UnsupportedError
 from mbkit.model import Frame, Joint, Model
+from mbkit.spatial import skew
 
 #: The frame of a body, not that of its inertia.
 _BODY_FRAME = mujoco.mjtObj.mjOBJ_XBODY
@@ -109,7 +110,7 @@ class MujocoBodies:
         """Return velocities, (6,), of a body's point in world axes, linear first."""
         six = np.zeros(6)
         mujoco.mj_objectVelocity(self._m, self._d, _BODY_FRAME, body, six, 0)
-        return np.concatenate([six[3:] + np.cross(six[:3], p - self._d.xpos[body]), six[:3]])
+        return np.concatenate([six[3:] + skew(six[:3]) @ (p - self._d.xpos[body]), six[:3]])
 
     def _velocity(self, q: Array, v: Array, frames: tuple[Frame, ...], axes: str) -> Array:
         self._place(q, v)
@@ -127,10 +128,10 @@ class MujocoBodies:
         for frame in frames:
             R, p, body = self._placed(frame)
             twist, arm = self._twist(p, body), p - self._d.xpos[body]
-            w = twist[3:]
+            turning = skew(twist[3:])
             # Of the point at the body's origin: MuJoCo adds ω × v to the spatial one.
             mujoco.mj_objectAcceleration(self._m, self._d, _BODY_FRAME, body, six, 0)
-            classical = np.concatenate([six[3:] + np.cross(six[:3], arm) + np.cross(w, np.cross(w, arm)), six[:3]])
+            classical = np.concatenate([six[3:] + (skew(six[:3]) + turning @ turning) @ arm, six[:3]])
             out.append(accelerated(R, p, twist, classical, axes, kind))
         return np.array(out)
 
@@ -191,7 +192,7 @@ class MujocoBodies:
         d = self._d
         moment, force = d.cfrc_int[body, :3], d.cfrc_int[body, 3:]
         arm = d.subtree_com[self._m.body_rootid[body]] - d.subtree_com[0]
-        return np.concatenate([force, moment + np.cross(arm, force)])
+        return np.concatenate([force, moment + skew(arm) @ force])
 
     def _locked_inertia(self, q: Array) -> Array:
         self._place(q)
@@ -241,7 +242,7 @@ class MujocoBodies:
         applied = self._d.xfrc_applied
         for force, moment, point, body in self._external(wrenches, frames, axes):
             applied[body, :3] += force
-            applied[body, 3:] += moment + np.cross(point - self._d.xipos[body], force)
+            applied[body, 3:] += moment + skew(point - self._d.xipos[body]) @ force
         try:
             yield
         finally:
@@ -271,7 +272,7 @@ class MujocoBodies:
         def load(joint: Joint) -> Array:
             body, held = self._maps.bodies[joint.child], carried[joint.child]
             R, arm = self._d.xmat[body].reshape(3, 3), self._d.subtree_com[0] - self._d.xpos[body]
-            return np.concatenate([R.T @ held[:3], R.T @ (held[3:] + np.cross(arm, held[:3]))])
+            return np.concatenate([R.T @ held[:3], R.T @ (held[3:] + skew(arm) @ held[:3])])
 
         return self._directed(np.array([load(joint) for joint in joints]).reshape(-1, 6))
 

@@ -98,7 +98,7 @@ class PinocchioBodies:
             if axes == ALIGNED:
                 R = d.oMi[carrier].rotation @ X_JF.rotation
                 at = pin.getFrameVelocity(m, d, carrier, X_JF, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-                own = pin.Motion(R @ own.linear + np.cross(at.angular, at.linear), R @ own.angular)
+                own = pin.Motion(R @ own.linear + pin.skew(at.angular) @ at.linear, R @ own.angular)
             out.append(own.vector)
         return np.array(out)
 
@@ -143,7 +143,7 @@ class PinocchioBodies:
         center = self._d.com[0]
         out = np.array(h)
         # Neither centre has a velocity across the momentum, so that rates have no further part.
-        out[3:] += np.cross(center - self._of_all(center, self._pin.ground_moment), h[:3], axisb=0, axisc=0)
+        out[3:] += pin.skew(center - self._of_all(center, self._pin.ground_moment)) @ h[:3]
         return out
 
     def _center_of_mass(self, q: Array) -> Array:

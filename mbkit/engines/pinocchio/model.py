@@ -155,7 +155,7 @@ class PointSprings:
         for (spring, *ends), (_, pull) in zip(self._ends, self._pulls(m, d, q, v), strict=True):
             for sign, body, (joint, point) in zip((1, -1), (spring.body_a, spring.body_b), ends, strict=True):
                 force = sign * d.oMi[joint].rotation.T @ pull
-                out.append((body, pin.Force(force, np.cross(point, force))))
+                out.append((body, pin.Force(force, pin.skew(point) @ force)))
         return out
 
     def _pulls(self, m: Any, d: Any, q: Array, v: Array) -> Iterator[tuple[Array, Array]]:
