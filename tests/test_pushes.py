@@ -31,6 +31,14 @@ def brick(gravity: Any = (0, 0, 0)) -> Model:
     return b.build()
 
 
+def damped() -> Model:
+    b = mb.ModelBuilder("damped")
+    b.add_body("rod", mass=2.0, com=(0.5, 0, 0))
+    b.add_joint("hinge", "revolute", parent="world", child="rod", axis=(0, 1, 0), damping=0.3)
+    b.add_frame("tip", body="rod", translation=(1.0, 0, 0))
+    return b.build()
+
+
 def arm() -> Model:
     """A chain without quaternions, whose integrators' velocity is v."""
     return random_tree(3, n=4, kinds=("revolute", "prismatic", "revolute", "universal"))
@@ -118,7 +126,8 @@ def test_engines_agree_on_robots(robot: str, floating: bool, wrenches: Any, axes
     q, v = model.random_state(np.random.default_rng(0))
     given: dict[str, Any] = {"dt": 0.01, "wrenches": wrenches, "wrench_axes": axes, "doubt": False}
     reference = mb.simulate(mb.dynamics(model, "lagrangian", compile=False), q, v, 0.1, **given)
-    for engine in ENGINES[1:]:
+    # The machine code of a step of the larger one takes seconds to compile.
+    for engine in ENGINES[floating:]:
         close(mb.simulate(mb.dynamics(model, engine), q, v, 0.1, **given), reference)
 
 
@@ -290,6 +299,49 @@ def test_a_pushed_run_raises_no_doubts_of_its_energy() -> None:
         )
     assert run.check().passed
     assert run.energy()[-1] > 0.1
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_what_pushes_nothing_does_no_work(engine: str) -> None:
+    model = damped()
+    dyn = mb.dynamics(model, engine)
+    free = mb.simulate(dyn, [1.0], [0.0], 0.1, dt=0.01)
+    for wrenches in ({"tip": np.zeros(6)}, {"world": WRENCH}, {}):
+        run = mb.simulate(dyn, [1.0], [0.0], 0.1, dt=0.01, wrenches=wrenches)
+        np.testing.assert_allclose(run.q, free.q, rtol=0, atol=10 * EPS)
+        np.testing.assert_allclose(run.work(), free.work(), rtol=0, atol=10 * EPS)
+        assert set(run.wrenches()) == set(wrenches)
+
+
+def test_a_batch_of_none_and_a_model_without_velocities() -> None:
+    model = damped()
+    given: dict[str, Any] = {"dt": 0.01, "wrenches": {"tip": np.empty((0, 6))}}
+    run = mb.simulate(mb.dynamics(model), np.empty((0, 1)), np.empty((0, 1)), 0.1, **given)
+    assert run.work().shape == (0, 11)
+    b = mb.ModelBuilder("welded")
+    b.add_body("block", mass=1.0, inertia=(1, 1, 1))
+    b.add_joint("weld", "fixed", parent="world", child="block")
+    for engine in ENGINES:
+        run = mb.simulate(mb.dynamics(b.build(), engine), [], [], 0.02, dt=0.01, wrenches={"block": WRENCH})
+        assert not run.work().any()
+
+
+def test_functions_stand_beside_samples() -> None:
+    model = arm()
+    q, v = model.random_state(np.random.default_rng(0))
+    rows = np.random.default_rng(1).standard_normal((5, 6))
+
+    def torque(_t: float, _q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return -v
+
+    runs = [
+        mb.simulate(mb.dynamics(model, engine), q, v, 0.05, dt=0.01, torque=torque, wrenches={tip(model): rows})
+        for engine in ENGINES
+    ]
+    for run in runs:
+        close(run, runs[0])
+        np.testing.assert_array_equal(run.wrenches()[tip(model)], rows[[0, 1, 2, 3, 4, 4]])
+        np.testing.assert_array_equal(run.tau(), -run.v)
 
 
 # Bad input

@@ -126,9 +126,14 @@ class RunData:
         whole = self._force()
         return {frame.name: whole[..., nv + 6 * k : nv + 6 * k + 6] for k, frame in enumerate(frames)}
 
+    @property
+    def _numbers(self) -> int:
+        """How many numbers τ and wrenches are."""
+        return int(self.v.shape[-1]) + (6 * len(self._acting[0]) if self._acting else 0)
+
     def _force(self) -> Array:
         """Return τ and wrenches at each state."""
-        acted, size = self._acted(), self.v.shape[-1] + (6 * len(self._acting[0]) if self._acting else 0)
+        acted, size = self._acted(), self._numbers
         if isinstance(acted, SampledTorque):
             return acted.values.copy()
         rows = np.broadcast_to(np.zeros(size) if acted is None else acted.at(self.t), (*self.v.shape[:-1], size))
@@ -147,7 +152,7 @@ class RunData:
             whole = _generalized(dyn, q, force.values, self._acting)
             steps = _by_cubics(t, np.sum((whole + _damping(dyn, q, v)) * v, axis=-1))
         else:
-            held = np.zeros(v.shape[-1]) if force is None else force.between(t)
+            held = np.zeros(self._numbers) if force is None else force.between(t)
             steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
         out = np.zeros(q.shape[:-1])
         np.cumsum(steps, axis=-1, out=out[..., 1:])
@@ -215,7 +220,7 @@ class RunData:
 def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array], *states: Array) -> Array:
     """Return evaluate(dyn, q, v, ...), of a shape, at states (K, ·) or (N, K, ·); NaN where one is not finite."""
     lead = states[0].shape[:-1]
-    flat = [x.reshape(-1, x.shape[-1]) for x in states]
+    flat = [x.reshape(int(np.prod(lead)), x.shape[-1]) for x in states]
     good = np.flatnonzero(np.logical_and.reduce([np.isfinite(x).all(-1) for x in flat]))
     out = np.full((int(np.prod(lead)), *shape), np.nan)
     for start in range(0, len(good), _MANY):

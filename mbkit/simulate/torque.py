@@ -170,7 +170,7 @@ class Torque:
         self._of_all = self._constant
         if batch is not None:
             each = whole[:, 0] if constant and whole.ndim == 3 else self._constant
-            self._of_all = np.broadcast_to(each, (batch, self._size))
+            self._of_all = np.ascontiguousarray(np.broadcast_to(each, (batch, self._size)))
         self._functions = tuple(functions)
         self._with_functions = ForceFunctions(PiecewiseConstantTorque(self._constant, None), self._functions)
 
