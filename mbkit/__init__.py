@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from mbkit import testing as testing
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
+    from mbkit.engines.operational_space import OperationalSpace as OperationalSpace
+    from mbkit.engines.operational_space import operational_space as operational_space
     from mbkit.errors import MbkitError as MbkitError
     from mbkit.identify import excitation as excitation
     from mbkit.identify import identify as identify
@@ -58,6 +60,7 @@ _HOME = {
     "Mimic": "mbkit.model",
     "Model": "mbkit.model",
     "ModelBuilder": "mbkit.model",
+    "OperationalSpace": "mbkit.engines.operational_space",
     "Parameter": "mbkit.model",
     "Trajectory": "mbkit.simulate",
     "compare": "mbkit.studies",
@@ -69,6 +72,7 @@ _HOME = {
     "explain": "mbkit.studies.explain",
     "identify": "mbkit.identify",
     "load": "mbkit.load",
+    "operational_space": "mbkit.engines.operational_space",
     "robots": "mbkit.load",
     "sensitivities": "mbkit.simulate",
     "stress": "mbkit.studies",

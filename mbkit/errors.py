@@ -173,6 +173,10 @@ class NoCompilerWarning(MbkitWarning):
     """There is no compiler: functions are interpreted, slower and with the same results."""
 
 
+class SingularPoseWarning(MbkitWarning):
+    """A task is near a singular pose, and its inverse is damped there."""
+
+
 class NonPhysicalWarning(MbkitWarning):
     """A body with an inconsistent inertia, used as it was written."""
 
