@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from functools import cached_property
+from inspect import signature
 from typing import Any, ClassVar, Final
 
 import casadi as ca
@@ -186,9 +187,11 @@ class OracleDynamics(Dynamics):
         names = _ARGUMENTS.get(quantity)
         if names is None:
             raise UnknownNameError("quantity", str(quantity), _ARGUMENTS)
-        if len(arguments) < len(names) or (len(arguments) > len(names) and quantity not in BODY_QUANTITIES):
+        stacked = quantity.endswith("derivatives")
+        most = len(names) if stacked else len(signature(getattr(self, quantity)).parameters)
+        if not len(names) <= len(arguments) <= most:
             raise InputError(f"{quantity}: expected {', '.join(names)}, got {len(arguments)} arguments")
-        if quantity.endswith("derivatives"):
+        if stacked:
             out = self._evaluate(quantity, **dict(zip(names, arguments, strict=True)))
         else:
             out = np.asarray(getattr(self, quantity)(*arguments))

@@ -22,6 +22,7 @@ from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.beyond_terms import omissions, rollouts
+from mbkit.studies.compare.body_terms import BODY_TERMS, BodyScales
 from mbkit.studies.compare.errors import Errors, Scales, interleaved
 from mbkit.studies.compare.result import Comparison, Row
 from mbkit.studies.compare.terms import TERMS, States, Term, power_errors, states
@@ -60,16 +61,20 @@ class Judge:
                 acting = acting + np.abs(quantity(at.q, at.v))
         gravity = float(np.linalg.norm(model.gravity))
         heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
-        self.scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
+        self.scales: Scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
+        self.terms: tuple[Term, ...] = TERMS
+        if model.has_bodies and not model.constrained:
+            self.terms += BODY_TERMS
+            self.scales = BodyScales.around(self.scales, oracle, at)
         self.joint_of = [j.name for j in model.independent_joints for _ in range(j.type.nv)]
 
     def rows(self, tell: Progress) -> tuple[list[Row], list[Refusal]]:
         """Return a row per term and engine."""
         rows: list[Row] = []
-        for k, term in enumerate(TERMS):
-            tell(k / (len(TERMS) + 1), term.name)
+        for k, term in enumerate(self.terms):
+            tell(k / (len(self.terms) + 1), term.name)
             rows += self._term(term)
-        tell(len(TERMS) / (len(TERMS) + 1), "power balance")
+        tell(len(self.terms) / (len(self.terms) + 1), "power balance")
 
         for name, dyn in self.engines.items():
             try:

@@ -82,25 +82,33 @@ def _near_singular(model: Model, rng: np.random.Generator, n: int) -> Array:
 
 @dataclass(frozen=True)
 class Term:
-    """One compared quantity: a method of `Dynamics`, and the fields of `States` that it takes."""
+    """One compared quantity: a method of `Dynamics`, and the fields of `States` that it takes.
+
+    `more` returns the arguments behind those, such as a frame of the model.
+    """
 
     name: str
     quantity: str
     arguments: tuple[str, ...]
-    errors: Callable[[Array, Array, Scales], Errors]
+    errors: Callable[[Array, Array, Any], Errors]
+    more: Callable[[Model], tuple[Any, ...]] = lambda _: ()
 
     def call(self, dyn: Dynamics, states: States) -> Array:
         """Return the values at all states."""
-        return np.asarray(getattr(dyn, self.quantity)(*(getattr(states, a) for a in self.arguments)))
+        return np.asarray(getattr(dyn, self.quantity)(*self._given(dyn, states)))
 
     def reference(self, oracle: OracleDynamics, states: States) -> tuple[Array, Array]:
         """Return the oracle's values at all states, high and low part."""
-        return oracle.extended(self.quantity, *(getattr(states, a) for a in self.arguments))
+        return oracle.extended(self.quantity, *self._given(oracle, states))
+
+    def _given(self, dyn: Dynamics, states: States) -> list[Any]:
+        return [*(getattr(states, a) for a in self.arguments), *self.more(dyn.model)]
 
     def single(self, dyn: Dynamics, states: States) -> Callable[[], Any]:
         """Return a call at one random state, for timing."""
         method = getattr(dyn, self.quantity)
         arguments = [np.ascontiguousarray(getattr(states, a)[0]) for a in self.arguments]
+        arguments += self.more(dyn.model)
         return lambda: method(*arguments)
 
 

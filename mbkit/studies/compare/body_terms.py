@@ -1,0 +1,203 @@
+"""The terms of bodies and of the whole that are compared: motion of a frame, momentum, loads.
+
+The frame is the body at the end of the longest branch. Linear and angular parts have scales of their own, in which no
+number that happens to be small counts: what the velocities can do to a point, or to the bodies. With the columns J_j of
+the frame's Jacobian, W = Σ |J_ω,j v_j| and U = Σ |J_v,j v_j| bound its velocity, and W U, W² the acceleration that
+comes from velocities. Forces are measured by all matter moving as the frame does, or by the largest that there is, and
+moments by these with the longest branch for an arm. A_G's column j is at most
+√(m M_jj) and √(tr I_G M_jj) (Cauchy and Schwarz).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines.oracle import OracleDynamics
+from mbkit.model import Model
+from mbkit.studies.compare.errors import Errors, Scales, acceleration_errors, ratio
+from mbkit.studies.compare.terms import States, Term
+
+#: N and Nm on the frame, in its own axes.
+WRENCH: Final = (3.0, -2.0, 5.0, 0.4, 0.7, -0.3)
+
+
+@dataclass(frozen=True)
+class BodyScales(Scales):
+    """What errors of bodies are measured against, per sample."""
+
+    columns: Array = None  # type: ignore[assignment]  # (N, 2, nv), norms of J's linear and angular columns
+    velocity: Array = None  # type: ignore[assignment]  # (N, 2), U and W of the frame
+    acceleration: Array = None  # type: ignore[assignment]  # (N, 2), of the frame
+    reach: Array = None  # type: ignore[assignment]  # (N,), length of the longest branch
+    curved: Array = None  # type: ignore[assignment]  # (N,), force on all matter where velocities bend the frame's way
+    force: Array = None  # type: ignore[assignment]  # (N,), and where it is accelerated, with its weight
+    mass: float = 0.0
+    spread: Array = None  # type: ignore[assignment]  # (N,), tr I_G
+
+    @classmethod
+    def around(cls, scales: Scales, oracle: OracleDynamics, at: States) -> BodyScales:
+        """Return the scales of a model's bodies beside those of its equation of motion."""
+        model, frame = oracle.model, farthest(oracle.model)
+        J = oracle.jacobian(at.q, frame)
+        columns = np.stack([np.linalg.norm(J[:, :3], axis=1), np.linalg.norm(J[:, 3:], axis=1)], axis=1)
+        reach = _reach(oracle, at.q)
+        speed, push = (np.einsum("nij,nj->ni", columns, np.abs(x)) for x in (at.v, at.a))
+        curved = speed * speed[:, 1:]
+        I = oracle.locked_inertia(at.q)
+        return cls(
+            **vars(scales),
+            columns=columns,
+            velocity=speed,
+            acceleration=push + curved,
+            reach=reach,
+            curved=model.mass * curved[:, 0],
+            force=model.mass * (push + curved)[:, 0] + model.mass * np.linalg.norm(model.gravity),
+            mass=model.mass,
+            spread=np.einsum("nii->n", I[:, 3:, 3:]),
+        )
+
+
+def farthest(model: Model) -> str:
+    """Return the body at the end of the longest branch, counted in joints."""
+    depth = {"world": 0}
+    for joint in model.tree:
+        depth[joint.child] = depth[joint.parent] + 1
+    return max(depth, key=depth.__getitem__)
+
+
+def _reach(oracle: OracleDynamics, q: Array) -> Array:
+    """Return the longest way from the world to a body along its branch, at each pose."""
+    model = oracle.model
+    X = oracle.body_poses(q)
+    places = {"world": np.zeros((len(q), 3))} | {b.name: X[:, k, :3, 3] for k, b in enumerate(model.bodies)}
+    ways = {"world": np.zeros(len(q))}
+    for joint in model.tree:
+        step = np.linalg.norm(places[joint.child] - places[joint.parent], axis=1)
+        ways[joint.child] = ways[joint.parent] + step
+    com = {b.name: float(np.linalg.norm(b.com)) for b in model.bodies}
+    return np.asarray(np.max([way + com.get(name, 0.0) for name, way in ways.items()], axis=0))
+
+
+def _halves(error: Array, linear: Array, angular: Array) -> Errors:
+    """Measure (N, 6) or (N, k, 6), of which every six have linear and angular part."""
+    e = np.abs(error).reshape(len(error), -1, 2, 3)
+    size = np.linalg.norm(e, axis=3)
+    relative = ratio(size, np.stack([linear, angular], axis=1)[:, None, :])
+    return Errors(e.max(axis=(1, 2, 3), initial=0.0), relative.max(axis=(1, 2), initial=0.0), np.empty(0))
+
+
+def _pose_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001  # as the others
+    turned = np.abs(error[:, :3, :3]).max(axis=(1, 2))
+    moved = np.linalg.norm(error[:, :3, 3], axis=1)
+    relative = np.maximum(turned, ratio(moved, scales.reach))
+    return Errors(np.abs(error).max(axis=(1, 2)), relative, np.empty(0))
+
+
+def _jacobian_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001  # as the others
+    e = np.stack([np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)], axis=1)
+    each = ratio(e, scales.columns.max(axis=2, initial=0.0)[:, :, None])
+    return Errors(
+        np.abs(error).max(axis=(1, 2), initial=0.0), each.max(axis=(1, 2), initial=0.0), each.max(axis=(0, 1))
+    )
+
+
+def _velocity_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001  # as the others
+    return _halves(error, *scales.velocity.T)
+
+
+def _acceleration_of_frame_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001
+    return _halves(error, *scales.acceleration.T)
+
+
+def _center_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
+    e = np.linalg.norm(error, axis=1)
+    relative = ratio(e, np.maximum(scales.reach, np.linalg.norm(reference, axis=1)))
+    return Errors(np.abs(error).max(axis=1), relative, np.empty(0))
+
+
+def _momentum_matrix_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001
+    root = np.sqrt(np.abs(scales.diagonal))
+    linear = ratio(np.linalg.norm(error[:, :3], axis=1), np.sqrt(scales.mass) * root)
+    angular = ratio(np.linalg.norm(error[:, 3:], axis=1), np.sqrt(scales.spread)[:, None] * root)
+    each = np.maximum(linear, angular)
+    return Errors(np.abs(error).max(axis=(1, 2), initial=0.0), each.max(axis=1, initial=0.0), each.max(axis=0))
+
+
+def _load_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
+    return _forces(error, reference, scales.force, scales.reach)
+
+
+def _momentum_rate_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
+    return _forces(error[:, None], reference[:, None], scales.curved, scales.reach)
+
+
+def _forces(error: Array, reference: Array, force: Array, arm: Array) -> Errors:
+    force = np.maximum(force, np.abs(reference[..., :3]).max(axis=(1, 2), initial=0.0))
+    return _halves(error, force, np.maximum(force * arm, np.abs(reference[..., 3:]).max(axis=(1, 2), initial=0.0)))
+
+
+def _locked_inertia_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001
+    linear = np.abs(error[:, :3]).max(axis=(1, 2)) / (scales.mass or 1.0)
+    angular = ratio(np.abs(error[:, 3:, 3:]).max(axis=(1, 2)), scales.spread)
+    return Errors(np.abs(error).max(axis=(1, 2)), np.maximum(linear, angular), np.empty(0))
+
+
+def _inverse_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001  # as the others
+    """Measure M⁻¹ scaled as M is, by its norm, per cond(M)."""
+    root = np.sqrt(np.abs(scales.diagonal))
+    e = np.abs(error) * root[:, :, None] * root[:, None, :]
+    # The norm of the scaled inverse is its condition over the norm of what it is the inverse of.
+    each = ratio(e, (scales.condition**2 / scales.size)[:, None, None])
+    return Errors(
+        np.abs(error).max(axis=(1, 2), initial=0.0), each.max(axis=(1, 2), initial=0.0), each.max(axis=(0, 1))
+    )
+
+
+def _pushed_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001  # as the others
+    """Measure Jᵀ w by what the columns let it be."""
+    most = np.tensordot(np.linalg.norm(np.reshape(WRENCH, (2, 3)), axis=1), scales.columns, (0, 1))
+    e = np.abs(error)
+    relative = ratio(np.linalg.norm(e, axis=1), np.linalg.norm(most, axis=1))
+    return Errors(e.max(axis=1, initial=0.0), relative, ratio(e, most).max(axis=0))
+
+
+def _frame(model: Model) -> tuple[Any, ...]:
+    return (farthest(model),)
+
+
+def _wrench(model: Model) -> tuple[Any, ...]:
+    return ({farthest(model): WRENCH},)
+
+
+def _nothing(model: Model) -> tuple[Any, ...]:  # noqa: ARG001  # as the others
+    return ()
+
+
+_Measure = Callable[[Array, Array, Any], Errors]
+
+
+def _term(name: str, quantity: str, arguments: str, errors: _Measure, more: Callable[[Model], Any] = _nothing) -> Term:
+    return Term(name, quantity, tuple(arguments.split()), errors, more)
+
+
+#: Compared after the terms of the equation of motion, where there are bodies.
+BODY_TERMS: Final = (
+    _term("pose", "pose", "q", _pose_errors, _frame),
+    _term("Jacobian", "jacobian", "q", _jacobian_errors, _frame),
+    _term("velocity", "velocity", "q v", _velocity_errors, _frame),
+    _term("acceleration", "acceleration", "q v a", _acceleration_of_frame_errors, _frame),
+    _term("J̇ v", "jacobian_dot_v", "q v", _acceleration_of_frame_errors, _frame),
+    _term("centre of mass", "center_of_mass", "q", _center_errors),
+    _term("A_G", "centroidal_momentum_matrix", "q", _momentum_matrix_errors),
+    _term("Ȧ_G v", "centroidal_momentum_bias", "q v", _momentum_rate_errors),
+    _term("locked inertia", "locked_inertia", "q", _locked_inertia_errors),
+    _term("M⁻¹", "mass_matrix_inverse", "q", _inverse_errors),
+    _term("joint loads", "joint_wrenches", "q v a", _load_errors),
+    _term("Jᵀ wrench", "generalized_force", "q", _pushed_errors, _wrench),
+    _term("forward dynamics, wrench", "forward_dynamics", "q v tau", acceleration_errors, _wrench),
+)
