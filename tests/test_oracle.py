@@ -108,6 +108,27 @@ def test_newton_and_euler_agree_on_robots(robot, floating):
         assert off(ours, theirs) < 1e-30, term
 
 
+@pytest.mark.parametrize("mimic", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_newton_and_euler_witness_bodies_and_loads(seed, mimic):
+    model = random_tree(seed, 11, mimic=mimic)
+    reading = newton_euler.Reading(plain(model))
+    oracle = OracleDynamics(model, as_read(model, reading))
+    q, v, a, _ = (x[0] for x in states(model, 1, seed))
+    names = [b.name for b in model.bodies]
+    pushed = {names[0]: [1.0, 2.0, -3.0, 0.5, 0.25, 1.0], names[-1]: [-2.0, 0.5, 1.0, 0.0, -1.0, 0.75]}
+    found = newton_euler.bodies(reading, q, v, a, pushed)
+    carried = {joint.child: joint.name for joint in model.joints}
+    ours = {
+        "twist": oracle.digits("velocity", q, v, names, "local"),
+        "acceleration": oracle.digits("acceleration", q, v, a, names, "local", "spatial"),
+        "load": oracle.digits("joint_wrenches", q, v, a, pushed, "local", [carried[n] for n in names]),
+    }
+    for k, (what, values) in enumerate(ours.items()):
+        theirs = np.array([list(found[name][2 + k]) for name in names])
+        assert off(values, theirs) < 1e-30, what
+
+
 def test_newton_and_euler_see_an_eps():
     """Rotations that miss orthogonality by an eps, as doubles do, are 14 decades above the tolerance."""
     model = random_tree(0, 6, ("revolute",))

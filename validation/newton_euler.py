@@ -198,9 +198,56 @@ def inverse_dynamics(
 ) -> Any:
     """M a + C v + g - τ_passive, or some of it: `inertial` is M a + C v."""
     links, n = reading.links, reading.description["nv"]
+    transforms, _, _, forces, poses = _balance(reading, q, v, a, gravity=gravity, inertial=inertial)
+    if passive:
+        _pull(reading, q, v, poses, forces)
+    tau = mp.zeros(n, 1)
+    for k in reversed(range(len(links))):
+        link = links[k]
+        if link.sources:
+            push = link.subspace.T * forces[k]
+            for i, (entry, ratio) in enumerate(link.sources):
+                own = link.armature[i] * ratio * mp.mpf(a[entry]) if inertial else mp.mpf(0)
+                if passive:
+                    own += link.damping[i] * ratio * mp.mpf(v[entry])
+                    if link.stiffness[i]:
+                        where, scale, offset = link.coordinates[i]
+                        own += link.stiffness[i] * (scale * mp.mpf(q[where]) + offset - link.rest[i])
+                tau[entry] += ratio * (push[i] + own)
+        if link.parent >= 0:
+            forces[link.parent] += transforms[k].T * forces[k]
+    return tau
+
+
+def bodies(reading: Reading, q: Any, v: Any, a: Any, wrenches: Any = None) -> dict[str, Any]:
+    """Motion and load of each body: R and p in the world, and six-vectors (linear, angular) in its axes at its origin.
+
+    They are twist, spatial acceleration, and the load of the joint that carries it (force, moment). `wrenches` act on
+    bodies, in their axes at their origins.
+    """
+    transforms, velocities, _, forces, poses = _balance(reading, q, v, a)
+    _, _, moved, _, _ = _balance(reading, q, v, a, gravity=False)
+    _pull(reading, q, v, poses, forces)
+    for body, wrench in (wrenches or {}).items():
+        forces[reading.of_body[body]] -= stacked(vector(wrench[3:]), vector(wrench[:3]))
+    for k in reversed(range(len(forces))):
+        if reading.links[k].parent >= 0:
+            forces[reading.links[k].parent] += transforms[k].T * forces[k]
+    out = {}
+    for body, k in reading.of_body.items():
+        if k >= 0:
+            turned = [stacked(x[3:], x[:3]) for x in (velocities[k], moved[k], forces[k])]
+            out[body] = (*poses[k], *turned)
+    return out
+
+
+def _balance(
+    reading: Reading, q: Any, v: Any, a: Any, *, gravity: bool = True, inertial: bool = True
+) -> tuple[list[Any], list[Any], list[Any], list[Any], list[Any]]:
+    """Transforms, velocities, accelerations, the force that each link needs, and poses."""
     transforms, velocities, accelerations, forces, poses = [], [], [], [], []
     base = stacked(mp.zeros(3, 1), -reading.gravity if gravity else mp.zeros(3, 1))
-    for link in links:
+    for link in reading.links:
         R, p = reading.placement(link, q)
         X = motion_transform(R, p)
         rates = mp.matrix([ratio * mp.mpf(v[i]) for i, ratio in link.sources] or [0])
@@ -220,24 +267,7 @@ def inverse_dynamics(
         velocities.append(velocity)
         accelerations.append(acceleration)
         forces.append(link.inertia * acceleration - cross_motion(velocity).T * momentum)
-    if passive:
-        _pull(reading, q, v, poses, forces)
-    tau = mp.zeros(n, 1)
-    for k in reversed(range(len(links))):
-        link = links[k]
-        if link.sources:
-            push = link.subspace.T * forces[k]
-            for i, (entry, ratio) in enumerate(link.sources):
-                own = link.armature[i] * ratio * mp.mpf(a[entry]) if inertial else mp.mpf(0)
-                if passive:
-                    own += link.damping[i] * ratio * mp.mpf(v[entry])
-                    if link.stiffness[i]:
-                        where, scale, offset = link.coordinates[i]
-                        own += link.stiffness[i] * (scale * mp.mpf(q[where]) + offset - link.rest[i])
-                tau[entry] += ratio * (push[i] + own)
-        if link.parent >= 0:
-            forces[link.parent] += transforms[k].T * forces[k]
-    return tau
+    return transforms, velocities, accelerations, forces, poses
 
 
 def _pull(reading: Reading, q: Any, v: Any, poses: Any, forces: Any) -> None:
