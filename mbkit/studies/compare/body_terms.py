@@ -4,8 +4,8 @@ The frame is the body at the end of the longest branch. Linear and angular parts
 number that happens to be small counts: what the velocities can do to a point, or to the bodies. With the columns J_j of
 the frame's Jacobian, W = Σ |J_ω,j v_j| and U = Σ |J_v,j v_j| bound its velocity, and W U, W² the acceleration that
 comes from velocities. Forces are measured by all matter moving as the frame does, or by the largest that there is, and
-moments by these with the longest branch for an arm. A_G's column j is at most
-√(m M_jj) and √(tr I_G M_jj) (Cauchy and Schwarz).
+moments by these with the longest branch for an arm. A_G's column j is at most √(m M_jj) and √(tr I M_jj) (Cauchy and
+Schwarz), with the inertia about the world's origin.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class BodyScales(Scales):
     curved: Array = None  # type: ignore[assignment]  # (N,), force on all matter where velocities bend the frame's way
     force: Array = None  # type: ignore[assignment]  # (N,), and where it is accelerated, with its weight
     mass: float = 0.0
-    spread: Array = None  # type: ignore[assignment]  # (N,), tr I_G
+    spread: Array = None  # type: ignore[assignment]  # (N,), trace of the inertia about the world's origin
 
     @classmethod
     def around(cls, scales: Scales, oracle: OracleDynamics, at: States) -> BodyScales:
@@ -48,6 +48,7 @@ class BodyScales(Scales):
         reach = _reach(oracle, at.q)
         speed, push = (np.einsum("nij,nj->ni", columns, np.abs(x)) for x in (at.v, at.a))
         curved = speed * speed[:, 1:]
+        center = oracle.center_of_mass(at.q)
         I = oracle.locked_inertia(at.q)
         return cls(
             **vars(scales),
@@ -58,7 +59,8 @@ class BodyScales(Scales):
             curved=model.mass * curved[:, 0],
             force=model.mass * (push + curved)[:, 0] + model.mass * np.linalg.norm(model.gravity),
             mass=model.mass,
-            spread=np.einsum("nii->n", I[:, 3:, 3:]),
+            # About the world's origin, where the sums begin: about G a point mass has none.
+            spread=np.einsum("nii->n", I[:, 3:, 3:]) + 2 * model.mass * np.sum(center**2, axis=1),
         )
 
 

@@ -134,7 +134,8 @@ class Judge:
     def _allowed(self, term: Term, engine: str, errors: Errors) -> float:
         """Return the tolerance, or the engine's own bound where its formula cannot do better."""
         # Accelerations are M's solution: they cannot be better than M.
-        if term.quantity not in ("mass_matrix", "forward_dynamics") or errors.relative.max() <= self.tolerance:
+        of_mass = term.quantity in ("mass_matrix", "mass_matrix_inverse", "forward_dynamics")
+        if not of_mass or errors.relative.max() <= self.tolerance:
             return self.tolerance
         amplified = self.engines[engine].mass_matrix_rounding(self.at.q[errors.worst])
         return self.tolerance if amplified is None else max(self.tolerance, _ROUNDINGS * _EPS * float(amplified))
