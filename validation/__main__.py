@@ -27,6 +27,7 @@ class Part(NamedTuple):
 #: Those whose result is a time come last; let nothing else run beside them.
 PARTS = {
     "accuracy": Part(20, ("accuracy.json",), "terms against 34 digits: robots, floating robots, random trees"),
+    "bodies": Part(20, ("bodies.json",), "motion, momentum, loads and M⁻¹ against 34 digits"),
     "readme_figure": Part(2, ("check_all.json",), "every robot of example-robot-data in three engines"),
     "published": Part(2, ("published_checks.json",), "published problems, to their printed digits"),
     "identification": Part(

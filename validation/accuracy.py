@@ -63,7 +63,7 @@ def told(error):
     return re.sub(r"(?<![^\s'\"(])/(?:[^\s'\":]+/)*", "", str(error))
 
 
-def measured(make):
+def measured(make, terms=TERMS, engines=ENGINES, samples=64):
     """Return the errors of one system: engine -> term -> figures, and what was refused."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MbkitWarning)
@@ -73,9 +73,9 @@ def measured(make):
             return {"refused": told(error)}
         if not model.nv:
             return {"refused": "nothing moves"}
-        oracle, at = OracleDynamics(model), states(model, 64, 0)
+        oracle, at = OracleDynamics(model), states(model, samples, 0)
         errors, notes = {}, []
-        for engine in ENGINES:
+        for engine in engines:
             try:
                 dyn = mb.dynamics(model, engine)
             except MbkitError as error:
@@ -83,7 +83,7 @@ def measured(make):
                 continue
             judge = Judge(model, {engine: dyn}, oracle, at, tolerance=np.inf)
             errors[engine] = {}
-            for term in TERMS:
+            for term in terms:
                 try:
                     errors[engine][term.name] = figures(judge, term, dyn)
                 except MbkitError as error:
@@ -95,22 +95,22 @@ def figures(judge, term, dyn):
     """Return the errors of one term in eps: the worst state's, the median, the worst joint's."""
     high, low = term.reference(judge.oracle, judge.at)
     e = term.errors((term.call(dyn, judge.at) - high) - low, high, judge.scales)
-    worst, joint = e.worst, int(np.argmax(e.per_velocity))
+    worst, joint = e.worst, int(np.argmax(e.per_velocity)) if e.per_velocity.size else None
     return {
         "eps": round(float(e.relative[worst]) / EPS, 3),
         "median": round(float(np.median(e.relative)) / EPS, 3),
-        "per_joint": round(float(e.per_velocity[joint]) / EPS, 3),
-        "joint": judge.joint_of[joint],
+        "per_joint": 0.0 if joint is None else round(float(e.per_velocity[joint]) / EPS, 3),
+        "joint": "" if joint is None else judge.joint_of[joint],
         "state": judge.at.kinds[worst],
     }
 
 
-def summary(found):
+def summary(found, terms=TERMS, engines=ENGINES):
     """Return a line per group, engine and term: how many, median, worst and where."""
     lines = []
     for group in BARS:
-        for engine in ENGINES:
-            for term in (t.name for t in TERMS):
+        for engine in engines:
+            for term in (t.name for t in terms):
                 at = [
                     (s["errors"][engine][term], name)
                     for name, s in found.items()
