@@ -280,7 +280,7 @@ def test_a_page_loads_nothing_and_holds_the_scene(tmp_path: Path) -> None:
     q, _ = model.random_state(1, 4)
     shown = mb.show(model, q, tmp_path / "a.html")
     page = (tmp_path / "a.html").read_text()
-    assert page == shown.html
+    assert page == shown.html == model.show(q, tmp_path / "b.html").html
     assert not re.search(r"https?://|\bsrc=|\bhref=|@import|url\(", page)
     scene, block = unpacked(page)
     (script,) = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)

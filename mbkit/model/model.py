@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from importlib import import_module
+from os import PathLike
 from typing import Any, Final
 
 import numpy as np
@@ -220,6 +222,19 @@ class Model(Description):
             raise UnsupportedError(f"{what}: {self.name} was written as energies and has no bodies")
 
     # Variants
+
+    def show(
+        self,
+        q: ArrayLike | None = None,
+        path: str | PathLike[str] | None = None,
+        *,
+        shapes: str = "visual",
+        triangles: int = 250_000,
+    ) -> Any:
+        """Show the model at a configuration, as `mbkit.show` does, which has the parameters."""
+        # By name: a description knows nothing that draws it, and loads it for this call alone.
+        view: Any = import_module("mbkit.show.view").show(self, q, path, shapes=shapes, triangles=triangles)
+        return view
 
     def without(self, *features: str) -> Model:
         """Return the same description less some features.
