@@ -25,6 +25,7 @@ ALIGNED: Final = "local_world_aligned"
 AXES: Final = (LOCAL, WORLD, ALIGNED)
 SPATIAL: Final = "spatial"
 CLASSICAL: Final = "classical"
+_OF_TWO_AXES: Final = ("pose", "jacobian")
 #: Quantities of this part of the protocol.
 QUANTITIES: Final = (
     *("pose", "jacobian", "velocity", "acceleration", "jacobian_dot_v"),
@@ -68,6 +69,16 @@ def accelerated(R: Array, p: Array, velocity: Array, classical: Array, axes: str
     return spatial
 
 
+class Parts(tuple[Any, ...]):
+    """Frames or joints, the same object in every call: quicker to look up than their values."""
+
+    __slots__ = ()
+    __hash__ = object.__hash__
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+
 class FramesAndMomenta:
     """Motion of frames, centre of mass and momentum; `Dynamics` inherits it.
 
@@ -77,7 +88,6 @@ class FramesAndMomenta:
     """
 
     model: Model
-    samples: Any
     _evaluate: Callable[..., Array]
     _frames_held: dict[Any, tuple[Frame, ...]]
 
@@ -91,7 +101,7 @@ class FramesAndMomenta:
         if key not in held:
             if not key:
                 raise InputError("frame: expected a name or a list of names, got an empty list")
-            held[key] = tuple(map(self.model.frame, key))
+            held[key] = Parts(map(self.model.frame, key))
         return held[key], single
 
     def _of_frames(self, quantity: str, frame: str | Sequence[str], *more: str, **states: ArrayLike) -> Array:
@@ -99,8 +109,8 @@ class FramesAndMomenta:
         out = self._evaluate(quantity, frames, *more, **states)
         if not single:
             return out
-        batch = any(np.ndim(x) == 2 for x in states.values()) or self.samples is not None
-        return out[:, 0] if batch else out[0]
+        # Of one state the frames come first; a value of a frame has one axis, or two.
+        return out[0] if out.ndim == 2 + (quantity in _OF_TWO_AXES) else out[:, 0]
 
     def pose(self, q: ArrayLike, frame: str | Sequence[str]) -> Array:
         """Return X_WF of a frame or body, shape (4, 4) or (N, 4, 4).

@@ -96,7 +96,7 @@ def _term(name: str) -> Callable[..., Any]:
 
 def _names(value: Any) -> Any:
     """Return the names of frames or joints, and anything else as it is."""
-    return tuple(x.name for x in value) if type(value) is tuple else value
+    return tuple(x.name for x in value) if isinstance(value, tuple) else value
 
 
 def _body_term(name: str) -> Callable[..., Any]:
@@ -295,7 +295,12 @@ class LagrangianDynamics(Dynamics):
         return super()._states(arguments)
 
     def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
-        short = self._short.get((quantity, *map(_names, more)))
+        short = self._short.get((quantity, *more))
+        if short is None and more:
+            # Frames and joints are the same objects in the next call, and quicker to look up than their names.
+            short = self._short.get((quantity, *map(_names, more)))
+            if short is not None:
+                self._short[quantity, *more] = short
         if short is not None:
             own = (*arguments.values(), *self._trailing(arguments["q"])) if self._parametric else arguments.values()
             one = np.empty(short.shape)

@@ -10,13 +10,14 @@ A wrench is six numbers, force then moment about the origin of a frame, N and Nm
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, rows
-from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, axes_named
+from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, Parts, axes_named
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Joint, Model, PointSpring
 
@@ -137,16 +138,24 @@ class Loads:
             frames, states["wrenches"] = self._stacked_wrenches(wrenches)
         return self._evaluate("joint_wrenches", loaded, frames, axes_named(axes), **states)
 
+    @cached_property
+    def _moving_joints(self) -> tuple[Joint, ...]:
+        return Parts(joint for joint in self.model.joints if joint.type.nv)
+
     def _joints(self, names: Sequence[str] | None) -> tuple[Joint, ...]:
-        known = {joint.name: joint for joint in self.model.joints}
         if names is None:
-            return tuple(joint for joint in known.values() if joint.type.nv)
-        if isinstance(names, str):
+            return self._moving_joints
+        if isinstance(names, str) or not isinstance(names, Sequence):
             raise InputError(f"joints: expected a list of names, got {names!r}")
-        for name in names:
-            if name not in known:
-                raise UnknownNameError("joint", str(name), known)
-        return tuple(known[name] for name in names)
+        held: dict[Any, tuple[Joint, ...]] = self.__dict__.setdefault("_joints_held", {})
+        key = tuple(names)
+        if key not in held:
+            known = {joint.name: joint for joint in self.model.joints}
+            for name in key:
+                if name not in known:
+                    raise UnknownNameError("joint", str(name), known)
+            held[key] = Parts(known[name] for name in key)
+        return held[key]
 
     def newton_euler_residual(
         self,
