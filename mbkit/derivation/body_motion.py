@@ -289,12 +289,15 @@ class BodyQuantity(NamedTuple):
         Of one state's value: 1 where the matrix is a column, 2 where it is the value, 3 where `rows` of its rows
         make one of several values.
     rows : int
+    acts_on : str
+        Where the matrix is a force: the term of the equation of motion that is meant, with this force on the system.
     """
 
     arguments: tuple[str, ...]
     make: Callable[..., Any]
     axes: int = 2
     rows: int = 1
+    acts_on: str = ""
 
 
 def _frame_jacobians(motion: BodyMotion, frames: tuple[str, ...], axes: str) -> Any:
@@ -329,13 +332,14 @@ BODY_QUANTITIES: Final[dict[str, BodyQuantity]] = {
     "centroidal_momentum_matrix": BodyQuantity(("q",), _by_v("centroidal_momentum")),
     "centroidal_momentum_bias": BodyQuantity(("q", "v"), _rate("centroidal_momentum", moved=False), 1),
     "locked_inertia": BodyQuantity(("q",), lambda m: m.locked_inertia),
-    "generalized_force": BodyQuantity(
-        ("q", "wrenches"), lambda m, frames, axes, wrenches: m.generalized_force(frames, axes, wrenches), 1
+    "generalized_force": BodyQuantity(("q", "wrenches"), BodyMotion.generalized_force, 1),
+    "inverse_dynamics_with_wrenches": BodyQuantity(
+        ("q", "v", "a", "wrenches"), BodyMotion.generalized_force, 1, acts_on="inverse_dynamics"
     ),
-    "joint_wrenches": BodyQuantity(
-        ("q", "v", "a", "wrenches"),
-        lambda m, joints, frames, axes, wrenches: m.joint_wrenches(joints, frames, axes, wrenches),
+    "forward_dynamics_with_wrenches": BodyQuantity(
+        ("q", "v", "tau", "wrenches"), BodyMotion.generalized_force, 1, acts_on="forward_dynamics"
     ),
+    "joint_wrenches": BodyQuantity(("q", "v", "a", "wrenches"), BodyMotion.joint_wrenches),
     "regressor": BodyQuantity(("q", "v", "a"), lambda m, columns: torque_regressor(m.kin, m.a, columns)),
     "momentum_regressor": BodyQuantity(("q", "v"), lambda m, columns: momentum_regressor(m.kin, columns)),
     "energy_regressor": BodyQuantity(("q", "v"), lambda m, columns: energy_regressor(m.kin, columns)),

@@ -331,7 +331,8 @@ class Equations:
 
     def body_quantity(self, name: str, *extra: Any) -> ca.Function:
         """Return one of `BODY_QUANTITIES` as a function; `extra` are its names of frames and the like."""
-        quantity, given = BODY_QUANTITIES[name], {"q": self.q, "v": self.v, "a": self.a}
+        quantity = BODY_QUANTITIES[name]
+        given = {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau}
         names = quantity.arguments
         if "wrenches" in names:
             *_, frames, _ = extra
@@ -339,4 +340,9 @@ class Equations:
             extra = (*extra, wrenches)
             # Where none acts there is no such argument.
             names = names if frames else tuple(x for x in names if x != "wrenches")
-        return self.named(name, names, [given[n] for n in names], quantity.make(self.motion, *extra))
+        out = quantity.make(self.motion, *extra)
+        if quantity.acts_on == "inverse_dynamics":
+            out = self.inverse_dynamics - out
+        elif quantity.acts_on == "forward_dynamics":
+            out = ca.substitute(self.forward_dynamics, self.tau, self.tau + out)
+        return self.named(name, names, [given[n] for n in names], out)

@@ -271,5 +271,7 @@ class OracleDynamics(Dynamics):
     )
 
 
-for _name in BODY_QUANTITIES:
-    setattr(OracleDynamics, f"_{_name}", _body_term(_name))
+for _name, _quantity in BODY_QUANTITIES.items():
+    # Its accelerations come from M, and take the force of wrenches as any other.
+    if not _quantity.acts_on:
+        setattr(OracleDynamics, f"_{_name}", _body_term(_name))

@@ -48,8 +48,7 @@ class BodyScales(Scales):
         reach = _reach(oracle, at.q)
         speed, push = (np.einsum("nij,nj->ni", columns, np.abs(x)) for x in (at.v, at.a))
         curved = speed * speed[:, 1:]
-        center = oracle.center_of_mass(at.q)
-        I = oracle.locked_inertia(at.q)
+        center, I = oracle.center_of_mass(at.q), oracle.locked_inertia(at.q)
         return cls(
             **vars(scales),
             columns=columns,
@@ -187,7 +186,7 @@ def _term(name: str, quantity: str, arguments: str, errors: _Measure, more: Call
     return Term(name, quantity, tuple(arguments.split()), errors, more)
 
 
-#: Compared after the terms of the equation of motion, where there are bodies.
+#: Compared after the terms of the equation of motion, where there are bodies with mass.
 BODY_TERMS: Final = (
     _term("pose", "pose", "q", _pose_errors, _frame),
     _term("Jacobian", "jacobian", "q", _jacobian_errors, _frame),

@@ -63,7 +63,7 @@ class Judge:
         heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
         self.scales: Scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
         self.terms: tuple[Term, ...] = TERMS
-        if model.has_bodies and not model.constrained:
+        if model.has_bodies and model.mass:
             self.terms += BODY_TERMS
             self.scales = BodyScales.around(self.scales, oracle, at)
         self.joint_of = [j.name for j in model.independent_joints for _ in range(j.type.nv)]
