@@ -28,6 +28,7 @@ class Part(NamedTuple):
 PARTS = {
     "accuracy": Part(20, ("accuracy.json",), "terms against 34 digits: robots, floating robots, random trees"),
     "bodies": Part(20, ("bodies.json",), "motion, momentum, loads and M⁻¹ against 34 digits"),
+    "bench_bodies": Part(2, ("bench_bodies.json",), "batches of motion, momentum and loads beside engines in a loop"),
     "readme_figure": Part(2, ("check_all.json",), "every robot of example-robot-data in three engines"),
     "published": Part(2, ("published_checks.json",), "published problems, to their printed digits"),
     "identification": Part(
