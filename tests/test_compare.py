@@ -50,7 +50,9 @@ def test_robots_agree(robot):
     assert result.passed, result.verdict
     assert result.engines == ("pinocchio", "lagrangian", "mujoco")
     assert {r.term for r in result.rows} == TERM_NAMES
-    assert len(result.rows) == 3 * len(TERM_NAMES)
+    # MuJoCo holds a body without mass as joints of the next one, and has no load between these.
+    assert [r.term for r in result.refusals] == ["joint loads"] * (robot == "human")
+    assert len(result.rows) == 3 * len(TERM_NAMES) - len(result.refusals)
     for row in result.rows:
         # What an engine's own formula cannot do better is said aloud, and only there.
         assert row.relative <= 1e-12 or (robot == "tiago_no_hand" and row.term == "M" and "own formula" in row.reason)

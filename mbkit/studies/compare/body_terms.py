@@ -2,10 +2,10 @@
 
 The frame is the body at the end of the longest branch. Linear and angular parts have scales of their own, in which no
 number that happens to be small counts: what the velocities can do to a point, or to the bodies. With the columns J_j of
-the frame's Jacobian, W = Σ |J_ω,j v_j| and U = Σ |J_v,j v_j| bound its velocity, and W U, W² the acceleration that
-comes from velocities. Forces are measured by all matter moving as the frame does, or by the largest that there is, and
-moments by these with the longest branch for an arm. A_G's column j is at most √(m M_jj) and √(tr I M_jj) (Cauchy and
-Schwarz), with the inertia about the world's origin.
+the frame's Jacobian, the linear part at least the angular one times the reach, W = Σ |J_ω,j v_j| and U = Σ |J_v,j v_j|
+bound its velocity, and W U, W² the acceleration that comes from velocities. Forces are measured by all matter moving as
+the frame does, or by the largest that there is, and moments by these with the longest branch for an arm. A_G's column j
+is at most √(m M_jj) and √(tr I M_jj) (Cauchy and Schwarz), with the inertia about the world's origin.
 """
 
 from __future__ import annotations
@@ -44,8 +44,10 @@ class BodyScales(Scales):
         """Return the scales of a model's bodies beside those of its equation of motion."""
         model, frame = oracle.model, farthest(oracle.model)
         J = oracle.jacobian(at.q, frame)
-        columns = np.stack([np.linalg.norm(J[:, :3], axis=1), np.linalg.norm(J[:, 3:], axis=1)], axis=1)
+        linear, angular = np.linalg.norm(J[:, :3], axis=1), np.linalg.norm(J[:, 3:], axis=1)
         reach = _reach(oracle, at.q)
+        # An engine may start from any point: a frame that a joint only turns stands still up to rounding.
+        columns = np.stack([np.maximum(linear, angular * reach[:, None]), angular], axis=1)
         speed, push = (np.einsum("nij,nj->ni", columns, np.abs(x)) for x in (at.v, at.a))
         curved = speed * speed[:, 1:]
         center, I = oracle.center_of_mass(at.q), oracle.locked_inertia(at.q)
