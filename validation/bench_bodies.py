@@ -23,6 +23,8 @@ from validation.stamp import stamp
 HERE = Path(__file__).parent
 ROBOTS = (("ur5", False), ("panda", False), ("anymal_b", True), ("talos", True))
 BATCH, LOOP, ROUNDS = 10_000, 400, 9
+#: States of a batch whose results are large.
+FEW = 1_000
 ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
@@ -42,6 +44,8 @@ def own_calls(model):
         "centroidal_momentum_matrix": lambda: dyn.centroidal_momentum_matrix(q),
         "mass_matrix_inverse": lambda: dyn.mass_matrix_inverse(q),
         "joint_wrenches": lambda: dyn.joint_wrenches(q, v, a),
+        "forward_dynamics_derivatives": lambda: dyn.forward_dynamics_derivatives(q[:FEW], v[:FEW], a[:FEW]),
+        "regressor": lambda: dyn.regressor(q[:FEW], v[:FEW], a[:FEW]),
     }
 
 
@@ -73,6 +77,8 @@ def pinocchio_calls(model):
         "centroidal_momentum_matrix": lambda q, v, _: pin.ccrba(m, d, q, v),
         "mass_matrix_inverse": lambda q, *_: pin.computeMinverse(m, d, q),
         "joint_wrenches": lambda q, v, a: pin.rnea(m, d, q, v, a),
+        "forward_dynamics_derivatives": lambda q, v, a: pin.computeABADerivatives(m, d, q, v, a),
+        "regressor": lambda q, v, a: pin.computeJointTorqueRegressor(m, d, q, v, a),
     }, m
 
 
@@ -127,12 +133,13 @@ def measured(name, floating):
     positions = [(d.qpos.copy(), rng.standard_normal(len(d.qvel))) for _ in range(LOOP)]
     out = {}
     for quantity, batch in own.items():
+        size = FEW if quantity in ("forward_dynamics_derivatives", "regressor") else BATCH
         batch()
         ns = {"lagrangian": [], "pinocchio": [], "mujoco": []}
         for _ in range(ROUNDS):
             start = time.perf_counter()
             batch()
-            ns["lagrangian"].append((time.perf_counter() - start) / BATCH * 1e9)
+            ns["lagrangian"].append((time.perf_counter() - start) / size * 1e9)
             ns["pinocchio"].append(looped(theirs[quantity], states))
             if quantity in mujocos:
 

@@ -261,6 +261,14 @@ class LinkEquations(Equations):
         return by_q, by_v, by_tau
 
     @cached_property
+    def mass_matrix_inverse(self) -> Any:
+        """M⁻¹, from the factors of forward dynamics."""
+        if self.least_constraint is not None:
+            return super().mass_matrix_inverse
+        inverse, factors = GaussElimination(self._elimination_frames).inverse_factors()
+        return implicit(self._column(inverse), self._matrix(factors))[0]
+
+    @cached_property
     def _elimination_frames(self) -> LinkMechanics:
         """The short frames, if an elimination of all accelerations keeps its digits there, else the plain ones."""
         exact, form = (self._reduced(mechanics, ()) for mechanics in (self.plain, self.mechanics))
