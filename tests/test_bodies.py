@@ -301,3 +301,53 @@ def test_a_model_without_velocities_has_a_mass_and_loads(engine):
         load = dyn.joint_wrenches(none, none, none, joints=["f"])[0]
         weight = 2.0 * 9.81
         assert load == pytest.approx([0, 0, weight, 2 * weight, -weight, 0])
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "mujoco", "drake"])
+def test_far_from_the_origin_loads_and_momenta_keep_their_digits(engine):
+    b = mb.ModelBuilder("far")
+    b.add_body("base", mass=3.0, com=(0.1, 0, 0), inertia=(0.2, 0.3, 0.4))
+    b.add_body("arm", mass=1.0, com=(0, 0, 0.2), inertia=(0.02, 0.03, 0.04))
+    b.add_joint("float", "free", parent="world", child="base")
+    b.add_joint("elbow", "revolute", parent="base", child="arm", axis=(0, 1, 0), translation=(0, 0, 0.5))
+    model = b.build()
+    q, v, a, _ = (x[0] for x in states(model, 1))
+    q[:3] = 1e3, -2e3, 5e2
+    dyn, own = mb.dynamics(model, engine), mb.dynamics(model, "oracle")
+    # A thousand metres leave their rounding in positions of parts of a metre.
+    tolerance = 1e4 * CLOSE
+    for quantity, given in (("joint_wrenches", (q, v, a)), ("centroidal_momentum", (q, v)), ("locked_inertia", (q,))):
+        assert off(getattr(dyn, quantity)(*given), getattr(own, quantity)(*given)) < tolerance, quantity
+
+
+def test_mujoco_names_a_body_that_it_has_not():
+    b = mb.ModelBuilder("gimbal")
+    b.add_body("ring", mass=0.0, com=(0, 0, 0), inertia=(0, 0, 0))
+    b.add_body("bob", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("outer", "revolute", parent="world", child="ring", axis=(1, 0, 0))
+    b.add_joint("inner", "revolute", parent="ring", child="bob", axis=(0, 1, 0), translation=(0, 0.1, 0))
+    model = b.build()
+    dyn, own = mb.dynamics(model, "mujoco"), mb.dynamics(model, "oracle")
+    q, v, a = np.array([[0.3, 0.4], [1.0, -2.0], [0.5, 0.6]])
+    with pytest.raises(UnsupportedError, match=r"'ring'.*without mass"):
+        dyn.velocity(q, v, "ring")
+    with pytest.raises(UnsupportedError, match=r"'outer'.*'ring'"):
+        dyn.joint_wrenches(q, v, a)
+    assert off(dyn.joint_wrenches(q, v, a, joints=["inner"]), own.joint_wrenches(q, v, a, joints=["inner"])) < CLOSE
+
+
+@pytest.mark.parametrize("engine", LOADED)
+def test_wrenches_that_fail_leave_nothing_behind(engine):
+    """Engines hold forces in their data; the next call is not to feel them."""
+    model = tree("without springs")
+    dyn = mb.dynamics(model, engine)
+    q, v, a, tau = (x[0] for x in at("without springs").values())
+    before = dyn.forward_dynamics(q, v, tau), dyn.joint_wrenches(q, v, a), dyn.inverse_dynamics(q, v, a)
+    dyn.forward_dynamics(q, v, tau, {"tip": np.ones(6)})
+    dyn.joint_wrenches(q, v, a, {"tip": np.ones(6)})
+    with pytest.raises(mb.errors.InputError):
+        dyn.joint_wrenches(q, v, a, {"tip": np.full(6, np.nan)})
+    with pytest.raises(mb.errors.UnknownNameError):
+        dyn.forward_dynamics(q, v, tau, {"tipp": np.ones(6)})
+    after = dyn.forward_dynamics(q, v, tau), dyn.joint_wrenches(q, v, a), dyn.inverse_dynamics(q, v, a)
+    assert all(np.array_equal(x, y) for x, y in zip(before, after, strict=True))
