@@ -18,7 +18,7 @@ from tests.random_trees import ALL, IN_MUJOCO, SOUND, off, random_tree, states
 
 EPS = np.finfo(float).eps
 #: Normwise, of trees of ten bodies: what large terms leave of their rounding where they cancel.
-CLOSE = 5000 * EPS
+CLOSE = 500 * EPS
 NOTHING = {"springs": False, "damping": False, "armature": False}
 TREES = {
     "all joint types": lambda: random_tree(11, 11, ALL, mimic=True),
