@@ -353,3 +353,33 @@ def test_wrenches_that_fail_leave_nothing_behind(engine):
         dyn.forward_dynamics(q, v, tau, {"tipp": np.ones(6)})
     after = dyn.forward_dynamics(q, v, tau), dyn.joint_wrenches(q, v, a), dyn.inverse_dynamics(q, v, a)
     assert all(np.array_equal(x, y) for x, y in zip(before, after, strict=True))
+
+
+def test_a_batch_of_wrenches_beside_one_state_has_a_residual_each():
+    model = mb.load("ur5")
+    dyn = mb.dynamics(model, "lagrangian")
+    q, v = model.random_state(np.random.default_rng(0))
+    wrenches = {"tool0": np.random.default_rng(1).standard_normal((3, 6))}
+    moved = dyn.forward_dynamics(q, v, v, wrenches)
+    residual = dyn.newton_euler_residual(q, v, moved, v, wrenches)
+    assert residual.shape == (3, len(model.bodies), 6)
+    assert np.abs(residual).max() < CLOSE * np.abs(dyn.joint_wrenches(q, v, moved, wrenches)).max()
+    weights = mb.dynamics(mb.catalog.pendulum(mass=mb.Parameter("m")), "lagrangian").at(m=np.array([1.0, 2.0]))
+    assert weights.newton_euler_residual([0.1], [1.0], [1.0], [0.0]).shape == (2, 1, 6)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "oracle"])
+def test_energies_without_bodies_have_none_of_this(engine):
+    model = mb.lagrangian.from_model(mb.catalog.slider_crank()).model
+    dyn = mb.dynamics(model, engine)
+    q, zero = model.neutral(), np.zeros(3)
+    assert not {"center_of_mass", "joint_wrenches", "pose", "regressor"} & dyn.supports
+    for call in (
+        lambda: dyn.center_of_mass(q),
+        lambda: dyn.locked_inertia(q),
+        lambda: dyn.joint_wrenches(q, zero, zero),
+        lambda: dyn.velocity(q, zero, "crank"),
+        lambda: dyn.generalized_force(q, {"crank": np.ones(6)}),
+    ):
+        with pytest.raises(UnsupportedError, match="written as energies"):
+            call()

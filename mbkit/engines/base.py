@@ -37,6 +37,10 @@ QUANTITIES: Final = (
     *regressors.QUANTITIES,
 )
 
+#: What a model that was written as energies does not have.
+_OF_BODIES: Final = frozenset(
+    {*frames_and_momenta.QUANTITIES, *loads.QUANTITIES, *regressors.QUANTITIES} - {"mass_matrix_inverse"}
+)
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
 #: Names in a list of an error message.
@@ -165,7 +169,8 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
     def supports(self) -> frozenset[str]:
         """Names of the quantities that this engine can give."""
         needed = {x: loads.FOLLOWING.get(x, x) for x in QUANTITIES}
-        return frozenset(x for x, y in needed.items() if y not in self.refuses and hasattr(self, f"_{y}"))
+        given = {x for x, y in needed.items() if y not in self.refuses and hasattr(self, f"_{y}")}
+        return frozenset(given if self.model.has_bodies else given - _OF_BODIES)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.model.name!r}: nq={self.model.nq}, nv={self.model.nv}>"
@@ -203,11 +208,6 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
         (2.0, 3.0)
         """
         return type(self)(self.model.with_nominal(values))
-
-    @property
-    def samples(self) -> int | None:
-        """Size of the batch that the parameters' values make, None where every sample has the same."""
-        return None
 
     def of_samples(self, which: ArrayLike) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
         """Return the dynamics of these samples of a batch, by index: itself, unless parameters differ between them."""
@@ -482,6 +482,8 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
 
     def _method(self, quantity: str) -> Callable[..., Any]:
         """Return the adapter's method for a quantity; raise `UnsupportedError` where it has none."""
+        if quantity in _OF_BODIES:
+            self.model.require_bodies(quantity)
         method = getattr(self, f"_{quantity}", None)
         if method is None or quantity in self.refuses:
             reason = self.refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")

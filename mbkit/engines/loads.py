@@ -44,6 +44,11 @@ class Loads:
     pose: Callable[..., Array]
     body_poses: Callable[[ArrayLike], Array]
 
+    @property
+    def samples(self) -> int | None:
+        """Size of the batch that the parameters' values make, None where every sample has the same."""
+        return None
+
     def _stacked_wrenches(self, wrenches: Wrenches) -> tuple[tuple[Frame, ...], Array]:
         """Return the frames, and the wrenches one behind the other, (6 k,) or (N, 6 k)."""
         if not isinstance(wrenches, Mapping):
@@ -191,21 +196,21 @@ class Loads:
         model = self.model
         states = {"q": model.check_q(q), "v": model.check_v(v), "a": model.check_v(a, "a")}
         states["tau"] = model.check_v(tau, "tau")
-        single = batch_of(**states) is None and not any(np.ndim(w) == 2 for w in (wrenches or {}).values())
-        q, v, a, tau = (np.atleast_2d(x) for x in states.values())
-        q, v, a, tau = (np.broadcast_to(x, (max(map(len, (q, v, a, tau))), x.shape[1])) for x in (q, v, a, tau))
+        pushes = {name: np.asarray(w, dtype=float) for name, w in (wrenches or {}).items()}
+        size = self.samples or batch_of(**states, **pushes)
+        q, v, a, tau = (np.broadcast_to(x, (size or 1, x.shape[-1])) for x in states.values())
         names = [joint.name for joint in model.tree]
         acting = self.forward_dynamics(q, v, tau, wrenches, axes)
         loads = self.joint_wrenches(q, v, acting, wrenches, axes, names)
         balance = _Balance(self, q, v, a)
         for k, joint in enumerate(model.tree):
             balance.load(joint, loads[:, k])
-        for name, wrench in (wrenches or {}).items():
-            balance.apply(name, np.asarray(wrench, dtype=float), axes_named(axes))
+        for name, wrench in pushes.items():
+            balance.apply(name, wrench, axes_named(axes))
         for spring in model.springs:
             balance.stretch(spring)
         out = balance.residual()
-        return out[0] if single else out
+        return out[0] if size is None else out
 
 
 def _times(R: Array, x: Array) -> Array:
