@@ -417,6 +417,7 @@ def equations(rates: Callable[[Any, Any], Any], n: int) -> Any:
         q=q,
         v=v,
         tau=tau,
+        force=tau,
         extra_arguments={},
         model=double_pendulum(),
         kin=SimpleNamespace(qdot=v),
