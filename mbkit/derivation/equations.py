@@ -21,6 +21,7 @@ import numpy as np
 
 from mbkit.derivation import kinematics as energies
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyMotion
+from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS, ConstrainedMotion
 from mbkit.derivation.fingerprint import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
 from mbkit.derivation.kinematics import Kinematics
 from mbkit.derivation.least_constraint import LeastConstraint, squares
@@ -295,10 +296,11 @@ class Equations:
 
     def function(self, name: str) -> ca.Function:
         """Return a quantity as a function of its arguments, with repeated operations as they came."""
-        if name not in FUNCTIONS:
-            raise UnknownNameError("quantity", name, FUNCTIONS)
+        known = FUNCTIONS | (CONSTRAINT_FUNCTIONS if self.model.constrained else {})
+        if name not in known:
+            raise UnknownNameError("quantity", name, known)
         symbols = {"q": self.q, "v": self.v, "a": self.a, "tau": self.force}
-        names = FUNCTIONS[name]
+        names = known[name]
         return self.named(name, names, [symbols[n] for n in names], getattr(self, name))
 
     def stacked(self, name: str) -> ca.Function:
@@ -346,3 +348,7 @@ class Equations:
         elif quantity.acts_on == "forward_dynamics":
             out = ca.substitute(self.forward_dynamics, self.tau, self.tau + out)
         return self.named(name, names, [given[n] for n in names], out)
+
+
+class ConstrainedEquations(ConstrainedMotion, Equations):
+    """The same with loops and prescribed motions."""

@@ -16,6 +16,7 @@ DECISIVE: Final = (
     "model",
     "lagrangian",
     "engines/lagrangian.py",
+    "engines/constraint_manifold.py",
     "spatial.py",
     "_check.py",
 )

@@ -31,6 +31,7 @@ from mbkit.derivation.mass_matrix_solve import Elimination, elimination_order, e
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model import Model
 from mbkit.model.joint_types import cross3
+from mbkit.model.manifold import random_state
 from mbkit.spatial import skew
 
 # An inertia as a sum of squares of rates, in rational numbers.
@@ -274,7 +275,7 @@ def cancellation(model: Model, enough: float = np.inf) -> float:
 
 def hard_poses(model: Model, rng: np.random.Generator) -> Array:
     """Return random poses, and as many with right angles, where the axes of machines align."""
-    return np.concatenate([model.random_state(rng, _STATES)[0], _right_angles(model, rng)])
+    return np.concatenate([random_state(model, rng, _STATES)[0], _right_angles(model, rng)])
 
 
 def _right_angles(model: Model, rng: np.random.Generator) -> Array:

@@ -1,7 +1,7 @@
 """The equations of motion from link to link: fewer operations than derivatives of the energies take.
 
 The same quantities as `mbkit.derivation.equations`, which derives them from T and V: inverse dynamics by d'Alembert's
-principle (`mbkit.derivation.link_mechanics`), M by composite bodies (`mbkit.derivation.composite_bodies`), forward
+principle and M by composite bodies (`mbkit.derivation.link_mechanics`), forward
 dynamics from Gauss's function (`mbkit.derivation.gauss_elimination`). The energies stay those of the bodies.
 
 Forces and accelerations are derived twice: in short frames, with matter moved, and in the description's own. The short
@@ -18,12 +18,12 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.derivation.composite_bodies import mass_matrix
-from mbkit.derivation.equations import NOTHING, Acting, Elimination, Equations
+from mbkit.derivation.constraints import ConstrainedMotion
+from mbkit.derivation.equations import NOTHING, Acting, ConstrainedEquations, Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
 from mbkit.derivation.least_constraint import hard_poses, has_squares, loses_digits, mass_matrices
 from mbkit.derivation.link_derivatives import Entries, LinkDerivatives, has_constant_columns
-from mbkit.derivation.link_mechanics import LinkMechanics
+from mbkit.derivation.link_mechanics import LinkMechanics, mass_matrix
 from mbkit.derivation.links import Links
 from mbkit.derivation.mass_matrix_solve import implicit, solve
 from mbkit.derivation.model_values import Constants, scalar
@@ -64,8 +64,10 @@ def equations_of(
         written: Equations = of_energies(constants)
         return written
     if constants == "symbols" or elimination == "mass matrix":
-        return Equations(model, constants, acting=acting)
-    return LinkEquations(model, elimination=elimination or elimination_of(model), acting=acting)
+        energies = ConstrainedEquations if model.constrained else Equations
+        return energies(model, constants, acting=acting)
+    links = ConstrainedLinkEquations if model.constrained else LinkEquations
+    return links(model, elimination=elimination or elimination_of(model), acting=acting)
 
 
 class LinkEquations(Equations):
@@ -289,6 +291,10 @@ class LinkEquations(Equations):
     @staticmethod
     def _scalars(x: Any) -> list[Any]:
         return [scalar(x[i]) for i in range(x.shape[0])]
+
+
+class ConstrainedLinkEquations(ConstrainedMotion, LinkEquations):
+    """The same with loops and prescribed motions."""
 
 
 def _size(x: Any) -> int:

@@ -90,9 +90,11 @@ _JOINT: Final = (*_PLACE, "axes", "pitch", "armature", "damping", "stiffness", "
 _MIMIC: Final = ("ratio", "offset")
 _COUPLING: Final = ("factors", "stiffness", "rest_length", "damping", "armature")
 _SPRING: Final = ("point_a", "point_b", "stiffness", "rest_length", "damping")
+_LOOP: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "length")
+_MOTION: Final = ("offset", "rate", "amplitude", "frequency", "phase")
 # A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum of literal masses could be divided
 # by, and its quotient be rounded to double.
-_DIRECTIONS: Final = frozenset({"rotation", "axes"})
+_DIRECTIONS: Final = frozenset({"rotation", "axes", "rotation_a", "rotation_b"})
 
 
 def is_zero(value: Any) -> bool:
@@ -116,8 +118,8 @@ class Values:
     Attributes
     ----------
     gravity : list of 3 scalars
-    bodies, joints, springs, couplings : dict of str to SimpleNamespace
-        By name. A joint that mimics has `ratio` and `offset` too.
+    bodies, joints, springs, couplings, loops, prescribed : dict of str to SimpleNamespace
+        By name; motions by that of their joint. A joint that mimics has `ratio` and `offset` too.
     named : dict of str to casadi.SX
         The parameters' symbols.
     parameters : (p, 1) casadi.SX
@@ -143,6 +145,7 @@ class Values:
             for b in model.bindings
         }
         self._read_parts(model)
+        self.prescribed = {p.joint: self._read("prescribed", p.joint, p, _MOTION) for p in model.prescribed}
 
     def _read_parts(self, model: Model) -> None:
         self.gravity = self._read("gravity", "", model, ("gravity",)).gravity
@@ -150,6 +153,7 @@ class Values:
         self.joints = {j.name: self._joint(j) for j in model.joints}
         self.springs = {s.name: self._read("springs", s.name, s, _SPRING) for s in model.springs}
         self.couplings = {c.name: self._read("couplings", c.name, c, _COUPLING) for c in model.couplings}
+        self.loops = {x.name: self._read("loops", x.name, x, _LOOP) for x in model.loops}
         self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}
 
     @property

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, all_finite, batch_of, real, rows
-from mbkit.engines import frames_and_momenta, loads, regressors
+from mbkit.engines import constrained, frames_and_momenta, loads, regressors
+from mbkit.engines.constrained import Constrained
 from mbkit.engines.frames_and_momenta import LOCAL, FramesAndMomenta, axes_named
 from mbkit.engines.linearization import LinearizationQuantities
 from mbkit.engines.loads import Loads, Wrenches
@@ -35,6 +36,7 @@ QUANTITIES: Final = (
     *frames_and_momenta.QUANTITIES,
     *loads.QUANTITIES,
     *regressors.QUANTITIES,
+    *constrained.QUANTITIES,
 )
 
 #: What a model that was written as energies does not have.
@@ -64,16 +66,15 @@ def unit_quaternions(q: Array, starts: Iterable[int]) -> bool:
     return True
 
 
-def require_tree(model: Model, user: str) -> None:
+def require_tree(model: Model, user: str, why: str = "it takes the tree alone") -> None:
     """Raise `UnsupportedError` for a model with loops or prescribed motions, in the name of an engine or study."""
     for feature, text in (("loops", "loop closures"), ("prescribed", "motions prescribed in time")):
         parts = getattr(model, feature)
         if parts:
             names = first_names((repr(x.name) for x in parts), ", ...")
             raise UnsupportedError(
-                f"{user}: {model.name} has {text} ({names}), and an engine takes the tree alone; "
-                "mbkit.lagrangian.from_model(model).dynamics() solves it with them, "
-                f"and model.without({feature!r}) is the tree without them"
+                f"{user}: {model.name} has {text} ({names}), and {why}; mbkit.dynamics(model, 'lagrangian') solves it "
+                f"with them, and model.without({feature!r}) is the tree without them"
             )
 
 
@@ -112,7 +113,7 @@ def scalar(value: Array) -> Any:
     return value if value.ndim else float(value)
 
 
-class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
+class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors, Constrained):
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
     Every method takes one state or a batch with one leading axis, checks shapes, finite numbers and unit quaternions,
@@ -139,6 +140,8 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
     takes_parameters: ClassVar[bool] = False
     #: Whether a model may be energies without bodies.
     takes_written: ClassVar[bool] = False
+    #: Why it does not take loops and prescribed motions; empty where it does.
+    lacks_constraints: ClassVar[str] = "it takes the tree alone"
     #: Whether it has `mbkit.derivation.Equations` and compiles whole steps of them.
     derived: ClassVar[bool] = False
     #: Of the significand with which it computes.
@@ -162,7 +165,8 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
             )
         if not self.takes_parameters:
             model.require_values(self.engine)
-        require_tree(model, self.engine)
+        if model.constrained and self.lacks_constraints:
+            require_tree(model, self.engine, self.lacks_constraints)
         self.model = model
 
     @property
@@ -170,6 +174,8 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
         """Names of the quantities that this engine can give."""
         needed = {x: loads.FOLLOWING.get(x, x) for x in QUANTITIES}
         given = {x for x, y in needed.items() if y not in self.refuses and hasattr(self, f"_{y}")}
+        missing = constrained.OF_TREES if self.model.constrained else constrained.QUANTITIES
+        given = {x for x in given if needed[x] not in missing}
         return frozenset(given if self.model.has_bodies else given - _OF_BODIES)
 
     def __repr__(self) -> str:
@@ -389,13 +395,15 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
         UnknownNameError
             No method of this name.
         UnsupportedError
-            A method without an explicit step; a model with constraints or motions prescribed in time.
+            A method without an explicit step.
 
         Notes
         -----
-        On the lagrangian engine the step is the same machine code as in `mbkit.simulate`: microseconds for a state, and
-        batches are shared among threads. The first step of a model compiles it. Other engines and ``compile=False``
-        evaluate the forward dynamics stage by stage, by the same formulas.
+        The state that a step leads to is projected onto loops and prescribed motions, and these are taken at the time
+        that the dynamics hold: ``dyn.at(t=...)``. On the lagrangian engine the step is the same machine code as in
+        `mbkit.simulate`: microseconds for a state, and batches are shared among threads. The first step of a model
+        compiles it. Other engines and ``compile=False`` evaluate the forward dynamics stage by stage, by the same
+        formulas.
 
         Examples
         --------
@@ -414,12 +422,6 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
                 q, v, _beside(self.model.check_v(tau, "tau"), w), dt, method
             )
         chosen, h = explicit_method(method), real("dt", dt, positive=True)
-        for has, feature in (
-            (self.model.constrained, "constraints"),
-            (self.model.time_parameter, "motions prescribed in time"),
-        ):
-            if has:
-                raise UnsupportedError(f"step: {self.model.name} has {feature}; use mbkit.simulate, which follows them")
         self._method("forward_dynamics")
         states, _ = self._states({"q": q, "v": v, "tau": tau})
         # An overflow is reported as an error.
@@ -445,19 +447,23 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
         assert isinstance(formula, (Tableau, SemiImplicitEuler))
         w = space.to_integrator_velocity(q, v)
 
-        def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:  # noqa: ARG001  # no time
+        clock = self.model.time_parameter
+        start = 0.0 if clock is None else float(self.model.parameters[clock] or 0.0)
+
+        def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
             v = space.to_body_velocity(q, w)
             if not (good := _finite_rows(q, v)).all():
                 raise _NotFiniteError(good)
             try:
-                a = self.forward_dynamics(q, v, tau)
+                a = at_time(self, t).forward_dynamics(q, v, tau)
             except NumericalError:
                 # Its message would blame the model for a state that has grown beyond all bounds.
                 raise _NotFiniteError(np.array(False)) from None
             return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
 
-        q1, w1, _ = formula.step(space, rates, ArrayStages(method.stages, v.shape), 0.0, dt, q, w)
-        return q1, space.to_body_velocity(q1, w1)
+        q1, w1, _ = formula.step(space, rates, ArrayStages(method.stages, v.shape), start, dt, q, w)
+        v1 = space.to_body_velocity(q1, w1)
+        return self._pulled(start + dt, q1, v1) if self.projects else (q1, v1)
 
     def _under(self, frames: tuple[Frame, ...], axes: str) -> Dynamics:
         """Return the same dynamics with wrenches on frames behind τ in that argument: nv + 6 k numbers.
@@ -484,6 +490,9 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors):
         """Return the adapter's method for a quantity; raise `UnsupportedError` where it has none."""
         if quantity in _OF_BODIES:
             self.model.require_bodies(quantity)
+        if self.model.constrained and quantity in constrained.OF_TREES:
+            reason = constrained.OF_TREES[quantity]
+            raise UnsupportedError(f"{self.engine} cannot give {quantity} of {self.model.name}: {reason}")
         method = getattr(self, f"_{quantity}", None)
         if method is None or quantity in self.refuses:
             reason = self.refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")
@@ -579,7 +588,7 @@ class WrenchedDynamics(Dynamics):
     _bare: Dynamics
 
     def __init__(self, dyn: Dynamics, frames: tuple[Frame, ...], axes: str) -> None:
-        self._bare, self._acting = dyn, (frames, axes)
+        self._bare, self._acting, self.soft_constraints = dyn, (frames, axes), dyn.soft_constraints
         super().__init__(dyn.model)
         self._forward_dynamics = dyn._method("forward_dynamics")
         dyn._method("jacobian")

@@ -54,10 +54,15 @@ _STACKED: Final = "stacked"
 #: What one compiled function gives, and how its result loses the axes that the quantity does not have.
 _TRIM: Final[dict[str, Callable[[Array], Array]]] = {
     **{name: _trimmed(quantity) for name, quantity in BODY_QUANTITIES.items()},
-    **dict.fromkeys(("mass_matrix", "mass_matrix_inverse", "coriolis_matrix"), lambda x: x),
+    **dict.fromkeys(("mass_matrix", "mass_matrix_inverse", "coriolis_matrix", "constraint_jacobian"), lambda x: x),
     _STACKED: lambda x: x.reshape(*x.shape[:-1], 3, x.shape[-1] // 3).swapaxes(-2, -3),
     **dict.fromkeys(
-        ("coriolis_force", "gravity", "nle", "passive", "inverse_dynamics", "forward_dynamics"), lambda x: x[..., 0]
+        (
+            *("coriolis_force", "gravity", "nle", "passive", "inverse_dynamics", "forward_dynamics"),
+            *("constraint_residual", "constraint_rate", "constraint_bias", "constraint_forces"),
+            "generalized_constraint_force",
+        ),
+        lambda x: x[..., 0],
     ),
     **dict.fromkeys(("kinetic_energy", "potential_energy", "energy_rate"), lambda x: x[..., 0, 0]),
 }
@@ -144,7 +149,7 @@ class LagrangianDynamics(Dynamics):
     derived = True
     takes_parameters = True
     takes_written = True
-    lacks_derivatives = ""
+    lacks_derivatives = lacks_constraints = ""
 
     def __init__(
         self,
@@ -325,6 +330,10 @@ class LagrangianDynamics(Dynamics):
     _kinetic_energy, _potential_energy, _energy_rate = map(_term, ("kinetic_energy", "potential_energy", "energy_rate"))
 
     _mass_matrix_inverse = _term("mass_matrix_inverse")
+    _constraint_residual, _constraint_jacobian = _term("constraint_residual"), _term("constraint_jacobian")
+    _constraint_rate, _constraint_bias = _term("constraint_rate"), _term("constraint_bias")
+    _constraint_forces = _term("constraint_forces")
+    _generalized_constraint_force = _term("generalized_constraint_force")
 
     def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
         """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""
@@ -372,10 +381,8 @@ class LagrangianDynamics(Dynamics):
 
     @property
     def compiles_steps(self) -> bool:
-        """Whether whole steps are machine code: with a compiler, without constraints or a time."""
-        model = self.model
-        # A compiled step has one value of each parameter, the time among them, and looks for no constraints behind it.
-        if not model.nv or model.constrained or model.time_parameter:
+        """Whether whole steps are machine code: with a compiler, for a model that moves."""
+        if not self.model.nv:
             return False
         return not isinstance(self.code("forward_dynamics"), Machine)
 
@@ -423,7 +430,9 @@ class LagrangianDynamics(Dynamics):
 
             step = CompiledStep(self.model, self.equations, self.step_plan(method.name), self._part)
             held = self._steps[method.name] = method, step
-        return held[1].run(q, v, tau, dt, *self._trailing(q), threads=self.threads)[:2]
+        q1, v1, finite = held[1].run(q, v, tau, dt, *self._trailing(q), threads=self.threads)
+        # Lost to its constraints: in Python the projection goes on until it is done.
+        return (q1, v1) if finite or not self.model.constrained else super()._step(method, q, v, tau, dt)
 
     def _momentum_step_slopes(
         self, dt: float, q: Array, v: Array, tau: Array, *, parameters: bool

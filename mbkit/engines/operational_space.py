@@ -19,7 +19,7 @@ from mbkit._check import Array, real
 from mbkit._warn import warn
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
-from mbkit.errors import InputError, NumericalError, SingularPoseWarning
+from mbkit.errors import InputError, NumericalError, SingularPoseWarning, UnsupportedError
 
 #: Rows of a task by name.
 _ROWS: Final = {"linear": (0, 1, 2), "angular": (3, 4, 5)}
@@ -88,6 +88,8 @@ def operational_space(
         For unusable arguments.
     NumericalError
         M is singular, or the task is and `damping` is 0.
+    UnsupportedError
+        A model with loops or other constraints.
 
     Warns
     -----
@@ -104,6 +106,11 @@ def operational_space(
     """
     if not isinstance(dyn, Dynamics):
         raise no_dynamics(dyn)
+    if dyn.model.constrained:
+        raise UnsupportedError(
+            f"operational_space: {dyn.model.name} has loops or other constraints, which change the inertia that a "
+            "frame feels; without('loops', 'prescribed') is its tree"
+        )
     if not isinstance(frame, str):
         raise InputError(f"frame: expected a name, got {type(frame).__name__}; stack the Jacobians of several")
     threshold = real("damping", damping)

@@ -25,6 +25,7 @@ from mbkit.codegen.extended_precision import Backend, Extended, arithmetic, digi
 from mbkit.codegen.program import program
 from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
+from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS
 from mbkit.engines.base import Dynamics, scalar
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.errors import InputError, UnknownNameError
@@ -33,8 +34,10 @@ from mbkit.model import Frame, Model
 #: Quantity -> its arguments, as in `Dynamics`.
 _ARGUMENTS: Final = {
     **FUNCTIONS,
+    **CONSTRAINT_FUNCTIONS,
     **{name: tuple(x for x in of.arguments if x != "wrenches") for name, of in BODY_QUANTITIES.items()},
 }
+_WRITTEN: Final = {**FUNCTIONS, **CONSTRAINT_FUNCTIONS}
 #: What one function gives together, in this order.
 _TERMS: Final = ("mass_matrix", "coriolis_force", "gravity", "passive", "nle")
 
@@ -53,6 +56,14 @@ def _term(name: str) -> Callable[..., Any]:
 
 def _single(name: str) -> Callable[..., Any]:
     return lambda self, *states: self._run((name,), *states)[0][:, 0, 0]
+
+
+def _column(name: str) -> Callable[..., Any]:
+    return lambda self, *states: self._run((name,), *states)[0][:, :, 0]
+
+
+def _whole(name: str) -> Callable[..., Any]:
+    return lambda self, *states: self._run((name,), *states)[0]
 
 
 def _body_term(name: str) -> Callable[..., Any]:
@@ -96,7 +107,7 @@ class OracleDynamics(Dynamics):
     engine = "oracle"
     bits = 113
     takes_written = True
-    lacks_derivatives = ""
+    lacks_derivatives = lacks_constraints = ""
     refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}
 
     def __init__(
@@ -218,7 +229,7 @@ class OracleDynamics(Dynamics):
         if name != "terms":
             if name in BODY_QUANTITIES:
                 return eq.body_quantity(name, *extra)
-            return eq.function(name) if name in FUNCTIONS else getattr(eq, name)(*extra)
+            return eq.function(name) if name in _WRITTEN else getattr(eq, name)(*extra)
         outs = [ca.densify(getattr(eq, x)) for x in _TERMS]
         return ca.Function("terms", [eq.q, eq.v, *eq.extra_arguments.values()], outs)
 
@@ -265,6 +276,11 @@ class OracleDynamics(Dynamics):
 
     def _parameter_derivatives(self, quantity: str, *states: Array) -> Any:
         return of_parameters(self.model, quantity, self._run(("parameter_derivatives", quantity), *states)[0])
+
+    _constraint_jacobian = _whole("constraint_jacobian")
+    _constraint_residual, _constraint_rate = _column("constraint_residual"), _column("constraint_rate")
+    _generalized_constraint_force = _column("generalized_constraint_force")
+    _constraint_bias, _constraint_forces = _column("constraint_bias"), _column("constraint_forces")
 
     _kinetic_energy, _potential_energy, _energy_rate = map(
         _single, ("kinetic_energy", "potential_energy", "energy_rate")

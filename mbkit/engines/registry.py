@@ -246,8 +246,8 @@ def dynamics(model: Model, engine: str = PINOCCHIO, **options: Any) -> Dynamics:
         MuJoCo, Drake (``pip install mbkit[drake]``), or the own derivation at 34 digits, for
         measuring the others; or an engine of `register_engine`.
     **options
-        The lagrangian engine's ``compile=`` (True or False) and ``threads=``; other
-        engines have none.
+        The lagrangian engine's ``compile=`` (True or False) and ``threads=``; MuJoCo's ``solref=`` and ``solimp=`` of
+        the soft constraints that hold loops; other engines have none.
 
     Returns
     -------

@@ -27,7 +27,6 @@ Vector = list[Any]
 _Way = list[Joint]
 #: Relative size of a zero term that rounded rotations leave.
 _DUST: Final = Fraction(1, 10**15)
-_LOOP: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b")
 _MOTION: Final = ("offset", "rate", "amplitude", "frequency", "phase")
 
 
@@ -49,7 +48,6 @@ class _Numbers(Values):
     def __init__(self, model: Model, bound: dict[Any, Any], read: Callable[[float], Any]) -> None:
         self._bound, self._number = bound, read
         self._read_parts(model)
-        self.loops = {x.name: self._read("loops", x.name, x, _LOOP) for x in model.loops}
 
     def motion(self, prescribed: Prescribed) -> Any:
         """Return the numbers of a motion, which a model of the same form need not have."""

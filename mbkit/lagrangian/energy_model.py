@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any
@@ -13,11 +12,9 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of, count, generator, real
+from mbkit._check import Array, batch_of, real
 from mbkit._escape import html, one_line
-from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
-from mbkit.lagrangian.constraints import Manifold, is_judged, manifold_of, refuse_unreachable, require_independent
+from mbkit.errors import UnknownNameError, UnsupportedError
 from mbkit.lagrangian.energies.casadi_equations import EnergyEquations, VelocityMap
 from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.lagrangian.energies.symbols import plain
@@ -49,10 +46,6 @@ def _coordinate(name: str, before: str) -> Joint:
     fields |= dict.fromkeys(("armature", "damping", "friction", "stiffness", "rest"), np.zeros(1))
     fields |= {"rotation": np.eye(3), "translation": np.zeros(3), "axes": np.array([[1.0, 0.0, 0.0]]), "pitch": 0.0}
     return Joint(name=name, kind=PRISMATIC.name, parent=before, child=name, lower=np.full(1, -np.inf), **fields)
-
-
-#: Random states that are drawn, each of which may be too far from the constraints.
-_DRAWS = 50
 
 
 class EnergyModel(Model):
@@ -150,7 +143,7 @@ class EnergyModel(Model):
         moved = {n: real(f"parameter {n!r}", x) for n, x in values.items()}
         out = object.__new__(type(self))
         # Nothing but the values differs: what was derived from the rest is kept.
-        kept = {k: x for k, x in self.__dict__.items() if k not in ("parameters", "digest", "_states")}
+        kept = {k: x for k, x in self.__dict__.items() if k not in ("parameters", "digest")}
         out.__dict__.update(kept, _values={**self._values, **moved})
         return out
 
@@ -171,39 +164,6 @@ class EnergyModel(Model):
         raise UnsupportedError(
             f"without: {self.name} was written as energies, of which only 'damping' can be left out, got {features}"
         )
-
-    def random_state(self, rng: np.random.Generator | int, size: int | None = None) -> tuple[Array, Array]:
-        """Draw a random state; under constraints the nearest consistent one, and not a singular pose."""
-        if not self.constrained:
-            return super().random_state(rng, size)
-        rng = generator("rng", rng)
-        drawn = [self._consistent_state(rng) for _ in range(1 if size is None else count("size", size))]
-        q, v = np.array(drawn).reshape(len(drawn), 2, self.nv).transpose(1, 0, 2)
-        return (q[0], v[0]) if size is None else (q, v)
-
-    def _consistent_state(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        for _ in range(_DRAWS):
-            # From some places there is no way to the constraints; on some branches they depend on each other.
-            with suppress(InputError, NumericalError):
-                q, v = super().random_state(rng)
-                # Some pose is far cheaper than the nearest one, and on such a branch refused all the same.
-                require_independent(self._states.dyn, self._states.restored(q, v))
-                state = self._states.project(q, v)
-                require_independent(self._states.dyn, state[0])
-                return state
-        refuse_unreachable(self._states.dyn)
-        return self._states.project(*super().random_state(rng))
-
-    def require_independent(self, q: Array, *, once: bool = False) -> None:
-        """Refuse constraints that depend on each other at q, once all parameters have values."""
-        if not self.constrained or not len(q) or None in self.parameters.values():
-            return
-        if not (once and is_judged(self.form, self)):
-            require_independent(self._states.dyn, np.atleast_2d(q)[0])
-
-    @cached_property
-    def _states(self) -> Manifold:
-        return manifold_of(LagrangianDynamics(self, compile=False))
 
     def integrate(self, q: ArrayLike, dq: ArrayLike) -> Array:
         """Return q + D(q) dq: the configuration that a displacement dq in the space of v leads to."""

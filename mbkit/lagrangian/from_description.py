@@ -96,10 +96,10 @@ def from_model(
     if symbols or symbols is None:
         named = in_symbols(model)
         if named is None and symbols:
-            known = "it has named parameters already" if model.parameters else "it is no system of the catalog"
+            known = "it has named parameters already" if model.bindings else "it is no system of the catalog"
             raise InputError(f"symbols: {model.name}: {known}; leave symbols out to keep its numbers")
     source = named or model
-    parameters = {name: sp.Symbol(name) for name in source.parameters}
+    parameters = {name: sp.Symbol(name) for name in source.parameters if name != source.time_parameter}
     clash = [s.name for s in q if s.name in parameters]
     if clash:
         raise InputError(f"coordinates: {clash[0]!r} is a parameter of {model.name}; give coordinates=... other names")

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit._escape import one_line
 from mbkit.engines.base import QUANTITIES, Dynamics
+from mbkit.engines.constraint_manifold import Manifold, require_few
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError
-from mbkit.lagrangian.constraints import Manifold, require_few
 from mbkit.lagrangian.energy_model import abstract_parts
 from mbkit.model import Model
 
@@ -221,7 +221,7 @@ class Embedded:
         self.model = manifold.dyn.model
         form = manifold.equations.form
         rows = len(form.constraints)
-        require_few(form)
+        require_few(manifold)
         self.degrees = self.model.nv - rows
         if self.degrees < 1:
             raise InputError(f"{self.model.name}: {rows} constraints leave none of {self.model.nv} coordinates free")

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, real, rows
 from mbkit._escape import one_line
 from mbkit.engines import Dynamics, dynamics
-from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.lagrangian.constraints import Manifold, manifold_of, refuse_unreachable, require_independent
+from mbkit.engines.constraint_manifold import Manifold, manifold_of, projected, require_independent
+from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities, parameter_values
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion
 from mbkit.lagrangian.energies.symbols import name_of
@@ -237,18 +237,9 @@ class Lagrangian(EnergyForm):
         manifold = self._manifold(t, values)
         q, v = np.broadcast_arrays(self.model.check_q(q), self.model.check_v(v))
         if q.ndim == 1:
-            return self._projected(manifold, q, v)
-        states = [self._projected(manifold, *pair) for pair in zip(q, v, strict=True)]
+            return projected(manifold.dyn, q, v)
+        states = [projected(manifold.dyn, *pair) for pair in zip(q, v, strict=True)]
         return np.array([pair[0] for pair in states]), np.array([pair[1] for pair in states])
-
-    def _projected(self, manifold: Manifold, q: Array, v: Array) -> tuple[Array, Array]:
-        try:
-            states = manifold.project(q, v)
-        except InputError:
-            refuse_unreachable(manifold.dyn, q)
-            raise
-        require_independent(manifold.dyn, states[0], everywhere=True)
-        return states
 
     def embedded(self, independent: Sequence[Any] | None = None, **values: float) -> Embedded:
         """Return the system on independent coordinates alone, for `mbkit.simulate`.

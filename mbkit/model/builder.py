@@ -15,6 +15,7 @@ from mbkit import spatial
 from mbkit._check import Array, _as_float, finite_array, real, shown
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
 from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
+from mbkit.model.loops import LOOP_KINDS, LoopKind
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
@@ -196,7 +197,9 @@ _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
         ("com", "translation", "point_a", "point_b", "translation_a", "translation_b"), ArgumentReader.place
     ),
     **dict.fromkeys(("rotation_a", "rotation_b"), ArgumentReader.rotation),
-    **dict.fromkeys(("mass", "pitch", "stiffness", "rest_length", "damping", "armature"), ArgumentReader.quantity),
+    **dict.fromkeys(
+        ("mass", "pitch", "stiffness", "rest_length", "damping", "armature", "length"), ArgumentReader.quantity
+    ),
     **dict.fromkeys(("offset", "rate", "amplitude", "frequency", "phase"), ArgumentReader.quantity),
     "inertia": ArgumentReader.inertia,
     "joints": lambda read, name, value: tuple(read.name(name, x) for x in value),
@@ -433,7 +436,7 @@ class ModelBuilder:
     def add_loop(
         self,
         name: str,
-        kind: Literal["point", "frame"],
+        kind: LoopKind,
         *,
         body_a: str,
         body_b: str,
@@ -441,28 +444,32 @@ class ModelBuilder:
         rotation_a: ArrayLike | None = None,
         translation_b: _Vector = (0.0, 0.0, 0.0),
         rotation_b: ArrayLike | None = None,
+        length: Number = 0.0,
     ) -> None:
-        """Close a loop: two points, or two frames, of two bodies stay together.
-
-        `mbkit.lagrangian.from_model` makes constraints of it; the engines by themselves refuse it.
+        """Close a loop by a joint between two bodies that the tree has already placed.
 
         Parameters
         ----------
         name, body_a, body_b : str
             One body may be ``"world"``.
-        kind : {"point", "frame"}
-            Points that coincide, as in a ball joint (in a plane: a hinge), or frames that do, as if welded.
+        kind : {"point", "frame", "revolute", "universal", "cylindrical", "prismatic", "distance"}
+            Points that coincide, as in a ball joint (in a plane: a hinge), or frames that do, as if welded. The next
+            four are joints: the frames' z-axes are that of a hinge or slider, and the two of a universal joint. The
+            last is a rod between the points, without mass.
         translation_a, translation_b : (3,) array_like
             The points, or the frames' origins, in the axes of the two bodies, m.
         rotation_a, rotation_b : (3, 3) array_like, optional
             The frames' orientations in their bodies.
+        length : float
+            Of a rod, m; of no other kind.
         """
-        if not isinstance(kind, str) or kind not in ("point", "frame"):
-            self._read.faults.append(f"loop {shown(name)}: unknown kind {shown(kind)}; use 'point' or 'frame'")
+        if not isinstance(kind, str) or kind not in LOOP_KINDS:
+            there = ", ".join(map(repr, LOOP_KINDS))
+            self._read.faults.append(f"loop {shown(name)}: unknown kind {shown(kind)}; there are {there}")
             kind = "point"
         a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
-        self._add(Loop, "loops", "loop", name, a | b, {"kind": kind})
+        self._add(Loop, "loops", "loop", name, a | b | {"length": length}, {"kind": kind})
 
     def prescribe(
         self,
@@ -476,7 +483,7 @@ class ModelBuilder:
     ) -> None:
         """Move a one-velocity joint in time: offset + rate t + amplitude sin(frequency t + phase).
 
-        `mbkit.lagrangian.from_model` puts it into the energies; the engines by themselves refuse it.
+        The joint keeps its coordinate, which a constraint holds on this motion; its multiplier is the drive's force.
         """
         values = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
         self._add(Prescribed, "prescribed", "prescribed", joint, values)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, count, pairwise
 from types import MappingProxyType
 from typing import Any, Self, TypeVar
 
@@ -225,6 +225,8 @@ class Description:
     source : str
         Path of the file that the loader read, with the shapes to draw; empty without one. Like the notes, it does not
         count for equality.
+    time : float
+        At which motions prescribed in time are taken, s; neither does it count.
     """
 
     name: str
@@ -240,6 +242,7 @@ class Description:
     nonphysical: tuple[tuple[str, str], ...] = ()
     bindings: tuple[Binding, ...] = ()
     source: str = ""
+    time: float = 0.0
     layout: Layout = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -296,8 +299,17 @@ class Description:
 
     @cached_property
     def parameters(self) -> Mapping[str, float | None]:
-        """Nominal value of each named parameter, None where it has none."""
-        return MappingProxyType({p.name: p.value for b in self.bindings for p in b.expression.parameters()})
+        """Nominal value of each named parameter, None where it has none; the time of prescribed motions is the last."""
+        values = {p.name: p.value for b in self.bindings for p in b.expression.parameters()}
+        return MappingProxyType(values | ({self.time_parameter: self.time} if self.time_parameter else {}))
+
+    @cached_property
+    def time_parameter(self) -> str | None:
+        """Name of the parameter that is the time; None where the equations do not depend on it."""
+        if not self.prescribed:
+            return None
+        taken = {p.name for b in self.bindings for p in b.expression.parameters()}
+        return next(name for name in chain(("t", "time"), (f"t_{k}" for k in count())) if name not in taken)
 
     def require_values(self, what: str) -> None:
         """Raise `InputError` that names the parameters without a value, if there are any."""
@@ -350,6 +362,22 @@ class Description:
         for joint in self.tree:
             out[joint.name] = below[joint.child] = below[joint.parent] | {joint.name}
         return MappingProxyType(out)
+
+    def way(self, body: str) -> tuple[str, ...]:
+        """Return the bodies from one down to the world, both included."""
+        out = [body]
+        while out[-1] != "world":
+            out.append(self._parents[out[-1]])
+        return tuple(out)
+
+    @cached_property
+    def _parents(self) -> Mapping[str, str]:
+        return MappingProxyType({joint.child: joint.parent for joint in self.joints})
+
+    def carrier(self, loop: Loop) -> str:
+        """Return the last body that carries both ends of a loop, whose axes its rows have; ``"world"`` for most."""
+        below = set(self.way(loop.body_b))
+        return next(body for body in self.way(loop.body_a) if body in below)
 
     def branched(self, coupling: JointCoupling) -> bool:
         """Return whether two joints of a coupling are on different branches of the tree."""

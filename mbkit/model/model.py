@@ -46,11 +46,6 @@ class Model(Description):
         return None
 
     @property
-    def time_parameter(self) -> str | None:
-        """Name of the parameter that is the time; None where the equations do not depend on it."""
-        return None
-
-    @property
     def velocity_map(self) -> Any:
         """q̇ = D(q) v of quasi-velocities; None where the joints' types give q̇."""
         return None
@@ -58,13 +53,15 @@ class Model(Description):
     @property
     def constrained(self) -> bool:
         """Whether constraints bind the coordinates to each other, so that not every (q, v) is a state."""
-        return False
+        return bool(self.loops or self.prescribed)
 
     def require_independent(self, q: Array, *, once: bool = False) -> None:
         """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq), with the rows.
 
         With `once`, constraints that were independent at some configuration are not tested again.
         """
+        if self.constrained and len(q) and None not in self.parameters.values():
+            _states_of(self).require_independent(q, once=once)
 
     # Earlier names of the same, for scripts.
     written = property(lambda self: self.energy_equations)
@@ -90,13 +87,15 @@ class Model(Description):
         Returns
         -------
         q : (nq,) or (size, nq) array
-            Uniform within the limits, clipped to ±π rad; ±1 m where a length has none; uniform rotations.
+            Uniform within the limits, clipped to ±π rad; ±1 m where a length has none; uniform rotations. Under
+            constraints the nearest consistent state, and not a singular pose.
         v : (nv,) or (size, nv) array
             Standard normal.
         """
         if size is not None:
             count("size", size)
-        return manifold.random_state(self, generator("rng", rng), size)
+        rng = generator("rng", rng)
+        return _states_of(self).random(rng, size) if self.constrained else manifold.random_state(self, rng, size)
 
     def check_q(self, q: ArrayLike, name: str = "q") -> Array:
         """Return `q` as float64, checked for shape, finite numbers and unit quaternions."""
@@ -254,7 +253,7 @@ class Model(Description):
         return model
 
     def with_parameters(self, /, **values: float) -> Model:
-        """Return the same description with plain numbers, by name, for some or all parameters.
+        """Return the same description with plain numbers, by name, for some or all parameters; the time stays one.
 
         Raises
         ------
@@ -266,12 +265,20 @@ class Model(Description):
             No matter is like the result, as `ModelBuilder.build` would say.
         """
         numbers = self._parameter_values(values)
-        return check_substituted(self, self._substituted(lambda p: numbers.get(p.name, p)))
+        time = numbers.get(self.time_parameter or "", self.time)
+        return check_substituted(self, replace(self._substituted(lambda p: numbers.get(p.name, p)), time=time))
 
     def with_nominal(self, values: Mapping[str, Any]) -> Model:
         """Return the same parametrised model at other nominal values."""
         numbers = self._parameter_values(values)
-        return check_substituted(self, self._substituted(lambda p: Parameter(p.name, numbers.get(p.name, p.value))))
+        time = numbers.pop(self.time_parameter or "", self.time)
+        if not numbers:
+            # A run asks so at every step: nothing but the time differs, and what follows from the rest is kept.
+            out = object.__new__(type(self))
+            out.__dict__.update({k: x for k, x in self.__dict__.items() if k != "parameters"}, time=time)
+            return out
+        moved = self._substituted(lambda p: Parameter(p.name, numbers.get(p.name, p.value)))
+        return check_substituted(self, replace(moved, time=time))
 
     def _parameter_values(self, values: Mapping[str, Any]) -> dict[str, float]:
         for name in values:
@@ -321,6 +328,12 @@ class Model(Description):
             f"<p><b>{html(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._mass_text()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
+
+
+def _states_of(model: Model) -> Any:
+    """Return the consistent states of a model under constraints."""
+    # By name: a description knows no derivation, and asks for it only here.
+    return import_module("mbkit.engines.constraint_manifold").states_of(model)
 
 
 def _unlimited(joint: Joint) -> Joint:

@@ -241,15 +241,18 @@ class JointCoupling(_Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Loop(_Frozen):
-    """A loop closure: two points (`kind` "point", 3 equations) or frames ("frame", 6) of two bodies stay together.
+    """A loop closure: a joint between two bodies that the tree has already placed.
 
     Attributes
     ----------
     name, kind, body_a, body_b : str
+        A `kind` is one of `mbkit.model.loops.LOOP_KINDS`.
     rotation_a, rotation_b : (3, 3) arrays
-        Axes of the frames in body axes; unused by a loop of points.
+        Axes of the frames in body axes, with the joint's axis along z; unused by points and rods.
     translation_a, translation_b : (3,) arrays
         The two points in body axes, m.
+    length : float
+        Of a rod between the points, m; zero for every other kind.
     """
 
     name: str
@@ -260,6 +263,7 @@ class Loop(_Frozen):
     body_b: str
     rotation_b: Array
     translation_b: Array
+    length: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ from mbkit._check import Array
 from mbkit.errors import InputError, ModelError, Suggestions, nearest
 from mbkit.model import manifold
 from mbkit.model.description import Description
+from mbkit.model.loops import held_directions
 from mbkit.model.parts import Body, Joint, JointCoupling, Loop
 from mbkit.spatial import skew
 
@@ -72,6 +73,10 @@ def structure_faults(description: Description) -> Iterator[str]:
         yield from unknown(f"loop {loop.name!r}", (loop.body_a, loop.body_b))
         if loop.body_a == loop.body_b:
             yield f"loop {loop.name!r}: both ends on {loop.body_a!r}; it would close nothing"
+        if loop.kind == "distance" and not loop.length > 0 and not np.isnan(loop.length):
+            yield f"loop {loop.name!r}: expected a rod with a length above 0, got {loop.length:g}; use kind 'point'"
+        if loop.kind != "distance" and loop.length:
+            yield f"loop {loop.name!r}: length {loop.length:g} on a loop of kind {loop.kind!r}; only a rod has one"
     yield from _tree_faults(bodies, joints)
     yield from _mimic_faults(joints)
     single = {j.name for j in joints if j.type.nv == 1 and not j.mimic}
@@ -376,15 +381,17 @@ class _Sample(NamedTuple):
     size: int
 
     def held(self, loop: Loop) -> Array:
-        """Return the Jacobian of a loop's constraints in world axes, for all velocities."""
+        """Return the Jacobian of a loop's constraints, as if it were closed, for all velocities."""
         ends = []
         for body, point in ((loop.body_a, loop.translation_a), (loop.body_b, loop.translation_b)):
             moving, own = self.jacobians[body]
             J, R = np.zeros((6, self.size)), self.rotations[body]
             J[:, moving] = own
-            moved = [R @ (J[:3] - skew(np.asarray(point)) @ J[3:]), R @ J[3:]]
-            ends.append(np.concatenate(moved if loop.kind == "frame" else moved[:1]))
-        return np.asarray(ends[0] - ends[1])
+            ends.append((R @ (J[:3] - skew(np.asarray(point)) @ J[3:]), R @ J[3:]))
+        linear, angular = (a - b for a, b in zip(*ends, strict=True))
+        A, B = self.rotations[loop.body_a] @ loop.rotation_a, self.rotations[loop.body_b] @ loop.rotation_b
+        moved, turned = held_directions(loop.kind, A, B)
+        return np.concatenate([moved @ linear, turned @ angular])
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -4,6 +4,7 @@ The equation of motion holds f̈ = 0 only, so that f and ḟ drift. One-step met
 iteration with the mass matrix as the weight; it moves a state by the step's own error, so that the order stays. Near a
 singular pose explicit methods project their stages too, since f̈ = 0 divides their errors by J's smallest singular
 value. A projection would spoil the history of multistep methods (BDF, LSODA, CVODES): only their kept states have it.
+An engine with soft constraints projects nothing: how far its states leave the constraints is part of its answer.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from mbkit.methods.registry import ADAPTIVE_METHOD, IMPLICIT_METHODS, SERIES_MET
 from mbkit.simulate.result import SolverResult
 
 if TYPE_CHECKING:
-    from mbkit.lagrangian.constraints import Manifold
+    from mbkit.engines.constraint_manifold import Manifold
 
 #: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
 LOOSEST: Final = 1e-9
@@ -37,7 +38,7 @@ _TAKES_PART: Final = 0.1
 
 def _manifold(dyn: Dynamics, t: float) -> Manifold:
     # The import loads CasADi.
-    from mbkit.lagrangian.constraints import manifold_of
+    from mbkit.engines.constraint_manifold import manifold_of
 
     return manifold_of(dyn).at(t)
 
@@ -46,7 +47,7 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
     """Return initial states without rounding; an `InputError` where one or the constraints are inconsistent."""
     if not dyn.model.constrained:
         return q, v
-    from mbkit.lagrangian.constraints import refuse_unreachable, require_independent
+    from mbkit.engines.constraint_manifold import refuse_unreachable, require_independent
 
     manifold = _manifold(dyn, t)
     try:
@@ -54,8 +55,12 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
     except InputError:
         refuse_unreachable(manifold.member(0).dyn, np.atleast_2d(q)[0])
         raise
-    for k, one in enumerate(np.atleast_2d(q)):
-        require_independent(manifold.member(k).dyn, one)
+    if not dyn.projects:
+        # Soft ones need no independence.
+        return q, v
+    poses = np.atleast_2d(q)
+    for k in np.flatnonzero(manifold.doubtful(poses)) if len(poses) > 1 else range(len(poses)):
+        require_independent(manifold.member(int(k)).dyn, poses[k])
     return manifold.pulled(q, v)
 
 
@@ -129,7 +134,8 @@ class SingularPoses:
         if not self.times:
             return ""
         when = ", ".join(f"{t:.4g}" for t in self.times[:3]) + (" and later" if len(self.times) > 3 else "")
-        rows = " and ".join(f"constraints[{k}]" for k in self._rows)
+        names = _manifold(self._dyn, self.times[0]).names
+        rows = " and ".join(names[k] for k in self._rows)
         return (
             f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
             f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the tolerance"
@@ -137,14 +143,14 @@ class SingularPoses:
 
 
 def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:
-    """Return a run with its kept states projected onto the constraints."""
-    if not dyn.model.constrained or not outcome.q.size:
+    """Return a run with its kept states projected onto the constraints; an engine's soft ones keep their drift."""
+    if not dyn.projects or not outcome.q.size:
         return outcome
-    from mbkit.lagrangian.constraints import manifold_of
+    from mbkit.engines.constraint_manifold import manifold_of
 
     q, v = outcome.q.copy(), outcome.v.copy()
     shape = q.shape
-    flat_q, flat_v = q.reshape(-1, shape[-1]), v.reshape(-1, shape[-1])
+    flat_q, flat_v = q.reshape(-1, shape[-1]), v.reshape(-1, v.shape[-1])
     good = np.flatnonzero(np.isfinite(flat_q).all(axis=1) & np.isfinite(flat_v).all(axis=1))
     own = manifold_of(dyn).dyn
     trajectories = shape[0] if q.ndim == 3 else None

@@ -12,7 +12,8 @@ from typing import Any, Final
 import casadi as ca
 
 from mbkit.derivation.equations import Equations
-from mbkit.derivation.steps.fixed import SYMBOLS, Part, SymbolicSpace, SymbolicStages, choose, function_of
+from mbkit.derivation.steps.fixed import Part, SymbolicStages, function_of
+from mbkit.derivation.steps.symbols import SYMBOLS, SymbolicSpace, choose
 from mbkit.methods.one_step import StepFactors, embedded_error, end_of_attempt, larger, next_step, predictive_factors
 from mbkit.methods.tableaus import EmbeddedTableau
 

@@ -18,40 +18,16 @@ import casadi as ca
 
 from mbkit._check import Array
 from mbkit.derivation.equations import Equations
+from mbkit.derivation.steps.onto_constraints import nears_singular, projection, reach
+from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.errors import InputError
 from mbkit.methods.one_step import SemiImplicitEuler
 from mbkit.methods.registry import METHODS, method_of
 from mbkit.methods.tableaus import Tableau
 from mbkit.model.integration_space import Space
-from mbkit.model.quaternions import Arithmetic
 
 _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
-
-
-def choose(condition: ca.SX, yes: Any, no: Any) -> Any:
-    """Return `yes` where the condition is 1, `no` where it is 0, whatever the other one is."""
-    # casadi.if_else would negate the condition by an operation of its own.
-    chosen = ca.SX.binary(ca.OP_IF_ELSE_ZERO, condition, ca.SX(yes))
-    return chosen + ca.SX.binary(ca.OP_IF_ELSE_ZERO, 1 - condition, ca.SX(no))
-
-
-#: Arithmetic of expressions.
-SYMBOLS: Final = Arithmetic(ca.sqrt, ca.sin, ca.cos, choose)
-
-
-class SymbolicSpace(Space):
-    """The integrators' space on casadi.SX columns."""
-
-    arithmetic = staticmethod(lambda x: SYMBOLS)  # noqa: ARG005  # of symbols there is one kind
-    part = staticmethod(lambda x, part: x[part])
-    components = staticmethod(lambda x, part: ca.vertsplit(x[part]))
-    copied = staticmethod(lambda x: ca.SX(x))
-
-    @staticmethod
-    def put(x: Any, part: slice, components: Any) -> None:
-        """Write scalars or a column into a part of a column."""
-        x[part] = ca.vertcat(*components) if isinstance(components, list) else components
 
 
 class SymbolicStages:
@@ -127,7 +103,7 @@ def step(equations: Equations, method: str) -> ca.Function:
     """
     s, space = _symbols(equations), SymbolicSpace(equations.model)
     names = {n: s[n] for n in ("q", "v", "tau", "dt", *equations.extra_arguments)}
-    q1, w1 = _stepped(
+    q1, w1, _ = _stepped(
         equations, method, s, space.to_integrator_velocity(s["q"], s["v"]), _acceleration(equations, space, s)
     )
     return function_of(f"{method}_step", names, {"q1": q1, "v1": space.to_body_velocity(q1, w1)})
@@ -137,14 +113,15 @@ def march(equations: Equations, method: str) -> tuple[Part, ...]:
     """Return one part: the whole step in the integrators' own velocity, for many steps in a row.
 
     It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum of the squares of all states so
-    far: a number that once was not finite, or beyond all bounds, shows in it for ever.
+    far: a number that once was not finite, or beyond all bounds, shows in it for ever; so does a step that is lost to
+    its constraints.
     """
     name, reads = f"{method_of(method).code_name}_march", (*_MARCH, *equations.extra_arguments)
 
     def make() -> ca.Function:
         s, space = _symbols(equations), SymbolicSpace(equations.model)
-        q1, w1 = _stepped(equations, method, s, s["w"], _acceleration(equations, space, s))
-        return function_of(name, {n: s[n] for n in reads}, _with_squares(s, q1, w1))
+        ends = _stepped(equations, method, s, s["w"], _acceleration(equations, space, s))
+        return function_of(name, {n: s[n] for n in reads}, _with_squares(s, *ends))
 
     return (Part(name, reads, _MARCHED, make),)
 
@@ -170,37 +147,54 @@ def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
     parts: list[Part] = []
     prefix = method_of(method).code_name
 
-    def acceleration(q: Any, w: Any) -> Any:
+    timed = equations.model.time_parameter is not None
+    known |= equations.extra_arguments if equations.model.constrained else {}
+
+    def acceleration(t: Any, q: Any, w: Any) -> Any:
         i = sum(part.name == "forward_dynamics" for part in parts)
         v = space.to_body_velocity(q, w)
-        at = ("q", "w")
+        at, more = ("q", "w"), (*equations.extra_arguments,)
         if i or not space.flat:
             at = (f"q_{i}", f"v_{i}")
-            parts.append(Part.of(f"{prefix}_stage_{i}", known, dict(zip(at, (q, v), strict=True))))
-        reads = (*at, "tau", *equations.extra_arguments)
+            writes = dict(zip(at, (q, v), strict=True))
+            if timed:
+                more = (f"parameters_{i}",)
+                writes[more[0]] = _at_time(equations, t)["parameters"]
+            parts.append(Part.of(f"{prefix}_stage_{i}", known, writes))
+        reads = (*at, "tau", *more)
         parts.append(Part("forward_dynamics", reads, (f"a_{i}",), lambda: equations.function("forward_dynamics")))
         a = known[f"a_{i}"] = ca.SX.sym(f"a_{i}", equations.model.nv)
         return space.acceleration(q, v, a)
 
-    q1, w1 = _stepped(equations, method, s, s["w"], acceleration)
+    ends = _stepped(equations, method, s, s["w"], acceleration)
     known["squares"] = s["squares"]
-    return (*parts, Part.of(f"{prefix}_end", known, _with_squares(s, q1, w1)))
+    return (*parts, Part.of(f"{prefix}_end", known, _with_squares(s, *ends)))
 
 
 def _stepped(
-    equations: Equations, method: str, s: dict[str, Any], w: Any, acceleration: Callable[[Any, Any], Any]
-) -> tuple[Any, Any]:
-    """Return q and w after a step from q and this w, with acceleration(q, w) -> ẇ."""
+    equations: Equations, method: str, s: dict[str, Any], w: Any, acceleration: Callable[[Any, Any, Any], Any]
+) -> tuple[Any, Any, Any]:
+    """Return q and w after a step from q and this w, and 1 where it is lost to its constraints, else 0.
+
+    That is near a singular pose, and where a step is so long that its projection is not done.
+
+    acceleration(t, q, w) is ẇ at a time after the step's start.
+    """
     formula, space = method_of(method).formula, SymbolicSpace(equations.model)
     if not isinstance(formula, (Tableau, SemiImplicitEuler)) or not formula.explicit:
         explicit = ", ".join(m.name for m in METHODS.values() if m.kind == "fixed" and m.compiled and m.formula)
         raise InputError(f"method: expected one with an explicit step, got {method!r}; there are: {explicit}")
 
-    def rates(t: Any, q: Any, u: Any, w: Any) -> tuple[Any, Any]:  # noqa: ARG001  # the time is a parameter
-        return w if u is None else space.rate(u, w), acceleration(q, w)
+    def rates(t: Any, q: Any, u: Any, w: Any) -> tuple[Any, Any]:
+        return w if u is None else space.rate(u, w), acceleration(t, q, w)
 
     q1, w1, _ = formula.step(space, rates, SymbolicStages(space.nv), 0.0, s["dt"], s["q"], w)
-    return q1, w1
+    if not equations.model.constrained:
+        return q1, w1, 0.0
+    before, behind = equations.extra_arguments.values(), _at_time(equations, s["dt"]).values()
+    q1, v1, ends, far = projection(equations)(q1, space.to_body_velocity(q1, w1), *behind)
+    lost = ca.fmax(far, nears_singular(reach(equations)(s["q"], *before), ends))
+    return q1, space.to_integrator_velocity(q1, v1), lost
 
 
 def _symbols(equations: Equations) -> dict[str, Any]:
@@ -209,18 +203,30 @@ def _symbols(equations: Equations) -> dict[str, Any]:
     return {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
 
 
-def _acceleration(equations: Equations, space: Space, s: dict[str, Any]) -> Callable[[Any, Any], Any]:
-    forward, behind = equations.function("forward_dynamics"), [s["tau"], *equations.extra_arguments.values()]
+def _acceleration(equations: Equations, space: Space, s: dict[str, Any]) -> Callable[[Any, Any, Any], Any]:
+    forward = equations.function("forward_dynamics")
 
-    def acceleration(q: Any, w: Any) -> Any:
+    def acceleration(t: Any, q: Any, w: Any) -> Any:
         v = space.to_body_velocity(q, w)
-        return space.acceleration(q, v, forward(q, v, *behind))
+        return space.acceleration(q, v, forward(q, v, s["tau"], *_at_time(equations, t).values()))
 
     return acceleration
 
 
-def _with_squares(s: dict[str, Any], q1: Any, w1: Any) -> dict[str, Any]:
-    return dict(zip(_MARCHED, (q1, w1, s["squares"] + (ca.sumsqr(q1) + ca.sumsqr(w1))), strict=True))
+def _at_time(equations: Equations, t: Any) -> dict[str, Any]:
+    """Return the extra arguments t seconds after the step's start: the time is the last of the parameters."""
+    given = dict(equations.extra_arguments)
+    if equations.model.time_parameter is not None:
+        parameters = given["parameters"]
+        *others, time = ca.vertsplit(parameters)
+        given["parameters"] = ca.vertcat(*others, time + t)
+    return given
+
+
+def _with_squares(s: dict[str, Any], q1: Any, w1: Any, lost: Any) -> dict[str, Any]:
+    # Infinite where it is lost.
+    squares = s["squares"] + (ca.sumsqr(q1) + ca.sumsqr(w1)) + lost / (1 - lost)
+    return dict(zip(_MARCHED, (q1, w1, squares), strict=True))
 
 
 def function_of(name: str, arguments: dict[str, Any], results: dict[str, Any]) -> ca.Function:

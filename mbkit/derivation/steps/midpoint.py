@@ -33,8 +33,9 @@ import casadi as ca
 
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.mass_matrix_solve import solve
-from mbkit.derivation.steps.fixed import Part, SymbolicSpace, function_of
+from mbkit.derivation.steps.fixed import Part, function_of
 from mbkit.derivation.steps.rosenbrock import Factors
+from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.model import quaternions
 
 #: Weights of the velocities of the last steps in the first guess of the next one: the

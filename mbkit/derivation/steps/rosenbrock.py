@@ -26,7 +26,8 @@ import casadi as ca
 from mbkit._check import Array
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.adaptive import AttemptParts
-from mbkit.derivation.steps.fixed import SYMBOLS, Part, SymbolicSpace, SymbolicStages, function_of
+from mbkit.derivation.steps.fixed import Part, SymbolicStages, function_of
+from mbkit.derivation.steps.symbols import SYMBOLS, SymbolicSpace
 from mbkit.methods.one_step import elementary_factors, with_defect
 from mbkit.methods.tableaus import RosenbrockTableau
 

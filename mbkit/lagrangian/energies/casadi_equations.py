@@ -11,78 +11,24 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
+from mbkit.derivation.constraints import ConstraintFactors, ConstraintQuantities, ConstraintTerms
 from mbkit.derivation.equations import Equations
-from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.derivation.model_values import Constants, Values
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities
 from mbkit.lagrangian.energies.sympy_to_casadi import Conversion
 from mbkit.model import Model
 
-#: Mass of a coordinate that has none, in terms of the mean one.
-_MASSLESS: Final = 1e-20
-_TINY: Final = 1e-300
-#: Times that a solution is refined. Each time leaves what the factors lose of the error before.
-_REFINED: Final = 2
+#: Characters of a constraint in a message: of a loop in space it has thousands.
+_SHOWN: Final = 100
 
 
-class ConstraintTerms:
-    """f(q, t) and its derivatives J = ∂f/∂q, ∂f/∂t, rate ḟ = J v + ∂f/∂t and γ, with f̈ = J v̇ + γ."""
-
-    def __init__(self, value: ca.SX, q: ca.SX, v: ca.SX, time: Any) -> None:
-        self.value = value
-        self.jacobian = ca.jacobian(value, q)
-        self.by_time = ca.SX(value.shape[0], 1) if time is None else ca.jacobian(value, time)
-        self.rate = ca.mtimes(self.jacobian, v) + self.by_time
-        self.gamma = ca.jtimes(self.rate, q, v)
-        if time is not None:
-            self.gamma = self.gamma + ca.jacobian(self.rate, time)
-
-    def stiffening(self, M: Any) -> Any:
-        """Return s > 0, (m, 1), so that W = M + Jᵀ diag(s) J has an inverse where M has it on J's null space.
-
-        With J v̇ prescribed, the term changes neither v̇ nor λ. s is the geometric mean of the sum's and the lightest
-        coordinate's mass along a row: W keeps the digits of both, of a light rod in a loop as of a heavy body.
-        """
-        masses = ca.diag(M)
-        masses = masses + _MASSLESS / masses.shape[0] * ca.sum1(masses)
-        squares = self.jacobian**2
-        heavy, light = ca.mtimes(squares, masses), ca.mtimes(squares, 1 / masses)
-        # Of a row without slope the term is zero.
-        return ca.sqrt((heavy + _TINY) / (light + _TINY)) / (ca.sum2(squares) + _TINY)
-
-    def weight(self, M: Any) -> Any:
-        """Return W = M + Jᵀ diag(s) J of `stiffening`."""
-        return M + ca.mtimes(self.jacobian.T, self.stiffening(M) * self.jacobian)
+def _short(x: Any) -> str:
+    text = str(x)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]} ..."
 
 
-def _constrained_motion(c: ConstraintTerms, M: Any, force: Any, order: tuple[int, ...]) -> tuple[Any, Any]:
-    """Return v̇ and λ of M v̇ - Jᵀ λ = force, J v̇ = -γ, by the factors of W and J W⁻¹ Jᵀ and by refinement.
-
-    Near a singular pose, and with masses that differ by decades, the factors lose the square of the digits that the
-    equations lose. Only f̈ = 0 holds: integrators project drifted states (`mbkit.simulate.constraint_projection`).
-    """
-    J, m = c.jacobian, c.value.shape[0]
-    s = c.stiffening(M)
-    W = Factors(M + ca.mtimes(J.T, s * J), order)
-    Y = W.solve(J.T)
-    S = Factors(ca.mtimes(J, Y), range(m))
-
-    def solved(force: Any, rate: Any) -> tuple[Any, Any]:
-        """Return x and λ of M x - Jᵀ λ = force, J x = rate."""
-        free = W.solve(force + ca.mtimes(J.T, s * rate))
-        multipliers = S.solve(rate - ca.mtimes(J, free))
-        return free + ca.mtimes(Y, multipliers), multipliers
-
-    a, multipliers = solved(force, -c.gamma)
-    for _ in range(_REFINED):
-        left = force - ca.mtimes(M, a) + ca.mtimes(J.T, multipliers)
-        da, more = solved(left, -c.gamma - ca.mtimes(J, a))
-        a, multipliers = a + da, multipliers + more
-    return a, multipliers
-
-
-class EnergyEquations(Equations):
+class EnergyEquations(ConstraintQuantities, Equations):
     """The equations derived from T and V; `constants` says how numbers stand in the expressions."""
 
     def __init__(self, model: Model, form: EnergyForm, constants: Constants = "literal") -> None:
@@ -100,7 +46,8 @@ class EnergyEquations(Equations):
         read = Conversion(names, values.number)
         self._T, self._V, self._R = ca.SX(read(form.T)), ca.SX(read(form.V)), ca.SX(read(form.dissipation))
         self._Q = read.matrix(form.forces)
-        self.constraints = ConstraintTerms(read.matrix(form.constraints), self.q, self.v, self.time)
+        rows = tuple(f"constraints[{k}] ({_short(x)})" for k, x in enumerate(form.constraints))
+        self.constraints = ConstraintTerms(read.matrix(form.constraints), self.q, self.v, self.time, rows)
         #: Of each momentum k, (γ^k v)_i = Σ_j γ^k_ij v_j; none where velocities are rates.
         self._turns: list[Any] = []
         qdot, pullback = self.v, lambda x: x
@@ -179,13 +126,26 @@ class EnergyEquations(Equations):
         return self._inertial(ca.SX(self.model.nv, 1)) + self.gravity
 
     @cached_property
+    def constraint_factors(self) -> ConstraintFactors:
+        """Factors of M and of J M⁻¹ Jᵀ."""
+        return ConstraintFactors(self.constraints, self.mass_matrix, self.elimination_order, careful=True)
+
+    @cached_property
     def _constrained(self) -> tuple[Any, Any]:
-        return _constrained_motion(
-            self.constraints, self.mass_matrix, self.tau + self.generalized_force, self.elimination_order
-        )
+        return self.constraint_factors.motion(self.tau + self.generalized_force)
 
     @property
-    def multipliers(self) -> Any:
+    def all_constraints(self) -> Any:
+        """The constraints, which are independent of each other."""
+        return self.constraints
+
+    @property
+    def independent_constraints(self) -> tuple[int, ...]:
+        """All of them."""
+        return tuple(range(len(self.constraints.names)))
+
+    @property
+    def constraint_forces(self) -> Any:
         """λ(q, v, τ) of the constraints."""
         return self._constrained[1]
 

@@ -49,7 +49,7 @@ def in_symbols(model: Model) -> Model | None:
     The values are solved from the model's numbers. An argument of zero stays the number zero.
     """
     system = next((n for n in catalog.systems() if model.name == n or _numbered(model.name, n)), None)
-    if system is None or model.parameters:
+    if system is None or model.bindings:
         return None
     names, numbers = _content(model)
     for size in range(1, model.nv + 1):

@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, finite_array
 from mbkit._escape import html, terminal
 from mbkit.engines.base import Dynamics, at_time
+from mbkit.engines.constraint_manifold import manifold_of, refuse_unreachable, require_independent
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError
-from mbkit.lagrangian.constraints import manifold_of, refuse_unreachable, require_independent
 from mbkit.lagrangian.system import Lagrangian
 
 #: Of the forces that balance: what rounding leaves of them.

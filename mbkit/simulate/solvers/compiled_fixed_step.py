@@ -26,7 +26,7 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import GridRecord, divergence_reason
+from mbkit.simulate.solvers.fixed_step import GridRecord, divergence_reason, run_fixed
 from mbkit.simulate.solvers.vector_field import BOUND, are_bounded
 from mbkit.simulate.time_grid import Indices
 
@@ -198,19 +198,29 @@ class Chunk(BlockLoop):
     """At most `most` states that take explicit steps.
 
     `torques`: each step of a block has its own; `all_kept`: each state of a block can be read, not only the last;
-    `watched`: it is looked for steps that are not good.
+    `watched`: it is looked for steps that are not good; `clock`: place of the time among the parameters.
     """
 
     block = BLOCK
 
     def __init__(
-        self, plan: Plan, space: Space, most: int, *, torques: bool, all_kept: bool, watched: bool = False
+        self,
+        plan: Plan,
+        space: Space,
+        most: int,
+        *,
+        torques: bool,
+        all_kept: bool,
+        watched: bool = False,
+        clock: int | None = None,
     ) -> None:
         places = {**dict.fromkeys(_STATE.values(), BLOCK + 1 if all_kept else 2), "tau": BLOCK if torques else 1}
+        places["parameters"] = 1 if clock is None else BLOCK
+        self._clock = clock
         own = {name: (places.get(name, 1), rows) for name, rows in plan.sizes.items() if name not in _STATE}
         super().__init__(own, most)
         self._calls, self._space, self._watched = len(plan.parts), space, watched
-        period = BLOCK if all_kept or torques else 2
+        period = BLOCK if all_kept or torques or clock is not None else 2
         steps = [call for j in range(period) for call in self._step(plan, j)]
         self._sequence = KernelSequence(steps, BLOCK // period)
 
@@ -227,8 +237,10 @@ class Chunk(BlockLoop):
         """Put in states, (n, nq) and (n, nv) of `Space`, and the values of parameters, (p,) or (n, p)."""
         self._begin(parameters, q=q, w=w, squares=np.zeros((len(q), 1)))
 
-    def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:  # noqa: ARG002  # no time enters
+    def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
         self._hold(steps, dt, torques)
+        if self._clock is not None:
+            self._room["parameters"][:steps, self._clock] = (start + np.arange(steps) * dt)[:, None]
         self._sequence.run(0, steps * self._calls)
         self._taken = steps
         if self._watched:
@@ -255,10 +267,11 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     assert isinstance(dyn, LagrangianDynamics)
     plan, space, n = dyn.step_plan(method), Space(dyn.model), len(problem.q)
     w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn.parameter_values
+    clock = None if dyn.model.time_parameter is None else list(dyn.model.parameters).index(dyn.model.time_parameter)
     squares = np.zeros(n)
 
     def new_chunk(most: int, *, all_kept: bool, watched: bool = False) -> Chunk:
-        return Chunk(plan, space, most, torques=problem.torque.held, all_kept=all_kept, watched=watched)
+        return Chunk(plan, space, most, torques=problem.torque.held, all_kept=all_kept, watched=watched, clock=clock)
 
     def blocks(chunk: Chunk, members: Indices, ends: Indices) -> Iterator[tuple[int, dict[int, list[Array]]]]:
         chunk.begin(problem.q[members], w0[members], values[members] if values.ndim == 2 else values)
@@ -283,6 +296,9 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     run_parts(parts, new_worker, workers, grid.steps, problem.bar)
     # A NaN is not below anything.
     suspects, lost = np.flatnonzero(~(squares < BOUND**2)), dict[int, list[Array]]()
+    if len(suspects) and dyn.model.constrained:
+        # Near a singular pose stages are projected too, and the pose is told.
+        return run_fixed(problem)
     for first in range(0, len(suspects), _widest(plan)):
         members = suspects[first : first + _widest(plan)]
         for _, last in blocks(new_chunk(len(members), all_kept=True, watched=True), members, members[:0]):

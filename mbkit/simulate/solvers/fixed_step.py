@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model.integration_space import Space
+from mbkit.simulate.constraint_projection import SingularPoses
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.gauss import CollocationStep
@@ -105,9 +107,10 @@ class Stepper:
 
 
 class _FieldStepper(Stepper):
-    """Steps of a method that only evaluates ẇ."""
+    """Steps of a method that only evaluates ẇ; it looks for singular poses of constraints on the way of one state."""
 
     def __init__(self, problem: IntegrationProblem) -> None:
+        self._poses = SingularPoses(problem.dyn) if problem.dyn.projects and problem.batch is None else None
         self.space = Space(problem.dyn.model)
         self.field = Field(problem.dyn, self.space)
         self._step = make_step(problem.method, self.field, self.space)
@@ -119,7 +122,15 @@ class _FieldStepper(Stepper):
         self.field.only(members)
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
-        return self.field.settled(t, q, w)
+        q, w = self.field.settled(t, q, w)
+        if self._poses is not None:
+            self._poses.saw(t, q)
+        return q, w
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The singular poses on the way, in a sentence."""
+        return (self._poses.describe(),) if self._poses is not None and self._poses.times else ()
 
     def to_body_velocity(self, q: Array, w: Array) -> Array:
         return np.asarray(self.space.to_body_velocity(q, w))
@@ -134,7 +145,8 @@ def run_fixed(problem: IntegrationProblem) -> SolverResult:
     stepper = _FieldStepper(problem)
     run = SteppedRun(problem, stepper, stepper.space.to_integrator_velocity(problem.q0, problem.v0))
     error = run.to_end()
-    return run.record.result(lambda _: run.why, stepper.field.evaluations, error=error)
+    result = run.record.result(lambda _: run.why, stepper.field.evaluations, error=error)
+    return replace(result, doubts=stepper.doubts)
 
 
 class SteppedRun:

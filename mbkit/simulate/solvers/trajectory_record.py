@@ -78,7 +78,7 @@ class TrajectoryRecord:
         self._problem, self._model, self._space, self._save = problem, dyn.model, space, problem.save
         self._watch = Watch(problem.events, member) if problem.events else None
         own = dyn if member is None or not dyn.model.constrained else dyn.of_samples([member])
-        self.poses = SingularPoses(own) if dyn.model.constrained else None
+        self.poses = SingularPoses(own) if dyn.projects else None
         self.steps = self.rejected = 0
         self.reached = problem.start
         self.last: Array | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -17,6 +18,7 @@ from mbkit.simulate.constraint_projection import Approach, beside, settled
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
+Projection = Callable[[Dynamics, float, Array, Array], tuple[Array, Array]]
 DIVERGED: Final = "the state grew beyond all bounds"
 #: A state with a number of this size has diverged: no machine goes there, and energies below can still be computed.
 BOUND: Final = 1e100
@@ -58,7 +60,12 @@ class Field:
 
     def _use(self, own: Dynamics) -> None:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.time_parameter is not None
-        self._approach, self._constrained = Approach(), own.model.constrained
+        self._approach, self._constrained = Approach(), own.projects
+
+    @property
+    def projects(self) -> bool:
+        """Whether states are projected onto constraints."""
+        return self._constrained
 
     @property
     def near_singular(self) -> bool:
@@ -69,16 +76,23 @@ class Field:
         """Return the state that a step led to, on its constraints if there are some."""
         if not self._constrained:
             return q, w
-        q, w = settled(self._own, t, q, w)
+        q, w = self._projected(settled, t, q, w)
         if self._explicit:
             self._approach.saw(self._own, t, q)
         return q, w
+
+    def _projected(self, onto: Projection, t: float, q: Array, w: Array) -> tuple[Array, Array]:
+        """Return the state that a projection makes of one in the integrators' velocity."""
+        if self._space is None:
+            return onto(self._own, t, q, w)
+        q, v = onto(self._own, t, q, self._space.to_body_velocity(q, w))
+        return q, self._space.to_integrator_velocity(q, v)
 
     def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ at an explicit method's stage; near a singular pose at the state on the constraints beside it."""
         if self._constrained and self.near_singular:
             # One of a batch with parameters of its own is a batch of one.
-            q, w = (x.reshape(y.shape) for x, y in zip(beside(self._own, t, q, w), (q, w), strict=True))
+            q, w = (x.reshape(y.shape) for x, y in zip(self._projected(beside, t, q, w), (q, w), strict=True))
         return self(t, q, w, force)
 
     def __call__(self, t: float, q: Array, w: Array, force: Force) -> Array:
@@ -130,7 +144,7 @@ class Rates:
     def settled(self, t: float, y: Array) -> Array:
         """Return the state that a step led to, on its constraints if there are some."""
         nq = self._model.nq
-        return np.concatenate(self._field.settled(t, y[:nq], y[nq:])) if self._model.constrained else y
+        return np.concatenate(self._field.settled(t, y[:nq], y[nq:])) if self._field.projects else y
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""

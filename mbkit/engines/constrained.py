@@ -1,0 +1,169 @@
+"""Quantities of loops and prescribed motions: f(q, t) = 0, its Jacobian and the forces that hold it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, batch_of
+from mbkit.errors import UnsupportedError
+
+if TYPE_CHECKING:
+    from mbkit.model import Model
+
+QUANTITIES: Final = (
+    "constraint_residual",
+    "constraint_jacobian",
+    "constraint_rate",
+    "constraint_bias",
+    "constraint_forces",
+    "generalized_constraint_force",
+)
+
+#: What a model under constraints does not have, and why.
+OF_TREES: Final = {
+    "joint_wrenches": "the load of a joint depends on the forces in the loops, which a motion (q, v, a) does not tell; "
+    "constraint_forces(q, v, tau) has these forces"
+}
+
+
+class Constrained:
+    """The part of `Dynamics` for models with loops and prescribed motions.
+
+    ::
+
+        M v̇ + C v + g = τ + τ_passive + Jᵀ λ        J v̇ + γ = 0
+
+    Rows of loops stand in the axes of the body that carries both ends, in the order of `constraint_names`; those of
+    prescribed motions follow. The multiplier of a point is the force on body a, that of a frame's turn the torque on
+    it, and that of a prescribed motion the force of its drive. A model without any raises `UnsupportedError`.
+
+    Accelerations of `forward_dynamics` hold the constraints; every other term, such as `inverse_dynamics`, is that of
+    the tree, without λ.
+    """
+
+    model: Model
+    #: Whether the engine lets constraints give way: its states are those of its own equations, and none is projected.
+    soft_constraints: bool = False
+    _evaluate: Callable[..., Array]
+
+    @property
+    def projects(self) -> bool:
+        """Whether runs project their states onto constraints."""
+        return self.model.constrained and not self.soft_constraints
+
+    def _bound(self, quantity: str, **states: ArrayLike) -> Array:
+        if not self.model.constrained:
+            raise UnsupportedError(f"{quantity}: {self.model.name} has no loops and no other constraints")
+        return self._evaluate(quantity, **states)
+
+    @property
+    def _states_held(self) -> Any:
+        # By name: the consistent states are those of the own derivation, an engine above this protocol.
+        return import_module("mbkit.engines.constraint_manifold")
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """Names of the rows, such as ``"loop 'pin' x"``; empty without constraints."""
+        return self._states_held.names_of(self) if self.model.constrained else ()
+
+    def constraint_residual(self, q: ArrayLike) -> Array:
+        """Return f(q, t), zero where all loops are closed; (m,) or (N, m), in m and rad."""
+        return self._bound("constraint_residual", q=q)
+
+    def constraint_jacobian(self, q: ArrayLike) -> Array:
+        """Return J, with ḟ = J v + ∂f/∂t; (m, nv) or (N, m, nv)."""
+        return self._bound("constraint_jacobian", q=q)
+
+    def constraint_rate(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return ḟ = J v + ∂f/∂t, (m,) or (N, m)."""
+        return self._bound("constraint_rate", q=q, v=v)
+
+    def constraint_bias(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return γ, with f̈ = J v̇ + γ; (m,) or (N, m)."""
+        return self._bound("constraint_bias", q=q, v=v)
+
+    def constraint_forces(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
+        """Return the multipliers λ under the force τ, (m,) or (N, m).
+
+        Where rows are redundant, λ is not unique: it is the one with the least norm, in N and N m. Jᵀ λ, which
+        `generalized_constraint_force` returns, is unique all the same.
+        """
+        return self._bound("constraint_forces", q=q, v=v, tau=tau)
+
+    def generalized_constraint_force(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
+        """Return Jᵀ λ, the generalized force that keeps the constraints under τ; (nv,) or (N, nv)."""
+        return self._bound("generalized_constraint_force", q=q, v=v, tau=tau)
+
+    def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:
+        J, forces = self.constraint_jacobian(q), self.constraint_forces(q, v, tau)
+        return (np.swapaxes(J, -1, -2) @ forces[..., None])[..., 0]
+
+    def project(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+        """Return the nearest consistent state, f = 0 and ḟ = 0, in the metric of the mass matrix.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        v : (nv,) or (N, nv) array_like
+
+        Returns
+        -------
+        q, v : arrays
+            Of the same shapes. Without constraints they are the arguments.
+
+        Raises
+        ------
+        InputError
+            The constraints contradict each other, or no consistent state is near.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.slider_crank(), "lagrangian")
+        >>> q, v = dyn.project([0.5, -0.2, -0.1], [1.0, 0.0, 0.0])
+        >>> bool(abs(dyn.constraint_residual(q)).max() < 1e-14)
+        True
+        """
+        model = self.model
+        q, v = model.check_q(q), model.check_v(v)
+        batch_of(q=q, v=v)
+        if not model.constrained:
+            return q, v
+        states = self._states_held
+        lead = np.broadcast_shapes(q.shape[:-1], v.shape[:-1])
+        q, v = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in (q, v))
+        if not lead:
+            return states.projected(self, q, v)  # type: ignore[no-any-return]  # by name
+        pairs = [states.projected(self, *pair) for pair in zip(q, v, strict=True)]
+        return np.array([x for x, _ in pairs]).reshape(q.shape), np.array([x for _, x in pairs]).reshape(v.shape)
+
+    def _pulled(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the consistent states near the ends of a step."""
+        return self._states_held.pulled(self, t, q, v)  # type: ignore[no-any-return]  # by name
+
+    def mobility(self, q: ArrayLike | None = None) -> Any:
+        """Return the degrees of freedom and the redundant rows, at a configuration or where the loops are closed.
+
+        Parameters
+        ----------
+        q : (nq,) array_like, optional
+            Where the loops are closed, which is not looked at. By default some closed configuration at which most rows
+            are independent.
+
+        Returns
+        -------
+        Mobility
+            With `degrees_of_freedom`, `rows`, and the names of `redundant` ones.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> print(mb.dynamics(mb.catalog.slider_crank(), "lagrangian").mobility())
+        slider_crank: degrees of freedom 1, of 2 rows none is redundant
+        """
+        return self._states_held.mobility(self, None if q is None else self.model.check_q(q))

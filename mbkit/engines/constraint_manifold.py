@@ -1,0 +1,602 @@
+"""Constraints f(q, t) = 0 in numbers: the states that they allow, and whether they are independent there.
+
+A state is consistent where f = 0 and ḟ = J v + ∂f/∂t = 0. Independence belongs to a pose: a set may have full rank on
+one branch of a mechanism only (a row of equal four-bars).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.derivation.constraints import independent_rows
+from mbkit.derivation.mass_matrix_solve import solve
+from mbkit.derivation.steps.symbols import SymbolicSpace
+from mbkit.engines.base import Dynamics, at_time
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.model import Model
+from mbkit.model.manifold import random_state
+
+_EPS: Final = float(np.finfo(float).eps)
+#: Of each row's scale: what rounding and a few typed digits leave of a consistent state.
+_CONSISTENT: Final = 1e-8
+# Newton's iteration squares the residual: from here it ends at rounding.
+_NEAR: Final = 1e-8
+_MOST: Final = 60
+_TWIN: Final = "_constrained_twin"
+#: Random states that are drawn, each of which may be too far from the constraints, and how many of them anywhere.
+_DRAWS: Final = 50
+_ANYWHERE: Final = 10
+_NEARER: Final = 0.9
+
+
+def _function(eq: Any, name: str) -> ca.Function:
+    """Return a compiled function of (q), (q, v) or (q, v, τ), and the parameters."""
+    c, m = eq.constraints, eq.constraints.value.shape[0]
+    inputs = {"q": eq.q, "v": eq.v}
+    if name == "constraint_rows":
+        del inputs["v"]
+        outputs = {"f": c.value, "J": c.jacobian}
+    elif name == "constraint":
+        M = eq.mass_matrix
+        outputs = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": c.weight(M), "M": M}
+    elif name == "constraint_step":
+        # q after a step of Newton's, v consistent there, f before it and its scale.
+        space = SymbolicSpace(eq.model)
+        Y = solve(c.weight(eq.mass_matrix), c.jacobian.T, eq.elimination_order)
+        S = ca.mtimes(c.jacobian, Y)
+        moved = -ca.mtimes(Y, solve(S, c.value, range(m)))
+        q1 = space.retract(eq.q, space.to_integrator_velocity(eq.q, moved))
+        Y1, S1, rate1 = (ca.substitute(x, eq.q, q1) for x in (Y, S, c.rate))
+        v1 = eq.v - ca.mtimes(Y1, solve(S1, rate1, range(m)))
+        outputs = {"q1": q1, "v1": v1, "f": c.value, "scale": ca.sqrt(ca.sum2(c.jacobian**2))}
+    elif name == "all_rows":
+        del inputs["v"]
+        outputs = {"f": eq.constraint_residual, "J": eq.constraint_jacobian, "ways": eq.loop_ways}
+    elif name == "multipliers":
+        inputs["tau"] = eq.tau
+        outputs = {"lambda": eq.constraint_forces}
+    elif name == "embedded":
+        outputs = {
+            "J": c.jacobian,
+            "by_time": c.by_time,
+            "gamma": c.gamma,
+            "M": eq.mass_matrix,
+            "force": eq.passive - eq.nle,
+        }
+    else:
+        # curvature: ∂(Jᵀ λ)/∂q; λ takes the place of v's first entries.
+        outputs = {"H": ca.jacobian(ca.mtimes(c.jacobian.T, eq.v[:m]), eq.q)}
+    inputs |= eq.extra_arguments
+    dense = [ca.densify(x) for x in outputs.values()]
+    return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs), {"cse": True})
+
+
+class _Terms(NamedTuple):
+    """Numbers at one state: f (m,), J (m, n), ḟ (m,), the weight W and the mass matrix (n, n)."""
+
+    f: Array
+    J: Array
+    rate: Array
+    W: Array
+    M: Array
+
+    @property
+    def scale(self) -> Array:
+        """What a row changes by when every coordinate changes by 1."""
+        sizes = np.abs(self.J).sum(axis=1)
+        return np.where(sizes > 0, sizes, 1.0)
+
+
+class Manifold:
+    """The consistent states of dynamics with constraints, in numbers."""
+
+    def __init__(self, dyn: LagrangianDynamics) -> None:
+        self.dyn = dyn
+
+    def at(self, t: float) -> Manifold:
+        """Return the states at a time."""
+        return Manifold(at_time(self.dyn, t)) if self.dyn.model.time_parameter else self
+
+    @property
+    def equations(self) -> Any:
+        """The equations, with their `constraints`."""
+        return self.dyn.equations
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """A text for each row."""
+        names: tuple[str, ...] = self.equations.constraints.names
+        return names
+
+    @property
+    def judged(self) -> bool:
+        """Whether the constraints were independent at some pose, with these values of the parameters."""
+        return self._values() in self.equations.kept.get("judged", ())
+
+    def judge(self) -> None:
+        """Keep that they were."""
+        self.equations.kept.setdefault("judged", set()).add(self._values())
+
+    def _values(self) -> tuple[float, ...]:
+        model = self.dyn.model
+        return tuple(float(x or 0.0) for n, x in model.parameters.items() if n != model.time_parameter)
+
+    def call(self, name: str, *arguments: Array) -> list[Array]:
+        """Return the outputs of a compiled function, with its parameters behind."""
+        code = self.dyn.code(name, make=lambda: _function(self.equations, name))
+        if self.dyn.model.parameters:
+            p, lead = self.dyn.parameter_values, arguments[0].shape[:-1]
+            if p.ndim > 1 and not lead:
+                # One of a batch is a batch of one.
+                (p,) = p
+            arguments = (*arguments, np.broadcast_to(p, (*lead, p.shape[-1])))
+        return list(code(*arguments))
+
+    def all_rows(self, q: Array) -> Array:
+        """Return J of all rows, redundant ones among them."""
+        return self.call("all_rows", q)[1]
+
+    def still_open(self, q: Array) -> list[str]:
+        """Return what is open at a configuration where the independent rows are zero: others, and half a turn."""
+        f, J, ways = self.call("all_rows", q)
+        scale = np.maximum(np.abs(J).sum(axis=1), 1.0) * max(1.0, float(np.abs(q).max()))
+        names = self.equations.all_constraints.names
+        rows = [names[k] for k in np.flatnonzero(~(np.abs(f[:, 0]) <= _CONSISTENT * scale))]
+        turned = [loop.name for loop, way in zip(self.dyn.model.loops, ways[:, 0], strict=True) if way < 0]
+        return rows or [f"loop {name!r} half a turn off" for name in turned]
+
+    def value(self, q: Array) -> Array:
+        """Return f, (m,) or (N, m)."""
+        return np.asarray(self.call("constraint_rows", q)[0][..., 0])
+
+    def jacobian(self, q: Array) -> Array:
+        """Return J, (m, n) or (N, m, n)."""
+        return self.call("constraint_rows", q)[1]
+
+    def multipliers(self, q: Array, v: Array, tau: Array) -> Array:
+        """Return λ, (m,) or (N, m)."""
+        return np.asarray(self.call("multipliers", q, v, tau)[0][..., 0])
+
+    def _terms(self, q: Array, v: Array) -> _Terms:
+        f, J, _, rate, W, M = self.call("constraint", q, v)
+        return _Terms(f[:, 0], J, rate[:, 0], W, M)
+
+    # Consistency
+
+    def check(self, q: Array, v: Array) -> None:
+        """Refuse an inconsistent state, of one or a batch, with the residuals (InputError)."""
+        states = np.atleast_2d(q), np.atleast_2d(v)
+        suspects = range(len(states[0])) if self.dyn.samples is not None else self._inconsistent(*states)
+        for k, one_q, one_v in ((k, states[0][k], states[1][k]) for k in suspects):
+            terms = self.member(k)._terms(one_q, one_v)
+            for name, what, residual, x in (("q0", "f", terms.f, one_q), ("v0", "J v + ∂f/∂t", terms.rate, one_v)):
+                if not (np.abs(residual) <= _CONSISTENT * terms.scale * max(1.0, float(np.abs(x).max()))).all():
+                    where = "" if q.ndim == 1 else f" of state {k}"
+                    raise InputError(
+                        f"{name}: the constraints of {self.dyn.model.name} ask for {what} = 0, which is "
+                        f"{_residuals(residual)}{where}; project(q0, v0) returns the nearest consistent state"
+                    )
+        if self.dyn.samples is None:
+            f, _, ways = self.call("all_rows", states[0])
+            suspects = np.flatnonzero((np.abs(f) > _CONSISTENT).any(axis=(1, 2)) | (ways < 0).any(axis=(1, 2))).tolist()
+            for k in suspects:
+                if still := self.still_open(states[0][k]):
+                    where = "" if q.ndim == 1 else f" of state {k}"
+                    raise InputError(f"q0: {self.dyn.model.name} is open there{where}: {', '.join(still)}")
+
+    def _inconsistent(self, q: Array, v: Array) -> list[int]:
+        """Return which states of a batch may be inconsistent."""
+        f, J, _, rate, *_ = self.call("constraint", q, v)
+        scale = np.abs(J).sum(axis=-1)
+        scale = np.where(scale > 0, scale, 1.0)
+        bad = np.zeros(len(q), dtype=bool)
+        for residual, x in ((f, q), (rate, v)):
+            size = np.maximum(1.0, np.abs(x).max(axis=1))[:, None]
+            bad |= ~(np.abs(residual[..., 0]) <= _CONSISTENT * scale * size).all(axis=1)
+        return [int(k) for k in np.flatnonzero(bad)]
+
+    def doubtful(self, q: Array) -> Array:
+        """Return, for each of a batch, whether the constraints may depend on each other there."""
+        if self.dyn.samples is not None or len(self.equations.all_constraints.names) > len(self.names):
+            return np.full(len(q), True)
+        J = self.jacobian(q)
+        size = np.linalg.norm(J, axis=-1)
+        typical = np.maximum(size.max(axis=0), _ROUNDED)
+        least = np.linalg.svd(J / typical[:, None], compute_uv=False)[:, -1]
+        return np.asarray(~(least > _FLAT))
+
+    def member(self, k: int) -> Manifold:
+        """Return the states of one sample of a batch of parameters; the same where there is none."""
+        if self.dyn.samples is None:
+            return self
+        one = self.dyn.of_samples([k])
+        return Manifold(one.at(**dict(zip(one.model.parameters, one.parameter_values[0].tolist(), strict=True))))
+
+    def pulled(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the consistent state beside one that has drifted a little, or of each of a batch.
+
+        A state that is far from the constraints or not finite comes back as it is or as NaN.
+        """
+        for _ in range(4):
+            q, v, f, scale = (x[..., 0] for x in self.call("constraint_step", q, v))
+            if not bool((np.abs(f) / scale > _NEAR).any()):
+                break
+        return q, v
+
+    def project(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the nearest consistent state, in the metric of the mass matrix there; InputError if there is none."""
+        x = self.restored(q, v)
+        M, n, model = self._terms(q, v).M, len(v), self.dyn.model
+        # Stationary: M (x - q) + Jᵀ μ = 0 with f(x) = 0.
+        last = np.inf
+        for _ in range(_MOST):
+            f, J, *_ = self._terms(x, v)
+            K = np.block([[M, J.T], [J, np.zeros((len(J), len(J)))]])
+            away = np.concatenate([M @ model.difference(x, q), -f])
+            step = np.linalg.lstsq(K, away, rcond=1e-14)[0][:n]
+            size = float(np.linalg.norm(step))
+            if size <= 1e-12 * (1 + float(np.linalg.norm(x))):
+                break
+            # Where the constraints bend strongly, whole steps go to and fro about the foot.
+            x = self.restored(model.integrate(x, step if size < last else 0.5 * step), v)
+            last = min(last, size)
+        terms = self._terms(x, v)
+        return x, v + _least_change(terms.W, terms.J, -terms.rate)
+
+    def restored(self, q: Array, v: Array) -> Array:
+        """Return a configuration with f = 0, by steps that are the least in the mass matrix's metric."""
+        x, terms = q, self._terms(q, v)
+        best = float(np.linalg.norm(terms.f / terms.scale))
+        for _ in range(_MOST):
+            if best <= 4 * _EPS * (1 + float(np.abs(x).max())):
+                break
+            step, length = _least_change(terms.W, terms.J, -terms.f), 1.0
+            while length > 1e-6:
+                moved = self.dyn.model.integrate(x, length * step)
+                beyond = self._terms(moved, v)
+                size = float(np.linalg.norm(beyond.f / beyond.scale))
+                if size < best:
+                    break
+                length *= 0.5
+            else:
+                break
+            x, terms, best = moved, beyond, size
+        if not best <= 1e-10 * (1 + float(np.abs(x).max())):
+            raise InputError(
+                f"q: {self.dyn.model.name} has no consistent state near it; f = {_residuals(terms.f)} is the "
+                "least reached"
+            )
+        if still := self.still_open(x):
+            raise InputError(
+                f"q: {self.dyn.model.name}: near it the other rows close where these are open: {', '.join(still)}; "
+                "start nearer to a closed configuration"
+            )
+        return np.asarray(x)
+
+
+def _residuals(x: Array) -> str:
+    return f"[{', '.join(f'{e:.3g}' for e in x)}]"
+
+
+def manifold_of(dyn: Dynamics) -> Manifold:
+    """Return the consistent states of dynamics; those of another engine by the own derivation."""
+    if not dyn.model.constrained:
+        raise UnsupportedError(f"{dyn.model.name}: has no loops, no prescribed motions and no other constraints")
+    if isinstance(dyn, LagrangianDynamics):
+        return Manifold(dyn)
+    # Deriving costs more than most runs: once for each engine's object.
+    if _TWIN not in vars(dyn):
+        vars(dyn)[_TWIN] = LagrangianDynamics(dyn.model)
+    return Manifold(vars(dyn)[_TWIN])
+
+
+class ConsistentStates:
+    """What a model asks of its constraints, by equations that are interpreted and derived once."""
+
+    def __init__(self, model: Model) -> None:
+        self.manifold = Manifold(LagrangianDynamics(model, compile=False))
+
+    def at(self, model: Model) -> ConsistentStates:
+        """Return the same for other values of the model's parameters."""
+        out = object.__new__(type(self))
+        out.manifold = Manifold(self.manifold.dyn._with(model, {}))
+        return out
+
+    def require_independent(self, q: Array, *, once: bool = False) -> None:
+        """Refuse constraints that depend on each other at q; with `once`, if that was never looked at."""
+        if not (once and self.manifold.judged):
+            require_independent(self.manifold.dyn, np.atleast_2d(q)[0])
+
+    def random(self, rng: np.random.Generator, size: int | None) -> tuple[Array, Array]:
+        """Return random consistent states that are no singular poses."""
+        drawn = [self._drawn(rng) for _ in range(1 if size is None else size)]
+        model = self.manifold.dyn.model
+        sizes = (model.nq, model.nv)
+        q, v = (np.array([state[k] for state in drawn]).reshape(-1, n) for k, n in enumerate(sizes))
+        return (q[0], v[0]) if size is None else (q, v)
+
+    def _drawn(self, rng: np.random.Generator) -> tuple[Array, Array]:
+        dyn = self.manifold.dyn
+        for k in range(_DRAWS):
+            # From some places there is no way to the constraints; on some branches they depend on each other.
+            with suppress(InputError, NumericalError):
+                q, v = random_state(dyn.model, rng, None)
+                if k >= _ANYWHERE:
+                    # Of many loops few configurations are near a closed one: nearer and nearer to one that is known.
+                    model, known = dyn.model, self.manifold.equations.closed_configuration
+                    known = model.neutral() if known is None else known
+                    q = model.integrate(known, _NEARER ** (k - _ANYWHERE) * model.difference(known, q))
+                # Some pose is far cheaper than the nearest one, and on such a branch refused all the same.
+                require_independent(dyn, self.manifold.restored(q, v))
+                state = self.manifold.project(q, v)
+                require_independent(dyn, state[0])
+                return state
+        refuse_unreachable(dyn)
+        return self.manifold.project(*random_state(dyn.model, rng, None))
+
+
+#: The name under which a model keeps its own.
+_STATES: Final = "_consistent_states"
+
+
+def states_of(model: Model) -> ConsistentStates:
+    """Return the consistent states of a model under constraints, derived once for it."""
+    kept = vars(model)
+    if _STATES not in kept:
+        kept[_STATES] = ConsistentStates(model)
+    states: ConsistentStates = kept[_STATES]
+    if states.manifold.dyn.model is not model:
+        # The same constraints at other values of parameters, or at another time.
+        states = kept[_STATES] = states.at(model)
+    return states
+
+
+def _least_change(W: Array, J: Array, change: Array) -> Array:
+    """Return the x with J x = change that is the least in xᵀ W x; the nearest to it where J has dependent rows."""
+    try:
+        L = np.linalg.cholesky(W)
+    except np.linalg.LinAlgError:
+        L = np.eye(len(W))
+    A = np.linalg.solve(L, J.T).T
+    y = np.linalg.lstsq(A, change, rcond=1e-12)[0]
+    return np.asarray(np.linalg.solve(L.T, y))
+
+
+def pulled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+    """Return the consistent states at a time that are near the ends of a step."""
+    return manifold_of(dyn).at(t).pulled(q, v)
+
+
+def projected(dyn: Dynamics, q: Array, v: Array) -> tuple[Array, Array]:
+    """Return the nearest consistent state; an `InputError` where there is none or the constraints are redundant."""
+    manifold = manifold_of(dyn)
+    try:
+        state = manifold.project(q, v)
+    except InputError:
+        refuse_unreachable(manifold.dyn, q)
+        raise
+    require_independent(manifold.dyn, state[0], everywhere=True)
+    return state
+
+
+def names_of(dyn: Dynamics) -> tuple[str, ...]:
+    """Return the names of all rows, redundant ones among them."""
+    names: tuple[str, ...] = manifold_of(dyn).equations.all_constraints.names
+    return names
+
+
+@dataclass(frozen=True)
+class Mobility:
+    """How many degrees of freedom constraints leave, and which of their rows are redundant.
+
+    Attributes
+    ----------
+    model : str
+    degrees_of_freedom : int
+        Velocities less the rank of J.
+    rows, redundant : tuple of str
+        Names of all rows, and of those that follow from the others.
+    """
+
+    model: str
+    degrees_of_freedom: int
+    rows: tuple[str, ...]
+    redundant: tuple[str, ...]
+
+    def __str__(self) -> str:
+        n = len(self.redundant)
+        which = f"{n or 'none'} {'are' if n > 1 else 'is'} redundant{': ' if n else ''}{', '.join(self.redundant)}"
+        return f"{self.model}: degrees of freedom {self.degrees_of_freedom}, of {len(self.rows)} rows {which}"
+
+
+def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
+    """Return the mobility at a configuration, or at some one where the loops are closed."""
+    model = dyn.model
+    if not model.constrained:
+        return Mobility(model.name, model.nv, (), ())
+    names = names_of(dyn)
+    if q is None:
+        independent: Collection[int] = manifold_of(dyn).equations.independent_constraints
+    else:
+        independent, _ = independent_rows(np.asarray(dyn.constraint_jacobian(q)))
+    redundant = tuple(name for i, name in enumerate(names) if i not in independent)
+    return Mobility(model.name, model.nv - len(independent), names, redundant)
+
+
+# Independence
+
+#: Random starts from which a consistent configuration is searched, and steps from each.
+_STARTS: Final = 12
+_STEPS: Final = 100
+#: Configurations near a pose at which J is evaluated too, and how far they are away, rad or m.
+_BESIDE: Final = 4
+_ASIDE: Final = 0.05
+#: Remainder of a row that follows from the others, relative to the row's size.
+_DEPENDENT: Final = 1e-7
+#: Of a row's size beside the pose: its slope where a square is nearly zero.
+_FLAT: Final = 1e-4
+#: A slope that is rounding alone.
+_ROUNDED: Final = 1e-14
+#: Residual of a consistent configuration, in terms of the rows' sizes.
+_HOLDS: Final = 1e-10
+
+
+def require_few(manifold: Manifold) -> None:
+    """Refuse more constraints than coordinates."""
+    rows, n = len(manifold.names), manifold.dyn.model.nv
+    if rows > n:
+        raise InputError(f"constraints: {rows} of them for {n} coordinates; at most {n} can be independent")
+
+
+def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) -> None:
+    """Refuse constraints whose Jacobian has dependent rows around q (InputError) or at q alone (NumericalError).
+
+    With `everywhere` a singular pose is allowed: only a set that is redundant around q is refused.
+    """
+    manifold = manifold_of(dyn)
+    require_few(manifold)
+    _require_redundant(manifold, q)
+    rng = np.random.default_rng(0)
+    beside = [dyn.model.integrate(q, _ASIDE * rng.standard_normal(dyn.model.nv)) for _ in range(_BESIDE)]
+    sizes = np.max([np.linalg.norm(manifold.jacobian(x), axis=1) for x in (q, *beside)], axis=0)
+    scale = np.where(sizes > _ROUNDED, sizes, 1.0)
+    J = manifold.jacobian(q) / scale[:, None]
+    dependent, others = _dependent(J)
+    flat = bool((np.linalg.norm(J, axis=1) < _FLAT)[sizes > _ROUNDED].any())
+    if not len(dependent) and not flat:
+        manifold.judge()
+        return
+    _explain(manifold, [q, *beside], scale, sizes)
+    if everywhere or not len(dependent):
+        return
+    raise NumericalError(
+        f"q: {dyn.model.name} is at a singular pose, where {_named(dependent, manifold)} "
+        f"{_reason(others, manifold, 'has no slope')}: forces and accelerations are not determined there; take a pose "
+        "beside it"
+    )
+
+
+def _require_redundant(manifold: Manifold, q: Array) -> None:
+    """Refuse a configuration at which rows that are redundant elsewhere are not (InputError)."""
+    equations = manifold.equations
+    names, independent = equations.all_constraints.names, equations.independent_constraints
+    if len(names) == len(independent):
+        return
+    here, _ = independent_rows(manifold.all_rows(q))
+    if len(here) > len(independent):
+        more = ", ".join(name for k, name in enumerate(names) if k not in independent)
+        raise InputError(
+            f"q: {manifold.dyn.model.name} has {len(here)} independent rows here and {len(independent)} where it can "
+            f"move, without {more}; start on the branch on which it moves"
+        )
+
+
+def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> None:
+    """Refuse constraints that no configuration satisfies, or that are redundant where one does (InputError).
+
+    The search starts at q, then at random configurations.
+    """
+    states, model = manifold_of(dyn), dyn.model
+    rng = np.random.default_rng(0)
+    starts = [_far_out(model, float(rng.choice([1.0, 3.0])), rng) for _ in range(_STARTS)]
+    starts[:0] = [] if q is None else [q]
+    least, left = np.inf, np.zeros(len(states.names))
+    for start in starts:
+        sizes = np.linalg.norm(states.jacobian(start), axis=1)
+        end, f = _nearest(states, start, np.where(sizes > _ROUNDED, sizes, 1.0))
+        size = float(np.linalg.norm(f))
+        still = states.still_open(end) if size < _HOLDS else []
+        if size < _HOLDS and not still:
+            require_independent(dyn, end, everywhere=True)
+            return
+        if size < least:
+            least, left = size, f
+    if least < _HOLDS:
+        raise InputError(
+            f"q: {model.name}: from {len(starts)} starts its loops close only with something open: "
+            f"{', '.join(still) or 'rows that are redundant elsewhere'}; start nearer to a closed configuration"
+        )
+    against = np.flatnonzero(np.abs(left) > 1e-6 * np.abs(left).max())
+    raise InputError(
+        f"constraints: no configuration satisfies them all, from {len(starts)} starts; it seems that "
+        f"{_named(against, states)} {'contradict each other' if len(against) > 1 else 'cannot hold'}: the least "
+        f"that is left of them is {least:.3g}"
+    )
+
+
+def _far_out(model: Model, far: float, rng: np.random.Generator) -> Array:
+    """Return a random configuration, so many times as far from the neutral one."""
+    q, _ = random_state(model, rng, None)
+    return q if far == 1.0 else model.integrate(q, (far - 1) * model.difference(model.neutral(), q))
+
+
+def _explain(manifold: Manifold, starts: list[Array], scale: Array, sizes: Array) -> None:
+    """Raise why J has dependent rows at and around the first start; return where it has full rank nearby."""
+    consistent = [x for x, f in (_nearest(manifold, q, scale) for q in starts) if np.linalg.norm(f) < _HOLDS]
+    if not consistent:
+        refuse_unreachable(manifold.dyn, starts[0])
+        return
+    slopes = [manifold.jacobian(x) / scale[:, None] for x in consistent]
+    flat = np.flatnonzero((np.max([np.linalg.norm(J, axis=1) for J in slopes], axis=0) < _FLAT) & (sizes > _ROUNDED))
+    if len(flat):
+        raise InputError(
+            f"constraints: {_named(flat, manifold)} has no slope where it holds, here and at the poses around, so "
+            "that no force can hold it; write a square as f = 0 instead of f**2 = 0, or start from another pose"
+        )
+    dependent, others = min((_dependent(J) for J in slopes), key=lambda pair: len(pair[0]))
+    if len(dependent):
+        raise InputError(
+            f"constraints: the set is redundant, here and at poses around; {_named(dependent, manifold)} "
+            f"{_reason(others, manifold, 'holds by itself')}; leave it out, as its multiplier is not determined, or "
+            "start from another pose"
+        )
+
+
+def _nearest(manifold: Manifold, q: Array, scale: Array) -> tuple[Array, Array]:
+    """Return where damped Gauss-Newton ends, and the scaled f there."""
+    f = manifold.value(q) / scale
+    for _ in range(_STEPS):
+        step = _least_change(np.eye(manifold.dyn.model.nv), manifold.jacobian(q) / scale[:, None], -f)
+        length = 1.0
+        while length > 1e-9:
+            moved = manifold.dyn.model.integrate(q, length * step)
+            beyond = manifold.value(moved) / scale
+            if np.linalg.norm(beyond) < (1 - 1e-4 * length) * np.linalg.norm(f):
+                break
+            length *= 0.5
+        else:
+            break
+        q, f = moved, beyond
+        if np.linalg.norm(f) < 1e-13:
+            break
+    return q, f
+
+
+def _dependent(J: Array) -> tuple[Array, Array]:
+    """Return the rows that the others imply, and those others that are needed for it."""
+    from scipy.linalg import qr
+
+    _, R, order = qr(J.T, mode="economic", pivoting=True)
+    rank = int(np.count_nonzero(np.abs(np.diag(R)) > _DEPENDENT))
+    kept, dependent = order[:rank], np.sort(order[rank:])
+    if not len(dependent) or not rank:
+        return dependent, np.empty(0, dtype=int)
+    # As a combination of those that were kept.
+    weights = np.linalg.lstsq(J[kept].T, J[dependent].T, rcond=None)[0]
+    return dependent, np.sort(kept[np.abs(weights).max(axis=1) > 1e-6])
+
+
+def _named(which: Iterable[int], manifold: Manifold) -> str:
+    return ", ".join(manifold.names[k] for k in which)
+
+
+def _reason(others: Array, manifold: Manifold, alone: str) -> str:
+    return f"follows from {_named(others, manifold)}" if len(others) else alone
