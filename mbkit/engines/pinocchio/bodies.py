@@ -42,6 +42,7 @@ class PinocchioBodies:
     _full_v: Callable[[Array], Array]
     _inverse_dynamics: Callable[..., Array]
     _forward_dynamics: Callable[..., Array]
+    _generalized_force: Callable[..., Array]
     _joints_of: Callable[[Callable[[Array, Array], bool]], str]
 
     def _columns(self, J: Any) -> Array:
@@ -216,6 +217,8 @@ class PinocchioBodies:
     def _forward_dynamics_with_wrenches(
         self, q: Array, v: Array, tau: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str
     ) -> Array:
+        if self.model.constrained:
+            return self._forward_dynamics(q, v, tau + self._generalized_force(q, wrenches, frames, axes))
         outside = self._on_joints(self._applied(self._full_q(q), wrenches, frames, axes))
         return self._forward_dynamics(q, v, tau, outside)
 

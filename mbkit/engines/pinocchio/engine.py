@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from copy import copy
 from functools import cached_property
 from math import isfinite
 from typing import TYPE_CHECKING, Any, ClassVar, Final
@@ -20,6 +21,7 @@ from mbkit.engines import known_defects
 from mbkit.engines.base import Dynamics, first_names, unit_quaternions
 from mbkit.engines.frames_and_momenta import LOCAL
 from mbkit.engines.pinocchio.bodies import PinocchioBodies
+from mbkit.engines.pinocchio.constraints import PinConstraints, PinocchioConstrained
 from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
 from mbkit.engines.pinocchio.regressors import PinRegressors
 from mbkit.engines.regressors import with_losses
@@ -112,7 +114,16 @@ def _sound(model: Model, unread: set[int]) -> Sound:
 _WRONG_DERIVATIVES: Final = ("universal", "spherical_zyx")
 
 
-class PinocchioDynamics(PinocchioBodies, Dynamics):
+#: What would be false of a model with loops or prescribed motions, and why.
+_WITHOUT_LOOPS: Final = {
+    "forward_dynamics_derivatives": (
+        f"computeConstraintDynamicsDerivatives of Pinocchio {pin.__version__} is not the derivative by q of "
+        "constraintDynamics; mbkit.dynamics(model, 'lagrangian') has it"
+    ),
+}
+
+
+class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
     """Pinocchio's algorithms on a description.
 
     Attributes
@@ -123,10 +134,14 @@ class PinocchioDynamics(PinocchioBodies, Dynamics):
 
     engine = "pinocchio"
     refuses: ClassVar[dict[str, str]] = {"function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has"}
+    lacks_constraints = ""
     _batches = False
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
+        if model.constrained:
+            # Of this model alone, in the place of the class's.
+            vars(self)["refuses"] = self.refuses | _WITHOUT_LOOPS
         self._pin: PinModel = build(model)
         self.pin_model = self._m = self._pin.model
         self._d = self._m.createData()
@@ -140,6 +155,9 @@ class PinocchioDynamics(PinocchioBodies, Dynamics):
         self._G = layout.G[self._pin.v_order]
         self._Gt = np.ascontiguousarray(self._G.T)
         self._placements: dict[str, tuple[int, pin.SE3]] = {}
+        if model.constrained:
+            rotors = self._joint_passive.armature is not None
+            self._held = PinConstraints(model, self._pin, None if self._direct else self._G, rotors)
         # A class that derives from this one may have methods of its own.
         if type(self) is PinocchioDynamics:
             self._install_direct_calls()
@@ -169,6 +187,11 @@ class PinocchioDynamics(PinocchioBodies, Dynamics):
             if self._joint_passive.armature is not None:
                 own = {name: own[name] for name in ("gravity", "nle")}
             bare |= own
+        if self.model.constrained:
+            bare["forward_dynamics"] = self._forward_dynamics
+        if self.model.prescribed:
+            # Of one time, and `at` copies the rest.
+            del bare["forward_dynamics"]
         for name, call in bare.items():
             checked = getattr(self, name)
             direct = _FACTORIES[name](call, checked, _sound(self.model, unread.get(name, set())))
@@ -190,6 +213,15 @@ class PinocchioDynamics(PinocchioBodies, Dynamics):
         from mbkit.show import shapes_of
 
         return geometry(self._pin, shapes_of(self.model, shapes))
+
+    def at(self, /, **values: Any) -> Dynamics:
+        """Return the same dynamics at other values of the model's named parameters; the time alone builds nothing."""
+        if not values or set(values) - {self.model.time_parameter}:
+            return super().at(**values)
+        out = copy(self)
+        out.model = self.model.with_nominal(values)
+        out._held = self._held.at(out.model.time)
+        return out
 
     # Between the description's coordinates and Pinocchio's.
 
@@ -236,6 +268,8 @@ class PinocchioDynamics(PinocchioBodies, Dynamics):
         return self._force(out)
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array, *outside: Any) -> Array:
+        if self.model.constrained:
+            return self._constrained_motion(q, v, tau)
         q, v = self._full_q(q), self._full_v(v)
         m, d, passive = self._m, self._d, self._full_passive(q, v)
         if not self._reduced and self._joint_passive.armature is None:

@@ -1,0 +1,469 @@
+"""Loops and prescribed motions by Pinocchio. A part of `PinocchioDynamics`.
+
+`pinocchio.constraintDynamics` gives the accelerations where it can: every loop is a "point" or a "frame", no motion is
+prescribed, no joint mimics another, no coupling has an armature, and no row is redundant but those of a plane that does
+not move. It factors J M⁻¹ Jᵀ + μ and iterates (Carpentier, Budhiraja and Mansard 2021, Proximal and sparse resolution
+of constrained dynamic equations). Elsewhere the equation
+
+    M v̇ - Jᵀ λ = τ + τ_passive - h        J v̇ = -γ
+
+is solved by LAPACK, with M of `crba`, h of `rnea`, and rows from Pinocchio's placements, Jacobians and accelerations of
+frames. `PinConstraints.solver` tells which. An answer of constraintDynamics is looked at: its numbers are finite, the
+ends' accelerations agree, and no pivot says that rows depend on each other. LAPACK takes over where one of this fails,
+and says so where nothing is determined. Without regularization constraintDynamics returns NaN for a loop in a plane,
+whose third row is redundant.
+
+Both solve the same equation where loops are closed. Beside such states, as at a stage of a Runge-Kutta step,
+constraintDynamics holds the ends' accelerations in the axes of end a, and the rows here those of the body that carries
+both: v̇ differs by the gap times squared speeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from math import cos, inf, isfinite, sin
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pinocchio as pin
+
+from mbkit._check import Array
+from mbkit.engines.base import first_names
+from mbkit.engines.pinocchio.model import PinModel
+from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.model import Model
+from mbkit.model.loops import LOOP_KINDS
+from mbkit.model.parts import Loop
+from mbkit.spatial import skew
+
+if TYPE_CHECKING:
+    from mbkit.derivation.constraints import RowChoice
+
+#: Kinds of loops that Pinocchio's rigid constraints have.
+_RIGID: Final = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.CONTACT_6D}
+#: μ in terms of the largest pivot of J M⁻¹ Jᵀ. An iteration leaves μ / σ of the error along a singular value σ, and
+#: rounding of a redundant row, eps / μ, must stay small.
+_MU: Final = 1e-10
+_ITERATIONS: Final = 20
+_ACCURACY: Final = 1e-14
+#: Pivot of a row that depends on the others, in terms of the largest one. It is the square of what is left of the row.
+_NO_PIVOT: Final = 1e-12
+#: Disagreement of the ends' accelerations in terms of these, up to which an answer is taken.
+_AGREES: Final = 1e-11
+#: Times that a solution of LAPACK is refined: of masses that differ by decades the factors lose digits of the rows.
+_REFINED: Final = 2
+_ALIGNED: Final = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+_LOCAL: Final = pin.ReferenceFrame.LOCAL
+
+
+@dataclass(frozen=True)
+class Rows:
+    """f, J, ḟ and γ of rows."""
+
+    f: Array
+    J: Array
+    rate: Array
+    gamma: Array
+
+    def __getitem__(self, which: Any) -> Rows:
+        return Rows(self.f[which], self.J[which], self.rate[which], self.gamma[which])
+
+    @staticmethod
+    def stacked(parts: list[Rows]) -> Rows:
+        """Return rows one below the other."""
+        columns = ([getattr(x, name) for x in parts] for name in ("f", "J", "rate", "gamma"))
+        return Rows(*(np.concatenate(x) for x in columns))
+
+
+class _Frame:
+    """A frame on a joint: its place and rotation in the world, Jacobians, velocities and accelerations of v̇ = 0."""
+
+    def __init__(self, m: Any, d: Any, G: Array | None, joint: int, X_JF: Any) -> None:
+        X = d.oMi[joint] * X_JF
+        self.R, self.p = X.rotation, X.translation
+        # Of the world's joint in a model without others, Pinocchio would read beyond an array.
+        J = np.zeros((6, m.nv))
+        if joint:
+            J = pin.getFrameJacobian(m, d, joint, X_JF, _ALIGNED).reshape(6, m.nv)
+        J = J if G is None else J @ G
+        speed, rate = (
+            own(m, d, joint, X_JF, _ALIGNED) for own in (pin.getFrameVelocity, pin.getFrameClassicalAcceleration)
+        )
+        self.J, self.J_turn = J[:3], J[3:]
+        self.v, self.w = speed.linear, speed.angular
+        self.a, self.alpha = rate.linear, rate.angular
+
+
+class _Relative:
+    """Both ends of a loop as the body sees them that carries both, in its axes.
+
+    r is the gap from end b to end a, with its derivatives. A and B are the ends' rotations, with Jacobians of turning,
+    angular velocities and their rates.
+    """
+
+    def __init__(self, loop: Loop, a: _Frame, b: _Frame, c: _Frame) -> None:
+        self.length = loop.length
+        to = c.R.T
+        gap, speed = a.p - b.p, a.v - b.v
+        self.r = to @ gap
+        self.J = to @ (a.J - b.J + skew(gap) @ c.J_turn)
+        self.dr = to @ (speed - _cross(c.w, gap))
+        # Of gap = R r, twice differentiated.
+        rest = _cross(c.alpha, gap) + 2.0 * _cross(c.w, speed) - _cross(c.w, _cross(c.w, gap))
+        self.ddr = to @ (a.a - b.a - rest)
+        self.A, self.B = to @ a.R, to @ b.R
+        (self.J_a, self.w_a, self.dw_a), (self.J_b, self.w_b, self.dw_b) = (
+            (to @ (e.J_turn - c.J_turn), to @ (e.w - c.w), to @ (e.alpha - c.alpha - _cross(c.w, e.w))) for e in (a, b)
+        )
+
+    def gap(self) -> Rows:
+        """Return the gap."""
+        return Rows(self.r, self.J, self.dr, self.ddr)
+
+    def turn(self) -> Rows:
+        """Return the axis of the turn from frame b to frame a, times the sine of its angle.
+
+        Of Q = A Bᵀ it is half of what is skew, and its rate ½ (tr Q - Q) ω_a - ½ (tr Q - Qᵀ) ω_b.
+        """
+        Q = self.A @ self.B.T
+        dQ = skew(self.w_a) @ Q - Q @ skew(self.w_b)
+        value = 0.5 * np.array([Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1]])
+        on_a, on_b, da, db = (0.5 * (np.trace(x) * np.eye(3) - x) for x in (Q, Q.T, dQ, dQ.T))
+        gamma = on_a @ self.dw_a - on_b @ self.dw_b + da @ self.w_a - db @ self.w_b
+        return Rows(value, on_a @ self.J_a - on_b @ self.J_b, on_a @ self.w_a - on_b @ self.w_b, gamma)
+
+    def between(self, i: int, j: int) -> Rows:
+        """Return the cosine of the angle between axis i of frame a and axis j of frame b."""
+        a, b = self.A[:, i], self.B[:, j]
+        n, w, J = _cross(a, b), self.w_a - self.w_b, self.J_a - self.J_b
+        dn = _cross(_cross(self.w_a, a), b) + _cross(a, _cross(self.w_b, b))
+        return _row(a @ b, n @ J, n @ w, n @ (self.dw_a - self.dw_b) + dn @ w)
+
+    def across(self) -> Rows:
+        """Return the rows that keep frame b's z-axis along frame a's."""
+        return Rows.stacked([self.between(0, 2), self.between(1, 2)])
+
+    def sideways(self) -> Rows:
+        """Return the gap across frame a's z-axis."""
+        out = []
+        for i in range(2):
+            a = self.A[:, i]
+            n, da = _cross(a, self.r), _cross(self.w_a, a)
+            gamma = n @ self.dw_a + _cross(self.w_a, da) @ self.r + 2.0 * da @ self.dr + a @ self.ddr
+            out.append(_row(a @ self.r, n @ self.J_a + a @ self.J, n @ self.w_a + a @ self.dr, gamma))
+        return Rows.stacked(out)
+
+    def stretch(self) -> Rows:
+        """Return (r² - l²) / 2 l of a rod."""
+        r, size = self.r, self.length
+        value = (r @ r - size * size) / (2.0 * size)
+        return _row(value, r @ self.J / size, r @ self.dr / size, (self.dr @ self.dr + r @ self.ddr) / size)
+
+
+def _row(f: Any, J: Array, rate: Any, gamma: Any) -> Rows:
+    return Rows(np.array([f]), J[None], np.array([rate]), np.array([gamma]))
+
+
+def _cross(a: Array, b: Array) -> Array:
+    # numpy.cross takes ten times as long.
+    x, y, z = a
+    u, v, w = b
+    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
+#: Kind of a loop -> its rows, in the order of `mbkit.derivation.constraints.LOOP_ROWS`.
+_ROWS: Final[dict[str, tuple[Callable[[_Relative], Rows], ...]]] = {
+    "point": (_Relative.gap,),
+    "frame": (_Relative.gap, _Relative.turn),
+    "revolute": (_Relative.gap, _Relative.across),
+    "universal": (_Relative.gap, lambda ends: ends.between(2, 2)),
+    "cylindrical": (_Relative.sideways, _Relative.across),
+    "prismatic": (_Relative.sideways, _Relative.turn),
+    "distance": (_Relative.stretch,),
+}
+
+
+class PinConstraints:
+    """The rows of a model's loops and prescribed motions, and its motion under them, in Pinocchio's numbers.
+
+    Configurations and velocities are Pinocchio's; J and forces are on the description's velocities.
+    """
+
+    def __init__(self, model: Model, maps: PinModel, G: Array | None, rotors: bool) -> None:
+        self._model, self._m, self._d = model, maps.model, maps.model.createData()
+        self._G, self._rotors, self._time = G, rotors, model.time
+        self._still = np.zeros(self._m.nv)
+        #: Of each loop both ends and the body that carries both: joint and placement on it.
+        self._ends: list[list[tuple[int, Any]]] = []
+        #: Whether the body that carries both ends stands still.
+        self._grounded: list[bool] = []
+        for loop in model.loops:
+            both = model.carrier(loop)
+            sides = [(loop.body_a, loop.rotation_a, loop.translation_a)]
+            sides += [(loop.body_b, loop.rotation_b, loop.translation_b), (both, np.eye(3), np.zeros(3))]
+            placed = []
+            for body, R, p in sides:
+                joint, R_JB, p_JB = maps.bodies[body]
+                placed.append((joint, pin.SE3(R_JB @ R, p_JB + R_JB @ p)))
+            self._ends.append(placed)
+            self._grounded.append(placed[2][0] == 0)
+
+    def at(self, time: float) -> PinConstraints:
+        """Return the same at another time."""
+        out = copy(self)
+        out._time = time
+        return out
+
+    # Rows
+
+    @cached_property
+    def choice(self) -> RowChoice:
+        """Which rows say something, and which of those are independent."""
+        # The import loads CasADi, which trees never need here.
+        from mbkit.derivation.constraints import choose_rows
+
+        return choose_rows(self._model)
+
+    def every(self, q: Array, v: Array) -> Rows:
+        """Return all rows, those that say nothing among them."""
+        m, d = self._m, self._d
+        pin.forwardKinematics(m, d, q, v, self._still)
+        pin.computeJointJacobians(m, d)
+        parts = []
+        for loop, ends in zip(self._model.loops, self._ends, strict=True):
+            seen = _Relative(loop, *(_Frame(m, d, self._G, *end) for end in ends))
+            parts += [rows(seen) for rows in _ROWS[loop.kind]]
+        return Rows.stacked(parts) if parts else Rows(*(np.zeros((0, *x)) for x in ((), (self._model.nv,), (), ())))
+
+    def rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
+        """Return the rows that say something; `given` are q and v of the description."""
+        return Rows.stacked([self.every(q, v), *self._motions(*given)])[list(self.choice.kept)]
+
+    def _motions(self, q: Array, v: Array) -> list[Rows]:
+        layout, t, out = self._model.layout, self._time, []
+        for x in self._model.prescribed:
+            i, k = layout.full_q[x.joint].start, layout.full_v[x.joint].start
+            turn = x.frequency * t + x.phase
+            path = x.offset + x.rate * t + x.amplitude * sin(turn)
+            speed = x.rate + x.amplitude * x.frequency * cos(turn)
+            to = layout.G[k]
+            gamma = x.amplitude * x.frequency**2 * sin(turn)
+            out.append(_row(layout.G_q[i] @ q + layout.offsets[i] - path, to, to @ v - speed, gamma))
+        return out
+
+    # Motion
+
+    @cached_property
+    def solver(self) -> str:
+        """What gives the accelerations: "constraintDynamics", or "LAPACK" from Pinocchio's terms."""
+        model = self._model
+        if model.prescribed or model.layout.reduced or self._rotors or any(x.kind not in _RIGID for x in model.loops):
+            return "LAPACK"
+        kept, independent = self.choice.kept, self.choice.independent
+        first = 0
+        for loop, grounded in zip(model.loops, self._grounded, strict=True):
+            last = first + LOOP_KINDS[loop.kind]
+            # Of a plane that is carried along, what is redundant is so where the loop is closed, and not beside.
+            if not grounded and any(i not in kept for i in range(first, last)):
+                return "LAPACK"
+            first = last
+        return "constraintDynamics" if len(independent) == len(kept) else "LAPACK"
+
+    @cached_property
+    def _rigid(self) -> tuple[Any, Any]:
+        """Pinocchio's models and data of the loops."""
+        models, data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+        for loop, (a, b, _) in zip(self._model.loops, self._ends, strict=True):
+            models.append(pin.RigidConstraintModel(_RIGID[loop.kind], self._m, *a, *b, _LOCAL))
+            data.append(models[-1].createData())
+        pin.initConstraintDynamics(self._m, self._d, models, data)
+        return models, data
+
+    @cached_property
+    def _mu(self) -> float:
+        q = pin.neutral(self._m)
+        settings = pin.ProximalSettings(_ACCURACY, _ACCURACY, _MU, 1)
+        pin.constraintDynamics(self._m, self._d, q, self._still, self._still, *self._rigid, settings)
+        largest = float(np.max(self._pivots(), initial=0.0))
+        return _MU * largest if 0.0 < largest < inf else _MU
+
+    def _pivots(self) -> Array:
+        """Return those of J M⁻¹ Jᵀ + μ, after constraintDynamics."""
+        rows = sum(LOOP_KINDS[loop.kind] for loop in self._model.loops)
+        # Pinocchio factors the whole of the equation, where they are the negative ones.
+        return np.asarray(-self._d.constraint_chol.D[:rows])
+
+    def iterated(self, q: Array, v: Array, force: Array) -> Array | None:
+        """Return v̇ of constraintDynamics under a force without h, all of it Pinocchio's; None where it is none."""
+        m, d, mu = self._m, self._d, self._mu
+        models, data = self._rigid
+        settings = pin.ProximalSettings(_ACCURACY, _ACCURACY, mu, _ITERATIONS)
+        a: Array = pin.constraintDynamics(m, d, q, v, force, models, data, settings).copy()
+        if not isfinite(sum(a.tolist())):
+            return None
+        pivots = self._pivots()
+        if np.count_nonzero(pivots - mu > _NO_PIVOT * pivots.max()) != len(self.choice.independent):
+            return None
+        return a if self._agree(q, v, a) else None
+
+    def _agree(self, q: Array, v: Array, a: Array) -> bool:
+        """Return whether the accelerations of the loops' ends agree, as constraintDynamics means it."""
+        m = self._m
+        # The data of constraintDynamics is kept for the multipliers.
+        own = self._kinematic
+        pin.forwardKinematics(m, own, q, v, a)
+        for loop, (one, other, _) in zip(self._model.loops, self._ends, strict=True):
+            if loop.kind == "point":
+                x, y = (pin.getFrameClassicalAcceleration(m, own, *e, _ALIGNED).linear for e in (one, other))
+            else:
+                place = (own.oMi[one[0]] * one[1]).actInv(own.oMi[other[0]] * other[1])
+                (v_a, v_b), (x, y) = (
+                    [of(m, own, *e, _LOCAL) for e in (one, other)]
+                    for of in (pin.getFrameVelocity, pin.getFrameAcceleration)
+                )
+                v_b, y = place.act(v_b), place.act(y)
+                x, y = (x + v_a.cross(v_b)).vector, y.vector
+            (*x,), (*y,) = x.tolist(), y.tolist()
+            size = max(map(abs, (*x, *y)))
+            if not max(abs(s - t) for s, t in zip(x, y, strict=True)) <= _AGREES * max(size, 1e-3):
+                return False
+        return True
+
+    @cached_property
+    def _kinematic(self) -> Any:
+        return self._m.createData()
+
+    def iterated_forces(self, q: Array) -> Array:
+        """Return λ of all rows after `iterated`, in the axes of the body that carries both ends."""
+        m, own = self._m, self._kinematic
+        pin.forwardKinematics(m, own, q)
+        out, first, given = [], 0, np.asarray(self._d.lambda_c)
+        for loop, (a, _, c) in zip(self._model.loops, self._ends, strict=True):
+            R = (own.oMi[c[0]].rotation @ c[1].rotation).T @ own.oMi[a[0]].rotation @ a[1].rotation
+            last = first + LOOP_KINDS[loop.kind]
+            out += [R @ part for part in given[first:last].reshape(-1, 3)]
+            first = last
+        return np.concatenate(out)
+
+    def solved(self, rows: Rows, M: Array, force: Array) -> tuple[Array, Array]:
+        """Return v̇ and λ of all rows by LAPACK, in the description's velocities; `force` includes -h.
+
+        Raises
+        ------
+        NumericalError
+            A singular pose, or a mass matrix that is singular on what the rows leave free.
+        """
+        from scipy.linalg import lapack
+
+        from mbkit.derivation.constraints import DEPENDENT
+
+        which = list(self.choice.independent)
+        J, gamma = rows.J[which], rows.gamma[which]
+        n, k = len(M), len(J)
+        masses = np.abs(np.diag(M))
+        across = 1.0 / np.sqrt(np.where(masses > 0, masses, 1.0))
+        scaled = J * across
+        sizes = np.linalg.norm(scaled, axis=1)
+        scaled = scaled / np.where(sizes > 0, sizes, 1.0)[:, None]
+        if not np.isfinite(scaled).all() or not np.isfinite(force).all():
+            raise NumericalError(f"pinocchio: the terms of {self._model.name} are not finite at this state")
+        if k and np.linalg.svd(scaled, compute_uv=False)[-1] < DEPENDENT:
+            raise NumericalError(self._singular(scaled))
+        rates = 1.0 / np.where(sizes > 0, sizes, 1.0)
+        K = np.block([[across[:, None] * M * across, -scaled.T], [scaled, np.zeros((k, k))]])
+        factors = lapack.dgetrf(K)
+        a, forces = np.zeros(n), np.zeros(k)
+        for _ in range(1 + _REFINED):
+            left = np.concatenate([across * (force - M @ a + J.T @ forces), -rates * (gamma + J @ a)])
+            x, _ = lapack.dgetrs(*factors[:2], left)
+            a, forces = a + across * x[:n], forces + rates * x[n:]
+        if factors[2] or not np.isfinite(a).all():
+            raise NumericalError(
+                f"pinocchio: the mass matrix of {self._model.name} is singular on what its loops leave free"
+            )
+        if k < len(rows.J):
+            # Jᵀ λ = J_allᵀ μ with J_all = C J, for every μ with Cᵀ μ = λ.
+            C = np.linalg.lstsq(J.T, rows.J.T, rcond=None)[0].T
+            forces = np.linalg.lstsq(C.T, forces, rcond=None)[0]
+        return a, forces
+
+    def _singular(self, J: Array) -> str:
+        # The smallest singular value's vector says which rows depend on each other.
+        weights = np.linalg.svd(J.T)[2][-1]
+        parts = [
+            *(f"loop {x.name!r}" for x in self._model.loops for _ in range(LOOP_KINDS[x.kind])),
+            *(f"motion of {x.joint!r}" for x in self._model.prescribed),
+        ]
+        rows = [self.choice.kept[i] for i in self.choice.independent]
+        names = dict.fromkeys(parts[i] for i, w in zip(rows, weights, strict=True) if abs(w) > 1e-3)
+        return (
+            f"pinocchio: {self._model.name} is at a singular pose, where rows of {first_names(names)} depend on each "
+            "other: accelerations and forces are not determined there; take a pose beside it"
+        )
+
+
+class PinocchioConstrained:
+    """Quantities of loops and prescribed motions; `PinocchioDynamics` inherits it."""
+
+    model: Model
+    _held: PinConstraints
+    # Of the other parts.
+    _full_q: Callable[[Array], Array]
+    _full_v: Callable[[Array], Array]
+    _force: Callable[[Array], Array]
+    _full_passive: Callable[[Array, Array], Array]
+    _mass_matrix: Callable[[Array], Array]
+    _nle: Callable[[Array, Array], Array]
+    _passive: Callable[[Array, Array], Array]
+
+    @property
+    def constraint_solver(self) -> str:
+        """What gives accelerations under loops and prescribed motions: "constraintDynamics" or "LAPACK"."""
+        if not self.model.constrained:
+            raise UnsupportedError(f"constraint_solver: {self.model.name} has no loops and no other constraints")
+        return self._held.solver
+
+    def _rows(self, q: Array, v: Array | None = None) -> Rows:
+        v = np.zeros(self.model.nv) if v is None else v
+        return self._held.rows(self._full_q(q), self._full_v(v), (q, v))
+
+    def _constraint_residual(self, q: Array) -> Array:
+        return self._rows(q).f
+
+    def _constraint_jacobian(self, q: Array) -> Array:
+        return self._rows(q).J
+
+    def _constraint_rate(self, q: Array, v: Array) -> Array:
+        return self._rows(q, v).rate
+
+    def _constraint_bias(self, q: Array, v: Array) -> Array:
+        return self._rows(q, v).gamma
+
+    def _constrained_motion(self, q: Array, v: Array, tau: Array) -> Array:
+        """Return v̇ under the constraints."""
+        a = self._iterated(q, v, tau)
+        return self._solved(q, v, tau)[0] if a is None else self._force(a)
+
+    def _constraint_forces(self, q: Array, v: Array, tau: Array) -> Array:
+        held = self._held
+        if self._iterated(q, v, tau) is None:
+            return self._solved(q, v, tau)[1]
+        forces = held.iterated_forces(self._full_q(q))
+        if len(held.choice.kept) == len(forces):
+            return forces
+        J = held.every(self._full_q(q), self._full_v(np.zeros_like(v))).J
+        # Rows that are left out follow from the others.
+        return np.asarray(np.linalg.lstsq(J[list(held.choice.kept)].T, J.T @ forces, rcond=None)[0])
+
+    def _iterated(self, q: Array, v: Array, tau: Array) -> Array | None:
+        if self._held.solver != "constraintDynamics":
+            return None
+        q, v = self._full_q(q), self._full_v(v)
+        return self._held.iterated(q, v, self._full_v(tau) + self._full_passive(q, v))
+
+    def _solved(self, q: Array, v: Array, tau: Array) -> tuple[Array, Array]:
+        force = tau + self._passive(q, v) - self._nle(q, v)
+        return self._held.solved(self._rows(q, v), self._mass_matrix(q), force)
