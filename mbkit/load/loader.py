@@ -65,6 +65,7 @@ def load(
     nonphysical: Literal["error", "warn"] | None = None,
     gravity: ArrayLike | None = None,
     meshes: Literal["auto", "never"] = "auto",
+    loops: bool = True,
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
@@ -81,7 +82,7 @@ def load(
         Whether the base link moves freely, on a joint named ``"root_joint"``.
     mimic : {"reduce", "free"}
         What a URDF's mimic joints become: functions of the joints they follow, without coordinates of their own, or
-        independent joints. An MJCF's equality constraints are left out, and noted.
+        independent joints. An MJCF's equalities of joints are left out, and noted.
     nonphysical : {"error", "warn"}, optional
         What to do about inconsistent inertias: refuse them, or use them as written with a warning. By default robots
         by name warn, and files are refused. A negative mass is always refused.
@@ -90,6 +91,9 @@ def load(
     meshes : {"auto", "never"}
         Whether an MJCF's meshes are read where a body has no other inertia, which MuJoCo's compiler then infers; with
         "never" such bodies are refused.
+    loops : bool
+        Whether an MJCF's active <connect> and <weld> elements become loops, which hold exactly; without, they are left
+        out and noted, as those of joints and tendons are.
 
     Returns
     -------
@@ -126,6 +130,7 @@ def load(
         ("nonphysical", nonphysical, ("error", "warn", None), "'error', 'warn' or None"),
         ("floating_base", floating_base, (True, False), "True or False"),
         ("meshes", meshes, ("auto", "never"), "'auto' or 'never'"),
+        ("loops", loops, (True, False), "True or False"),
     ):
         if not isinstance(value, (str, bool, np.bool_, NoneType)) or value not in allowed:
             raise InputError(f"{name}: expected {expected}, got {shown(value)}")
@@ -144,7 +149,7 @@ def load(
         from mbkit.load.mjcf import model_of_mjcf
 
         whole = xml_reader.with_includes(root, path)
-        model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes)
+        model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes, loops)
     else:
         raise xml_reader.unknown_root(path, root)
     doubts = scale_doubts(model)

@@ -21,6 +21,7 @@ from mbkit.errors import ModelError
 from mbkit.load.mjcf_attributes import Compiler, Defaults, about, check_names
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, name_list
 from mbkit.load.mjcf_couplings import Transmissions
+from mbkit.load.mjcf_equalities import Equalities
 from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, add_free_base, read_tree
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
@@ -48,6 +49,7 @@ def model_of_mjcf(
     nonphysical: Literal["error", "warn"],
     gravity: ArrayLike | None,
     meshes: Literal["auto", "never"],
+    loops: bool,
 ) -> Model:
     """Return the model of a <mujoco> element; for the arguments see `mbkit.load.load`."""
     read = Reader()
@@ -88,12 +90,14 @@ def model_of_mjcf(
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=gravity)
     snap = _Tree(b, scene, springs).add_bodies(scale)
     transmissions = Transmissions(mujoco, scene, off)
+    equalities = Equalities(mujoco, scene, off, wanted=loops)
     if read.faults:
         raise ModelError(str(path), read.faults)
     sprung = f"stiffness and damping from MuJoCo's compiler (springdamper): {name_list(springs)}" if springs else ""
     for note in (*_notes(mujoco, path, scene, flags, scale), inferred, sprung, misspelt, snap.note):
         if note:
             b.note(note)
+    equalities.add_to(b, snap)
     try:
         model = b.build(nonphysical=nonphysical, point_masses=False)
     except ModelError as error:

@@ -151,7 +151,7 @@ class _Acting:
 
 
 class Transmissions:
-    """Reads the tendons, actuators and equality constraints of a file; its option flags switch `disabled` off."""
+    """Reads the tendons and actuators of a file; its option flags switch `disabled` off."""
 
     def __init__(self, mujoco: Element, scene: Scene, disabled: set[str]) -> None:
         self._scene, self._read, self._disabled = scene, scene.read, disabled
@@ -170,7 +170,7 @@ class Transmissions:
 
         def inside(section: str) -> list[tuple[Element, str]]:
             elements = (e for s in mujoco.all(section) for e in s.children)
-            return [(e, _label(e, k)) for k, e in enumerate(elements, 1)]
+            return [(e, element_label(e, k)) for k, e in enumerate(elements, 1)]
 
         tendons = inside("tendon")
         self._tendons = [self._tendon(e, label, k) for k, (e, label) in enumerate(tendons, 1)]
@@ -178,7 +178,6 @@ class Transmissions:
             e.attributes.get("name", ""): t.factors for (e, _), t in zip(tendons, self._tendons, strict=True)
         }
         self._actuators = [self._actuator(e, label, k) for k, (e, label) in enumerate(inside("actuator"), 1)]
-        self._equalities = [f"{label} ({_bound_parts(e)})" for e, label in inside("equality")]
 
     def _collect(self, element: Element, name: str) -> None:
         """Read the actuator defaults of a class and of the classes in it."""
@@ -323,8 +322,6 @@ class Transmissions:
         if self._actuators:
             controls = "; ".join(x.control for x in self._actuators)
             yield f"controls of actuators were left out, give their forces as tau: {controls}"
-        if self._equalities:
-            yield f"equality constraints left out: {'; '.join(self._equalities)}"
 
 
 def with_couplings(model: Model, couplings: Iterable[JointCoupling]) -> Model:
@@ -376,12 +373,13 @@ def _add_bias(settings: _Actuator, out: _Acting) -> None:
         out.left_out.append(f"force range {' '.join(f'{x:g}' for x in limits)}")
 
 
-def _bound_parts(element: Element) -> str:
+def bound_parts(element: Element) -> str:
     """Return the parts that an equality constraint binds."""
     ends = (f"{k} {v!r}" for k, v in element.attributes.items() if k.rstrip("12") in _ENDS)
     return ", ".join([element.tag, *ends])
 
 
-def _label(element: Element, number: int) -> str:
+def element_label(element: Element, number: int) -> str:
+    """Return its name, or its number and its place."""
     name = element.attributes.get("name", "")
     return repr(name) if name else f"number {number} ({element.tag}, {element.place})"

@@ -44,6 +44,7 @@ class MujocoBodies:
     _force: Callable[[Array], Array]
     _mass_matrix: Callable[[Array], Array]
     _forward_dynamics: Callable[..., Array]
+    _with_loops: Callable[[], contextlib.AbstractContextManager[None]]
 
     def _place(self, q: Array, v: Array | None = None) -> Array:
         """Put a state in, with poses and velocities of the bodies; return b of a_mj = T a + b."""
@@ -253,7 +254,7 @@ class MujocoBodies:
     ) -> Array:
         if self._reduced:
             return self._forward_dynamics(q, v, tau + self._generalized_force(q, wrenches, frames, axes))
-        with self._applied(q, wrenches, frames, axes):
+        with self._with_loops(), self._applied(q, wrenches, frames, axes):
             return self._forward_dynamics(q, v, tau)
 
     def _joint_wrenches(self, q: Array, v: Array, a: Array, *given: Any) -> Array:

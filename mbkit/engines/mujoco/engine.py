@@ -7,9 +7,10 @@ a_mj = T a + b with b = R (ω × v).
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Final
@@ -20,12 +21,14 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, real
 from mbkit._fork import fork_safe
+from mbkit._warn import warn
 from mbkit.engines import known_defects, regressors
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.mujoco.bodies import MujocoBodies
+from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopRows, Softness, law
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco.rollout import rollout
-from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.errors import DoubtfulRunWarning, InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
 
 if TYPE_CHECKING:
@@ -44,9 +47,21 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         The compiled model; free to read.
     disabled : tuple of str
         Features that are off, because the smooth terms do not need them.
+    softness : Softness
+        Of its equality constraints, which hold the loops.
+
+    Notes
+    -----
+    MuJoCo holds loops by soft equality constraints: `forward_dynamics` is its own answer, `qacc` of `mj_forward`, which
+    lets the loops open a little, and `constraint_law` tells by how much. The options `solref` and `solimp` are
+    MuJoCo's; ``**mbkit.engines.mujoco.constraints.stiffest(dt)`` are the stiffest ones for a step. Runs by MuJoCo's
+    and by mbkit's methods follow these accelerations: no state is projected, and what a loop opens is MuJoCo's. All
+    other terms are those of the tree.
     """
 
     engine = "mujoco"
+    lacks_constraints = ""
+    soft_constraints = True
     lacks_derivatives = (
         "MuJoCo differentiates by finite differences alone (mjd_inverseFD, mjd_transitionFD), which lose half of the "
         "digits; mbkit.dynamics(model, 'lagrangian') has exact ones"
@@ -55,11 +70,21 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         "coriolis_matrix": "MuJoCo forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
         **dict.fromkeys(regressors.QUANTITIES, "MuJoCo has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
+        "constraint_forces": "its soft constraints have rows of their own; constraint_law(q, v, tau).force is theirs, "
+        "and generalized_constraint_force(q, v, tau) is Jᵀ λ",
     }
+    softness = Softness()
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, *, solref: ArrayLike | None = None, solimp: ArrayLike | None = None) -> None:
         super().__init__(model)
-        self._hold(build(model))
+        self.softness = Softness.of(solref, solimp)
+        self._hold(build(model, softness=self.softness))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuilt, (type(self), self.model, self.softness)
+
+    def at(self, /, **values: Any) -> MujocoDynamics:
+        return _rebuilt(type(self), self.model.with_nominal(values), self.softness)
 
     def _hold(self, compiled: MujocoModel) -> None:
         self._maps = compiled
@@ -67,6 +92,12 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         self.mj_model = self._m = compiled.model
         self.disabled = compiled.disabled
         self._d = mujoco.MjData(self._m)
+        # Model and data with the loops; all terms but the accelerations are those of the tree.
+        self._closed = self._m, self._d
+        if self.model.loops:
+            self._m = copy.copy(self._m)
+            self._m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+            self._d = mujoco.MjData(self._m)
         self._reduced = self.model.layout.reduced
         self._lock = fork_safe(threading.RLock())
 
@@ -108,6 +139,102 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         from mbkit.show import shapes_of
 
         return build(self.model, shapes=shapes_of(self.model, shapes)).model
+
+    # Loops.
+
+    @cached_property
+    def _kept(self) -> list[int]:
+        """The rows that say something; an `InputError` for loops that never meet or that no joint moves."""
+        if not self.model.loops:
+            return []
+        # The import loads CasADi.
+        from mbkit.derivation.constraints import choose_rows
+
+        return list(choose_rows(self.model).kept)
+
+    @contextlib.contextmanager
+    def _with_loops(self) -> Iterator[None]:
+        """Evaluate with MuJoCo's equality constraints, on data of their own."""
+        _ = self._kept
+        tree = self._m, self._d
+        self._m, self._d = self._closed
+        if self._d is not tree[1]:
+            self._d.warning.number.fill(0)
+        try:
+            yield
+        finally:
+            self._m, self._d = tree
+
+    def constraint_law(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> ConstraintLaw:
+        """Return the law of MuJoCo's soft constraints at one state, by formulas of mbkit's own.
+
+        Parameters
+        ----------
+        q : (nq,) array_like
+        v, tau : (nv,) array_like
+
+        Returns
+        -------
+        ConstraintLaw
+            With the `acceleration` that MuJoCo's documentation asks for, which its solver reaches but for rounding, the
+            `rigid` one, the `digits` that softness leaves of it, and the law's terms row by row.
+
+        Raises
+        ------
+        UnsupportedError
+            A model without loops.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> model = mb.catalog.slider_crank()
+        >>> dyn = mb.dynamics(model, "mujoco")
+        >>> q, v = dyn.project([0.5, -0.2, -0.1], [1.0, 0.0, 0.0])
+        >>> said, done = dyn.constraint_law(q, v, [0.0] * 3), dyn.forward_dynamics(q, v, [0.0] * 3)
+        >>> bool(abs(said.acceleration - done).max() < 1e-12 * abs(done).max())
+        True
+        >>> 0 < said.digits < 3
+        True
+        """
+        if not self.model.loops:
+            raise UnsupportedError(f"constraint_law: {self.model.name} has no loops")
+        q, v, tau = self.model.check_q(q), self.model.check_v(v), self.model.check_v(tau, "tau")
+        if q.ndim > 1 or v.ndim > 1 or tau.ndim > 1:
+            raise InputError(f"constraint_law: expected one state, got shapes {q.shape}, {v.shape}, {tau.shape}")
+        with self._lock, heard_warnings(), self._with_loops():
+            b = self._set(q, v)
+            self._accelerated(tau)
+            M = full_mass_matrix(self._m, self._d)
+            return law(self._m, self._d, M, self.softness, lambda a: self._force(a - b), self._columns)
+
+    @cached_property
+    def _rows(self) -> tuple[LoopRows, list[int]]:
+        """The rows of the loops, and which of them say something."""
+        return LoopRows(self.mj_model, self.model, self._maps.bodies), self._kept
+
+    def _constraint_residual(self, q: Array) -> Array:
+        rows, kept = self._rows
+        self._place(q)
+        return rows.residual(self._d)[kept]
+
+    def _constraint_jacobian(self, q: Array) -> Array:
+        rows, kept = self._rows
+        self._place(q)
+        return self._columns(rows.jacobian(self._d)[kept])
+
+    def _constraint_rate(self, q: Array, v: Array) -> Array:
+        return np.asarray(self._constraint_jacobian(q) @ v)
+
+    def _constraint_bias(self, q: Array, v: Array) -> Array:
+        rows, kept = self._rows
+        b = self._place(q, v)
+        return rows.bias(self._d, b)[kept]
+
+    def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Array:
+        with self._with_loops():
+            self._set(q, v)
+            self._accelerated(tau)
+            return self._force(self._d.qfrc_constraint)
 
     # Between the description's numbers and MuJoCo's.
 
@@ -223,11 +350,16 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
             self._velocities()
             rest = self._force(self._d.qfrc_passive - self._d.qfrc_bias - self._times_mass(b))
             return self._directed(np.linalg.solve(M, tau + rest))
-        b = self._set(q, v)
+        with self._with_loops():
+            b = self._set(q, v)
+            self._accelerated(tau)
+            return self._directed(self._force(self._d.qacc - b))
+
+    def _accelerated(self, tau: Array) -> None:
+        """Let MuJoCo compute its accelerations at the state that is in."""
         self._d.qfrc_applied[:] = self._to_engine(tau)
         mujoco.mj_forward(self._m, self._d)
         self._d.qfrc_applied[:] = 0.0
-        return self._directed(self._force(self._d.qacc - b))
 
     def _kinetic_energy(self, q: Array, v: Array) -> Any:
         self._set(q, v)
@@ -294,10 +426,20 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
             raise InputError(f"tau: expected shape ({steps}, {self.model.nv}), one row a step, got {np.shape(tau)}")
         if self._lines:
             self.passive(q0, v0)  # raises where a spring has no direction to start in
-        model = copy.copy(self._m)
+        model, _ = copy.copy(self.mj_model), self._kept
+        if self.model.loops and 0 < self.softness.solref[0] < 2 * dt:
+            warn(
+                f"{self.model.name}: MuJoCo raises the time constant of its equalities from {self.softness.solref[0]:g}"
+                f" s to two steps, {2 * dt:g} s",
+                DoubtfulRunWarning,
+            )
         if euler_damping:
             model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
         return rollout(self.model, replace(self._maps, model=model), integrator, q0, v0, dt, tau, steps, progress)
+
+
+def _rebuilt(kind: type[MujocoDynamics], model: Model, softness: Softness) -> MujocoDynamics:
+    return kind(model, solref=softness.solref, solimp=softness.solimp)
 
 
 class Variant:
@@ -308,7 +450,7 @@ class Variant:
     """
 
     def __init__(self, dyn: MujocoDynamics, enable: Iterable[str] = (), *, spheres: bool = False) -> None:
-        maps = build(dyn.model, spheres=spheres)
+        maps = build(dyn.model, softness=dyn.softness, spheres=spheres)
         self._m = maps.model
         flags = int(self._m.opt.disableflags)
         for name in enable:

@@ -14,7 +14,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
 from mbkit.engines.mujoco.engine import MujocoDynamics
-from mbkit.engines.mujoco.model import JOINT_TYPES, Placed, heard_warnings, mapped, specified
+from mbkit.engines.mujoco.model import JOINT_TYPES, Placed, heard_warnings, mapped, not_held, specified
 from mbkit.errors import UnsupportedError
 from mbkit.model import Joint, Model
 
@@ -44,7 +44,7 @@ def mjcf_text(model: Model, comment: str) -> str:
     ]
     owners = {name: joint for joint in model.joints for name in placed.joints[joint.name]}
     lines += [*_body(spec.worldbody, owners, placed, model, "    "), "  </worldbody>"]
-    return "\n".join([*lines, *_tendons(spec, model), *_equalities(model), "</mujoco>", ""])
+    return "\n".join([*lines, *_tendons(spec, model), *_equalities(spec, model), "</mujoco>", ""])
 
 
 def read_back(model: Model, text: str) -> MujocoDynamics:
@@ -72,8 +72,7 @@ def _unsupported(model: Model) -> Iterator[str]:
     for coupling in model.couplings:
         if coupling.armature and model.branched(coupling):
             yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
-    yield from (f"loop {x.name!r} (MuJoCo's would be soft)" for x in model.loops)
-    yield from (f"joint {p.joint!r} is moved in time" for p in model.prescribed)
+    yield from not_held(model)
     yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
 
 
@@ -97,7 +96,8 @@ def _body(body: Any, owners: dict[str, Joint], placed: Placed, model: Model, ind
     for joint in body.joints:
         yield f"{indent}<joint{_joint(joint, owners[joint.name])}/>"
     for site in body.sites:
-        yield f"{indent}<site{_attributes(name=site.name, pos=site.pos)}/>"
+        turned = None if np.array_equal(site.quat, [1.0, 0.0, 0.0, 0.0]) else site.quat
+        yield f"{indent}<site{_attributes(name=site.name, pos=site.pos, quat=turned)}/>"
     for f in model.frames:
         if f.body == name:
             yield f"{indent}<site{_attributes(name=f.name, pos=f.translation, xyaxes=f.rotation.T[:2])}/>"
@@ -161,10 +161,13 @@ def _tendons(spec: Any, model: Model) -> Iterator[str]:
         yield "  </tendon>"
 
 
-def _equalities(model: Model) -> Iterator[str]:
+def _equalities(spec: Any, model: Model) -> Iterator[str]:
     mimics = [(j.name, j.mimic) for j in model.joints if j.mimic is not None]
-    if mimics:
+    if mimics or spec.equalities:
         yield "  <equality>"
+        for loop in spec.equalities:
+            tag = "connect" if loop.type == mujoco.mjtEq.mjEQ_CONNECT else "weld"
+            yield f"    <{tag}{_attributes(name=loop.name, site1=loop.name1, site2=loop.name2)}/>"
         for name, m in mimics:
             shape = (m.offset, m.ratio, 0.0, 0.0, 0.0)
             yield f"    <joint{_attributes(joint1=name, joint2=m.joint, polycoef=shape)}/>"

@@ -20,6 +20,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.base import STACKS, unknown_joint
 from mbkit.engines.imported import unused
+from mbkit.engines.mujoco.constraints import EQUALITIES, Softness
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.validation import static_bodies
@@ -88,14 +89,26 @@ class MujocoModel:
     disabled: tuple[str, ...]
 
 
-def build(description: Model, *, spheres: bool = False, shapes: Sequence[Shape] | None = None) -> MujocoModel:
+def build(
+    description: Model,
+    *,
+    softness: Softness | None = None,
+    spheres: bool = False,
+    shapes: Sequence[Shape] | None = None,
+) -> MujocoModel:
     """Compile the description, with shapes to draw and sites of its frames where shapes are given, if only none.
 
     `spheres` gives every body a sphere of 1 µm, to measure the cost of geometry.
 
     Raises `UnsupportedError` for a joint or a body that MuJoCo cannot hold, and names it.
     """
-    spec, placed, disabled = specified(description)
+    if description.loops and description.layout.reduced:
+        mimics = ", ".join(repr(j.name) for j in description.joints if j.mimic)
+        raise UnsupportedError(
+            f"mujoco: {description.name} has loops and mimic joints ({mimics}), which MuJoCo's own equations would "
+            "hold softly; the lagrangian engine reduces them, and mimic='free' loads independent joints"
+        )
+    spec, placed, disabled = specified(description, softness)
     if spheres:
         for name, body in placed.bodies.items():
             if name != "world":
@@ -131,11 +144,16 @@ class Placed:
     static: set[str]
 
 
-def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
+def specified(description: Model, softness: Softness | None = None) -> tuple[Any, Placed, tuple[str, ...]]:
     """Return the specification, not compiled yet, the places of the parts in it, and the features that are off.
 
-    Raises `UnsupportedError` for a joint of a type that MuJoCo does not have or an unevenly damped free joint.
+    Raises `UnsupportedError` for a joint or a loop of a kind that MuJoCo does not have, a prescribed motion, or an
+    unevenly damped free joint.
     """
+    for fault in not_held(description):
+        raise UnsupportedError(
+            f"mujoco: {description.name}: {fault}; mbkit.dynamics(model, 'lagrangian') holds all of them exactly"
+        )
     for joint in description.joints:
         if joint.kind not in JOINT_TYPES:
             raise unknown_joint("mujoco", joint)
@@ -155,7 +173,20 @@ def specified(description: Model) -> tuple[Any, Placed, tuple[str, ...]]:
     placed = _add_tree(spec, description)
     _add_springs(spec, description, placed)
     _add_couplings(spec, description, placed)
+    _add_loops(spec, description, placed, softness or Softness())
     return spec, placed, disabled
+
+
+def not_held(description: Model) -> Iterator[str]:
+    """Yield the loops and motions that are no equality of MuJoCo's, each with the reason."""
+    for loop in description.loops:
+        if loop.kind == "distance":
+            why = "MuJoCo's equality of a tendon's length leaves J̇ v out, which no stiffness makes up for"
+            yield f"loop {loop.name!r} is a rod (distance), and {why}"
+        elif loop.kind not in EQUALITIES:
+            yield f"loop {loop.name!r} is {loop.kind}, and MuJoCo has no such equality, only points and frames"
+    for motion in description.prescribed:
+        yield f"joint {motion.joint!r} is moved in time, and MuJoCo's equality of a joint holds a constant alone"
 
 
 #: Features that no smooth term needs, with their disable bits, and those that some models need.
@@ -172,6 +203,8 @@ _OFF: Final = {
     "warm start": "WARMSTART",
     "islands": "ISLAND",
 }
+#: Bits of what holds loops together.
+_FOR_LOOPS: Final = ("EQUALITY", "CONSTRAINT")
 _OFF_WITHOUT: Final = {
     "gravity": ("gravity", "GRAVITY"),
     "springs": ("springs", "SPRING"),
@@ -180,7 +213,8 @@ _OFF_WITHOUT: Final = {
 
 
 def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
-    bits = _OFF | dict(pair for need, pair in _OFF_WITHOUT.items() if not getattr(description.needs, need))
+    bits = {need: bit for need, bit in _OFF.items() if not (description.loops and bit in _FOR_LOOPS)}
+    bits |= dict(pair for need, pair in _OFF_WITHOUT.items() if not getattr(description.needs, need))
     spec.option.disableflags = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}", 0)) for bit in bits.values())
     spec.option.gravity = np.array(description.gravity)
     # 4.0.0 can give wrong accelerations with sparse Jacobians.
@@ -194,6 +228,7 @@ def _add_tree(spec: Any, description: Model) -> Placed:
     for joint in description.joints:
         children.setdefault(joint.parent, []).append(joint)
     sprung = {b for s in description.springs for b in (s.body_a, s.body_b)}
+    sprung |= {b for loop in description.loops for b in (loop.body_a, loop.body_b)}
     # (MuJoCo parent, R, p) of the frame in which a joint stands, and the joints stacked on the way there, each with its
     # frame in the same parent.
     at: dict[str, tuple[str, Array, Array, list[tuple[Joint, Array, Array]]]] = {
@@ -314,6 +349,27 @@ def _add_couplings(spec: Any, description: Model, placed: Placed) -> None:
         tendon.stiffness[0], tendon.damping[0] = coupling.stiffness, coupling.damping
         tendon.springlength = [sign * coupling.rest_length] * 2
         tendon.armature = coupling.armature
+
+
+def _add_loops(spec: Any, description: Model, placed: Placed, softness: Softness) -> None:
+    for k, loop in enumerate(description.loops):
+        ends = (
+            ("a", loop.body_a, loop.translation_a, loop.rotation_a),
+            ("b", loop.body_b, loop.translation_b, loop.rotation_b),
+        )
+        names = []
+        for end, body, point, R in ends:
+            names.append(f"loop{k}.{end}")
+            placed.bodies[body].add_site(name=names[-1], pos=np.array(point), quat=_wxyz(R))
+        equality = spec.add_equality(name=loop.name, type=EQUALITIES[loop.kind], objtype=mujoco.mjtObj.mjOBJ_SITE)
+        equality.name1, equality.name2 = names
+        equality.solref, equality.solimp = softness.solref, softness.solimp
+    if description.loops:
+        # Newton's solver ends at rounding: equalities alone are linear equations.
+        spec.option.solver, spec.option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 0.0
+        if softness.solref[0] > 0:
+            # MuJoCo raises a time constant to two steps; without steps there is none to raise it for.
+            spec.option.timestep = min(spec.option.timestep, softness.solref[0] / 2)
 
 
 def _refusal(description: Model, error: str) -> str:

@@ -1,0 +1,328 @@
+"""Loops in MuJoCo: the law of its soft equality constraints, and the rows of the contract from its kinematics.
+
+The law is that of the chapter "Computation" of MuJoCo's documentation, sections "Constraint model" and "Parameters";
+the names solref and solimp are those of "Modeling", section "Solver parameters". Of one equality with rows J, residual
+r and its size |r|::
+
+    d(r) = d_0 + y(|r| / width) (d_width - d_0)     impedance, y a spline of two powers
+    b = 2 / (d_width t)   k = 1 / (d_width t ζ)²    of solref = (t, ζ); of two negative numbers b and k themselves
+    a_ref = -b J v - k d(r) r - J̇ v                 reference acceleration
+    R = (1 - d(r)) / d(r) Â                         regularizer, with an estimate Â of the diagonal of A = J M⁻¹ Jᵀ
+    (A + R) f = a_ref - J a_0                       a_0 = M⁻¹ (τ + τ_passive - C v - g)
+    v̇ = a_0 + M⁻¹ Jᵀ f
+
+The chapter's first equations have J̇ v; MuJoCo 4.0 forms it for points and frames. As d goes to 1, R goes to zero: the
+acceleration of a closed loop becomes the rigid one. MuJoCo keeps d below 0.9999, so that it keeps four digits of it
+or so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from mbkit import spatial
+from mbkit._check import Array, real, rows
+from mbkit.errors import InputError, UnsupportedError
+from mbkit.model import Model
+
+#: Bounds that MuJoCo keeps an impedance in, and the least size that it divides by (mjMINIMP, mjMAXIMP, mjMINVAL).
+_LEAST, _MOST = 1e-4, 0.9999
+_TINY: Final = 1e-15
+#: Rows of A that say nothing new, as in a frame's loop in a plane.
+_DEPENDENT: Final = 1e-10
+_DEFAULT_SOLREF: Final = (0.02, 1.0)
+_DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
+#: MuJoCo's equality for each kind of loop that it holds.
+EQUALITIES: Final = {"point": mujoco.mjtEq.mjEQ_CONNECT, "frame": mujoco.mjtEq.mjEQ_WELD}
+
+
+@dataclass(frozen=True)
+class Softness:
+    """How soft MuJoCo's equality constraints are; the numbers of MJCF.
+
+    Attributes
+    ----------
+    solref : (float, float)
+        Time constant in s and damping ratio of the way back to a closed loop; or, of two negative numbers, minus the
+        stiffness and minus the damping of the reference acceleration.
+    solimp : (float, float, float, float, float)
+        Impedance of a closed loop, and of one that is open by a width and more; that width; midpoint and power of the
+        way between.
+    """
+
+    solref: tuple[float, float] = _DEFAULT_SOLREF
+    solimp: tuple[float, float, float, float, float] = _DEFAULT_SOLIMP
+
+    @classmethod
+    def of(cls, solref: Any = None, solimp: Any = None) -> Softness:
+        """Return checked settings; None is MuJoCo's default."""
+        ref = _numbers("solref", _DEFAULT_SOLREF if solref is None else solref, 2)
+        imp = _numbers("solimp", _DEFAULT_SOLIMP if solimp is None else solimp, 5)
+        if not ((ref > 0).all() or (ref < 0).all()):
+            # MuJoCo would take its default instead, after a warning.
+            raise InputError(f"solref: expected two positive or two negative numbers, got {tuple(ref.tolist())}")
+        if not ((imp[[0, 1, 3]] >= _LEAST).all() and (imp[[0, 1, 3]] <= _MOST).all() and imp[2] > 0 and imp[4] >= 1):
+            raise InputError(
+                f"solimp: expected impedances and a midpoint from {_LEAST} to {_MOST}, a width above 0 and a power "
+                f"from 1 on, got {tuple(imp.tolist())}"
+            )
+        return cls(tuple(ref.tolist()), tuple(imp.tolist()))
+
+    @property
+    def gains(self) -> tuple[float, float]:
+        """k in 1/s² and b in 1/s of the reference acceleration."""
+        (first, second), most = self.solref, self.solimp[1]
+        if first < 0:
+            return -first / most**2, -second / most
+        return 1 / (most * first * second) ** 2, 2 / (most * first)
+
+    def impedance(self, size: float) -> float:
+        """Return d(r) of an equality that is open by |r|."""
+        low, high, width, midpoint, power = self.solimp
+        x = min(size / width, 1.0)
+        if x <= midpoint:
+            y = x**power / midpoint ** (power - 1)
+        else:
+            y = 1 - (1 - x) ** power / (1 - midpoint) ** (power - 1)
+        return float(low + y * (high - low))
+
+
+def _numbers(name: str, x: Any, size: int) -> Array:
+    out = rows(name, x, size, "MuJoCo", "numbers")
+    if out.ndim != 1:
+        raise InputError(f"{name}: expected {size} numbers, got shape {out.shape}")
+    return out
+
+
+def stiffest(dt: float) -> dict[str, tuple[float, ...]]:
+    """Return the options of the stiffest equalities that MuJoCo holds with a step of `dt` seconds.
+
+    A time constant of two steps is the least one that its documentation allows ("Modeling", section "Solver
+    parameters"), and 0.9999 the greatest impedance.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> from mbkit.engines.mujoco.constraints import stiffest
+    >>> dyn = mb.dynamics(mb.catalog.slider_crank(), "mujoco", **stiffest(1e-3))
+    >>> dyn.softness.solref
+    (0.002, 1.0)
+    """
+    return {"solref": (2 * real("dt", dt, positive=True), 1.0), "solimp": (_MOST, _MOST, *_DEFAULT_SOLIMP[2:])}
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintLaw:
+    """What MuJoCo's documentation says of one state, by formulas of mbkit's own: `constraints.py` in this folder.
+
+    Rows are MuJoCo's: of each loop the gap in world axes, and of a frame the imaginary part of the turn's quaternion.
+
+    Attributes
+    ----------
+    softness : Softness
+    acceleration, rigid : (nv,) arrays
+        v̇ of the soft law, and that of rigid loops, R = 0 and a_ref = -J̇ v.
+    jacobian : (m, nv) array
+    residual, rate, bias : (m,) arrays
+        r, J v and J̇ v.
+    impedance, regularizer, reference, force : (m,) arrays
+        d(r), R, a_ref and f.
+    """
+
+    softness: Softness
+    acceleration: Array
+    rigid: Array
+    jacobian: Array
+    residual: Array
+    rate: Array
+    bias: Array
+    impedance: Array
+    regularizer: Array
+    reference: Array
+    force: Array
+
+    @property
+    def error(self) -> float:
+        """|v̇ - v̇_rigid| / |v̇_rigid|, the part of the rigid acceleration that softness costs."""
+        size = float(np.linalg.norm(self.rigid))
+        off = float(np.linalg.norm(self.acceleration - self.rigid))
+        return off / size if size else off
+
+    @property
+    def digits(self) -> float:
+        """Decimal digits that the soft acceleration keeps of the rigid one; infinite where they are equal."""
+        return float(-np.log10(self.error)) if self.error else float("inf")
+
+    def __str__(self) -> str:
+        return (
+            f"{len(self.residual)} rows, solref {self.softness.solref}, solimp {self.softness.solimp}: "
+            f"{self.digits:.1f} digits of the rigid acceleration"
+        )
+
+
+def law(
+    m: Any, d: Any, M: Array, softness: Softness, turned: Callable[[Array], Array], columns: Callable[[Array], Array]
+) -> ConstraintLaw:
+    """Return the law at the state that `mj_forward` was called with.
+
+    MuJoCo's are M, J, r, the smooth force and the estimates of the inverse weights; nothing of its solver is.
+    `turned` and `columns` turn an acceleration and a Jacobian into the description's coordinates.
+    """
+    J, r = np.array(d.efc_J).reshape(-1, m.nv), np.array(d.efc_pos)
+    rate, bias = J @ d.qvel, np.concatenate([_bias(m, d, i) for i in range(m.neq)])
+    stiffness, damping = softness.gains
+    impedance, estimate = np.empty(len(r)), np.empty(len(r))
+    for i in range(m.neq):
+        own = np.flatnonzero(d.efc_id == i)
+        impedance[own] = softness.impedance(float(np.linalg.norm(r[own])))
+        weights = sum(m.body_invweight0[m.site_bodyid[s]] for s in (m.eq_obj1id[i], m.eq_obj2id[i]))
+        estimate[own] = np.repeat(weights, 3)[: len(own)]
+    R = np.maximum((1 - impedance) / impedance * estimate, _TINY)
+    reference = -damping * rate - stiffness * impedance * r - bias
+    # In coordinates in which M is the identity.
+    L = np.linalg.cholesky(M)
+    B = np.linalg.solve(L, J.T).T
+    free = np.linalg.solve(L, d.qfrc_smooth)
+    f = np.linalg.solve(B @ B.T + np.diag(R), reference - B @ free)
+    rigid = free + np.linalg.lstsq(B, -bias - B @ free, rcond=_DEPENDENT)[0]
+    soft, rigid = (turned(np.linalg.solve(L.T, x)) for x in (free + B.T @ f, rigid))
+    return ConstraintLaw(softness, soft, rigid, columns(J), r, rate, bias, impedance, R, reference, f)
+
+
+def _bias(m: Any, d: Any, i: int) -> Array:
+    """Return J̇ v of an equality's rows."""
+    (rate_a, a), (rate_b, b) = (_motion(m, d, s) for s in (m.eq_obj1id[i], m.eq_obj2id[i]))
+    gap = a[:3] - b[:3]
+    if m.eq_type[i] == EQUALITIES["point"]:
+        return np.asarray(gap)
+    # r is the imaginary part of p = q̄_b q_a, times a scale: ṗ = ½ q̄_b Δω q_a, of quaternions in the world's axes.
+    Q = [_quaternion(m, d, s) for s in (m.eq_obj1id[i], m.eq_obj2id[i])]
+    wa, wb = (np.append(x[3:], 0.0) for x in (rate_a, rate_b))
+    turning = np.append(a[3:] - b[3:], 0.0) + 0.5 * (_times(wa - wb, wa) - _times(wb, wa - wb))
+    p = 0.5 * _times(spatial.conjugate(Q[1]), _times(turning, Q[0]))
+    return np.concatenate([gap, m.eq_data[i, 10] * p[:3]])
+
+
+def _motion(m: Any, d: Any, site: int) -> tuple[Array, Array]:
+    """Return J v and J̇ v of a site, (6,) each, in world axes, linear first."""
+    out = []
+    for of in (mujoco.mj_jac, mujoco.mj_jacDot):
+        J = np.zeros((6, m.nv))
+        of(m, d, J[:3], J[3:], d.site_xpos[site], m.site_bodyid[site])
+        out.append(J @ d.qvel)
+    return out[0], out[1]
+
+
+def _quaternion(m: Any, d: Any, site: int) -> Array:
+    """Return a site's quaternion with MuJoCo's sign, which decides that of the rows."""
+    return _times(*(np.roll(x, -1) for x in (d.xquat[m.site_bodyid[site]], m.site_quat[site])))
+
+
+def _times(p: Array, q: Array) -> Array:
+    """Return the product of two quaternions x, y, z, w."""
+    return np.append(p[3] * q[:3] + q[3] * p[:3] + np.cross(p[:3], q[:3]), p[3] * q[3] - p[:3] @ q[:3])
+
+
+# The rows of `mbkit.derivation.constraints`, from the motion of sites
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return a × b of columns."""
+    return np.cross(a, b, axis=0)
+
+
+class LoopRows:
+    """f, J and γ of the loops, in the axes of the body that carries both ends of each."""
+
+    def __init__(self, m: Any, description: Model, bodies: Mapping[str, int]) -> None:
+        self._m = m
+        self._loops: list[tuple[int, int, int, bool]] = []
+        for k, loop in enumerate(description.loops):
+            carrier = description.carrier(loop)
+            if carrier not in bodies:
+                raise UnsupportedError(
+                    f"mujoco: loop {loop.name!r} has its rows in the axes of {carrier!r}, a body without mass between "
+                    "two joints, which MuJoCo holds as two joints of one body"
+                )
+            self._loops.append((*(m.site(f"loop{k}.{end}").id for end in "ab"), bodies[carrier], loop.kind == "frame"))
+
+    def residual(self, d: Any) -> Array:
+        """Return f at the poses that are in."""
+        out = []
+        for a, b, carrier, frame in self._loops:
+            R, pairs = d.xmat[carrier].reshape(3, 3), self._values(d, a, b, frame)
+            out += [R.T @ x for x in pairs]
+        return np.concatenate(out)
+
+    @staticmethod
+    def _values(d: Any, a: int, b: int, frame: bool) -> list[Array]:
+        """Return the gap, and of frames ½ Σ b_k × a_k, in world axes."""
+        gap = d.site_xpos[a] - d.site_xpos[b]
+        A, B = (d.site_xmat[s].reshape(3, 3) for s in (a, b))
+        return [gap, 0.5 * _cross(B, A).sum(axis=1)] if frame else [gap]
+
+    def jacobian(self, d: Any) -> Array:
+        """Return J in MuJoCo's velocities."""
+        out = []
+        for a, b, carrier, frame in self._loops:
+            (va, wa), (vb, wb) = (self._columns(mujoco.mj_jac, d, s) for s in (a, b))
+            wc = self._jacobian(mujoco.mj_jac, d, d.xpos[carrier], carrier)[1]
+            R = d.xmat[carrier].reshape(3, 3)
+            changes = [va - vb, *([self._turn(d, a, b, wa, wb)] if frame else [])]
+            for x, change in zip(self._values(d, a, b, frame), changes, strict=True):
+                out.append(R.T @ (change - _cross(wc, x[:, None])))
+        return np.concatenate(out)
+
+    @staticmethod
+    def _turn(d: Any, a: int, b: int, wa: Array, wb: Array) -> Array:
+        """Return the rate of ½ Σ b_k × a_k for columns of angular velocities."""
+        A, B = (d.site_xmat[s].reshape(3, 3).T[:, :, None] for s in (a, b))
+        return np.asarray(
+            0.5 * sum(_cross(_cross(wb, y), x) + _cross(y, _cross(wa, x)) for x, y in zip(A, B, strict=True))
+        )
+
+    def bias(self, d: Any, b0: Array) -> Array:
+        """Return γ at the velocities that are in, where MuJoCo's accelerations are b0."""
+        out = []
+        for a, b, carrier, frame in self._loops:
+            (va, wa, la, ga), (vb, wb, lb, gb) = (
+                self._rates(d, d.site_xpos[s], self._m.site_bodyid[s], b0) for s in (a, b)
+            )
+            _, wc, _, gc = self._rates(d, d.xpos[carrier], carrier, b0)
+            R = d.xmat[carrier].reshape(3, 3)
+            rates, seconds = [va - vb], [la - lb]
+            if frame:
+                A, B = (d.site_xmat[s].reshape(3, 3) for s in (a, b))
+                first = [np.cross(w, x, axisb=0).T for w, x in ((wa, A), (wb, B))]
+                second = [
+                    np.cross(g, x, axisb=0).T + np.cross(w, y, axisb=0).T
+                    for g, w, x, y in ((ga, wa, A, first[0]), (gb, wb, B, first[1]))
+                ]
+                rates.append(0.5 * (_cross(first[1], A) + _cross(B, first[0])).sum(axis=1))
+                seconds.append(
+                    0.5 * (_cross(second[1], A) + 2 * _cross(first[1], first[0]) + _cross(B, second[0])).sum(axis=1)
+                )
+            for x, dx, ddx in zip(self._values(d, a, b, frame), rates, seconds, strict=True):
+                seen = ddx - 2 * np.cross(wc, dx) - np.cross(gc, x) + np.cross(wc, np.cross(wc, x))
+                out.append(R.T @ seen)
+        return np.concatenate(out)
+
+    def _columns(self, of: Any, d: Any, site: int) -> tuple[Array, Array]:
+        return self._jacobian(of, d, d.site_xpos[site], self._m.site_bodyid[site])
+
+    def _jacobian(self, of: Any, d: Any, p: Array, body: int) -> tuple[Array, Array]:
+        linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
+        of(self._m, d, linear, angular, p, body)
+        return linear, angular
+
+    def _rates(self, d: Any, p: Array, body: int, b0: Array) -> tuple[Array, Array, Array, Array]:
+        """Return linear and angular velocity of a point, and its accelerations at b0."""
+        linear, angular = self._jacobian(mujoco.mj_jac, d, p, body)
+        dlinear, dangular = self._jacobian(mujoco.mj_jacDot, d, p, body)
+        v = d.qvel
+        return linear @ v, angular @ v, dlinear @ v + linear @ b0, dangular @ v + angular @ b0

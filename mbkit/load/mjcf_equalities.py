@@ -1,0 +1,133 @@
+"""Equality constraints of an MJCF as loops (XML reference of MuJoCo 4.0, section "equality").
+
+A <connect> becomes a loop of two points, a <weld> one of two frames, both exact where MuJoCo's are soft. What an
+element with bodies does not say is measured in the reference configuration, the pose of the file: the second anchor of
+a <connect>, and the relative pose of a <weld>.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit import spatial
+from mbkit.load.mjcf_attributes import HERE, Pose, has_length
+from mbkit.load.mjcf_couplings import bound_parts, element_label
+from mbkit.load.mjcf_reader import Scene
+from mbkit.load.urdf_reader import Snapper
+from mbkit.load.xml_reader import Element, unused
+from mbkit.model import ModelBuilder
+from mbkit.model.validation import listing
+
+_KINDS: Final = {"connect": "point", "weld": "frame"}
+
+
+@dataclass(frozen=True)
+class _End:
+    """A frame on a body of the file, in its axes."""
+
+    body: str
+    pose: Pose
+
+
+class Equalities:
+    """The <equality> sections of a file; with `wanted` false, or switched off by a flag, none becomes a loop."""
+
+    def __init__(self, mujoco: Element, scene: Scene, disabled: set[str], *, wanted: bool) -> None:
+        self._scene, self._read = scene, scene.read
+        self._left_out: list[str] = []
+        self._loops: dict[str, tuple[str, _End, _End]] = {}
+        elements = [(e, element_label(e, k)) for k, e in self._numbered(mujoco)]
+        if not elements:
+            return
+        #: Pose of each body in the reference configuration, and the body that carries it there.
+        self._poses, self._carriers, self._anchors = {"world": HERE}, {"world": "world"}, {"world": np.zeros(3)}
+        for body in scene.bodies:
+            self._poses[body.name] = self._poses[body.parent] @ body.pose
+            self._carriers[body.name] = body.name if body.joints else self._carriers[body.parent]
+            self._anchors[body.name] = body.anchor
+        self._sites = {name: _End("world", X) for name, X in scene.sites}
+        self._sites |= {name: _End(body.name, X) for body in scene.bodies for name, X in body.sites}
+        moved = {e.attributes.get("name") for e in mujoco.walk() if e.attributes.get("mocap") == "true"}
+        for element, label in elements:
+            full = replace(scene.defaults.filled(replace(element, tag="equality"), None), tag=element.tag)
+            why = "" if element.tag in _KINDS else "no loop"
+            if off := disabled & {"equality", "constraint"}:
+                why = f"option flag {sorted(off)[0]} is off"
+            elif full.attributes.get("active") == "false":
+                why = "it is inactive"
+            elif not wanted and not why:
+                why = "loops=False"
+            ends = None if why else self._ends(full, f"equality {label}")
+            if ends is not None:
+                a, b = (end.body for end in ends)
+                if self._carriers[a] == self._carriers[b]:
+                    why = "no joint moves its ends against each other"
+                elif moved & {a, b}:
+                    why = "a motion capture body moves it"
+                else:
+                    name = unused(element.attributes.get("name") or f"{element.tag}{len(self._loops) + 1}", self._loops)
+                    self._loops[name] = (_KINDS[element.tag], *ends)
+                    continue
+            if why:
+                self._left_out.append(f"{label} ({bound_parts(element)}){'' if why == 'no loop' else f': {why}'}")
+
+    @staticmethod
+    def _numbered(mujoco: Element) -> Iterable[tuple[int, Element]]:
+        return enumerate((e for section in mujoco.all("equality") for e in section.children), 1)
+
+    def _ends(self, element: Element, item: str) -> tuple[_End, _End] | None:
+        """Return the two frames that an element binds; None after a fault."""
+        names = element.attributes
+        if "site1" in names or "site2" in names:
+            if any(x in names for x in ("body1", "body2", "anchor", "relpose")):
+                self._read.fault(f"{item}: sites, and bodies or an anchor; keep one of the two", element)
+                return None
+            found = [self._sites.get(names.get(key, "")) for key in ("site1", "site2")]
+            for key, site in zip(("site1", "site2"), found, strict=True):
+                if site is None:
+                    self._read.fault(f"{item}: {key} {names.get(key, '')!r} is no site of the file", element)
+            a, b = found
+            return None if a is None or b is None else (a, b)
+        body1, body2 = names.get("body1", ""), names.get("body2", "world")
+        for key, body in (("body1", body1), ("body2", body2)):
+            if body not in self._poses:
+                self._read.fault(f"{item}: {key} {body!r} is no body of the file", element)
+                return None
+        # Of the second body in the first one's axes, in the reference configuration.
+        between = _inverse(self._poses[body1]) @ self._poses[body2]
+        if element.tag == "connect":
+            point = np.array(self._read.numbers(element, "anchor", item, count=3))
+            at = _inverse(between) @ Pose(between.R, point)
+            return _End(body1, Pose(np.eye(3), point)), _End(body2, Pose(np.eye(3), at.p))
+        point = np.array(self._read.numbers(element, "anchor", item, count=3, default=(0.0, 0.0, 0.0)))
+        # A quaternion of zeros, MuJoCo's default, asks for the reference configuration.
+        given = np.array(
+            self._read.numbers(element, "relpose", item, count=7, default=(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        )
+        if has_length(given[3:]):
+            R = spatial.matrix_from_quaternion(spatial.normalized(np.roll(given[3:], -1)))
+            # MuJoCo takes its position for the first body's point, whatever the anchor on the second is.
+            return _End(body1, Pose(R, given[:3])), _End(body2, Pose(np.eye(3), point))
+        return _End(body1, between @ Pose(np.eye(3), point)), _End(body2, Pose(np.eye(3), point))
+
+    def add_to(self, b: ModelBuilder, snap: Snapper) -> None:
+        """Add the loops, with notes on them and on the equalities that are left out."""
+        for name, (kind, *ends) in self._loops.items():
+            sides: dict[str, Any] = {}
+            for end, side in zip(ends, "ab", strict=True):
+                sides[f"body_{side}"] = end.body
+                sides[f"translation_{side}"] = end.pose.p - self._anchors[end.body]
+                sides[f"rotation_{side}"] = snap(end.pose.R) if kind == "frame" else None
+            b.add_loop(name, kind, **sides)  # type: ignore[arg-type]  # of the kinds
+        if self._loops:
+            b.note(f"loops, held exactly where MuJoCo's are soft: {listing([repr(x) for x in self._loops], 6)}")
+        if self._left_out:
+            b.note(f"equality constraints left out: {'; '.join(self._left_out)}")
+
+
+def _inverse(X: Pose) -> Pose:
+    return Pose(X.R.T, -X.R.T @ X.p)
