@@ -3,7 +3,9 @@
 Every function takes keyword parameters in SI units, numbers or `mbkit.Parameter`; its docstring gives the coordinates,
 the zero pose and the source. Planar systems move in the x-z plane, gravity along -z, with angles from the downward
 vertical that grow towards +x: a right-handed turn about -y. Planar systems without gravity move in the x-y plane.
-Engines take all but `slider_crank`, which has a loop: `mbkit.lagrangian.from_model` solves it.
+
+Mechanisms with loops, of which `slider_crank` is one, are closed in their neutral pose: `Model.neutral` gives a state,
+and `mbkit.lagrangian.from_model` solves them. Their angles are measured from that pose.
 """
 
 from __future__ import annotations
@@ -22,6 +24,21 @@ from mbkit.catalog.mechanisms import (
     slider_crank,
     spherical_pendulum,
 )
+from mbkit.catalog.planar_loops import (
+    andrews_squeezer,
+    chebyshev,
+    five_bar,
+    four_bar,
+    four_bars,
+    hoecken,
+    inverted_slider_crank,
+    pantograph,
+    parallel_gripper,
+    peaucellier,
+    planar_3rrr,
+    scissor,
+    watt,
+)
 from mbkit.catalog.rigid_bodies import (
     clamped_beam,
     flexible_spacecraft,
@@ -30,12 +47,16 @@ from mbkit.catalog.rigid_bodies import (
     heavy_top,
     spacecraft_with_wheels,
 )
+from mbkit.catalog.spatial_loops import bricard, delta_robot, double_cardan_shaft, flyball_governor, stewart_platform
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 
-__all__ = ["acrobot", "cart_pole", "chain", "clamped_beam", "double_pendulum", "elastic_pendulum"]
-__all__ += ["flexible_spacecraft", "free_body", "furuta_pendulum", "get", "gyroscope", "heavy_top", "pendulum"]
-__all__ += ["slider_crank", "spacecraft_with_wheels", "spherical_pendulum", "systems"]
+__all__ = ["acrobot", "andrews_squeezer", "bricard", "cart_pole", "chain", "chebyshev", "clamped_beam"]
+__all__ += ["delta_robot", "double_cardan_shaft", "double_pendulum", "elastic_pendulum", "five_bar"]
+__all__ += ["flexible_spacecraft", "flyball_governor", "four_bar", "four_bars", "free_body", "furuta_pendulum"]
+__all__ += ["get", "gyroscope", "heavy_top", "hoecken", "inverted_slider_crank", "pantograph"]
+__all__ += ["parallel_gripper", "peaucellier", "pendulum", "planar_3rrr", "scissor", "slider_crank"]
+__all__ += ["spacecraft_with_wheels", "spherical_pendulum", "stewart_platform", "systems", "watt"]
 
 
 def systems() -> dict[str, Callable[..., Model]]:

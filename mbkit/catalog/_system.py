@@ -32,12 +32,16 @@ _UNITS: Final = {
     "stiffness": "N/m",
     "bending_stiffness": "N m²",
     "gravity": "m/s², along -z",
+    "density": "kg/m",
+    "ratio": "Without unit",
+    "angle": "rad",
     "axes": "Of any length",
 }
 _RAISES: Final = """Raises
 ------
 InputError
-    A parameter that is not finite or has the wrong sign, or moments that no body has.
+    A parameter that is not finite or has the wrong sign, moments that no body has, or lengths of links that do not
+    meet.
 
 """
 
@@ -70,20 +74,22 @@ def system(make: Callable[..., Model] | None = None, /, **rules: Callable[[str, 
 
     doc = inspect.cleandoc(make.__doc__ or "")
     section = "Notes\n-----" if "Notes\n-----" in doc else "References\n-----"
-    parameters = "".join(map(_described, defaults, defaults.values()))
+    fixed = [name for name, rule in rules.items() if rule in (number, acute)]
+    parameters = "".join(_described(name, x, name in fixed) for name, x in defaults.items())
     checked.__doc__ = doc.replace(section, f"Parameters\n----------\n{parameters}\n{_RAISES}{section}")
     SYSTEMS[make.__name__] = checked
     return checked
 
 
-def _described(name: str, default: Any) -> str:
+def _described(name: str, default: Any, fixed: bool) -> str:
     """Return the entry of a parameter in its function's docstring."""
     if isinstance(default, str):
         return f"{name} : str\n    Kind of joint.\n"
     if isinstance(default, int):
         return f"{name} : int\n    Number of equal parts.\n"
     unit = _UNITS.get(name) or _UNITS.get(name.rstrip("0123456789").rpartition("_")[2], "m")
-    return f"{name} : {'float or Parameter' if isinstance(default, float) else 'array_like'}\n    {unit}.\n"
+    scalar = "float" if fixed else "float or Parameter"
+    return f"{name} : {scalar if isinstance(default, float) else 'array_like'}\n    {unit}.\n"
 
 
 def positive(name: str, value: Number) -> Number:
@@ -102,6 +108,21 @@ def _signed(name: str, value: Number, **sign: bool) -> Number:
     if known(value):
         real(name, nominal(value), **sign)
     return value
+
+
+def number(name: str, value: Any) -> float:
+    """Return a number above zero; axes depend on it, so no parameter can stand for it."""
+    if isinstance(value, Expression):
+        raise InputError(f"{name}: expected a number, got a parameter; the directions of axes depend on it")
+    return real(name, value, positive=True)
+
+
+def acute(name: str, value: Any) -> float:
+    """Return a number between zero and π/2, as `number` does."""
+    angle = number(name, value)
+    if angle >= np.pi / 2:
+        raise InputError(f"{name}: expected an angle below π/2, got {angle:g} rad")
+    return angle
 
 
 def down(value: Number) -> tuple[float, float, Number]:
