@@ -10,7 +10,7 @@ from mbkit.report import document as doc
 from mbkit.report import figures, work_precision_view
 from mbkit.report.formatting import brief, count_text, error_text, mark, model_facts, refusals, time_text
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
-from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
+from mbkit.studies.compare.result import OWN_LAW, Comparison, Omission, RolloutRow, Row
 
 # Rounding stays far below this, and anything that acts is far above.
 _VISIBLE: Final = 1e-6
@@ -141,6 +141,7 @@ def _terms(result: Comparison) -> list[doc.Block]:
     but = ", but where an engine's own formula cannot do better (marked !)" if allowed else ""
     return [
         doc.Table(short, [*by_term.values()], on="terminal"),
+        *_soft(result),
         doc.Paragraph(
             f"Every engine against the {result.reference}, the own derivation evaluated with 34 digits, at "
             f"{result.rows[0].samples} states; an error above {result.tolerance:g} fails{but}.",
@@ -166,6 +167,20 @@ def _terms(result: Comparison) -> list[doc.Block]:
             note=True,
         ),
     ]
+
+
+def _soft(result: Comparison) -> list[doc.Block]:
+    """Return a sentence on each engine with soft constraints."""
+    out: list[doc.Block] = []
+    for engine in result.softness:
+        terms = [r.term for r in result.rows if r.engine == engine and r.reference == OWN_LAW]
+        out.append(
+            doc.Paragraph(
+                f"{', '.join(terms)} of {engine} are measured by its own law of soft constraints instead of the "
+                f"{result.reference}."
+            )
+        )
+    return out
 
 
 def _error(row: Row) -> doc.Span:

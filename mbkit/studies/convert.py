@@ -15,6 +15,8 @@ import numpy as np
 from mbkit import _interrupt
 from mbkit._escape import xml_holds
 from mbkit._version import __version__
+from mbkit.engines import dynamics
+from mbkit.engines.registry import DERIVED
 from mbkit.errors import MbkitError, MbkitWarning, OutputError, UnknownNameError, UnsupportedError
 from mbkit.load import load
 from mbkit.load.urdf_writer import urdf_text
@@ -130,6 +132,8 @@ def _to_mjcf(model: Model) -> Converted:
     notes = []
     if model.layout.reduced:
         notes.append("mimic joints are free joints with equality constraints, which MuJoCo keeps softly")
+    if model.loops:
+        notes.append("loops are equality constraints, which MuJoCo keeps softly")
     if model.needs.limits or model.needs.friction:
         notes.append("MuJoCo acts on joint limits and dry friction, softly, which mbkit's terms leave out")
     if any(np.isfinite(j.velocity_limit).any() for j in model.joints):
@@ -141,7 +145,12 @@ def _to_mjcf(model: Model) -> Converted:
         notes.append(f"principal moments of points and plates were lifted to what MuJoCo takes: {', '.join(lifted)}")
     text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
     at = states_of(model, _STATES, 0)
-    values = evaluated(read_back(model, text), at)
+    back = read_back(model, text)
+    values = evaluated(back, at)
+    if model.loops:
+        own = dynamics(model, DERIVED, compile=False).constraint_residual(at.q)
+        if not np.abs(back.constraint_residual(at.q) - own).max() < _TOLERANCE * max(1.0, np.abs(own).max()):
+            raise MbkitError(f"convert: loops of {model.name} read back otherwise; please report this model")
     difference = gaps(model_terms(model, at), values, at.v, velocity_joints(model))
     if not difference.comparable or difference.worst > _TOLERANCE:
         why = f"MuJoCo wants inertias with A + B >= C of {', '.join(lifted)}" if lifted else "please report this model"

@@ -1,4 +1,4 @@
-"""The terms of bodies and of the whole that are compared: motion of a frame, momentum, loads.
+"""The terms of bodies and of the whole that are compared: motion of a frame, momentum, loads, derivatives.
 
 The frame is the body at the end of the longest branch. Linear and angular parts have scales of their own, in which no
 number that happens to be small counts: what the velocities can do to a point, or to the bodies. With the columns J_j of
@@ -6,6 +6,10 @@ the frame's Jacobian, the linear part at least the angular one times the reach, 
 bound its velocity, and W U, W² the acceleration that comes from velocities. Forces are measured by all matter moving as
 the frame does, or by the largest that there is, and moments by these with the longest branch for an arm. A_G's column j
 is at most √(m M_jj) and √(tr I M_jj) (Cauchy and Schwarz), with the inertia about the world's origin.
+
+The regressor's columns are taken for a body with the mass of the whole at the reach, and its rows over √M_jj, so that
+all are of one unit. Derivatives of inverse dynamics are measured as forces are, by the norm of each matrix. Those of
+forward dynamics follow from these and M⁻¹.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.model import Model
+from mbkit.model.base_parameters import STANDARD
 from mbkit.studies.compare.errors import Errors, Scales, acceleration_errors, ratio
 from mbkit.studies.compare.terms import States, Term
 
@@ -38,6 +43,7 @@ class BodyScales(Scales):
     force: Array = None  # type: ignore[assignment]  # (N,), and where it is accelerated, with its weight
     mass: float = 0.0
     spread: Array = None  # type: ignore[assignment]  # (N,), trace of the inertia about the world's origin
+    speeds: Array = None  # type: ignore[assignment]  # (N, nv), v
 
     @classmethod
     def around(cls, scales: Scales, oracle: OracleDynamics, at: States) -> BodyScales:
@@ -62,6 +68,7 @@ class BodyScales(Scales):
             mass=model.mass,
             # About the world's origin, where the sums begin: about G a point mass has none.
             spread=np.einsum("nii->n", I[:, 3:, 3:]) + 2 * model.mass * np.sum(center**2, axis=1),
+            speeds=at.v,
         )
 
 
@@ -169,6 +176,33 @@ def _pushed_errors(error: Array, reference: Array, scales: BodyScales) -> Errors
     return Errors(e.max(axis=1, initial=0.0), relative, ratio(e, most).max(axis=0))
 
 
+def _regressor_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
+    """Measure (N, nv, 10 k) of the standard parameters by the largest force of a body with the mass of the whole."""
+    arm = scales.reach[:, None]
+    of_body = [arm**2 if name.startswith("I") else arm if name.startswith("h") else arm**0 for name in STANDARD]
+    weights = scales.mass * np.tile(np.hstack(of_body), error.shape[2] // len(STANDARD))[:, None, :]
+    root = np.sqrt(np.where(scales.diagonal > 0, scales.diagonal, 1.0))[:, :, None]
+    most = (np.abs(reference) * weights / root).max(axis=(1, 2), initial=0.0)
+    each = ratio((np.abs(error) * weights / root).max(axis=2, initial=0.0), most[:, None])
+    return Errors(np.abs(error).max(axis=(1, 2), initial=0.0), each.max(axis=1, initial=0.0), each.max(axis=0))
+
+
+def _slope_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
+    """Measure (N, 3, nv, nv), the derivatives by q, v and a, each by its norm; a joint's own figure as M's entries."""
+    speed, size = np.linalg.norm(scales.speeds, axis=1), np.linalg.norm(scales.M, 2, axis=(1, 2))
+    least = np.stack([scales.inertial, size * speed, size], axis=1)
+    relative = ratio(_norms(error), np.maximum(_norms(reference), least)).max(axis=1)
+    root = np.sqrt(np.where(scales.diagonal > 0, scales.diagonal, 1.0))
+    e, x = (np.abs(y) / (root[:, :, None] * root[:, None, :])[:, None] for y in (error, reference))
+    own = np.maximum(x.max(axis=(2, 3), initial=0.0), np.stack([speed**2, speed, np.ones_like(speed)], axis=1))
+    each = ratio(e.max(axis=3, initial=0.0), own[:, :, None])
+    return Errors(np.abs(error).max(axis=(1, 2, 3), initial=0.0), relative, each.max(axis=(0, 1)))
+
+
+def _norms(x: Array) -> Array:
+    return np.asarray(np.linalg.norm(x, axis=(2, 3)))
+
+
 def _frame(model: Model) -> tuple[Any, ...]:
     return (farthest(model),)
 
@@ -203,4 +237,6 @@ BODY_TERMS: Final = (
     _term("joint loads", "joint_wrenches", "q v a", _load_errors),
     _term("Jᵀ wrench", "generalized_force", "q", _pushed_errors, _wrench),
     _term("forward dynamics, wrench", "forward_dynamics", "q v tau", acceleration_errors, _wrench),
+    _term("regressor", "regressor", "q v a", _regressor_errors),
+    _term("∂ID/∂(q, v, a)", "inverse_dynamics_derivatives", "q v a", _slope_errors),
 )

@@ -16,11 +16,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
+
+#: Singular values of redundant rows, in terms of the largest one.
+_REDUNDANT: Final = 1e-11
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,7 @@ class Scales:
     acting: Array  # (N, nv), |τ| + |nle| + |τ_passive|, which cancel in M a
     size: Array  # (N,), norm of M scaled to a unit diagonal
     condition: Array  # (N,), cond(M) scaled likewise: no unit changes it
+    constrained: Array | None = None  # (N,), condition of all equations under constraints; None without any
 
     @classmethod
     def of(cls, M: Array, v: Array, acting: Array, weight: float = 0.0) -> Scales:
@@ -46,6 +50,11 @@ class Scales:
         inertial = norm * np.sum(v * v, axis=1)
         size = np.linalg.norm(scaled, 2, axis=(1, 2))
         return cls(M, diagonal, inertial, heavy, acting, size, np.linalg.cond(scaled))
+
+    @property
+    def of_accelerations(self) -> Array:
+        """Condition of the equations that accelerations solve, (N,)."""
+        return self.condition if self.constrained is None else self.constrained
 
 
 @dataclass(frozen=True)
@@ -87,13 +96,51 @@ def acceleration_errors(error: Array, reference: Array, scales: Scales) -> Error
     size = np.maximum(np.linalg.norm(root * reference, axis=1), pushed)
     own = np.maximum(np.abs(reference), scales.acting / np.where(scales.diagonal > 0, scales.diagonal, np.inf))
     force = np.einsum("nij,nj->ni", scales.M, error) / np.where(root > 0, root, np.inf)
-    backward = ratio(np.linalg.norm(force, axis=1), scales.size * size)
-    forward = ratio(np.linalg.norm(root * e, axis=1), size * scales.condition)
+    # Under constraints M e is no force that is wrong: a part of it is in J's rows.
+    free = scales.constrained is None
+    backward = ratio(np.linalg.norm(force, axis=1), scales.size * size) if free else 0.0
+    condition = scales.of_accelerations
+    forward = ratio(np.linalg.norm(root * e, axis=1), size * condition)
     return Errors(
         e.max(axis=1, initial=0.0),
         np.maximum(forward, backward),
-        ratio(e, own * scales.condition[:, None]).max(axis=0),
+        ratio(e, own * condition[:, None]).max(axis=0),
     )
+
+
+def row_errors(error: Array, reference: Array, scales: Scales) -> Errors:  # noqa: ARG001  # as the others
+    """Measure errors of f, J and its bias by their largest numbers, or 1."""
+    e = np.abs(error).reshape(len(error), -1)
+    size = np.maximum(1.0, np.abs(reference).reshape(len(error), -1).max(axis=1, initial=0.0))
+    return Errors(e.max(axis=1, initial=0.0), ratio(e.max(axis=1, initial=0.0), size), np.empty(0))
+
+
+def constraint_force_errors(error: Array, reference: Array, scales: Scales) -> Errors:
+    """Measure errors of Jᵀ λ in the norm f_j / √M_jj, beside the forces that act, per condition of all equations."""
+    e, root = np.abs(error), np.sqrt(np.where(scales.diagonal > 0, scales.diagonal, np.inf))
+    size = np.maximum(*(np.linalg.norm(x / root, axis=1) for x in (reference, scales.acting)))
+    own = np.maximum(np.abs(reference), scales.acting)
+    condition = scales.of_accelerations
+    relative = ratio(np.linalg.norm(e / root, axis=1), size * condition)
+    return Errors(e.max(axis=1, initial=0.0), relative, ratio(e, own * condition[:, None]).max(axis=0))
+
+
+def condition_under_constraints(M: Array, J: Array) -> Array:
+    """Return cond([[M, Jᵀ], [J, 0]]) of each sample, with M's diagonal and J's rows scaled to one; (N,).
+
+    Redundant rows do not count.
+    """
+    root = np.sqrt(np.einsum("nii->ni", M))
+    root = np.where(root > 0, root, 1.0)
+    rows = J / root[:, None, :]
+    size = np.linalg.norm(rows, axis=2, keepdims=True)
+    rows = rows / np.where(size > 0, size, 1.0)
+    scaled = M / (root[:, :, None] * root[:, None, :])
+    zero = np.zeros((len(M), J.shape[1], J.shape[1]))
+    whole = np.block([[scaled, rows.swapaxes(1, 2)], [rows, zero]])
+    singular = np.linalg.svd(whole, compute_uv=False)
+    kept = np.where(singular > _REDUNDANT * singular[:, :1], singular, np.inf)
+    return np.asarray(singular[:, 0] / kept.min(axis=1))
 
 
 def matrix_errors(error: Array, reference: Array, scales: Scales) -> Errors:  # noqa: ARG001  # as the others

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+#: The reference of terms of an engine whose constraints are soft.
+OWN_LAW: Final = "own law"
 #: Where an error of exactly zero stands on an axis of digits.
 _SAME: Final = 17.0
 
@@ -35,7 +37,8 @@ _SAME: Final = 17.0
 class Row:
     """One term of one engine against the reference, worst over all samples.
 
-    `reference` is ``"oracle"``, or an engine where the oracle has no value. `max_abs` is the largest absolute
+    `reference` is ``"oracle"``, an engine where the oracle has no value, or ``"own law"`` where an engine's constraints
+    are soft. `max_abs` is the largest absolute
     difference of any entry, in the term's own unit; `relative` the worst normwise error of a sample, and `median` the
     median, see `mbkit.studies.compare.errors`; `per_joint` the worst error of a joint relative to its own scale, and
     `joint` that joint, empty for energies. `worst_kind` (random, neutral, at limits, near singular), `worst_q` and
@@ -150,8 +153,10 @@ class Comparison(ResultTable):
     """Several engines on one description: do they agree, to how many digits, at what cost.
 
     `facts` has nq, nv, mass, digest, needs and notes of the model. `reference` is what the terms of all `engines` were
-    measured by: the oracle. `precision` is the error against run time of a few methods on a short horizon. `setup` has
-    the seconds to build each engine; the derivation works when first called. `seconds` is the time of the whole study.
+    measured by: the oracle. Accelerations of an engine with soft constraints are measured by its own written law
+    instead, and `softness` has the digits that it keeps of the rigid ones, at the median state. `precision` is the
+    error against run time of a few methods on a short horizon. `setup` has the seconds to build each engine; the
+    derivation works when first called. `seconds` is the time of the whole study.
     """
 
     model: str
@@ -167,6 +172,7 @@ class Comparison(ResultTable):
     omissions: tuple[Omission, ...] = ()
     refusals: tuple[Refusal, ...] = ()
     setup: dict[str, float] = field(default_factory=dict)
+    softness: dict[str, float] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     processor: str = ""
     seconds: float = 0.0
@@ -230,6 +236,10 @@ class Comparison(ResultTable):
         absent = dict.fromkeys(r.engine for r in self.refusals if not r.term and r.engine not in self.engines)
         out += [f"{', '.join(absent)} left out"] if absent else []
         out += [f"no {r.term}" for r in self.refusals if not r.engine]
+        out += [
+            f"{name} holds loops softly, by its own law, with {x:.1f} digits of the rigid acceleration"
+            for name, x in self.softness.items()
+        ]
         unjudged = [r for r in self.rollouts if not r.judged]
         cut = [r for r in self.rollouts if r.judged and r.cut]
         out += [f"{len(unjudged)} of {len(self.rollouts)} rollouts not judged"] if unjudged else []

@@ -23,9 +23,18 @@ from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.beyond_terms import omissions, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, BodyScales
-from mbkit.studies.compare.errors import Errors, Scales, interleaved
-from mbkit.studies.compare.result import Comparison, Row
-from mbkit.studies.compare.terms import TERMS, States, Term, power_errors, states
+from mbkit.studies.compare.errors import Errors, Scales, condition_under_constraints, interleaved
+from mbkit.studies.compare.result import OWN_LAW, Comparison, Row
+from mbkit.studies.compare.terms import (
+    CONSTRAINT_TERMS,
+    FORWARD_DYNAMICS,
+    OF_CONSTRAINED_MOTION,
+    TERMS,
+    States,
+    Term,
+    power_errors,
+    states,
+)
 from mbkit.studies.results import Refusal, model_info
 from mbkit.studies.study_runs import free_of_mimic, require_motion
 from mbkit.studies.work_precision.study import work_precision
@@ -54,6 +63,8 @@ class Judge:
         self.defects = defects or {}
         self.at, self.tolerance = at, tolerance
         self.refusals: list[Refusal] = []
+        #: Of each engine with soft constraints the digits of the rigid acceleration that are left, at the median state.
+        self.softness: dict[str, float] = {}
         acting = np.abs(at.tau)
         for quantity in (oracle.nle, oracle.passive):
             # Where a term has no value, its own row says so.
@@ -62,7 +73,10 @@ class Judge:
         gravity = float(np.linalg.norm(model.gravity))
         heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
         self.scales: Scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
-        self.terms: tuple[Term, ...] = TERMS
+        if model.constrained:
+            condition = condition_under_constraints(self.scales.M, oracle.constraint_jacobian(at.q))
+            self.scales = replace(self.scales, constrained=condition)
+        self.terms: tuple[Term, ...] = TERMS + (CONSTRAINT_TERMS if model.constrained else ())
         if model.has_bodies and model.mass:
             self.terms += BODY_TERMS
             self.scales = BodyScales.around(self.scales, oracle, at)
@@ -99,6 +113,8 @@ class Judge:
                 except MbkitError as error:
                     self._refuse(name, term.name, error)
             defects[name] = announced(caught) or self.defects.get(name, "")
+        if not values and not broken:
+            return []
         if broken and not values:
             # All alike: the model, not an engine. Named, and not counted as agreement.
             self.refusals += [Refusal(name, term.name, why) for name, why in broken.items()]
@@ -113,11 +129,28 @@ class Judge:
             for name, why in broken.items()
         ]
         for name, value in values.items():
-            errors = term.errors((value - high) - low, high, self.scales)
+            against, exact, rest = reference, high, low
+            soft = self.model.constrained and self.engines[name].soft_constraints
+            if soft and term.quantity in OF_CONSTRAINED_MOTION:
+                against, exact, rest = OWN_LAW, self._own_law(term, name), np.zeros_like(value)
+            errors = term.errors((value - exact) - rest, exact, self.scales)
             row = self._row(term.name, name, errors, defects[name], self._allowed(term, name, errors))
             ns, spread = times[name]
-            rows.append(replace(row, reference=reference, ns=ns, ns_spread=spread, zero=not high.any()))
+            rows.append(replace(row, reference=against, ns=ns, ns_spread=spread, zero=not exact.any()))
         return rows
+
+    def _own_law(self, term: Term, name: str) -> Array:
+        """Return what the written law of an engine with soft constraints says of a term at all states."""
+        dyn: Any = self.engines[name]
+        # Wrenches act as their generalized force.
+        pushed = [dyn.generalized_force(self.at.q, *more)] if (more := term.more(self.model)) else []
+        laws = [
+            dyn.constraint_law(*state) for state in zip(self.at.q, self.at.v, sum(pushed, self.at.tau), strict=True)
+        ]
+        self.softness[name] = float(np.median([law.digits for law in laws]))
+        if term.quantity == FORWARD_DYNAMICS:
+            return np.array([law.acceleration for law in laws])
+        return np.array([law.jacobian.T @ law.force for law in laws])
 
     def _reference(self, term: Term, values: dict[str, Array]) -> tuple[str, Array, Array]:
         """Return the engine of the reference values, and their high and low part."""
@@ -238,6 +271,7 @@ def compare(
     built, refusals, setup, defects = _build(model, names, tell, compile=not terms_only)
     reference = ""
     rows: list[Row] = []
+    result: dict[str, Any] = {}
     # What was written as energies has the derivation and its 34 digits, and no other engine.
     enough = len(built) > 1 or (bool(built) and not model.has_bodies)
     if enough:
@@ -246,11 +280,12 @@ def compare(
         study = Judge(model, built, OracleDynamics(model), states(model, samples, seed), tolerance, defects)
         rows, refused = study.rows(lambda f, text: tell(0.05 + f * (0.85 if terms_only else 0.35), text))
         refusals += refused
-    result: dict[str, Any] = {}
+        result["softness"] = study.softness
     # Without mass nothing can be simulated.
     massless = any(r.term == "M" and r.zero for r in rows)
     if enough and not terms_only and not massless:
-        result, refused = _beyond_terms(model, built, seed, tell)
+        beyond, refused = _beyond_terms(model, built, seed, tell)
+        result |= beyond
         refusals += refused
     tell(1.0, "done")
     return Comparison(

@@ -18,10 +18,12 @@ from mbkit.studies.compare.errors import (
     Errors,
     Scales,
     acceleration_errors,
+    constraint_force_errors,
     energy_errors,
     force_errors,
     matrix_errors,
     ratio,
+    row_errors,
 )
 
 # An angle this far from gimbal lock loses four digits in anything that divides
@@ -95,7 +97,9 @@ class Term:
 
     def call(self, dyn: Dynamics, states: States) -> Array:
         """Return the values at all states."""
-        return np.asarray(getattr(dyn, self.quantity)(*self._given(dyn, states)))
+        value = getattr(dyn, self.quantity)(*self._given(dyn, states))
+        # Derivatives come as a tuple of matrices.
+        return np.stack(value, axis=-3) if isinstance(value, tuple) else np.asarray(value)
 
     def reference(self, oracle: OracleDynamics, states: States) -> tuple[Array, Array]:
         """Return the oracle's values at all states, high and low part."""
@@ -126,9 +130,20 @@ TERMS: Final = (
     Term("potential energy", "potential_energy", ("q",), energy_errors),
 )
 
+FORWARD_DYNAMICS: Final = "forward_dynamics"
+#: Quantities that depend on how an engine holds constraints.
+OF_CONSTRAINED_MOTION: Final = (FORWARD_DYNAMICS, "generalized_constraint_force")
+#: Of models with loops and prescribed motions. Jᵀ λ is unique where λ is not.
+CONSTRAINT_TERMS: Final = (
+    Term("f", "constraint_residual", ("q",), row_errors),
+    Term("J", "constraint_jacobian", ("q",), row_errors),
+    Term("J̇ v rows", "constraint_bias", ("q", "v"), row_errors),
+    Term("Jᵀ λ", "generalized_constraint_force", ("q", "v", "tau"), constraint_force_errors),
+)
+
 
 def power_errors(dyn: Dynamics, oracle: OracleDynamics, at: States, scales: Scales) -> Errors:
-    """Return the errors of the power balance, dE/dt = (τ + τ_damping) · v, with the engine's own acceleration.
+    """Return the errors of the power balance, dE/dt = (τ + τ_damping + Jᵀ λ) · v, with the engine's own acceleration.
 
     The rate of energy is differentiated exactly from T and V by the oracle; acceleration and damping are the engine's.
     So it fails if either the engine's dynamics or the energies are wrong, whatever two engines agree on.
@@ -136,10 +151,12 @@ def power_errors(dyn: Dynamics, oracle: OracleDynamics, at: States, scales: Scal
     a = dyn.forward_dynamics(at.q, at.v, at.tau)
     damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))
     inertial, rate = oracle.inverse_dynamics(at.q, at.v, a), oracle.energy_rate(at.q, at.v, a)
-    e = np.abs(rate - np.sum((at.tau + damping) * at.v, axis=1))
+    # Drives do work, and so do constraints that give way.
+    held = dyn.generalized_constraint_force(at.q, at.v, at.tau) if dyn.model.constrained else np.zeros_like(at.v)
+    e = np.abs(rate - np.sum((at.tau + damping + held) * at.v, axis=1))
     # M a is as large as M's norm lets it be, and that is where it is rounded.
     root = np.sqrt(scales.diagonal)
     speed, size = np.linalg.norm(root * at.v, axis=1), np.linalg.norm(root * a, axis=1)
-    pushes = sum(np.linalg.norm(x, axis=1) for x in (inertial, at.tau, damping))
+    pushes = sum(np.linalg.norm(x, axis=1) for x in (inertial, at.tau, damping, held))
     scale = speed * size + np.linalg.norm(at.v, axis=1) * pushes + scales.inertial
     return Errors(e, ratio(e, scale), np.empty(0))

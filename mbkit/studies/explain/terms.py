@@ -72,7 +72,9 @@ def states_of(model: Model, samples: int, seed: int) -> States:
     """Return random states of a model."""
     # An importer may give limits with lower > upper.
     fits = all(np.all(j.lower <= j.upper) for j in model.joints)
-    return States(*(model if fits else model.without("limits")).random_state(np.random.default_rng(seed), samples))
+    # Terms are those of the tree.
+    tree = model.without("loops", "prescribed", *([] if fits else ["limits"]))
+    return States(*tree.random_state(np.random.default_rng(seed), samples))
 
 
 def velocity_joints(model: Model) -> list[str]:

@@ -440,7 +440,14 @@ def _written(stripped: Stripped, floating_base: bool) -> Model:
         if stripped.format == "urdf":
             return urdf_links(stripped.root, str(stripped.path), floating_base=floating_base)
         return model_of_mjcf(
-            stripped.root, stripped.path, floating_base=False, nonphysical="warn", gravity=None, meshes="auto"
+            stripped.root,
+            stripped.path,
+            floating_base=False,
+            nonphysical="warn",
+            gravity=None,
+            meshes="auto",
+            # Of other importers the tree alone is read.
+            loops=False,
         )
 
 
