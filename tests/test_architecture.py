@@ -34,9 +34,9 @@ ENGINE_NAMES = (
     # The engine as the default of a signature.
     "lagrangian/system.py",
 )
-#: Files and folders that may write the name of a joint type. Models are described with the public builder, and
-#: formats have tables from their words to ours.
-JOINT_NAMES = ("model/joint_types.py", "engines/", "load/", "catalog/", "studies/stress/cases/")
+#: Files and folders that may write the name of a joint type. Models are described with the public builder, formats
+#: have tables from their words to ours, and kinds of loops are named after joints.
+JOINT_NAMES = ("model/joint_types.py", "model/loops.py", "engines/", "load/", "catalog/", "studies/stress/cases/")
 #: Files and folders that may write the name of a method of integration.
 METHOD_NAMES = (
     "methods/",

@@ -71,9 +71,9 @@ def parametric() -> mb.Model:
 
 
 MODELS = {
-    **{f"all types {s}": random_tree(s, 12) for s in (20, 21)},
-    **{f"a branch of all types {s}": random_tree(s, 10, nearest=1) for s in (22, 23)},
-    **{f"mimic joints {s}": random_tree(s, 12, mimic=True, nearest=2) for s in (24, 25)},
+    "all types": random_tree(20, 12),
+    "a branch of all types": random_tree(22, 10, nearest=1),
+    "mimic joints": random_tree(24, 12, mimic=True, nearest=2),
     "free and ball joints below others": random_tree(26, 6, ("free", "ball", "helical", "prismatic"), nearest=1),
     "slides": random_tree(27, 8, ("prismatic", "helical", "planar"), nearest=2),
     "many roots": random_tree(28, 6, ("revolute", "ball"), nearest=6),
@@ -241,7 +241,7 @@ def test_the_links_give_inverse_factors_of_the_mass_matrix(name):
     assert off(L @ (inverse * L.T) @ M, np.eye(n)) < 10 * np.linalg.cond(M) * EPS
 
 
-@pytest.mark.parametrize("seed", [1, 4, 10])
+@pytest.mark.parametrize("seed", [1, 10])
 def test_they_have_the_digits_of_the_accelerations(seed):
     """Factors of a formed mass matrix would lose up to a hundred times as many."""
     model = random_tree(seed, 12, nearest=2, mimic=True, springs=False, damping=False)

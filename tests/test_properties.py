@@ -1,4 +1,4 @@
-"""The structure of the equations of motion, on 200 random trees of every joint kind.
+"""The structure of the equations of motion, on 80 random trees of every joint kind.
 
 Each tree is derived once and run in CasADi's own machine. Every property gives an
 error and a scale: the norms of the terms that meet in it, with ‖M‖ ‖v‖², ‖M‖ ‖a‖ and
@@ -26,7 +26,7 @@ EPS = np.finfo(float).eps
 # Rounding grows like the root of the number of roundings, not like the number: a few
 # eps in a vector, √nv more in the norm of a matrix, which here is up to some 60 by 60.
 K = 20
-CHUNKS, PER_CHUNK, SAMPLES = 20, 10, 1
+CHUNKS, PER_CHUNK, SAMPLES = 8, 10, 1
 #: Joints of the ten trees of a chunk; in the last four, one of every shape, the tenth has 24.
 SIZES = (2, 3, 3, 4, 5, 6, 7, 8, 10, 14)
 LARGE = 24

@@ -1,0 +1,452 @@
+"""Loops and prescribed motions of a model on the own derivation: one form, redundant rows, states, steps, runs."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+from scipy.spatial.transform import Rotation
+
+import mbkit as mb
+from mbkit.errors import InputError, ModelError, UnsupportedError
+from mbkit.lagrangian import from_model
+from mbkit.model.loops import LOOP_KINDS
+from mbkit.model.parts import Loop, Prescribed
+from tests.random_trees import random_tree
+
+EPS = float(np.finfo(float).eps)
+
+
+def four_bar(**loop: object) -> mb.Model:
+    b = mb.ModelBuilder("four_bar")
+    for name, parent, at, length in (
+        ("crank", "world", 0.0, 0.3),
+        ("coupler", "crank", 0.3, 0.9),
+        ("rocker", "world", 1.0, 0.7),
+    ):
+        inertia = (0.0, 2 * length**3 / 12, 2 * length**3 / 12)
+        b.add_body(name, mass=2 * length, com=(length / 2, 0, 0), inertia=inertia)
+        b.add_joint(f"at_{name}", "revolute", parent=parent, child=name, translation=(at, 0, 0), axis=(0, -1, 0))
+    ends = {"body_a": "coupler", "translation_a": (0.9, 0, 0), "body_b": "rocker", "translation_b": (0.7, 0, 0)}
+    b.add_loop("pin", **({"kind": "point"} | ends | loop))  # type: ignore[arg-type]  # by name
+    return b.build()
+
+
+def closed_tree(seed: int, kind: str = "point", *, drive: bool = False) -> tuple[mb.Model, np.ndarray]:
+    """Return a random tree with a loop between two of its bodies, and a configuration at which it is closed."""
+    rng = np.random.default_rng(seed)
+    model = random_tree(seed, 6, springs=False)
+    q, _ = model.random_state(rng)
+    dyn = mb.dynamics(model, "lagrangian", compile=False)
+    names = [b.name for b in model.bodies]
+
+    def freedoms(a: int, b: int) -> int:
+        """Return how many velocities move one body against the other."""
+        carried = {j.child: j.name for j in model.joints}
+        way = model.chains[carried[names[a]]] ^ model.chains[carried[names[b]]]
+        return sum(j.type.nv for j in model.independent_joints if j.name in way)
+
+    pairs = [(a, b) for a in range(len(names)) for b in range(a) if freedoms(a, b) > LOOP_KINDS[kind] + drive]
+    a, b = pairs[rng.integers(len(pairs))]
+    poses = dyn.body_poses(q)
+    where = {name: poses[k] for k, name in enumerate(names)}
+    A, B = where[names[a]], where[names[b]]
+    own = np.eye(4)
+    own[:3, :3], own[:3, 3] = Rotation.random(random_state=seed).as_matrix(), rng.standard_normal(3)
+    there = A @ own
+    length = 0.0
+    if kind == "distance":
+        length = 0.7
+        there[:3, 3] += length * Rotation.random(random_state=seed + 1).as_matrix()[0]
+    if kind == "universal":
+        there[:3, :3] = there[:3, :3] @ Rotation.from_euler("xz", [np.pi / 2, 0.4]).as_matrix()
+    if kind in ("cylindrical", "prismatic"):
+        there[:3, 3] += 0.3 * there[:3, 2]
+    if kind in ("cylindrical", "revolute"):
+        there[:3, :3] = there[:3, :3] @ Rotation.from_euler("z", 0.6).as_matrix()
+    other = np.linalg.inv(B) @ there
+    loop = Loop("loop", kind, names[a], own[:3, :3], own[:3, 3], names[b], other[:3, :3], other[:3, 3], length)
+    model = replace(model, loops=(loop,))
+    if drive:
+        joint = next(j for j in model.independent_joints if j.type.nv == 1)
+        at = float(q[model.layout.q[joint.name].start])
+        model = replace(model, prescribed=(Prescribed(joint.name, at, 0.5, 0.3, 2.0, 0.0),))
+    return model, q
+
+
+@pytest.mark.parametrize("kind", LOOP_KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_equation_of_motion_holds_under_every_kind_of_loop(kind: str, seed: int) -> None:
+    model, q = closed_tree(seed, kind, drive=seed == 2)
+    dyn, oracle = (mb.dynamics(model, name) for name in ("lagrangian", "oracle"))
+    assert np.abs(dyn.constraint_residual(q)).max() < 1e-13
+    rng = np.random.default_rng(seed)
+    q, v = dyn.project(q, rng.standard_normal(model.nv))
+    tau = rng.standard_normal(model.nv)
+    a, J = dyn.forward_dynamics(q, v, tau), dyn.constraint_jacobian(q)
+    force, pull = dyn.inverse_dynamics(q, v, a), dyn.generalized_constraint_force(q, v, tau)
+    assert np.allclose(pull, J.T @ dyn.constraint_forces(q, v, tau), atol=0, rtol=1e-12)
+    M = dyn.mass_matrix(q)
+    root = np.sqrt(np.diag(M))
+    K = np.block([[M / np.outer(root, root), (J / root).T], [J / root, np.zeros((len(J), len(J)))]])
+    singular = np.linalg.svd(K, compute_uv=False)
+    condition = singular[0] / singular[model.nv + len(dyn.constraint_names) - len(dyn.mobility().redundant) - 1]
+    size = np.linalg.norm(force) + np.linalg.norm(pull) + np.linalg.norm(M @ a)
+    assert np.linalg.norm(force - tau - pull) < 1e3 * EPS * size
+    bias = dyn.constraint_bias(q, v)
+    assert np.linalg.norm(J @ a + bias) < 1e2 * EPS * condition * (np.linalg.norm(np.abs(J) @ np.abs(a)) + 1)
+    exact = oracle.forward_dynamics(q, v, tau)
+    assert np.linalg.norm(root * (a - exact)) < 10 * EPS * condition * np.linalg.norm(root * exact)
+    # What the loop's rows claim is what the poses of the bodies say.
+    assert np.abs(oracle.constraint_residual(q) - dyn.constraint_residual(q)).max() < 1e-14
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bias_and_rate_are_derivatives_along_a_motion(seed: int) -> None:
+    model, q = closed_tree(seed, "frame" if seed else "revolute", drive=True)
+    dyn = mb.dynamics(model, "oracle")
+    rng = np.random.default_rng(seed)
+    v, a, h = rng.standard_normal(model.nv), rng.standard_normal(model.nv), 1e-4
+
+    def moved(s: float) -> tuple[np.ndarray, np.ndarray, mb.Dynamics]:
+        return model.integrate(q, s * v + 0.5 * s * s * a), v + s * a, dyn.at(t=s)
+
+    ends = [moved(s) for s in (-h, h)]
+    rate = np.subtract(*[now.constraint_residual(x) for x, _, now in ends[::-1]]) / (2 * h)
+    assert np.abs(rate - dyn.constraint_rate(q, v)).max() < 1e-6
+    second = np.subtract(*[now.constraint_rate(x, w) for x, w, now in ends[::-1]]) / (2 * h)
+    whole = dyn.constraint_jacobian(q) @ a + dyn.constraint_bias(q, v)
+    # A free joint's v is no constant along the exponential of ½ s² a: of first order in s it is.
+    assert np.abs(second - whole).max() < 1e-5 * (1 + np.abs(whole).max())
+
+
+def test_catalog_system_moves_as_it_does_on_paper() -> None:
+    model = mb.catalog.slider_crank()
+    dyn, paper = mb.dynamics(model, "lagrangian"), from_model(model).dynamics()
+    q, v = model.random_state(0, 20)
+    tau = np.random.default_rng(1).standard_normal((20, model.nv))
+    a = dyn.forward_dynamics(q, v, tau)
+    assert np.allclose(a, paper.forward_dynamics(q, v, tau), rtol=1e-9, atol=1e-9)
+    runs = [mb.simulate(x, q[0], v[0], 1.0, "rk853", save=[1.0]) for x in (dyn, paper)]
+    assert np.allclose(runs[0].q, runs[1].q, atol=1e-8)
+
+
+def test_planar_rows_that_say_nothing_are_left_out_in_any_plane() -> None:
+    assert mb.dynamics(four_bar(), "lagrangian").constraint_names == ("loop 'pin' x", "loop 'pin' z")
+    turned = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
+    model = four_bar()
+    joints = tuple(
+        replace(j, rotation=turned @ j.rotation, translation=turned @ j.translation) if j.parent == "world" else j
+        for j in model.joints
+    )
+    tilted = replace(model, joints=joints, gravity=turned @ model.gravity)
+    dyns = [mb.dynamics(x, "lagrangian") for x in (model, tilted)]
+    assert all(len(d.constraint_names) == 2 and d.mobility().degrees_of_freedom == 1 for d in dyns)
+    q, v = model.random_state(0)
+    a, b = (d.forward_dynamics(q, v, np.zeros(3)) for d in dyns)
+    assert np.allclose(a, b, rtol=1e-11)
+
+
+def bricard() -> mb.Model:
+    """Bricard's six equal bars of 1 m at right angles (IFToMM A04), its neutral pose in the edges of a cube."""
+    b = mb.ModelBuilder("bricard")
+    path = np.array([(1, 0, 0), (0, -1, 0), (0, 0, 1), (-1, 0, 0), (0, 1, 0)], dtype=float)
+    axes = np.array([(0, 1, 0), (0, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)], dtype=float)
+    before, at = "world", np.zeros(3)
+    for k, (bar, axis) in enumerate(zip(path, axes, strict=True), 1):
+        inertia = (np.eye(3) - np.outer(bar, bar)) / 12
+        b.add_body(f"bar{k}", mass=1.0, com=bar / 2, inertia=inertia)
+        b.add_joint(f"hinge{k}", "revolute", parent=before, child=f"bar{k}", translation=at, axis=axis)
+        before, at = f"bar{k}", bar
+    align = Rotation.from_euler("y", 90, degrees=True).as_matrix()
+    end = path.sum(axis=0)
+    b.add_loop(
+        "last", "revolute", body_a="bar5", translation_a=path[-1], rotation_a=align, body_b="world",
+        translation_b=end, rotation_b=align,
+    )  # fmt: skip
+    return b.build()
+
+
+def test_bricard_is_redundant_and_moves() -> None:
+    model = bricard()
+    dyn = mb.dynamics(model, "lagrangian")
+    mobility = dyn.mobility()
+    assert mobility.degrees_of_freedom == 1
+    assert len(mobility.rows) == 5
+    assert len(mobility.redundant) == 1
+    assert "of 5 rows 1 is redundant" in str(mobility)
+    q = model.neutral()
+    assert np.abs(dyn.constraint_residual(q)).max() < 1e-15
+    tau = np.zeros(model.nv)
+    run = mb.simulate(dyn, q, tau, 3.0, "rk853", rtol=1e-11, atol=1e-11)
+    assert run.stats.finished
+    # The row that was left out holds all the same.
+    assert np.abs(dyn.constraint_residual(run.q)).max() < 1e-9
+    energy = dyn.kinetic_energy(run.q, run.v) + dyn.potential_energy(run.q)
+    assert np.ptp(energy) < 1e-7
+    q, v = run.q[-1], run.v[-1]
+    J, forces = dyn.constraint_jacobian(q), dyn.constraint_forces(q, v, tau)
+    # The least norm: nothing of λ lies where Jᵀ gives no force.
+    U, s, _ = np.linalg.svd(J)
+    assert s[-1] < 1e-8 * s[0]
+    assert abs(U[:, -1] @ forces) < 1e-7 * np.linalg.norm(forces)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_prescribed_motion_is_followed_and_its_drive_pays_for_the_energy(compiled: bool) -> None:
+    b = mb.ModelBuilder("driven")
+    b.add_body("arm", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+    b.add_joint("drive", "revolute", parent="world", child="arm", axis=(0, 1, 0))
+    b.add_body("bob", mass=0.5, com=(0, 0, -0.4), inertia=(0.02, 0.02, 0.01))
+    b.add_joint("swing", "revolute", parent="arm", child="bob", translation=(0, 0, -1), axis=(0, 1, 0))
+    b.prescribe("drive", offset=0.2, rate=0.3, amplitude=0.4, frequency=3.0, phase=0.1)
+    model = b.build()
+    dyn = mb.dynamics(model, "lagrangian", compile=compiled)
+    q, v = dyn.project([0.2, 0.3], [0.0, 0.5])
+    run = mb.simulate(dyn, q, v, 2.0, "rk4", dt=1e-3)
+    path = 0.2 + 0.3 * run.t + 0.4 * np.sin(3 * run.t + 0.1)
+    assert np.abs(run.q[:, 0] - path).max() < 1e-14
+    along = [dyn.at(t=t) for t in run.t[::20]]
+    states = zip(along, run.q[::20], run.v[::20], strict=True)
+    power = np.array([now.constraint_forces(x, w, np.zeros(2))[0] * w[0] for now, x, w in states])
+    energy = dyn.kinetic_energy(run.q, run.v) + dyn.potential_energy(run.q)
+    work = trapezoid(power, run.t[::20])
+    assert abs(energy[-1] - energy[0] - work) < 2e-3 * np.abs(energy).max()
+    exact = mb.simulate(dyn, q, v, 2.0, "rk853", rtol=1e-12, atol=1e-12, save=[2.0])
+    assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-9
+
+
+@pytest.mark.parametrize("method", ["semi_implicit_euler", "rk4"])
+def test_compiled_steps_are_those_of_python(method: str) -> None:
+    model, q = closed_tree(1, "point", drive=True)
+    v = np.zeros(model.nv)
+    runs = []
+    for compiled in (True, False):
+        dyn = mb.dynamics(model, "lagrangian", compile=compiled)
+        start = dyn.project(q, v)
+        runs.append(mb.simulate(dyn, *start, 0.05, method, dt=1e-3))
+    assert np.abs(runs[0].q - runs[1].q).max() < 1e-10
+    dyn = mb.dynamics(model, "lagrangian")
+    gap = [np.abs(dyn.at(t=t).constraint_residual(x)).max() for t, x in zip(runs[0].t, runs[0].q, strict=True)]
+    assert max(gap) < 1e-14
+
+
+def test_gap_does_not_grow_and_orders_stay() -> None:
+    model = four_bar()
+    dyn = mb.dynamics(model, "lagrangian")
+    q, v = dyn.project([0.5, -0.3, 1.2], [5.0, 0.0, 0.0])
+    exact = mb.simulate(dyn, q, v, 1.0, "rk853", rtol=1e-13, atol=1e-13, save=[1.0]).q[-1]
+    errors = [np.abs(mb.simulate(dyn, q, v, 1.0, "rk4", dt=h, save=[1.0]).q[-1] - exact).max() for h in (4e-3, 2e-3)]
+    assert 12 < errors[0] / errors[1] < 20
+    run = mb.simulate(dyn, q, v, 200.0, "rk4", dt=1e-3, save=np.arange(0.0, 200.5, 10.0))
+    turned = EPS * np.abs(run.q).max()
+    assert np.abs(dyn.constraint_residual(run.q)).max() < 1e-14 + 2 * turned
+
+
+def test_batches_and_singles_are_the_same_numbers() -> None:
+    model = four_bar()
+    dyn = mb.dynamics(model, "lagrangian")
+    q, v = model.random_state(0, 9)
+    tau = np.ones((9, 3))
+    for name, states in (
+        ("forward_dynamics", (q, v, tau)),
+        ("constraint_forces", (q, v, tau)),
+        ("generalized_constraint_force", (q, v, tau)),
+        ("constraint_jacobian", (q,)),
+        ("constraint_bias", (q, v)),
+    ):
+        whole = getattr(dyn, name)(*states)
+        assert np.allclose(whole[4], getattr(dyn, name)(*(x[4] for x in states)), rtol=1e-13)
+    projected = dyn.project(q + 0.01, v)
+    assert np.abs(dyn.constraint_residual(projected[0])).max() < 1e-14
+    assert np.array_equal(projected[0][3], dyn.project(q[3] + 0.01, v[3])[0])
+
+
+def test_derivatives_of_forward_dynamics_are_those_of_differences() -> None:
+    model, q = closed_tree(0, "point")
+    dyn = mb.dynamics(model, "lagrangian")
+    q, v = dyn.project(q, np.ones(model.nv))
+    tau, h = np.ones(model.nv), 1e-6
+    by = dyn.forward_dynamics_derivatives(q, v, tau)
+    for k, e in enumerate(np.eye(model.nv)):
+        pairs = ((model.integrate(q, s * h * e), v, tau) for s in (1, -1))
+        slope = np.subtract(*(dyn.forward_dynamics(*state) for state in pairs)) / (2 * h)
+        assert np.abs(by.q[:, k] - slope).max() < 1e-5 * (1 + np.abs(by.q).max())
+        slope = (dyn.forward_dynamics(q, v, tau + h * e) - dyn.forward_dynamics(q, v, tau - h * e)) / (2 * h)
+        assert np.abs(by.tau[:, k] - slope).max() < 1e-6 * (1 + np.abs(by.tau).max())
+
+
+def test_links_without_mass_in_a_loop() -> None:
+    b = mb.ModelBuilder("light_coupler")
+    for name, parent, at, mass in (
+        ("crank", "world", 0.0, 1.0),
+        ("coupler", "crank", 0.3, 0.0),
+        ("rocker", "world", 1.0, 2.0),
+    ):
+        b.add_body(name, mass=mass, com=(0.2, 0, 0) if mass else (0, 0, 0), inertia=(mass / 100,) * 3)
+        b.add_joint(f"at_{name}", "revolute", parent=parent, child=name, translation=(at, 0, 0), axis=(0, -1, 0))
+    b.add_loop("pin", "point", body_a="coupler", translation_a=(0.9, 0, 0), body_b="rocker", translation_b=(0.7, 0, 0))
+    model = b.build()
+    dyn, oracle = (mb.dynamics(model, name) for name in ("lagrangian", "oracle"))
+    q, v = model.random_state(2)
+    tau = np.array([1.0, 0.0, 0.5])
+    a, exact = (x.forward_dynamics(q, v, tau) for x in (dyn, oracle))
+    assert np.allclose(a, exact, rtol=1e-10)
+
+
+def test_pickle_time_and_names() -> None:
+    model, q = closed_tree(2, "revolute", drive=True)
+    dyn = mb.dynamics(model, "lagrangian").at(t=0.25)
+    copy = pickle.loads(pickle.dumps(dyn))
+    assert copy.model.time == 0.25
+    assert copy.constraint_names == dyn.constraint_names
+    assert np.array_equal(copy.constraint_residual(q), dyn.constraint_residual(q))
+    assert model.time_parameter == "t"
+    assert dict(dyn.model.parameters) == {"t": 0.25}
+    assert isinstance(dyn.function("constraint_residual"), ca.Function)
+
+
+def test_without_constraints_there_are_no_such_quantities() -> None:
+    dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
+    assert not any(name.startswith("constraint") for name in dyn.supports)
+    assert dyn.constraint_names == ()
+    with pytest.raises(UnsupportedError, match="has no loops"):
+        dyn.constraint_residual([0.0, 0.0])
+    assert dyn.mobility().degrees_of_freedom == 2
+    q, v = dyn.project([0.1, 0.2], [0.3, 0.4])
+    assert q.tolist() == [0.1, 0.2]
+    assert v.tolist() == [0.3, 0.4]
+
+
+def test_loops_that_cannot_be_are_refused_with_the_reason() -> None:
+    far = four_bar(translation_b=(5.0, 0, 0))
+    with pytest.raises(InputError, match=r"no configuration satisfies them all.*loop 'pin'"):
+        mb.dynamics(far, "lagrangian").project(np.zeros(3), np.zeros(3))
+    with pytest.raises(InputError, match=r"the ends never meet.*0.2"):
+        mb.dynamics(four_bar(translation_b=(0.7, 0.2, 0)), "lagrangian").constraint_residual(np.zeros(3))
+    with pytest.raises(InputError, match="closes nothing"):
+        mb.dynamics(four_bar(body_b="world", body_a="crank", translation_a=(0, 0, 0), translation_b=(0, 0, 0)),
+                    "lagrangian").constraint_residual(np.zeros(3))  # fmt: skip
+    with pytest.raises(ModelError, match="both ends on 'rocker'"):
+        four_bar(body_a="rocker")
+    with pytest.raises(ModelError, match="expected a rod with a length above 0"):
+        four_bar(kind="distance")
+    with pytest.raises(ModelError, match="only a rod has one"):
+        four_bar(length=1.0)
+    with pytest.raises(ModelError, match="unknown kind 'weld'"):
+        four_bar(kind="weld")
+    with pytest.raises(InputError, match=r"q0: the constraints of four_bar ask for f = 0"):
+        mb.simulate(mb.dynamics(four_bar(), "lagrangian"), np.zeros(3), np.zeros(3), 0.1, "rk4", dt=1e-3)
+
+
+def test_a_singular_pose_is_passed_by_projected_stages_and_told() -> None:
+    # All links of a parallelogram in one line: its Jacobian loses a row there.
+    b = mb.ModelBuilder("parallelogram")
+    for name, parent, at, length in (
+        ("crank", "world", 0.0, 1.0),
+        ("coupler", "crank", 1.0, 2.0),
+        ("rocker", "world", 2.0, 1.0),
+    ):
+        b.add_body(name, mass=length, com=(length / 2, 0, 0), inertia=(0.0, length**3 / 12, length**3 / 12))
+        b.add_joint(f"at_{name}", "revolute", parent=parent, child=name, translation=(at, 0, 0), axis=(0, -1, 0))
+    b.add_loop("pin", "point", body_a="coupler", translation_a=(2, 0, 0), body_b="rocker", translation_b=(1, 0, 0))
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    q, v = dyn.project([1.0, -1.0, 1.0], [-2.0, 2.0, -2.0])
+    with pytest.warns(mb.errors.MbkitWarning, match="singular pose"):
+        run = mb.simulate(dyn, q, v, 1.5, "rk4", dt=1e-3)
+    assert run.q[-1, 0] < -0.5
+    assert np.abs(dyn.constraint_residual(run.q)).max() < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_all_rows_are_closed_and_no_frame_is_half_a_turn_off(seed: int) -> None:
+    model, _ = closed_tree(seed, "frame")
+    dyn = mb.dynamics(model, "lagrangian")
+    (loop,) = model.loops
+    q, _ = model.random_state(seed, 4)
+    assert np.abs(dyn.constraint_residual(q)).max() < 1e-12
+    poses = dyn.body_poses(q)
+    names = [b.name for b in model.bodies]
+    A, B = (poses[:, names.index(x), :3, :3] for x in (loop.body_a, loop.body_b))
+    turn = np.swapaxes(A @ loop.rotation_a, 1, 2) @ (B @ loop.rotation_b)
+    assert np.abs(turn - np.eye(3)).max() < 1e-11
+
+
+def test_a_start_half_a_turn_off_is_refused() -> None:
+    b = mb.ModelBuilder("welded")
+    for k, parent in enumerate(("world", "arm0", "arm1", "arm2")):
+        b.add_body(f"arm{k}", mass=1.0, com=(0.1, 0, 0), inertia=(0.1, 0.1, 0.1))
+        b.add_joint(
+            f"j{k}", "revolute", parent=parent, child=f"arm{k}", translation=(0.5 if k else 0, 0, 0), axis=(0, 0, 1)
+        )
+    b.add_loop("weld", "frame", body_a="arm3", body_b="world", translation_b=(0.5, 0, 0))
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    closed, _ = dyn.project([1.0, 1.0, 2.0, 2.0], np.zeros(4))
+    turned = np.array([*closed[:3], closed[3] + np.pi])
+    assert np.abs(dyn.constraint_residual(turned)).max() < 1e-12
+    mb.simulate(dyn, closed, np.zeros(4), 0.01, "rk4", dt=1e-3)
+    with pytest.raises(InputError, match="loop 'weld' half a turn off"):
+        mb.simulate(dyn, turned, np.zeros(4), 0.01, "rk4", dt=1e-3)
+
+
+def test_the_time_is_a_parameter_that_stays() -> None:
+    model, q = closed_tree(2, "point", drive=True)
+    later = model.with_parameters(t=0.5)
+    assert later.time == 0.5
+    assert later.time_parameter == "t"
+    own = mb.dynamics(model, "lagrangian")
+    assert np.array_equal(mb.dynamics(later, "lagrangian").constraint_residual(q), own.at(t=0.5).constraint_residual(q))
+
+
+@pytest.mark.parametrize("name", ["four_bar", "bricard", "andrews_squeezer", "flyball_governor"])
+def test_engines_agree_on_mechanisms_mujoco_by_its_own_law(name: str) -> None:
+    result = mb.compare(mb.catalog.get(name)(), samples=4, terms_only=True)
+    assert result.passed, result.verdict
+    assert set(result.engines) == {"pinocchio", "lagrangian", "mujoco"}
+    of_motion = {
+        r.term: r.reference for r in result.rows if r.engine == "mujoco" and r.term in ("forward dynamics", "Jᵀ λ", "M")
+    }
+    assert of_motion == {"forward dynamics": "own law", "Jᵀ λ": "own law", "M": "oracle"}
+    assert result.softness["mujoco"] < 4
+    assert "mujoco holds loops softly" in result.verdict
+
+
+def test_a_wrong_loop_is_found() -> None:
+    model = mb.catalog.four_bar()
+    (loop,) = model.loops
+    moved = replace(model, loops=(replace(loop, translation_a=loop.translation_a + np.array([1e-9, 0.0, 0.0])),))
+    own = mb.dynamics(model, "lagrangian")
+    q, v = own.project([0.4, 0.1, 0.1], [1.0, 0.0, 0.0])
+    gap = mb.dynamics(moved, "pinocchio").forward_dynamics(q, v, np.zeros(3)) - own.forward_dynamics(q, v, np.zeros(3))
+    assert np.abs(gap).max() > 1e-11
+
+
+def test_power_of_drives_counts_in_the_balance() -> None:
+    model, _ = closed_tree(1, "point", drive=True)
+    result = mb.compare(model, ("pinocchio", "lagrangian"), samples=4, terms_only=True)
+    rows = [r for r in result.rows if r.term == "power balance"]
+    assert len(rows) == 2
+    assert all(r.passed for r in rows), [r.relative for r in rows]
+
+
+def test_what_would_be_the_trees_alone_is_refused() -> None:
+    dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
+    q = np.zeros(3)
+    with pytest.raises(UnsupportedError, match="operational_space: four_bar has loops"):
+        mb.operational_space(dyn, q, "coupler")
+    with pytest.raises(UnsupportedError, match="joint_wrenches of four_bar"):
+        dyn.newton_euler_residual(q, q, q, q)
+
+
+def test_a_whole_comparison_of_a_mechanism_passes_with_its_loops_on() -> None:
+    result = mb.compare(mb.catalog.four_bar(), samples=4)
+    assert result.passed, result.verdict
+    assert {r.engine for r in result.rollouts} == {"mujoco"}
+    (loops,) = (o for o in result.omissions if o.need == "loops")
+    assert loops.present
+    assert "needed" in loops.what
+    assert type(result).from_json(result.to_json()).softness == result.softness
