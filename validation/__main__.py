@@ -43,6 +43,8 @@ PARTS = {
     "bench_terms": Part(15, ("terms.json",), "one sample of inverse and forward dynamics"),
     "operations": Part(10, ("operations.json",), "operations of each form, and the vector units' limit"),
     "bench_single_calls": Part(1, ("single_calls.json",), "a single call, beside the bare call of the engine"),
+    "four_bar": Part(1, ("four_bar.json",), "a loop in four engines: error, gap and time of a step"),
+    "mechanisms": Part(5, ("mechanisms.json",), "mechanisms with loops: errors, softness, time of a step"),
     "bench_rollouts": Part(5, ("rollouts.json",), "batches of rollouts, beside mujoco.rollout"),
     "bench_trajectory": Part(5, ("trajectory.json",), "one trajectory to an error of 1e-9"),
     "bench_derivation": Part(1, ("derivation.json",), "equations to read, beside sympy.physics.mechanics"),
