@@ -316,7 +316,7 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     'pendulum_forward_dynamics'
     """
     wanted = _checked(quantities)
-    for feature, present in (("loops", model.needs.loops), ("prescribed", model.needs.time)):
+    for feature, present in (("loops", model.needs.loops), ("prescribed", model.prescribed)):
         if present:
             raise UnsupportedError(
                 f"{model.name} has {feature!r}, which C code of its tree leaves out; export "

@@ -24,10 +24,12 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector
 from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.errors import InputError
 from mbkit.model import Model
+from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.manifold import random_state
 from mbkit.model.parts import Loop
@@ -158,8 +160,8 @@ def _rows(kin: Kinematics, time: Any) -> Iterator[tuple[str, str, Any]]:
             yield loop.name, f"loop {loop.name!r} {name}", row
     for motion in model.prescribed:
         (at,) = kin.coordinates(model.joint(motion.joint))
-        x = kin.values.prescribed[motion.joint]
-        path = x.offset + x.rate * time + x.amplitude * ca.sin(ca.SX(x.frequency * time + x.phase))
+        numbers = casadi_arithmetic(kin.values.number)
+        path = MOTION_LAWS[type(motion)].path(motion, kin.values.prescribed[motion.joint], time, numbers)
         yield motion.joint, f"motion of {motion.joint!r}", at - path
 
 

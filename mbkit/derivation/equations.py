@@ -22,6 +22,7 @@ import numpy as np
 from mbkit.derivation import kinematics as energies
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyMotion
 from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS, ConstrainedMotion
+from mbkit.derivation.elements.forces import ElementForces
 from mbkit.derivation.fingerprint import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
 from mbkit.derivation.kinematics import Kinematics
 from mbkit.derivation.least_constraint import LeastConstraint, squares
@@ -127,8 +128,17 @@ class Equations:
 
     @cached_property
     def potential_energy(self) -> Any:
-        """V(q) of gravity and springs."""
-        return energies.gravity_energy(self.kin) + energies.spring_energy(self.kin)
+        """V(q) of gravity, springs, and forces with a potential."""
+        return energies.gravity_energy(self.kin) + self._stored
+
+    @cached_property
+    def elements(self) -> ElementForces:
+        """Forces that are given by functions."""
+        return ElementForces(self.kin)
+
+    @cached_property
+    def _stored(self) -> Any:
+        return energies.spring_energy(self.kin) + self.elements.energy
 
     @cached_property
     def energy_rate(self) -> Any:
@@ -143,13 +153,13 @@ class Equations:
 
     @cached_property
     def damping(self) -> Any:
-        """Forces of dampers."""
-        return energies.damping_forces(self.kin)
+        """Forces of dampers, and of functions without a potential."""
+        return energies.damping_forces(self.kin) + self.elements.force
 
     @cached_property
     def passive(self) -> Any:
-        """Forces of springs and dampers."""
-        return self.damping - self.kin.pullback(ca.gradient(energies.spring_energy(self.kin), self.q))
+        """Forces of springs and dampers, and those given by functions."""
+        return self.damping - self.kin.pullback(ca.gradient(self._stored, self.q))
 
     @cached_property
     def _hamel(self) -> Any:

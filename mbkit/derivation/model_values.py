@@ -15,6 +15,8 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.model import Frame, Joint, Model
+from mbkit.model.elements.forces import Bushing
+from mbkit.model.elements.motion_laws import MOTION_LAWS
 
 # CasADi's operators first search a conversion of their operands, some 15 µs each; `SX.binary` takes 2. A tree's
 # kinematics are tens of thousands of them. This module replaces CasADi in the formulas of the joint types.
@@ -91,7 +93,8 @@ _MIMIC: Final = ("ratio", "offset")
 _COUPLING: Final = ("factors", "stiffness", "rest_length", "damping", "armature")
 _SPRING: Final = ("point_a", "point_b", "stiffness", "rest_length", "damping")
 _LOOP: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "length")
-_MOTION: Final = ("offset", "rate", "amplitude", "frequency", "phase")
+_FORCE: Final = ("numbers",)
+_BUSHING: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "stiffness", "damping", "numbers")
 # A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum of literal masses could be divided
 # by, and its quotient be rounded to double.
 _DIRECTIONS: Final = frozenset({"rotation", "axes", "rotation_a", "rotation_b"})
@@ -118,7 +121,7 @@ class Values:
     Attributes
     ----------
     gravity : list of 3 scalars
-    bodies, joints, springs, couplings, loops, prescribed : dict of str to SimpleNamespace
+    bodies, joints, springs, couplings, loops, prescribed, forces : dict of str to SimpleNamespace
         By name; motions by that of their joint. A joint that mimics has `ratio` and `offset` too.
     named : dict of str to casadi.SX
         The parameters' symbols.
@@ -145,7 +148,12 @@ class Values:
             for b in model.bindings
         }
         self._read_parts(model)
-        self.prescribed = {p.joint: self._read("prescribed", p.joint, p, _MOTION) for p in model.prescribed}
+        self.prescribed = {
+            p.joint: self._read("prescribed", p.joint, p, MOTION_LAWS[type(p)].numbers) for p in model.prescribed
+        }
+        # Of what is evaluated later too: the constants are an argument that must not grow.
+        for x in (number for part in (*model.forces, *model.prescribed) for number in part.constants):
+            self._scalar(x)
 
     def _read_parts(self, model: Model) -> None:
         self.gravity = self._read("gravity", "", model, ("gravity",)).gravity
@@ -154,6 +162,10 @@ class Values:
         self.springs = {s.name: self._read("springs", s.name, s, _SPRING) for s in model.springs}
         self.couplings = {c.name: self._read("couplings", c.name, c, _COUPLING) for c in model.couplings}
         self.loops = {x.name: self._read("loops", x.name, x, _LOOP) for x in model.loops}
+        self.forces = {
+            f.name: self._read("forces", f.name, f, _BUSHING if isinstance(f, Bushing) else _FORCE)
+            for f in model.forces
+        }
         self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}
 
     @property

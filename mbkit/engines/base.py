@@ -6,7 +6,10 @@ quantities that follow from others are here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from copy import copy
+from functools import cached_property
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -43,6 +46,8 @@ QUANTITIES: Final = (
 _OF_BODIES: Final = frozenset(
     {*frames_and_momenta.QUANTITIES, *loads.QUANTITIES, *regressors.QUANTITIES} - {"mass_matrix_inverse"}
 )
+#: What needs the force on each body.
+_OF_OWN_LOADS: Final = frozenset({"joint_wrenches"})
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
 #: Names in a list of an error message.
@@ -76,6 +81,16 @@ def require_tree(model: Model, user: str, why: str = "it takes the tree alone") 
                 f"{user}: {model.name} has {text} ({names}), and {why}; mbkit.dynamics(model, 'lagrangian') solves it "
                 f"with them, and model.without({feature!r}) is the tree without them"
             )
+
+
+def require_no_forces(model: Model, engine: str) -> None:
+    """Raise `UnsupportedError` for a model with forces by functions, in the name of an engine's own integrators."""
+    if model.forces:
+        names = first_names((repr(f.name) for f in model.forces), ", ...")
+        raise UnsupportedError(
+            f"{engine}: its own integrators do not know the forces of {model.name} by functions ({names}); use a "
+            "method that any engine has, such as rk4, or model.without('forces')"
+        )
 
 
 class InverseDynamicsDerivatives(NamedTuple):
@@ -146,6 +161,8 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors, Con
     derived: ClassVar[bool] = False
     #: Of the significand with which it computes.
     bits: ClassVar[int] = DOUBLE_BITS
+    #: Whether the adapter's own terms hold the forces that are given by functions; else they are added to them.
+    has_elements: ClassVar[bool] = False
     #: Whether the adapter's methods take batches too, all of one size, and not single states alone.
     _batches: ClassVar[bool] = True
     #: Frames whose wrenches stand behind τ in that argument, six numbers each, and their axes.
@@ -174,7 +191,8 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors, Con
         """Names of the quantities that this engine can give."""
         needed = {x: loads.FOLLOWING.get(x, x) for x in QUANTITIES}
         given = {x for x, y in needed.items() if y not in self.refuses and hasattr(self, f"_{y}")}
-        missing = constrained.OF_TREES if self.model.constrained else constrained.QUANTITIES
+        missing = {*(constrained.OF_TREES if self.model.constrained else constrained.QUANTITIES)}
+        missing |= _OF_OWN_LOADS if self.model.forces else set()
         given = {x for x in given if needed[x] not in missing}
         return frozenset(given if self.model.has_bodies else given - _OF_BODIES)
 
@@ -213,7 +231,15 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors, Con
         >>> float(dyn.mass_matrix([0.0])[0, 0]), float(dyn.at(m=3.0).mass_matrix([0.0])[0, 0])
         (2.0, 3.0)
         """
-        return type(self)(self.model.with_nominal(values))
+        return self._at_time(values) or type(self)(self.model.with_nominal(values))
+
+    def _at_time(self, values: Mapping[str, Any]) -> Self | None:
+        """Return the same dynamics, with all that was built, at another time; None for other values."""
+        if not values or set(values) - {self.model.time_parameter}:
+            return None
+        out = copy(self)
+        out.model = self.model.with_nominal(values)
+        return out
 
     def of_samples(self, which: ArrayLike) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
         """Return the dynamics of these samples of a batch, by index: itself, unless parameters differ between them."""
@@ -493,11 +519,32 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors, Con
         if self.model.constrained and quantity in constrained.OF_TREES:
             reason = constrained.OF_TREES[quantity]
             raise UnsupportedError(f"{self.engine} cannot give {quantity} of {self.model.name}: {reason}")
+        if self.model.forces and quantity in _OF_OWN_LOADS:
+            raise UnsupportedError(
+                f"{self.engine} cannot give {quantity} of {self.model.name}: forces by functions are known by what "
+                "they do to the motion, not to single bodies; model.without('forces') has the loads without them"
+            )
         method = getattr(self, f"_{quantity}", None)
         if method is None or quantity in self.refuses:
             reason = self.refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")
             raise UnsupportedError(f"{self.engine} cannot give {quantity}: {reason}")
+        if self.model.forces and not self.has_elements:
+            return self._elements.beside(quantity, method, self)  # type: ignore[no-any-return]  # by name
         return method  # type: ignore[no-any-return]  # by name
+
+    def _lost_force(self, q: Array, v: Array) -> Array:
+        """Return the generalized force of functions without a potential, (nv,) or (N, nv), of checked states.
+
+        It is the part of `passive` beside springs and dampers whose work no energy accounts for.
+        """
+        if not self.model.forces:
+            return np.zeros((*np.broadcast_shapes(np.shape(q)[:-1], np.shape(v)[:-1]), self.model.nv))
+        return np.asarray(self._elements.lost(self, q, v))
+
+    @cached_property
+    def _elements(self) -> Any:
+        """Forces given by functions, compiled; CasADi is loaded for a model that has some."""
+        return import_module("mbkit.engines.elements.compiled_forces").CompiledForces(self.model)
 
     def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
         """Return a quantity at states, checked; `more` are arguments that are the same for every state."""
@@ -584,7 +631,7 @@ def _beside(tau: Array, wrenches: Array) -> Array:
 class WrenchedDynamics(Dynamics):
     """`Dynamics._under` of an engine, by its own Jacobians."""
 
-    takes_parameters = True
+    takes_parameters = has_elements = True
     _bare: Dynamics
 
     def __init__(self, dyn: Dynamics, frames: tuple[Frame, ...], axes: str) -> None:
@@ -597,6 +644,9 @@ class WrenchedDynamics(Dynamics):
     def engine(self) -> str:  # type: ignore[override]  # that of another
         """Name of the engine."""
         return self._bare.engine
+
+    def at(self, /, **values: Any) -> Dynamics:
+        return WrenchedDynamics(self._bare.at(**values), *self._acting)
 
     def forward_dynamics(
         self,

@@ -146,7 +146,7 @@ class LagrangianDynamics(Dynamics):
     """
 
     engine = "lagrangian"
-    derived = True
+    derived = has_elements = True
     takes_parameters = True
     takes_written = True
     lacks_derivatives = lacks_constraints = ""
@@ -252,6 +252,8 @@ class LagrangianDynamics(Dynamics):
             if name not in self.model.parameters:
                 raise UnknownNameError("parameter", name, self.model.parameters)
         many = {name: _column(name, x) for name, x in values.items() if np.ndim(x)}
+        if (times := many.get(self.model.time_parameter or "")) is not None and len(times):
+            self.model.require_times("time", float(times.min()), float(times.max()))
         batched = {name: x for name, x in self._batched.items() if name not in values} | many
         if len({len(x) for x in batched.values()}) > 1:
             message = ", ".join(f"{name} has {len(x)}" for name, x in batched.items())

@@ -106,6 +106,7 @@ class OracleDynamics(Dynamics):
 
     engine = "oracle"
     bits = 113
+    has_elements = True
     takes_written = True
     lacks_derivatives = lacks_constraints = ""
     refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}

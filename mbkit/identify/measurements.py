@@ -162,7 +162,7 @@ def equations(dyn: Dynamics, unknowns: Unknowns, data: Measurements, progress: P
 def _blocks(dyn: Dynamics, unknowns: Unknowns, data: Measurements) -> Iterator[tuple[slice, Array, Array]]:
     """Yield samples with their regressor and the torque that it has to explain."""
     model, needs = dyn.model, dyn.model.needs
-    known = needs.springs or needs.damping or needs.armature
+    known = needs.springs or needs.damping or needs.armature or needs.forces
     size = max(64, _BLOCK // max(model.nv * len(unknowns.names), 1))
     for start in range(0, len(data), size):
         part = slice(start, min(start + size, len(data)))

@@ -19,6 +19,7 @@ from mbkit.errors import InputError
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 from mbkit.lagrangian.trig.shortest_form import number, shortest_form
 from mbkit.model import Joint, Model
+from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.joint_types import cross3
 from mbkit.model.parts import Loop, PointSpring, Prescribed
 
@@ -27,7 +28,6 @@ Vector = list[Any]
 _Way = list[Joint]
 #: Relative size of a zero term that rounded rotations leave.
 _DUST: Final = Fraction(1, 10**15)
-_MOTION: Final = ("offset", "rate", "amplitude", "frequency", "phase")
 
 
 def instead_of_writing(model: Model) -> str:
@@ -49,9 +49,9 @@ class _Numbers(Values):
         self._bound, self._number = bound, read
         self._read_parts(model)
 
-    def motion(self, prescribed: Prescribed) -> Any:
+    def motion(self, prescribed: Motion) -> Any:
         """Return the numbers of a motion, which a model of the same form need not have."""
-        return self._read("prescribed", prescribed.joint, prescribed, _MOTION)
+        return self._read("prescribed", prescribed.joint, prescribed, MOTION_LAWS[type(prescribed)].numbers)
 
     def _scalar(self, value: float, direction: bool = False) -> Any:  # noqa: ARG002
         return self._number(value)

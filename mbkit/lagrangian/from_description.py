@@ -10,7 +10,8 @@ import sympy as sp
 
 from mbkit.derivation.kinematics import dissipation, spring_energy
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.lagrangian.description_kinematics import SymbolicKinematics, closure, instead_of_writing, motion
+from mbkit.lagrangian.description_kinematics import SymbolicKinematics, closure, instead_of_writing
+from mbkit.lagrangian.elements import acting, law
 from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.energy_model import EnergyModel
 from mbkit.lagrangian.printing.catalog_symbols import in_symbols
@@ -35,7 +36,7 @@ def from_model(
 
     The joints' formulas are evaluated on exact sums of cosines and sines. Numbers are the decimals of the description.
     Springs are in V, dampers in the dissipation, armature in T; dry friction and limits are left out, as in every
-    engine.
+    engine. Forces of functions at joints are written out, their potentials in V.
 
     Loop closures become holonomic constraints, in the order of `model.loops`, in the axes of the body that carries
     both ends. A point closure has three rows, two in a plane, and its multipliers are the force on body a; a frame
@@ -60,7 +61,8 @@ def from_model(
     Raises
     ------
     UnsupportedError
-        Ball or free joints, too many terms to read, or no coordinate that is left to move.
+        Ball or free joints, forces by functions elsewhere than at joints, too many terms to read, or no coordinate
+        that is left to move.
     InputError
         `symbols` of a model that is not in the catalog, names that do not fit, or a loop whose ends never meet or do
         not move against each other.
@@ -93,7 +95,7 @@ def from_model(
     _check(model)
     q = _coordinates(model, coordinates)
     named = None
-    if symbols or symbols is None:
+    if symbols or (symbols is None and not model.forces):
         named = in_symbols(model)
         if named is None and symbols:
             known = "it has named parameters already" if model.bindings else "it is no system of the catalog"
@@ -107,24 +109,27 @@ def from_model(
     kin = SymbolicKinematics(source, q, v, parameters, progress or (lambda *_: None))
     T, V, R = kin.kinetic_energy, kin.gravity_energy + spring_energy(kin.written), dissipation(kin.written)
     t = _time({*parameters, *(s.name for s in (*q, *v))})
-    moved = {model.coordinate_names.index(p.joint): motion(kin, p, t) for p in model.prescribed}
+    moved = {model.coordinate_names.index(p.joint): law(kin, p, t) for p in model.prescribed}
     rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]
     if drives:
         rows += [(model.coordinate_names[i], q[i] - x) for i, x in moved.items()]
         moved = {}
     put = {q[i]: x for i, x in moved.items()} | {v[i]: sp.diff(x, t) for i, x in moved.items()}
-    T, V, R, *constraints = (x.xreplace(put) for x in (T, V, R, *(row for _, row in rows)))
+    stored, pushed = acting(kin, t)
+    T, V, R, *constraints = (x.xreplace(put) for x in (T, V + stored, R, *(row for _, row in rows)))
+    pushed = [x.xreplace(put) for x in pushed]
     kept = [i for i in range(len(q)) if i not in moved]
     # Dampers on prescribed joints alone act on no coordinate that is left.
     R = R if R.free_symbols & {v[i] for i in kept} else sp.Integer(0)
     _check_kept(model, {q[i] for i in kept}, zip((name for name, _ in rows), constraints, strict=True))
-    used = set().union(*(x.free_symbols for x in (T, V, R, *constraints)))
+    used = set().union(*(x.free_symbols for x in (T, V, R, *constraints, *pushed)))
     return Lagrangian(
         T,
         V,
         [q[i] for i in kept],
         [v[i] for i in kept],
         time=t,
+        forces={q[i]: pushed[i] for i in kept if pushed[i] != 0},
         dissipation=R,
         constraints=constraints,
         # What only a frame needs is no part of the equation; a name of the user's own is kept all the same.
@@ -143,7 +148,7 @@ def _check(model: Model) -> None:
     if not model.nv:
         raise UnsupportedError(f"{model.name}: no joint of it moves, so there is no equation")
     # Engines take trees of any size. What they refuse is solved here alone.
-    bound = model.needs.loops or model.needs.time
+    bound = model.loops or model.prescribed
     most = _MOST_BOUND if bound else _MOST
     if model.nv > most:
         raise UnsupportedError(

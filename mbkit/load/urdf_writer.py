@@ -64,6 +64,7 @@ def _unsupported(model: Model) -> Iterator[str]:
     yield from (f"coupling {c.name!r} between joints" for c in model.couplings)
     yield from (f"loop {x.name!r}" for x in model.loops)
     yield from (f"joint {p.joint!r} is moved in time" for p in model.prescribed)
+    yield from (f"{force} (a function)" for force in model.forces)
 
 
 def _numbers(values: Any) -> str:

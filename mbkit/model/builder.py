@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike
 from mbkit import spatial
 from mbkit._check import Array, _as_float, finite_array, real, shown
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
+from mbkit.model.elements.declare import ElementBuilder
 from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.loops import LOOP_KINDS, LoopKind
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring
 from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
 # The squares of sums of such lengths still fit a double.
@@ -225,7 +226,7 @@ def shape_of(value: Any) -> tuple[int, ...] | None:
         return None
 
 
-class ModelBuilder:
+class ModelBuilder(ElementBuilder):
     """Collects bodies, joints and forces, and builds a frozen `Model` of them.
 
     A faulty call is remembered and not raised: `build` reports all faults in one `ModelError`. Parts may be declared
@@ -255,7 +256,7 @@ class ModelBuilder:
         self._bindings: list[Binding] = []
         self._gravity = self._numbers("gravity", "", gravity=self._read.quantities("gravity", gravity, 3))["gravity"]
         self._parts: dict[str, list[Any]] = {
-            kind: [] for kind in ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed")
+            kind: [] for kind in ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed", "forces")
         }
         self._notes: list[str] = []
 
@@ -471,23 +472,6 @@ class ModelBuilder:
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
         self._add(Loop, "loops", "loop", name, a | b | {"length": length}, {"kind": kind})
 
-    def prescribe(
-        self,
-        joint: str,
-        *,
-        offset: Number = 0.0,
-        rate: Number = 0.0,
-        amplitude: Number = 0.0,
-        frequency: Number = 0.0,
-        phase: Number = 0.0,
-    ) -> None:
-        """Move a one-velocity joint in time: offset + rate t + amplitude sin(frequency t + phase).
-
-        The joint keeps its coordinate, which a constraint holds on this motion; its multiplier is the drive's force.
-        """
-        values = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
-        self._add(Prescribed, "prescribed", "prescribed", joint, values)
-
     def note(self, text: str) -> None:
         """Add a sentence to the model's notes."""
         self._notes.append(self._read.name("note text", text, longest=1_000_000))
@@ -547,7 +531,8 @@ class ModelBuilder:
             message = f"{self._name}: physically impossible, used as written: {impossible}"
             warnings.warn(message, NonPhysicalWarning, stacklevel=2)
         notes = (*model.notes, *(f"never moves, so this cannot act: {text}" for text in idle))
-        return replace(model, notes=notes, nonphysical=inconsistent)
+        # Tables of motions need not begin at time 0.
+        return replace(model, notes=notes, nonphysical=inconsistent, time=float(np.clip(0.0, *model.interval)))
 
     def _add(
         self,

@@ -15,9 +15,11 @@ import numpy as np
 
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, UnknownNameError
+from mbkit.model.elements.forces import Bushing, Force, drives, lost, needs_time
+from mbkit.model.elements.motion_laws import Motion, beyond, interval
 from mbkit.model.joint_types import KINDS
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, Prescribed, read_only
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, read_only
 
 
 def _plain(value: Any) -> Any:
@@ -43,7 +45,8 @@ def digest(*parts: Any) -> str:
 class Needs:
     """One flag per feature; True where the description has it.
 
-    Friction, limits and loops are data; the smooth terms of every engine leave friction and limits out.
+    Friction, limits and loops are data; the smooth terms of every engine leave friction and limits out. `forces` are
+    those given by functions; their parts do not count as springs and dampers.
     """
 
     gravity: bool
@@ -57,6 +60,7 @@ class Needs:
     loops: bool
     quaternions: bool
     time: bool
+    forces: bool = False
 
     @classmethod
     def of(
@@ -66,14 +70,15 @@ class Needs:
         springs: Iterable[PointSpring],
         couplings: Iterable[JointCoupling],
         loops: Iterable[Loop],
-        prescribed: Iterable[Prescribed],
+        prescribed: Iterable[Motion],
         bound: Iterable[str] = (),
+        forces: Iterable[Force] = (),
     ) -> Needs:
         """Read the flags off the parts of a description.
 
         `bound` names the attributes with parameters: a zero may have another value when it is evaluated.
         """
-        joints, couplings, bound = tuple(joints), tuple(couplings), frozenset(bound)
+        joints, couplings, bound, forces = tuple(joints), tuple(couplings), frozenset(bound), tuple(forces)
         between = *joints, *springs, *couplings
 
         def present(name: str, parts: Iterable[Any]) -> bool:
@@ -90,7 +95,8 @@ class Needs:
             mimic=any(j.mimic is not None for j in joints),
             loops=bool(tuple(loops)),
             quaternions=any(j.type.quaternion is not None for j in joints),
-            time=bool(tuple(prescribed)),
+            time=bool(tuple(prescribed)) or any(f.of_time for f in forces),
+            forces=bool(forces),
         )
 
     def as_dict(self) -> dict[str, bool]:
@@ -214,7 +220,7 @@ class Description:
     springs : tuple of PointSpring
     couplings : tuple of JointCoupling
     loops : tuple of Loop
-    prescribed : tuple of Prescribed
+    prescribed : tuple of Prescribed, FormulaMotion or SplineMotion
     notes : tuple of str
         Decisions of the loader, for the user.
     nonphysical : tuple of (str, str)
@@ -227,6 +233,8 @@ class Description:
         count for equality.
     time : float
         At which motions prescribed in time are taken, s; neither does it count.
+    forces : tuple of JointForce, FrameForce or Bushing
+        Given by functions of the time and the state.
     """
 
     name: str
@@ -237,12 +245,13 @@ class Description:
     springs: tuple[PointSpring, ...] = ()
     couplings: tuple[JointCoupling, ...] = ()
     loops: tuple[Loop, ...] = ()
-    prescribed: tuple[Prescribed, ...] = ()
+    prescribed: tuple[Motion, ...] = ()
     notes: tuple[str, ...] = ()
     nonphysical: tuple[tuple[str, str], ...] = ()
     bindings: tuple[Binding, ...] = ()
     source: str = ""
     time: float = 0.0
+    forces: tuple[Force, ...] = ()
     layout: Layout = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -299,14 +308,14 @@ class Description:
 
     @cached_property
     def parameters(self) -> Mapping[str, float | None]:
-        """Nominal value of each named parameter, None where it has none; the time of prescribed motions is the last."""
+        """Nominal value of each named parameter, None where it has none; the time, where it enters, is the last."""
         values = {p.name: p.value for b in self.bindings for p in b.expression.parameters()}
         return MappingProxyType(values | ({self.time_parameter: self.time} if self.time_parameter else {}))
 
     @cached_property
     def time_parameter(self) -> str | None:
         """Name of the parameter that is the time; None where the equations do not depend on it."""
-        if not self.prescribed:
+        if not (self.prescribed or needs_time(self)):
             return None
         taken = {p.name for b in self.bindings for p in b.expression.parameters()}
         return next(name for name in chain(("t", "time"), (f"t_{k}" for k in count())) if name not in taken)
@@ -320,10 +329,32 @@ class Description:
             raise InputError(f"{what}: {self.name}: no value for parameter {names}; {give}")
 
     @cached_property
+    def driven_by_forces(self) -> bool:
+        """Whether a force of the model may add energy: one that is given by more than a potential."""
+        return drives(self)
+
+    @cached_property
+    def loses_energy(self) -> bool:
+        """Whether dampers, or forces without a potential, do work that the energy does not account for."""
+        return self.needs.damping or lost(self)
+
+    @cached_property
+    def interval(self) -> tuple[float, float]:
+        """The times from and to which all prescribed motions are known, s; infinite without tables."""
+        ends = [interval(p) for p in self.prescribed]
+        return max((a for a, _ in ends), default=-np.inf), min((b for _, b in ends), default=np.inf)
+
+    def require_times(self, what: str, *times: float) -> None:
+        """Raise `InputError` for times at which a prescribed motion is not known, with the joint and the time."""
+        if fault := beyond(self.prescribed, *times):
+            raise InputError(f"{what}: {self.name}: {fault}; give a table that covers it, or other times")
+
+    @cached_property
     def needs(self) -> Needs:
         """What this description needs from an engine."""
         bound = (b.field for b in self.bindings)
-        return Needs.of(self.gravity, self.joints, self.springs, self.couplings, self.loops, self.prescribed, bound)
+        parts = self.gravity, self.joints, self.springs, self.couplings, self.loops, self.prescribed
+        return Needs.of(*parts, bound, self.forces)
 
     @cached_property
     def digest(self) -> str:
@@ -331,7 +362,8 @@ class Description:
         names = ("name", "gravity", "bodies", "joints", "frames", "springs", "loops", "prescribed")
         parts = [getattr(self, name) for name in names]
         types = [KINDS[kind] for kind in sorted({j.kind for j in self.joints})]
-        return digest(*parts, *self.couplings, *self.bindings, *(t.digest for t in types if not t.built_in))
+        more = (*self.couplings, *self.bindings, *(t.digest for t in types if not t.built_in))
+        return digest(*parts, *more, *((type(f).__name__, f) for f in self.forces))
 
     @cached_property
     def form_digest(self) -> str:
@@ -374,7 +406,7 @@ class Description:
     def _parents(self) -> Mapping[str, str]:
         return MappingProxyType({joint.child: joint.parent for joint in self.joints})
 
-    def carrier(self, loop: Loop) -> str:
+    def carrier(self, loop: Loop | Bushing) -> str:
         """Return the last body that carries both ends of a loop, whose axes its rows have; ``"world"`` for most."""
         below = set(self.way(loop.body_b))
         return next(body for body in self.way(loop.body_a) if body in below)
@@ -431,7 +463,7 @@ class Description:
                 part, [(b.field, b.index, x) for b, x in bindings if (b.where, b.part) == (where, name)]
             )
 
-        kinds = ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed")
+        kinds = ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed", "forces")
         changes: dict[str, Any] = {kind: tuple(filled(kind, p, p.name) for p in getattr(self, kind)) for kind in kinds}
         expressions = tuple(replace(b, expression=x) for b, x in bindings if isinstance(x, Expression))
         out: Self = replace(filled("gravity", self, ""), **changes, bindings=expressions)

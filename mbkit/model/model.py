@@ -24,7 +24,7 @@ from mbkit.model.validation import check_substituted
 _PER_VELOCITY: Final = {"damping": "damping", "springs": "stiffness", "armature": "armature", "friction": "friction"}
 #: Elements between joints or points, and the numbers that make them act.
 _ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness", "damping", "armature")}
-_FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed")
+_FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed", "forces")
 
 
 class Model(Description):
@@ -241,8 +241,9 @@ class Model(Description):
         Parameters
         ----------
         *features : str
-            Any of damping, springs, armature, friction, gravity, limits, loops, prescribed. Springs and damping are
-            those of joints, point-to-point elements and couplings, armature that of joints and couplings.
+            Any of damping, springs, armature, friction, gravity, limits, loops, prescribed, forces. Springs and damping
+            are those of joints, point-to-point elements and couplings, armature that of joints and couplings; forces
+            are those given by functions, with bushings.
         """
         model = self
         for feature in features:
@@ -266,12 +267,14 @@ class Model(Description):
         """
         numbers = self._parameter_values(values)
         time = numbers.get(self.time_parameter or "", self.time)
+        self.require_times("time", time)
         return check_substituted(self, replace(self._substituted(lambda p: numbers.get(p.name, p)), time=time))
 
     def with_nominal(self, values: Mapping[str, Any]) -> Model:
         """Return the same parametrised model at other nominal values."""
         numbers = self._parameter_values(values)
         time = numbers.pop(self.time_parameter or "", self.time)
+        self.require_times("time", time)
         if not numbers:
             # A run asks so at every step: nothing but the time differs, and what follows from the rest is kept.
             out = object.__new__(type(self))
@@ -287,7 +290,7 @@ class Model(Description):
         return {name: real(f"parameter {name!r}", value) for name, value in values.items()}
 
     def _without(self, feature: str) -> Model:
-        if feature in ("gravity", "loops", "prescribed"):
+        if feature in ("gravity", "loops", "prescribed", "forces"):
             empty: Any = {feature: np.zeros(3) if feature == "gravity" else ()}
             return replace(self, bindings=tuple(b for b in self.bindings if b.where != feature), **empty)
         if feature == "limits":
@@ -323,7 +326,7 @@ class Model(Description):
             for j in self.tree
         )
         head = "".join(f"<th>{h}</th>" for h in ("joint", "kind", "parent", "child", "child's mass, kg", "mimics"))
-        notes = "".join(f"<li>{html(n)}</li>" for n in (*map(str, self.couplings), *self.notes))
+        notes = "".join(f"<li>{html(n)}</li>" for n in (*map(str, (*self.couplings, *self.forces)), *self.notes))
         return (
             f"<p><b>{html(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._mass_text()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")

@@ -286,6 +286,9 @@ class Prescribed(_Frozen):
     frequency: float = 0.0
     phase: float = 0.0
 
+    #: Of a formula; numbers that are attributes do not count.
+    constants = ()
+
     @property
     def name(self) -> str:
         """The joint's, which has one motion."""

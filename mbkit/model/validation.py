@@ -13,6 +13,8 @@ from mbkit._check import Array
 from mbkit.errors import InputError, ModelError, Suggestions, nearest
 from mbkit.model import manifold
 from mbkit.model.description import Description
+from mbkit.model.elements.forces import force_faults
+from mbkit.model.elements.motion_laws import motion_faults
 from mbkit.model.loops import held_directions
 from mbkit.model.parts import Body, Joint, JointCoupling, Loop
 from mbkit.spatial import skew
@@ -86,6 +88,8 @@ def structure_faults(description: Description) -> Iterator[str]:
             yield f"prescribed {name!r}: expected a joint of one velocity that mimics none; there are: {there}"
         if count > 1:
             yield f"prescribed {name!r}: moved {count} times; give one motion"
+    yield from motion_faults(description.prescribed)
+    yield from force_faults(description)
 
 
 def _negative(item: str, part: Any, *names: str) -> Iterator[str]:

@@ -19,6 +19,8 @@ from mbkit._check import Array, count, real, shown
 from mbkit._escape import one_line
 from mbkit.errors import InputError, OutputError
 from mbkit.model import Model
+from mbkit.model.elements.formula import NUMPY
+from mbkit.model.elements.motion_laws import position
 from mbkit.show import movie, page
 from mbkit.show.scene import Kind, Scene, require_bodies
 
@@ -179,7 +181,8 @@ def _with_prescribed(model: Model, q: Array, t: Array) -> Array:
     out = np.empty((len(q), model.nq))
     out[:, [i for i in range(model.nq) if i not in moved]] = q
     for i, x in moved.items():
-        out[:, i] = x.offset + x.rate * t + x.amplitude * np.sin(x.frequency * t + x.phase)
+        model.require_times("show", float(t.min(initial=np.inf)), float(t.max(initial=-np.inf)))
+        out[:, i] = position(x, t, NUMPY)
     return out
 
 

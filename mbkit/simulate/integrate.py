@@ -111,7 +111,7 @@ def integrate(
         compiled = chosen.kind == "native" or (_compiles(own) and not read.callable)
         work = max(outcome.steps, outcome.evaluations)
         work = work // min(batch or 1, _SIDE_BY_SIDE) if compiled else work * _IN_PYTHON
-        driven = applied is not None
+        driven = applied is not None or model.driven_by_forces
         doubts += tuple(diagnostics(dyn, chosen, setting, states, driven=driven, steps=outcome.steps, work=work))
     stats = Stats(
         steps=outcome.steps,
@@ -180,6 +180,7 @@ def times_of(
     if dt is not None and method.kind == "adaptive":
         raise InputError(f"dt: {method.name} chooses its own steps; give rtol, or method={DEFAULT_METHOD!r} with dt")
     start = _held_time(dyn) if t0 is None else real("t0", t0)
+    dyn.model.require_times("simulate", start, start + duration)
     shortest = duration if method.kind == "adaptive" else min(duration, step)
     if 4 * np.finfo(float).eps * abs(start) > shortest > 0:
         raise InputError(f"t0: expected times that differ after {shortest:g} s, got {start:g} s; shift the time's zero")

@@ -140,11 +140,14 @@ class RunData:
         return rows.copy() if acted is None else np.where(np.isfinite(self.v).all(-1, keepdims=True), rows, np.nan)
 
     def work(self, engine: str | Dynamics | None = None) -> Array:
-        """Return ∫ (τ + τ_damping + Σ Jᵀ w)·v dt since the first state in J, shape (K,) or (N, K).
+        """Return ∫ (τ + τ_lost + Σ Jᵀ w)·v dt since the first state in J, shape (K,) or (N, K).
+
+        τ_lost are the forces of dampers, and those given by functions without a potential.
+
 
         The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇; UnsupportedError
-        where its rows change between two saved states. On quasi-velocities, for dampers, wrenches and functions it
-        is a quadrature of fourth order in the distance of the saved states; a function that jumps makes it first
+        where its rows change between two saved states. On quasi-velocities, for dampers, wrenches and functions
+        it is a quadrature of fourth order in the distance of the saved states; a function that jumps makes it first
         order, and so do rows that jump beside a function.
         """
         dyn, force, t, q, v = self._by(engine), self._acted(), self.t, self.q, self.v
@@ -154,6 +157,8 @@ class RunData:
         else:
             held = np.zeros(self._numbers) if force is None else force.between(t)
             steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
+        if self.model.forces:
+            steps = steps + _by_cubics(t, np.sum(along(dyn, v.shape[-1:], _lost, q, v) * v, axis=-1))
         out = np.zeros(q.shape[:-1])
         np.cumsum(steps, axis=-1, out=out[..., 1:])
         return out
@@ -260,12 +265,13 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
     coordinates, plain = np.array(_plain(dyn.model), dtype=int).reshape(-1, 2).T
     damped, turned = dyn.model.needs.damping or wrenches.any(), len(plain) < nv and bool(pushed.any())
     ends = [(q[..., i : len(h) + i, :], v[..., i : len(h) + i, :]) for i in (0, 1)]
+    owns = [_at_end(dyn, v.shape[:-1], i) for i in (0, 1)]
     a = [np.zeros(0)] * 2
     if damped or turned:
-        forces = [_generalized(dyn, end[0], held, acting) for end in ends]
+        forces = [_generalized(own, end[0], held, acting) for own, end in zip(owns, ends, strict=True)]
         a = [
-            along(dyn, (nv,), lambda own, *at: own.forward_dynamics(*at), *end, force)
-            for end, force in zip(ends, forces, strict=True)
+            along(own, (nv,), lambda one, *at: one.forward_dynamics(*at), *end, force)
+            for own, end, force in zip(owns, ends, forces, strict=True)
         ]
     distance = np.zeros(pushed.shape)
     if turned:
@@ -275,12 +281,21 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
     if damped:
         alone = np.concatenate([np.zeros(pushed.shape), wrenches], axis=-1)
 
-        def acts(q: Array, v: Array) -> Array:
-            return _damping(dyn, q, v) + _generalized(dyn, q, alone, acting)
+        def acts(own: Dynamics) -> Callable[[Array, Array], Array]:
+            return lambda q, v: _damping(own, q, v) + _generalized(own, q, alone, acting)
 
-        pairs = (_power(dyn.model, acts, h[:, None], *end, rate) for end, rate in zip(ends, a, strict=True))
+        each = zip(owns, ends, a, strict=True)
+        pairs = (_power(dyn.model, acts(own), h[:, None], *end, rate) for own, end, rate in each)
         out = out + _corrected(h, *pairs)
     return np.asarray(out)
+
+
+def _at_end(dyn: Dynamics, lead: tuple[int, ...], end: int) -> Dynamics:
+    """Return the dynamics at the first or last states of all intervals, where time enters."""
+    if dyn.model.time_parameter is None:
+        return dyn
+    samples = np.arange(int(np.prod(lead))).reshape(lead)
+    return dyn.of_samples(samples[..., end : lead[-1] - 1 + end].ravel())
 
 
 def _corrected(h: Array, start: tuple[Array, Array], end: tuple[Array, Array]) -> Array:
@@ -319,7 +334,12 @@ def _damping(dyn: Dynamics, q: Array, v: Array) -> Array:
     if not dyn.model.has_bodies:
         return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v), q, v)
     # At rest the passive force is that of springs.
-    return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v) - own.passive(q, np.zeros_like(v)), q, v)
+    return along(dyn, v.shape[-1:], lambda own, q, v: _dampers(own, q, v) - _dampers(own, q, np.zeros_like(v)), q, v)
+
+
+def _dampers(dyn: Dynamics, q: Array, v: Array) -> Array:
+    """Return the passive force without that of functions, whose work is counted apart."""
+    return np.asarray(dyn.passive(q, v) - dyn._lost_force(q, v))
 
 
 def _plain(model: Model) -> list[tuple[int, int]]:
@@ -350,6 +370,10 @@ def _by_cubics(t: Array, p: Array) -> Array:
     moments = np.broadcast_to((1.0 / (powers + 1))[:, None], (n - 1, width, 1))
     weights = np.linalg.solve(V, moments)[..., 0] * h[:, None]
     return np.asarray(np.sum(weights * p[..., around], axis=-1))
+
+
+def _lost(dyn: Dynamics, q: Array, v: Array) -> Array:
+    return np.asarray(dyn._lost_force(q, v))
 
 
 # Momenta

@@ -126,10 +126,11 @@ def heard_warnings() -> Iterator[list[str]]:
 def energy_drift(dyn: Dynamics, run: Trajectory) -> tuple[float, float, float] | None:
     """Return the largest energy change, the larger of T and the change of V, and the largest of T and V.
 
-    None with dampers or explicit time, whose work is not known. By the oracle, the change has 34 digits.
+    None with dampers, forces without a potential or explicit time, whose work is not known.
+    By the oracle, the change has 34 digits.
     """
     model, q, v = dyn.model, run.q, run.v
-    if model.needs.damping or model.time_parameter is not None:
+    if model.loses_energy or model.time_parameter is not None:
         return None
 
     def energy(name: str, *state: Array) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit._fork import fork_safe
 from mbkit.engines import regressors
-from mbkit.engines.base import MappedDynamics
+from mbkit.engines.base import MappedDynamics, require_no_forces
 from mbkit.engines.drake.bodies import DrakeBodies
 from mbkit.engines.drake.model import DrakeModel, build
 from mbkit.errors import NumericalError, UnsupportedError
@@ -243,6 +243,7 @@ class DrakeRun:
         v: Array,
         watch: Callable[[float], object],
     ) -> None:
+        require_no_forces(dyn.model, "drake")
         if dyn.model.layout.reduced:
             raise UnsupportedError("drake: its integrators know no mimic joints; load with mimic='free'")
         for joint in dyn.model.joints:

@@ -23,7 +23,7 @@ from mbkit._check import Array, batch_of, count, real
 from mbkit._fork import fork_safe
 from mbkit._warn import warn
 from mbkit.engines import known_defects, regressors
-from mbkit.engines.base import MappedDynamics
+from mbkit.engines.base import MappedDynamics, require_no_forces
 from mbkit.engines.mujoco.bodies import MujocoBodies
 from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopRows, Softness, law
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
@@ -84,7 +84,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         return _rebuilt, (type(self), self.model, self.softness)
 
     def at(self, /, **values: Any) -> MujocoDynamics:
-        return _rebuilt(type(self), self.model.with_nominal(values), self.softness)
+        return self._at_time(values) or _rebuilt(type(self), self.model.with_nominal(values), self.softness)
 
     def _hold(self, compiled: MujocoModel) -> None:
         self._maps = compiled
@@ -203,7 +203,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
             raise InputError(f"constraint_law: expected one state, got shapes {q.shape}, {v.shape}, {tau.shape}")
         with self._lock, heard_warnings(), self._with_loops():
             b = self._set(q, v)
-            self._accelerated(tau)
+            self._accelerated(tau + self._elements.force(self, q, v) if self.model.forces else tau)
             M = full_mass_matrix(self._m, self._d)
             return law(self._m, self._d, M, self.softness, lambda a: self._force(a - b), self._columns)
 
@@ -408,8 +408,9 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         ------
         UnsupportedError
             For reduced mimic joints (MuJoCo would make them soft), and forces on a free joint's translation (MuJoCo
-            holds them in world axes).
+            holds them in world axes), and forces given by functions, which MuJoCo does not know.
         """
+        require_no_forces(self.model, "mujoco")
         if self._reduced:
             names = ", ".join(j.name for j in self.model.joints if j.mimic)
             raise UnsupportedError(

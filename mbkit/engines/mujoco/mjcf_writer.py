@@ -73,6 +73,7 @@ def _unsupported(model: Model) -> Iterator[str]:
         if coupling.armature and model.branched(coupling):
             yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
     yield from not_held(model)
+    yield from (f"{force} (a function)" for force in model.forces)
     yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
 
 

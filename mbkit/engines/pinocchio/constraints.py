@@ -34,7 +34,7 @@ from mbkit._check import Array
 from mbkit.engines.base import first_names
 from mbkit.engines.pinocchio.model import PinModel
 from mbkit.errors import NumericalError, UnsupportedError
-from mbkit.model import Model
+from mbkit.model import Model, Prescribed
 from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop
 from mbkit.spatial import skew
@@ -242,15 +242,26 @@ class PinConstraints:
         """Return the rows that say something; `given` are q and v of the description."""
         return Rows.stacked([self.every(q, v), *self._motions(*given)])[list(self.choice.kept)]
 
+    @cached_property
+    def _laws(self) -> list[Callable[[float], tuple[float, float, float]]]:
+        """Position, velocity and acceleration of each motion at a time."""
+        from mbkit.derivation.elements.motions import law_rates
+
+        return [law_rates(x) for x in self._model.prescribed]
+
     def _motions(self, q: Array, v: Array) -> list[Rows]:
         layout, t, out = self._model.layout, self._time, []
-        for x in self._model.prescribed:
+        for number, x in enumerate(self._model.prescribed):
             i, k = layout.full_q[x.joint].start, layout.full_v[x.joint].start
-            turn = x.frequency * t + x.phase
-            path = x.offset + x.rate * t + x.amplitude * sin(turn)
-            speed = x.rate + x.amplitude * x.frequency * cos(turn)
+            if isinstance(x, Prescribed):
+                turn = x.frequency * t + x.phase
+                path = x.offset + x.rate * t + x.amplitude * sin(turn)
+                speed = x.rate + x.amplitude * x.frequency * cos(turn)
+                gamma = x.amplitude * x.frequency**2 * sin(turn)
+            else:
+                path, speed, rate = self._laws[number](t)
+                gamma = -rate
             to = layout.G[k]
-            gamma = x.amplitude * x.frequency**2 * sin(turn)
             out.append(_row(layout.G_q[i] @ q + layout.offsets[i] - path, to, to @ v - speed, gamma))
         return out
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from copy import copy
 from functools import cached_property
 from math import isfinite
 from typing import TYPE_CHECKING, Any, ClassVar, Final
@@ -189,7 +188,10 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
             bare |= own
         if self.model.constrained:
             bare["forward_dynamics"] = self._forward_dynamics
-        if self.model.prescribed:
+        if self.model.forces:
+            # They are added the checked way.
+            del bare["inverse_dynamics"], bare["forward_dynamics"]
+        elif self.model.prescribed:
             # Of one time, and `at` copies the rest.
             del bare["forward_dynamics"]
         for name, call in bare.items():
@@ -216,11 +218,9 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
 
     def at(self, /, **values: Any) -> Dynamics:
         """Return the same dynamics at other values of the model's named parameters; the time alone builds nothing."""
-        if not values or set(values) - {self.model.time_parameter}:
-            return super().at(**values)
-        out = copy(self)
-        out.model = self.model.with_nominal(values)
-        out._held = self._held.at(out.model.time)
+        out = super().at(**values)
+        if self.model.constrained and isinstance(out, PinocchioDynamics):
+            out._held = out._held.at(out.model.time)
         return out
 
     # Between the description's coordinates and Pinocchio's.

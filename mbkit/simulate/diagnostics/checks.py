@@ -91,7 +91,7 @@ def diagnostics(
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
         fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
         limit = _ENERGY if method.order in _LOW else _ENERGY_HIGH
-        checks.append(energy_drift([samples[i] for i in whole], fast, model.needs.damping, limit))
+        checks.append(energy_drift([samples[i] for i in whole], fast, model.loses_energy, limit))
     # Neither the engine nor the method may solve with the mass matrix.
     matrices = [one.M for member in samples for one in member]
     if matrices and (method.mass_matrix or getattr(dyn, "elimination", "") != "least constraint"):

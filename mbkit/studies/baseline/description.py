@@ -21,6 +21,7 @@ from mbkit.load import load
 from mbkit.load.loader import find
 from mbkit.load.urdf_reader import read_links
 from mbkit.model import Model
+from mbkit.model.elements.formula import Formula
 from mbkit.studies._targets import resolved
 
 Part = dict[str, Any]
@@ -42,6 +43,7 @@ SECTIONS: Final = {
     "couplings": "coupling",
     "loops": "loop",
     "motions": "prescribed motion of joint",
+    "forces": "force",
 }
 FLAT: Final = ("system", "parameters", "expressions", "energies")
 _UPPER: Final = ("upper", "velocity_limit", "effort_limit")
@@ -66,6 +68,7 @@ def described(model: Model) -> Description:
         "couplings": _parts(model.couplings),
         "loops": _parts(model.loops),
         "motions": {m.joint: _part(m, "joint") for m in model.prescribed},
+        "forces": _parts(model.forces),
     }
     return {section: parts for section, parts in out.items() if any(parts.values())}
 
@@ -117,6 +120,9 @@ def _part(part: Any, name: str) -> Part:
 
 
 def _plain(value: Any) -> Any:
+    if value is None or isinstance(value, Formula):
+        # A text: files of baselines have no nested parts.
+        return "" if value is None else repr((value.arguments, value.operations, value.outputs))
     if isinstance(value, tuple):
         return ", ".join(value)
     return [float(x) for x in value.ravel()] if isinstance(value, np.ndarray) else value

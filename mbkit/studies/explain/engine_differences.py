@@ -190,7 +190,7 @@ class _Engines:
             other_sign = {"g": {"g": -1.0}, "nle": {"nle": 1.0, "g": -2.0}}
             mixes.append(("gravity", "has the gravity forces with the other sign", other_sign))
             mixes.append(("gravity", "leaves gravity out of nle", {"nle": {"nle": 1.0, "g": -1.0}}))
-        if model.needs.damping or model.needs.springs:
+        if model.needs.damping or model.needs.springs or model.needs.forces:
             mixes.append(("passive forces", "has springs and dampers in nle", {"nle": {"nle": 1.0, "passive": -1.0}}))
             mixes.append(("passive forces", "has passive forces with the other sign", {"passive": {"passive": -1.0}}))
         for kind, says, mix in mixes:

@@ -72,7 +72,7 @@ def explain(
     InputError
         An unusable argument, a parameter without a value, or a model in which nothing moves.
     UnsupportedError
-        A model that was written as energies, or an engine without the mass matrix.
+        A model that was written as energies or has forces by functions, or an engine without the mass matrix.
 
     Examples
     --------
@@ -100,6 +100,11 @@ def _model(x: Model | Dynamics, which: str) -> Model:
         )
     if not model.has_bodies:
         raise UnsupportedError(f"explain: {model.name} was written as energies and has no bodies to compare")
+    if model.forces:
+        raise UnsupportedError(
+            f"explain: {model.name} has forces by functions, which have no numbers to match; explain "
+            "model.without('forces')"
+        )
     if not model.nv:
         raise InputError(f"{which}: nothing moves in {model.name} (nv = 0), so there is nothing to explain")
     return model

@@ -1,0 +1,1 @@
+"""Elements given by functions, as CasADi expressions."""

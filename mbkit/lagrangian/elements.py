@@ -1,0 +1,122 @@
+"""Motion laws and joint forces of a model in SymPy: its formulas on exact numbers and symbols."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import sympy as sp
+
+from mbkit.errors import UnsupportedError
+from mbkit.lagrangian.description_kinematics import SymbolicKinematics, exact, motion
+from mbkit.model.elements.forces import RATE, TIME, JointForce
+from mbkit.model.elements.formula import Arithmetic
+from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
+from mbkit.model.parts import Prescribed
+
+
+def _decided(holds: Any) -> Any:
+    return sp.Piecewise((1, holds), (0, True))
+
+
+def _condition(x: Any) -> Any:
+    """Return what makes a decision of 1 or 0 true; one that `_decided` has made is read back."""
+    x = sp.sympify(x)
+    if isinstance(x, sp.Piecewise) and x.args[0][0] == 1 and len(x.args) == 2:
+        return x.args[0][1]
+    return sp.Ne(x, 0)
+
+
+def _same(name: str) -> Callable[..., Any]:
+    return lambda *x: getattr(sp, name)(*map(sp.sympify, x))
+
+
+_SAME_NAME: Final = "sqrt sin cos tan asin acos atan exp log sinh cosh tanh asinh acosh atanh atan2 sign"
+#: The operations of formulas in SymPy, on the decimals that were written.
+SYMPY: Final = Arithmetic(
+    exact,
+    {
+        **{name: _same(name) for name in _SAME_NAME.split()},
+        "neg": lambda x: -x,
+        "sq": lambda x: x * x,
+        "twice": lambda x: 2 * x,
+        "inv": lambda x: 1 / sp.sympify(x),
+        "fabs": _same("Abs"),
+        "expm1": lambda x: sp.exp(x) - 1,
+        "log1p": lambda x: sp.log(1 + x),
+        "add": lambda a, b: a + b,
+        "sub": lambda a, b: a - b,
+        "mul": lambda a, b: a * b,
+        "div": lambda a, b: sp.sympify(a) / b,
+        "pow": lambda a, b: sp.sympify(a) ** b,
+        "hypot": lambda a, b: sp.sqrt(a**2 + b**2),
+        "fmin": _same("Min"),
+        "fmax": _same("Max"),
+        "lt": lambda a, b: _decided(sp.Lt(a, b)),
+        "le": lambda a, b: _decided(sp.Le(a, b)),
+        "eq": lambda a, b: _decided(sp.Eq(a, b)),
+        "ne": lambda a, b: _decided(sp.Ne(a, b)),
+        "not": lambda x: _decided(sp.Not(_condition(x))),
+        "and": lambda a, b: _decided(sp.And(_condition(a), _condition(b))),
+        "or": lambda a, b: _decided(sp.Or(_condition(a), _condition(b))),
+        "if_else_zero": lambda a, b: sp.Piecewise((b, _condition(a)), (0, True)),
+    },
+)
+
+
+def law(kin: SymbolicKinematics, part: Motion, t: sp.Symbol) -> sp.Expr:
+    """Return a prescribed motion as a function of the time."""
+    if isinstance(part, Prescribed):
+        return motion(kin, part, t)
+    numbers = kin.written.values.motion(part)
+    of = MOTION_LAWS[type(part)]
+    if hasattr(numbers, "knots"):
+        return _pieces(numbers, t)
+    return sp.sympify(of.path(part, numbers, t, SYMPY))
+
+
+def _pieces(numbers: Any, t: sp.Symbol) -> sp.Expr:
+    """Return a spline as polynomials between its knots; the last one goes on."""
+    knots, out = numbers.knots, []
+    for k in range(len(knots) - 1):
+        s, polynomial = t - knots[k], sp.Integer(0)
+        for row in numbers.coefficients:
+            polynomial = polynomial * s + row[k]
+        out.append((polynomial, t < knots[k + 1] if k < len(knots) - 2 else sp.true))
+    return sp.Piecewise(*out)
+
+
+def acting(kin: SymbolicKinematics, t: sp.Symbol) -> tuple[sp.Expr, list[sp.Expr]]:
+    """Return the potential of a model's joint forces, and the rest as one force along each coordinate.
+
+    Raises
+    ------
+    UnsupportedError
+        Forces on frames and bushings, which this form of the equations does not write out.
+    """
+    model = kin.model
+    V, forces = sp.Integer(0), [sp.Integer(0)] * model.nv
+    for force in model.forces:
+        if not isinstance(force, JointForce):
+            raise UnsupportedError(
+                f"{model.name}: {force} is no force at a joint, and is not written out in symbols; "
+                "mbkit.dynamics(model, 'lagrangian') has it, and model.without('forces') is the system without forces"
+            )
+        joint, constants = model.joint(force.joint), kin.written.values.forces[force.name].numbers
+        others = dict(
+            zip(
+                (*model.coordinate_names, *(n + RATE for n in model.velocity_names)),
+                (*kin.symbols, *kin.rates),
+                strict=True,
+            )
+        )
+        rates = kin.rates_of[joint.name]
+        own = dict(zip(force.own(model), (*kin.symbols_of[joint.name], *rates), strict=True))
+        values = others | dict(zip(force.symbols, constants, strict=True)) | {TIME: t} | own
+        if force.potential is not None:
+            V += force.potential(values, SYMPY)[0]
+        if force.formula is not None:
+            for x, rate in zip(force.formula(values, SYMPY), rates, strict=True):
+                for i, w in enumerate(kin.rates):
+                    forces[i] += x * sp.diff(rate, w)
+    return V, forces

@@ -1,0 +1,330 @@
+"""The part of `ModelBuilder` for elements that are given by functions: forces, bushings and motions in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, shown
+from mbkit.errors import MbkitError
+from mbkit.model.elements.forces import DISPLACEMENT, POINT, RATE, TIME, TWIST, Bushing, FrameForce, JointForce
+from mbkit.model.elements.formula import Formula
+from mbkit.model.elements.motion_laws import FormulaMotion, SplineMotion
+from mbkit.model.parameters import Expression, Number
+from mbkit.model.parts import Prescribed
+
+Axes = Literal["local", "local_world_aligned", "world"]
+Ends = Literal["natural", "clamped", "quintic"]
+_AXES: Final = get_args(Axes)
+_ENDS: Final = get_args(Ends)
+_Vector = ArrayLike | Sequence[Number]
+#: Values by the names that stand for them in expressions.
+Constants = Mapping[str, Number]
+
+
+def _door() -> Any:
+    # By name: a description loads neither CasADi nor SymPy unless somebody brings an expression.
+    return import_module("mbkit.lagrangian.formulas")
+
+
+class ElementBuilder:
+    """Declares forces by functions and motions in time; `ModelBuilder` inherits it."""
+
+    _read: Any
+    _add: Callable[..., None]
+
+    def prescribe(
+        self,
+        joint: str,
+        law: Any = None,
+        *,
+        offset: Number = 0.0,
+        rate: Number = 0.0,
+        amplitude: Number = 0.0,
+        frequency: Number = 0.0,
+        phase: Number = 0.0,
+        spline: Ends = "natural",
+        parameters: Constants | None = None,
+    ) -> None:
+        """Move a one-velocity joint in time, by a law or by offset + rate t + amplitude sin(frequency t + phase).
+
+        The joint keeps its coordinate, which a constraint holds on this motion; its multiplier is the drive's force.
+
+        Parameters
+        ----------
+        joint : str
+        law : object, optional
+            An expression of a symbol ``t``, s, by CasADi (SX) or SymPy, or a function that returns one; a spline of
+            SciPy: `PPoly`, such as `CubicSpline`, or `BSpline`; or a table, the pair (times, values). Its second
+            derivative must be continuous. A spline or table is known from its first to its last time: a run or an
+            evaluation beyond it is refused with the time.
+        offset, rate, amplitude : float
+            rad or m, per second for the rate; without a law.
+        frequency, phase : float
+            rad/s and rad.
+        spline : {"natural", "clamped", "quintic"}
+            Between the values of a table: a cubic spline without acceleration or at rest at its ends, or a quintic one
+            at rest there without acceleration.
+        parameters : dict of str to float, optional
+            Constants of the expression by the names of their symbols; each may be a `Parameter`.
+
+        Examples
+        --------
+        >>> import casadi as ca
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("arm")
+        >>> b.add_body("link", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+        >>> b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, 1, 0))
+        >>> t, w = ca.SX.sym("t"), ca.SX.sym("w")
+        >>> b.prescribe("hinge", 0.5 * (1 - ca.cos(w * t)), parameters={"w": mb.Parameter("w", 2.0)})
+        >>> dyn = mb.dynamics(b.build(), "lagrangian")
+        >>> dyn.at(t=1.5).project([0.0], [0.0])[0].round(12).tolist()
+        [0.994996248301]
+        """
+        harmonic = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
+        if law is None:
+            if parameters:
+                self._read.faults.append(f"prescribed {shown(joint)}: parameters without a law; give them as numbers")
+            self._add(Prescribed, "prescribed", "prescribed", joint, harmonic)
+            return
+        item = f"prescribed {shown(joint)}"
+        if given := [name for name, x in harmonic.items() if isinstance(x, Expression) or x != 0]:
+            self._read.faults.append(f"{item}: a law and {given[0]}; expected one of them")
+        if spline not in _ENDS:
+            self._read.faults.append(f"{item}: spline: expected one of {', '.join(_ENDS)}, got {shown(spline)}")
+            return
+        try:
+            pieces = _door().read_spline(law, spline)
+        except MbkitError as error:
+            self._read.faults.append(f"{item}: {error}")
+            return
+        if pieces is not None:
+            ready = {"knots": pieces[0], "coefficients": pieces[1]}
+            self._add(SplineMotion, "prescribed", "prescribed", joint, {}, ready)
+            return
+        formulas, constants = self._formulas(item, parameters, law=((law, 1),), given={"law": (TIME,)})
+        if formulas["law"] is not None:
+            self._add(FormulaMotion, "prescribed", "prescribed", joint, {}, {"formula": formulas["law"]} | constants)
+
+    def add_joint_force(
+        self,
+        name: str,
+        joint: str,
+        force: Any = None,
+        *,
+        potential: Any = None,
+        parameters: Constants | None = None,
+    ) -> None:
+        """Add a generalized force at a joint, a function of (t, q, v): a spring, a damper, a motor.
+
+        It is one of the passive forces on every engine, and enters derivatives and linearizations exactly.
+
+        Parameters
+        ----------
+        name, joint : str
+        force : object, optional
+            N m or N, one per velocity of the joint: an expression by CasADi (SX) or SymPy, or a function of (t, q, v)
+            that returns one when it is called with symbols. Its symbols are ``t``, the joint's ``q`` and ``v`` (of a
+            joint with several, ``q_0``, ``q_1``, ... as ``casadi.SX.sym("q", n)`` names them), and of the rest of the
+            model the names of coordinates, and with ``_dot`` behind them of velocities: ``elbow``, ``elbow_dot``.
+        potential : object, optional
+            An energy of the same positions, J: the force is less its derivative, and `potential_energy` holds it.
+        parameters : dict of str to float, optional
+            Constants of the expressions by the names of their symbols; each may be a `Parameter`.
+
+        Notes
+        -----
+        A function that needs numbers, such as a measured table or a controller with a memory, is no part of a
+        description: it is the argument `torque` of `mbkit.simulate`.
+
+        Examples
+        --------
+        A spring that hardens, and a damper that grows with the square of the speed:
+
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("door")
+        >>> b.add_body("leaf", mass=20.0, com=(0.4, 0, 0), inertia=(1.0, 1.0, 1.0))
+        >>> b.add_joint("hinge", "revolute", parent="world", child="leaf", axis=(0, 0, 1))
+        >>> b.add_joint_force("closer", "hinge", lambda t, q, v: -2.0 * abs(v) * v, potential=lambda q: 3.0 * q**4)
+        >>> dyn = mb.dynamics(b.build())
+        >>> dyn.passive([0.5], [1.0]).tolist(), dyn.potential_energy([0.5])
+        ([-3.5], 0.1875)
+        """
+        item = f"force {shown(name)}"
+        given = {"formula": (TIME, "q", "v"), "potential": ("q",)}
+        formulas, constants = self._formulas(
+            item, parameters, formula=((force, None),), potential=((potential, 1),), given=given
+        )
+        joint = self._read.name(f"{item}: joint", joint)
+        self._add(JointForce, "forces", "force", name, {}, {"joint": joint} | formulas | constants)
+
+    def add_force(
+        self,
+        name: str,
+        frame: str,
+        *,
+        force: Any = None,
+        moment: Any = None,
+        axes: Axes = "local",
+        potential: Any = None,
+        parameters: Constants | None = None,
+    ) -> None:
+        """Add a force and a moment on a frame, constant or functions of the time and the state.
+
+        Parameters
+        ----------
+        name : str
+        frame : str
+            The frame whose origin the force acts on, or a body's own frame.
+        force, moment : (3,) sequence or object, optional
+            N and N m. Numbers, `Parameter`, or expressions by CasADi (SX) or SymPy; or a function of (t, p, twist) that
+            returns three. Symbols are ``t``; the origin's place ``x, y, z`` in the world, m; the frame's velocity
+            ``vx, vy, vz, wx, wy, wz`` in `axes`, m/s and rad/s; and names of coordinates and velocities, as in
+            `add_joint_force`.
+        axes : {"local", "local_world_aligned", "world"}
+            Of force, moment and velocity, as in `Dynamics.generalized_force`.
+        potential : object, optional
+            An energy V(x, y, z), also of coordinates, J: the force is less its gradient; a function is one of p.
+        parameters : dict of str to float, optional
+            Constants of the expressions by the names of their symbols; each may be a `Parameter`.
+
+        Examples
+        --------
+        Drag against the square of the speed:
+
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("ball")
+        >>> b.add_body("ball", mass=1.0, inertia=(0.1, 0.1, 0.1))
+        >>> b.add_joint("free", "free", parent="world", child="ball")
+        >>> def drag(t, p, twist):
+        ...     speed = (twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2) ** 0.5
+        ...     return -0.1 * speed * twist[:3]
+        >>> b.add_force("drag", "ball", force=drag)
+        >>> dyn = mb.dynamics(b.build())
+        >>> dyn.passive([0, 0, 0, 0, 0, 0, 1], [2.0, 0, 0, 0, 0, 0]).round(12).tolist()
+        [-0.4, 0.0, 0.0, 0.0, 0.0, 0.0]
+        """
+        item = f"force {shown(name)}"
+        if axes not in _AXES:
+            self._read.faults.append(f"{item}: axes: expected one of {', '.join(_AXES)}, got {shown(axes)}")
+            axes = "local"
+        parts = None if force is None and moment is None else [(0.0,) * 3 if x is None else x for x in (force, moment)]
+        given = {"formula": (TIME, POINT, TWIST), "potential": (POINT,)}
+        formulas, constants = self._formulas(
+            item,
+            parameters,
+            formula=((None, 6),) if parts is None else tuple((x, 3) for x in parts),
+            potential=((potential, 1),),
+            given=given,
+        )
+        frame = self._read.name(f"{item}: frame", frame)
+        self._add(FrameForce, "forces", "force", name, {}, {"frame": frame, "axes": axes} | formulas | constants)
+
+    def add_bushing(
+        self,
+        name: str,
+        *,
+        body_a: str,
+        body_b: str,
+        translation_a: _Vector = (0.0, 0.0, 0.0),
+        rotation_a: ArrayLike | None = None,
+        translation_b: _Vector = (0.0, 0.0, 0.0),
+        rotation_b: ArrayLike | None = None,
+        stiffness: Any = 0.0,
+        damping: Any = 0.0,
+        force: Any = None,
+        potential: Any = None,
+        parameters: Constants | None = None,
+    ) -> None:
+        """Join two bodies by springs and dampers in all six directions.
+
+        The displacement x is the position of frame b's origin and the rotation vector of frame b, in frame a. On it
+        acts -(stiffness x + damping ẋ) and, where they are given, a function and a potential; the forces on both bodies
+        follow from their virtual work, so that the elastic part has an energy however far it is displaced. Rotations
+        go up to half a turn, near which digits are lost.
+
+        Parameters
+        ----------
+        name, body_a, body_b : str
+            A body may be ``"world"``.
+        translation_a, translation_b : (3,) array_like
+            Origins of the frames, in the axes of the two bodies, m.
+        rotation_a, rotation_b : (3, 3) array_like, optional
+            Orientations of the frames in their bodies.
+        stiffness, damping : float, (6,) or (6, 6) array_like
+            Of x: N/m and N m/rad, N s/m and N m s/rad; a diagonal or a matrix. Numbers or `Parameter`.
+        force : object, optional
+            The six forces on x, N and N m, as expressions by CasADi (SX) or SymPy, or as a function of (t, x, x_dot).
+            Symbols are ``t``, ``x, y, z, rx, ry, rz`` and their rates ``x_dot`` to ``rz_dot``, and names of coordinates
+            and velocities, as in `add_joint_force`.
+        potential : object, optional
+            An energy of the displacement, J; a function is one of x.
+        parameters : dict of str to float, optional
+            Constants of the expressions by the names of their symbols; each may be a `Parameter`.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("mount")
+        >>> b.add_body("engine", mass=100.0, inertia=(5.0, 5.0, 5.0))
+        >>> b.add_joint("free", "free", parent="world", child="engine")
+        >>> k = [2e5, 2e5, 1e5, 3e3, 3e3, 2e3]
+        >>> b.add_bushing("rubber", body_a="world", body_b="engine", stiffness=k, damping=50.0)
+        >>> dyn = mb.dynamics(b.build(), "lagrangian")
+        >>> dyn.potential_energy([0.001, 0, 0, 0, 0, 0, 1])
+        0.1
+        """
+        item = f"bushing {shown(name)}"
+        given = {"formula": (TIME, DISPLACEMENT, tuple(x + RATE for x in DISPLACEMENT)), "potential": (DISPLACEMENT,)}
+        formulas, constants = self._formulas(
+            item, parameters, formula=((force, 6),), potential=((potential, 1),), given=given
+        )
+        matrices = {n: self._matrix(f"{item}: {n}", x) for n, x in (("stiffness", stiffness), ("damping", damping))}
+        a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
+        b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
+        self._add(Bushing, "forces", "bushing", name, a | b, matrices | formulas | constants)
+
+    def _matrix(self, name: str, value: Any) -> Array:
+        """Return a 6 by 6 matrix of a matrix, its diagonal or one number for all of it."""
+        if np.ndim(value) == 2:
+            rows = list(value)
+            if len(rows) == 6:
+                matrix = [self._read.quantities(f"{name}[{i}]", row, 6) for i, row in enumerate(rows)]
+                return np.array(matrix, dtype=object if any(x.dtype == object for x in matrix) else float)
+            self._read.faults.append(f"{name}: expected a number, shape (6,) or (6, 6), got {np.shape(value)}")
+            return np.zeros((6, 6))
+        diagonal = self._read.quantities(name, value, 6)
+        out: Array = np.zeros((6, 6), dtype=diagonal.dtype)
+        out[range(6), range(6)] = diagonal
+        return out
+
+    def _formulas(
+        self, item: str, parameters: Constants | None, *, given: Mapping[str, Any], **wanted: Any
+    ) -> tuple[dict[str, Formula | None], dict[str, Any]]:
+        """Read expressions with the numbers that they should have; return formulas, and their constants' fields."""
+        formulas: dict[str, Formula | None] = dict.fromkeys(wanted)
+        values: dict[str, Number] = {}
+        named: Any = parameters or {}
+        if not isinstance(named, Mapping):
+            self._read.faults.append(f"{item}: parameters: expected a mapping of names to numbers, got {shown(named)}")
+            named = {}
+        for name, x in named.items():
+            values[self._read.name(f"{item}: parameters", name)] = self._read.quantity(f"{item}: parameters: {name}", x)
+        things: list[Expression] = []
+        for what, parts in wanted.items():
+            if all(x is None for x, _ in parts):
+                continue
+            label = {"formula": "force"}.get(what, what)
+            try:
+                formulas[what] = _door().read_formula(parts, given[what], things)
+            except MbkitError as error:
+                self._read.faults.append(f"{item}: {label}: {error}")
+        used = {name for x in formulas.values() if x is not None for name in x.arguments}
+        if idle := [n for n in values if n not in used]:
+            self._read.faults.append(f"{item}: parameters: {idle[0]!r} is in no expression; leave it out")
+        values |= {f"#{k + 1}": self._read.quantity(item, x) for k, x in enumerate(things)}
+        return formulas, {"symbols": tuple(values), "numbers": np.array([*values.values()], dtype=object)}
