@@ -71,6 +71,9 @@ METHODS = {
     "add_coupling": {"name": "c", "factors": {"j": 1.0}, "stiffness": 1.0},
     "add_loop": {"name": "l", "kind": "point", "body_a": "b", "body_b": "world"},
     "prescribe": {"joint": "j"},
+    "add_joint_force": {"name": "u", "joint": "j", "force": 1.0},
+    "add_force": {"name": "w", "frame": "b", "force": (1.0, 0, 0)},
+    "add_bushing": {"name": "g", "body_a": "b", "body_b": "world", "stiffness": 1.0},
     "note": {"text": "words"},
     "build": {},
 }

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 import casadi as ca
 import numpy as np
 
-from mbkit._check import Array, finite_array, shown
+from mbkit._check import Array, finite_array, real, shown
 from mbkit.codegen.program import program
 from mbkit.errors import InputError, MbkitError
 from mbkit.model.elements.formula import Formula, Operation
@@ -118,9 +118,7 @@ def _scalar(x: Any, things: list[Expression]) -> Any:
 
         return ca.SX(Conversion({s: ca.SX.sym(s.name) for s in x.free_symbols}, float)(x))
     if isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool):
-        if not np.isfinite(x):
-            raise InputError(f"expected finite numbers, got {x}")
-        return ca.SX(float(x))
+        return ca.SX(real("a number", x))
     if isinstance(x, ca.MX):
         raise InputError(
             "expected a casadi.SX, got an MX; write it with SX, or casadi.Function(...).expand() makes one"
@@ -144,7 +142,7 @@ def read_spline(value: Any, ends: Ends) -> tuple[Array, Array] | None:
     """
     from scipy.interpolate import BSpline, CubicSpline, PPoly, make_interp_spline
 
-    if isinstance(value, (list, tuple, np.ndarray)):
+    if isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.ndim):
         if len(value) != 2 or not all(np.ndim(x) == 1 for x in value):
             return None
         t, x = (

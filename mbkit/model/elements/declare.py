@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from typing import Any, Final, Literal, get_args
 
@@ -29,6 +30,10 @@ Constants = Mapping[str, Number]
 def _door() -> Any:
     # By name: a description loads neither CasADi nor SymPy unless somebody brings an expression.
     return import_module("mbkit.lagrangian.formulas")
+
+
+def _is_zero(x: Any) -> bool:
+    return isinstance(x, (int, float)) and x == 0
 
 
 class ElementBuilder:
@@ -87,20 +92,18 @@ class ElementBuilder:
         """
         harmonic = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
         if law is None:
-            if parameters:
+            if parameters is not None:
                 self._read.faults.append(f"prescribed {shown(joint)}: parameters without a law; give them as numbers")
             self._add(Prescribed, "prescribed", "prescribed", joint, harmonic)
             return
         item = f"prescribed {shown(joint)}"
-        if given := [name for name, x in harmonic.items() if isinstance(x, Expression) or x != 0]:
+        if given := [name for name, x in harmonic.items() if not _is_zero(x)]:
             self._read.faults.append(f"{item}: a law and {given[0]}; expected one of them")
-        if spline not in _ENDS:
+        if not isinstance(spline, str) or spline not in _ENDS:
             self._read.faults.append(f"{item}: spline: expected one of {', '.join(_ENDS)}, got {shown(spline)}")
             return
-        try:
-            pieces = _door().read_spline(law, spline)
-        except MbkitError as error:
-            self._read.faults.append(f"{item}: {error}")
+        good, pieces = self._asked(item, law, lambda: _door().read_spline(law, spline))
+        if not good:
             return
         if pieces is not None:
             ready = {"knots": pieces[0], "coefficients": pieces[1]}
@@ -209,7 +212,7 @@ class ElementBuilder:
         [-0.4, 0.0, 0.0, 0.0, 0.0, 0.0]
         """
         item = f"force {shown(name)}"
-        if axes not in _AXES:
+        if not isinstance(axes, str) or axes not in _AXES:
             self._read.faults.append(f"{item}: axes: expected one of {', '.join(_AXES)}, got {shown(axes)}")
             axes = "local"
         parts = None if force is None and moment is None else [(0.0,) * 3 if x is None else x for x in (force, moment)]
@@ -288,9 +291,23 @@ class ElementBuilder:
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
         self._add(Bushing, "forces", "bushing", name, a | b, matrices | formulas | constants)
 
+    def _asked(self, item: str, value: Any, call: Callable[[], Any]) -> tuple[bool, Any]:
+        """Return whether a call succeeded and what it returned; its error is a fault of an argument."""
+        try:
+            return True, call()
+        except MbkitError as error:
+            self._read.faults.append(f"{item}: {error}")
+        except Exception:
+            # Any: objects may bring conversions of their own.
+            self._read.faults.append(f"{item}: expected numbers or expressions, got {shown(value)}")
+        return False, None
+
     def _matrix(self, name: str, value: Any) -> Array:
         """Return a 6 by 6 matrix of a matrix, its diagonal or one number for all of it."""
-        if np.ndim(value) == 2:
+        good, size = self._asked(name, value, lambda: np.ndim(value))
+        if not good:
+            return np.zeros((6, 6))
+        if size == 2:
             rows = list(value)
             if len(rows) == 6:
                 matrix = [self._read.quantities(f"{name}[{i}]", row, 6) for i, row in enumerate(rows)]
@@ -308,21 +325,22 @@ class ElementBuilder:
         """Read expressions with the numbers that they should have; return formulas, and their constants' fields."""
         formulas: dict[str, Formula | None] = dict.fromkeys(wanted)
         values: dict[str, Number] = {}
-        named: Any = parameters or {}
+        named: Any = {} if parameters is None else parameters
         if not isinstance(named, Mapping):
             self._read.faults.append(f"{item}: parameters: expected a mapping of names to numbers, got {shown(named)}")
             named = {}
         for name, x in named.items():
             values[self._read.name(f"{item}: parameters", name)] = self._read.quantity(f"{item}: parameters: {name}", x)
         things: list[Expression] = []
+
+        def read(what: str, parts: Any) -> None:
+            formulas[what] = _door().read_formula(parts, given[what], things)
+
         for what, parts in wanted.items():
             if all(x is None for x, _ in parts):
                 continue
             label = {"formula": "force"}.get(what, what)
-            try:
-                formulas[what] = _door().read_formula(parts, given[what], things)
-            except MbkitError as error:
-                self._read.faults.append(f"{item}: {label}: {error}")
+            self._asked(f"{item}: {label}", [x for x, _ in parts], partial(read, what, parts))
         used = {name for x in formulas.values() if x is not None for name in x.arguments}
         if idle := [n for n in values if n not in used]:
             self._read.faults.append(f"{item}: parameters: {idle[0]!r} is in no expression; leave it out")

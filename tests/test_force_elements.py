@@ -1,0 +1,543 @@
+"""Forces by functions, at joints, on frames and in bushings: against closed forms, the oracle and every engine."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from typing import Any
+
+import casadi as ca
+import mpmath
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.spatial.transform import Rotation
+
+import mbkit as mb
+from mbkit.errors import InputError, ModelError, UnsupportedError
+from mbkit.simulate import METHODS
+
+RNG = np.random.default_rng
+#: A symmetric positive matrix without any zero.
+_ROOT = RNG(0).standard_normal((6, 6))
+STIFFNESS = _ROOT @ _ROOT.T
+R_TIP = Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix()
+
+
+def tree() -> mb.ModelBuilder:
+    """Return a floating base with an arm of two links, a frame at its tip, and a damped spring in its elbow."""
+    b = mb.ModelBuilder("arm")
+    b.add_body("base", mass=3.0, inertia=(0.2, 0.3, 0.25), com=(0.01, 0.02, 0.03))
+    b.add_body("upper", mass=1.0, com=(0.2, 0, 0), inertia=(0.01, 0.02, 0.02))
+    b.add_body("lower", mass=0.7, com=(0.1, 0, 0.05), inertia=(0.01, 0.02, 0.02))
+    b.add_joint("float", "free", parent="world", child="base")
+    b.add_joint("shoulder", "revolute", parent="base", child="upper", axis=(0, 1, 0), translation=(0.1, 0, 0))
+    elbow = {"axis": (0, 0, 1), "translation": (0.4, 0, 0), "damping": 0.1, "stiffness": 2.0}
+    b.add_joint("elbow", "revolute", parent="upper", child="lower", **elbow)
+    b.add_frame("tip", body="lower", translation=(0.3, 0.1, 0), rotation=R_TIP)
+    return b
+
+
+def push(t: Any, p: Any, twist: Any) -> Any:
+    return -0.3 * twist[:3] * (twist[0] ** 2 + twist[1] ** 2 + twist[2] ** 2 + 0.1) ** 0.5 + p[:3] * t
+
+
+def all_elements() -> mb.Model:
+    """Return the arm with a force of each sort, time, parameters and potentials among them."""
+    b = tree()
+    t, q, v, k, elbow, rate = sp.symbols("t q v k elbow elbow_dot")
+    law = -k * sp.sin(q) + 0.3 * sp.cos(2 * t) * rate - sp.Rational(1, 3) * v * elbow**2
+    b.add_joint_force("motor", "shoulder", law, potential=k * q**4, parameters={"k": mb.Parameter("k", 2.0)})
+    moment = (0.1, mb.Parameter("M", 0.2), math.pi)
+    for axes in ("local", "world", "local_world_aligned"):
+        b.add_force(f"push {axes}", "tip", force=push, moment=moment, axes=axes, potential=lambda p: p[0] ** 2 + p[2])
+    b.add_bushing(
+        "rubber",
+        body_a="base",
+        body_b="lower",
+        translation_a=(0.1, 0.2, 0.3),
+        translation_b=(0.0, 0.1, 0.3),
+        rotation_b=R_TIP,
+        stiffness=STIFFNESS,
+        damping=0.3 * STIFFNESS,
+        force=lambda t, x, x_dot: -(x**3) + ca.sin(t) - 0.1 * x_dot * abs(x_dot),
+        potential=lambda x: x[0] * x[3] ** 2,
+    )
+    return b.build()
+
+
+MODEL = all_elements()
+TIME = 0.7
+Q, V = MODEL.random_state(0, 4)
+A, TAU = RNG(1).standard_normal((2, 4, MODEL.nv))
+
+
+def off(x: Any, exact: Any) -> float:
+    return float(np.abs(np.asarray(x) - exact).max() / np.abs(exact).max())
+
+
+# Engines
+
+
+@pytest.fixture(scope="module")
+def oracle() -> Any:
+    return mb.dynamics(MODEL, "oracle").at(t=TIME)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco", "drake"])
+def test_every_engine_has_the_same_forces(engine: str, oracle: Any) -> None:
+    if engine == "drake":
+        pytest.importorskip("pydrake")
+    dyn = mb.dynamics(MODEL, engine).at(t=TIME)
+    wrenches = {"tip": np.arange(6.0)}
+    for quantity, states in {
+        "passive": (Q, V),
+        "potential_energy": (Q,),
+        "inverse_dynamics": (Q, V, A),
+        "forward_dynamics": (Q, V, TAU),
+    }.items():
+        assert off(getattr(dyn, quantity)(*states), getattr(oracle, quantity)(*states)) < 1e-13, quantity
+    for quantity, last in (("inverse_dynamics", A), ("forward_dynamics", TAU)):
+        given = (Q, V, last, wrenches, "world")
+        assert off(getattr(dyn, quantity)(*given), getattr(oracle, quantity)(*given)) < 1e-13, quantity
+        if not dyn.lacks_derivatives:
+            name = f"{quantity}_derivatives"
+            for x, exact in zip(getattr(dyn, name)(Q, V, last), getattr(oracle, name)(Q, V, last), strict=True):
+                assert off(x, exact) < 1e-12, name
+    one = dyn.forward_dynamics(Q[0], V[0], TAU[0])
+    assert off(one, oracle.forward_dynamics(Q, V, TAU)[0]) < 1e-13
+    assert off(dyn.at(t=0.0).passive(Q, V), oracle.passive(Q, V)) > 1e-3
+
+
+def test_gravity_and_nle_do_not_hold_them() -> None:
+    dyn, bare = (mb.dynamics(m, "lagrangian") for m in (MODEL, MODEL.without("forces")))
+    assert np.array_equal(dyn.nle(Q, V), bare.nle(Q, V))
+    assert np.array_equal(dyn.gravity(Q), bare.gravity(Q))
+
+
+@pytest.mark.parametrize("quantity", ["inverse_dynamics", "forward_dynamics"])
+def test_derivatives_are_those_of_the_terms(quantity: str, oracle: Any) -> None:
+    """Central differences of 34 digits, whose error is h² of the third derivative."""
+    last, h = (A if quantity == "inverse_dynamics" else TAU)[0], 1e-9
+    by_q, by_v, _ = getattr(mb.dynamics(MODEL, "lagrangian").at(t=TIME), f"{quantity}_derivatives")(Q[0], V[0], last)
+
+    def slope(move: Any) -> np.ndarray:
+        ends = [oracle.extended(quantity, *move(s), last) for s in (-h, h)]
+        return ((ends[1][0] - ends[0][0]) + (ends[1][1] - ends[0][1])) / (2 * h)
+
+    for k, e in enumerate(np.eye(MODEL.nv)):
+        # The displacement is rounded to double, so half of the digits of h are left.
+        assert off(slope(lambda s, e=e: (Q[0], V[0] + s * e)), by_v[:, k]) < 1e-5
+        assert off(slope(lambda s, e=e: (MODEL.integrate(Q[0], s * e), V[0])), by_q[:, k]) < 1e-5
+
+
+# What they are: against formulas written apart
+
+
+@pytest.mark.parametrize("axes", ["local", "world", "local_world_aligned"])
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_a_force_on_a_frame_is_the_wrench_that_the_function_gives(engine: str, axes: Any) -> None:
+    b = tree()
+    b.add_force("push", "tip", force=push, moment=(1.0, 2.0, 3.0), axes=axes)
+    model = b.build()
+    dyn, bare = mb.dynamics(model, engine).at(t=TIME), mb.dynamics(model.without("forces"), engine)
+    for q, v in zip(Q, V, strict=True):
+        p, twist = bare.pose(q, "tip")[:3, 3], bare.velocity(q, v, "tip", axes)
+        wrench = np.concatenate([push(TIME, p, twist), [1.0, 2.0, 3.0]])
+        expected = bare.generalized_force(q, {"tip": wrench}, axes)
+        assert off(dyn.passive(q, v) - bare.passive(q, v), expected) < 1e-13
+
+
+def displacement(dyn: mb.Dynamics, q: np.ndarray) -> np.ndarray:
+    """Return x of the bushing of `all_elements`, from the poses of the bodies and SciPy's rotation vector."""
+    A, B = dyn.pose(q, "base"), dyn.pose(q, "lower")
+    own, other = np.eye(4), np.eye(4)
+    own[:3, 3], other[:3, 3], other[:3, :3] = (0.1, 0.2, 0.3), (0.0, 0.1, 0.3), R_TIP
+    seen = np.linalg.inv(A @ own) @ B @ other
+    return np.concatenate([seen[:3, 3], Rotation.from_matrix(seen[:3, :3]).as_rotvec()])
+
+
+def test_a_bushing_acts_on_the_rates_of_its_displacement() -> None:
+    b = tree()
+    ends = {"body_a": "base", "body_b": "lower", "translation_a": (0.1, 0.2, 0.3), "translation_b": (0.0, 0.1, 0.3)}
+    b.add_bushing(
+        "rubber",
+        **ends,
+        rotation_b=R_TIP,
+        stiffness=STIFFNESS,
+        damping=STIFFNESS[::-1] @ STIFFNESS[::-1].T,
+        force=lambda t, x, rate: -(x**3) - rate**3,
+    )
+    model = b.build()
+    dyn, bare, h = mb.dynamics(model, "lagrangian"), mb.dynamics(model.without("forces"), "lagrangian"), 1e-6
+    for q, v in zip(Q, V, strict=True):
+        x = displacement(bare, q)
+        assert dyn.potential_energy(q) - bare.potential_energy(q) == pytest.approx(0.5 * x @ STIFFNESS @ x, rel=1e-12)
+
+        def moved(u: np.ndarray, q: np.ndarray = q) -> np.ndarray:
+            ends = (displacement(bare, model.integrate(q, s * u)) for s in (h, -h))
+            return np.subtract(*ends) / (2 * h)
+
+        J, rate = np.array([moved(e) for e in np.eye(model.nv)]).T, moved(v)
+        f = -STIFFNESS @ x - STIFFNESS[::-1] @ STIFFNESS[::-1].T @ rate - x**3 - rate**3
+        # Differences over h leave 1e-16 / h, and h².
+        assert off(dyn.passive(q, v) - bare.passive(q, v), J.T @ f) < 1e-8
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.031, 0.0316, 0.032, 0.5, 2.0, 3.1])
+def test_a_rotation_vector_is_exact_at_every_angle(angle: float) -> None:
+    """0.0316 rad is where the series ends; the oracle holds its digits on both sides."""
+    b = mb.ModelBuilder("twist", gravity=(0, 0, 0))
+    b.add_body("disc", mass=1.0, inertia=(1.0, 1.0, 1.0))
+    b.add_joint("turn", "revolute", parent="world", child="disc", axis=(0, 0, 1))
+    b.add_bushing("shaft", body_a="world", body_b="disc", stiffness=[0, 0, 0, 5.0, 6.0, 7.0])
+    model = b.build()
+    with mpmath.workdps(40):
+        exact = mpmath.mpf(7) / 2 * mpmath.mpf(angle) ** 2
+        high, low = mb.dynamics(model, "oracle").extended("potential_energy", [angle])
+        assert abs(mpmath.mpf(float(high)) + mpmath.mpf(float(low)) - exact) <= mpmath.mpf(1e-29) * exact
+    dyn = mb.dynamics(model, "lagrangian")
+    assert dyn.passive([angle], [0.0])[0] == pytest.approx(-7 * angle, rel=2e-14, abs=0)
+    assert dyn.inverse_dynamics_derivatives([angle], [0.0], [0.0]).q[0, 0] == pytest.approx(7.0, rel=1e-12)
+
+
+def frequencies(model: mb.Model) -> np.ndarray:
+    """Return the frequencies of small motions about the neutral configuration, rad/s."""
+    dyn, n = mb.dynamics(model, "lagrangian"), model.nv
+    at = model.neutral(), np.zeros(n), np.zeros(n)
+    by_q, by_v, _ = dyn.forward_dynamics_derivatives(*at)
+    roots = np.linalg.eigvals(np.block([[np.zeros((n, n)), np.eye(n)], [by_q, by_v]]))
+    return np.sort(np.abs(roots.imag))[::2]
+
+
+def test_a_body_on_a_bushing_has_the_frequencies_of_the_closed_form() -> None:
+    """A bushing h below the centre of mass couples sliding and rocking: M = diag(m, I), K = [[k, k h], [k h, k h² + c]]."""
+    m, inertia, h = 2.0, (0.3, 0.4, 0.5), 0.2
+    k, c = np.array([1000.0, 1500.0, 800.0]), np.array([30.0, 40.0, 50.0])
+    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
+    b.add_body("block", mass=m, inertia=inertia)
+    b.add_joint("free", "free", parent="world", child="block")
+    ends = {"body_a": "world", "body_b": "block", "translation_a": (0, 0, -h), "translation_b": (0, 0, -h)}
+    b.add_bushing("rubber", **ends, stiffness=[*k, *c])
+
+    def pair(k: float, c: float, moment: float) -> np.ndarray:
+        K, M = np.array([[k, k * h], [k * h, k * h**2 + c]]), np.diag([m, moment])
+        return np.sqrt(np.linalg.eigvals(np.linalg.solve(M, K)).real)
+
+    expected = [*pair(k[0], c[1], inertia[1]), *pair(k[1], c[0], inertia[0])]
+    expected += [math.sqrt(k[2] / m), math.sqrt(c[2] / inertia[2])]
+    assert np.allclose(frequencies(b.build()), np.sort(expected), rtol=1e-12, atol=0)
+
+
+def test_expressions_of_either_library_and_functions_say_the_same() -> None:
+    q, v, w = ca.SX.sym("q"), ca.SX.sym("v"), ca.SX.sym("w")
+    x, y, z = sp.symbols("q v w")
+    laws: list[Any] = [
+        -w * ca.sin(q) * v - ca.if_else(q > 0, 2.0, 3.0),
+        -z * sp.sin(x) * y - sp.Piecewise((2, x > 0), (3, True)),
+        lambda t, q, v: -1.5 * np.sin(q) * v - ca.if_else(q > 0, 2.0, 3.0),
+    ]
+    forces = []
+    for k, law in enumerate(laws):
+        b = tree()
+        b.add_joint_force("f", "shoulder", law, parameters=None if k == 2 else {"w": 1.5})
+        forces.append(mb.dynamics(b.build(), "lagrangian").passive(Q, V))
+    assert np.array_equal(forces[0], forces[1])
+    assert off(forces[2], forces[0]) < 1e-15
+
+
+def test_a_joint_of_several_velocities_takes_one_force_each() -> None:
+    b = mb.ModelBuilder("disc")
+    b.add_body("disc", mass=1.0, inertia=(1.0, 1.0, 1.0))
+    b.add_joint("plane", "planar", parent="world", child="disc")
+    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
+    b.add_joint_force("f", "plane", -q - 0.1 * v**3, potential=ca.dot(q, q))
+    dyn = mb.dynamics(b.build())
+    assert np.allclose(dyn.passive([1.0, 2.0, 3.0], [1.0, 0.0, -1.0]), [-3.1, -6.0, -8.9], rtol=1e-15)
+    assert dyn.potential_energy([1.0, 2.0, 3.0]) == 14.0
+
+
+# Energy
+
+
+def still(*, drag: float) -> mb.Model:
+    b = tree()
+    b.add_joint_force("spring", "shoulder", lambda t, q, v: -drag * v * abs(v), potential=lambda q: 3 * q**4 - q)
+    b.add_force("well", "tip", potential=lambda p: 2 * p[0] ** 2 + p[1] ** 2 + p[0] * p[2])
+    ends = {"body_a": "base", "body_b": "lower"}
+    b.add_bushing("rubber", **ends, stiffness=np.diag([40.0] * 3 + [5.0] * 3) + 0.1 * STIFFNESS, damping=drag)
+    return b.build().without("damping")
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_potentials_keep_the_energy(engine: str) -> None:
+    model = still(drag=0.0)
+    assert not model.loses_energy
+    v = 0.5 * RNG(3).standard_normal(model.nv)
+    run = mb.simulate(mb.dynamics(model, engine), model.neutral(), v, 1.0, "rk853", rtol=1e-12)
+    assert np.ptp(run.energy()) < 1e-10 * np.abs(run.energy()).max()
+    assert np.array_equal(run.work(), np.zeros(len(run.t)))
+
+
+def test_the_work_of_the_other_forces_balances_the_energy() -> None:
+    """It is a quadrature of fourth order in the distance of the states, and the run is one of fourth order."""
+    model, errors = MODEL, []
+    v = 0.2 * RNG(3).standard_normal(model.nv)
+    dyn = mb.dynamics(model, "lagrangian")
+    for dt in (1e-3, 5e-4):
+        run = mb.simulate(dyn, model.neutral(), v, 0.5, "rk4", dt, t0=0.3)
+        assert not run.stats.doubts
+        errors.append(np.abs(run.power_balance()).max() / np.ptp(run.energy()))
+    assert errors[0] < 1e-6
+    assert errors[0] / errors[1] > 12
+    both = mb.simulate(dyn, np.array([model.neutral()] * 2), np.array([v, v]), 0.5, "rk4", 5e-4, t0=0.3)
+    assert np.allclose(both.power_balance()[1], run.power_balance(), rtol=0, atol=1e-12)
+
+
+def test_a_run_whose_damper_takes_energy_away_is_no_doubt() -> None:
+    model = still(drag=3.0)
+    run = mb.simulate(mb.dynamics(model), model.neutral(), np.ones(model.nv), 0.5)
+    assert run.energy()[-1] < run.energy()[0] - 0.01
+    assert not run.stats.doubts
+    assert np.abs(run.power_balance()).max() < 1e-6
+
+
+# Time
+
+
+def slider() -> mb.Model:
+    """Return 2 kg on a rail under the force 3 cos 5 t."""
+    b = mb.ModelBuilder("slider", gravity=(0, 0, 0))
+    b.add_body("car", mass=2.0)
+    b.add_joint("rail", "prismatic", parent="world", child="car", axis=(1, 0, 0))
+    b.add_joint_force("drive", "rail", lambda t, q, v: 3 * ca.cos(5 * t))
+    return b.build()
+
+
+def closed_form(t0: float, t: float) -> tuple[float, float]:
+    """Return x and v at t of the slider at rest at t0."""
+    c = 3 / (2 * 5)
+    v = c * (math.sin(5 * t) - math.sin(5 * t0))
+    return -c / 5 * (math.cos(5 * t) - math.cos(5 * t0)) - c * math.sin(5 * t0) * (t - t0), v
+
+
+@pytest.mark.parametrize("name", [n for n, m in METHODS.items() if not m.engines or "lagrangian" in m.engines])
+def test_every_method_starts_at_t0_and_follows_the_time(name: str) -> None:
+    method, t0, duration = METHODS[name], 0.4, 1.0
+    dyn = mb.dynamics(slider(), "lagrangian")
+    given: dict[str, Any] = {"dt": 1e-3} if method.kind == "fixed" else {"rtol": 1e-9}
+    save = None if method.kind == "fixed" else [t0, t0 + 0.3, t0 + duration]
+    run = mb.simulate(dyn, [0.0], [0.0], duration, name, save=save, t0=t0, **given)
+    assert run.t[0] == t0
+    assert run.t[-1] == pytest.approx(t0 + duration, rel=1e-15)
+    x, v = closed_form(t0, t0 + duration)
+    # An Euler's error at this step, and that of a method of second order; the others' are theirs by tolerance.
+    worst = {1: 5e-3, 2: 5e-6}.get(method.order, 1e-8) if method.kind == "fixed" else 1e-7
+    assert abs(run.q[-1, 0] - x) < worst
+    assert abs(run.v[-1, 0] - v) < worst
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "mujoco", "drake", "oracle"])
+def test_every_engine_starts_at_t0_and_follows_the_time(engine: str) -> None:
+    if engine == "drake":
+        pytest.importorskip("pydrake")
+    run = mb.simulate(mb.dynamics(slider(), engine), [0.0], [0.0], 0.2, "rk4", 0.01, t0=0.4)
+    x, v = closed_form(0.4, 0.6)
+    # h⁴ of a twentieth of the frequency.
+    assert np.abs([run.q[-1, 0] - x, run.v[-1, 0] - v]).max() < 1e-8
+    late = mb.dynamics(slider(), engine).at(t=0.4)
+    assert late.step([0.0], [0.0], [0.0], 0.01)[0][0] == pytest.approx(run.q[1, 0], rel=1e-12)
+
+
+def test_wrenches_of_a_run_stand_beside_a_force_of_the_time() -> None:
+    b = tree()
+    b.add_force("wave", "tip", force=(ca.sin(3 * ca.SX.sym("t")), 0, 0), axes="local_world_aligned")
+    model = b.build()
+    q, v, push = model.neutral(), np.zeros(model.nv), {"tip": [0.0, 1.0, 0, 0, 0, 0.5]}
+    runs = [
+        mb.simulate(mb.dynamics(model, engine), q, v, 0.1, "rk4", 0.01, t0=0.2, wrenches=push)
+        for engine in ("lagrangian", "pinocchio", "mujoco")
+    ]
+    for run in runs[1:]:
+        assert np.abs(run.q - runs[0].q).max() < 1e-13
+
+
+# The description
+
+
+def test_a_description_with_forces_is_plain_data() -> None:
+    again = pickle.loads(pickle.dumps(MODEL))
+    assert again == MODEL
+    assert again.digest == all_elements().digest
+    bare = MODEL.without("forces")
+    assert bare == tree().build()
+    assert (MODEL.needs.forces, bare.needs.forces) == (True, False)
+    assert (MODEL.needs.time, bare.needs.time) == (True, False)
+    assert MODEL.time_parameter == "t"
+    assert bare.time_parameter is None
+    assert "bushing &#x27;rubber&#x27; between" in MODEL._repr_html_()
+    b = tree()
+    b.add_joint_force("f", "elbow", lambda t, q, v: -q)
+    one = b.build()
+    b = tree()
+    b.add_joint_force("f", "elbow", lambda t, q, v: -2 * q)
+    assert one.digest != b.build().digest
+
+
+def test_parameters_of_forces_are_those_of_the_model() -> None:
+    assert dict(MODEL.parameters) == {"k": 2.0, "M": 0.2, "t": 0.0}
+    dyn = mb.dynamics(MODEL, "lagrangian")
+    fixed = MODEL.with_parameters(k=3.0, M=0.1)
+    assert list(fixed.parameters) == ["t"]
+    exact = mb.dynamics(fixed, "oracle").passive(Q, V)
+    assert off(dyn.at(k=3.0, M=0.1).passive(Q, V), exact) < 1e-13
+    assert off(mb.dynamics(MODEL, "pinocchio").at(k=3.0, M=0.1).passive(Q, V), exact) < 1e-13
+    many = dyn.at(k=np.array([1.0, 2.0, 3.0, 4.0]), M=0.1).passive(Q, V)
+    assert off(many[2], exact[2]) < 1e-13
+    # The law is linear in k: its slope is its difference.
+    by = dyn.parameter_derivatives("inverse_dynamics", Q, V, A)[..., 0]
+    change = dyn.at(k=2.5).inverse_dynamics(Q, V, A) - dyn.at(k=1.5).inverse_dynamics(Q, V, A)
+    assert off(by, change) < 1e-12
+
+
+def test_a_bushing_may_have_parameters_for_constants() -> None:
+    b = tree()
+    k = mb.Parameter("k", 3.0)
+    b.add_bushing("rubber", body_a="base", body_b="lower", stiffness=[k, k, k, k / 10, k / 10, k / 10], damping=k / 7)
+    model = b.build()
+    dyn = mb.dynamics(model, "lagrangian").at(k=5.0)
+    exact = mb.dynamics(model.with_parameters(k=5.0), "oracle").passive(Q, V)
+    assert off(dyn.passive(Q, V), exact) < 1e-13
+
+
+def test_joint_forces_are_written_out_in_symbols() -> None:
+    def double() -> mb.ModelBuilder:
+        b = mb.ModelBuilder("double")
+        for name, parent, z in (("one", "world", 0.0), ("two", "one", -1.0)):
+            b.add_body(name, mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.02))
+            b.add_joint(f"j{name}", "revolute", parent=parent, child=name, axis=(0, 1, 0), translation=(0, 0, z))
+        return b
+
+    b = double()
+    k, q, other = sp.symbols("k q jone")
+    b.add_joint_force("f", "jone", lambda t, q, v: -2 * v * abs(v) + ca.sin(3 * t), potential=lambda q: 2 * q**4)
+    law = -k * sp.sin(q - other) * sp.Piecewise((1, q > 0), (2, True))
+    b.add_joint_force("g", "jtwo", law, parameters={"k": mb.Parameter("k", 3.0)})
+    model = b.build()
+    lag = mb.lagrangian.from_model(model)
+    assert sp.Symbol("jone") ** 4 * 2 in lag.V.args
+    q, v = model.random_state(1, 20)
+    own, paper = mb.dynamics(model, "lagrangian").at(t=0.4), lag.dynamics().at(t=0.4)
+    assert off(paper.forward_dynamics(q, v, 0 * v), own.forward_dynamics(q, v, 0 * v)) < 1e-13
+    b = double()
+    b.add_force("push", "two", force=(1.0, 0, 0))
+    with pytest.raises(UnsupportedError, match="force 'push' on 'two'"):
+        mb.lagrangian.from_model(b.build())
+
+
+# Bad input
+
+
+def fault(add: Any) -> str:
+    b = tree()
+    add(b)
+    with pytest.raises(ModelError) as caught:
+        b.build()
+    return str(caught.value)
+
+
+t_, q_, v_, x_ = (ca.SX.sym(n) for n in ("t", "q", "v", "stray"))
+
+
+@pytest.mark.parametrize(
+    ("add", "words"),
+    [
+        (lambda b: b.add_joint_force("f", "elbow", -q_ * x_), ["force 'f'", "unknown symbol 'stray'", "parameters="]),
+        (lambda b: b.add_joint_force("f", "elbow", -ca.SX.sym("shouldr")), ["did you mean 'shoulder'"]),
+        (lambda b: b.add_joint_force("f", "elbo", -q_), ["unknown joint 'elbo'", "'elbow'"]),
+        (lambda b: b.add_joint_force("f", "float", -ca.SX.sym("q_0")), ["expected 6 components, got 1"]),
+        (lambda b: b.add_joint_force("f", "elbow"), ["never act"]),
+        (lambda b: b.add_joint_force("f", "elbow", potential=v_**2), ["potential", "'v'"]),
+        (lambda b: b.add_joint_force("f", "elbow", potential=q_ * t_), ["potential", "'t'"]),
+        (lambda b: b.add_joint_force("f", "elbow", -q_, parameters={"k": 1.0}), ["'k'", "in no expression"]),
+        (lambda b: b.add_joint_force("f", "elbow", -q_, parameters={"q": 1.0}), ["symbol 'q' stands for", "rename"]),
+        (lambda b: b.add_joint_force("f", "elbow", ca.MX.sym("q")), ["expected a casadi.SX, got an MX"]),
+        (lambda b: b.add_joint_force("f", "elbow", lambda t, q, v: math.sin(q)), ["the function raised", "torque="]),
+        (lambda b: b.add_joint_force("f", "elbow", lambda t, q, v: 1.0 if q > 0 else 2.0), ["the function raised"]),
+        (lambda b: b.add_joint_force("f", "elbow", sp.gamma(sp.Symbol("q"))), ["gamma"]),
+        (lambda b: b.add_joint_force("f", "elbow", math.nan), ["finite"]),
+        (lambda b: b.add_force("f", "tp", force=(1, 0, 0)), ["unknown frame 'tp'", "'tip'"]),
+        (lambda b: b.add_force("f", "tip", force=(1, 0)), ["expected 3 numbers, got 2"]),
+        (lambda b: b.add_force("f", "tip", force=(1, 0, 0), axes="global"), ["axes", "'global'"]),
+        (lambda b: [b.add_force("f", "tip", force=(1, 0, 0)) for _ in "ab"], ["declared 2 times"]),
+        (lambda b: b.add_bushing("b", body_a="base", body_b="base", stiffness=1.0), ["both frames on 'base'"]),
+        (lambda b: b.add_bushing("b", body_a="base", body_b="lowe", stiffness=1.0), ["'lowe'", "'lower'"]),
+        (lambda b: b.add_bushing("b", body_a="base", body_b="lower", stiffness=np.tri(6)), ["symmetric"]),
+        (lambda b: b.add_bushing("b", body_a="base", body_b="lower", damping=-1.0), ["damping", "drives the motion"]),
+        (lambda b: b.add_bushing("b", body_a="base", body_b="lower", stiffness=np.eye(3)), ["(6, 6)"]),
+        (lambda b: b.add_bushing("b", body_a="base", body_b="lower"), ["never act"]),
+    ],
+)
+def test_what_is_no_force_is_refused_with_the_reason(add: Any, words: list[str]) -> None:
+    text = fault(add)
+    for word in words:
+        assert word in text
+
+
+def test_a_symbol_with_two_meanings_is_refused() -> None:
+    b = mb.ModelBuilder("cart")
+    b.add_body("cart", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+    b.add_force("f", "cart", force=(-ca.SX.sym("x"), 0, 0))
+    with pytest.raises(ModelError, match="'x' stands for one of its own arguments and a coordinate"):
+        b.build()
+    b = mb.ModelBuilder("cart")
+    b.add_body("cart", mass=1.0)
+    b.add_joint("q", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+    b.add_joint_force("f", "q", -2 * q_)
+    assert mb.dynamics(b.build()).passive([1.0], [0.0]) == -2.0
+
+
+def test_what_does_not_know_forces_refuses_them_by_name() -> None:
+    q, v = MODEL.neutral(), np.zeros(MODEL.nv)
+    with pytest.raises(UnsupportedError, match="'motor'.*rk4"):
+        mb.simulate(mb.dynamics(MODEL, "mujoco"), q, v, 0.1, "mujoco_rk4")
+    for engine in ("lagrangian", "pinocchio", "oracle"):
+        dyn = mb.dynamics(MODEL, engine)
+        assert "joint_wrenches" not in dyn.supports
+        with pytest.raises(UnsupportedError, match="forces by functions"):
+            dyn.joint_wrenches(q, v, v)
+    for form in ("mjcf", "urdf"):
+        with pytest.raises(UnsupportedError, match="bushing 'rubber'"):
+            mb.convert(MODEL.with_parameters(k=1.0, M=1.0), form)
+    with pytest.raises(UnsupportedError, match="without\\('forces'\\)"):
+        mb.explain(MODEL, MODEL)
+
+
+def test_drakes_own_integrators_refuse_forces_by_name() -> None:
+    pytest.importorskip("pydrake")
+    name = next(n for n, m in METHODS.items() if m.engines == ("drake",))
+    with pytest.raises(UnsupportedError, match="'drive'"):
+        mb.simulate(mb.dynamics(slider(), "drake"), [0.0], [0.0], 0.1, name)
+
+
+def test_a_state_at_which_a_force_is_not_a_number_is_refused() -> None:
+    b = tree()
+    b.add_joint_force("f", "elbow", lambda t, q, v: -ca.sqrt(q))
+    model = b.build()
+    q = model.neutral()
+    q[-1] = -1.0
+    for engine in ("lagrangian", "pinocchio", "mujoco"):
+        with pytest.raises(mb.errors.NumericalError, match=engine):
+            mb.dynamics(model, engine).forward_dynamics(q, np.zeros(model.nv), np.zeros(model.nv))
+
+
+def test_compare_judges_engines_with_forces() -> None:
+    result = mb.compare(MODEL.with_parameters(k=1.0, M=1.0), engines=("pinocchio", "lagrangian", "mujoco"), samples=8)
+    assert result.passed
+    assert {"passive", "potential_energy"} <= {row.term for row in result.rows}
+
+
+def test_a_run_needs_a_time_that_is_a_number() -> None:
+    with pytest.raises(InputError, match="t0"):
+        mb.simulate(mb.dynamics(slider()), [0.0], [0.0], 0.1, t0=math.nan)
