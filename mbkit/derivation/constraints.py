@@ -64,6 +64,7 @@ class ConstraintTerms:
         self, value: ca.SX, q: ca.SX, v: ca.SX, time: Any, names: tuple[str, ...], qdot: ca.SX | None = None
     ) -> None:
         self.value, self.names = value, names
+        self._q, self._v, self._qdot = q, v, qdot
         by_q = ca.jacobian(value, q)
         self.jacobian = by_q if qdot is None else ca.mtimes(by_q, ca.jacobian(qdot, v))
         self.by_time = ca.SX(value.shape[0], 1) if time is None else ca.jacobian(value, time)
@@ -71,6 +72,11 @@ class ConstraintTerms:
         self.gamma = ca.jtimes(self.rate, q, v if qdot is None else qdot)
         if time is not None:
             self.gamma = self.gamma + ca.jacobian(self.rate, time)
+
+    def rate_along(self, by: Any) -> Any:
+        """Return the derivative of ḟ along a move of the configuration, (nv,), with v and the time held."""
+        move = by if self._qdot is None else ca.substitute(self._qdot, self._v, by)
+        return ca.jtimes(self.rate, self._q, move)
 
     def stiffening(self, M: Any) -> Any:
         """Return s > 0, (m, 1), so that W = M + Jᵀ diag(s) J has an inverse where M has it on J's null space.

@@ -80,14 +80,16 @@ def _is_batch(given: Sequence[Any], sizes: Sequence[int], starts: Sequence[int])
 class Plan:
     """An explicit method's step for one model in machine code: its parts in order, and the rows of what they use.
 
-    `code` compiles a part.
+    `code` compiles a part. `thorough`: of a step that the quick projection onto constraints loses.
     """
 
-    def __init__(self, equations: Equations, method: str, code: Callable[[Part], Compiled]) -> None:
-        self.parts = march_in_stages(equations, method)
+    def __init__(
+        self, equations: Equations, method: str, code: Callable[[Part], Compiled], *, thorough: bool = False
+    ) -> None:
+        self.parts = march_in_stages(equations, method, thorough=thorough)
         forward = next(part for part in self.parts if part.name == "forward_dynamics")
         if method_of(method).stages * code(forward).operations <= _ONE_PIECE:
-            self.parts = march(equations, method)
+            self.parts = march(equations, method, thorough=thorough)
         self.codes = tuple(code(part) for part in self.parts)
         self.sizes: dict[str, int] = {}
         for part, own in zip(self.parts, self.codes, strict=True):

@@ -170,6 +170,8 @@ class LagrangianDynamics(Dynamics):
         self._machines: dict[tuple[str, ...], Any] = {}
         self._short: dict[tuple[str, ...], QuantityCall] = {}
         self._steps: dict[str, tuple[Method, CompiledStep]] = {}
+        #: For steps that the others lose to their constraints.
+        self._thorough_steps: dict[str, tuple[Method, CompiledStep]] = {}
         self._wrenched: dict[Any, LagrangianDynamics] = {}
         self._parametric = bool(model.parameters)
 
@@ -388,15 +390,18 @@ class LagrangianDynamics(Dynamics):
             return False
         return not isinstance(self.code("forward_dynamics"), Machine)
 
-    def step_plan(self, method: str) -> Plan:
-        """Return the compiled parts of an explicit method's step; `compiles_steps` says whether there are some."""
+    def step_plan(self, method: str, *, thorough: bool = False) -> Plan:
+        """Return the compiled parts of an explicit method's step; `compiles_steps` says whether there are some.
+
+        `thorough`: with the projection for steps that the usual one loses to their constraints.
+        """
         from mbkit.engines.compiled_calls import Plan
 
-        plans: dict[str, Plan] = self.equations.kept.setdefault("rollout", {})
-        name = METHODS[method].code_name
-        if name not in plans:
-            plans[name] = Plan(self.equations, method, self._part)
-        return plans[name]
+        plans: dict[tuple[str, bool], Plan] = self.equations.kept.setdefault("rollout", {})
+        key = METHODS[method].code_name, thorough
+        if key not in plans:
+            plans[key] = Plan(self.equations, method, self._part, thorough=thorough)
+        return plans[key]
 
     def _part(self, part: Part) -> Any:
         return self.code(part.name, make=part.make)
@@ -426,14 +431,17 @@ class LagrangianDynamics(Dynamics):
     def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
         if not self.compiles_steps:
             return super()._step(method, q, v, tau, dt)
-        held = self._steps.get(method.name)
-        if held is None or held[0] is not method:
-            from mbkit.engines.compiled_calls import CompiledStep
+        for steps in (self._steps, self._thorough_steps) if self.model.constrained else (self._steps,):
+            held = steps.get(method.name)
+            if held is None or held[0] is not method:
+                from mbkit.engines.compiled_calls import CompiledStep
 
-            step = CompiledStep(self.model, self.equations, self.step_plan(method.name), self._part)
-            held = self._steps[method.name] = method, step
-        q1, v1, finite = held[1].run(q, v, tau, dt, *self._trailing(q), threads=self.threads)
-        # Lost to its constraints: in Python the projection goes on until it is done.
+                plan = self.step_plan(method.name, thorough=steps is self._thorough_steps)
+                held = steps[method.name] = method, CompiledStep(self.model, self.equations, plan, self._part)
+            q1, v1, finite = held[1].run(q, v, tau, dt, *self._trailing(q), threads=self.threads)
+            if finite:
+                break
+        # Lost to its constraints all the same: in Python the projection goes on until it is done.
         return (q1, v1) if finite or not self.model.constrained else super()._step(method, q, v, tau, dt)
 
     def _momentum_step_slopes(

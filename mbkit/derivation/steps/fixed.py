@@ -18,7 +18,7 @@ import casadi as ca
 
 from mbkit._check import Array
 from mbkit.derivation.equations import Equations
-from mbkit.derivation.steps.onto_constraints import nears_singular, projection, reach
+from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, quick_projection, thorough_projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.errors import InputError
 from mbkit.methods.one_step import SemiImplicitEuler
@@ -28,6 +28,8 @@ from mbkit.model.integration_space import Space
 
 _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
+#: Of a step: rounding of a stage's time.
+_SAME_TIME: Final = 1e-12
 
 
 class SymbolicStages:
@@ -109,18 +111,18 @@ def step(equations: Equations, method: str) -> ca.Function:
     return function_of(f"{method}_step", names, {"q1": q1, "v1": space.to_body_velocity(q1, w1)})
 
 
-def march(equations: Equations, method: str) -> tuple[Part, ...]:
+def march(equations: Equations, method: str, *, thorough: bool = False) -> tuple[Part, ...]:
     """Return one part: the whole step in the integrators' own velocity, for many steps in a row.
 
     It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum of the squares of all states so
     far: a number that once was not finite, or beyond all bounds, shows in it for ever; so does a step that is lost to
-    its constraints.
+    its constraints. `thorough` projections lose fewer steps.
     """
-    name, reads = f"{method_of(method).code_name}_march", (*_MARCH, *equations.extra_arguments)
+    name, reads = f"{_prefix(method, thorough)}_march", (*_MARCH, *equations.extra_arguments)
 
     def make() -> ca.Function:
         s, space = _symbols(equations), SymbolicSpace(equations.model)
-        ends = _stepped(equations, method, s, s["w"], _acceleration(equations, space, s))
+        ends = _stepped(equations, method, s, s["w"], _acceleration(equations, space, s), thorough=thorough)
         return function_of(name, {n: s[n] for n in reads}, _with_squares(s, *ends))
 
     return (Part(name, reads, _MARCHED, make),)
@@ -136,7 +138,11 @@ def velocity_changes(equations: Equations) -> tuple[tuple[Part, ...], tuple[Part
     return (before,), (Part.of("body_velocity", {"q1": s["q"], "w1": s["w"]}, {"v1": v1}),)
 
 
-def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
+def _prefix(method: str, thorough: bool) -> str:
+    return method_of(method).code_name + ("_thorough" if thorough else "")
+
+
+def march_in_stages(equations: Equations, method: str, *, thorough: bool = False) -> tuple[Part, ...]:
     """Return the same step cut at each evaluation of the forward dynamics.
 
     The forward dynamics, most of the step, is then compiled once instead of once a stage. Between the parts go the
@@ -145,7 +151,7 @@ def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
     s, space = _symbols(equations), SymbolicSpace(equations.model)
     known = {n: s[n] for n in ("q", "w", "dt")}
     parts: list[Part] = []
-    prefix = method_of(method).code_name
+    prefix = _prefix(method, thorough)
 
     timed = equations.model.time_parameter is not None
     known |= equations.extra_arguments if equations.model.constrained else {}
@@ -166,13 +172,19 @@ def march_in_stages(equations: Equations, method: str) -> tuple[Part, ...]:
         a = known[f"a_{i}"] = ca.SX.sym(f"a_{i}", equations.model.nv)
         return space.acceleration(q, v, a)
 
-    ends = _stepped(equations, method, s, s["w"], acceleration)
+    ends = _stepped(equations, method, s, s["w"], acceleration, thorough=thorough)
     known["squares"] = s["squares"]
     return (*parts, Part.of(f"{prefix}_end", known, _with_squares(s, *ends)))
 
 
 def _stepped(
-    equations: Equations, method: str, s: dict[str, Any], w: Any, acceleration: Callable[[Any, Any, Any], Any]
+    equations: Equations,
+    method: str,
+    s: dict[str, Any],
+    w: Any,
+    acceleration: Callable[[Any, Any, Any], Any],
+    *,
+    thorough: bool = True,
 ) -> tuple[Any, Any, Any]:
     """Return q and w after a step from q and this w, and 1 where it is lost to its constraints, else 0.
 
@@ -184,17 +196,30 @@ def _stepped(
     if not isinstance(formula, (Tableau, SemiImplicitEuler)) or not formula.explicit:
         explicit = ", ".join(m.name for m in METHODS.values() if m.kind == "fixed" and m.compiled and m.formula)
         raise InputError(f"method: expected one with an explicit step, got {method!r}; there are: {explicit}")
+    last: list[Any] = [s["q"]]
 
     def rates(t: Any, q: Any, u: Any, w: Any) -> tuple[Any, Any]:
+        last[:] = [q]
         return w if u is None else space.rate(u, w), acceleration(t, q, w)
 
     q1, w1, _ = formula.step(space, rates, SymbolicStages(space.nv), 0.0, s["dt"], s["q"], w)
     if not equations.model.constrained:
         return q1, w1, 0.0
     before, behind = equations.extra_arguments.values(), _at_time(equations, s["dt"]).values()
-    q1, v1, ends, far = projection(equations)(q1, space.to_body_velocity(q1, w1), *behind)
-    lost = ca.fmax(far, nears_singular(reach(equations)(s["q"], *before), ends))
+    v1 = space.to_body_velocity(q1, w1)
+    if thorough or not _ends_at_a_stage(formula):
+        last = [q1]
+        q1, v1, far = thorough_projection(equations)(q1, v1, *behind)
+    else:
+        q1, v1, far = quick_projection(equations)(q1, v1, *last, *behind)
+    depends = dependence(equations)
+    lost = ca.logic_or(far, nears_singular(depends(s["q"], *before), depends(*last, *behind)))
     return q1, space.to_integrator_velocity(q1, v1), lost
+
+
+def _ends_at_a_stage(formula: Tableau | SemiImplicitEuler) -> bool:
+    """Return whether the last stage is near the end of the step, so that its factors are good enough there."""
+    return isinstance(formula, Tableau) and formula.stages > 1 and bool(abs(formula.c[-1] - 1) < _SAME_TIME)
 
 
 def _symbols(equations: Equations) -> dict[str, Any]:

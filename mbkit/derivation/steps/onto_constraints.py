@@ -1,8 +1,12 @@
 """The end of a step under constraints: projection onto f = 0 and ḟ = 0, as CasADi expressions.
 
-The equation of motion holds f̈ = 0 only, so that f and ḟ drift by the step's own error. One step of Newton's iteration
-in the metric of the mass matrix, and two more with the same factors, take both to rounding, and the order of the method
-stays (Hairer, Lubich, Wanner 2006, Geometric Numerical Integration, ch. IV.4).
+The equation of motion holds f̈ = 0 only, so that f and ḟ drift by the step's own error. Newton's iteration in the metric
+of the mass matrix takes both to rounding, and the order of the method stays (Hairer, Lubich, Wanner 2006, Geometric
+Numerical Integration, ch. IV.4).
+
+As a rule one iteration is enough, with the factors that the last stage has left: the drift is that of a step, and the
+stage is near the end. `quick_projection` says where it was not, and the step is then taken again with
+`thorough_projection`, three iterations with factors of its own.
 """
 
 from __future__ import annotations
@@ -13,65 +17,95 @@ import casadi as ca
 import numpy as np
 
 from mbkit.derivation.constraints import ConstraintTerms
-from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.model.manifold import random_state
 
 #: A pose is singular ahead where J's rows would depend on each other within so many steps at the present pace.
 _AHEAD: Final = 4
-#: Of the coordinates: what the last iteration may move. The next one would move it times the first one's.
+#: Of the coordinates: what the last of three iterations may move. The next one would move it times the first one's.
 _LAST: Final = 1e-11
+#: Of the coordinates and velocities: about what one iteration may leave, if rows bend as much as they slope.
+_LEFT: Final = 1e-17
 #: Configurations at which the usual size of a row is found.
 _POSES: Final = 8
 
 
-def projection(equations: Any) -> ca.Function:
-    """Return (q, v, more) -> (q1, v1, reach, far): the consistent state near a step's end, and 1 where it is too far.
+def quick_projection(equations: Any) -> ca.Function:
+    """Return (q, v, near, more) -> (q1, v1, far): the consistent state beside a step's end.
 
-    `reach` is 0 where rows of J depend on each other or have no slope, and about 1 where they are far from that.
+    The factors are those at the configuration `near`; far is 1 where one iteration leaves more than rounding.
     """
-    if "projection" not in equations.kept:
+    if "quick projection" not in equations.kept:
         c: ConstraintTerms = equations.constraints
         q, v, extra = equations.q, equations.v, equations.extra_arguments
-        space = SymbolicSpace(equations.model)
-        Y, S, reach = _factors(equations)
+        near, by = ca.SX.sym("near", *q.shape), ca.SX.sym("by", *v.shape)
+        more, change = [*extra.values()], _change(equations)
+        du = change(near, c.value, *more)
+        # To first order in the move: what is left is its square times the velocity.
+        rate = ca.substitute(c.rate + c.rate_along(by), by, du)
+        dv = change(near, rate, *more)
+        size, apart = ca.sumsqr(du), ca.sumsqr(q - near)
+        left = (size + ca.sumsqr(dv)) * (size + apart)
+        far = left > _LEFT**2 * (1 + ca.sumsqr(q) + ca.sumsqr(v))
+        outs = [_moved(equations, q, du), v + dv, far]
+        equations.kept["quick projection"] = ca.Function("quick_projection", [q, v, near, *more], outs)
+    out: ca.Function = equations.kept["quick projection"]
+    return out
 
-        def change(residual: Any) -> Any:
-            return -ca.mtimes(Y, S.solve(residual))
 
-        def moved(q: Any, by: Any) -> Any:
-            return space.retract(q, space.to_integrator_velocity(q, by))
-
-        more = [*extra.values()]
+def thorough_projection(equations: Any) -> ca.Function:
+    """Return (q, v, more) -> (q1, v1, far): the consistent state near a step's end, and 1 where it is too far."""
+    if "thorough projection" not in equations.kept:
+        c: ConstraintTerms = equations.constraints
+        q, v, extra = equations.q, equations.v, equations.extra_arguments
+        more, change = [*extra.values()], _change(equations)
         rows = ca.Function("rows", [q, v, *more], [c.value, c.rate])
-        q1 = moved(q, change(c.value))
-        q1 = moved(q1, change(rows(q1, v, *more)[0]))
+        q1 = _moved(equations, q, change(q, c.value, *more))
+        q1 = _moved(equations, q1, change(q, rows(q1, v, *more)[0], *more))
         residual, rate = rows(q1, v, *more)
-        v1 = v + change(rate)
-        v1 = v1 + change(rows(q1, v1, *more)[1])
-        last = change(residual)
+        v1 = v + change(q, rate, *more)
+        v1 = v1 + change(q, rows(q1, v1, *more)[1], *more)
+        last = change(q, residual, *more)
         far = ca.sumsqr(last) > _LAST**2 * (1 + ca.sumsqr(q1))
-        equations.kept["projection"] = ca.Function("projection", [q, v, *more], [moved(q1, last), v1, reach, far])
-    out: ca.Function = equations.kept["projection"]
+        outs = [_moved(equations, q1, last), v1, far]
+        equations.kept["thorough projection"] = ca.Function("thorough_projection", [q, v, *more], outs)
+    out: ca.Function = equations.kept["thorough projection"]
     return out
 
 
-def reach(equations: Any) -> ca.Function:
-    """Return (q, more) -> the reach of `projection`."""
-    if "reach" not in equations.kept:
+def _moved(equations: Any, q: Any, by: Any) -> Any:
+    space = SymbolicSpace(equations.model)
+    return space.retract(q, space.to_integrator_velocity(q, by))
+
+
+def _change(equations: Any) -> ca.Function:
+    """Return (q, residual, more) -> -M⁻¹ Jᵀ S⁻¹ residual: the least change by which rows lose a residual.
+
+    Its factors are those of forward dynamics at q, which a program has once.
+    """
+    if "change" not in equations.kept:
+        own, extra = equations.constraint_factors, equations.extra_arguments
+        residual = ca.SX.sym("residual", equations.constraints.value.shape[0])
+        out = -ca.mtimes(own.Y, own.S.solve(residual))
+        equations.kept["change"] = ca.Function("change", [equations.q, residual, *extra.values()], [out])
+    change: ca.Function = equations.kept["change"]
+    return change
+
+
+def dependence(equations: Any) -> ca.Function:
+    """Return (q, more) -> how nearly rows of J depend on each other.
+
+    The largest ratio of a pivot of S at usual poses to the one at q: about 1, and infinite where a row follows from
+    others or has no slope. Its root grows as the inverse of the distance from such a pose.
+    """
+    if "dependence" not in equations.kept:
+        worst: Any = 0.0
+        for inverse, size in zip(equations.constraint_factors.S.inverse, _largest(equations), strict=True):
+            worst = ca.fmax(worst, size * inverse)
         given = [equations.q, *equations.extra_arguments.values()]
-        equations.kept["reach"] = ca.Function("reach", given, [_factors(equations)[2]])
-    out: ca.Function = equations.kept["reach"]
+        equations.kept["dependence"] = ca.Function("dependence", given, [worst])
+    out: ca.Function = equations.kept["dependence"]
     return out
-
-
-def _factors(equations: Any) -> tuple[Any, Factors, Any]:
-    """Return Y = M⁻¹ Jᵀ, the factors of S = J Y, and the root of the smallest pivot of S beside what it can be."""
-    own, sizes = equations.constraint_factors, _largest(equations)
-    worst: Any = 0.0
-    for inverse, size in zip(own.S.inverse, sizes, strict=True):
-        worst = ca.fmax(worst, size * inverse)
-    return own.Y, own.S, 1 / ca.sqrt(worst)
 
 
 def _largest(equations: Any) -> list[float]:
@@ -87,5 +121,9 @@ def _largest(equations: Any) -> list[float]:
 
 
 def nears_singular(before: Any, behind: Any) -> Any:
-    """Return 1 where a step that changes the reach so would meet a singular pose within a few more of its kind."""
-    return behind < _AHEAD * ca.fabs(behind - before)
+    """Return 1 where a step that changes the `dependence` so would meet a singular pose within a few more of its kind.
+
+    With r = 1/√dependence, as far from such a pose: r1 < n abs(r1 - r0), or r1 > n/(n - 1) r0, or r1 < n/(n + 1) r0.
+    """
+    nearer, farther = (_AHEAD + 1) ** 2 / _AHEAD**2, (_AHEAD - 1) ** 2 / _AHEAD**2
+    return ca.logic_or(behind > nearer * before, behind < farther * before)

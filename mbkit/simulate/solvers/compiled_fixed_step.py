@@ -265,43 +265,50 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core."""
     dyn, method, grid, record = problem.dyn, problem.method, problem.grid, GridRecord(problem)
     assert isinstance(dyn, LagrangianDynamics)
-    plan, space, n = dyn.step_plan(method), Space(dyn.model), len(problem.q)
+    space = Space(dyn.model)
     w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn.parameter_values
     clock = None if dyn.model.time_parameter is None else list(dyn.model.parameters).index(dyn.model.time_parameter)
-    squares = np.zeros(n)
+    workers = workers or dyn.threads or cores()
+    # Every block costs some calls: worth it for a state now and then, not for most.
+    dense = 2 * len(record.kept) > grid.steps
 
-    def new_chunk(most: int, *, all_kept: bool, watched: bool = False) -> Chunk:
+    def new_chunk(plan: Plan, most: int, *, all_kept: bool, watched: bool = False) -> Chunk:
         return Chunk(plan, space, most, torques=problem.torque.held, all_kept=all_kept, watched=watched, clock=clock)
 
     def blocks(chunk: Chunk, members: Indices, ends: Indices) -> Iterator[tuple[int, dict[int, list[Array]]]]:
         chunk.begin(problem.q[members], w0[members], values[members] if values.ndim == 2 else values)
         return run_blocks(problem, record, chunk, members, ends.tolist())
 
-    workers = workers or dyn.threads or cores()
-    parts = _split(n, _widest(plan), workers)
-    # Every block costs some calls: worth it for a state now and then, not for most.
-    dense = 2 * len(record.kept) > grid.steps
+    def suspects_of(plan: Plan, members: Indices) -> Indices:
+        """Take members of the batch to the end; return those that were not bounded, or lost to their constraints."""
+        n, squares = len(members), np.zeros(len(members))
+        parts = _split(n, _widest(plan), workers)
 
-    def new_worker() -> Callable[[slice], Iterator[int]]:
-        # The parts differ by one state at most.
-        chunk = new_chunk(-(-n // len(parts)), all_kept=dense)
+        def new_worker() -> Callable[[slice], Iterator[int]]:
+            # The parts differ by one state at most.
+            chunk = new_chunk(plan, -(-n // len(parts)), all_kept=dense)
 
-        def run(part: slice) -> Iterator[int]:
-            for end, _ in blocks(chunk, np.arange(n)[part], record.kept[:0] if dense else record.kept):
-                yield end
-            squares[part] = chunk.states("squares", [0])[:, 0, 0]
+            def run(part: slice) -> Iterator[int]:
+                for end, _ in blocks(chunk, members[part], record.kept[:0] if dense else record.kept):
+                    yield end
+                squares[part] = chunk.states("squares", [0])[:, 0, 0]
 
-        return run
+            return run
 
-    run_parts(parts, new_worker, workers, grid.steps, problem.bar)
-    # A NaN is not below anything.
-    suspects, lost = np.flatnonzero(~(squares < BOUND**2)), dict[int, list[Array]]()
+        run_parts(parts, new_worker, workers, grid.steps, problem.bar)
+        # A NaN is not below anything.
+        return members[~(squares < BOUND**2)]
+
+    plan, lost = dyn.step_plan(method), dict[int, list[Array]]()
+    suspects = suspects_of(plan, np.arange(len(problem.q)))
     if len(suspects) and dyn.model.constrained:
-        # Near a singular pose stages are projected too, and the pose is told.
-        return run_fixed(problem)
+        if len(suspects_of(dyn.step_plan(method, thorough=True), suspects)):
+            # Near a singular pose stages are projected too, and the pose is told.
+            return run_fixed(problem)
+        suspects = suspects[:0]
     for first in range(0, len(suspects), _widest(plan)):
         members = suspects[first : first + _widest(plan)]
-        for _, last in blocks(new_chunk(len(members), all_kept=True, watched=True), members, members[:0]):
+        for _, last in blocks(new_chunk(plan, len(members), all_kept=True, watched=True), members, members[:0]):
             lost |= last
 
     def why(i: int) -> str:
