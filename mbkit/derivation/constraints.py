@@ -26,6 +26,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector
+from mbkit.derivation.least_constraint import hard_poses
 from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.errors import InputError
 from mbkit.model import Model
@@ -38,8 +39,10 @@ from mbkit.model.validation import sample_mass_matrix
 #: Mass of a coordinate that has none, in terms of the mean one.
 _MASSLESS: Final = 1e-20
 _TINY: Final = 1e-300
-#: Times that a solution is refined. Each time leaves what the factors lose of the error before.
-_REFINED: Final = 2
+#: Times that a solution is refined by careful factors, and by those of a mass matrix that loses digits where a joint
+#: locks. Each time leaves what the factors lose of the error before.
+_REFINED_CAREFUL: Final = 2
+_REFINED: Final = 1
 #: Part of a row that is left of it, once the others are taken away, up to which it follows from them.
 DEPENDENT: Final = 1e-7
 #: Of a mechanism's size: what a few typed digits leave where ends can meet.
@@ -50,6 +53,10 @@ _STARTS: Final = 12
 _STEPS: Final = 60
 #: Smallest eigenvalue of a mass matrix with a unit diagonal that still has an inverse of some digits.
 _SINGULAR: Final = 1e-9
+#: Eigenvalue up to which elimination loses more than some five digits, and how many times as large it has to be with
+#: constraints in the matrix for these to be worth their operations.
+_LOSES: Final = 1e-5
+_BETTER: Final = 1e3
 #: Residual of a closed configuration, m or rad.
 _CLOSED: Final = 1e-10
 
@@ -97,15 +104,15 @@ class ConstraintTerms:
 
 
 class ConstraintFactors:
-    """Factors of M and of S = J M⁻¹ Jᵀ, which give v̇ and λ.
+    """Factors of M and of S = J M⁻¹ Jᵀ, which give v̇ and λ, and how often the solution is `refined`.
 
     Where M itself would lose digits or has no inverse, as with links without mass in a loop, `careful` ones are those
-    of W = M + Jᵀ diag(s) J, and the solution is refined. Near a singular pose, and with masses that differ by decades,
-    factors lose the square of the digits that the equations lose.
+    of W = M + Jᵀ diag(s) J. Near a singular pose, and with masses that differ by decades, factors lose the square of
+    the digits that the equations lose.
     """
 
-    def __init__(self, c: ConstraintTerms, M: Any, order: tuple[int, ...], *, careful: bool) -> None:
-        self._c, self._M, self._careful = c, M, careful
+    def __init__(self, c: ConstraintTerms, M: Any, order: tuple[int, ...], *, careful: bool, refined: int) -> None:
+        self._c, self._M, self._careful, self._refined = c, M, careful, refined
         self._stiffening = c.stiffening(M) if careful else None
         self._W = Factors(c.weight(M) if careful else M, order)
         #: W⁻¹ Jᵀ, (n, m), and J W⁻¹ Jᵀ with its factors.
@@ -128,7 +135,7 @@ class ConstraintFactors:
         """
         c, M = self._c, self._M
         a, multipliers = self._solved(force, -c.gamma)
-        for _ in range(_REFINED if self._careful else 0):
+        for _ in range(self._refined):
             left = force - ca.mtimes(M, a) + ca.mtimes(c.jacobian.T, multipliers)
             da, more = self._solved(left, -c.gamma - ca.mtimes(c.jacobian, a))
             a, multipliers = a + da, multipliers + more
@@ -357,12 +364,16 @@ def singular_mass_matrix(model: Model) -> bool:
     """Return whether M of the tree has no inverse, or is not known, at the model's nominal numbers."""
     if any(x is None for x in model.parameters.values()):
         return True
-    M = sample_mass_matrix(model)
+    return _least_part(sample_mass_matrix(model)) < _SINGULAR
+
+
+def _least_part(M: Array) -> float:
+    """Return the smallest eigenvalue of a symmetric matrix with its diagonal scaled to one; 0 where that is not done."""
     diagonal = np.diag(M)
     if not (np.isfinite(M).all() and (diagonal > 0).all()):
-        return True
+        return 0.0
     root = np.sqrt(diagonal)
-    return bool(np.linalg.eigvalsh(M / root[:, None] / root)[0] < _SINGULAR)
+    return max(float(np.linalg.eigvalsh(M / root[:, None] / root)[0]), 0.0)
 
 
 class ConstraintQuantities:
@@ -418,6 +429,7 @@ class ConstrainedMotion(ConstraintQuantities):
     nle: Any
     elimination: Any
     elimination_order: tuple[int, ...]
+    extra_arguments: dict[str, ca.SX]
 
     @property
     def time(self) -> Any:
@@ -457,8 +469,26 @@ class ConstrainedMotion(ConstraintQuantities):
     @cached_property
     def constraint_factors(self) -> ConstraintFactors:
         """Factors of M, or more careful ones where M would lose digits, and of J M⁻¹ Jᵀ."""
-        careful = self.elimination == "least constraint" or singular_mass_matrix(self.model)
-        return ConstraintFactors(self.constraints, self.mass_matrix, self.elimination_order, careful=careful)
+        doubtful = self.elimination == "least constraint"
+        careful = singular_mass_matrix(self.model) or (doubtful and self._constraints_hold_what_mass_does_not())
+        times = _REFINED_CAREFUL if careful else _REFINED if doubtful else 0
+        return ConstraintFactors(
+            self.constraints, self.mass_matrix, self.elimination_order, careful=careful, refined=times
+        )
+
+    def _constraints_hold_what_mass_does_not(self) -> bool:
+        """Return whether W = M + Jᵀ diag(s) J of `ConstraintTerms` keeps digits that M loses at some hard pose.
+
+        Not where a joint locks, or a thin rod turns about its line: loops do not see that motion either.
+        """
+        given = [np.array(list(self.model.parameters.values()), dtype=np.float64)] if self.extra_arguments else []
+        weights = [ca.densify(x) for x in (self.mass_matrix, self.constraints.weight(self.mass_matrix))]
+        matrices = ca.Function("weights", [self.q, *self.extra_arguments.values()], weights)
+        for q in hard_poses(self.model, np.random.default_rng(0)):
+            mass, held = (_least_part(np.array(x)) for x in matrices(q, *given))
+            if mass < _LOSES and held > max(_BETTER * mass, _SINGULAR):
+                return True
+        return False
 
     @cached_property
     def _constrained(self) -> tuple[Any, Any]:

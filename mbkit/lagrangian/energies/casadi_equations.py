@@ -128,7 +128,7 @@ class EnergyEquations(ConstraintQuantities, Equations):
     @cached_property
     def constraint_factors(self) -> ConstraintFactors:
         """Factors of M and of J M⁻¹ Jᵀ."""
-        return ConstraintFactors(self.constraints, self.mass_matrix, self.elimination_order, careful=True)
+        return ConstraintFactors(self.constraints, self.mass_matrix, self.elimination_order, careful=True, refined=2)
 
     @cached_property
     def _constrained(self) -> tuple[Any, Any]:
