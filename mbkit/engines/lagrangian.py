@@ -422,8 +422,12 @@ class LagrangianDynamics(Dynamics):
             dt = real("dt", dt)
         # Another method may have been registered by this name.
         if held is not None and held[0] is METHODS.get(method) and dt > 0:
-            behind = self._trailing(q) if self._parametric else ()
-            out: tuple[Array, Array] | None = held[1].single(q, v, tau, dt, *behind)
+            out: tuple[Array, Array] | None
+            if not self._parametric:
+                out, behind = held[1].single(q, v, tau, dt), ()
+            else:
+                behind = self._trailing(q)
+                out = held[1].single(q, v, tau, dt, *behind)
             if out is not None or (out := held[1].batch(q, v, tau, dt, *behind, threads=self.threads)) is not None:
                 return out
         return super().step(q, v, tau, dt, method, wrenches, axes)

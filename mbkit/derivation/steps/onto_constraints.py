@@ -25,7 +25,7 @@ _AHEAD: Final = 4
 #: Of the coordinates: what the last of three iterations may move. The next one would move it times the first one's.
 _LAST: Final = 1e-11
 #: Of the coordinates and velocities: about what one iteration may leave, if rows bend as much as they slope.
-_LEFT: Final = 1e-17
+_LEFT: Final = 1e-16
 #: Configurations at which the usual size of a row is found.
 _POSES: Final = 8
 
