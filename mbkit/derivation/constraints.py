@@ -112,7 +112,7 @@ class ConstraintFactors:
     """
 
     def __init__(self, c: ConstraintTerms, M: Any, order: tuple[int, ...], *, careful: bool, refined: int) -> None:
-        self._c, self._M, self._careful, self._refined = c, M, careful, refined
+        self._c, self._M, self.careful, self._refined = c, M, careful, refined
         self._stiffening = c.stiffening(M) if careful else None
         self._W = Factors(c.weight(M) if careful else M, order)
         #: W⁻¹ Jᵀ, (n, m), and J W⁻¹ Jᵀ with its factors.
@@ -120,10 +120,10 @@ class ConstraintFactors:
         self.matrix = ca.mtimes(c.jacobian, self.Y)
         self.S = Factors(self.matrix, range(c.value.shape[0]))
 
-    def _solved(self, force: Any, rate: Any) -> tuple[Any, Any]:
+    def solved(self, force: Any, rate: Any) -> tuple[Any, Any]:
         """Return x and λ of M x - Jᵀ λ = force, J x = rate."""
         J = self._c.jacobian
-        given = force + ca.mtimes(J.T, self._stiffening * rate) if self._careful else force
+        given = force + ca.mtimes(J.T, self._stiffening * rate) if self.careful else force
         free = self._W.solve(given)
         multipliers = self.S.solve(rate - ca.mtimes(J, free))
         return free + ca.mtimes(self.Y, multipliers), multipliers
@@ -134,10 +134,10 @@ class ConstraintFactors:
         Only f̈ = 0 holds: integrators project drifted states (`mbkit.derivation.steps.onto_constraints`).
         """
         c, M = self._c, self._M
-        a, multipliers = self._solved(force, -c.gamma)
+        a, multipliers = self.solved(force, -c.gamma)
         for _ in range(self._refined):
             left = force - ca.mtimes(M, a) + ca.mtimes(c.jacobian.T, multipliers)
-            da, more = self._solved(left, -c.gamma - ca.mtimes(c.jacobian, a))
+            da, more = self.solved(left, -c.gamma - ca.mtimes(c.jacobian, a))
             a, multipliers = a + da, multipliers + more
         return a, multipliers
 
@@ -368,7 +368,7 @@ def singular_mass_matrix(model: Model) -> bool:
 
 
 def _least_part(M: Array) -> float:
-    """Return the smallest eigenvalue of a symmetric matrix with its diagonal scaled to one; 0 where that is not done."""
+    """Return the smallest eigenvalue of a mass matrix once its diagonal is scaled to one; 0 where that is not done."""
     diagonal = np.diag(M)
     if not (np.isfinite(M).all() and (diagonal > 0).all()):
         return 0.0

@@ -17,8 +17,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_times
-from mbkit.errors import InputError, UnsupportedError
-from mbkit.methods.registry import ADAPTIVE_METHOD, IMPLICIT_METHODS, SERIES_METHOD
+from mbkit.errors import InputError
 from mbkit.simulate.result import SolverResult
 
 if TYPE_CHECKING:
@@ -160,12 +159,3 @@ def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:
         own = own.of_samples(np.repeat(np.arange(trajectories), shape[1]))
     flat_q[good], flat_v[good] = manifold_of(own.of_samples(good)).pulled(flat_q[good], flat_v[good])
     return replace(outcome, q=q, v=v)
-
-
-def refuse_constraints(dyn: Dynamics, method: str, why: str) -> None:
-    """Raise where a method does not run under constraints."""
-    if dyn.model.constrained:
-        raise UnsupportedError(
-            f"{method}: {dyn.model.name} has constraints, {why}; {IMPLICIT_METHODS} are the implicit methods "
-            f"for it, {ADAPTIVE_METHOD!r} and {SERIES_METHOD!r} the accurate ones"
-        )

@@ -165,7 +165,7 @@ def march_in_stages(equations: Equations, method: str, *, thorough: bool = False
             writes = dict(zip(at, (q, v), strict=True))
             if timed:
                 more = (f"parameters_{i}",)
-                writes[more[0]] = _at_time(equations, t)["parameters"]
+                writes[more[0]] = at_time(equations, t)["parameters"]
             parts.append(Part.of(f"{prefix}_stage_{i}", known, writes))
         reads = (*at, "tau", *more)
         parts.append(Part("forward_dynamics", reads, (f"a_{i}",), lambda: equations.function("forward_dynamics")))
@@ -205,7 +205,7 @@ def _stepped(
     q1, w1, _ = formula.step(space, rates, SymbolicStages(space.nv), 0.0, s["dt"], s["q"], w)
     if not equations.model.constrained:
         return q1, w1, 0.0
-    before, behind = equations.extra_arguments.values(), _at_time(equations, s["dt"]).values()
+    before, behind = equations.extra_arguments.values(), at_time(equations, s["dt"]).values()
     v1 = space.to_body_velocity(q1, w1)
     if thorough or not _ends_at_a_stage(formula):
         last = [q1]
@@ -233,12 +233,12 @@ def _acceleration(equations: Equations, space: Space, s: dict[str, Any]) -> Call
 
     def acceleration(t: Any, q: Any, w: Any) -> Any:
         v = space.to_body_velocity(q, w)
-        return space.acceleration(q, v, forward(q, v, s["tau"], *_at_time(equations, t).values()))
+        return space.acceleration(q, v, forward(q, v, s["tau"], *at_time(equations, t).values()))
 
     return acceleration
 
 
-def _at_time(equations: Equations, t: Any) -> dict[str, Any]:
+def at_time(equations: Equations, t: Any) -> dict[str, Any]:
     """Return the extra arguments t seconds after the step's start: the time is the last of the parameters."""
     given = dict(equations.extra_arguments)
     if equations.model.time_parameter is not None:

@@ -113,7 +113,9 @@ class Midpoint:
     def __init__(self, equations: Equations) -> None:
         self._equations, self._space = equations, _MomentumSpace(equations.model)
         nq, nv = equations.model.nq, equations.model.nv
-        sizes = {"q": nq, **dict.fromkeys(("v", "v1", "pi", "w", "w_1", "w_2"), nv)}
+        #: Entries of a step's unknown.
+        self.unknowns = self._size_of_unknowns()
+        sizes = {"q": nq, **dict.fromkeys(("v", "v1", "pi"), nv), **dict.fromkeys(("w", "w_1", "w_2"), self.unknowns)}
         sizes |= {"tau": equations.force.numel(), **dict.fromkeys(("dt", "miss", "misses"), 1)}
         self._s = {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
         step = ("q", "pi", "w", "tau", "dt")
@@ -144,6 +146,9 @@ class Midpoint:
 
         return Part(name, reads, writes, function)
 
+    def _size_of_unknowns(self) -> int:
+        return self._equations.model.nv
+
     def _at_midpoint(self, w: Any) -> tuple[Any, Any, Any]:
         """Return q_m, μ and f of a step with this velocity."""
         s = self._s
@@ -155,7 +160,8 @@ class Midpoint:
     def _forces(self) -> ca.Function:
         """(q, w, tau) -> μ = ∂L/∂w and f = ∂L/∂q + τ + damping, along `move`."""
         eq, space = self._equations, self._space
-        w = self._s["w"]
+        # Its own argument, of a velocity's size.
+        w = self._s["v"]
         v = space.to_body_velocity(eq.q, w)
         kinetic = ca.substitute(eq.kinetic_energy, eq.v, v)
         applied = eq.tau + ca.substitute(eq.damping, eq.v, v)
@@ -181,19 +187,17 @@ class Midpoint:
         factors = Factors.of(jacobian, self._equations.elimination_order)
         change = factors.applied(factors.values, ca.vertsplit(residual))
         w1 = s["w"] - change
-        reach = (LEAST / s["dt"]) ** 2
-        limit = SMALL**2 * ca.sumsqr(w1) + reach * (1 + ca.sumsqr(s["q"]))
-        # A NaN is not below anything.
-        return w1, 1 - (ca.sumsqr(change) < limit)
+        return w1, 1 - is_last(change, w1, s["q"], s["dt"])
 
     def _end(self) -> tuple[Any, ...]:
         s, h = self._s, self._s["dt"]
         q_m, _, f = self._at_midpoint(s["w"])
         q1 = self._space.retract(s["q"], h * s["w"])
         pi1 = s["pi"] + h * self._space.to_fixed(q_m, f)
-        guess = sum(weight * s[n] for weight, n in zip(GUESS, ("w", "w_1", "w_2"), strict=True))
-        lost = 1 - (ca.sumsqr(q1) + ca.sumsqr(pi1) < _RUNAWAY)
-        return q1, pi1, guess, s["misses"] + s["miss"] + lost
+        return q1, pi1, self._guess(), s["misses"] + s["miss"] + is_lost(q1, pi1)
+
+    def _guess(self) -> Any:
+        return sum(weight * self._s[n] for weight, n in zip(GUESS, ("w", "w_1", "w_2"), strict=True))
 
     def _momentum(self) -> tuple[Any]:
         eq, s = self._equations, self._s
@@ -230,3 +234,14 @@ class Midpoint:
 
     def _velocity(self) -> tuple[Any]:
         return (solve(*self._velocity_system(), self._equations.elimination_order),)
+
+
+def is_last(change: Any, w: Any, q: Any, h: Any) -> Any:
+    """Return 1 where a correction of w was the last one needed, else 0."""
+    # A NaN is not below anything.
+    return ca.sumsqr(change) < SMALL**2 * ca.sumsqr(w) + (LEAST / h) ** 2 * (1 + ca.sumsqr(q))
+
+
+def is_lost(q: Any, pi: Any) -> Any:
+    """Return 1 where a state is beyond all bounds, else 0."""
+    return 1 - (ca.sumsqr(q) + ca.sumsqr(pi) < _RUNAWAY)

@@ -351,11 +351,11 @@ class MidpointChunk(BlockLoop):
 
     carried = ("q", "pi")
 
-    def __init__(self, dyn: LagrangianDynamics, count: int, steps: int, *, torques: bool) -> None:
-        midpoint, nq, nv = Midpoint(dyn.equations), dyn.model.nq, dyn.model.nv
+    def __init__(self, dyn: LagrangianDynamics, midpoint: Midpoint, count: int, steps: int, *, torques: bool) -> None:
+        nq, nv, unknowns = dyn.model.nq, dyn.model.nv, midpoint.unknowns
         self._newton, self._end = midpoint.newton, midpoint.end
         self._codes = {part.name: dyn.code(part.name, make=part.make) for part in (self._newton, self._end)}
-        most = min(_CACHE // (8 * padded(count) * (nq + 3 * nv + 1)), _LONGEST, isqrt(steps))
+        most = min(_CACHE // (8 * padded(count) * (nq + nv + 2 * unknowns + 1)), _LONGEST, isqrt(steps))
         n, back = max(most, _SHORTEST), len(GUESS) - 1
         self._longest, self.block = n, _FIRST
         # The time is one of the parameters, and another in each step.
@@ -363,7 +363,8 @@ class MidpointChunk(BlockLoop):
         self._clock = None if clock is None else names.index(clock)
         # The velocity of each step behind those of the last ones before the block.
         sizes = {"q": (n + 1, nq), "pi": (n + 1, nv), "misses": (n + 1, 1)}
-        sizes |= {"w": (n + back, nv), "guess": (2, nv), "trial": (2, nv), "miss": (1, 1), "dt": (1, 1)}
+        sizes |= {"w": (n + back, unknowns), **dict.fromkeys(("guess", "trial"), (2, unknowns))}
+        sizes |= {"miss": (1, 1), "dt": (1, 1)}
         sizes["tau"] = n if torques else 1, dyn.equations.force.numel()
         sizes["parameters"] = 1 if clock is None else n, len(names)
         super().__init__(sizes, count)

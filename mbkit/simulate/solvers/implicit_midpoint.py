@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.mass_matrix_solve import factors_written_out
+from mbkit.derivation.steps.constrained_midpoint import ConstrainedMidpoint
 from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import GUESS, LEAST, MOST, SMALL, Midpoint
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import FunctionError
 from mbkit.model.integration_space import Space
-from mbkit.simulate.constraint_projection import refuse_constraints
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.fixed_step import GridRecord, SteppedRun, Stepper
@@ -42,15 +42,15 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
     """Step one state or a batch over the grid; a trajectory that diverges stops there, and the others go on."""
     dyn = problem.dyn
     assert isinstance(dyn, LagrangianDynamics)
-    refuse_constraints(dyn, problem.method, "which its step in (q, p) does not know")
-    midpoint, q0 = Midpoint(dyn.equations), problem.q
+    midpoint, q0 = midpoint_of(dyn), problem.q
     why: Callable[[int], str]
     error: FunctionError | None = None
-    w0 = Space(dyn.model).to_integrator_velocity(q0, problem.v)
+    w0 = np.zeros((len(q0), midpoint.unknowns))
+    w0[:, : dyn.model.nv] = Space(dyn.model).to_integrator_velocity(q0, problem.v)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         (pi0,) = called(dyn, midpoint.momentum, None, problem.start, q0, problem.v)
         if _machine_code(dyn, midpoint, problem):
-            record, iterations, why = _in_chunks(dyn, problem, pi0, w0)
+            record, iterations, why = _in_chunks(dyn, midpoint, problem, pi0, w0)
         else:
             stepper = MidpointStepper(dyn, problem, w0)
             run = SteppedRun(problem, stepper, pi0[0] if problem.batch is None else pi0)
@@ -60,6 +60,11 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
     # Each iteration is an evaluation, and so is the end of each step.
     evaluations = iterations + int(record.steps.sum())
     return record.result(why, evaluations, iterations, error)
+
+
+def midpoint_of(dyn: LagrangianDynamics) -> Midpoint:
+    """Return the parts of a step of these dynamics."""
+    return (ConstrainedMidpoint if dyn.model.constrained else Midpoint)(dyn.equations)
 
 
 def called(
@@ -103,7 +108,7 @@ def _reason(q: Array, pi: Array) -> str:
 
 
 def _in_chunks(
-    dyn: LagrangianDynamics, problem: IntegrationProblem, pi0: Array, w0: Array
+    dyn: LagrangianDynamics, midpoint: Midpoint, problem: IntegrationProblem, pi0: Array, w0: Array
 ) -> tuple[GridRecord, int, Callable[[int], str]]:
     """Run every trajectory, some side by side, and such chunks at once on several cores.
 
@@ -121,7 +126,7 @@ def _in_chunks(
 
     def run(part: slice) -> Iterator[int]:
         members = np.arange(n)[part]
-        chunk = MidpointChunk(dyn, len(members), grid.steps, torques=problem.torque.held)
+        chunk = MidpointChunk(dyn, midpoint, len(members), grid.steps, torques=problem.torque.held)
         chunk.begin(problem.q[part], pi0[part], w0[part], values[part] if values.ndim == 2 else values)
         for end, lost in run_blocks(problem, record, chunk, members):
             reasons.update({i: _reason(*last) for i, last in lost.items()})
@@ -136,7 +141,7 @@ class MidpointStepper(Stepper):
     """Newton's iteration for trajectories side by side, one step at a time; `iterations` are of all together."""
 
     def __init__(self, dyn: LagrangianDynamics, problem: IntegrationProblem, w0: Array) -> None:
-        self._dyn, self._midpoint, self._space = dyn, Midpoint(dyn.equations), Space(dyn.model)
+        self._dyn, self._midpoint, self._space = dyn, midpoint_of(dyn), Space(dyn.model)
         self._single = problem.batch is None
         self._members: Indices = np.arange(len(w0))
         # The velocities of the last steps, and the first guess of the next one.
@@ -177,8 +182,9 @@ class MidpointStepper(Stepper):
             if not len(todo):
                 break
             if not isinstance(force, np.ndarray):
-                q_m = self._space.retract(q[todo], (h / 2) * w[todo])
-                state = q_m, self._space.to_body_velocity(q_m, w[todo])
+                velocity = w[todo, : self._space.nv]
+                q_m = self._space.retract(q[todo], (h / 2) * velocity)
+                state = q_m, self._space.to_body_velocity(q_m, velocity)
                 tau[todo] = force(t + h / 2, *(x[0] for x in state)) if self._single else force(t + h / 2, *state, todo)
             w1, solved = self._newton(self._members[todo], t + h / 2, q[todo], pi[todo], w[todo], tau[todo], h)
             change = np.abs(w1 - w[todo]).max(axis=1, initial=0.0)
