@@ -131,10 +131,6 @@ def test_every_method_stays_on_the_constraints(rod, method):
     q, v = on_circle(1.0, 0.3)
     dyn = rod.dynamics(options=OWN)
     kind = METHODS[method]
-    if method == "implicit_midpoint":
-        with pytest.raises(UnsupportedError, match="gauss4"):
-            mb.simulate(dyn, q, v, 1.0, method)
-        return
     grid = np.linspace(0, 2.0, 21)
     how = {"dt": 0.01} if kind.kind == "fixed" else {"rtol": 1e-8}
     run = mb.simulate(dyn, q, v, 2.0, method, save=grid, **how)
@@ -142,7 +138,13 @@ def test_every_method_stays_on_the_constraints(rod, method):
     exact = mb.simulate(by_angle().dynamics(options=OWN), [1.0], [0.3], 2.0, "dop853", rtol=1e-13, save=grid)
     error = np.abs(run.q - 1.5 * np.column_stack([np.sin(exact.q[:, 0]), -np.cos(exact.q[:, 0])])).max()
     # Of the methods' own order: Euler's of first order is the coarse one.
-    assert error < {"semi_implicit_euler": 0.1, "bdf": 1e-5, "cvodes": 1e-5, "lsoda": 1e-5}.get(method, 1e-6)
+    assert error < {
+        "semi_implicit_euler": 0.1,
+        "implicit_midpoint": 1e-3,
+        "bdf": 1e-5,
+        "cvodes": 1e-5,
+        "lsoda": 1e-5,
+    }.get(method, 1e-6)
 
 
 def test_ten_thousand_steps_of_the_coarsest_method_stay_on_the_constraints(rod):

@@ -18,7 +18,7 @@ The unknowns of a step are w and, behind it, λ.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import casadi as ca
 
@@ -26,6 +26,9 @@ from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import at_time
 from mbkit.derivation.steps.midpoint import Midpoint, is_last, is_lost
 from mbkit.derivation.steps.rosenbrock import Factors
+
+#: Of a row without slope, or one that moves links without mass alone.
+_TINY: Final = 1e-150
 
 
 class ConstrainedMidpoint(Midpoint):
@@ -86,9 +89,7 @@ class ConstrainedMidpoint(Midpoint):
         momentum, end, pushes = self._whole(w, 0 * multipliers)
         by_w, slopes = ca.jacobian(momentum, s["w"])[:, : eq.model.nv], ca.jacobian(end, s["w"])[:, : eq.model.nv]
         if eq.constraint_factors.careful:
-            # Zero with the constraints, and an inverse where the mass has none.
-            weight = ca.mtimes(pushes, ca.diag(eq.constraints.stiffening(eq.mass_matrix)))
-            weight = ca.substitute(weight, eq.q, s["q"])
+            weight = ca.mtimes(pushes, ca.diag(self._masses(s["q"], *self._at(-0.5))))
             momentum, by_w = momentum + ca.mtimes(weight, end), by_w + ca.mtimes(weight, slopes)
         factors = Factors.of(by_w, eq.elimination_order)
         free, *columns = (
@@ -100,6 +101,17 @@ class ConstrainedMidpoint(Midpoint):
         new = S.applied(S.values, ca.vertsplit(ca.mtimes(slopes, free) - end))
         change = free - ca.mtimes(Y, new)
         return ca.vertcat(w - change, new), 1 - is_last(change, w - change, s["q"], s["dt"])
+
+    @cached_property
+    def _masses(self) -> ca.Function:
+        """(q) -> s > 0 of each row, the mean mass along it: J0ᵀ diag(s) J1 has an inverse where the mass has none.
+
+        The term is zero with the constraints, and as heavy as the links that are not without mass.
+        """
+        eq = self._equations
+        squares, masses = eq.constraints.jacobian**2, ca.diag(eq.mass_matrix)
+        out = (ca.mtimes(squares, masses) + _TINY) / (ca.sum2(squares) + _TINY) ** 2
+        return ca.Function("masses", [eq.q, *eq.extra_arguments.values()], [out])
 
     def _end(self) -> tuple[Any, ...]:
         s, h, space = self._s, self._s["dt"], self._space
