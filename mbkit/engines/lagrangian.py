@@ -364,7 +364,11 @@ class LagrangianDynamics(Dynamics):
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         if self.model.constrained:
-            self.model.require_independent(q, once=True)
+            # Kept with the equations: a run at other times, or of another object, asks again at every evaluation.
+            manifold = self._states_held.Manifold(self)
+            if not manifold.judged:
+                self.model.require_independent(q, once=True)
+                manifold.judge()
         return self._trimmed("forward_dynamics", q, v, tau)
 
     # Steps
