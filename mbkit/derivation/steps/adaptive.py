@@ -3,19 +3,29 @@
 It ends at the end of the run if that is near, estimates its error, and either goes on to the new state or stays; the
 length of the next attempt is chosen too. The formulas are those of `mbkit.methods`. On rotations the error is that of
 the rotation vector, relative to 1.
+
+Under constraints the new state is the consistent one beside the step's end. A step whose end is too far from them is
+rejected, and one that ends near a singular pose has an infinite error, by which the caller knows it.
 """
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any, Final
 
 import casadi as ca
 
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import Part, SymbolicStages, function_of
+from mbkit.derivation.steps.onto_constraints import dependence, thorough_projection
 from mbkit.derivation.steps.symbols import SYMBOLS, SymbolicSpace, choose
 from mbkit.methods.one_step import StepFactors, embedded_error, end_of_attempt, larger, next_step, predictive_factors
 from mbkit.methods.tableaus import EmbeddedTableau
+
+#: A step's end that is too far from its constraints has at least so many times the tolerated error.
+_TOO_FAR: Final = 1e3
+#: Dependence of rows at which a pose counts as singular: a hundredth of the usual distance from one.
+_SINGULAR: Final = 1e4
 
 #: A round reads these and writes the same names with a 1 behind, from which the next one starts. `h` is the length to
 #: try, `most` what it may grow by at most, `last` the 32nd root of the last accepted error, `end` the time not to pass.
@@ -47,6 +57,8 @@ def embedded_parts(equations: Equations, tableau: EmbeddedTableau) -> list[Part]
     q1, w1, u = tableau.step(parts.space, rates, stages, s["t"], s["step"], s["q"], s["w"])
     scales = parts.scales(q1, w1, u)
     error = embedded_error(SYMBOLS, tableau.errors, stages, scales, s["step"], 2 * equations.model.nv)
+    if equations.model.constrained:
+        q1, w1, error = parts.onto_constraints(q1, w1, error)
     parts.decide(known, q1, w1, error, predictive_factors(SYMBOLS, error, s["last"]))
     return parts.parts
 
@@ -104,6 +116,14 @@ class AttemptParts:
         )
         return by_u, by_w
 
+    def onto_constraints(self, q1: Any, w1: Any, error: Any) -> tuple[Any, Any, Any]:
+        """Return the consistent state beside a step's end, and the error that it counts as."""
+        extra, space = self.equations.extra_arguments, self.space
+        q, v, far = thorough_projection(self.equations)(q1, space.to_body_velocity(q1, w1), *extra.values())
+        singular = dependence(self.equations)(q1, *extra.values()) > _SINGULAR
+        error = choose(far, larger(SYMBOLS, error, _TOO_FAR), error)
+        return q, space.to_integrator_velocity(q, v), choose(singular, inf, error)
+
     def decide(self, rates: dict[str, Any], q1: Any, w1: Any, error: Any, factors: StepFactors) -> None:
         """Go on to the new state if its error is below 1, or stay; choose the length of the next attempt."""
         s = self.named("q", "w", "t", "h", "most", "last", "end", "step", "t_new", "rtol", "atol", "least")
@@ -112,4 +132,5 @@ class AttemptParts:
         h, most, last = next_step(SYMBOLS, factors, good, s["step"], s["h"], s["most"], s["last"])
         q, w, t = (choose(good, new, s[old]) for new, old in ((q1, "q"), (w1, "w"), (s["t_new"], "t")))
         state = q, w, t, h, most, last, s["end"], error, (t < s["end"]) * (s["least"] < h)
-        self.add("end", {**s, **rates}, {f"{name}1": value for name, value in zip(STATE, state, strict=True)})
+        extra = self.equations.extra_arguments if self.equations.model.constrained else {}
+        self.add("end", {**s, **rates, **extra}, {f"{name}1": value for name, value in zip(STATE, state, strict=True)})

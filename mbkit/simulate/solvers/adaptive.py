@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Final, Protocol
 
@@ -373,8 +374,18 @@ def run_embedded(problem: IntegrationProblem) -> SolverResult:
     Where the own derivation is compiled and the torque is no function, the steps run as machine code; elsewhere stage
     by stage, by the same formulas. Torques held as an array start a new step at each interval.
     """
+    if _compiles(problem, problem.method):
+        # Loads LLVM, which interpreting never needs.
+        from mbkit.simulate.solvers.adaptive_compiled import NearSingularPoseError
+
+        with suppress(NearSingularPoseError):
+            return _run(problem, compiled=True)
+    return _run(problem, compiled=False)
+
+
+def _run(problem: IntegrationProblem, *, compiled: bool) -> SolverResult:
     space, stops = Space(problem.dyn.model), problem.stops
-    attempts = make_attempts(problem, problem.method, space, problem.tolerances)
+    attempts = make_attempts(problem, problem.method, space, problem.tolerances, compiled=compiled)
     records = [TrajectoryRecord(problem, i, space) for i in range(len(problem.q))]
 
     def to_end(group: Sequence[TrajectoryRecord], report: Callable[[], None]) -> None:
@@ -416,24 +427,32 @@ def _report(problem: IntegrationProblem, group: Sequence[TrajectoryRecord], firs
     problem.bar.update((first + done) / len(problem.q))
 
 
-def make_attempts(problem: IntegrationProblem, method: str, space: Space, tolerances: Tolerances) -> StepAttempts:
-    """Return the step attempts of ``"rk853"`` or ``"rodas5"``: machine code where there can be some."""
-    dyn, stiff = problem.dyn, isinstance(method_of(method).formula, RosenbrockTableau)
-    # A compiled step has one value of the time, and does not look for constraints.
-    plain = not problem.torque.callable and not dyn.model.time_parameter and not dyn.model.constrained
-    if dyn.derived and plain and dyn.model.nv:
-        # Other engines need no CasADi.
-        from mbkit.codegen.backend import has_compiler
-        from mbkit.derivation.mass_matrix_solve import factors_written_out
-        from mbkit.engines.lagrangian import LagrangianDynamics
+def make_attempts(
+    problem: IntegrationProblem, method: str, space: Space, tolerances: Tolerances, *, compiled: bool = True
+) -> StepAttempts:
+    """Return the step attempts of ``"rk853"`` or ``"rodas5"``: machine code where there can be some, and is wanted."""
+    if compiled and _compiles(problem, method):
+        from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
 
-        small = not stiff or factors_written_out(dyn.model, compiled=True)
-        if isinstance(dyn, LagrangianDynamics) and dyn.compile and small and has_compiler():
-            # Loads LLVM, which interpreting never needs.
-            from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
-
-            return CompiledAttempts(problem, space, tolerances, method)
+        return CompiledAttempts(problem, space, tolerances, method)
+    stiff = isinstance(method_of(method).formula, RosenbrockTableau)
     return (RosenbrockAttempts if stiff else RungeKuttaAttempts)(problem, space, tolerances)
+
+
+def _compiles(problem: IntegrationProblem, method: str) -> bool:
+    """Return whether there can be machine code of an attempt."""
+    dyn, stiff = problem.dyn, isinstance(method_of(method).formula, RosenbrockTableau)
+    # A compiled step has one value of the time, and the linear system of a stiff one no constraints.
+    plain = not problem.torque.callable and not dyn.model.time_parameter and not (stiff and dyn.model.constrained)
+    if not (dyn.derived and plain and dyn.model.nv):
+        return False
+    # Other engines need no CasADi.
+    from mbkit.codegen.backend import has_compiler
+    from mbkit.derivation.mass_matrix_solve import factors_written_out
+    from mbkit.engines.lagrangian import LagrangianDynamics
+
+    small = not stiff or factors_written_out(dyn.model, compiled=True)
+    return isinstance(dyn, LagrangianDynamics) and dyn.compile and small and has_compiler()
 
 
 def march(

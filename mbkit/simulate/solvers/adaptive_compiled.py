@@ -35,6 +35,10 @@ def _code(dyn: LagrangianDynamics, own: EmbeddedTableau | RosenbrockTableau) -> 
     return codes[own.name]
 
 
+class NearSingularPoseError(Exception):
+    """A step that ended near a singular pose, where stages have to be projected; never leaves mbkit."""
+
+
 class _Arena:
     """The room of one function, and its calls."""
 
@@ -150,6 +154,8 @@ class CompiledAttempts:
         arena, log = self._outer, self._log
         before = arena.state.copy()
         count = arena.run(arena.state, log, self.rounds, on=True)
+        if self._dyn.model.constrained and np.isposinf(log[:count, self._row["error"]][:, self._active]).any():
+            raise NearSingularPoseError
         out = []
         for place in np.flatnonzero(self._active).tolist():
             going = log[:count, self._row["go"], place] != 0

@@ -97,7 +97,9 @@ class AutoContext:
 
     def make(self, method: str, tolerances: Tolerances) -> StepAttempts:
         """Return the step attempts of a method, whose evaluations are counted with all others."""
-        attempts = make_attempts(self.problem, method, self.space, tolerances)
+        # A compiled attempt under constraints ends the run near a singular pose.
+        compiled = not self.problem.dyn.model.constrained
+        attempts = make_attempts(self.problem, method, self.space, tolerances, compiled=compiled)
         self.attempts.append(attempts)
         self.costs = _COMPILED if attempts.rounds > 1 else _IN_PYTHON
         return attempts

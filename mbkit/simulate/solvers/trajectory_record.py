@@ -117,9 +117,8 @@ class TrajectoryRecord:
         self.reached = until
         if steps:
             self.last = accepted.q[steps]
-        if self.poses is not None:
-            for k in range(1, steps + 1):
-                self.poses.saw(float(accepted.t[k]), accepted.q[k])
+        if self.poses is not None and steps:
+            self.poses.saw_all(accepted.t[1 : steps + 1], accepted.q[1 : steps + 1])
         if hit is not None:
             self._stop_at(hit)
         elif lost:
