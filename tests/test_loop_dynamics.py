@@ -237,7 +237,8 @@ def test_compiled_steps_are_those_of_python(method: str) -> None:
 
 def test_gap_does_not_grow_and_orders_stay() -> None:
     model = four_bar()
-    dyn = mb.dynamics(model, "lagrangian")
+    # 200,000 steps pay for compiling.
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
     q, v = dyn.project([0.5, -0.3, 1.2], [5.0, 0.0, 0.0])
     exact = mb.simulate(dyn, q, v, 1.0, "rk853", rtol=1e-13, atol=1e-13, save=[1.0]).q[-1]
     errors = [np.abs(mb.simulate(dyn, q, v, 1.0, "rk4", dt=h, save=[1.0]).q[-1] - exact).max() for h in (4e-3, 2e-3)]

@@ -277,6 +277,9 @@ class Model(Description):
         self.require_times("time", time)
         if not numbers:
             # A run asks so at every step: nothing but the time differs, and what follows from the rest is kept.
+            if self.constrained:
+                # Before the copy, so that all times share one derivation and one choice of rows.
+                _states_of(self)
             out = object.__new__(type(self))
             out.__dict__.update({k: x for k, x in self.__dict__.items() if k != "parameters"}, time=time)
             return out
