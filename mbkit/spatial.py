@@ -40,10 +40,17 @@ def skew(w: Array) -> Array:
     return out
 
 
+def _cross(a: Array, b: Array) -> Array:
+    """Return a × b, (..., 3): the numbers of `numpy.cross`, which takes five times as long for one pair."""
+    x, y, z = a[..., 0], a[..., 1], a[..., 2]
+    u, v, w = b[..., 0], b[..., 1], b[..., 2]
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
+
+
 def multiply(a: Array, b: Array) -> Array:
     """Return the quaternion product a b, (..., 4)."""
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    vector = aw * bv + bw * av + np.cross(av, bv)
+    vector = aw * bv + bw * av + _cross(av, bv)
     scalar = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
     return np.concatenate([vector, scalar], axis=-1)
 
@@ -61,8 +68,8 @@ def normalized(a: Array) -> Array:
 def rotate(quaternion: Array, x: Array) -> Array:
     """Return the vectors x (..., 3), rotated by unit quaternions (..., 4)."""
     u, w = quaternion[..., :3], quaternion[..., 3:]
-    t = 2.0 * np.cross(u, x)
-    return np.asarray(x + w * t + np.cross(u, t))
+    t = 2.0 * _cross(u, x)
+    return np.asarray(x + w * t + _cross(u, t))
 
 
 def matrix_from_quaternion(quaternion: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import warnings
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import mujoco
@@ -28,6 +29,7 @@ def off(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.linalg.norm(x - y) / np.linalg.norm(y))
 
 
+@cache
 def closed_tree(seed: int, kind: str, n: int = 8) -> tuple[Model, np.ndarray]:
     """Return a random tree with a loop between two bodies, and a configuration in which it is closed."""
     model, rng = random_tree(seed, n, IN_MUJOCO), np.random.default_rng(seed)

@@ -286,6 +286,10 @@ class _Numbers:
         return q if np.linalg.norm(f) < _CLOSED and (turned >= 0).all() else None
 
 
+#: The name under which a model keeps its own.
+_CHOICE: Final = "_row_choice"
+
+
 def choose_rows(model: Model) -> RowChoice:
     """Return which rows of a model say something, and which of those are independent where its loops are closed.
 
@@ -294,6 +298,15 @@ def choose_rows(model: Model) -> RowChoice:
     InputError
         A loop whose ends never meet, or that no joint moves.
     """
+    # Each engine asks, and the search for closed configurations takes seconds of a tree with free joints.
+    kept = vars(model)
+    if _CHOICE not in kept:
+        kept[_CHOICE] = _chosen_rows(model)
+    choice: RowChoice = kept[_CHOICE]
+    return choice
+
+
+def _chosen_rows(model: Model) -> RowChoice:
     numbers, rng = _Numbers(model), np.random.default_rng(0)
     anywhere = [random_state(model, rng, None)[0] for _ in range(_LOOKS)]
     kept = _with_something_to_say(numbers, anywhere)
