@@ -17,7 +17,7 @@ from mbkit.errors import MbkitWarning
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import METHODS, simulate
 
-NATIVE = tuple(m.name for m in METHODS.values() if m.kind == "native")
+NATIVE = tuple(m.name for m in METHODS.values() if m.kind == "native" and "mujoco" in m.engines)
 IMPLICIT = ("mujoco_implicit", "mujoco_implicitfast", "mujoco_discrete")
 
 

@@ -193,6 +193,7 @@ _ABOUT: Final = {
     "drake_bogacki_shampine3": "Drake's own Bogacki-Shampine 3(2)",
     "drake_radau3": "Drake's own Radau IIA of two stages, implicit",
     "drake_implicit_euler": "Drake's own implicit Euler with error control",
+    "drake_sap": "Drake's own discrete plant, whose SAP solver holds loops (Castro, Permenter and Han 2023)",
 }
 
 
@@ -221,6 +222,12 @@ def _mujoco(scheme: str, stability: Stability, own: str = "") -> Method:
 def _drake(scheme: str, order: int) -> Method:
     more: dict[str, Any] = {"engines": ("drake",), "events": False, "callables": False, "wrenches": False}
     return _adaptive(f"drake_{scheme}", order, "native:run_drake", scheme=scheme, least=1e-15, **more)
+
+
+def _drake_discrete() -> Method:
+    more: dict[str, Any] = {"solver": "native:run_drake_discrete", "stability": IMPLICIT_IN_VELOCITY}
+    name = "drake_sap"
+    return Method(name, "native", 1, 1, _ABOUT[name], engines=("drake",), callables=False, wrenches=False, **more)
 
 
 _STIFF: Final[dict[str, Any]] = {"jacobian": True, "fills_tolerance": True}
@@ -284,6 +291,7 @@ METHODS: Final[dict[str, Method]] = {
         _drake("bogacki_shampine3", 3),
         _drake("radau3", 3),
         _drake("implicit_euler", 1),
+        _drake_discrete(),
     )
 }
 _BUILT_IN: Final = frozenset(METHODS)

@@ -10,7 +10,6 @@ b = R (ω × v) in the linear rows.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from functools import cached_property
 from typing import Any, ClassVar, Final
 
@@ -19,22 +18,36 @@ from numpy.typing import ArrayLike
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.math import RollPitchYaw, RotationMatrix
 from pydrake.multibody.tree import MultibodyForces, MultibodyForces_
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
-from pydrake.systems.framework import EventStatus
 
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._fork import fork_safe
 from mbkit.engines import regressors
-from mbkit.engines.base import MappedDynamics, require_no_forces
+from mbkit.engines.base import MappedDynamics
+from mbkit.engines.constrained import QUANTITIES as CONSTRAINT_QUANTITIES
 from mbkit.engines.drake.bodies import DrakeBodies
 from mbkit.engines.drake.model import DrakeModel, build
-from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.errors import NumericalError
 from mbkit.model import Model
+
+#: Name of the method that runs loops.
+SAP: Final = "drake_sap"
+#: Drake 1.51: evaluating a continuous plant's accelerations with constraints is an error.
+NO_CONSTRAINTS: Final = "Drake's continuous plant has no constraints between bodies"
+_WITHOUT_LOOPS: Final = {
+    **dict.fromkeys(
+        ("forward_dynamics", "forward_dynamics_derivatives", *CONSTRAINT_QUANTITIES),
+        f"{NO_CONSTRAINTS}; mbkit.simulate(..., method={SAP!r}) runs its discrete one, and "
+        "mbkit.dynamics(model, 'lagrangian') has the terms",
+    )
+}
 
 
 class DrakeDynamics(DrakeBodies, MappedDynamics):
     """Drake on a description.
+
+    Of a model with loops the terms are those of the tree, and its runs are Drake's discrete ones: loops are among the
+    constraints of the discrete plant alone.
 
     Attributes
     ----------
@@ -45,7 +58,8 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
     """
 
     engine = "drake"
-    lacks_derivatives = ""
+    lacks_derivatives = lacks_constraints = ""
+    soft_constraints = True
     refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "Drake forms C v without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no CasADi form; mbkit.dynamics(model, 'lagrangian') has",
@@ -54,6 +68,8 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
+        if model.constrained:
+            vars(self)["refuses"] = self.refuses | _WITHOUT_LOOPS
         self._hold(build(model))
 
     def _hold(self, compiled: DrakeModel) -> None:
@@ -218,101 +234,3 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
         plant, context = self._without_bushings
         self.put(plant, context, x, u)
         return total + plant.CalcPotentialEnergy(context)
-
-
-# Drake's own integrators on the plant that was built.
-
-# Drake's default of 0.1 s would hold a slow motion's steps down for no reason.
-_MAX_STEP: Final = 1e9
-
-
-class DrakeRun:
-    """A state that one of Drake's integrators carries on; `scheme` is of `pydrake.systems.analysis`.
-
-    `accuracy` bounds the relative error of a step; `watch` gets the time, s, after each step and may raise. Raises
-    `UnsupportedError` for mimic joints, which Drake does not reduce, and ball joints, whose angles have a pole there.
-    """
-
-    def __init__(
-        self,
-        dyn: DrakeDynamics,
-        scheme: str,
-        accuracy: float,
-        t: float,
-        q: Array,
-        v: Array,
-        watch: Callable[[float], object],
-    ) -> None:
-        require_no_forces(dyn.model, "drake")
-        if dyn.model.layout.reduced:
-            raise UnsupportedError("drake: its integrators know no mimic joints; load with mimic='free'")
-        for joint in dyn.model.joints:
-            if joint.kind == "ball":
-                raise UnsupportedError(
-                    f"drake: ball joint {joint.name!r} has roll, pitch and yaw there, which end at a pole; "
-                    "use a method that any engine has, such as rk853"
-                )
-        self._layout, self._maps = dyn.model.layout, dyn.maps
-        plant = self._plant = dyn.maps.plant
-        self._context = plant.CreateDefaultContext()
-        self._force = plant.get_applied_generalized_force_input_port()
-        self.push(np.zeros(dyn.model.nv))
-        dyn.put(plant, self._context, *dyn.to_drake(q, v)[:2])
-        simulator = Simulator(plant, self._context)
-        config = SimulatorConfig(integration_scheme=scheme, accuracy=accuracy, max_step_size=_MAX_STEP)
-        ApplySimulatorConfig(config, simulator)
-        # The configuration resets the time.
-        self._context.SetTime(t)
-        integrator = simulator.get_mutable_integrator()
-        # Too small a step is an error, not carried on with an error that nobody knows.
-        integrator.set_throw_on_minimum_step_size_violation(True)
-
-        def monitor(context: Any) -> Any:
-            watch(context.get_time())
-            return EventStatus.DidNothing()
-
-        simulator.set_monitor(monitor)
-        self._simulator, self._integrator = simulator, integrator
-
-    def push(self, tau: Array) -> None:
-        """Hold a generalized force from now on; `UnsupportedError` for bodies that turn freely."""
-        if tau.any() and self._maps.turning:
-            raise UnsupportedError(
-                "drake: a force on a free joint would be held in world axes; use a method that any engine has"
-            )
-        self._force.FixValue(self._context, self._layout.expand_v(tau)[self._maps.v_index])
-
-    def over(self, t: float) -> tuple[Array, Array]:
-        """Go on to a time, s; return q and v there."""
-        self._simulator.AdvanceTo(t)
-        return self.state()
-
-    def state(self) -> tuple[Array, Array]:
-        """Return q and v, with unit quaternions."""
-        layout, maps = self._layout, self._maps
-        x, u = self._plant.GetPositions(self._context), self._plant.GetVelocities(self._context)
-        q, v = np.empty(layout.sizes[2]), np.empty(layout.sizes[3])
-        q[maps.q_index] = x
-        for joint, _, iv in maps.turning:
-            quaternion = q[layout.full_q[joint.name]][-4:]
-            quaternion /= np.linalg.norm(quaternion)
-            R = spatial.matrix_from_quaternion(quaternion)
-            u[iv : iv + 3], u[iv + 3 : iv + 6] = R.T @ u[iv : iv + 3], R.T @ u[iv + 3 : iv + 6]
-        v[maps.v_index] = u
-        return q, v
-
-    @property
-    def steps(self) -> int:
-        """Accepted steps."""
-        return int(self._integrator.get_num_steps_taken())
-
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of the dynamics."""
-        return int(self._integrator.get_num_derivative_evaluations())
-
-    @property
-    def rejected(self) -> int:
-        """Rejected steps."""
-        of = self._integrator
-        return int(of.get_num_step_shrinkages_from_error_control() + of.get_num_step_shrinkages_from_substep_failures())

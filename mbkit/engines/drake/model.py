@@ -15,13 +15,13 @@ from typing import Any, Final
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody import tree
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 
 from mbkit._check import Array
 from mbkit.engines.base import STACKS, unknown_joint
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Joint, Model
-from mbkit.model.parts import PointSpring
+from mbkit.model.parts import Loop, PointSpring
 from mbkit.model.validation import static_bodies
 
 _TURN: Final = 2 * np.pi
@@ -29,7 +29,7 @@ _TURN: Final = 2 * np.pi
 
 @dataclass(frozen=True)
 class DrakeModel:
-    """A continuous, finalized plant, and the maps between its coordinates and the description's."""
+    """A finalized plant, and the maps between its coordinates and the description's."""
 
     plant: Any
     #: Entry i is full coordinate q_index[i], but the three angles of a ball joint, which mean nothing there.
@@ -44,8 +44,10 @@ class DrakeModel:
     bushings: tuple[tuple[float, Any, Array, Any, Array], ...]
 
 
-def build(description: Model, *, gravity: bool = True, bushings: bool = True) -> DrakeModel:
+def build(description: Model, *, gravity: bool = True, bushings: bool = True, step: float = 0.0) -> DrakeModel:
     """Return the plant, with or without gravity and the springs that have no length at rest.
+
+    With a step, s, it is discrete and holds the loops; a continuous one is the tree alone.
 
     Raises `UnsupportedError` for what Drake refuses or cannot hold, and names it.
     """
@@ -56,7 +58,10 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True) ->
             "of joint coordinates"
         )
     # A step of zero makes it continuous: ẋ = f(x) and nothing else.
-    plant = MultibodyPlant(0.0)
+    plant = MultibodyPlant(step)
+    if step:
+        # Of Drake's discrete solvers the one that takes constraints.
+        plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     plant.mutable_gravity_field().set_gravity_vector(np.array(description.gravity) * gravity)
     bodies: dict[str, Any] = {"world": plant.world_body()}
     static = static_bodies(description.joints)
@@ -66,6 +71,9 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True) ->
     added = {joint.name: _add(plant, joint, bodies) for joint in description.joints}
     springs = [s for s in description.springs if bushings or s.rest_length > 0]
     bushings_ = tuple(x for spring in springs for x in _add_spring(plant, spring, bodies))
+    for loop in description.loops if step else ():
+        with _refusal(f"drake: refuses loop {loop.name!r}"):
+            CONSTRAINTS[loop.kind](plant, loop, bodies[loop.body_a], bodies[loop.body_b])
     with _refusal(f"drake: refuses {description.name}"):
         plant.Finalize()
     return mapped(plant, description, added, bodies, bushings_)
@@ -100,6 +108,28 @@ def _add_spring(
         length, stiffness = 1.0, 0.0
     if stiffness or spring.damping:
         plant.AddForceElement(tree.LinearSpringDamper(*ends, length, stiffness, spring.damping))
+
+
+def _ball(plant: Any, loop: Loop, a: Any, b: Any) -> None:
+    plant.AddBallConstraint(a, np.array(loop.translation_a), b, np.array(loop.translation_b))
+
+
+def _weld(plant: Any, loop: Loop, a: Any, b: Any) -> None:
+    ends = ((loop.rotation_a, loop.translation_a), (loop.rotation_b, loop.translation_b))
+    X_AP, X_BQ = (RigidTransform(RotationMatrix(np.array(R)), np.array(p)) for R, p in ends)
+    plant.AddWeldConstraint(a, X_AP, b, X_BQ)
+
+
+def _rod(plant: Any, loop: Loop, a: Any, b: Any) -> None:
+    plant.AddDistanceConstraint(a, np.array(loop.translation_a), b, np.array(loop.translation_b), loop.length)
+
+
+#: Kind of a loop -> what adds Drake's constraint, for the kinds that it has.
+CONSTRAINTS: Final[dict[str, Callable[[Any, Loop, Any, Any], None]]] = {
+    "point": _ball,
+    "frame": _weld,
+    "distance": _rod,
+}
 
 
 def _inertia(body: Body, static: bool) -> Any:

@@ -1,4 +1,4 @@
-"""The engines' own integrators: MuJoCo's with a step, Drake's with a tolerance."""
+"""The engines' own integrators: MuJoCo's with a step, Drake's with a tolerance or a step."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.engines import Dynamics
 from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import GridRecord
+from mbkit.simulate.solvers.fixed_step import GridRecord, SteppedRun, Stepper
 from mbkit.simulate.solvers.trajectory_record import StoppedError, TrajectoryRecord, assemble_result, diverged, run_each
-from mbkit.simulate.solvers.vector_field import are_bounded, is_bounded
+from mbkit.simulate.solvers.vector_field import DivergenceError, are_bounded, is_bounded
 from mbkit.simulate.time_grid import check_room
+from mbkit.simulate.torque import Force
 
 
 def run_native(problem: IntegrationProblem) -> SolverResult:
@@ -58,7 +60,8 @@ def run_drake(problem: IntegrationProblem) -> SolverResult:
     `rtol` is taken.
     """
     # Drake is an extra.
-    from mbkit.engines.drake.engine import DrakeDynamics, DrakeRun
+    from mbkit.engines.drake.engine import DrakeDynamics
+    from mbkit.engines.drake.rollout import DrakeRun
 
     dyn = problem.dyn
     assert isinstance(dyn, DrakeDynamics)
@@ -86,3 +89,34 @@ def run_drake(problem: IntegrationProblem) -> SolverResult:
 
     records = run_each(problem, walk)
     return assemble_result(problem, records, evaluations=sum(run.evaluations for run in runs))
+
+
+class _DiscreteStepper(Stepper):
+    """Steps of Drake's discrete plants, state by state; the step's length is part of a plant."""
+
+    def __init__(self, dyn: Dynamics) -> None:
+        self._dyn, self._runs = dyn, dict[float, Any]()
+
+    def __call__(self, t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:  # noqa: ARG002
+        from mbkit.engines.drake.engine import DrakeDynamics
+        from mbkit.engines.drake.rollout import DiscreteRun
+
+        assert isinstance(self._dyn, DrakeDynamics)
+        if h not in self._runs:
+            self._runs[h] = DiscreteRun(self._dyn, h)
+        tau = np.broadcast_to(np.asarray(force), w.shape)
+        try:
+            if q.ndim == 1:
+                return self._runs[h].step(q, w, tau)  # type: ignore[no-any-return]  # Drake is an extra
+            pairs = [self._runs[h].step(*state) for state in zip(q, w, tau, strict=True)]
+        except RuntimeError as error:
+            raise DivergenceError(str(error).strip().splitlines()[0]) from None
+        return np.array([x for x, _ in pairs]), np.array([x for _, x in pairs])
+
+
+def run_drake_discrete(problem: IntegrationProblem) -> SolverResult:
+    """Step one state, or each of a batch by itself, on Drake's discrete plant."""
+    stepper = _DiscreteStepper(problem.dyn)
+    run = SteppedRun(problem, stepper, problem.v0.copy())
+    error = run.to_end()
+    return run.record.result(lambda _: run.why, int(run.record.steps.sum()), error=error)
