@@ -90,9 +90,12 @@ def _mark_options(node: Any) -> dict[str, Any]:
     return out
 
 
-def _load_options(node: Any) -> dict[str, Any]:
+def _load_options(request: pytest.FixtureRequest) -> dict[str, Any]:
     """Return the options of `mbkit.load` among the arguments of a test's markers."""
-    return {k: x for k, x in _mark_options(node).items() if k not in ("robots", "engines")}
+    options = {k: x for k, x in _mark_options(request.node).items() if k not in ("robots", "engines")}
+    if isinstance(options.get("loops"), str):
+        options["loops"] = _target(options["loops"], request)
+    return options
 
 
 def _list_of(value: Any, name: str) -> list[Any]:
@@ -118,7 +121,7 @@ def mbkit_model(request: pytest.FixtureRequest) -> Model:
         return robot() if callable(robot) else robot  # type: ignore[no-any-return]
     from mbkit.studies._targets import model_of
 
-    target, options = _target(os.fspath(robot), request), _load_options(request.node)
+    target, options = _target(os.fspath(robot), request), _load_options(request)
     key = "model", target, repr(options)
     return _once(request.config, key, lambda: _without_traceback(lambda: model_of(target, options)))
 
@@ -250,9 +253,10 @@ class MbkitBaseline:
         robot = getattr(self._request.node, "callspec", None) and self._request.node.callspec.params.get("mbkit_model")
         if not isinstance(robot, (str, os.PathLike)) or self._request.getfixturevalue("mbkit_model") is not model:
             return "", {}
-        from mbkit.studies._targets import kept
+        from mbkit.studies._targets import kept, kept_options
 
-        return kept(_target(os.fspath(robot), self._request), path), _load_options(self._request.node)
+        options = kept_options(_load_options(self._request), path)
+        return kept(_target(os.fspath(robot), self._request), path), options
 
     def _shown(self, path: Path) -> str:
         root = self._request.config.rootpath

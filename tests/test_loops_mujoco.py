@@ -293,6 +293,7 @@ def test_equalities_without_a_loop_are_named(tmp_path: Path) -> None:
         ('<weld name="x" body1="b" body2="f"/>', "no joint moves"),
         ('<weld name="x" body1="m" body2="c"/>', "motion capture"),
         ('<joint name="x" joint1="j1" joint2="j2"/>', "'x' (joint, joint1 'j1', joint2 'j2')"),
+        ('<tendon name="x" tendon1="t"/>', "'x' (tendon, tendon1 't')"),
     ):
         model = loaded(tmp_path, equality)
         assert not model.loops
@@ -309,6 +310,24 @@ def test_equalities_without_a_loop_are_named(tmp_path: Path) -> None:
     ):
         with pytest.raises(ModelError, match=why):
             loaded(tmp_path, equality)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "said"),
+    [
+        # The scene's default class.
+        ('torquescale="1"', "solref 0.01 1"),
+        ('solref="-300 -20" solimp="0.9 0.95 0.001"', "solref -300 -20, solimp 0.9 0.95 0.001"),
+        ('torquescale="0.5"', "solref 0.01 1, torquescale 0.5"),
+    ],
+)
+def test_softness_that_an_exact_loop_does_not_have_is_named(tmp_path: Path, attributes: str, said: str) -> None:
+    model = loaded(tmp_path, f'<weld name="x" site1="s" site2="r" {attributes}/>')
+    assert f"left out, since loops are exact: 'x' ({said})" in model.notes
+    path = tmp_path / "plain.xml"
+    path.write_text((SCENE % '<weld name="x" site1="s" site2="r"/>').replace('solref="0.01 1"', ""))
+    assert not any("exact: " in note for note in mb.load(path).notes)
+    assert mb.load(path).loops == model.loops
 
 
 @pytest.mark.parametrize("kind", ["point", "frame"])

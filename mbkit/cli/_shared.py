@@ -105,15 +105,18 @@ def load_options(command: Command) -> Command:
     """Add the options for reading a file or robot; the command gets those that were set as `options`."""
 
     @functools.wraps(command)
-    def with_options(*args: Any, floating_base: bool, mimic: str | None, nonphysical: str | None, **more: Any) -> None:
-        options = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical}
+    def with_options(
+        *args: Any, floating_base: bool, mimic: str | None, nonphysical: str | None, loops: str | None, **more: Any
+    ) -> None:
+        options = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical, "loops": loops}
         command(*args, options={k: v for k, v in options.items() if v is not None}, **more)
 
     bodies, mimics = click.Choice(["error", "warn"]), click.Choice(["reduce", "free"])
     base = click.option("--floating-base", is_flag=True, help="Let the base of a file or robot move freely.")
     mimic = click.option("--mimic", type=mimics, help="What mimic joints become.  [default: reduce]")
     nonphysical = click.option("--nonphysical", type=bodies, help="Refuse impossible bodies, or take them.")
-    return base(mimic(nonphysical(with_options)))
+    loops = click.option("--loops", metavar="FILE", help="TOML file of loops to add, a table [[loop]] for each.")
+    return base(mimic(nonphysical(loops(with_options))))
 
 
 def stem_of(target: str, name: str) -> str:

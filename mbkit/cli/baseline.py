@@ -60,10 +60,10 @@ def record(targets: tuple[str, ...], path: Path, engines: tuple[str, ...], **set
 def _record_one(target: str, file: Path, engines: tuple[str, ...], options: dict[str, Any], **settings: Any) -> None:
     from mbkit.simulate.progress import Bar
     from mbkit.studies import baseline as baselines
-    from mbkit.studies._targets import kept, model_of
+    from mbkit.studies._targets import kept, kept_options, model_of
 
     model = model_of(target, options)
-    place = kept(target, file)
+    place, options = kept(target, file), kept_options(options, file)
     with Bar(f"record {model.name}") as bar:
         result = baselines.record(model, file, engines or None, target=place, options=options, progress=bar, **settings)
     size = file.stat().st_size / 1000
@@ -128,11 +128,11 @@ def _check_one(
     from mbkit.report.explain_view import baseline_view
     from mbkit.simulate.progress import Bar
     from mbkit.studies import baseline as baselines
-    from mbkit.studies._targets import kept, model_of
+    from mbkit.studies._targets import kept, kept_options, model_of, resolved_options
 
     recorded = baselines.read(file)
     # A target of other options is recorded with them.
-    options = {**recorded.options, **options}
+    options = {**resolved_options(recorded.options, file), **options}
     model = _model(recorded, file) if target is None else model_of(target, options)
     new_target = None if target is None else kept(target, file)
     with Bar(f"check {file.name}") as bar:
@@ -156,7 +156,7 @@ def _check_one(
         samples=recorded.states.kinds.count("random"),
         seed=recorded.seed,
         target=new_target or recorded.target,
-        options=options,
+        options=kept_options(options, file),
         # It was read above, so it is this robot's.
         force=True,
     )
@@ -208,7 +208,7 @@ def _name(target: str) -> str:
 
 
 def _model(recorded: Baseline, file: Path) -> Model:
-    from mbkit.studies._targets import is_code, model_of, resolved
+    from mbkit.studies._targets import is_code, model_of, resolved, resolved_options
 
     if not recorded.target:
         raise BaselineError(f"{file}: it was recorded of a model in Python, so there is nothing to load; give --target")
@@ -218,7 +218,7 @@ def _model(recorded: Baseline, file: Path) -> Model:
             f"{file}: it was recorded of the function {recorded.target}, which is not run because a file names it; "
             f"to run it: mbkit baseline check {file} --target {recorded.target}"
         )
-    return model_of(resolved(recorded.target, file), recorded.options)
+    return model_of(resolved(recorded.target, file), resolved_options(recorded.options, file))
 
 
 def _files(paths: tuple[Path, ...]) -> list[Path]:

@@ -20,6 +20,7 @@ from mbkit._check import shown
 from mbkit._warn import warn
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, ModelError, UnknownNameError
 from mbkit.load import xml_reader
+from mbkit.load.added_loops import Loops, add_loops
 from mbkit.load.urdf_reader import examine
 from mbkit.model import Model
 from mbkit.model.validation import scale_doubts
@@ -65,7 +66,7 @@ def load(
     nonphysical: Literal["error", "warn"] | None = None,
     gravity: ArrayLike | None = None,
     meshes: Literal["auto", "never"] = "auto",
-    loops: bool = True,
+    loops: bool | Loops = True,
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
@@ -91,9 +92,11 @@ def load(
     meshes : {"auto", "never"}
         Whether an MJCF's meshes are read where a body has no other inertia, which MuJoCo's compiler then infers; with
         "never" such bodies are refused.
-    loops : bool
+    loops : bool, path or sequence of Loop or dict
         Whether an MJCF's active <connect> and <weld> elements become loops, which hold exactly; without, they are left
-        out and noted, as those of joints and tendons are.
+        out and noted, as those of joints and tendons are. Or loops beside those of the file: dicts with the arguments
+        of `ModelBuilder.add_loop`, `Loop` objects, or a TOML file with a table ``[[loop]]`` of these arguments for
+        each. A URDF has no loops of its own. Their bodies may be frames too, such as links that were merged.
 
     Returns
     -------
@@ -108,7 +111,7 @@ def load(
     LoadError
         The file, or one that it includes, is missing, or is not readable as a URDF or MJCF.
     ModelError
-        The file has faults; all of them are listed.
+        The file or the added loops have faults; all of them are listed.
 
     Warns
     -----
@@ -124,16 +127,19 @@ def load(
     8
     >>> mb.load("panda", mimic="free").nv
     9
+    >>> rod = {"name": "rod", "kind": "distance", "body_a": "panda_link2", "body_b": "panda_link4", "length": 0.3}
+    >>> mb.load("panda", loops=[rod]).loops[0].body_b
+    'panda_link4'
     """
     for name, value, allowed, expected in (
         ("mimic", mimic, ("reduce", "free"), "'reduce' or 'free'"),
         ("nonphysical", nonphysical, ("error", "warn", None), "'error', 'warn' or None"),
         ("floating_base", floating_base, (True, False), "True or False"),
         ("meshes", meshes, ("auto", "never"), "'auto' or 'never'"),
-        ("loops", loops, (True, False), "True or False"),
     ):
         if not isinstance(value, (str, bool, np.bool_, NoneType)) or value not in allowed:
             raise InputError(f"{name}: expected {expected}, got {shown(value)}")
+    added = None if isinstance(loops, (bool, np.bool_)) else loops
     path, by_name = _locate(source)
     policy = nonphysical or ("warn" if by_name else "error")
     root = xml_reader.read(path)
@@ -149,9 +155,11 @@ def load(
         from mbkit.load.mjcf import model_of_mjcf
 
         whole = xml_reader.with_includes(root, path)
-        model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes, loops)
+        model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes, added is not None or bool(loops))
     else:
         raise xml_reader.unknown_root(path, root)
+    if added is not None:
+        model = add_loops(model, added)
     doubts = scale_doubts(model)
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)

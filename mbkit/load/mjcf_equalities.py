@@ -23,6 +23,8 @@ from mbkit.model import ModelBuilder
 from mbkit.model.validation import listing
 
 _KINDS: Final = {"connect": "point", "weld": "frame"}
+#: How soft MuJoCo holds an element: nothing of it is left in an exact loop.
+_SOFT: Final = ("solref", "solimp", "torquescale")
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class Equalities:
     def __init__(self, mujoco: Element, scene: Scene, disabled: set[str], *, wanted: bool) -> None:
         self._scene, self._read = scene, scene.read
         self._left_out: list[str] = []
+        self._soft: list[str] = []
         self._loops: dict[str, tuple[str, _End, _End]] = {}
         elements = [(e, element_label(e, k)) for k, e in self._numbered(mujoco)]
         if not elements:
@@ -71,6 +74,8 @@ class Equalities:
                 else:
                     name = unused(element.attributes.get("name") or f"{element.tag}{len(self._loops) + 1}", self._loops)
                     self._loops[name] = (_KINDS[element.tag], *ends)
+                    if numbers := self._softness(full, f"equality {label}"):
+                        self._soft.append(f"{name!r} ({numbers})")
                     continue
             if why:
                 self._left_out.append(f"{label} ({bound_parts(element)}){'' if why == 'no loop' else f': {why}'}")
@@ -78,6 +83,13 @@ class Equalities:
     @staticmethod
     def _numbered(mujoco: Element) -> Iterable[tuple[int, Element]]:
         return enumerate((e for section in mujoco.all("equality") for e in section.children), 1)
+
+    def _softness(self, element: Element, item: str) -> str:
+        """Return the numbers by which an element is softer or stiffer than MuJoCo's default, as text."""
+        said = {name: element.attributes[name] for name in _SOFT if name in element.attributes}
+        if "torquescale" in said and self._read.number(element, "torquescale", item, 1.0) == 1.0:
+            del said["torquescale"]
+        return ", ".join(f"{name} {' '.join(text.split())[:40]}" for name, text in said.items())
 
     def _ends(self, element: Element, item: str) -> tuple[_End, _End] | None:
         """Return the two frames that an element binds; None after a fault."""
@@ -125,6 +137,8 @@ class Equalities:
             b.add_loop(name, kind, **sides)  # type: ignore[arg-type]  # of the kinds
         if self._loops:
             b.note(f"loops, held exactly where MuJoCo's are soft: {listing([repr(x) for x in self._loops], 6)}")
+        if self._soft:
+            b.note(f"left out, since loops are exact: {listing(self._soft, 6)}")
         if self._left_out:
             b.note(f"equality constraints left out: {'; '.join(self._left_out)}")
 

@@ -570,6 +570,21 @@ class ModelBuilder(ElementBuilder):
         )
 
 
+def with_loops(model: Model, loops: Iterable[Mapping[str, Any]]) -> Model:
+    """Return a model with more loops, given by the arguments of `ModelBuilder.add_loop`; a `ModelError` of all faults.
+
+    What the file of a robot cannot hold is added here to the model that was read.
+    """
+    b = ModelBuilder(model.name)
+    for one in loops:
+        b.add_loop(**one)
+    bindings = (*model.bindings, *b._bindings)
+    added = replace(model, loops=(*model.loops, *b._parts["loops"]), bindings=bindings)
+    if faults := [*b._read.faults, *structure_faults(added)]:
+        raise ModelError(model.name, faults)
+    return added
+
+
 def _resolve(joints: Iterable[Joint], bindings: Iterable[Binding]) -> tuple[tuple[Joint, ...], tuple[Binding, ...]]:
     """Let every mimic joint point at a joint that is free itself."""
     by_name = {j.name: j for j in joints}

@@ -141,6 +141,16 @@ def resolved(target: str, baseline: Path) -> str:
     return os.path.normpath(baseline.absolute().parent / target) if target.startswith(".") else target
 
 
+def kept_options(options: Mapping[str, Any], baseline: Path) -> dict[str, Any]:
+    """Return options of loading as a baseline keeps them: a file of loops by its place, as a target is."""
+    return {k: kept(x, baseline) if k == "loops" and isinstance(x, str) else x for k, x in options.items()}
+
+
+def resolved_options(options: Mapping[str, Any], baseline: Path) -> dict[str, Any]:
+    """Return kept options as a target is loaded with them from the current folder."""
+    return {k: resolved(x, baseline) if k == "loops" and isinstance(x, str) else x for k, x in options.items()}
+
+
 # Which engines are there, and models as any of them takes them.
 
 

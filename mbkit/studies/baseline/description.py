@@ -22,7 +22,7 @@ from mbkit.load.loader import find
 from mbkit.load.urdf_reader import read_links
 from mbkit.model import Model
 from mbkit.model.elements.formula import Formula
-from mbkit.studies._targets import resolved
+from mbkit.studies._targets import resolved, resolved_options
 
 Part = dict[str, Any]
 #: Section -> part -> field -> number, text or list of numbers; a flat section has one part without name.
@@ -294,7 +294,7 @@ def links_of(model: Model, target: str, options: Mapping[str, Any], baseline: Pa
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MbkitWarning)
             # By its own name: a robot's inconsistent bodies stay as written.
-            if load(resolved(target, baseline), **options).digest != model.digest:
+            if load(resolved(target, baseline), **resolved_options(options, baseline)).digest != model.digest:
                 return {}
             return _merged(read_links(path))
     except (MbkitError, TypeError):
