@@ -16,6 +16,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.constraint_manifold import states_of
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, MbkitError, MbkitWarning
 from mbkit.model import Model
@@ -59,6 +60,9 @@ def free_of_mimic(model: Model) -> Model:
 def start_state(model: Model, seed: int) -> tuple[Array, Array]:
     """Return a gentle start near the middle of the joints' ranges: a wild one measures chaos, not integrators."""
     q, v = state_within_limits(model, np.random.default_rng([seed, 1]), 0.1)
+    if model.time_parameter is not None and model.constrained:
+        # A prescribed motion has the velocity that it has.
+        return states_of(model).manifold.project(q, 0.1 * v)
     return q, 0.1 * v
 
 

@@ -20,11 +20,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real
+from mbkit.codegen.extended_precision import Extended, arithmetic
 from mbkit.codegen.interpreter import Machine
+from mbkit.codegen.program import program
 from mbkit.codegen.taylor import PRECISIONS, order_of, precision, taylor_system
 from mbkit.derivation import Equations, equations_of
+from mbkit.derivation.steps.onto_constraints import projection
 from mbkit.engines import Dynamics, dynamics
-from mbkit.engines.base import require_tree
+from mbkit.engines.base import at_time
+from mbkit.engines.constraint_manifold import states_of
 from mbkit.engines.registry import DERIVED, INDEPENDENT
 from mbkit.errors import InputError, MbkitError, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, METHODS, SCIPY_METHOD, SERIES_METHOD
@@ -97,6 +101,10 @@ class Deadline:
             raise LateError
 
 
+#: (high, low) parts of numbers with twice a double's digits.
+Pair = tuple[Array, Array]
+
+
 @dataclass(frozen=True)
 class Motion:
     """The motion: model, start, duration, saved times from 0, and applied torque."""
@@ -114,6 +122,38 @@ class Motion:
     def equations(self) -> Equations:
         """The own derivation, with every number of the model as a symbol."""
         return equations_of(self.model, constants="symbols")
+
+    @cached_property
+    def start(self) -> tuple[Pair, Pair]:
+        """q0 and v0 as pairs of doubles; under constraints the state beside them that holds these to 32 digits."""
+        if not self.model.constrained:
+            return (self.q0, 0 * self.q0), (self.v0, 0 * self.v0)
+        own = arithmetic()
+        q, v, *_ = Extended(program(projection(self.equations)), own)(
+            *(own.array(x[None]) for x in (self.q0, self.v0)), *self._constants(np.zeros(1))
+        )
+        return own.pair(q[0, :, 0]), own.pair(v[0, :, 0])
+
+    def gap(self, q: Pair, t: Array) -> Array:
+        """Return how far the constraints are open at configurations, (K,), rad or m; zeros without any."""
+        if not self.model.constrained:
+            return np.zeros(len(t))
+        own = arithmetic()
+        run = Extended(program(self.equations.function("constraint_residual")), own)
+        f, _ = own.pair(run(own.from_pair(*q), *self._constants(t))[0][..., 0])
+        return np.asarray(np.abs(f).max(axis=1))
+
+    def values(self, t: Array) -> Array:
+        """Return the values of the equations' numbers at these times, (K, k)."""
+        out = np.tile(self.equations.constant_values, (len(t), 1))
+        if (clock := self.model.time_parameter) is not None:
+            # Parameters stand first among them.
+            out[:, [*self.model.parameters].index(clock)] = t
+        return out
+
+    def _constants(self, t: Array) -> list[Any]:
+        values = self.values(t)
+        return [arithmetic().array(values)] if values.size else []
 
     @property
     def stops(self) -> list[float]:
@@ -176,16 +216,19 @@ def taylor_pair(motion: Motion, bits: int, deadline: Deadline) -> Known:
         runs.append(states)
         steps, why = steps or count, why or early
     first, second = (np.stack(states[: min(map(len, runs))]) for states in runs)
-    apart = [gap(model, first[:, :nq], second[:, :nq]), _largest(first[:, nq:] - second[:, nq:])]
+    q, v = kind.pair(first[:, :nq]), kind.pair(first[:, nq:])
+    # What opens the loops of one of them may open those of the other alike.
+    opened = motion.gap(q, motion.save[: len(first)])
+    apart = [np.maximum(gap(model, first[:, :nq], second[:, :nq]), opened), _largest(first[:, nq:] - second[:, nq:])]
     orders = " and ".join(str(order_of(x)) for x in tolerances)
     how = f"Taylor series of orders {orders} in {PRECISIONS[bits]} numbers on the own derivation"
-    return Known(kind.pair(first[:, :nq]), kind.pair(first[:, nq:]), np.array(apart), how, why, steps, shared=True)
+    return Known(q, v, np.array(apart), how, why, steps, shared=True)
 
 
 def _states(motion: Motion, kind: Any, steps: TaylorSteps, deadline: Deadline, most: int) -> tuple[list[Any], int, str]:
     """Return up to so many saved states as far as they come, the steps, and why they end early."""
     model, saved = motion.model, motion.save.tolist()[:most]
-    y0 = _unit(model, kind.array(np.concatenate([motion.q0, motion.v0])))
+    y0 = _unit(model, kind.array(*(np.concatenate(parts) for parts in zip(*motion.start, strict=True))))
     states, count, force = [y0], 0, motion.torque.of_member(None)
     try:
         for t in steps(0.0, y0, motion.stops, force):
@@ -253,6 +296,7 @@ def _road(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[Dynamic
             if motion.torque.callable and not METHODS[method].callables:
                 continue
             dyn = dynamics(motion.model, engine)
+            _require_rigid(dyn)
             # A run of no length shows whether the engine has the method.
             simulate(dyn, motion.q0, motion.v0, 0.0, method)
         except UnsupportedError as error:
@@ -262,17 +306,20 @@ def _road(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[Dynamic
     raise UnsupportedError(f"reference: no independent engine for {motion.model.name}; {'; '.join(reasons)}")
 
 
+def _require_rigid(dyn: Dynamics) -> None:
+    """Refuse an engine whose loops give way: its motion is another one."""
+    if dyn.model.constrained and dyn.soft_constraints:
+        raise UnsupportedError(f"{dyn.engine} holds loops softly")
+
+
 def _leg(motion: Motion, dyn: Dynamics, method: str, q: Array, v: Array, rows: slice, deadline: Deadline) -> Trajectory:
     """Return the motion between two of the saved times."""
-    times = motion.save[rows]
-    start, applied = float(times[0]), motion.torque_argument
-    torque: Any
+    times, torque = motion.save[rows], motion.torque_argument
     if motion.torque.held:
-        torque = np.asarray(applied)[rows.start : rows.stop - 1]
-    else:
-        torque = (lambda t, q, v: applied(start + t, q, v)) if callable(applied) else applied
-    settings = {"torque": torque, "save": times - start, "rtol": METHODS[method].least}
-    return quiet_simulate(dyn, q, v, float(times[-1] - start), method, progress=deadline.look, **settings)
+        torque = np.asarray(torque)[rows.start : rows.stop - 1]
+    start, length = float(times[0]), float(times[-1] - times[0])
+    settings = {"torque": torque, "save": times, "t0": start, "rtol": METHODS[method].least}
+    return quiet_simulate(dyn, q, v, length, method, progress=deadline.look, **settings)
 
 
 #: How well two runs must agree, relative to the size of the motion.
@@ -373,7 +420,7 @@ def reference(
     Raises
     ------
     InputError, UnsupportedError
-        Unusable arguments; neither heyoka nor two engines for this model, or it has loops or prescribed motions.
+        Unusable arguments, such as a start at which a loop is open; neither heyoka nor two engines for this model.
 
     Notes
     -----
@@ -382,6 +429,9 @@ def reference(
     quadruple precision, if there is time; Taylor series (or an embedded Runge-Kutta pair) in double on the own
     derivation beside DOP853 on another engine. Series share the derivation's formulas, so the accelerations along them
     are compared with another engine's.
+
+    Under constraints the start is the state beside q0 and v0 that holds them to 32 digits. The series hold f̈ = 0 with
+    the digits of their numbers, and how far the loops open on the way counts as an error of the reference.
 
     Examples
     --------
@@ -411,10 +461,12 @@ def checked_motion(
     """Return a motion from checked arguments; see `reference`."""
     expect_model(model)
     model.require_values("a reference")
-    require_tree(model, "reference")
     q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
     if q.ndim != 1 or v.ndim != 1:
         raise InputError(f"q0, v0: expected one state, got shapes {q.shape} and {v.shape}; give one after the other")
+    if model.constrained:
+        states_of(model).manifold.at(0.0).check(q, v)
+        model.require_independent(q)
     duration = real("duration", duration, nonnegative=True)
     times = save_times(save, 0.0, duration)
     whole = times[0] == 0 and times[-1] == duration
@@ -506,14 +558,23 @@ def _witness(motion: Motion, best: Reference) -> str:
     q, v = best.q[which], best.v[which]
     force, last = motion.torque.of_member(None), max(len(motion.stops) - 1, 0)
     tau = np.array([force(min(int(k), last)) for k in which])
-    values = motion.equations.constant_values
-    constants = [np.broadcast_to(values, (len(q), len(values)))] if len(values) else []
+    constants = [motion.values(best.t[which])] if len(motion.equations.constant_values) else []
     a = Machine(motion.equations.function("forward_dynamics"))(q, v, tau, *constants)[0][..., 0]
     for engine in INDEPENDENT:
         try:
-            other = dynamics(motion.model, engine).forward_dynamics(q, v, tau)
+            dyn = dynamics(motion.model, engine)
+            _require_rigid(dyn)
+            other = _accelerations(dyn, best.t[which], q, v, tau)
         except MbkitError:
             continue
         apart = np.abs(a - other).max() / (np.abs(a).max() or 1.0)
         return f"; accelerations along it differ by {apart:.1e} from those of {engine}"
     return "; no other engine holds the model, so its formulas were checked by no other derivation"
+
+
+def _accelerations(dyn: Dynamics, t: Array, q: Array, v: Array, tau: Array) -> Array:
+    """Return accelerations at states of different times."""
+    if dyn.model.time_parameter is None:
+        return np.asarray(dyn.forward_dynamics(q, v, tau))
+    states = zip(t.tolist(), q, v, tau, strict=True)
+    return np.array([at_time(dyn, time).forward_dynamics(*state) for time, *state in states])

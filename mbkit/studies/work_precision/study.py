@@ -113,8 +113,8 @@ def work_precision(
     Raises
     ------
     InputError, UnknownNameError, UnsupportedError
-        Unusable arguments; loops or prescribed motions, which engines do not support, without `reference`. The limits
-        of an engine or method are in `refusals`.
+        Unusable arguments, such as a start at which a loop is open. The limits of an engine or method are in
+        `refusals`.
     NumericalError
         No two computations of this motion agree even at its beginning.
     InterruptedSweepError
