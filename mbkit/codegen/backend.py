@@ -6,13 +6,15 @@ import importlib.util
 import os
 import threading
 import warnings
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 import casadi as ca
 
 from mbkit._fork import fork_safe
+from mbkit.codegen import disk_cache as disk
 from mbkit.codegen.interpreter import Machine
 from mbkit.errors import NoCompilerWarning
 
@@ -25,6 +27,37 @@ DERIVING: Final = fork_safe(threading.RLock())
 #: Operations, repeated ones included, above which LLVM's time, some 10 s per 100k, is not spent unasked: a Coriolis
 #: matrix of a hundred joints has twice as many, and is interpreted in 0.5 ms.
 _MAX_OPERATIONS: Final = 200_000
+T = TypeVar("T")
+
+
+class LastUsed(Generic[T]):
+    """Derived things by the name of all that they depend on: the last used ones, up to a number of operations."""
+
+    def __init__(self, most: int, operations: Callable[[T], int]) -> None:
+        self._most, self._operations, self._sum = most, operations, 0
+        self._kept: OrderedDict[str, T] = OrderedDict()
+
+    def get(self, name: Sequence[str], make: Callable[[], T]) -> T:
+        """Return what was made under this name before, or make it; within `force_recompile` once more."""
+        key = disk.key_of(*name)
+        with DERIVING:
+            if key in self._kept and not disk.is_bypassed(key):
+                self._kept.move_to_end(key)
+                return self._kept[key]
+            made = make()
+            disk.mark_made(key)
+            if key in self._kept:
+                self._sum -= self._operations(self._kept.pop(key))
+            self._kept[key] = made
+            self._sum += self._operations(made)
+            while self._sum > self._most:
+                self._sum -= self._operations(self._kept.popitem(last=False)[1])
+        return made
+
+
+#: Functions for the interpreter, which deriving takes a thousand times as long as evaluating once. An operation takes
+#: some 100 bytes.
+_DERIVED: Final[LastUsed[ca.Function]] = LastUsed(500_000, lambda f: int(f.n_instructions()))
 
 
 def compile_by_default() -> bool:
@@ -39,7 +72,7 @@ def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile:
     functions.
     """
     if not compile or not has_compiler():
-        return Machine(make())
+        return Machine(_DERIVED.get(name, make))
     # Loads LLVM, which interpreting never needs.
     from mbkit.codegen.compiled import compiled
 

@@ -75,6 +75,12 @@ def is_bypassed(key: str) -> bool:
     return fresh is not None and key not in fresh
 
 
+def mark_made(key: str) -> None:
+    """Count an entry as compiled again, within a block of `force_recompile`."""
+    if (fresh := _RECOMPILED.get()) is not None:
+        fresh.add(key)
+
+
 def read(key: str) -> tuple[dict[str, Any], bytes] | None:
     """Return the description and code of an entry, or None without a valid one."""
     at = folder()
@@ -104,8 +110,7 @@ def read(key: str) -> tuple[dict[str, Any], bytes] | None:
 
 def write(key: str, about: dict[str, Any], code: bytes) -> None:
     """Write an entry; failures are ignored."""
-    if (fresh := _RECOMPILED.get()) is not None:
-        fresh.add(key)
+    mark_made(key)
     if (at := folder()) is None:
         return
     rest = json.dumps({**about, "key": key}).encode() + b"\n" + code

@@ -265,7 +265,7 @@ def product(M: Any, x: Any) -> Any:
 
 
 def solve(M: Any, f: Any, pattern: Array, order: Sequence[int], own: Arithmetic) -> Any:
-    """Return M⁻¹ f, (N, n), for M (N, n, n) and f (N, n) of 113-bit numbers; not finite where M is singular.
+    """Return M⁻¹ f for M (N, n, n) and f (N, n) or (N, n, m) of 113-bit numbers; not finite where M is singular.
 
     `pattern` (n, n) says where M can be other than zero; `order` has every parent before its children.
     """
@@ -275,6 +275,7 @@ def solve(M: Any, f: Any, pattern: Array, order: Sequence[int], own: Arithmetic)
     for k, i in enumerate(order):
         rows.append({m: M[:, i, j] for m, j in enumerate(order[: k + 1]) if pattern[i, j] or m == k})
     x = [f[:, i] for i in order]
+    across = (slice(None),) + (None,) * (f.ndim - 2)
     diagonal: list[Any] = [None] * n
     factors: list[dict[int, Any]] = [{} for _ in range(n)]
     with np.errstate(all="ignore"):
@@ -287,11 +288,11 @@ def solve(M: Any, f: Any, pattern: Array, order: Sequence[int], own: Arithmetic)
                     if j <= i:
                         rows[i][j] = rows[i].get(j, zero) - factors[k][i] * entry
             for i, factor in factors[k].items():
-                x[i] = x[i] - factor * x[k]
+                x[i] = x[i] - factor[across] * x[k]
         for k in range(n):
-            x[k] = own.divide(x[k], diagonal[k])
+            x[k] = own.divide(x[k], diagonal[k][across])
             for i, factor in factors[k].items():
-                x[k] = x[k] - factor * x[i]
+                x[k] = x[k] - factor[across] * x[i]
     out = np.empty_like(f)
     for k, i in enumerate(order):
         out[:, i] = x[k]

@@ -6,6 +6,7 @@ while the graph is built. With symbols it is an argument, so that the graph can 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, Final, Literal
 
@@ -18,8 +19,9 @@ from mbkit.model import Frame, Joint, Model
 from mbkit.model.elements.forces import Bushing
 from mbkit.model.elements.motion_laws import MOTION_LAWS
 
-# CasADi's operators first search a conversion of their operands, some 15 µs each; `SX.binary` takes 2. A tree's
-# kinematics are tens of thousands of them. This module replaces CasADi in the formulas of the joint types.
+# CasADi's operators first search a conversion of their operands, some 15 µs each; `SX.binary` takes 2, and 4 with a
+# float, which it converts each time. A tree's kinematics are tens of thousands of them. This module replaces CasADi in
+# the formulas of the joint types.
 
 
 class Scalar(ca.SX):
@@ -64,7 +66,15 @@ def _is(x: Any, number: float) -> bool:
     return not isinstance(x, ca.SX) and x == number
 
 
+# Equal floats are one node of a graph anyway.
+_constant = lru_cache(maxsize=4096)(ca.SX)
+
+
 def _of(operation: int, a: Any, b: Any) -> Any:
+    if not isinstance(b, ca.SX):
+        b = _constant(b)
+    elif not isinstance(a, ca.SX):
+        a = _constant(a)
     return scalar(ca.SX.binary(operation, a, b))
 
 

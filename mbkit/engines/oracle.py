@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array
+from mbkit.codegen.backend import LastUsed
 from mbkit.codegen.extended_precision import Backend, Extended, arithmetic, digits, product, solve
 from mbkit.codegen.program import program
 from mbkit.derivation import FUNCTIONS, equations_of
@@ -41,6 +42,9 @@ _WRITTEN: Final = {**FUNCTIONS, **CONSTRAINT_FUNCTIONS}
 #: What one function gives together, in this order.
 _TERMS: Final = ("mass_matrix", "coriolis_force", "gravity", "passive", "nle")
 
+
+#: Programs by description and quantity. An operation takes some 400 bytes.
+_DERIVED: Final[LastUsed[Extended]] = LastUsed(200_000, lambda x: len(x.program.operations))
 
 _Key = tuple[tuple[int, ...], bytes]
 
@@ -222,7 +226,10 @@ class OracleDynamics(Dynamics):
 
     def _run(self, name: tuple[Any, ...], q: Array, *arguments: Any) -> list[Any]:
         if name not in self._programs:
-            self._programs[name] = Extended(program(self._function_of(*name)), self._arithmetic)
+            self._programs[name] = _DERIVED.get(
+                (self._form, *map(str, name)),
+                lambda: Extended(program(self._function_of(*name)), self._arithmetic),
+            )
         return self._programs[name](self._normalized(q), *arguments, *self._constants)
 
     def _function_of(self, name: str, *extra: Any) -> ca.Function:
@@ -259,6 +266,12 @@ class OracleDynamics(Dynamics):
         force = self._arithmetic.array(tau) + terms["passive"] - terms["nle"]
         return solve(terms["mass_matrix"], force, self._pattern, self.equations.elimination_order, self._arithmetic)
 
+    @property
+    def _form(self) -> str:
+        """All that the programs depend on but their names."""
+        frames, axes = self._acting
+        return f"{self.model.digest} under {[x.name for x in frames]} {axes} in {self._arithmetic.name}"
+
     @cached_property
     def _pattern(self) -> Array:
         return np.asarray(ca.DM(self.equations.mass_matrix.sparsity(), 1).full())
@@ -267,7 +280,9 @@ class OracleDynamics(Dynamics):
         return self._run(("coriolis_matrix",), q, v)[0]
 
     def _mass_matrix_inverse(self, q: Array) -> Any:
-        return self._run(("mass_matrix_inverse",), q)[0]
+        M, own = self._terms(q)["mass_matrix"], self._arithmetic
+        unit = own.array(np.broadcast_to(np.eye(self.model.nv), M.shape))
+        return solve(M, unit, self._pattern, self.equations.elimination_order, own)
 
     _inverse_dynamics_derivatives = _stack("inverse_dynamics_derivatives")
     _forward_dynamics_derivatives = _stack("forward_dynamics_derivatives")
