@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mbkit import testing as testing
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
+    from mbkit.engines import engine as engine
     from mbkit.engines.operational_space import OperationalSpace as OperationalSpace
     from mbkit.engines.operational_space import operational_space as operational_space
     from mbkit.errors import MbkitError as MbkitError
@@ -67,6 +68,7 @@ _HOME = {
     "compare_parsers": "mbkit.studies.importers",
     "convert": "mbkit.studies.convert",
     "dynamics": "mbkit.engines",
+    "engine": "mbkit.engines",
     "equilibrium": "mbkit.lagrangian.statics.equilibrium",
     "excitation": "mbkit.identify",
     "explain": "mbkit.studies.explain",

@@ -14,6 +14,7 @@ from mbkit import _escape
 __all__ = [
     "BaselineError",
     "DoubtfulRunWarning",
+    "EngineProcessError",
     "EventError",
     "FunctionError",
     "InputError",
@@ -152,6 +153,10 @@ class UnsupportedError(MbkitError, NotImplementedError):
 
 class NumericalError(MbkitError, ArithmeticError):
     """A computation gave NaN or infinity where a number was due."""
+
+
+class EngineProcessError(MbkitError, RuntimeError):
+    """The process of another version of an engine died, or was ended because it took too long."""
 
 
 class MbkitWarning(UserWarning):

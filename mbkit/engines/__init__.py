@@ -3,6 +3,7 @@
 from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.engines.linearization import DiscreteLinearization, InverseDynamicsSecondDerivatives, Linearization
 from mbkit.engines.registry import ENGINES, EngineInfo, dynamics, register_engine
+from mbkit.engines.versions.engine_version import EngineVersion, engine
 
 __all__ = [
     "ENGINES",
@@ -10,8 +11,10 @@ __all__ = [
     "DiscreteLinearization",
     "Dynamics",
     "EngineInfo",
+    "EngineVersion",
     "InverseDynamicsSecondDerivatives",
     "Linearization",
     "dynamics",
+    "engine",
     "register_engine",
 ]

@@ -13,6 +13,7 @@ from importlib.metadata import entry_points
 from typing import Any, Final
 
 from mbkit.engines.base import Dynamics
+from mbkit.engines.versions.engine_version import EngineVersion
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
@@ -235,7 +236,7 @@ def compared() -> tuple[str, ...]:
     return tuple(info.name for info in ENGINES.values() if not info.reference)
 
 
-def dynamics(model: Model, engine: str = PINOCCHIO, **options: Any) -> Dynamics:
+def dynamics(model: Model, engine: str | EngineVersion = PINOCCHIO, **options: Any) -> Dynamics:
     """Return the model's dynamics as one engine computes them.
 
     Parameters
@@ -244,7 +245,7 @@ def dynamics(model: Model, engine: str = PINOCCHIO, **options: Any) -> Dynamics:
     engine : {"pinocchio", "lagrangian", "mujoco", "drake", "oracle"}
         Rigid-body algorithms of Pinocchio, mbkit's own derivation from energies,
         MuJoCo, Drake (``pip install mbkit[drake]``), or the own derivation at 34 digits, for
-        measuring the others; or an engine of `register_engine`.
+        measuring the others; or an engine of `register_engine`; or another version of an engine, from `mbkit.engine`.
     **options
         The lagrangian engine's ``compile=`` (True or False) and ``threads=``; MuJoCo's ``solref=`` and ``solimp=`` of
         the soft constraints that hold loops; other engines have none.
@@ -261,6 +262,13 @@ def dynamics(model: Model, engine: str = PINOCCHIO, **options: Any) -> Dynamics:
         The engine is not installed, or cannot hold this model; with the reason.
     """
     expect_model(model)
+    if isinstance(engine, EngineVersion):
+        # The import is for few.
+        from mbkit.engines.versions.dynamics import VersionDynamics
+
+        if options:
+            raise InputError(f"{', '.join(options)}: {engine} has no options")
+        return VersionDynamics(model, engine)
     if not isinstance(engine, str):
         raise UnknownNameError("engine", str(engine), ENGINES)
     adapter = find_engine(engine).load()

@@ -1,0 +1,180 @@
+"""What a description is in the coordinates of an engine of another version, and how it travels there.
+
+A model travels as plain data: numbers in JSON keep every digit, and no parser of a version is between the description
+and its dynamics. MuJoCo has no other constructor in all versions than its parser of MJCF, and gets the text of
+`mbkit.convert`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines.base import STACKS, first_names
+from mbkit.errors import UnsupportedError
+from mbkit.model import Joint, Model
+from mbkit.model.validation import static_bodies
+
+
+class Convention(NamedTuple):
+    """Coordinates of joints that rotate freely, in an engine.
+
+    Attributes
+    ----------
+    free_q, free_v, ball_q : tuple of int
+        The engine's number k is the description's number so and so; an empty `ball_q` stands for roll, pitch and yaw.
+    turned : mapping
+        Joint type -> starts of the triples of its velocity that are in the axes of the joint's fixed frame.
+    linear : int
+        Where a free joint's linear velocity begins.
+    """
+
+    free_q: tuple[int, ...] = (0, 1, 2, 3, 4, 5, 6)
+    free_v: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    ball_q: tuple[int, ...] = (0, 1, 2, 3)
+    turned: Mapping[str, tuple[int, ...]] = {}
+    linear: int = 0
+
+
+CONVENTIONS: Final[Mapping[str, Convention]] = {
+    "mujoco": Convention((0, 1, 2, 6, 3, 4, 5), ball_q=(3, 0, 1, 2), turned={"free": (0,)}),
+    "pinocchio": Convention(),
+    "drake": Convention((6, 3, 4, 5, 0, 1, 2), (3, 4, 5, 0, 1, 2), (), {"free": (0, 3), "ball": (0,)}, 3),
+}
+
+
+def _one(joint: Joint) -> list[dict[str, Any]]:
+    return [{"type": joint.kind, "axes": joint.axes.tolist(), "pitch": joint.pitch}]
+
+
+def _stacked(joint: Joint) -> list[dict[str, Any]]:
+    return [{"type": kind, "axes": [axis.tolist()], "pitch": 0.0} for kind, axis in STACKS[joint.kind](joint)]
+
+
+#: Joint type -> the joints that an engine has in its place, one after the other.
+_OF_ALL: Final[dict[str, Callable[[Joint], list[dict[str, Any]]]]] = {
+    "fixed": lambda _: [],
+    **dict.fromkeys(("revolute", "continuous", "prismatic", "planar"), _stacked),
+    **dict.fromkeys(("helical", "ball", "free"), _one),
+}
+_STEPS: Final = {
+    "pinocchio": _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _one),
+    "drake": _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _stacked),
+}
+
+
+def travelling(engine: str, model: Model) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
+    """Return a description as an engine's file in `remote` takes it, and the engine's joints of each joint.
+
+    Raises `UnsupportedError` for what the engine does not have, or what does not travel.
+    """
+    if engine not in _STEPS:
+        return _mjcf(model)
+    for what, parts in (("springs between points", model.springs), ("couplings", model.couplings)):
+        if parts:
+            names = first_names(repr(x.name) for x in parts)
+            raise UnsupportedError(f"{engine} of other versions: {model.name} has {what} ({names}), which are not sent")
+    static, steps = static_bodies(model.joints), _STEPS[engine]
+    for joint in model.joints:
+        if joint.kind not in steps:
+            raise UnsupportedError(
+                f"{engine} of other versions: joint {joint.name!r} is {joint.kind}, which is not sent"
+            )
+    return {
+        "gravity": model.gravity.tolist(),
+        "bodies": {
+            b.name: {
+                "mass": b.mass,
+                "com": b.com.tolist(),
+                "inertia": b.inertia.tolist(),
+                "static": b.name in static,
+            }
+            for b in model.bodies
+        },
+        "joints": [
+            {
+                "name": joint.name,
+                "parent": joint.parent,
+                "child": joint.child,
+                "rotation": joint.rotation.tolist(),
+                "translation": joint.translation.tolist(),
+                "armature": joint.armature.tolist(),
+                "steps": [{**step, "type": _plain_type(step["type"])} for step in steps[joint.kind](joint)],
+            }
+            for joint in model.tree
+        ],
+    }, {joint.name: (joint.name,) for joint in model.joints}
+
+
+def _plain_type(kind: str) -> str:
+    return "revolute" if kind == "continuous" else kind
+
+
+def _mjcf(model: Model) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
+    # The import loads MuJoCo.
+    from mbkit.engines.mujoco.mjcf_writer import mjcf_text
+    from mbkit.engines.mujoco.model import specified
+
+    text = mjcf_text(model, "for another version")
+    return {"text": text}, {name: tuple(own) for name, own in specified(model)[1].joints.items()}
+
+
+class Places(NamedTuple):
+    """Where the engine's numbers are in the description's full coordinates."""
+
+    #: Entry i is full coordinate q_index[i]; the angles of a ball joint with roll, pitch and yaw mean nothing.
+    q_index: np.ndarray
+    v_index: np.ndarray
+    #: Joints with velocities in other axes: the joint, its places in the engine's q and v.
+    turning: tuple[tuple[Joint, list[int], list[int]], ...]
+
+
+def places(engine: str, model: Model, names: Mapping[str, Sequence[str]], joints: Mapping[str, Any]) -> Places:
+    """Return the places of an engine's coordinates, from those of its joints, by name."""
+    convention, layout = CONVENTIONS[engine], model.layout
+    own: dict[str, tuple[list[int], list[int]]] = {}
+    for joint in model.joints:
+        if joint.type.nv:
+            at = [joints[name] for name in names[joint.name]]
+            own[joint.name] = [k for q, _ in at for k in q], [k for _, v in at for k in v]
+    q_index = np.zeros(sum(len(q) for q, _ in own.values()), int)
+    v_index = np.zeros(sum(len(v) for _, v in own.values()), int)
+    turning = []
+    for joint in model.joints:
+        if joint.name not in own:
+            continue
+        at_q, at_v = own[joint.name]
+        order_q: Sequence[int] = range(joint.type.nq)
+        order_v: Sequence[int] = range(joint.type.nv)
+        if joint.type.quaternion is not None:
+            free = joint.type.nv > 3
+            order_q = convention.free_q if free else convention.ball_q or (0,) * 3
+            order_v = convention.free_v if free else order_v
+            if joint.kind in convention.turned:
+                turning.append((joint, at_q, at_v))
+        q_index[at_q] = layout.full_q[joint.name].start + np.array(order_q, int)
+        v_index[at_v] = layout.full_v[joint.name].start + np.array(order_v, int)
+    return Places(q_index, v_index, tuple(turning))
+
+
+def joint_passive(model: Model, q: Array, v: Array) -> Array:
+    """Return the force of springs and dampers at joints, (nv,), for engines whose algorithms leave it out."""
+    layout = model.layout
+    full_q, out = layout.expand_q(q), np.zeros(layout.sizes[3])
+    for joint in layout.joints:
+        at_q, at_v = layout.full_q[joint.name], layout.full_v[joint.name]
+        out[at_v] = -joint.damping * layout.expand_v(v)[at_v]
+        if joint.stiffness.any():
+            out[at_v] -= joint.stiffness * (full_q[at_q] - joint.rest)
+    return np.asarray(layout.G.T @ out)
+
+
+def spring_energy(model: Model, q: Array) -> float:
+    """Return the energy of the springs at joints, J."""
+    layout = model.layout
+    full_q = layout.expand_q(q)
+    sprung = [j for j in layout.joints if j.stiffness.any()]
+    return 0.5 * sum(float(j.stiffness @ (full_q[layout.full_q[j.name]] - j.rest) ** 2) for j in sprung)

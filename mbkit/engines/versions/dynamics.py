@@ -1,0 +1,198 @@
+"""An engine of another version behind the protocol: each evaluation is a call of its process."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit import spatial
+from mbkit._check import Array
+from mbkit.engines.base import MappedDynamics
+from mbkit.engines.frames_and_momenta import seen_from
+from mbkit.engines.versions.description import CONVENTIONS, joint_passive, places, spring_energy, travelling
+from mbkit.engines.versions.engine_version import EngineVersion
+from mbkit.engines.versions.process import RemoteError, new_key, process_of
+from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.model import Frame, Model
+
+#: Quantities that not every engine gives by itself.
+_REFUSED: Final = {
+    "coriolis_matrix": "this engine forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
+    "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
+}
+
+
+class VersionDynamics(MappedDynamics):
+    """An engine of another version on a description.
+
+    Each quantity is that of the engine's own function in that version, in the description's coordinates.
+
+    Attributes
+    ----------
+    version : EngineVersion
+
+    Notes
+    -----
+    A call takes some 0.2 ms more than the engine: the state goes to another process and the value comes back. Springs
+    and dampers at the joints are mbkit's own where the engine's algorithms know none (Pinocchio) and where they are not
+    sent (Drake); MuJoCo's are its own.
+    """
+
+    def __init__(self, model: Model, version: EngineVersion) -> None:
+        self.version = version
+        super().__init__(model)
+        self._data, self._names = travelling(version.engine, model)
+        self._process, self._key, self._held = process_of(version), new_key(), 0
+        weakref.finalize(self, self._process.unneeded.append, self._key)
+        self._build()
+        gives = self._call("about")[0]["gives"]
+        self._own_passive = "passive" in gives
+        vars(self)["refuses"] = {x: why for x, why in _REFUSED.items() if x not in gives}
+
+    @property
+    def engine(self) -> str:  # type: ignore[override]  # of this object
+        """Name of the engine with its version."""
+        return self.version.name
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.model, self.version)
+
+    def at(self, /, **values: Any) -> VersionDynamics:
+        return type(self)(self.model.with_nominal(values), self.version)
+
+    def _call(self, name: str, *arrays: Array, **plain: Any) -> tuple[dict[str, Any], list[Array]]:
+        return self._process.call(name, arrays, self._key, self.version.seconds, **plain)
+
+    def _build(self) -> None:
+        """Send the model, to a process that does not hold it yet."""
+        self._held = self._process.start()
+        try:
+            head, _ = self._call("build", **self._data)
+        except RemoteError as error:
+            raise UnsupportedError(f"{self.engine}: refuses {self.model.name}: {error}") from None
+        self._places = places(self.version.engine, self.model, self._names, head["joints"])
+        self._v_index = self._places.v_index
+
+    def _ask(self, name: str, *arrays: Array, **plain: Any) -> list[Array]:
+        if self._process.start() != self._held:
+            # The one that held the model has died since.
+            self._build()
+        try:
+            return self._call(name, *arrays, **plain)[1]
+        except RemoteError as error:
+            raise NumericalError(f"{self.engine}: {name} of {self.model.name}: {error}") from None
+
+    def _native(self, q: Array, v: Array | None = None) -> tuple[Array, Array, Array]:
+        """Return the engine's q and v, and b of a_engine = T a + b."""
+        layout, convention = self.model.layout, CONVENTIONS[self.version.engine]
+        full_q, index = layout.expand_q(q), self._places.v_index
+        x, b = full_q[self._places.q_index], np.zeros(len(index))
+        own = b if v is None else layout.expand_v(v)[index]
+        self._turned = []
+        for joint, at_q, at_v in self._places.turning:
+            quaternion = full_q[layout.full_q[joint.name]][-4:]
+            R = spatial.matrix_from_quaternion(quaternion)
+            first = at_v[0]
+            self._turned += [(R, slice(first + k, first + k + 3)) for k in convention.turned[joint.kind]]
+            if len(at_q) < 4:
+                x[at_q] = spatial.rpy_from_matrix(R)
+            if joint.type.nv > 3:
+                linear = slice(first + convention.linear, first + convention.linear + 3)
+                angular = slice(first + 3 - convention.linear, first + 6 - convention.linear)
+                b[linear] = R @ np.cross(own[angular], own[linear])
+        return x, np.zeros(len(index)) if v is None else self._to_engine(v), b
+
+    # The protocol.
+
+    def _mass_matrix(self, q: Array) -> Array:
+        x, _, _ = self._native(q)
+        return self._columns(self._columns(self._ask("mass_matrix", x)[0]).T)
+
+    def _coriolis_matrix(self, q: Array, v: Array) -> Array:
+        x, u, _ = self._native(q, v)
+        return self._columns(self._columns(self._ask("coriolis_matrix", x, u)[0]).T).T
+
+    def _with_rotation(self, name: str, q: Array, v: Array) -> Array:
+        """Return a force of velocities, and M b of the change of velocities."""
+        x, u, b = self._native(q, v)
+        out = self._ask(name, x, u)[0]
+        return self._force(out + self._ask("mass_matrix", x)[0] @ b if b.any() else out)
+
+    def _coriolis_force(self, q: Array, v: Array) -> Array:
+        return self._with_rotation("coriolis_force", q, v)
+
+    def _nle(self, q: Array, v: Array) -> Array:
+        return self._with_rotation("nle", q, v)
+
+    def _gravity(self, q: Array) -> Array:
+        return self._force(self._ask("gravity", self._native(q)[0])[0])
+
+    def _passive(self, q: Array, v: Array) -> Array:
+        if not self._own_passive:
+            return joint_passive(self.model, q, v)
+        x, u, _ = self._native(q, v)
+        return self._force(self._ask("passive", x, u)[0])
+
+    def _beside(self, q: Array, v: Array) -> Array | float:
+        """Return the passive force that the engine does not know of."""
+        return 0.0 if self._own_passive else joint_passive(self.model, q, v)
+
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        x, u, b = self._native(q, v)
+        out = self._force(self._ask("inverse_dynamics", x, u, self._to_engine(a) + b)[0])
+        return np.asarray(out - self._beside(q, v))
+
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+        if self.model.layout.reduced:
+            rest = self._inverse_dynamics(q, v, np.zeros(self.model.nv))
+            return np.asarray(np.linalg.solve(self._mass_matrix(q), tau - rest))
+        x, u, b = self._native(q, v)
+        return self._force(self._ask("forward_dynamics", x, u, self._to_engine(tau + self._beside(q, v)))[0] - b)
+
+    def _kinetic_energy(self, q: Array, v: Array) -> Any:
+        return self._ask("kinetic_energy", *self._native(q, v)[:2])[0]
+
+    def _potential_energy(self, q: Array) -> Any:
+        own = self._ask("potential_energy", self._native(q)[0])[0]
+        return own if self._own_passive else own + spring_energy(self.model, q)
+
+    def _of_frame(self, q: Array, frame: Frame) -> tuple[Array, Array, Array, Array]:
+        """Return R_WF and p_WF, and the Jacobians of the origin and of turning in world axes."""
+        R, p, linear, angular = self._ask("frame", self._native(q)[0], body=frame.body)
+        arm = R @ frame.translation
+        return R @ frame.rotation, p + arm, linear - spatial.skew(arm) @ angular, angular
+
+    def _placement(self, q: Array, frame: Frame) -> tuple[Array, Array]:
+        return self._of_frame(q, frame)[:2]
+
+    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
+        return np.array([self._columns(seen_from(*self._of_frame(q, frame), axes)) for frame in frames])
+
+    # Beside the protocol.
+
+    def rollout(self, q0: Array, v0: Array, method: str, dt: float, steps: int) -> tuple[Array, Array]:
+        """Return the states of a run by the engine's own integrator, (steps + 1, nq) and (steps + 1, nv).
+
+        Raises `UnsupportedError` for an engine without one, and for mimic joints, which it would not reduce.
+        """
+        if self.model.layout.reduced:
+            raise UnsupportedError(f"{self.engine}: its own runs do not reduce mimic joints")
+        x, u, _ = self._native(self.model.check_q(q0), self.model.check_v(v0))
+        try:
+            xs, us = self._ask("rollout", x, u, method=method, dt=dt, steps=steps)
+        except NumericalError as error:
+            raise UnsupportedError(str(error)) from None
+        q, v = np.empty_like(xs), np.empty_like(us)
+        q[:, self._places.q_index] = xs
+        for k in range(len(q)):
+            self._native(q[k])
+            v[k] = self._force(us[k])
+        return q, v
+
+    def seconds(self, q: Array, v: Array, repeats: int = 200) -> float:
+        """Return the shortest time of one forward dynamics in the engine's process, s, without the way there."""
+        x, u, _ = self._native(self.model.check_q(q), self.model.check_v(v))
+        plain: dict[str, Any] = {"repeats": repeats}
+        return float(self._ask("seconds", x, u, **plain)[0])

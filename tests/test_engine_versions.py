@@ -1,0 +1,339 @@
+"""Engines of other versions: environments, processes and the protocol; the present interpreter is an environment."""
+
+from __future__ import annotations
+
+import ast
+import os
+import pickle
+import signal
+import stat
+import sys
+import threading
+from importlib.metadata import version as installed
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.engines.versions import environment, process
+from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion, versions_of
+from mbkit.engines.versions.remote import serve
+from mbkit.errors import EngineProcessError, InputError, UnknownNameError, UnsupportedError
+from tests.random_trees import IN_MUJOCO, SOUND, random_tree
+
+ENGINES = tuple(PACKAGES)
+
+
+def script(path: Path, text: str) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
+
+
+def present(engine: str, version: str, before: str = "") -> EngineVersion:
+    """Make an environment of the present interpreter, and return its engine."""
+    python = environment.python_of(environment.place(PACKAGES[engine].distribution, version))
+    script(python, f'{before}\nexec "{sys.executable}" "$@"')
+    return mb.engine(f"{engine}=={version}")
+
+
+@pytest.fixture(autouse=True)
+def environments(tmp_path, monkeypatch):
+    monkeypatch.setenv("MBKIT_ENVIRONMENTS", str(tmp_path / "environments"))
+    process._end_all()
+    yield tmp_path / "environments"
+    process._end_all()
+
+
+def chain() -> mb.Model:
+    """Two joints with springs, dampers and rotors."""
+    b = mb.ModelBuilder("chain")
+    for name, kind, parent, body in (("j1", "revolute", "world", "one"), ("j2", "prismatic", "one", "two")):
+        b.add_body(body, mass=2.0, com=(0.1, 0.2, 0.3), inertia=(0.3, 0.4, 0.5))
+        numbers = {"damping": 0.3, "stiffness": 2.0, "rest": 0.1, "armature": 0.2, "axis": (0.6, 0.0, 0.8)}
+        b.add_joint(name, kind, parent=parent, child=body, translation=(0.1, 0.0, 0.4), **numbers)
+    return b.build()
+
+
+TURNING = tuple(kind for kind in SOUND if kind in IN_MUJOCO)
+STACKED = ("revolute", "universal", "spherical_zyx")
+BARE = {"springs": False, "damping": False, "armature": False}
+MODELS = {
+    "panda": lambda: mb.load("panda"),
+    "floating": lambda: mb.load("ur5", floating_base=True),
+    "mimic": lambda: mb.load("kinova"),
+    "turning": lambda: random_tree(1, 12, TURNING, **BARE),
+    "helical": lambda: random_tree(
+        1, 6, ("helical", "fixed", "prismatic"), springs=False, damping=False, armature=False
+    ),
+    "universal": lambda: random_tree(2, 6, STACKED, **BARE),
+    "springs": chain,
+}
+TERMS = {
+    "mass_matrix": 1,
+    "gravity": 1,
+    "potential_energy": 1,
+    "coriolis_force": 2,
+    "nle": 2,
+    "passive": 2,
+    "kinetic_energy": 2,
+    "inverse_dynamics": 3,
+    "forward_dynamics": 3,
+}
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("name", MODELS)
+def test_terms_are_those_of_the_oracle(engine, name):
+    model = MODELS[name]()
+    if engine == "drake":
+        pytest.importorskip("pydrake")
+    version = present(engine, installed(PACKAGES[engine].distribution))
+    if name == "helical" and engine == "mujoco":
+        with pytest.raises(UnsupportedError, match="helical"):
+            mb.dynamics(model, version)
+        return
+    dyn = mb.dynamics(model, version)
+    oracle, rng = mb.dynamics(model, "oracle"), np.random.default_rng(0)
+    q, v = model.random_state(rng, 3)
+    states = q, v, rng.standard_normal(v.shape)
+    # Pinocchio's matrix and energy are known to be wrong for these.
+    wrong = {"universal": "coriolis_force", "springs": "kinetic_energy"}.get(name) if engine == "pinocchio" else None
+    for term, arguments in TERMS.items():
+        value, truth = (getattr(d, term)(*states[:arguments]) for d in (dyn, oracle))
+        right = np.abs(value - truth).max() <= 1e-12 * max(1.0, np.abs(truth).max())
+        assert right == (term != wrong), term
+    body = model.bodies[-1].name
+    for quantity in (lambda d: d.jacobian(q, body), lambda d: d.pose(q, body)):
+        assert np.abs(quantity(dyn) - quantity(oracle)).max() < 1e-12
+
+
+def test_an_engine_says_what_it_is_and_what_it_cannot_give():
+    model = mb.catalog.double_pendulum()
+    dyn = mb.dynamics(model, present("mujoco", "4.0.0"))
+    assert dyn.engine == "mujoco==4.0.0"
+    with pytest.raises(UnsupportedError, match="without the matrix"):
+        dyn.coriolis_matrix([0.1, 0.2], [1.0, 2.0])
+    with pytest.raises(InputError, match="q: expected shape"):
+        dyn.gravity([0.1])
+    with pytest.raises(InputError, match="has no options"):
+        mb.dynamics(model, mb.engine("mujoco==4.0.0"), threads=2)
+    again = pickle.loads(pickle.dumps(dyn))
+    assert np.array_equal(again.mass_matrix([0.1, 0.2]), dyn.mass_matrix([0.1, 0.2]))
+    run = mb.simulate(dyn, [0.1, 0.2], [0.0, 0.0], 0.01, dt=1e-3)
+    other = mb.simulate(mb.dynamics(model, "lagrangian"), [0.1, 0.2], [0.0, 0.0], 0.01, dt=1e-3)
+    assert run.q[-1] == pytest.approx(other.q[-1], abs=1e-12)
+
+
+def test_its_own_runs_are_those_of_the_library():
+    model = random_tree(5, 4, ("free", "revolute"), springs=False, damping=False)
+    dyn, here = mb.dynamics(model, present("mujoco", installed("mujoco"))), mb.dynamics(model, "mujoco")
+    q0, v0 = model.random_state(0)
+    for ours, theirs in zip(
+        dyn.rollout(q0, v0, "rk4", 1e-3, 20), here.rollout("rk4", q0, v0, 1e-3, None, 20), strict=True
+    ):
+        assert np.abs(ours - theirs).max() < 1e-12
+    with pytest.raises(UnsupportedError, match="rollout"):
+        mb.dynamics(model, present("pinocchio", "4.1.0")).rollout(q0, v0, "rk4", 1e-3, 20)
+
+
+def test_what_does_not_travel_is_refused_by_name():
+    version = present("pinocchio", "4.1.0")
+    b = mb.ModelBuilder("sprung")
+    b.add_body("bob", mass=1.0)
+    b.add_joint("slide", "prismatic", parent="world", child="bob", axis=(0, 0, 1))
+    b.add_spring("coil", body_a="world", body_b="bob", stiffness=1.0)
+    with pytest.raises(UnsupportedError, match="coil"):
+        mb.dynamics(b.build(), version)
+    with pytest.raises(UnsupportedError, match="loop"):
+        mb.dynamics(mb.catalog.slider_crank(), version)
+
+
+def test_what_a_library_prints_is_no_answer():
+    dyn = mb.dynamics(mb.catalog.pendulum(), present("mujoco", "4.0.0", before='echo "hello"; echo "[1]" >&2'))
+    assert dyn.mass_matrix([0.0]).shape == (1, 1)
+
+
+def test_a_process_that_dies_is_an_error_and_the_next_call_starts_another():
+    version = present("mujoco", "4.0.0")
+    dyn = mb.dynamics(mb.catalog.pendulum(), version)
+    before = dyn.mass_matrix([0.3])
+    own = process.process_of(version)
+    folder = own._folder
+    pid = own._process.pid
+    # As a library does it: in the middle of a call.
+    os.kill(pid, signal.SIGSTOP)
+    threading.Timer(0.3, lambda: [os.kill(pid, s) for s in (signal.SIGSEGV, signal.SIGCONT)]).start()
+    with pytest.raises(EngineProcessError, match="SIGSEGV"):
+        dyn.mass_matrix([0.3])
+    assert not folder.exists()
+    assert np.array_equal(dyn.mass_matrix([0.3]), before)
+
+
+def test_a_process_that_hangs_is_ended_in_time():
+    version = present("mujoco", "4.0.0")
+    dyn = mb.dynamics(mb.catalog.pendulum(), mb.engine(version.name, seconds=0.5))
+    os.kill(process.process_of(version)._process.pid, signal.SIGSTOP)
+    with pytest.raises(EngineProcessError, match=r"ended after 0\.5 s"):
+        dyn.gravity([0.3])
+    assert dyn.gravity([0.0]) == pytest.approx([0.0], abs=1e-15)
+
+
+def test_a_process_that_does_not_start_says_its_last_words():
+    version = present("mujoco", "4.0.0", before='echo "libGL is missing" >&2; exit 3')
+    with pytest.raises(EngineProcessError, match=r"status 3 \(libGL is missing\)"):
+        mb.dynamics(mb.catalog.pendulum(), version)
+
+
+def test_a_fork_has_a_process_of_its_own():
+    dyn = mb.dynamics(mb.catalog.pendulum(), present("mujoco", "4.0.0"))
+    before = dyn.mass_matrix([0.3])
+    child = os.fork()
+    if not child:
+        os._exit(0 if np.array_equal(dyn.mass_matrix([0.3]), before) else 1)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert np.array_equal(dyn.mass_matrix([0.3]), before)
+
+
+@pytest.mark.parametrize("name", ["mujoco", "mujoco==", "mujoco==3.1 --pre", "mujoco==../x", 3, None])
+def test_what_is_no_version_is_refused(name):
+    with pytest.raises(InputError, match="expected an engine and its version"):
+        mb.engine(name)
+
+
+def test_an_engine_without_versions_is_refused():
+    with pytest.raises(UnknownNameError, match="pinocchio"):
+        mb.engine("pinochio==2.7.0")
+    with pytest.raises(InputError, match="seconds"):
+        mb.engine("mujoco==3.1.0", seconds=0)
+
+
+# Environments, by an installer of the tests' own.
+
+INSTALLER = """
+if [ "$1" = venv ]; then
+  for last; do :; done
+  mkdir -p "$last/bin"
+  printf '#!/bin/sh\\nexec "{python}" "$@"\\n' > "$last/bin/python"
+  chmod +x "$last/bin/python"
+  exit 0
+fi
+echo "$@" >> "{log}"
+{install}
+"""
+
+
+@pytest.fixture
+def installer(tmp_path, monkeypatch):
+    """Put a ``uv`` of one's own before the path; return the function that says what it does, and its log."""
+    log = tmp_path / "log"
+    log.touch()
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
+
+    def does(install: str) -> Path:
+        script(tmp_path / "bin" / "uv", INSTALLER.format(python=sys.executable, log=log, install=install))
+        return log
+
+    return does
+
+
+def test_an_environment_is_made_once_and_whole(installer, environments):
+    log, lines = installer("exit 0"), []
+    place = environment.place("mujoco", "9.9")
+    # What a process left that was ended while it built.
+    script(place.with_name(f".{place.name}.part") / "bin" / "python", "exit 1")
+    for _ in range(2):
+        python = environment.interpreter("mujoco", "9.9", "mujoco", lines.append)
+    assert python.is_file()
+    assert len(log.read_text().splitlines()) == 1
+    assert "mujoco==9.9 numpy" in log.read_text()
+    assert len(lines) == 2
+    assert "making an environment of mujoco 9.9" in lines[0]
+    assert [p.name for p in environments.iterdir() if p.is_dir()] == [place.name]
+    assert mb.engine("mujoco==9.9").installed
+    environment.remove("mujoco", "9.9")
+    assert not mb.engine("mujoco==9.9").installed
+
+
+def test_two_at_once_build_one(installer):
+    log = installer("sleep 0.5; exit 0")
+    made = []
+    threads = [
+        threading.Thread(target=lambda: made.append(environment.interpreter("mujoco", "9.9", "mujoco", len)))
+        for _ in range(3)
+    ]
+    for step in (threading.Thread.start, threading.Thread.join):
+        for thread in threads:
+            step(thread)
+    assert len(made) == 3
+    assert len(log.read_text().splitlines()) == 1
+
+
+def test_what_is_compiled_for_an_older_numpy_gets_it(installer):
+    log = installer('case "$*" in *"numpy<2"*) exit 0;; esac; exit 0')
+    with pytest.raises(UnsupportedError, match="no_such_module cannot be imported: ModuleNotFoundError"):
+        environment.interpreter("mujoco", "9.9", "no_such_module", len)
+    assert [line.split()[-1] for line in log.read_text().splitlines()] == ["numpy", "numpy<2"]
+
+
+def test_an_unknown_version_is_answered_with_those_that_there_are(installer):
+    installer('echo "ERROR: Could not find a version of mujoco==9.9 (from versions: 3.1.0, 4.0.0)" >&2; exit 1')
+    with pytest.raises(UnknownNameError, match=r"version of mujoco '9\.9'.*4\.0\.0, 3\.1\.0"):
+        mb.dynamics(mb.catalog.pendulum(), mb.engine("mujoco==9.9"))
+
+
+def test_without_a_network_the_reason_is_that_of_the_installer(installer, environments):
+    installer(
+        'echo "WARNING: Retrying: Failed to establish a new connection: Name or service not known" >&2\n'
+        'echo "ERROR: Could not find a version that satisfies mujoco==9.9 (from versions: none)" >&2; exit 1'
+    )
+    with pytest.raises(UnsupportedError, match=r"mujoco 9\.9: no environment.*Failed to establish a new connection"):
+        mb.dynamics(mb.catalog.pendulum(), mb.engine("mujoco==9.9"))
+    assert [p for p in environments.iterdir() if p.is_dir()] == []
+
+
+def test_the_files_of_the_other_side_stand_alone():
+    """They run on another NumPy and beside no mbkit, and no number of a version is in them."""
+    for path in Path(serve.__file__).parent.glob("*.py"):
+        tree = ast.parse(path.read_text("utf-8"))
+        names = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
+        names |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+        assert not [name for name in names if name.startswith("mbkit")], path.name
+        compared = [x for node in ast.walk(tree) if isinstance(node, ast.Compare) for x in ast.walk(node)]
+        assert not [x for x in compared if isinstance(x, ast.Name) and "version" in x.id.lower()], path.name
+
+
+def test_messages_hold_arrays_of_any_shape_and_no_pickles():
+    arrays = [np.float64(3.0), np.zeros((0, 3)), np.arange(12.0).reshape(3, 4).T]
+    data = serve.packed({"call": "x"}, arrays)
+    read = iter([data])
+    rest = bytearray(next(read))
+
+    def take(size):
+        out, rest[:] = bytes(rest[:size]), rest[size:]
+        return out
+
+    head, back = serve.unpacked(take)
+    assert head == {"call": "x", "arrays": 3}
+    assert all(np.array_equal(a, b) and np.shape(a) == b.shape for a, b in zip(arrays, back, strict=True))
+    with pytest.raises(TypeError):
+        serve.packed({}, [np.array([object()])])
+
+
+def test_a_real_old_version(monkeypatch, tmp_path_factory):
+    """The smallest download: MuJoCo 3.1.6, which has no MjSpec and another mj_fullM."""
+    kept = os.environ.get("MBKIT_TEST_ENVIRONMENTS", str(tmp_path_factory.mktemp("environments")))
+    monkeypatch.setenv("MBKIT_ENVIRONMENTS", kept)
+    version = mb.engine("mujoco==3.1.6")
+    try:
+        version.interpreter()
+    except (UnsupportedError, UnknownNameError) as error:
+        pytest.skip(f"no environment can be made here: {error}")
+    model = mb.load("ur5", floating_base=True)
+    dyn, oracle = mb.dynamics(model, version), mb.dynamics(model, "oracle")
+    q, v = model.random_state(0)
+    for value, truth in ((dyn.mass_matrix(q), oracle.mass_matrix(q)), (dyn.nle(q, v), oracle.nle(q, v))):
+        assert np.abs(value - truth).max() < 1e-12 * np.abs(truth).max()
+    assert "4.0.0" in versions_of("mujoco")
