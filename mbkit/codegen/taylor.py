@@ -146,10 +146,11 @@ class TaylorSystem:
                 f"taylor: {name} takes {size} operations, too many for a Taylor series; method='rk853' or 'dop853'"
             )
         self.operations = size
-        # Each quaternion's norm is a square root too, and each constraint's weight, of what never vanishes.
+        # Each quaternion's norm is a square root too, each constraint's weight, and each disc's height, of what never
+        # vanishes.
         kinks, model = sum(o.name in _KINKS for o in graph.operations), equations.model
-        rows = equations.constraints.value.numel() if model.constrained else 0  # type: ignore[attr-defined]  # written
-        self.kinked = kinks > len(model.quaternions) + rows
+        rows = len(equations.constraints.names) if model.constrained else 0  # type: ignore[attr-defined]  # written
+        self.kinked = kinks > len(model.quaternions) + rows + len(model.no_slip)
         # Parameters stand first among the arguments behind tau.
         self.clock = list(model.parameters).index(model.time_parameter) if model.time_parameter else None
         self._nq, self._nv = graph.inputs[:2]

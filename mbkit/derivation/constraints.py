@@ -1,11 +1,14 @@
-"""Constraints f(q, t) = 0 of loops and of motions prescribed in time, as CasADi expressions.
+"""Constraints of loops, of motions prescribed in time and of contacts without slip, as CasADi expressions.
 
-One form for all of them, with the multipliers λ::
+Rows that hold positions, f(q, t) = 0, come first; behind them rows that hold velocities alone, A(q) v = b, which have
+no integral (non-holonomic). One form for all of them, with the multipliers λ::
 
     M v̇ + C v + g = τ + τ_passive + Jᵀ λ        J v̇ + γ = 0
 
-J is the Jacobian of f on the velocities: ḟ = J v + ∂f/∂t, and f̈ = J v̇ + γ (Featherstone 2008, Rigid Body Dynamics
-Algorithms, ch. 8). By Gauss's principle v̇ is the least change, in the metric of M, of the free acceleration.
+J has the Jacobian of f on the velocities, and A below it. The rate J v + c is zero: ḟ = J v + ∂f/∂t of the first rows,
+A v - b of the others; its derivative is J v̇ + γ (Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 8). By Gauss's
+principle, which asks nothing of a row but that it is linear in v̇, v̇ is the least change, in the metric of M, of the
+free acceleration.
 
 Rows of a loop stand in the axes of the body that carries both its ends. A row that follows from the others at every
 configuration, such as the third of a point loop in a plane, says nothing and is left out. A row that follows from the
@@ -15,25 +18,27 @@ which those with the least norm are given, and left out of the equation.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
-from mbkit.derivation.kinematics import Kinematics, Vector
+from mbkit.derivation.kinematics import Kinematics, Vector, add, dot3
 from mbkit.derivation.least_constraint import hard_poses
 from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.errors import InputError
-from mbkit.model import Model
+from mbkit.model import Model, NoSlip
 from mbkit.model.elements.motion_laws import MOTION_LAWS
+from mbkit.model.joint_types import cross3
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.manifold import random_state
 from mbkit.model.parts import Loop
+from mbkit.model.rolling import NO_SLIP_ROWS, contact
 from mbkit.model.validation import sample_mass_matrix
 
 #: Mass of a coordinate that has none, in terms of the mean one.
@@ -62,20 +67,31 @@ _CLOSED: Final = 1e-10
 
 
 class ConstraintTerms:
-    """f(q, t) and its derivatives J, ∂f/∂t, rate ḟ = J v + ∂f/∂t and γ, with f̈ = J v̇ + γ.
+    """f(q, t), and of all rows J, the rate J v + c, and γ, with the rate's derivative J v̇ + γ.
 
-    `names` has one text for each row, and `qdot` is D(q) v where velocities are not the coordinates' rates.
+    `names` has one text for each row, and `qdot` is D(q) v where velocities are not the coordinates' rates. `speeds`
+    has A v - b of the rows that hold velocities alone, which stand behind those of f. `by_time` is c: ∂f/∂t, then -b.
     """
 
     def __init__(
-        self, value: ca.SX, q: ca.SX, v: ca.SX, time: Any, names: tuple[str, ...], qdot: ca.SX | None = None
+        self,
+        value: ca.SX,
+        q: ca.SX,
+        v: ca.SX,
+        time: Any,
+        names: tuple[str, ...],
+        qdot: ca.SX | None = None,
+        speeds: ca.SX | None = None,
     ) -> None:
         self.value, self.names = value, names
         self._q, self._v, self._qdot = q, v, qdot
         by_q = ca.jacobian(value, q)
-        self.jacobian = by_q if qdot is None else ca.mtimes(by_q, ca.jacobian(qdot, v))
-        self.by_time = ca.SX(value.shape[0], 1) if time is None else ca.jacobian(value, time)
-        self.rate = ca.mtimes(self.jacobian, v) + self.by_time
+        J = by_q if qdot is None else ca.mtimes(by_q, ca.jacobian(qdot, v))
+        speeds = ca.SX(0, 1) if speeds is None else speeds
+        self.jacobian = ca.vertcat(J, ca.jacobian(speeds, v))
+        by_time = ca.SX(value.shape[0], 1) if time is None else ca.jacobian(value, time)
+        self.by_time = ca.vertcat(by_time, ca.substitute(speeds, v, ca.SX.zeros(*v.shape)))
+        self.rate = ca.vertcat(ca.mtimes(J, v) + by_time, speeds)
         self.gamma = ca.jtimes(self.rate, q, v if qdot is None else qdot)
         if time is not None:
             self.gamma = self.gamma + ca.jacobian(self.rate, time)
@@ -84,6 +100,11 @@ class ConstraintTerms:
         """Return the derivative of ḟ along a move of the configuration, (nv,), with v and the time held."""
         move = by if self._qdot is None else ca.substitute(self._qdot, self._v, by)
         return ca.jtimes(self.rate, self._q, move)
+
+    @property
+    def positions(self) -> int:
+        """How many rows hold positions: the first ones."""
+        return int(self.value.shape[0])
 
     def stiffening(self, M: Any) -> Any:
         """Return s > 0, (m, 1), so that W = M + Jᵀ diag(s) J has an inverse where M has it on J's null space.
@@ -98,9 +119,10 @@ class ConstraintTerms:
         # Of a row without slope the term is zero.
         return ca.sqrt((heavy + _TINY) / (light + _TINY)) / (ca.sum2(squares) + _TINY)
 
-    def weight(self, M: Any) -> Any:
-        """Return W = M + Jᵀ diag(s) J of `stiffening`."""
-        return M + ca.mtimes(self.jacobian.T, self.stiffening(M) * self.jacobian)
+    def weight(self, M: Any, rows: int | None = None) -> Any:
+        """Return W = M + Jᵀ diag(s) J of `stiffening`, of all rows or of the first ones."""
+        J = self.jacobian[:rows, :]
+        return M + ca.mtimes(J.T, self.stiffening(M)[:rows, :] * J)
 
 
 class ConstraintFactors:
@@ -118,7 +140,7 @@ class ConstraintFactors:
         #: W⁻¹ Jᵀ, (n, m), and J W⁻¹ Jᵀ with its factors.
         self.Y = self._W.solve(c.jacobian.T)
         self.matrix = ca.mtimes(c.jacobian, self.Y)
-        self.S = Factors(self.matrix, range(c.value.shape[0]))
+        self.S = Factors(self.matrix, range(c.jacobian.shape[0]))
 
     def solved(self, force: Any, rate: Any) -> tuple[Any, Any]:
         """Return x and λ of M x - Jᵀ λ = force, J x = rate."""
@@ -131,7 +153,7 @@ class ConstraintFactors:
     def motion(self, force: Any) -> tuple[Any, Any]:
         """Return v̇ and λ of M v̇ - Jᵀ λ = force, J v̇ = -γ.
 
-        Only f̈ = 0 holds: integrators project drifted states (`mbkit.derivation.steps.onto_constraints`).
+        Only the rate's derivative is zero: integrators project states (`mbkit.derivation.steps.onto_constraints`).
         """
         c, M = self._c, self._M
         a, multipliers = self.solved(force, -c.gamma)
@@ -142,7 +164,7 @@ class ConstraintFactors:
         return a, multipliers
 
 
-# Rows of loops and of prescribed motions
+# Rows of loops, of prescribed motions and of contacts without slip
 
 
 def _carried(kin: Kinematics, body: str, to: str, x: Vector, weight: float) -> Vector:
@@ -164,18 +186,70 @@ def _ends(kin: Kinematics, loop: Loop) -> LoopEnds:
     return LoopEnds([x - y for x, y in zip(p, q, strict=True)], a, b, values.length)
 
 
-def _rows(kin: Kinematics, time: Any) -> Iterator[tuple[str, str, Any]]:
-    """Yield the part, the name and the expression of every row, those that say nothing among them."""
+class _Row(NamedTuple):
+    """A row: its part, its name and its expression, which is of f or, where it `moves`, of A v - b."""
+
+    part: str
+    name: str
+    value: Any
+    moves: bool = False
+
+
+def _velocity(kin: Kinematics, body: str, to: str, at: Vector) -> Vector:
+    """Return the velocity of the point of a body at a place, seen from the body `to` that carries it, in its axes.
+
+    Joint by joint from there: the wheel's turn about its own axis then stands in no sine.
+    """
+    out: Vector = [0.0] * 3
+    while body != to:
+        joint = kin.carrier(body)
+        values = kin.values.joints[joint.name]
+        twist = joint.type.twist(kin.formulas, values, kin.coordinates(joint), kin.velocities(joint))
+        linear, angular = (_carried(kin, body, to, list(x), 0.0) for x in twist)
+        origin = _carried(kin, body, to, [0.0] * 3, 1.0)
+        out = add(out, add(linear, cross3(angular, [x - y for x, y in zip(at, origin, strict=True)])))
+        body = joint.parent
+    return out
+
+
+def _contact_rows(kin: Kinematics, part: NoSlip) -> tuple[list[Any], list[Any]]:
+    """Return the expressions of the rows that hold positions and of those that hold velocities."""
+    values, both = kin.values.no_slip[part.name], kin.model.carrier(part)
+    a, b = _carried(kin, part.body_a, both, values.axis_a, 0.0), _carried(kin, part.body_b, both, values.axis_b, 0.0)
+    along = [_carried(kin, part.body_b, both, row, 0.0) for row in values.tangents]
+    place = contact(part.kind, a, b, along, values.radius, lambda x: kin.length(ca.SX(x)))
+    centre = _carried(kin, part.body_a, both, values.translation_a, 1.0)
+    ground = _carried(kin, part.body_b, both, values.translation_b, 1.0)
+    at = add(centre, place.offset)
+    ends = (_velocity(kin, body, both, at) for body in (part.body_a, part.body_b))
+    velocity, gap = ([x - y for x, y in zip(*two, strict=True)] for two in (ends, (centre, ground)))
+    return [dot3(gap, n) - place.reach for n in place.up], [dot3(velocity, t) - values.speed for t in place.along]
+
+
+def _rows(kin: Kinematics, time: Any) -> list[_Row]:
+    """Return every row, those that say nothing among them, with those that hold velocities alone behind the others."""
+    return sorted(_every_row(kin, time), key=lambda row: row.moves)
+
+
+def _every_row(kin: Kinematics, time: Any) -> Iterator[_Row]:
     model = kin.model
     for loop in model.loops:
         names, rows = LOOP_ROWS[loop.kind]
         for name, row in zip(names, rows(_ends(kin, loop)), strict=True):
-            yield loop.name, f"loop {loop.name!r} {name}", row
+            yield _Row(loop.name, f"loop {loop.name!r} {name}", row)
     for motion in model.prescribed:
         (at,) = kin.coordinates(model.joint(motion.joint))
         numbers = casadi_arithmetic(kin.values.number)
         path = MOTION_LAWS[type(motion)].path(motion, kin.values.prescribed[motion.joint], time, numbers)
-        yield motion.joint, f"motion of {motion.joint!r}", at - path
+        yield _Row(motion.joint, f"motion of {motion.joint!r}", at - path)
+    for part in model.no_slip:
+        for moves, texts, found in zip((False, True), NO_SLIP_ROWS[part.kind], _contact_rows(kin, part), strict=True):
+            for name, row in zip(texts, found, strict=True):
+                yield _Row(part.name, f"no slip {part.name!r} {name}", row, moves)
+
+
+def _column(entries: Iterable[Any]) -> Any:
+    return ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for x in entries))
 
 
 def _ways(kin: Kinematics) -> Any:
@@ -184,7 +258,7 @@ def _ways(kin: Kinematics) -> Any:
 
 
 class Constraints:
-    """The constraints of a model with loops or prescribed motions, from its kinematics.
+    """The constraints of a model, from its kinematics.
 
     Attributes
     ----------
@@ -199,22 +273,22 @@ class Constraints:
     """
 
     def __init__(self, kin: Kinematics, time: Any) -> None:
-        rows = list(_rows(kin, time))
+        rows = _rows(kin, time)
         choice = choose_rows(kin.model)
         kept = [rows[i] for i in choice.kept]
-        self.names = tuple(name for _, name, _ in kept)
+        self.names = tuple(row.name for row in kept)
         self.independent, self.closed = choice.independent, choice.closed
-        value = ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for *_, x in kept))
         self.ways = _ways(kin)
         turned = kin.qdot if kin.model.quaternions else None
+
+        def terms(of: list[_Row]) -> ConstraintTerms:
+            value, speeds = (_column(row.value for row in of if row.moves is moves) for moves in (False, True))
+            return ConstraintTerms(value, kin.q, kin.v, time, tuple(row.name for row in of), turned, speeds)
+
         #: All rows that say something, and those of the equation.
-        self.all = ConstraintTerms(value, kin.q, kin.v, time, self.names, turned)
-        if len(self.independent) == len(self.names):
-            self.terms = self.all
-        else:
-            which = list(self.independent)
-            named = tuple(self.names[i] for i in which)
-            self.terms = ConstraintTerms(value[which], kin.q, kin.v, time, named, turned)
+        self.all = terms(kept)
+        all_are = len(self.independent) == len(self.names)
+        self.terms = self.all if all_are else terms([kept[i] for i in self.independent])
 
     def spread(self, multipliers: Any) -> Any:
         """Return the multipliers of all rows with the least norm whose force is that of the independent ones.
@@ -235,34 +309,39 @@ class Constraints:
 class RowChoice:
     """Which of all rows say something, and which of those are independent where the loops are closed.
 
-    `closed` is a configuration at which they are, or None where none was found.
+    `closed` is a configuration at which they are, or None where none was found. The first `positions` of the kept rows
+    hold positions.
     """
 
     kept: tuple[int, ...]
+    positions: int
     independent: tuple[int, ...]
     closed: Array | None = field(default=None, compare=False)
 
 
 class _Numbers:
-    """f and J of all rows at the model's nominal numbers, and whether the frames of loops point the same way."""
+    """f, J and the rate at v = 0 of all rows at the nominal numbers, and whether the frames of loops point alike."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
         kin = Kinematics(model)
         time = kin.values.named[model.time_parameter] if model.time_parameter else None
-        rows = list(_rows(kin, time))
-        self.parts = [part for part, *_ in rows]
-        self.names = [name for _, name, _ in rows]
-        value = ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for *_, x in rows))
-        J = ca.mtimes(ca.jacobian(value, kin.q), ca.jacobian(kin.qdot, kin.v))
-        outs = [ca.densify(x) for x in (value, J, _ways(kin))]
+        rows = _rows(kin, time)
+        self.parts = [row.part for row in rows]
+        self.names = [row.name for row in rows]
+        #: How many rows hold positions: the first ones.
+        self.positions = sum(not row.moves for row in rows)
+        value, speeds = (_column(row.value for row in rows if row.moves is moves) for moves in (False, True))
+        c = ConstraintTerms(value, kin.q, kin.v, time, tuple(self.names), kin.qdot, speeds)
+        outs = [ca.densify(x) for x in (value, c.jacobian, c.by_time, _ways(kin))]
         self._call = ca.Function("rows", [kin.q, kin.values.parameters], outs)
         # A parameter without a value has one that is as good as another.
         self._parameters = [1.0 if x is None else x for x in model.parameters.values()]
 
     def __call__(self, q: Array) -> tuple[Array, Array]:
-        f, J, _ = self._call(q, self._parameters)
-        return np.array(f)[:, 0], np.array(J)
+        """Return f, then the rates at v = 0 of the rows that hold velocities alone, and J."""
+        f, J, still, _ = self._call(q, self._parameters)
+        return np.concatenate([np.array(f)[:, 0], np.array(still)[self.positions :, 0]]), np.array(J)
 
     def closed(self, q: Array, kept: list[int]) -> Array | None:
         """Return a configuration near q where these rows are zero, by damped Gauss-Newton; None where it ends else."""
@@ -282,7 +361,7 @@ class _Numbers:
                 break
             q, f, J = beyond, f1, J1
         # Half a turn away the sine of a frame's angle is zero too, and its rows depend on each other.
-        turned = np.array(self._call(q, self._parameters)[2])
+        turned = np.array(self._call(q, self._parameters)[3])
         return q if np.linalg.norm(f) < _CLOSED and (turned >= 0).all() else None
 
 
@@ -296,7 +375,7 @@ def choose_rows(model: Model) -> RowChoice:
     Raises
     ------
     InputError
-        A loop whose ends never meet, or that no joint moves.
+        A loop whose ends never meet, or that no joint moves; a disc that lies flat wherever the joints lead.
     """
     # Each engine asks, and the search for closed configurations takes seconds of a tree with free joints.
     kept = vars(model)
@@ -310,14 +389,16 @@ def _chosen_rows(model: Model) -> RowChoice:
     numbers, rng = _Numbers(model), np.random.default_rng(0)
     anywhere = [random_state(model, rng, None)[0] for _ in range(_LOOKS)]
     kept = _with_something_to_say(numbers, anywhere)
+    held = [i for i in kept if i < numbers.positions]
     tried = [model.neutral(), *anywhere, *(_wide(model, rng) for _ in range(_STARTS))]
-    closed = [x for x in (numbers.closed(q, kept) for q in tried) if x is not None]
+    closed = [x for x in (numbers.closed(q, held) for q in tried) if x is not None]
+    closed = [q for q in closed if np.isfinite(numbers(q)[1]).all()]
     if not closed:
         # The state that a user gives tells more: it is refused there, with what is left of each row.
-        return RowChoice(tuple(kept), tuple(range(len(kept))))
-    found = [(*independent_rows(numbers(q)[1][kept]), q) for q in closed]
+        return RowChoice(tuple(kept), len(held), tuple(range(len(kept))))
+    found = [(*independent_rows(numbers(q)[1][kept], len(held)), q) for q in closed]
     rows, _, q = max(found, key=lambda x: (len(x[0]), x[1]))
-    return RowChoice(tuple(kept), rows, q)
+    return RowChoice(tuple(kept), len(held), rows, q)
 
 
 def _wide(model: Model, rng: np.random.Generator) -> Array:
@@ -325,41 +406,68 @@ def _wide(model: Model, rng: np.random.Generator) -> Array:
 
 
 def _with_something_to_say(numbers: _Numbers, poses: list[Array]) -> list[int]:
-    """Return the rows that do not follow from others of their loop at every configuration, by constant weights."""
+    """Return the rows that do not follow from others of their part at every configuration, by constant weights."""
     kept: list[int] = []
     values = [numbers(q) for q in poses]
     slopes, sizes = np.concatenate([J for _, J in values], axis=1), np.array([f for f, _ in values])
     for part in dict.fromkeys(numbers.parts):
         own = np.array([i for i, x in enumerate(numbers.parts) if x == part])
-        chosen, _ = independent_rows(slopes[own]) if slopes[own].any() else ((), 0.0)
+        if not np.isfinite(slopes[own]).all():
+            raise InputError(
+                f"{numbers.model.name}: no slip {part!r}: the disc lies flat on its plane, whatever the joints do, and "
+                "touches it in no single point; turn its axis or the plane"
+            )
+        first = int(np.count_nonzero(own < numbers.positions))
+        chosen, _ = independent_rows(slopes[own], first) if slopes[own].any() else ((), 0.0)
         rest = [k for k in range(len(own)) if k not in chosen]
         weights = np.linalg.lstsq(slopes[own[list(chosen)]].T, slopes[own[rest]].T, rcond=None)[0].T
-        left = sizes[0][own[rest]] - weights @ sizes[0][own[list(chosen)]]
+        # A position says nothing of a velocity that is not zero, and the other way round.
+        alike = (np.array(rest, dtype=int)[:, None] < first) == (np.array(chosen, dtype=int) < first)
+        left = sizes[0][own[rest]] - np.where(alike, weights, 0.0) @ sizes[0][own[list(chosen)]]
         if (bad := np.flatnonzero(np.abs(left) > _MEETS * max(1.0, float(np.abs(sizes).max())))).size:
             row = numbers.names[own[rest[int(bad[0])]]]
+            what, way = ("the ends never meet", "between them; move or turn one end")
+            if rest[int(bad[0])] >= first:
+                what, way = ("no velocity has this speed", "of it, m/s; turn its direction, or give speed=0")
             raise InputError(
-                f"{numbers.model.name}: {row}: the ends never meet, whatever the joints do: "
-                f"{float(left[bad[0]]):.6g} is left between them; move or turn one end"
+                f"{numbers.model.name}: {row}: {what}, whatever the joints do: {float(left[bad[0]]):.6g} is left {way}"
             )
         if not chosen:
             raise InputError(
-                f"{numbers.model.name}: loop {part!r} closes nothing: no joint moves its ends against each other; "
-                "leave it out"
+                f"{numbers.model.name}: {numbers.names[own[0]].rpartition(repr(part))[0]}{part!r} closes nothing: no "
+                "joint moves its ends against each other; leave it out"
             )
         kept += sorted(int(own[k]) for k in chosen)
-    return kept
+    return sorted(kept)
 
 
-def independent_rows(J: Array) -> tuple[tuple[int, ...], float]:
-    """Return the largest set of rows that are independent, and what is left of the last one, by pivoting."""
-    from scipy.linalg import qr
+def independent_rows(J: Array, first: int | None = None) -> tuple[tuple[int, ...], float]:
+    """Return the largest set of rows that are independent, and what is left of the last one, by pivoting.
 
+    Of the first rows as many are taken as are independent among themselves, then others: a position that the rates of
+    others imply has to be held all the same.
+    """
     size = np.linalg.norm(J, axis=1)
     scale = np.where(size > DEPENDENT * size.max(initial=0.0), size, np.inf)
-    _, R, order = qr((J / scale[:, None]).T, mode="economic", pivoting=True)
+    scaled = J / scale[:, None]
+    first = len(J) if first is None else first
+    rows, least, basis = _pivoted(scaled[:first])
+    if first == len(J):
+        return rows, least
+    more, less, _ = _pivoted(scaled[first:] - scaled[first:] @ basis @ basis.T)
+    return (*rows, *(first + k for k in more)), min(least, less) if rows and more else least + less
+
+
+def _pivoted(rows: Array) -> tuple[tuple[int, ...], float, Array]:
+    """Return independent rows of unit size, what is left of the last one, and a basis of what they span, (n, k)."""
+    from scipy.linalg import qr
+
+    if not len(rows):
+        return (), 0.0, np.zeros((rows.shape[1], 0))
+    Q, R, order = qr(rows.T, mode="economic", pivoting=True)
     left = np.abs(np.diag(R))
     rank = int(np.count_nonzero(left > DEPENDENT))
-    return tuple(sorted(order[:rank].tolist())), float(left[rank - 1]) if rank else 0.0
+    return tuple(sorted(order[:rank].tolist())), float(left[rank - 1]) if rank else 0.0, np.asarray(Q[:, :rank])
 
 
 #: Name of each quantity of constraints -> the arguments of its function.
@@ -390,7 +498,7 @@ def _least_part(M: Array) -> float:
 
 
 class ConstraintQuantities:
-    """f, J, ḟ and γ of all rows, redundant ones among them; a mixin for equations that have `constraint_forces` too."""
+    """f, J, rate and γ of all rows, redundant ones among them; a mixin for equations with `constraint_forces`."""
 
     constraints: Any
     all_constraints: Any
@@ -407,27 +515,27 @@ class ConstraintQuantities:
 
     @property
     def constraint_residual(self) -> Any:
-        """f(q, t)."""
+        """f(q, t) of the rows that hold positions."""
         return self.all_constraints.value
 
     @property
     def constraint_jacobian(self) -> Any:
-        """J."""
+        """J of all rows."""
         return self.all_constraints.jacobian
 
     @property
     def constraint_rate(self) -> Any:
-        """J v + ∂f/∂t."""
+        """J v + ∂f/∂t, then A v - b."""
         return self.all_constraints.rate
 
     @property
     def constraint_bias(self) -> Any:
-        """γ, with f̈ = J v̇ + γ."""
+        """γ, with the rate's derivative J v̇ + γ."""
         return self.all_constraints.gamma
 
 
 class ConstrainedMotion(ConstraintQuantities):
-    """What loops and prescribed motions make of the equations of a tree; a mixin for `Equations`.
+    """What constraints make of the equations of a tree; a mixin for `Equations`.
 
     Every term but the accelerations is that of the tree.
     """

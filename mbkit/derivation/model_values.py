@@ -15,9 +15,10 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import InputError
-from mbkit.model import Frame, Joint, Model
+from mbkit.model import Frame, Joint, Model, NoSlip
 from mbkit.model.elements.forces import Bushing
 from mbkit.model.elements.motion_laws import MOTION_LAWS
+from mbkit.model.rolling import tangents
 
 # CasADi's operators first search a conversion of their operands, some 15 µs each; `SX.binary` takes 2, and 4 with a
 # float, which it converts each time. A tree's kinematics are tens of thousands of them. This module replaces CasADi in
@@ -105,9 +106,10 @@ _SPRING: Final = ("point_a", "point_b", "stiffness", "rest_length", "damping")
 _LOOP: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "length")
 _FORCE: Final = ("numbers",)
 _BUSHING: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "stiffness", "damping", "numbers")
+_NO_SLIP: Final = ("translation_a", "axis_a", "translation_b", "axis_b", "radius", "speed")
 # A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum of literal masses could be divided
 # by, and its quotient be rounded to double.
-_DIRECTIONS: Final = frozenset({"rotation", "axes", "rotation_a", "rotation_b"})
+_DIRECTIONS: Final = frozenset({"rotation", "axes", "rotation_a", "rotation_b", "axis_a", "axis_b", "tangents"})
 
 
 def is_zero(value: Any) -> bool:
@@ -131,7 +133,7 @@ class Values:
     Attributes
     ----------
     gravity : list of 3 scalars
-    bodies, joints, springs, couplings, loops, prescribed, forces : dict of str to SimpleNamespace
+    bodies, joints, springs, couplings, loops, no_slip, prescribed, forces : dict of str to SimpleNamespace
         By name; motions by that of their joint. A joint that mimics has `ratio` and `offset` too.
     named : dict of str to casadi.SX
         The parameters' symbols.
@@ -176,6 +178,7 @@ class Values:
             f.name: self._read("forces", f.name, f, _BUSHING if isinstance(f, Bushing) else _FORCE)
             for f in model.forces
         }
+        self.no_slip = {x.name: self._contact(x) for x in model.no_slip}
         self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}
 
     @property
@@ -202,6 +205,11 @@ class Values:
         values = self._read("joints", joint.name, joint, _JOINT)
         if joint.mimic:
             values.__dict__.update(self._read("joints", joint.name, joint.mimic, _MIMIC).__dict__)
+        return values
+
+    def _contact(self, part: NoSlip) -> Any:
+        values = self._read("no_slip", part.name, part, _NO_SLIP)
+        values.tangents = self._entries(("no_slip", part.name, "tangents"), (), tangents(part.axis_b))
         return values
 
     def _read(self, where: str, part: str, source: Any, fields: tuple[str, ...]) -> Any:

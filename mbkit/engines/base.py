@@ -72,8 +72,13 @@ def unit_quaternions(q: Array, starts: Iterable[int]) -> bool:
 
 
 def require_tree(model: Model, user: str, why: str = "it takes the tree alone") -> None:
-    """Raise `UnsupportedError` for a model with loops or prescribed motions, in the name of an engine or study."""
-    for feature, text in (("loops", "loop closures"), ("prescribed", "motions prescribed in time")):
+    """Raise `UnsupportedError` for a model with constraints, in the name of an engine or study."""
+    texts = {
+        "loops": "loop closures",
+        "prescribed": "motions prescribed in time",
+        "no_slip": "blades or rolling contacts, which hold velocities",
+    }
+    for feature, text in texts.items():
         parts = getattr(model, feature)
         if parts:
             names = first_names((repr(x.name) for x in parts), ", ...")

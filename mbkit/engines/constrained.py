@@ -1,4 +1,4 @@
-"""Quantities of loops and prescribed motions: f(q, t) = 0, its Jacobian and the forces that hold it."""
+"""Quantities of constraints: f(q, t) = 0 and A(q) v = b, their Jacobian and the forces that hold them."""
 
 from __future__ import annotations
 
@@ -32,15 +32,22 @@ OF_TREES: Final = {
 
 
 class Constrained:
-    """The part of `Dynamics` for models with loops and prescribed motions.
+    """The part of `Dynamics` for models with loops, prescribed motions, blades, and wheels and spheres that roll.
 
     ::
 
         M v̇ + C v + g = τ + τ_passive + Jᵀ λ        J v̇ + γ = 0
 
-    Rows of loops stand in the axes of the body that carries both ends, in the order of `constraint_names`; those of
-    prescribed motions follow. The multiplier of a point is the force on body a, that of a frame's turn the torque on
-    it, and that of a prescribed motion the force of its drive. A model without any raises `UnsupportedError`.
+    The first k of the m rows hold positions, f(q, t) = 0: `constraint_residual` has these alone. The others hold
+    velocities alone, A(q) v = b, and no function of q is zero with them; `velocity_constraint_names` are theirs. J, the
+    rate J v + c, γ and λ have all m rows, in the order of `constraint_names`: c is ∂f/∂t of the first and -b of the
+    others.
+
+    Rows of loops stand in the axes of the body that carries both ends; those of prescribed motions follow, then the
+    heights of what rolls, then velocities. The multiplier of a point is the force on body a, that of a frame's turn the
+    torque on it, and that of a prescribed motion the force of its drive. That of a height is the normal force on what
+    rolls, and those of its velocities are the forces of friction along these directions. A model without any raises
+    `UnsupportedError`.
 
     Accelerations of `forward_dynamics` hold the constraints; every other term, such as `inverse_dynamics`, is that of
     the tree, without λ.
@@ -71,24 +78,33 @@ class Constrained:
         """Names of the rows, such as ``"loop 'pin' x"``; empty without constraints."""
         return self._states_held.names_of(self) if self.model.constrained else ()
 
+    @property
+    def velocity_constraint_names(self) -> tuple[str, ...]:
+        """Names of the rows that hold velocities alone, the last ones of `constraint_names`."""
+        return self._states_held.names_of(self, moving=True) if self.model.no_slip else ()
+
     def constraint_residual(self, q: ArrayLike) -> Array:
-        """Return f(q, t), zero where all loops are closed; (m,) or (N, m), in m and rad."""
+        """Return f(q, t), zero where all loops are closed and all that rolls touches its plane.
+
+        (k,) or (N, k), in m and rad: the first k of the m rows of `constraint_names`. Rows that hold velocities alone
+        have no such function; their residual is that of `constraint_rate`.
+        """
         return self._bound("constraint_residual", q=q)
 
     def constraint_jacobian(self, q: ArrayLike) -> Array:
-        """Return J, with ḟ = J v + ∂f/∂t; (m, nv) or (N, m, nv)."""
+        """Return J of all rows, with the rates J v + c; (m, nv) or (N, m, nv)."""
         return self._bound("constraint_jacobian", q=q)
 
     def constraint_rate(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return ḟ = J v + ∂f/∂t, (m,) or (N, m)."""
+        """Return the rates J v + c of all rows, zero in a consistent state: ḟ, then A v - b; (m,) or (N, m)."""
         return self._bound("constraint_rate", q=q, v=v)
 
     def constraint_bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return γ, with f̈ = J v̇ + γ; (m,) or (N, m)."""
+        """Return γ of all rows, with the rates' derivative J v̇ + γ = 0; (m,) or (N, m)."""
         return self._bound("constraint_bias", q=q, v=v)
 
     def constraint_forces(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
-        """Return the multipliers λ under the force τ, (m,) or (N, m).
+        """Return the multipliers λ of all rows under the force τ, (m,) or (N, m).
 
         Where rows are redundant, λ is not unique: it is the one with the least norm, in N and N m. Jᵀ λ, which
         `generalized_constraint_force` returns, is unique all the same.
@@ -104,7 +120,10 @@ class Constrained:
         return (np.swapaxes(J, -1, -2) @ forces[..., None])[..., 0]
 
     def project(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-        """Return the nearest consistent state, f = 0 and ḟ = 0, in the metric of the mass matrix.
+        """Return the nearest consistent state, in the metric of the mass matrix.
+
+        The configuration goes onto f = 0, which rows that hold velocities alone have no part in; then the velocity goes
+        to where the rates of all rows are zero.
 
         Parameters
         ----------
@@ -158,7 +177,7 @@ class Constrained:
         Returns
         -------
         Mobility
-            With `degrees_of_freedom`, `rows`, and the names of `redundant` ones.
+            With `degrees_of_freedom` of velocity, `configuration_freedoms`, `rows`, and the names of `redundant` ones.
 
         Examples
         --------

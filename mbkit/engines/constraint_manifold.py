@@ -1,7 +1,8 @@
-"""Constraints f(q, t) = 0 in numbers: the states that they allow, and whether they are independent there.
+"""Constraints in numbers: the states that they allow, and whether they are independent there.
 
-A state is consistent where f = 0 and ḟ = J v + ∂f/∂t = 0. Independence belongs to a pose: a set may have full rank on
-one branch of a mechanism only (a row of equal four-bars).
+A state is consistent where f(q, t) = 0 and the rates J v + c of all rows are zero; rows that hold velocities alone, as
+those of a wheel that rolls, have no f, and let a configuration be whatever the others allow. Independence belongs to a
+pose: a set may have full rank on one branch of a mechanism only (a row of equal four-bars).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ _NEARER: Final = 0.9
 
 def _function(eq: Any, name: str) -> ca.Function:
     """Return a compiled function of (q), (q, v) or (q, v, τ), and the parameters."""
-    c, m = eq.constraints, eq.constraints.value.shape[0]
+    c, m, k = eq.constraints, eq.constraints.jacobian.shape[0], eq.constraints.positions
     inputs = {"q": eq.q, "v": eq.v}
     if name == "constraint_rows":
         del inputs["v"]
@@ -47,16 +48,21 @@ def _function(eq: Any, name: str) -> ca.Function:
     elif name == "constraint":
         M = eq.mass_matrix
         outputs = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": c.weight(M), "M": M}
+        # That of positions alone.
+        outputs["V"] = c.weight(M, k)
     elif name == "constraint_step":
         # q after a step of Newton's, v consistent there, f before it and its scale.
         space = SymbolicSpace(eq.model)
         Y = solve(c.weight(eq.mass_matrix), c.jacobian.T, eq.elimination_order)
         S = ca.mtimes(c.jacobian, Y)
-        moved = -ca.mtimes(Y, solve(S, c.value, range(m)))
-        q1 = space.retract(eq.q, space.to_integrator_velocity(eq.q, moved))
+        held, q1 = c.jacobian[:k, :], eq.q
+        if k:
+            X = Y if k == m else solve(c.weight(eq.mass_matrix, k), held.T, eq.elimination_order)
+            moved = -ca.mtimes(X, solve(ca.mtimes(held, X), c.value, range(k)))
+            q1 = space.retract(eq.q, space.to_integrator_velocity(eq.q, moved))
         Y1, S1, rate1 = (ca.substitute(x, eq.q, q1) for x in (Y, S, c.rate))
         v1 = eq.v - ca.mtimes(Y1, solve(S1, rate1, range(m)))
-        outputs = {"q1": q1, "v1": v1, "f": c.value, "scale": ca.sqrt(ca.sum2(c.jacobian**2))}
+        outputs = {"q1": q1, "v1": v1, "f": c.value, "scale": ca.sqrt(ca.sum2(held**2))}
     elif name == "all_rows":
         del inputs["v"]
         outputs = {"f": eq.constraint_residual, "J": eq.constraint_jacobian, "ways": eq.loop_ways}
@@ -80,19 +86,25 @@ def _function(eq: Any, name: str) -> ca.Function:
 
 
 class _Terms(NamedTuple):
-    """Numbers at one state: f (m,), J (m, n), ḟ (m,), the weight W and the mass matrix (n, n)."""
+    """Numbers at one state: f (k,), J (m, n), rates (m,), and weights (n, n): W of all rows, M, and V of positions."""
 
     f: Array
     J: Array
     rate: Array
     W: Array
     M: Array
+    V: Array
 
     @property
     def scale(self) -> Array:
         """What a row changes by when every coordinate changes by 1."""
         sizes = np.abs(self.J).sum(axis=1)
         return np.where(sizes > 0, sizes, 1.0)
+
+    @property
+    def held(self) -> Array:
+        """J of the rows that hold positions."""
+        return self.J[: len(self.f)]
 
 
 class Manifold:
@@ -147,27 +159,32 @@ class Manifold:
     def still_open(self, q: Array) -> list[str]:
         """Return what is open at a configuration where the independent rows are zero: others, and half a turn."""
         f, J, ways = self.call("all_rows", q)
-        scale = np.maximum(np.abs(J).sum(axis=1), 1.0) * max(1.0, float(np.abs(q).max()))
+        scale = np.maximum(np.abs(J[: len(f)]).sum(axis=1), 1.0) * max(1.0, float(np.abs(q).max()))
         names = self.equations.all_constraints.names
         rows = [names[k] for k in np.flatnonzero(~(np.abs(f[:, 0]) <= _CONSISTENT * scale))]
         turned = [loop.name for loop, way in zip(self.dyn.model.loops, ways[:, 0], strict=True) if way < 0]
         return rows or [f"loop {name!r} half a turn off" for name in turned]
 
     def value(self, q: Array) -> Array:
-        """Return f, (m,) or (N, m)."""
+        """Return f of the rows that hold positions, (k,) or (N, k)."""
         return np.asarray(self.call("constraint_rows", q)[0][..., 0])
 
     def jacobian(self, q: Array) -> Array:
         """Return J, (m, n) or (N, m, n)."""
         return self.call("constraint_rows", q)[1]
 
+    def position_jacobian(self, q: Array) -> Array:
+        """Return J of the rows that hold positions, (k, n) or (N, k, n)."""
+        f, J = self.call("constraint_rows", q)
+        return np.asarray(J[..., : f.shape[-2], :])
+
     def multipliers(self, q: Array, v: Array, tau: Array) -> Array:
         """Return λ, (m,) or (N, m)."""
         return np.asarray(self.call("multipliers", q, v, tau)[0][..., 0])
 
     def _terms(self, q: Array, v: Array) -> _Terms:
-        f, J, _, rate, W, M = self.call("constraint", q, v)
-        return _Terms(f[:, 0], J, rate[:, 0], W, M)
+        f, J, _, rate, W, M, V = self.call("constraint", q, v)
+        return _Terms(f[:, 0], J, rate[:, 0], W, M, V)
 
     # Consistency
 
@@ -177,8 +194,9 @@ class Manifold:
         suspects = range(len(states[0])) if self.dyn.samples is not None else self._inconsistent(*states)
         for k, one_q, one_v in ((k, states[0][k], states[1][k]) for k in suspects):
             terms = self.member(k)._terms(one_q, one_v)
-            for name, what, residual, x in (("q0", "f", terms.f, one_q), ("v0", "J v + ∂f/∂t", terms.rate, one_v)):
-                if not (np.abs(residual) <= _CONSISTENT * terms.scale * max(1.0, float(np.abs(x).max()))).all():
+            for name, what, residual, x in (("q0", "f", terms.f, one_q), ("v0", "J v + c", terms.rate, one_v)):
+                scale = _CONSISTENT * terms.scale[: len(residual)] * max(1.0, float(np.abs(x).max()))
+                if not (np.abs(residual) <= scale).all():
                     where = "" if q.ndim == 1 else f" of state {k}"
                     raise InputError(
                         f"{name}: the constraints of {self.dyn.model.name} ask for {what} = 0, which is "
@@ -200,7 +218,8 @@ class Manifold:
         bad = np.zeros(len(q), dtype=bool)
         for residual, x in ((f, q), (rate, v)):
             size = np.maximum(1.0, np.abs(x).max(axis=1))[:, None]
-            bad |= ~(np.abs(residual[..., 0]) <= _CONSISTENT * scale * size).all(axis=1)
+            rows = residual[..., 0]
+            bad |= ~(np.abs(rows) <= _CONSISTENT * scale[:, : rows.shape[1]] * size).all(axis=1)
         return [int(k) for k in np.flatnonzero(bad)]
 
     def doubtful(self, q: Array) -> Array:
@@ -238,7 +257,8 @@ class Manifold:
         # Stationary: M (x - q) + Jᵀ μ = 0 with f(x) = 0.
         last = np.inf
         for _ in range(_MOST):
-            f, J, *_ = self._terms(x, v)
+            terms = self._terms(x, v)
+            f, J = terms.f, terms.held
             K = np.block([[M, J.T], [J, np.zeros((len(J), len(J)))]])
             away = np.concatenate([M @ model.difference(x, q), -f])
             step = np.linalg.lstsq(K, away, rcond=1e-14)[0][:n]
@@ -254,15 +274,16 @@ class Manifold:
     def restored(self, q: Array, v: Array) -> Array:
         """Return a configuration with f = 0, by steps that are the least in the mass matrix's metric."""
         x, terms = q, self._terms(q, v)
-        best = float(np.linalg.norm(terms.f / terms.scale))
+        scale = terms.scale[: len(terms.f)]
+        best = float(np.linalg.norm(terms.f / scale))
         for _ in range(_MOST):
             if best <= 4 * _EPS * (1 + float(np.abs(x).max())):
                 break
-            step, length = _least_change(terms.W, terms.J, -terms.f), 1.0
+            step, length = _least_change(terms.V, terms.held, -terms.f), 1.0
             while length > 1e-6:
                 moved = self.dyn.model.integrate(x, length * step)
                 beyond = self._terms(moved, v)
-                size = float(np.linalg.norm(beyond.f / beyond.scale))
+                size = float(np.linalg.norm(beyond.f / beyond.scale[: len(beyond.f)]))
                 if size < best:
                     break
                 length *= 0.5
@@ -387,9 +408,10 @@ def projected(dyn: Dynamics, q: Array, v: Array) -> tuple[Array, Array]:
     return state
 
 
-def names_of(dyn: Dynamics) -> tuple[str, ...]:
-    """Return the names of all rows, redundant ones among them."""
-    names: tuple[str, ...] = manifold_of(dyn).equations.all_constraints.names
+def names_of(dyn: Dynamics, *, moving: bool = False) -> tuple[str, ...]:
+    """Return the names of all rows, redundant ones among them, or of those that hold velocities alone."""
+    every = manifold_of(dyn).equations.all_constraints
+    names: tuple[str, ...] = every.names[every.positions if moving else 0 :]
     return names
 
 
@@ -401,34 +423,43 @@ class Mobility:
     ----------
     model : str
     degrees_of_freedom : int
-        Velocities less the rank of J.
+        Velocities less the rank of J: the dimension of the velocities that a configuration allows.
     rows, redundant : tuple of str
         Names of all rows, and of those that follow from the others.
+    configuration_freedoms : int
+        Velocities less the rank of the rows that hold positions: the dimension of the configurations. With rows that
+        hold velocities alone it is the larger one: a car moves sideways, if not at once.
     """
 
     model: str
     degrees_of_freedom: int
     rows: tuple[str, ...]
     redundant: tuple[str, ...]
+    configuration_freedoms: int
 
     def __str__(self) -> str:
         n = len(self.redundant)
         which = f"{n or 'none'} {'are' if n > 1 else 'is'} redundant{': ' if n else ''}{', '.join(self.redundant)}"
-        return f"{self.model}: degrees of freedom {self.degrees_of_freedom}, of {len(self.rows)} rows {which}"
+        freedoms = f"{self.degrees_of_freedom}"
+        if self.configuration_freedoms != self.degrees_of_freedom:
+            freedoms += f" of velocity and {self.configuration_freedoms} of configuration"
+        return f"{self.model}: degrees of freedom {freedoms}, of {len(self.rows)} rows {which}"
 
 
 def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
     """Return the mobility at a configuration, or at some one where the loops are closed."""
     model = dyn.model
     if not model.constrained:
-        return Mobility(model.name, model.nv, (), ())
-    names = names_of(dyn)
+        return Mobility(model.name, model.nv, (), (), model.nv)
+    names, equations = names_of(dyn), manifold_of(dyn).equations
+    held = equations.all_constraints.positions
     if q is None:
-        independent: Collection[int] = manifold_of(dyn).equations.independent_constraints
+        independent: Collection[int] = equations.independent_constraints
     else:
-        independent, _ = independent_rows(np.asarray(dyn.constraint_jacobian(q)))
+        independent, _ = independent_rows(np.asarray(dyn.constraint_jacobian(q)), held)
     redundant = tuple(name for i, name in enumerate(names) if i not in independent)
-    return Mobility(model.name, model.nv - len(independent), names, redundant)
+    freedoms = model.nv - sum(i < held for i in independent)
+    return Mobility(model.name, model.nv - len(independent), names, redundant, freedoms)
 
 
 # Independence
@@ -490,7 +521,7 @@ def _require_redundant(manifold: Manifold, q: Array) -> None:
     names, independent = equations.all_constraints.names, equations.independent_constraints
     if len(names) == len(independent):
         return
-    here, _ = independent_rows(manifold.all_rows(q))
+    here, _ = independent_rows(manifold.all_rows(q), equations.all_constraints.positions)
     if len(here) > len(independent):
         more = ", ".join(name for k, name in enumerate(names) if k not in independent)
         raise InputError(
@@ -508,9 +539,9 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> None:
     rng = np.random.default_rng(0)
     starts = [_far_out(model, float(rng.choice([1.0, 3.0])), rng) for _ in range(_STARTS)]
     starts[:0] = [] if q is None else [q]
-    least, left = np.inf, np.zeros(len(states.names))
+    least, left = np.inf, np.zeros(states.equations.constraints.positions)
     for start in starts:
-        sizes = np.linalg.norm(states.jacobian(start), axis=1)
+        sizes = np.linalg.norm(states.position_jacobian(start), axis=1)
         end, f = _nearest(states, start, np.where(sizes > _ROUNDED, sizes, 1.0))
         size = float(np.linalg.norm(f))
         still = states.still_open(end) if size < _HOLDS else []
@@ -562,9 +593,11 @@ def _explain(manifold: Manifold, starts: list[Array], scale: Array, sizes: Array
 
 def _nearest(manifold: Manifold, q: Array, scale: Array) -> tuple[Array, Array]:
     """Return where damped Gauss-Newton ends, and the scaled f there."""
-    f = manifold.value(q) / scale
+    f = manifold.value(q)
+    scale = scale[: len(f)]
+    f = f / scale
     for _ in range(_STEPS):
-        step = _least_change(np.eye(manifold.dyn.model.nv), manifold.jacobian(q) / scale[:, None], -f)
+        step = _least_change(np.eye(manifold.dyn.model.nv), manifold.position_jacobian(q) / scale[:, None], -f)
         length = 1.0
         while length > 1e-9:
             moved = manifold.dyn.model.integrate(q, length * step)

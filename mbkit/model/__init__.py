@@ -6,7 +6,7 @@ from mbkit.model.description import Needs
 from mbkit.model.joint_types import KINDS, JointKind, JointType, kind_of, register_joint_type
 from mbkit.model.model import Model
 from mbkit.model.parameters import Expression, Number, Parameter, known, nominal
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring, Prescribed
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring, Prescribed
 
 __all__ = [
     "KINDS",
@@ -23,6 +23,7 @@ __all__ = [
     "Model",
     "ModelBuilder",
     "Needs",
+    "NoSlip",
     "Number",
     "Parameter",
     "PointSpring",

@@ -19,7 +19,8 @@ from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.loops import LOOP_KINDS, LoopKind
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, PointSpring
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring
+from mbkit.model.rolling import ROLLING_KINDS, RollingKind
 from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
 # The squares of sums of such lengths still fit a double.
@@ -164,18 +165,24 @@ class ArgumentReader:
             axes = list(np.eye(3)[:n])
         out = np.zeros((n, 3))
         for i, a in enumerate(axes):
-            vector = self.array(f"{item}: axis", a, (3,))
-            # The square of a component may overflow, or vanish.
-            largest = float(np.abs(vector).max())
-            if largest and not 1e-100 < largest < 1e100:
-                vector = vector / largest
-            length = float(np.linalg.norm(vector))
-            if not length:
-                self.faults.append(f"{item}: axis is zero; expected a direction")
-                vector, length = np.array([1.0, 0.0, 0.0]), 1.0
-            # A unit vector to rounding keeps its bits.
-            out[i] = vector if abs(length - 1) < 1e-15 else vector / length
+            out[i] = self.direction(f"{item}: axis", a)
         return out
+
+    def direction(self, name: str, value: ArrayLike | None) -> Array:
+        """Return a unit vector; zeros for None."""
+        if value is None:
+            return np.zeros(3)
+        vector = self.array(name, value, (3,))
+        # The square of a component may overflow, or vanish.
+        largest = float(np.abs(vector).max())
+        if largest and not 1e-100 < largest < 1e100:
+            vector = vector / largest
+        length = float(np.linalg.norm(vector))
+        if not length:
+            self.faults.append(f"{name} is zero; expected a direction")
+            vector, length = np.array([1.0, 0.0, 0.0]), 1.0
+        # A unit vector to rounding keeps its bits.
+        return vector if abs(length - 1) < 1e-15 else np.asarray(vector / length)
 
     def mimic(self, item: str, value: Mimic | Iterable[Any]) -> tuple[str, dict[str, Number]] | None:
         """Return the leader of a mimic joint, and ratio and offset; None after a fault."""
@@ -198,8 +205,10 @@ _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
         ("com", "translation", "point_a", "point_b", "translation_a", "translation_b"), ArgumentReader.place
     ),
     **dict.fromkeys(("rotation_a", "rotation_b"), ArgumentReader.rotation),
+    **dict.fromkeys(("axis_a", "axis_b"), ArgumentReader.direction),
     **dict.fromkeys(
-        ("mass", "pitch", "stiffness", "rest_length", "damping", "armature", "length"), ArgumentReader.quantity
+        ("mass", "pitch", "stiffness", "rest_length", "damping", "armature", "length", "radius", "speed"),
+        ArgumentReader.quantity,
     ),
     **dict.fromkeys(("offset", "rate", "amplitude", "frequency", "phase"), ArgumentReader.quantity),
     "inertia": ArgumentReader.inertia,
@@ -224,6 +233,11 @@ def shape_of(value: Any) -> tuple[int, ...] | None:
     except Exception:
         # Any: objects may bring conversions of their own.
         return None
+
+
+#: Kinds of parts, as a description names them.
+_OF_TREES: Final = ("bodies", "joints", "frames")
+_CONNECTING: Final = ("springs", "couplings", "loops", "prescribed", "forces", "no_slip")
 
 
 class ModelBuilder(ElementBuilder):
@@ -256,7 +270,18 @@ class ModelBuilder(ElementBuilder):
         self._bindings: list[Binding] = []
         self._gravity = self._numbers("gravity", "", gravity=self._read.quantities("gravity", gravity, 3))["gravity"]
         self._parts: dict[str, list[Any]] = {
-            kind: [] for kind in ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed", "forces")
+            kind: []
+            for kind in [
+                "bodies",
+                "joints",
+                "frames",
+                "springs",
+                "couplings",
+                "loops",
+                "prescribed",
+                "forces",
+                "no_slip",
+            ]
         }
         self._notes: list[str] = []
 
@@ -471,6 +496,100 @@ class ModelBuilder(ElementBuilder):
         a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
         self._add(Loop, "loops", "loop", name, a | b | {"length": length}, {"kind": kind})
+
+    def add_blade(
+        self,
+        name: str,
+        *,
+        body_a: str,
+        body_b: str = "world",
+        translation_a: _Vector = (0.0, 0.0, 0.0),
+        axis_a: ArrayLike | None = None,
+        axis_b: ArrayLike | None = None,
+        speed: Number = 0.0,
+    ) -> None:
+        """Let a point of a body have no velocity along a direction: a blade, knife edge, or wheel without side slip.
+
+        The row holds velocities alone. Two blades of a car are its axles; steering axes are ordinary joints.
+
+        Parameters
+        ----------
+        name, body_a, body_b : str
+            Body b sees the velocity; one body may be ``"world"``.
+        translation_a : (3,) array_like
+            The point in the axes of body a, m.
+        axis_a, axis_b : (3,) array_like, optional
+            The direction in the axes of body a, or in those of body b; one of them. Normalized here.
+        speed : float
+            Velocity along the direction instead of zero, m/s, such as that of a conveyor.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("skate", gravity=(0, 0, 0))
+        >>> b.add_body("skate", mass=1.0, inertia=(0.1, 0.1, 0.1))
+        >>> b.add_joint("glide", "planar", parent="world", child="skate")
+        >>> b.add_blade("edge", body_a="skate", axis_a=(0, 1, 0))
+        >>> print(mb.dynamics(b.build(), "lagrangian").mobility())
+        skate: degrees of freedom 2 of velocity and 3 of configuration, of 1 rows none is redundant
+        """
+        a = {"body_a": body_a, "translation_a": translation_a, "axis_a": axis_a}
+        b = {"body_b": body_b, "axis_b": axis_b, "speed": speed}
+        ready = {"kind": "blade", "translation_b": np.zeros(3)}
+        self._add(NoSlip, "no_slip", "no slip", name, a | b, ready)
+
+    def add_rolling(
+        self,
+        name: str,
+        kind: RollingKind,
+        *,
+        body_a: str,
+        radius: Number,
+        translation_a: _Vector = (0.0, 0.0, 0.0),
+        axis_a: ArrayLike | None = None,
+        body_b: str = "world",
+        translation_b: _Vector = (0.0, 0.0, 0.0),
+        axis_b: ArrayLike = (0.0, 0.0, 1.0),
+    ) -> None:
+        """Let a body roll on a plane without slip, as a thin disc or a sphere.
+
+        One row holds the height of the centre, a position; two hold the velocity of the contact point along the plane.
+        It is kept even where the plane would have to pull. A disc that lies flat on its plane touches in no single
+        point: engines raise `NumericalError` there.
+
+        Parameters
+        ----------
+        name, body_a, body_b : str
+            Body a rolls on a plane of body b, by default of the ground.
+        kind : {"disc", "sphere"}
+            A wheel is a disc.
+        radius : float
+            m.
+        translation_a : (3,) array_like
+            The centre in the axes of body a, m.
+        axis_a : (3,) array_like, optional
+            Of a disc, its axis in the axes of body a; a sphere has none. Turning positively about it, the disc rolls
+            forward along axis x normal. Normalized here.
+        translation_b, axis_b : (3,) array_like
+            A point and the normal of the plane in the axes of body b, m; the body is on the side of the normal.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("marble")
+        >>> b.add_body("marble", mass=0.1, inertia=(4e-6, 4e-6, 4e-6))
+        >>> b.add_joint("move", "free", parent="world", child="marble", translation=(0, 0, 0.01))
+        >>> b.add_rolling("floor", "sphere", body_a="marble", radius=0.01)
+        >>> mb.dynamics(b.build(), "lagrangian").mobility().degrees_of_freedom
+        3
+        """
+        if not isinstance(kind, str) or kind not in ROLLING_KINDS:
+            there = ", ".join(map(repr, ROLLING_KINDS))
+            self._read.faults.append(f"no slip {shown(name)}: unknown kind {shown(kind)}; there are {there}")
+            kind = "disc"
+        a = {"body_a": body_a, "translation_a": translation_a, "axis_a": axis_a, "radius": radius}
+        b = {"body_b": body_b, "translation_b": translation_b, "axis_b": axis_b}
+        self._add(NoSlip, "no_slip", "no slip", name, a | b, {"kind": kind})
 
     def note(self, text: str) -> None:
         """Add a sentence to the model's notes."""

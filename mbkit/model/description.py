@@ -19,7 +19,7 @@ from mbkit.model.elements.forces import Bushing, Force, drives, lost, needs_time
 from mbkit.model.elements.motion_laws import Motion, beyond, interval
 from mbkit.model.joint_types import KINDS
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, PointSpring, read_only
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, NoSlip, PointSpring, read_only
 
 
 def _plain(value: Any) -> Any:
@@ -61,6 +61,7 @@ class Needs:
     quaternions: bool
     time: bool
     forces: bool = False
+    no_slip: bool = False
 
     @classmethod
     def of(
@@ -71,6 +72,7 @@ class Needs:
         couplings: Iterable[JointCoupling],
         loops: Iterable[Loop],
         prescribed: Iterable[Motion],
+        no_slip: Iterable[NoSlip] = (),
         bound: Iterable[str] = (),
         forces: Iterable[Force] = (),
     ) -> Needs:
@@ -97,6 +99,7 @@ class Needs:
             quaternions=any(j.type.quaternion is not None for j in joints),
             time=bool(tuple(prescribed)) or any(f.of_time for f in forces),
             forces=bool(forces),
+            no_slip=bool(tuple(no_slip)),
         )
 
     def as_dict(self) -> dict[str, bool]:
@@ -221,6 +224,8 @@ class Description:
     couplings : tuple of JointCoupling
     loops : tuple of Loop
     prescribed : tuple of Prescribed, FormulaMotion or SplineMotion
+    no_slip : tuple of NoSlip
+        Blades, and discs and spheres that roll.
     notes : tuple of str
         Decisions of the loader, for the user.
     nonphysical : tuple of (str, str)
@@ -252,6 +257,7 @@ class Description:
     source: str = ""
     time: float = 0.0
     forces: tuple[Force, ...] = ()
+    no_slip: tuple[NoSlip, ...] = ()
     layout: Layout = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -353,8 +359,8 @@ class Description:
     def needs(self) -> Needs:
         """What this description needs from an engine."""
         bound = (b.field for b in self.bindings)
-        parts = self.gravity, self.joints, self.springs, self.couplings, self.loops, self.prescribed
-        return Needs.of(*parts, bound, self.forces)
+        held = self.loops, self.prescribed, self.no_slip
+        return Needs.of(self.gravity, self.joints, self.springs, self.couplings, *held, bound, self.forces)
 
     @cached_property
     def digest(self) -> str:
@@ -362,7 +368,7 @@ class Description:
         names = ("name", "gravity", "bodies", "joints", "frames", "springs", "loops", "prescribed")
         parts = [getattr(self, name) for name in names]
         types = [KINDS[kind] for kind in sorted({j.kind for j in self.joints})]
-        more = (*self.couplings, *self.bindings, *(t.digest for t in types if not t.built_in))
+        more = (*self.couplings, *self.no_slip, *self.bindings, *(t.digest for t in types if not t.built_in))
         return digest(*parts, *more, *((type(f).__name__, f) for f in self.forces))
 
     @cached_property
@@ -406,8 +412,8 @@ class Description:
     def _parents(self) -> Mapping[str, str]:
         return MappingProxyType({joint.child: joint.parent for joint in self.joints})
 
-    def carrier(self, loop: Loop | Bushing) -> str:
-        """Return the last body that carries both ends of a loop, whose axes its rows have; ``"world"`` for most."""
+    def carrier(self, loop: Loop | Bushing | NoSlip) -> str:
+        """Return the last body that carries both bodies of a loop, whose axes its rows have; ``"world"`` for most."""
         below = set(self.way(loop.body_b))
         return next(body for body in self.way(loop.body_a) if body in below)
 
@@ -463,7 +469,7 @@ class Description:
                 part, [(b.field, b.index, x) for b, x in bindings if (b.where, b.part) == (where, name)]
             )
 
-        kinds = ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed", "forces")
+        kinds = ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed", "forces", "no_slip")
         changes: dict[str, Any] = {kind: tuple(filled(kind, p, p.name) for p in getattr(self, kind)) for kind in kinds}
         expressions = tuple(replace(b, expression=x) for b, x in bindings if isinstance(x, Expression))
         out: Self = replace(filled("gravity", self, ""), **changes, bindings=expressions)

@@ -24,7 +24,7 @@ from mbkit.model.validation import check_substituted
 _PER_VELOCITY: Final = {"damping": "damping", "springs": "stiffness", "armature": "armature", "friction": "friction"}
 #: Elements between joints or points, and the numbers that make them act.
 _ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness", "damping", "armature")}
-_FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed", "forces")
+_FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed", "forces", "no_slip")
 
 
 class Model(Description):
@@ -53,7 +53,7 @@ class Model(Description):
     @property
     def constrained(self) -> bool:
         """Whether constraints bind the coordinates to each other, so that not every (q, v) is a state."""
-        return bool(self.loops or self.prescribed)
+        return bool(self.loops or self.prescribed or self.no_slip)
 
     def require_independent(self, q: Array, *, once: bool = False) -> None:
         """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq), with the rows.
@@ -241,9 +241,9 @@ class Model(Description):
         Parameters
         ----------
         *features : str
-            Any of damping, springs, armature, friction, gravity, limits, loops, prescribed, forces. Springs and damping
-            are those of joints, point-to-point elements and couplings, armature that of joints and couplings; forces
-            are those given by functions, with bushings.
+            Any of damping, springs, armature, friction, gravity, limits, loops, prescribed, forces, no_slip.
+            Springs and damping are those of joints, point-to-point elements and couplings, armature that of joints
+            and couplings; forces are those given by functions, with bushings.
         """
         model = self
         for feature in features:
@@ -293,7 +293,7 @@ class Model(Description):
         return {name: real(f"parameter {name!r}", value) for name, value in values.items()}
 
     def _without(self, feature: str) -> Model:
-        if feature in ("gravity", "loops", "prescribed", "forces"):
+        if feature in ("gravity", "loops", "prescribed", "forces", "no_slip"):
             empty: Any = {feature: np.zeros(3) if feature == "gravity" else ()}
             return replace(self, bindings=tuple(b for b in self.bindings if b.where != feature), **empty)
         if feature == "limits":
@@ -329,7 +329,8 @@ class Model(Description):
             for j in self.tree
         )
         head = "".join(f"<th>{h}</th>" for h in ("joint", "kind", "parent", "child", "child's mass, kg", "mimics"))
-        notes = "".join(f"<li>{html(n)}</li>" for n in (*map(str, (*self.couplings, *self.forces)), *self.notes))
+        parts = map(str, (*self.couplings, *self.forces, *self.no_slip))
+        notes = "".join(f"<li>{html(n)}</li>" for n in (*parts, *self.notes))
         return (
             f"<p><b>{html(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._mass_text()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")

@@ -293,3 +293,45 @@ class Prescribed(_Frozen):
     def name(self) -> str:
         """The joint's, which has one motion."""
         return self.joint
+
+
+@dataclass(frozen=True, eq=False)
+class NoSlip(_Frozen):
+    """A point of body a that does not slip past body b: of a blade, or where a disc or sphere touches a plane.
+
+    The velocity of a blade's point, as body b sees it, has the component `speed` along one direction. A disc or sphere
+    stays on the plane, and its point of contact has no velocity there (`mbkit.model.rolling`).
+
+    Attributes
+    ----------
+    name, kind, body_a, body_b : str
+        A `kind` is one of `mbkit.model.rolling.NO_SLIP_ROWS`.
+    translation_a : (3,) array
+        A blade's point, or the centre of a disc or sphere, in the axes of body a, m.
+    axis_a : (3,) array
+        Unit vector in the axes of body a: a blade's direction or a disc's axis. Zero for a sphere, and for a blade
+        whose direction body b carries.
+    translation_b : (3,) array
+        A point of the plane in the axes of body b, m.
+    axis_b : (3,) array
+        Unit vector in the axes of body b: the plane's normal, or a blade's direction.
+    radius : float
+        Of a disc or sphere, m; zero for a blade.
+    speed : float
+        Of a blade, m/s; zero for the others.
+    """
+
+    name: str
+    kind: str
+    body_a: str
+    translation_a: Array
+    axis_a: Array
+    body_b: str
+    translation_b: Array
+    axis_b: Array
+    radius: float = 0.0
+    speed: float = 0.0
+
+    def __str__(self) -> str:
+        size = f" of radius {self.radius:g} m" if self.radius else f" at {self.speed:g} m/s" if self.speed else ""
+        return f"no slip {self.name!r}: {self.kind}{size}, {self.body_a!r} on {self.body_b!r}"

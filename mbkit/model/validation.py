@@ -16,7 +16,8 @@ from mbkit.model.description import Description
 from mbkit.model.elements.forces import force_faults
 from mbkit.model.elements.motion_laws import motion_faults
 from mbkit.model.loops import held_directions
-from mbkit.model.parts import Body, Joint, JointCoupling, Loop
+from mbkit.model.parts import Body, Joint, JointCoupling, Loop, NoSlip
+from mbkit.model.rolling import LIES_FLAT, ROLLING_KINDS
 from mbkit.spatial import skew
 
 # Names in a message.
@@ -43,9 +44,9 @@ def structure_faults(description: Description) -> Iterator[str]:
     velocities = sum(j.type.nv for j in joints)
     if velocities > _MAX_VELOCITIES:
         yield f"{velocities} velocities; expected up to {_MAX_VELOCITIES}, because M has their square"
-    for what in ("bodies", "joints", "frames", "springs", "couplings", "loops"):
+    for what in ("bodies", "joints", "frames", "springs", "couplings", "loops", "no_slip"):
         names = [p.name for p in getattr(description, what)]
-        one = "body" if what == "bodies" else what[:-1]
+        one = {"bodies": "body", "no_slip": "no slip"}.get(what, what[:-1])
         yield from repeated_names(one, names)
         if one in ("body", "frame") and "world" in names:
             yield f"{one} 'world': that name is the ground's; choose another"
@@ -79,6 +80,9 @@ def structure_faults(description: Description) -> Iterator[str]:
             yield f"loop {loop.name!r}: expected a rod with a length above 0, got {loop.length:g}; use kind 'point'"
         if loop.kind != "distance" and loop.length:
             yield f"loop {loop.name!r}: length {loop.length:g} on a loop of kind {loop.kind!r}; only a rod has one"
+    for part in description.no_slip:
+        yield from unknown(f"no slip {part.name!r}", (part.body_a, part.body_b))
+        yield from _no_slip_faults(part)
     yield from _tree_faults(bodies, joints)
     yield from _mimic_faults(joints)
     single = {j.name for j in joints if j.type.nv == 1 and not j.mimic}
@@ -130,6 +134,22 @@ def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterat
     yield from _negative(item, coupling, "stiffness", "damping", "armature")
     if not np.any(coupling.factors):
         yield f"{item}: no joint has a factor other than zero; it would never act"
+
+
+def _no_slip_faults(part: NoSlip) -> Iterator[str]:
+    item, rolls = f"no slip {part.name!r}", part.kind in ROLLING_KINDS
+    a, b = part.axis_a.any(), part.axis_b.any()
+    if part.body_a == part.body_b:
+        yield f"{item}: both points on {part.body_a!r}; it would hold nothing"
+    if not rolls and bool(a) == bool(b):
+        yield f"{item}: expected the direction as axis_a or as axis_b, got {'both' if a else 'neither'}; give one"
+    if rolls and not b:
+        yield f"{item}: axis_b is missing; expected the normal of the plane"
+    if rolls and not part.radius > 0 and not np.isnan(part.radius):
+        yield f"{item}: expected a radius above 0, got {part.radius:g}"
+    if rolls and bool(a) != (part.kind in LIES_FLAT):
+        has = "has an axis; give axis_a" if not a else "has no axis; leave axis_a out"
+        yield f"{item}: a {part.kind} {has}"
 
 
 def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> Iterator[str]:

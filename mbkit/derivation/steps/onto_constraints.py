@@ -1,8 +1,9 @@
-"""The end of a step under constraints: projection onto f = 0 and ḟ = 0, as CasADi expressions.
+"""The end of a step under constraints: positions projected onto f = 0, velocities onto all rows, as CasADi expressions.
 
-The equation of motion holds f̈ = 0 only, so that f and ḟ drift by the step's own error. Newton's iteration in the metric
-of the mass matrix takes both to rounding, and the order of the method stays (Hairer, Lubich, Wanner 2006, Geometric
-Numerical Integration, ch. IV.4).
+The equation of motion holds J v̇ + γ = 0 only, so that f and the rates drift by the step's own error. Newton's iteration
+in the metric of the mass matrix takes both to rounding, and the order of the method stays (Hairer, Lubich, Wanner 2006,
+Geometric Numerical Integration, ch. IV.4). Rows that hold velocities alone move no position: the coordinates go where
+the velocities led them.
 
 As a rule one iteration is enough, with the factors that the last stage has left: the drift is that of a step, and the
 stage is near the end. `quick_projection` says where it was not, and the step is then taken again with
@@ -17,6 +18,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit.derivation.constraints import ConstraintTerms
+from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.model.manifold import random_state
 
@@ -39,8 +41,8 @@ def quick_projection(equations: Any) -> ca.Function:
         c: ConstraintTerms = equations.constraints
         q, v, extra = equations.q, equations.v, equations.extra_arguments
         near, by = ca.SX.sym("near", *q.shape), ca.SX.sym("by", *v.shape)
-        more, change = [*extra.values()], _change(equations)
-        du = change(near, c.value, *more)
+        more, shift, change = [*extra.values()], _shift(equations), _change(equations)
+        du = shift(near, c.value, *more)
         # To first order in the move: what is left is its square times the velocity.
         rate = ca.substitute(c.rate + c.rate_along(by), by, du)
         dv = change(near, rate, *more)
@@ -58,14 +60,14 @@ def thorough_projection(equations: Any) -> ca.Function:
     if "thorough projection" not in equations.kept:
         c: ConstraintTerms = equations.constraints
         q, v, extra = equations.q, equations.v, equations.extra_arguments
-        more, change = [*extra.values()], _change(equations)
+        more, shift, change = [*extra.values()], _shift(equations), _change(equations)
         rows = ca.Function("rows", [q, v, *more], [c.value, c.rate])
-        q1 = _moved(equations, q, change(q, c.value, *more))
-        q1 = _moved(equations, q1, change(q, rows(q1, v, *more)[0], *more))
+        q1 = _moved(equations, q, shift(q, c.value, *more))
+        q1 = _moved(equations, q1, shift(q, rows(q1, v, *more)[0], *more))
         residual, rate = rows(q1, v, *more)
         v1 = v + change(q, rate, *more)
         v1 = v1 + change(q, rows(q1, v1, *more)[1], *more)
-        last = change(q, residual, *more)
+        last = shift(q, residual, *more)
         far = ca.sumsqr(last) > _LAST**2 * (1 + ca.sumsqr(q1))
         outs = [_moved(equations, q1, last), v1, far]
         equations.kept["thorough projection"] = ca.Function("thorough_projection", [q, v, *more], outs)
@@ -78,14 +80,29 @@ def _moved(equations: Any, q: Any, by: Any) -> Any:
     return space.retract(q, space.to_integrator_velocity(q, by))
 
 
+def _shift(equations: Any) -> ca.Function:
+    """Return the same as `_change` for the rows that hold positions alone."""
+    k, rows = equations.constraints.positions, equations.constraints.jacobian.shape[0]
+    if k == rows:
+        return _change(equations)
+    if "shift" not in equations.kept:
+        own, extra = equations.constraint_factors, equations.extra_arguments
+        residual = ca.SX.sym("residual", k)
+        held = Factors(own.matrix[:k, :k], range(k)).solve(residual) if k else residual
+        out = -ca.mtimes(own.Y[:, :k], held)
+        equations.kept["shift"] = ca.Function("shift", [equations.q, residual, *extra.values()], [out])
+    shift: ca.Function = equations.kept["shift"]
+    return shift
+
+
 def _change(equations: Any) -> ca.Function:
-    """Return (q, residual, more) -> -M⁻¹ Jᵀ S⁻¹ residual: the least change by which rows lose a residual.
+    """Return (q, residual, more) -> -M⁻¹ Jᵀ S⁻¹ residual: the least change of velocities by which rows lose a residual.
 
     Its factors are those of forward dynamics at q, which a program has once.
     """
     if "change" not in equations.kept:
         own, extra = equations.constraint_factors, equations.extra_arguments
-        residual = ca.SX.sym("residual", equations.constraints.value.shape[0])
+        residual = ca.SX.sym("residual", equations.constraints.jacobian.shape[0])
         out = -ca.mtimes(own.Y, own.S.solve(residual))
         equations.kept["change"] = ca.Function("change", [equations.q, residual, *extra.values()], [out])
     change: ca.Function = equations.kept["change"]

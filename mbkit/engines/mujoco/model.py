@@ -178,7 +178,7 @@ def specified(description: Model, softness: Softness | None = None) -> tuple[Any
 
 
 def not_held(description: Model) -> Iterator[str]:
-    """Yield the loops and motions that are no equality of MuJoCo's, each with the reason."""
+    """Yield the loops, motions and contacts that are no equality of MuJoCo's, each with the reason."""
     for loop in description.loops:
         if loop.kind == "distance":
             why = "MuJoCo's equality of a tendon's length leaves J̇ v out, which no stiffness makes up for"
@@ -187,6 +187,8 @@ def not_held(description: Model) -> Iterator[str]:
             yield f"loop {loop.name!r} is {loop.kind}, and MuJoCo has no such equality, only points and frames"
     for motion in description.prescribed:
         yield f"joint {motion.joint!r} is moved in time, and MuJoCo's equality of a joint holds a constant alone"
+    for part in description.no_slip:
+        yield f"no slip {part.name!r} ({part.kind}) holds velocities, and MuJoCo's equalities hold positions alone"
 
 
 #: Features that no smooth term needs, with their disable bits, and those that some models need.

@@ -1,9 +1,9 @@
-"""Loops and prescribed motions by Pinocchio. A part of `PinocchioDynamics`.
+"""Loops, prescribed motions and contacts without slip by Pinocchio. A part of `PinocchioDynamics`.
 
 `pinocchio.constraintDynamics` gives the accelerations where it can: every loop is a "point" or a "frame", no motion is
-prescribed, no joint mimics another, no coupling has an armature, and no row is redundant but those of a plane that does
-not move. It factors J M⁻¹ Jᵀ + μ and iterates (Carpentier, Budhiraja and Mansard 2021, Proximal and sparse resolution
-of constrained dynamic equations). Elsewhere the equation
+prescribed, nothing rolls, as its constraints hold positions, no joint mimics another, no coupling has an armature, and
+no row is redundant but those of a plane that does not move. It factors J M⁻¹ Jᵀ + μ and iterates (Carpentier, Budhiraja
+and Mansard 2021, Proximal and sparse resolution of constrained dynamic equations). Elsewhere the equation
 
     M v̇ - Jᵀ λ = τ + τ_passive - h        J v̇ = -γ
 
@@ -24,7 +24,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from math import cos, inf, isfinite, sin
+from math import cos, inf, isfinite, sin, sqrt
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -36,7 +36,8 @@ from mbkit.engines.pinocchio.model import PinModel
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Model, Prescribed
 from mbkit.model.loops import LOOP_KINDS
-from mbkit.model.parts import Loop
+from mbkit.model.parts import Loop, NoSlip
+from mbkit.model.rolling import LIES_FLAT, NO_SLIP_ROWS, contact, tangents
 from mbkit.spatial import skew
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ _LOCAL: Final = pin.ReferenceFrame.LOCAL
 
 @dataclass(frozen=True)
 class Rows:
-    """f, J, ḟ and γ of rows."""
+    """f, J, rate and γ of rows; f is zero where a row holds velocities alone."""
 
     f: Array
     J: Array
@@ -163,6 +164,52 @@ class _Relative:
         return _row(value, r @ self.J / size, r @ self.dr / size, (self.dr @ self.dr + r @ self.ddr) / size)
 
 
+class _Contact:
+    """A contact without slip in world axes: W, the velocity of body a's point at the contact as body b sees it.
+
+    A row is a direction d with the rate d·W, the Jacobian dᵀ J and γ = ḋ·W + d·Ẇ. The contact point of a disc moves in
+    the disc, by ṙ - ω x r, across the normal: so n·W is the rate of the height.
+    """
+
+    def __init__(self, part: NoSlip, a: _Frame, b: _Frame) -> None:
+        kind, R = part.kind, part.radius
+        axis, normal = a.R @ part.axis_a, b.R @ part.axis_b
+        along = [b.R @ x for x in tangents(part.axis_b)]
+        place = contact(kind, axis, normal, along, R, sqrt)
+        r, to_a, to_b = np.array(place.offset), _cross(a.w, axis), _cross(b.w, normal)
+        if kind in LIES_FLAT:
+            r_rate, turns = _disc_rates(axis, normal, to_a, to_b, r, R)
+        else:
+            # A blade's direction is on one of both bodies.
+            r_rate = -R * to_b
+            turns = [_cross(b.w, x) for x in along] if R else [to_a + to_b]
+        arm = a.p + r - b.p
+        arm_rate = a.v + r_rate - b.v
+        self.J = a.J - skew(r) @ a.J_turn - b.J + skew(arm) @ b.J_turn
+        self.W = a.v + _cross(a.w, r) - b.v - _cross(b.w, arm)
+        self.dW = a.a + _cross(a.alpha, r) + _cross(a.w, r_rate) - b.a - _cross(b.alpha, arm) - _cross(b.w, arm_rate)
+        gap = a.p - b.p
+        self.held = [self._row(np.array(n), to_b, normal @ gap - place.reach, 0.0) for n in place.up]
+        self.moving = [
+            self._row(d, dd, 0.0, part.speed) for d, dd in zip(map(np.array, place.along), turns, strict=True)
+        ]
+
+    def _row(self, d: Array, rate: Array, f: Any, speed: float) -> Rows:
+        return _row(f, d @ self.J, d @ self.W - speed, rate @ self.W + d @ self.dW)
+
+
+def _disc_rates(a: Array, n: Array, da: Array, dn: Array, r: Array, R: float) -> tuple[Array, list[Array]]:
+    """Return the rates of the way r to a disc's lowest point and of its directions, from those of axis and normal."""
+    u, cosine, slope = -r / R, a @ n, da @ n + a @ dn
+    lowest = n - cosine * a
+    s = sqrt(lowest @ lowest)
+    dm = dn - slope * a - cosine * da
+    ds = u @ dm
+    forward = _cross(a, n) / s
+    d_forward = (_cross(da, n) + _cross(a, dn) - ds * forward) / s
+    return -R * (dm - ds * u) / s, [d_forward, _cross(dn, forward) + _cross(n, d_forward)]
+
+
 def _row(f: Any, J: Array, rate: Any, gamma: Any) -> Rows:
     return Rows(np.array([f]), J[None], np.array([rate]), np.array([gamma]))
 
@@ -187,7 +234,7 @@ _ROWS: Final[dict[str, tuple[Callable[[_Relative], Rows], ...]]] = {
 
 
 class PinConstraints:
-    """The rows of a model's loops and prescribed motions, and its motion under them, in Pinocchio's numbers.
+    """The rows of a model's constraints, and its motion under them, in Pinocchio's numbers.
 
     Configurations and velocities are Pinocchio's; J and forces are on the description's velocities.
     """
@@ -210,6 +257,14 @@ class PinConstraints:
                 placed.append((joint, pin.SE3(R_JB @ R, p_JB + R_JB @ p)))
             self._ends.append(placed)
             self._grounded.append(placed[2][0] == 0)
+        #: Of each contact without slip the joint and the placement on both bodies.
+        self._touching: list[list[tuple[int, Any]]] = []
+        for x in model.no_slip:
+            ends = []
+            for body, p in ((x.body_a, x.translation_a), (x.body_b, x.translation_b)):
+                joint, R_JB, p_JB = maps.bodies[body]
+                ends.append((joint, pin.SE3(R_JB, p_JB + R_JB @ p)))
+            self._touching.append(ends)
 
     def at(self, time: float) -> PinConstraints:
         """Return the same at another time."""
@@ -228,19 +283,34 @@ class PinConstraints:
         return choose_rows(self._model)
 
     def every(self, q: Array, v: Array) -> Rows:
-        """Return all rows, those that say nothing among them."""
+        """Return all rows of loops, those that say nothing among them."""
+        self._move(q, v)
         m, d = self._m, self._d
-        pin.forwardKinematics(m, d, q, v, self._still)
-        pin.computeJointJacobians(m, d)
         parts = []
         for loop, ends in zip(self._model.loops, self._ends, strict=True):
             seen = _Relative(loop, *(_Frame(m, d, self._G, *end) for end in ends))
             parts += [rows(seen) for rows in _ROWS[loop.kind]]
         return Rows.stacked(parts) if parts else Rows(*(np.zeros((0, *x)) for x in ((), (self._model.nv,), (), ())))
 
+    def _move(self, q: Array, v: Array) -> None:
+        pin.forwardKinematics(self._m, self._d, q, v, self._still)
+        pin.computeJointJacobians(self._m, self._d)
+
+    def _contacts(self) -> tuple[list[Rows], list[Rows]]:
+        """Return the rows of contacts that hold positions, and those that hold velocities, after `every`."""
+        m, d, held, moving = self._m, self._d, [], []
+        with np.errstate(divide="ignore", invalid="ignore"):
+            for part, ends in zip(self._model.no_slip, self._touching, strict=True):
+                seen = _Contact(part, *(_Frame(m, d, self._G, *end) for end in ends))
+                held += seen.held
+                moving += seen.moving
+        return held, moving
+
     def rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
         """Return the rows that say something; `given` are q and v of the description."""
-        return Rows.stacked([self.every(q, v), *self._motions(*given)])[list(self.choice.kept)]
+        loops = self.every(q, v)
+        held, moving = self._contacts()
+        return Rows.stacked([loops, *self._motions(*given), *held, *moving])[list(self.choice.kept)]
 
     @cached_property
     def _laws(self) -> list[Callable[[float], tuple[float, float, float]]]:
@@ -271,7 +341,8 @@ class PinConstraints:
     def solver(self) -> str:
         """What gives the accelerations: "constraintDynamics", or "LAPACK" from Pinocchio's terms."""
         model = self._model
-        if model.prescribed or model.layout.reduced or self._rotors or any(x.kind not in _RIGID for x in model.loops):
+        foreign = model.prescribed or model.no_slip or any(x.kind not in _RIGID for x in model.loops)
+        if foreign or model.layout.reduced or self._rotors:
             return "LAPACK"
         kept, independent = self.choice.kept, self.choice.independent
         first = 0
@@ -393,7 +464,7 @@ class PinConstraints:
             a, forces = a + across * x[:n], forces + rates * x[n:]
         if factors[2] or not np.isfinite(a).all():
             raise NumericalError(
-                f"pinocchio: the mass matrix of {self._model.name} is singular on what its loops leave free"
+                f"pinocchio: the mass matrix of {self._model.name} is singular on what its constraints leave free"
             )
         if k < len(rows.J):
             # Jᵀ λ = J_allᵀ μ with J_all = C J, for every μ with Cᵀ μ = λ.
@@ -407,6 +478,7 @@ class PinConstraints:
         parts = [
             *(f"loop {x.name!r}" for x in self._model.loops for _ in range(LOOP_KINDS[x.kind])),
             *(f"motion of {x.joint!r}" for x in self._model.prescribed),
+            *(f"no slip {x.name!r}" for k in (0, 1) for x in self._model.no_slip for _ in NO_SLIP_ROWS[x.kind][k]),
         ]
         rows = [self.choice.kept[i] for i in self.choice.independent]
         names = dict.fromkeys(parts[i] for i, w in zip(rows, weights, strict=True) if abs(w) > 1e-3)
@@ -417,7 +489,7 @@ class PinConstraints:
 
 
 class PinocchioConstrained:
-    """Quantities of loops and prescribed motions; `PinocchioDynamics` inherits it."""
+    """Quantities of constraints; `PinocchioDynamics` inherits it."""
 
     model: Model
     _held: PinConstraints
@@ -432,7 +504,7 @@ class PinocchioConstrained:
 
     @property
     def constraint_solver(self) -> str:
-        """What gives accelerations under loops and prescribed motions: "constraintDynamics" or "LAPACK"."""
+        """What gives accelerations under constraints: "constraintDynamics" or "LAPACK"."""
         if not self.model.constrained:
             raise UnsupportedError(f"constraint_solver: {self.model.name} has no loops and no other constraints")
         return self._held.solver
@@ -442,7 +514,7 @@ class PinocchioConstrained:
         return self._held.rows(self._full_q(q), self._full_v(v), (q, v))
 
     def _constraint_residual(self, q: Array) -> Array:
-        return self._rows(q).f
+        return self._rows(q).f[: self._held.choice.positions]
 
     def _constraint_jacobian(self, q: Array) -> Array:
         return self._rows(q).J
