@@ -5,7 +5,8 @@ the zero pose and the source. Planar systems move in the x-z plane, gravity alon
 vertical that grow towards +x: a right-handed turn about -y. Planar systems without gravity move in the x-y plane.
 
 Mechanisms with loops, of which `slider_crank` is one, are closed in their neutral pose: `Model.neutral` gives a state,
-and `mbkit.lagrangian.from_model` solves them. Their angles are measured from that pose.
+and `mbkit.lagrangian.from_model` solves them. Their angles are measured from that pose. So are `rolling_disc`,
+`chaplygin_sleigh` and `bicycle`, which roll or glide without slip, on the ground there.
 """
 
 from __future__ import annotations
@@ -47,15 +48,17 @@ from mbkit.catalog.rigid_bodies import (
     heavy_top,
     spacecraft_with_wheels,
 )
+from mbkit.catalog.rolling import bicycle, chaplygin_sleigh, rolling_disc
 from mbkit.catalog.spatial_loops import bricard, delta_robot, double_cardan_shaft, flyball_governor, stewart_platform
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 
-__all__ = ["acrobot", "andrews_squeezer", "bricard", "cart_pole", "chain", "chebyshev", "clamped_beam"]
+__all__ = ["acrobot", "andrews_squeezer", "bicycle", "bricard", "cart_pole", "chain", "chaplygin_sleigh"]
+__all__ += ["chebyshev", "clamped_beam"]
 __all__ += ["delta_robot", "double_cardan_shaft", "double_pendulum", "elastic_pendulum", "five_bar"]
 __all__ += ["flexible_spacecraft", "flyball_governor", "four_bar", "four_bars", "free_body", "furuta_pendulum"]
 __all__ += ["get", "gyroscope", "heavy_top", "hoecken", "inverted_slider_crank", "pantograph"]
-__all__ += ["parallel_gripper", "peaucellier", "pendulum", "planar_3rrr", "scissor", "slider_crank"]
+__all__ += ["parallel_gripper", "peaucellier", "pendulum", "planar_3rrr", "rolling_disc", "scissor", "slider_crank"]
 __all__ += ["spacecraft_with_wheels", "spherical_pendulum", "stewart_platform", "systems", "watt"]
 
 

@@ -28,13 +28,13 @@ _MAX_COUNT: Final = 2000
 #: Unit of a parameter by the last word of its name; lengths are in m.
 _UNITS: Final = {
     "mass": "kg",
-    **dict.fromkeys(("inertia", "axial", "across"), "kg m²"),
+    **dict.fromkeys(("inertia", "axial", "across", "product"), "kg m²"),
     "stiffness": "N/m",
     "bending_stiffness": "N m²",
     "gravity": "m/s², along -z",
     "density": "kg/m",
     "ratio": "Without unit",
-    "angle": "rad",
+    **dict.fromkeys(("angle", "tilt"), "rad"),
     "axes": "Of any length",
 }
 _RAISES: Final = """Raises
@@ -100,6 +100,11 @@ def positive(name: str, value: Number) -> Number:
 def nonnegative(name: str, value: Number) -> Number:
     """Return a number of at least zero, or an expression whose nominal value, if known, is at least zero."""
     return _signed(name, value, nonnegative=True)
+
+
+def finite(name: str, value: Number) -> Number:
+    """Return a number of either sign, or an expression."""
+    return _signed(name, value)
 
 
 def _signed(name: str, value: Number, **sign: bool) -> Number:

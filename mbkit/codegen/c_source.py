@@ -21,6 +21,7 @@ from mbkit.codegen.program import program
 from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
+from mbkit.model.description import CONSTRAINT_FEATURES
 
 #: Quantity -> (name in C of its one output, its meaning).
 _OUTPUTS: Final = {
@@ -306,7 +307,7 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     InputError
         No quantity, or a `name` that is no identifier in C.
     UnsupportedError
-        The model has loops or motions prescribed in time, or no joint that moves.
+        The model has constraints, or no joint that moves.
 
     Examples
     --------
@@ -316,11 +317,12 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     'pendulum_forward_dynamics'
     """
     wanted = _checked(quantities)
-    for feature, present in (("loops", model.needs.loops), ("prescribed", model.prescribed)):
-        if present:
+    for feature in CONSTRAINT_FEATURES:
+        if getattr(model, feature, ()):
+            paper = "mbkit.lagrangian.from_model(model).model with them, or " if feature != "no_slip" else ""
             raise UnsupportedError(
-                f"{model.name} has {feature!r}, which C code of its tree leaves out; export "
-                f"mbkit.lagrangian.from_model(model).model with them, or model.without({feature!r})"
+                f"{model.name} has {feature!r}, which C code of its tree leaves out; export {paper}"
+                f"model.without({feature!r})"
             )
     if not model.nv:
         raise UnsupportedError(f"{model.name} cannot be exported: no joint of it moves, and C has no empty arrays")

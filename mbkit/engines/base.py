@@ -29,6 +29,7 @@ from mbkit.methods.tableaus import Tableau
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import NEAR_UNIT
+from mbkit.model.rolling import LIES_FLAT
 
 if TYPE_CHECKING:
     from mbkit.show import Kind
@@ -623,6 +624,9 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors, Con
                 f"; possible cause: a point spring with a damper or a rest length has no direction where "
                 f"its length is zero: {', '.join(springs[:_MAX_NAMES])}"
             )
+        discs = [repr(x.name) for x in self.model.no_slip if x.kind in LIES_FLAT]
+        if discs:
+            return f"; possible cause: a disc that lies flat on its plane: {', '.join(discs[:_MAX_NAMES])}"
         return "; perhaps links without mass, or numbers so large that they overflow"
 
 

@@ -32,7 +32,7 @@ _DUST: Final = Fraction(1, 10**15)
 
 def instead_of_writing(model: Model) -> str:
     """Return the advice of a message for a model that is too large to be written out."""
-    features = [f for f in ("loops", "prescribed") if getattr(model, f)]
+    features = [f for f in ("loops", "prescribed", "no_slip") if getattr(model, f)]
     if not features:
         return 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
     names = ", ".join(map(repr, features))

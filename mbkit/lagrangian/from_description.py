@@ -61,8 +61,8 @@ def from_model(
     Raises
     ------
     UnsupportedError
-        Ball or free joints, forces by functions elsewhere than at joints, too many terms to read, or no coordinate
-        that is left to move.
+        Ball or free joints, blades or rolling contacts, forces by functions elsewhere than at joints, too many terms
+        to read, or no coordinate that is left to move.
     InputError
         `symbols` of a model that is not in the catalog, names that do not fit, or a loop whose ends never meet or do
         not move against each other.
@@ -139,6 +139,12 @@ def from_model(
 
 
 def _check(model: Model) -> None:
+    if model.no_slip:
+        names = ", ".join(repr(x.name) for x in model.no_slip)
+        raise UnsupportedError(
+            f"{model.name}: no slip {names} holds velocities, and a Lagrangian's constraints hold positions alone; "
+            'mbkit.dynamics(model, "lagrangian") solves it, and model.without("no_slip") is the system that slips'
+        )
     turning = [j.name for j in model.independent_joints if not j.type.coordinate_velocities]
     if turning:
         raise UnsupportedError(

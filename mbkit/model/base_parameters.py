@@ -264,7 +264,8 @@ def base_parameters(model: Description, tolerance: float) -> BaseParameters:
     tolerance = real("tolerance", tolerance, positive=True)
     if tolerance >= 1:
         raise InputError(f"tolerance: expected a number below 1, got {tolerance:g}")
-    for feature, what in (("loops", "loops"), ("prescribed", "prescribed motions")):
+    whats = {"loops": "loops", "prescribed": "prescribed motions", "no_slip": "contacts without slip"}
+    for feature, what in whats.items():
         if getattr(model, feature):
             raise UnsupportedError(
                 f"base parameters: expected a tree of free joints, got {what} in {model.name}; "

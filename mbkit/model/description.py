@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import chain, count, pairwise
 from types import MappingProxyType
-from typing import Any, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from mbkit.model.elements.motion_laws import Motion, beyond, interval
 from mbkit.model.joint_types import KINDS
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
 from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, NoSlip, PointSpring, read_only
+
+#: Attributes of a description that bind its coordinates or velocities to each other.
+CONSTRAINT_FEATURES: Final = ("loops", "prescribed", "no_slip")
 
 
 def _plain(value: Any) -> Any:

@@ -16,7 +16,7 @@ from mbkit._escape import html
 from mbkit.errors import UnknownNameError, UnsupportedError
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
-from mbkit.model.description import Description, expect_name
+from mbkit.model.description import CONSTRAINT_FEATURES, Description, expect_name
 from mbkit.model.parameters import Parameter
 from mbkit.model.parts import Joint
 from mbkit.model.validation import check_substituted
@@ -24,7 +24,7 @@ from mbkit.model.validation import check_substituted
 _PER_VELOCITY: Final = {"damping": "damping", "springs": "stiffness", "armature": "armature", "friction": "friction"}
 #: Elements between joints or points, and the numbers that make them act.
 _ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness", "damping", "armature")}
-_FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "loops", "prescribed", "forces", "no_slip")
+_FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "forces", *CONSTRAINT_FEATURES)
 
 
 class Model(Description):
@@ -53,7 +53,12 @@ class Model(Description):
     @property
     def constrained(self) -> bool:
         """Whether constraints bind the coordinates to each other, so that not every (q, v) is a state."""
-        return bool(self.loops or self.prescribed or self.no_slip)
+        return any(getattr(self, feature) for feature in CONSTRAINT_FEATURES)
+
+    @property
+    def constraints_do_work(self) -> bool:
+        """Whether constraints may feed energy: a motion prescribed in time, or a blade with a speed of its own."""
+        return self.time_parameter is not None or any(x.speed for x in self.no_slip)
 
     def require_independent(self, q: Array, *, once: bool = False) -> None:
         """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq), with the rows.
@@ -293,7 +298,7 @@ class Model(Description):
         return {name: real(f"parameter {name!r}", value) for name, value in values.items()}
 
     def _without(self, feature: str) -> Model:
-        if feature in ("gravity", "loops", "prescribed", "forces", "no_slip"):
+        if feature in ("gravity", "forces", *CONSTRAINT_FEATURES):
             empty: Any = {feature: np.zeros(3) if feature == "gravity" else ()}
             return replace(self, bindings=tuple(b for b in self.bindings if b.where != feature), **empty)
         if feature == "limits":

@@ -110,7 +110,7 @@ def _check_names(model: Model, to: str) -> None:
     """Raise for names that XML 1.0 cannot hold, not even escaped."""
     parts: Sequence[Any] = (
         *(*model.bodies, *model.joints, *model.frames),
-        *(*model.springs, *model.couplings, *model.loops),
+        *(*model.springs, *model.couplings, *model.loops, *model.no_slip),
     )
     bad = [name for name in dict.fromkeys([model.name, *(p.name for p in parts)]) if not xml_holds(name)]
     if bad:

@@ -134,7 +134,7 @@ def energy_drift(dyn: Dynamics, run: Trajectory) -> tuple[float, float, float] |
     By the oracle, the change has 34 digits.
     """
     model, q, v = dyn.model, run.q, run.v
-    if model.loses_energy or model.time_parameter is not None:
+    if model.loses_energy or model.constraints_do_work or model.time_parameter is not None:
         return None
 
     def energy(name: str, *state: Array) -> tuple[Array, Array]:

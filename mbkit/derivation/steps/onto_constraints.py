@@ -42,7 +42,7 @@ def quick_projection(equations: Any) -> ca.Function:
         q, v, extra = equations.q, equations.v, equations.extra_arguments
         near, by = ca.SX.sym("near", *q.shape), ca.SX.sym("by", *v.shape)
         more, shift, change = [*extra.values()], _shift(equations), _change(equations)
-        du = shift(near, c.value, *more)
+        du = ca.densify(shift(near, c.value, *more))
         # To first order in the move: what is left is its square times the velocity.
         rate = ca.substitute(c.rate + c.rate_along(by), by, du)
         dv = change(near, rate, *more)

@@ -87,7 +87,7 @@ def diagnostics(
         # The cause before its consequences.
         checks.insert(0, step_size(dyn, method, setting, float(t[-1] - t[0]), q[0], v[0]))
     # The forces of a system on paper may drive it.
-    if most >= 2 and not (driven or model.time_parameter or (not model.has_bodies and model.needs.damping)):
+    if most >= 2 and not (driven or model.constraints_do_work or (not model.has_bodies and model.needs.damping)):
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
         fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
         limit = _ENERGY if method.order in _LOW else _ENERGY_HIGH

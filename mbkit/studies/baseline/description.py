@@ -44,6 +44,7 @@ SECTIONS: Final = {
     "loops": "loop",
     "motions": "prescribed motion of joint",
     "forces": "force",
+    "no_slip": "no slip",
 }
 FLAT: Final = ("system", "parameters", "expressions", "energies")
 _UPPER: Final = ("upper", "velocity_limit", "effort_limit")
@@ -69,6 +70,7 @@ def described(model: Model) -> Description:
         "loops": _parts(model.loops),
         "motions": {m.joint: _part(m, "joint") for m in model.prescribed},
         "forces": _parts(model.forces),
+        "no_slip": _parts(model.no_slip),
     }
     return {section: parts for section, parts in out.items() if any(parts.values())}
 

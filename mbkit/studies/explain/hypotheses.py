@@ -21,7 +21,7 @@ from mbkit.model import Joint, Mimic, Model
 from mbkit.studies.explain.merged_model import LinkInBody, MergedModel, Tolerances, composite
 
 #: Kinds that act on the motion through no term, but through constraints.
-CONSTRAINTS: Final = frozenset({"loop", "prescribed motion"})
+CONSTRAINTS: Final = frozenset({"loop", "prescribed motion", "contact without slip"})
 _WATER: Final = 1000.0  # kg/m³
 _DEGREE: Final = np.pi / 180
 #: URDF's order of an inertia's six numbers, and MuJoCo's.
@@ -36,6 +36,7 @@ _SECTIONS: Final = (
     ("couplings", "name", "joint coupling", "coupling"),
     ("loops", "name", "loop", "loop"),
     ("prescribed", "joint", "prescribed motion", "motion of"),
+    ("no_slip", "name", "contact without slip", "no slip"),
 )
 
 
@@ -490,7 +491,7 @@ def _matter_differences(one: MergedModel, joint: Joint, other: MergedModel, near
 
 
 def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis]:
-    """Return the differences in gravity, springs, couplings, loops and prescribed motions."""
+    """Return the differences in gravity, springs, couplings and constraints."""
     out = []
     if not near.vector(a.gravity, b.gravity, max(1.0, float(np.abs(a.gravity).max()))):
         says = f"has the gravity {number_text(b.gravity)} m/s² for {number_text(a.gravity)}"
@@ -512,7 +513,7 @@ def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis
 
 
 def _with_parts(x: MergedModel, parts: Mapping[str, Any], section: str, key: str) -> MergedModel:
-    """Exchange springs, couplings, loops or prescribed motions by name; None takes one away."""
+    """Exchange springs, couplings or constraints by name; None takes one away."""
     kept = [p for p in getattr(x.model, section) if getattr(p, key) not in parts]
     return x.with_fields(**{section: (*kept, *(p for p in parts.values() if p is not None))})
 

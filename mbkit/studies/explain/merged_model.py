@@ -165,7 +165,7 @@ def merge(model: Model) -> MergedModel:
 
 
 def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
-    """Return the description with the ends of springs and loops in other frames."""
+    """Return the description with the ends of springs, loops and contacts in other frames."""
 
     def moved(part: Any) -> Any:
         ends: dict[str, Any] = {}
@@ -177,9 +177,14 @@ def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
                     ends[name] = change.point(getattr(part, name))
             if hasattr(part, f"rotation_{side}"):
                 ends[f"rotation_{side}"] = change.A @ getattr(part, f"rotation_{side}")
+            if hasattr(part, f"axis_{side}"):
+                ends[f"axis_{side}"] = change.A @ getattr(part, f"axis_{side}")
         return replace(part, **ends)
 
-    return replace(model, springs=tuple(map(moved, model.springs)), loops=tuple(map(moved, model.loops)))
+    parts: dict[str, Any] = {
+        where: tuple(map(moved, getattr(model, where))) for where in ("springs", "loops", "no_slip")
+    }
+    return replace(model, **parts)
 
 
 def composite(links: Iterable[LinkInBody]) -> MassProperties:

@@ -13,6 +13,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, NonPhysicalWarning
 from mbkit.model import JointCoupling, Model
+from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
 
 #: Compared terms: name in tables, quantity, arguments.
@@ -73,7 +74,7 @@ def states_of(model: Model, samples: int, seed: int) -> States:
     # An importer may give limits with lower > upper.
     fits = all(np.all(j.lower <= j.upper) for j in model.joints)
     # Terms are those of the tree.
-    tree = model.without("loops", "prescribed", *([] if fits else ["limits"]))
+    tree = model.without(*CONSTRAINT_FEATURES, *([] if fits else ["limits"]))
     return States(*tree.random_state(np.random.default_rng(seed), samples))
 
 
@@ -84,7 +85,7 @@ def velocity_joints(model: Model) -> list[str]:
 
 def model_terms(model: Model, at: States) -> Values:
     """Return all terms of a description, by Pinocchio."""
-    still = [f for f, has in (("loops", model.loops), ("prescribed", model.prescribed)) if has]
+    still = [f for f in CONSTRAINT_FEATURES if getattr(model, f)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NonPhysicalWarning)
         return evaluated(dynamics(model.without(*still)), at)
@@ -140,6 +141,7 @@ def restricted(model: Model, joints: Collection[str]) -> Model:
         couplings=tuple(trimmed_couplings(model, joints)),
         loops=tuple(x for x in model.loops if {x.body_a, x.body_b} <= here),
         prescribed=tuple(p for p in model.prescribed if p.joint in joints),
+        no_slip=tuple(x for x in model.no_slip if {x.body_a, x.body_b} <= here),
         nonphysical=tuple(x for x in model.nonphysical if x[0] in bodies),
     )
 
@@ -153,7 +155,7 @@ def trimmed_couplings(model: Model, joints: Collection[str]) -> Iterator[JointCo
 
 
 def part(model: Model, joints: Collection[str]) -> Model:
-    """Return some joints of a merged description with their bodies, without loops and prescribed motions.
+    """Return some joints of a merged description with their bodies, without constraints.
 
     A joint whose parent is left out is fixed in the world as it is on its parent.
     """
@@ -165,6 +167,7 @@ def part(model: Model, joints: Collection[str]) -> Model:
         couplings=tuple(c for c in model.couplings if set(c.joints) <= set(joints)),
         loops=(),
         prescribed=(),
+        no_slip=(),
     )
 
 
