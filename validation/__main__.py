@@ -45,6 +45,7 @@ PARTS = {
     "bench_single_calls": Part(1, ("single_calls.json",), "a single call, beside the bare call of the engine"),
     "four_bar": Part(1, ("four_bar.json",), "a loop in four engines: error, gap and time of a step"),
     "mechanisms": Part(5, ("mechanisms.json",), "mechanisms with loops: errors, softness, time of a step"),
+    "bicycle": Part(1, ("bicycle.json",), "the benchmark bicycle's eigenvalues beside its paper's formulas and print"),
     "bench_rollouts": Part(5, ("rollouts.json",), "batches of rollouts, beside mujoco.rollout"),
     "bench_trajectory": Part(5, ("trajectory.json",), "one trajectory to an error of 1e-9"),
     "bench_derivation": Part(1, ("derivation.json",), "equations to read, beside sympy.physics.mechanics"),

@@ -475,6 +475,7 @@ CONSTRAINT_FUNCTIONS: Final = {
     "constraint_residual": ("q",),
     "constraint_jacobian": ("q",),
     "constraint_rate": ("q", "v"),
+    "constraint_rate_gradient": ("q", "v"),
     "constraint_bias": ("q", "v"),
     "constraint_forces": ("q", "v", "tau"),
     "generalized_constraint_force": ("q", "v", "tau"),
@@ -527,6 +528,17 @@ class ConstraintQuantities:
     def constraint_rate(self) -> Any:
         """J v + ∂f/∂t, then A v - b."""
         return self.all_constraints.rate
+
+    @property
+    def constraint_rate_gradient(self) -> Any:
+        """Derivative of the rates by q, along the manifold."""
+        q = self.q  # type: ignore[attr-defined]  # of the equations
+        return ca.mtimes(ca.jacobian(self.constraint_rate, q), self.tangent)
+
+    @property
+    def tangent(self) -> Any:
+        """D of q̇ = D(q) v."""
+        return ca.jacobian(self.kin.qdot, self.v)  # type: ignore[attr-defined]  # of the equations
 
     @property
     def constraint_bias(self) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of
-from mbkit.errors import UnsupportedError
+from mbkit.errors import InputError, UnsupportedError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
@@ -19,6 +19,7 @@ QUANTITIES: Final = (
     "constraint_residual",
     "constraint_jacobian",
     "constraint_rate",
+    "constraint_rate_gradient",
     "constraint_bias",
     "constraint_forces",
     "generalized_constraint_force",
@@ -98,6 +99,55 @@ class Constrained:
     def constraint_rate(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return the rates J v + c of all rows, zero in a consistent state: ḟ, then A v - b; (m,) or (N, m)."""
         return self._bound("constraint_rate", q=q, v=v)
+
+    def constraint_rate_gradient(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the derivative of the rates J v + c by q, (m, nv) or (N, m, nv), on the own derivation and the oracle.
+
+        Column k is that of q ⊕ t e_k, with the components of v held.
+        """
+        return self._bound("constraint_rate_gradient", q=q, v=v)
+
+    def consistent_changes(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """Return the small changes of a consistent state that keep it consistent, as columns of N, (2 nv, k).
+
+        A change is x = (δq, δv), as in `Linearization`: ẋ = A x of ``linearize(q, v, tau)`` holds on these, so that
+        ``N.T @ A @ N`` is the linear motion in k coordinates. Columns are orthonormal, and k is the sum of
+        `configuration_freedoms` and `degrees_of_freedom` of ``mobility(q)``.
+
+        Parameters
+        ----------
+        q : (nq,) array_like
+        v : (nv,) array_like
+
+        Raises
+        ------
+        UnsupportedError
+            An engine without derivatives of constraints: the own derivation and the oracle have them.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> import numpy as np
+        >>> dyn = mb.dynamics(mb.catalog.rolling_disc(), "lagrangian")
+        >>> q, v = dyn.project(np.zeros(6), [2.0, 0, 0, 0, 0, 4.0])
+        >>> N = dyn.consistent_changes(q, v)
+        >>> swings = np.linalg.eigvals(N.T @ dyn.linearize(q, v, np.zeros(6)).A @ N).imag.max()
+        >>> bool(abs(swings - ((4.0**2 * 0.375 * 0.125 / 0.0625 - 4.905) / 0.3125) ** 0.5) < 1e-7)
+        True
+        """
+        model = self.model
+        q, v = model.check_q(q), model.check_v(v)
+        if q.ndim > 1 or v.ndim > 1:
+            raise InputError(f"consistent_changes: expected one state, got shapes {q.shape} and {v.shape}")
+        if not model.constrained:
+            return np.eye(2 * model.nv)
+        J, by_q = self.constraint_jacobian(q), self.constraint_rate_gradient(q, v)
+        held = len(self.constraint_names) - len(self.velocity_constraint_names)
+        rows = np.block([[J[:held], np.zeros((held, model.nv))], [by_q, J]])
+        sizes = np.linalg.norm(rows, axis=1, keepdims=True)
+        free = self.mobility(q)
+        left = free.configuration_freedoms + free.degrees_of_freedom
+        return np.asarray(np.linalg.svd(rows / np.where(sizes > 0, sizes, 1.0))[2][2 * model.nv - left :].T)
 
     def constraint_bias(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return γ of all rows, with the rates' derivative J v̇ + γ = 0; (m,) or (N, m)."""

@@ -54,7 +54,13 @@ _STACKED: Final = "stacked"
 #: What one compiled function gives, and how its result loses the axes that the quantity does not have.
 _TRIM: Final[dict[str, Callable[[Array], Array]]] = {
     **{name: _trimmed(quantity) for name, quantity in BODY_QUANTITIES.items()},
-    **dict.fromkeys(("mass_matrix", "mass_matrix_inverse", "coriolis_matrix", "constraint_jacobian"), lambda x: x),
+    **dict.fromkeys(
+        (
+            *("mass_matrix", "mass_matrix_inverse", "coriolis_matrix"),
+            *("constraint_jacobian", "constraint_rate_gradient"),
+        ),
+        lambda x: x,
+    ),
     _STACKED: lambda x: x.reshape(*x.shape[:-1], 3, x.shape[-1] // 3).swapaxes(-2, -3),
     **dict.fromkeys(
         (
@@ -336,7 +342,7 @@ class LagrangianDynamics(Dynamics):
     _mass_matrix_inverse = _term("mass_matrix_inverse")
     _constraint_residual, _constraint_jacobian = _term("constraint_residual"), _term("constraint_jacobian")
     _constraint_rate, _constraint_bias = _term("constraint_rate"), _term("constraint_bias")
-    _constraint_forces = _term("constraint_forces")
+    _constraint_forces, _constraint_rate_gradient = _term("constraint_forces"), _term("constraint_rate_gradient")
     _generalized_constraint_force = _term("generalized_constraint_force")
 
     def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:

@@ -293,7 +293,7 @@ class OracleDynamics(Dynamics):
     def _parameter_derivatives(self, quantity: str, *states: Array) -> Any:
         return of_parameters(self.model, quantity, self._run(("parameter_derivatives", quantity), *states)[0])
 
-    _constraint_jacobian = _whole("constraint_jacobian")
+    _constraint_jacobian, _constraint_rate_gradient = _whole("constraint_jacobian"), _whole("constraint_rate_gradient")
     _constraint_residual, _constraint_rate = _column("constraint_residual"), _column("constraint_rate")
     _generalized_constraint_force = _column("generalized_constraint_force")
     _constraint_bias, _constraint_forces = _column("constraint_bias"), _column("constraint_forces")

@@ -70,6 +70,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         "coriolis_matrix": "MuJoCo forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
         **dict.fromkeys(regressors.QUANTITIES, "MuJoCo has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
+        "constraint_rate_gradient": "its derivatives are finite differences; the lagrangian engine has this one",
         "constraint_forces": "its soft constraints have rows of their own; constraint_law(q, v, tau).force is theirs, "
         "and generalized_constraint_force(q, v, tau) is Jᵀ λ",
     }

@@ -132,7 +132,10 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
     """
 
     engine = "pinocchio"
-    refuses: ClassVar[dict[str, str]] = {"function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has"}
+    refuses: ClassVar[dict[str, str]] = {
+        "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
+        "constraint_rate_gradient": "its derivatives are of trees; mbkit.dynamics(model, 'lagrangian') has this one",
+    }
     lacks_constraints = ""
     _batches = False
 
