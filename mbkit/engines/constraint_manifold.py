@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.derivation.constraints import independent_rows
@@ -30,6 +31,11 @@ _EPS: Final = float(np.finfo(float).eps)
 _CONSISTENT: Final = 1e-8
 # Newton's iteration squares the residual: from here it ends at rounding.
 _NEAR: Final = 1e-8
+# How far Newton's iteration may move a state before it is looked whether its factors are of rounding.
+_FLUNG: Final = 1e-4
+#: Of the largest singular value of J, the smallest one at a singular pose: there v̇ from the equation of motion loses as
+#: many digits, eps/σ², as that of the pose itself is off, σ. It is the cube root of eps.
+AT_POSE: Final = 6e-6
 _MOST: Final = 60
 _TWIN: Final = "_constrained_twin"
 #: Random states that are drawn, each of which may be too far from the constraints, and how many of them anywhere.
@@ -242,13 +248,34 @@ class Manifold:
     def pulled(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the consistent state beside one that has drifted a little, or of each of a batch.
 
-        A state that is far from the constraints or not finite comes back as it is or as NaN.
+        A state that is far from the constraints or not finite comes back as it is or as NaN. One at a singular pose,
+        where the factors are of rounding, is pulled by the rows that are independent there.
         """
+        first = q, v
         for _ in range(4):
             q, v, f, scale = (x[..., 0] for x in self.call("constraint_step", q, v))
             if not bool((np.abs(f) / scale > _NEAR).any()):
                 break
+        moved = np.maximum(*(np.abs(x - x0).max(axis=-1) for x, x0 in zip((q, v), first, strict=True)))
+        if bool((moved <= _FLUNG).all()):
+            return q, v
+        for i in map(tuple, np.argwhere(self.at_pose(first[0]) & ~(moved <= _FLUNG))):
+            q[i], v[i] = self._pulled_at_pose(first[0][i], first[1][i])
         return q, v
+
+    def at_pose(self, q: Array) -> NDArray[np.bool_]:
+        """Return whether a configuration, or each of a batch, is a singular pose up to rounding."""
+        J = self.jacobian(q)
+        good = np.isfinite(J).all(axis=(-1, -2))
+        sizes = np.linalg.svd(np.where(good[..., None, None], J, 1.0), compute_uv=False)
+        return np.asarray(good & (sizes[..., -1] <= AT_POSE * sizes[..., 0]))
+
+    def _pulled_at_pose(self, q: Array, v: Array) -> tuple[Array, Array]:
+        for _ in range(2):
+            x = self._terms(q, v)
+            q = self.dyn.model.integrate(q, _least_change(x.W, x.J / x.scale[:, None], -x.f / x.scale, AT_POSE))
+        x = self._terms(q, v)
+        return q, v + _least_change(x.W, x.J / x.scale[:, None], -x.rate / x.scale, AT_POSE)
 
     def project(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the nearest consistent state, in the metric of the mass matrix there; InputError if there is none."""
@@ -380,14 +407,14 @@ def states_of(model: Model) -> ConsistentStates:
     return states
 
 
-def _least_change(W: Array, J: Array, change: Array) -> Array:
+def _least_change(W: Array, J: Array, change: Array, rounding: float = 1e-12) -> Array:
     """Return the x with J x = change that is the least in xᵀ W x; the nearest to it where J has dependent rows."""
     try:
         L = np.linalg.cholesky(W)
     except np.linalg.LinAlgError:
         L = np.eye(len(W))
     A = np.linalg.solve(L, J.T).T
-    y = np.linalg.lstsq(A, change, rcond=1e-12)[0]
+    y = np.linalg.lstsq(A, change, rcond=rounding)[0]
     return np.asarray(np.linalg.solve(L.T, y))
 
 

@@ -23,12 +23,13 @@ from mbkit.engines.base import at_time
 from mbkit.errors import FunctionError, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.lagrangian.independent_coordinates import SINGULAR, Chart, Embedded, EmbeddedDynamics
 from mbkit.methods.registry import METHODS, Method, method_of
-from mbkit.simulate.constraint_projection import SingularPoses, from_consistent
+from mbkit.simulate.constraint_projection import from_consistent
 from mbkit.simulate.events import Event, Hit, as_events
 from mbkit.simulate.integrate import integrate, times_of
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import Ended, Stats
 from mbkit.simulate.run_data import RunData
+from mbkit.simulate.singular_poses import SingularPoses
 from mbkit.simulate.time_grid import Grid, save_times
 from mbkit.simulate.torque import Torque
 

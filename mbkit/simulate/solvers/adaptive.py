@@ -34,10 +34,10 @@ from mbkit.methods.registry import Tolerances, method_of
 from mbkit.methods.tableaus import RosenbrockTableau, dormand_prince_853, rodas5p
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
-from mbkit.simulate.constraint_projection import LOOSEST
 from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
+from mbkit.simulate.singular_poses import LOOSEST, Approach
 from mbkit.simulate.solvers.trajectory_record import (
     AcceptedSteps,
     StoppedError,
@@ -99,6 +99,8 @@ class RungeKuttaAttempts:
     #: The power of a step's length with which its estimated error grows.
     grows = 8
     _factors = staticmethod(predictive_factors)
+    #: How much longer a step across a singular pose, which is always rk853's, may be than the last one.
+    _longer = 1.0
 
     def __init__(self, problem: IntegrationProblem, space: Space, tolerances: Tolerances) -> None:
         self._space, self._tolerances, self._torque, self._batch = space, tolerances, problem.torque, problem.batch
@@ -108,8 +110,8 @@ class RungeKuttaAttempts:
         self._force: Force = np.zeros(space.nv)
         self._h = self._t = self._stop = 0.0
         self._why = ""
-        # What the tolerance is multiplied by.
-        self._slack = 1.0
+        # What the tolerance is multiplied by, and the length across a singular pose.
+        self._slack, self._stretch = 1.0, self._longer
 
     @property
     def evaluations(self) -> int:
@@ -119,6 +121,11 @@ class RungeKuttaAttempts:
     def jacobians(self) -> int:
         return 0
 
+    @property
+    def approach(self) -> Approach:
+        """How near a singular pose the run is."""
+        return self._field.approach
+
     def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
         (member,) = which
         if self._batch is not None:
@@ -127,6 +134,7 @@ class RungeKuttaAttempts:
         self._q, self._w, self._t, self._h = q[0], w[0], t, h
         self._most, self._last, self._error = MAX_GROWTH, FIRST_ROOT, 0.0
         self._dropped, self._fresh = False, True
+        self._field.look(t, self._q, self._w)
 
     def hold(self, k: int, stop: float) -> None:
         self._force, self._stop, self._fresh = self._of_interval(k), stop, True
@@ -148,7 +156,9 @@ class RungeKuttaAttempts:
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
         if self._dropped or self._t >= self._stop or self.stuck(0) is not None:
             return []
-        t = end_of_attempt(SCALARS, self._t, self._h, self._stop)
+        approach = self._field.approach
+        length = approach.length(self._h, self._stretch) if approach.crosses(self._stretch * self._h) else self._h
+        t = end_of_attempt(SCALARS, self._t, length, self._stop)
         step = t - self._t
         before = [self._t], [self._q], [self._w]
         q, w, self._error = self._checked_attempt(step)
@@ -165,9 +175,11 @@ class RungeKuttaAttempts:
         loose = self._slack * self._tolerances.rtol >= LOOSEST
         if self._error >= 1 and not loose and self._field.near_singular:
             # Near a singular pose shorter steps are no better: their stages are nearer to it, and rounding grows.
-            self._slack, self._h, self._most = 10 * self._slack, 0.8 * step, 1.0
+            across = 0 < self._field.approach.ahead < step
+            self._slack, self._h, self._most = 10 * self._slack, step if across else 0.8 * step, 1.0
             return
         self._slack = 1.0 if good else self._slack
+        self._stretch = self._longer if good else 1.0
         factors = self._factors(SCALARS, np.float64(self._error if self._error >= 0 else math.nan), self._last)
         # A step of no length, far from the time's zero, ends the run.
         h, self._most, self._last = next_step(
@@ -248,6 +260,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
 
     grows = 5
     _factors = staticmethod(elementary_factors)
+    _longer = 8.0
 
     def __init__(self, problem: IntegrationProblem, space: Space, tolerances: Tolerances) -> None:
         super().__init__(problem, space, tolerances)
@@ -262,6 +275,8 @@ class RosenbrockAttempts(RungeKuttaAttempts):
             self._turning[start : start + 4] = 1.0
         # y, ẏ and ∂ẏ/∂y at the start; y and ẏ at the end of the last attempt; its t and y at both ends, and stages.
         self._start: tuple[Array, Array, Array] | None = None
+        # The last attempt was rk853's, across a singular pose.
+        self._across = False
         self._arrived: tuple[Array, Array] | None = None
         self._last_attempt: tuple[float, float, Array, Array, Array] | None = None
 
@@ -280,6 +295,11 @@ class RosenbrockAttempts(RungeKuttaAttempts):
             self._exact.only(which[0])
 
     def _attempt(self, step: float) -> tuple[Array, Array, float]:
+        self._across = self._field.approach.crosses(step)
+        if self._across:
+            # Its stages are not on the constraints, and its derivatives are those of accelerations that grow there.
+            self._start, self._fresh = None, True
+            return super()._attempt(step)
         own, (rtol, atol) = self._own, self._tolerances
         y, there, J = self._known()
         k = self._increments(self._t, y, step, there, J)
@@ -351,6 +371,8 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         return (4 * near - far - 3 * there) / (2 * apart)
 
     def _inner(self, t: float, q: Array, w: Array, end: float) -> tuple[Array, Array]:
+        if self._across:
+            return super()._inner(t, q, w, end)
         last = self._last_attempt
         if last is not None and last[0] == t and end <= last[1]:
             t0, t1, y0, y1, k = last

@@ -302,10 +302,10 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     plan, lost = dyn.step_plan(method), dict[int, list[Array]]()
     suspects = suspects_of(plan, np.arange(len(problem.q)))
     if len(suspects) and dyn.model.constrained:
-        if len(suspects_of(dyn.step_plan(method, thorough=True), suspects)):
-            # Near a singular pose stages are projected too, and the pose is told.
-            return run_fixed(problem)
-        suspects = suspects[:0]
+        suspects = suspects_of(dyn.step_plan(method, thorough=True), suspects)
+        if len(suspects):
+            # Near a singular pose stages are projected too, and the pose is told. The others of a batch are done.
+            return run_fixed(problem, record, suspects)
     for first in range(0, len(suspects), _widest(plan)):
         members = suspects[first : first + _widest(plan)]
         for _, last in blocks(new_chunk(plan, len(members), all_kept=True, watched=True), members, members[:0]):

@@ -17,9 +17,9 @@ from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model.integration_space import Space
-from mbkit.simulate.constraint_projection import SingularPoses
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
+from mbkit.simulate.singular_poses import SingularPoses
 from mbkit.simulate.solvers.gauss import CollocationStep
 from mbkit.simulate.solvers.vector_field import ALL, DIVERGED, DivergenceError, Field, are_bounded
 from mbkit.simulate.time_grid import Indices
@@ -111,6 +111,8 @@ class _FieldStepper(Stepper):
 
     def __init__(self, problem: IntegrationProblem) -> None:
         self._poses = SingularPoses(problem.dyn) if problem.dyn.projects and problem.batch is None else None
+        if self._poses is not None:
+            self._poses.began(problem.start, problem.q0)
         self.space = Space(problem.dyn.model)
         self.field = Field(problem.dyn, self.space)
         self._step = make_step(problem.method, self.field, self.space)
@@ -136,14 +138,16 @@ class _FieldStepper(Stepper):
         return np.asarray(self.space.to_body_velocity(q, w))
 
 
-def run_fixed(problem: IntegrationProblem) -> SolverResult:
+def run_fixed(
+    problem: IntegrationProblem, record: GridRecord | None = None, members: Indices | None = None
+) -> SolverResult:
     """Step one state or a batch over the grid, on any engine.
 
     A trajectory that diverges stops there; the others of its batch go on. A torque function that fails stops all of
-    them, with what they have.
+    them, with what they have. With a record of a whole batch, its other members are there already.
     """
     stepper = _FieldStepper(problem)
-    run = SteppedRun(problem, stepper, stepper.space.to_integrator_velocity(problem.q0, problem.v0))
+    run = SteppedRun(problem, stepper, stepper.space.to_integrator_velocity(problem.q0, problem.v0), record, members)
     error = run.to_end()
     result = run.record.result(lambda _: run.why, stepper.field.evaluations, error=error)
     return replace(result, doubts=stepper.doubts)
@@ -152,12 +156,24 @@ def run_fixed(problem: IntegrationProblem) -> SolverResult:
 class SteppedRun:
     """The current states, their record, and why the first of them diverged."""
 
-    def __init__(self, problem: IntegrationProblem, stepper: Stepper, w0: Array) -> None:
-        self._problem, self._step, self.record, self.why = problem, stepper, GridRecord(problem), ""
+    def __init__(
+        self,
+        problem: IntegrationProblem,
+        stepper: Stepper,
+        w0: Array,
+        record: GridRecord | None = None,
+        members: Indices | None = None,
+    ) -> None:
+        self._problem, self._step, self.why = problem, stepper, ""
+        self.record = GridRecord(problem) if record is None else record
         # Those of a batch that are still good.
         self._members: Indices | None = None if problem.batch is None else np.arange(problem.batch)
         self._row = self.record.rows(0, 0).stop
         self._q, self._w = problem.q0.copy(), w0
+        if members is not None and self._members is not None:
+            self._members, self._q, self._w = members, self._q[members], self._w[members]
+            self.record.steps[members] = 0
+            stepper.only(members)
 
     def to_end(self) -> FunctionError | None:
         """Step over the grid; return the error of a torque function that ended it."""

@@ -16,11 +16,20 @@ from mbkit.engines.base import at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import NumericalError
-from mbkit.methods.registry import ADAPTIVE_METHOD
+from mbkit.methods.registry import ADAPTIVE_METHOD, Tolerances
+from mbkit.model.integration_space import Space
 from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.trajectory_record import StoppedError, TrajectoryRecord, assemble_result, diverged, run_each
+from mbkit.simulate.solvers.adaptive import RungeKuttaAttempts
+from mbkit.simulate.solvers.trajectory_record import (
+    AcceptedSteps,
+    StoppedError,
+    TrajectoryRecord,
+    assemble_result,
+    diverged,
+    run_each,
+)
 from mbkit.simulate.solvers.vector_field import BLAMELESS, DIVERGED, Rates, is_bounded
 
 # Of a rate, relative to the largest or 1: what no truncation of a series makes.
@@ -46,7 +55,8 @@ def run_taylor(problem: IntegrationProblem) -> SolverResult:
             # With 34 digits the drift is far below what a double tells.
             settled = Rates(own).settled if dyn.model.constrained and kind.bits == 53 else None
             behind = kind.array(*own.constant_values) if dyn.bits > 53 else own.parameter_values.reshape(-1)
-            steps, force = TaylorSteps(system, integrator, kind, behind, settled), torque.of_member(member)
+            across = _Across(problem, i) if settled else None
+            steps, force = TaylorSteps(system, integrator, kind, behind, settled, across), torque.of_member(member)
             try:
                 for t in steps(problem.start, y, stops, force):
                     yield t, rounded(steps.y), lambda t: rounded(steps.at(t))
@@ -77,10 +87,58 @@ def rounded(y: Any) -> Array:
     return np.asarray(y, dtype=np.float64)
 
 
+#: Tolerance of a step across a singular pose: what rounding lets a step of rk853 hold.
+_CROSSING: Final = 1e-13
+
+
+class _Across:
+    """Steps of rk853 in place of a series near a singular pose, where a series has the digits of J's least value."""
+
+    def __init__(self, problem: IntegrationProblem, i: int) -> None:
+        self._space, self._model, self._i = Space(problem.dyn.model), problem.dyn.model, i
+        tolerances = Tolerances(*(max(x, _CROSSING) for x in problem.tolerances))
+        self._attempts = RungeKuttaAttempts(problem, self._space, tolerances)
+        self._start: AcceptedSteps | None = None
+
+    def begin(self, t: float, y: Array) -> None:
+        """Go on from a state."""
+        q, v = self._split(y)
+        self._attempts.start([self._i], q[None], self._space.to_integrator_velocity(q, v)[None], t)
+
+    def crosses(self, h: float) -> bool:
+        """Return whether a series of length h from where the last state was would meet a pose."""
+        return self._attempts.approach.crosses(h)
+
+    def step(self, k: int, stop: float) -> tuple[float, Array]:
+        """Return the time and the state after a step; `StoppedError` where there is none."""
+        self._attempts.hold(k, stop)
+        while True:
+            ((_, done),) = self._attempts.advance()
+            if len(done.t) > 1:
+                break
+            if (reason := self._attempts.stuck(0)) is not None:
+                raise reason
+        self._start = done
+        return float(done.t[-1]), self._state(done.q[-1], done.w[-1])
+
+    def at(self, t: float) -> Array:
+        """Return the state at a time within the last step."""
+        assert self._start is not None
+        q, w = self._attempts.within(0, self._start.rows(np.array([0])), np.array([t]))
+        return self._state(q[0], w[0])
+
+    def _split(self, y: Array) -> tuple[Array, Array]:
+        return unit_quaternions(self._model, y[: self._model.nq])[0], y[self._model.nq :]
+
+    def _state(self, q: Array, w: Array) -> Array:
+        return np.concatenate([q, self._space.to_body_velocity(q, w)])
+
+
 class TaylorSteps:
     """Steps of one trajectory at a time, with a borrowed integrator; t0, y0 and t, y are the ends of the last one.
 
-    `behind` are the values of the equations' extra arguments; settled(t, y) is the state to go on from after a step.
+    `behind` are the values of the equations' extra arguments; settled(t, y) is the state to go on from after a step,
+    and `across` takes those near a singular pose.
     """
 
     def __init__(
@@ -90,11 +148,12 @@ class TaylorSteps:
         kind: Precision,
         behind: Any,
         settled: Callable[[float, Array], Array] | None = None,
+        across: _Across | None = None,
     ) -> None:
         import heyoka
 
         self._system, self._integrator, self._kind, self._behind = system, integrator, kind, behind
-        self._settled = settled
+        self._settled, self._across, self._crossed = settled, across, False
         self._success, self._limit = heyoka.taylor_outcome.success, heyoka.taylor_outcome.time_limit
         self.t0 = self.t = 0.0
         self.y0 = self.y = np.empty(0)
@@ -125,6 +184,10 @@ class TaylorSteps:
                     outcome, h = integrator.step(max_delta_t=kind.dtype(holds), write_tc=True)
                     outcome = self._success if outcome == self._limit else outcome
                 last = h
+                if self._across is not None and self._stepped_across(k, stop, float(h)):
+                    integrator.time, state[:] = kind.dtype(self.t), self.y
+                    yield self.t
+                    continue
                 if outcome == self._limit:
                     integrator.time = end
                 elif outcome != self._success:
@@ -143,6 +206,16 @@ class TaylorSteps:
                 self.t0, self.y0 = self.t, self.y
                 self.t, self.y = float(integrator.time), state.copy()
                 yield self.t
+
+    def _stepped_across(self, k: int, stop: float, h: float) -> bool:
+        """Take a step across a singular pose if a series of length h would meet one; return whether there was one."""
+        assert self._across is not None
+        self._across.begin(self.t, rounded(self.y))
+        self._crossed = self._across.crosses(h)
+        if self._crossed:
+            self.t0, self.y0 = self.t, self.y
+            self.t, self.y = self._across.step(k, stop)
+        return self._crossed
 
     def _without_series(self) -> StoppedError:
         """Return why there was no step: the state ran away, or its rates are numbers and their derivatives none."""
@@ -187,4 +260,6 @@ class TaylorSteps:
             return self.y
         if t == self.t0:
             return self.y0
+        if self._crossed:
+            return self._across.at(t)  # type: ignore[union-attr]  # crossed by it
         return self._integrator.update_d_output(self._kind.dtype(t)).copy()

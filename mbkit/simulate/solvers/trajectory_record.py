@@ -13,10 +13,10 @@ from mbkit.errors import FunctionError
 from mbkit.methods.registry import Tolerances
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
-from mbkit.simulate.constraint_projection import SingularPoses
 from mbkit.simulate.events import Hit, State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
+from mbkit.simulate.singular_poses import SingularPoses
 from mbkit.simulate.solvers.vector_field import DIVERGED, are_bounded
 from mbkit.simulate.time_grid import Indices
 
@@ -95,6 +95,8 @@ class TrajectoryRecord:
             self._kept.append((np.array([self.reached]), q[None], v[None]))
         if self._watch is not None:
             self._watch.start(self.reached, q, v)
+        if self.poses is not None:
+            self.poses.began(self.reached, q)
 
     def take(self, accepted: AcceptedSteps, within: Within) -> bool:
         """Add steps; return whether to go on."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,8 @@ from mbkit.engines.base import at_time
 from mbkit.errors import InputError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
-from mbkit.simulate.constraint_projection import Approach, beside, settled
+from mbkit.simulate.constraint_projection import beside, settled
+from mbkit.simulate.singular_poses import Approach, at_singular_poses
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
@@ -77,9 +78,18 @@ class Field:
         if not self._constrained:
             return q, w
         q, w = self._projected(settled, t, q, w)
-        if self._explicit:
-            self._approach.saw(self._own, t, q)
+        self.look(t, q, w)
         return q, w
+
+    def look(self, t: float, q: Array, w: Array) -> None:
+        """Look how near a singular pose the run is, at the start or the end of a step."""
+        if self._constrained and self._explicit:
+            self._approach.saw(self._own, t, q, w if self._space is None else self._space.to_body_velocity(q, w))
+
+    @property
+    def approach(self) -> Approach:
+        """How near a singular pose the run is."""
+        return self._approach
 
     def _projected(self, onto: Projection, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a projection makes of one in the integrators' velocity."""
@@ -104,10 +114,33 @@ class Field:
                 raise DivergenceError(DIVERGED)
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
+        a = self._at_poses(t, q, v, force) if self.near_singular else None
+        if a is None:
+            a = self._evaluated(t, q, v, force)
+        return a if self._space is None else np.asarray(self._space.acceleration(q, v, a))
+
+    def _at_poses(self, t: float, q: Array, v: Array, force: Array) -> Array | None:
+        """Return v̇ where some states are at singular poses; None where none is."""
+        which, a, why = at_singular_poses(self._own, t, q, v, force)
+        if not which.any():
+            return None
+        if which.all():
+            if why:
+                raise DivergenceError(why)
+            return a
+        a[~which] = self._evaluated(t, q, v, force, ~which)
+        return a
+
+    def _evaluated(self, t: float, q: Array, v: Array, force: Array, which: Any = None) -> Array:
+        own, forward = self._own, self._forward
         if self._timed:
-            self._forward = at_time(self._own, t).forward_dynamics
+            forward = at_time(own, t).forward_dynamics
+        if which is not None:
+            own = own.of_samples(np.flatnonzero(which))
+            forward = (at_time(own, t) if self._timed else own).forward_dynamics
+            q, v, force = q[which], v[which], force if force.ndim == 1 else force[which]
         try:
-            a = self._forward(q, v, force)
+            a = forward(q, v, force)
         except NumericalError as error:
             largest = max(float(np.abs(x).max()) for x in (q, v))
             raise DivergenceError(str(error) if largest < BLAMELESS else DIVERGED) from None
@@ -115,9 +148,7 @@ class Field:
             if np.isfinite(q).all() and np.isfinite(v).all():
                 raise
             raise DivergenceError(DIVERGED) from None
-        if a.ndim != v.ndim:
-            a = a[0]
-        return a if self._space is None else np.asarray(self._space.acceleration(q, v, a))
+        return np.asarray(a if a.ndim == v.ndim else a[0])
 
 
 class Rates:

@@ -1,0 +1,265 @@
+"""Singular poses of constraints: whether a motion is determined there, how it goes through, and when it did.
+
+At a singular pose rows of J depend on each other: Uᵀ J = 0 for some combinations U of rows, and other branches of
+motion may begin there. A motion that arrives with a velocity goes on along its own branch: the derivative of
+Uᵀ (J v̇ + γ) = 0 is Uᵀ J̇ v̇ + Uᵀ (∂γ/∂v v̇ + ∂γ/∂q q̇ + ∂γ/∂t) = 0, which takes the place of the rows that are lost. The
+motion is determined where the rows of J and of Uᵀ J̇ together are independent: where the singular values of J that
+vanish do so at a rate. At rest they do not, and no equation says which branch comes next.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.engines.base import first_names
+
+if TYPE_CHECKING:
+    from mbkit.engines.constraint_manifold import Manifold
+
+#: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
+LOOSEST: Final = 1e-9
+#: Steps ahead in which a pose would be singular at the present pace.
+_AHEAD: Final = 4
+#: A sign change of the smallest singular value makes its third differences smaller than this part of those without.
+_SMOOTHER: Final = 0.5
+#: Steps' ends that decide on one interval.
+_WINDOW: Final = 4
+#: Of a unit vector: the entries of the constraints that depend on each other.
+_TAKES_PART: Final = 0.1
+#: Of the rows' size, 1/s: what typed digits leave of a velocity that is zero, as in `independent_rows`.
+_STILL: Final = 1e-7
+#: Of γ: what is left of it at a velocity of rounded digits that stays on a branch.
+_ON_BRANCH: Final = 1e-6
+#: Of the motion's time scale: the difference of times by which J's rate is found.
+_APART: Final = 1e-4
+#: Where a step of rk853 has the pose: in the middle of the widest gap between its stages, 1/3 and 0.6.
+_BETWEEN: Final = 7 / 15
+
+
+def manifold_at(dyn: Dynamics, t: float) -> Manifold:
+    """Return the states that the constraints of dynamics allow at a time."""
+    # The import loads CasADi.
+    from mbkit.engines.constraint_manifold import manifold_of
+
+    return manifold_of(dyn).at(t)
+
+
+class _Slopes(NamedTuple):
+    """J, γ, M and the force of gravity, springs and velocities at a state, and how J and γ change from there.
+
+    J̇ and `gamma_rate` are along the motion with constant velocity; `by_velocity` is ∂γ/∂v.
+    """
+
+    J: Array
+    gamma: Array
+    M: Array
+    force: Array
+    J_rate: Array
+    gamma_rate: Array
+    by_velocity: Array
+
+
+def _slopes(manifold: Manifold, t: float, q: Array, v: Array) -> _Slopes:
+    model, n = manifold.dyn.model, len(v)
+    apart = _APART / float(np.abs(v).max())
+    # γ is quadratic in v: differences of any length are its derivative.
+    around = float(np.abs(v).max()) * np.eye(n)
+    here = manifold.call("embedded", np.tile(q, (2 * n + 1, 1)), np.array([v, *(v + around), *(v - around)]))
+    J, _, gamma, M, force = (x[0] for x in here)
+    both = []
+    for side in (apart, -apart):
+        J1, _, gamma1, *_ = manifold.at(t + side).call("embedded", model.integrate(q, side * v), v)
+        both.append((J1, gamma1[:, 0]))
+    (J1, g1), (J0, g0) = both
+    by_velocity = (here[2][1 : n + 1, :, 0] - here[2][n + 1 :, :, 0]).T / (2 * around[0, 0])
+    return _Slopes(J, gamma[:, 0], M, force[:, 0], (J1 - J0) / (2 * apart), (g1 - g0) / (2 * apart), by_velocity)
+
+
+class Passage:
+    """A motion at a singular pose: by which rows it is one, why it is not determined there, and its acceleration."""
+
+    def __init__(self, manifold: Manifold, t: float, q: Array, v: Array, *, singular: bool = False) -> None:
+        self._manifold = manifold
+        from mbkit.engines.constraint_manifold import AT_POSE
+
+        U, sizes, Vt = np.linalg.svd(manifold.jacobian(q))
+        rank = min(int(np.count_nonzero(sizes > AT_POSE * sizes[0])), len(U) - singular)
+        self._size = float(sizes[0])
+        #: Whether rows depend on each other.
+        self.singular = rank < len(U)
+        self._lost, self._kept = U[:, rank:], U[:, :rank]
+        self._free = Vt[rank:].T
+        self._slopes = _slopes(manifold, t, q, v) if self.singular and v.any() else None
+
+    @cached_property
+    def undetermined(self) -> str:
+        """Where the motion is, and why it does not go on in one way; empty where it does."""
+        why = self._undetermined()
+        if not why:
+            return ""
+        which = np.flatnonzero(np.abs(self._lost).max(axis=1) > _TAKES_PART)
+        rows = first_names([self._manifold.names[k] for k in which])
+        return f"at a singular pose, where {rows} depend on each other, and {why}"
+
+    def _undetermined(self) -> str:
+        x = self._slopes
+        if x is None:
+            return "at rest there each branch of its motion is as good as another"
+        turning = self._turned(x.J_rate) @ self._free
+        if not np.linalg.svd(turning, compute_uv=False)[-1] > _STILL:
+            return "its velocity does not say on which branch it goes on"
+        if not np.abs(self._turned(x.gamma)).max() <= _ON_BRANCH * max(1.0, float(np.abs(x.gamma).max()) / self._size):
+            return "its velocity is on none of the branches"
+        return ""
+
+    def acceleration(self, tau: Array) -> Array:
+        """Return v̇ on the branch of the velocity; NaN where it is not determined."""
+        x, n = self._slopes, self._free.shape[0]
+        if x is None or self.undetermined or tau.shape[-1] != n:
+            return np.full(n, np.nan)
+        rows, equations = (
+            np.concatenate([self._kept.T @ x.J / self._size, self._turned(lost)])
+            for lost in (x.J_rate, x.J_rate + x.by_velocity)
+        )
+        right = -np.concatenate([self._kept.T @ x.gamma / self._size, self._turned(x.gamma_rate)])
+        weight = float(np.abs(x.M).max())
+        K = np.block([[x.M / weight, -rows.T], [equations, np.zeros((len(rows), len(rows)))]])
+        given = np.concatenate([(tau + x.force) / weight, right])
+        out: Array = np.linalg.lstsq(K, given, rcond=None)[0][:n]
+        return out
+
+    def _turned(self, x: Array) -> Array:
+        return np.asarray(self._lost.T @ x / self._size)
+
+
+def at_singular_poses(dyn: Dynamics, t: float, q: Array, v: Array, tau: Array) -> tuple[NDArray[np.bool_], Array, str]:
+    """Return which states are at singular poses, v̇ of these, and why one of them has none.
+
+    v̇ is NaN where the motion is not determined and, for now, of all other states.
+    """
+    manifold = manifold_at(dyn, t)
+    which, a, why = manifold.at_pose(q), np.full(v.shape, np.nan), ""
+    for i in map(tuple, np.argwhere(which)):
+        own = manifold.member(i[0]) if i else manifold
+        here = Passage(own, t, q[i], v[i], singular=True)
+        a[i] = here.acceleration(np.broadcast_to(tau, (*v.shape[:-1], tau.shape[-1]))[i])
+        if here.undetermined:
+            why = f"the motion is {here.undetermined}"
+    return which, a, why
+
+
+class Approach:
+    """Whether a run comes near a singular pose, by the smallest singular value σ of J at the ends of its steps.
+
+    Attributes
+    ----------
+    near : bool
+        Whether σ would be zero within a few steps like the last one, of any state of a batch; true until two ends are
+        known.
+    members : (N,) bool array
+        Of which states.
+    ahead : float
+        Of one state: when σ will be zero at its present rate, s from the last end; negative where it was before.
+    """
+
+    def __init__(self) -> None:
+        self.near, self.ahead = True, np.inf
+        self.members: NDArray[np.bool_] = np.array([True])
+        self._sizes: Array | float = np.inf
+
+    def saw(self, dyn: Dynamics, t: float, q: Array, v: Array) -> None:
+        """Take in the end of a step, of one state or a batch."""
+        manifold = manifold_at(dyn, t)
+        J = manifold.jacobian(q)
+        good = np.isfinite(J).all(axis=(-1, -2))
+        U, sizes, Vt = np.linalg.svd(np.where(good[..., None, None], J, 0.0), full_matrices=False)
+        least = np.where(good, sizes[..., -1], np.inf)
+        known = np.shape(self._sizes) == np.shape(least)
+        with np.errstate(invalid="ignore"):
+            change = np.abs(least - self._sizes) if known else np.full(np.shape(least), np.inf)
+            self.members = ~(least >= _AHEAD * change)
+        self.near, self._sizes, self.ahead = bool(self.members.any()), least, np.inf
+        if q.ndim == 1 and good and v.any():
+            apart = _APART / float(np.abs(v).max())
+            ends = [manifold.at(t + x).jacobian(manifold.dyn.model.integrate(q, x * v)) for x in (apart, -apart)]
+            rate = float(U[:, -1] @ (ends[0] - ends[1]) @ Vt[-1]) / (2 * apart)
+            self.ahead = float(-least / rate) if rate else np.inf
+
+    def length(self, h: float, longer: float) -> float:
+        """Return the length of the next step of rk853 with which no stage comes close to a pose ahead.
+
+        It is up to h, or that many times longer across the pose.
+        """
+        d, most = self.ahead, longer * h
+        if not 0.02 * h < d < 1.45 * most:
+            return h
+        # A little longer is better than a short step before it.
+        return d / _BETWEEN if d <= 1.05 * _BETWEEN * most else min(h, d - 0.45 * most)
+
+    def crosses(self, h: float) -> bool:
+        """Return whether a pose is as near as a step of length h, ahead or behind; then it is `near`."""
+        out = abs(self.ahead) < 2 * h
+        self.near = self.near or out
+        return out
+
+
+class SingularPoses:
+    """The singular poses that one trajectory passes, by J's smallest singular value at the ends of steps.
+
+    Through a singular pose the value is smooth once its sign is changed there.
+    """
+
+    def __init__(self, dyn: Dynamics) -> None:
+        self._dyn = dyn
+        self._seen: list[tuple[float, float, Array]] = []
+        self.times: list[float] = []
+        self._rows: list[int] = []
+
+    def began(self, t: float, q: Array) -> None:
+        """Take in the start."""
+        manifold = manifold_at(self._dyn, t)
+        if manifold.at_pose(q):
+            self.times.append(t)
+            self._rows = np.flatnonzero(np.abs(np.linalg.svd(manifold.jacobian(q))[0][:, -1]) > _TAKES_PART).tolist()
+
+    def saw(self, t: float, q: Array) -> None:
+        """Take in the end of a step."""
+        J = manifold_at(self._dyn, t).jacobian(q)
+        J = J.reshape(-1, J.shape[-1])
+        if not np.isfinite(J).all():
+            return
+        U, sizes, _ = np.linalg.svd(J)
+        self._seen = [*self._seen[1 - _WINDOW :], (t, float(sizes[-1]), U[:, -1])]
+        if len(self._seen) == _WINDOW:
+            self._decide()
+
+    def _decide(self) -> None:
+        times, sizes, _ = (np.array(x) for x in zip(*self._seen, strict=True))
+        if not (sizes[1] <= sizes[0] and sizes[2] <= sizes[3]) or (self.times and self.times[-1] >= times[0]):
+            return
+        middle = times - times[1]
+        plain, turned = (np.polyfit(middle, sizes * signs, 3) for signs in (1.0, np.array([1, 1, -1, -1])))
+        roots = np.roots(turned)
+        within = roots[(abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= middle[2])].real
+        if abs(turned[0]) < _SMOOTHER * abs(plain[0]) and len(within):
+            nearest = 1 if sizes[1] < sizes[2] else 2
+            self._rows = np.flatnonzero(np.abs(self._seen[nearest][2]) > _TAKES_PART).tolist()
+            self.times.append(float(times[1] + within[0]))
+
+    def describe(self) -> str:
+        """Return the poses in a sentence; empty where there are none."""
+        if not self.times:
+            return ""
+        when = ", ".join(f"{t:.4g}" for t in self.times[:3]) + (" and later" if len(self.times) > 3 else "")
+        names = manifold_at(self._dyn, self.times[0]).names
+        rows = " and ".join(names[k] for k in self._rows)
+        return (
+            f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
+            f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the tolerance"
+        )
