@@ -97,14 +97,18 @@ class Passage:
         self._free = Vt[rank:].T
         self._slopes = _slopes(manifold, t, q, v) if self.singular and v.any() else None
 
+    @property
+    def rows(self) -> list[int]:
+        """Which rows depend on each other."""
+        return [int(k) for k in np.flatnonzero(np.abs(self._lost).max(axis=1) > _TAKES_PART)]
+
     @cached_property
     def undetermined(self) -> str:
         """Where the motion is, and why it does not go on in one way; empty where it does."""
         why = self._undetermined()
         if not why:
             return ""
-        which = np.flatnonzero(np.abs(self._lost).max(axis=1) > _TAKES_PART)
-        rows = first_names([self._manifold.names[k] for k in which])
+        rows = first_names([self._manifold.names[k] for k in self.rows])
         return f"at a singular pose, where {rows} depend on each other, and {why}"
 
     def _undetermined(self) -> str:
@@ -144,7 +148,7 @@ def at_singular_poses(dyn: Dynamics, t: float, q: Array, v: Array, tau: Array) -
     v̇ is NaN where the motion is not determined and, for now, of all other states.
     """
     manifold = manifold_at(dyn, t)
-    which, a, why = manifold.at_pose(q), np.full(v.shape, np.nan), ""
+    which, a, why = manifold.at_pose(q) & np.isfinite(v).all(axis=-1), np.full(v.shape, np.nan), ""
     for i in map(tuple, np.argwhere(which)):
         own = manifold.member(i[0]) if i else manifold
         here = Passage(own, t, q[i], v[i], singular=True)
@@ -162,34 +166,39 @@ class Approach:
     near : bool
         Whether σ would be zero within a few steps like the last one, of any state of a batch; true until two ends are
         known.
-    members : (N,) bool array
-        Of which states.
     ahead : float
         Of one state: when σ will be zero at its present rate, s from the last end; negative where it was before.
     """
 
     def __init__(self) -> None:
         self.near, self.ahead = True, np.inf
-        self.members: NDArray[np.bool_] = np.array([True])
         self._sizes: Array | float = np.inf
 
     def saw(self, dyn: Dynamics, t: float, q: Array, v: Array) -> None:
         """Take in the end of a step, of one state or a batch."""
-        manifold = manifold_at(dyn, t)
-        J = manifold.jacobian(q)
+        states, alone = [manifold_at(dyn, t).jacobian(q)], q.ndim == 1 and bool(v.any()) and bool(np.isfinite(v).all())
+        apart = _APART / float(np.abs(v).max()) if alone else 0.0
+        if alone:
+            for x in (apart, -apart):
+                manifold = manifold_at(dyn, t + x)
+                states.append(manifold.jacobian(manifold.dyn.model.integrate(q, x * v)))
+        J = np.stack(states)
         good = np.isfinite(J).all(axis=(-1, -2))
-        U, sizes, Vt = np.linalg.svd(np.where(good[..., None, None], J, 0.0), full_matrices=False)
-        least = np.where(good, sizes[..., -1], np.inf)
+        # Without vectors, which would cost far more.
+        sizes = np.linalg.svd(np.where(good[..., None, None], J, 0.0), compute_uv=False)
+        least, *beside = np.where(good, sizes[..., -1], np.inf)
         known = np.shape(self._sizes) == np.shape(least)
         with np.errstate(invalid="ignore"):
             change = np.abs(least - self._sizes) if known else np.full(np.shape(least), np.inf)
-            self.members = ~(least >= _AHEAD * change)
-        self.near, self._sizes, self.ahead = bool(self.members.any()), least, np.inf
-        if q.ndim == 1 and good and v.any():
-            apart = _APART / float(np.abs(v).max())
-            ends = [manifold.at(t + x).jacobian(manifold.dyn.model.integrate(q, x * v)) for x in (apart, -apart)]
-            rate = float(U[:, -1] @ (ends[0] - ends[1]) @ Vt[-1]) / (2 * apart)
-            self.ahead = float(-least / rate) if rate else np.inf
+            self.near, self._sizes, self.ahead = bool((~(least >= _AHEAD * change)).any()), least, np.inf
+        if q.ndim == 1 and good.all():
+            from mbkit.engines.constraint_manifold import AT_POSE
+
+            rate = (beside[0] - beside[1]) / (2 * apart) if alone else 0.0
+            if least <= AT_POSE * sizes[0, 0]:
+                self.ahead = 0.0
+            elif rate:
+                self.ahead = float(-least / rate)
 
     def length(self, h: float, longer: float) -> float:
         """Return the length of the next step of rk853 with which no stage comes close to a pose ahead.
@@ -226,7 +235,7 @@ class SingularPoses:
         manifold = manifold_at(self._dyn, t)
         if manifold.at_pose(q):
             self.times.append(t)
-            self._rows = np.flatnonzero(np.abs(np.linalg.svd(manifold.jacobian(q))[0][:, -1]) > _TAKES_PART).tolist()
+            self._rows = Passage(manifold, t, q, np.zeros(manifold.dyn.model.nv), singular=True).rows
 
     def saw(self, t: float, q: Array) -> None:
         """Take in the end of a step."""
@@ -234,13 +243,12 @@ class SingularPoses:
         J = J.reshape(-1, J.shape[-1])
         if not np.isfinite(J).all():
             return
-        U, sizes, _ = np.linalg.svd(J)
-        self._seen = [*self._seen[1 - _WINDOW :], (t, float(sizes[-1]), U[:, -1])]
+        self._seen = [*self._seen[1 - _WINDOW :], (t, float(np.linalg.svd(J, compute_uv=False)[-1]), J)]
         if len(self._seen) == _WINDOW:
             self._decide()
 
     def _decide(self) -> None:
-        times, sizes, _ = (np.array(x) for x in zip(*self._seen, strict=True))
+        times, sizes = (np.array(x) for x in list(zip(*self._seen, strict=True))[:2])
         if not (sizes[1] <= sizes[0] and sizes[2] <= sizes[3]) or (self.times and self.times[-1] >= times[0]):
             return
         middle = times - times[1]
@@ -249,7 +257,7 @@ class SingularPoses:
         within = roots[(abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= middle[2])].real
         if abs(turned[0]) < _SMOOTHER * abs(plain[0]) and len(within):
             nearest = 1 if sizes[1] < sizes[2] else 2
-            self._rows = np.flatnonzero(np.abs(self._seen[nearest][2]) > _TAKES_PART).tolist()
+            self._rows = np.flatnonzero(np.abs(np.linalg.svd(self._seen[nearest][2])[0][:, -1]) > _TAKES_PART).tolist()
             self.times.append(float(times[1] + within[0]))
 
     def describe(self) -> str:

@@ -129,6 +129,9 @@ class _FieldStepper(Stepper):
             self._poses.saw(t, q)
         return q, w
 
+    def reason(self, q: Array, w: Array) -> str:
+        return self.field.undetermined or super().reason(q, w)
+
     @property
     def doubts(self) -> tuple[str, ...]:
         """The singular poses on the way, in a sentence."""

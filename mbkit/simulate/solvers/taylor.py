@@ -61,7 +61,7 @@ def run_taylor(problem: IntegrationProblem) -> SolverResult:
                 for t in steps(problem.start, y, stops, force):
                     yield t, rounded(steps.y), lambda t: rounded(steps.at(t))
             except StoppedError as error:
-                if error.ended != "diverged":
+                if error.ended != "diverged" or steps.crossed:
                     raise
                 interval = min(int(np.searchsorted(stops, steps.t, side="right")), len(stops) - 1)
                 raise diverged(_reason(own, steps.t, rounded(steps.y), force(interval))) from None
@@ -138,7 +138,7 @@ class TaylorSteps:
     """Steps of one trajectory at a time, with a borrowed integrator; t0, y0 and t, y are the ends of the last one.
 
     `behind` are the values of the equations' extra arguments; settled(t, y) is the state to go on from after a step,
-    and `across` takes those near a singular pose.
+    and `across` takes those near a singular pose. `crossed` is whether it took the last one.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class TaylorSteps:
         import heyoka
 
         self._system, self._integrator, self._kind, self._behind = system, integrator, kind, behind
-        self._settled, self._across, self._crossed = settled, across, False
+        self._settled, self._across, self.crossed = settled, across, False
         self._success, self._limit = heyoka.taylor_outcome.success, heyoka.taylor_outcome.time_limit
         self.t0 = self.t = 0.0
         self.y0 = self.y = np.empty(0)
@@ -184,7 +184,10 @@ class TaylorSteps:
                     outcome, h = integrator.step(max_delta_t=kind.dtype(holds), write_tc=True)
                     outcome = self._success if outcome == self._limit else outcome
                 last = h
-                if self._across is not None and self._stepped_across(k, stop, float(h)):
+                # At the pose itself there is no series.
+                if self._across is not None and self._stepped_across(
+                    k, stop, h if h > 0 and outcome in (self._success, self._limit) else np.inf
+                ):
                     integrator.time, state[:] = kind.dtype(self.t), self.y
                     yield self.t
                     continue
@@ -211,11 +214,11 @@ class TaylorSteps:
         """Take a step across a singular pose if a series of length h would meet one; return whether there was one."""
         assert self._across is not None
         self._across.begin(self.t, rounded(self.y))
-        self._crossed = self._across.crosses(h)
-        if self._crossed:
+        self.crossed = self._across.crosses(float(h))
+        if self.crossed:
             self.t0, self.y0 = self.t, self.y
             self.t, self.y = self._across.step(k, stop)
-        return self._crossed
+        return self.crossed
 
     def _without_series(self) -> StoppedError:
         """Return why there was no step: the state ran away, or its rates are numbers and their derivatives none."""
@@ -260,6 +263,6 @@ class TaylorSteps:
             return self.y
         if t == self.t0:
             return self.y0
-        if self._crossed:
+        if self.crossed:
             return self._across.at(t)  # type: ignore[union-attr]  # crossed by it
         return self._integrator.update_d_output(self._kind.dtype(t)).copy()

@@ -54,10 +54,13 @@ class Field:
         self._dyn, self._space, self._explicit = dyn, None if space is None or space.flat else space, explicit
         self._use(dyn)
         self.evaluations = 0
+        #: Why a motion at a singular pose went no further.
+        self.undetermined = ""
 
     def only(self, members: Indices) -> None:
         """Go on with these members of the whole batch."""
         self._use(self._dyn.of_samples(members))
+        self.undetermined = ""
 
     def _use(self, own: Dynamics) -> None:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.time_parameter is not None
@@ -111,7 +114,7 @@ class Field:
         if not isinstance(force, np.ndarray):
             # Never call the user's function on a state that is not finite.
             if not are_bounded(q, v).all():
-                raise DivergenceError(DIVERGED)
+                raise DivergenceError(self.undetermined or DIVERGED)
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
         a = self._at_poses(t, q, v, force) if self.near_singular else None
@@ -124,6 +127,7 @@ class Field:
         which, a, why = at_singular_poses(self._own, t, q, v, force)
         if not which.any():
             return None
+        self.undetermined = why or self.undetermined
         if which.all():
             if why:
                 raise DivergenceError(why)
@@ -147,7 +151,7 @@ class Field:
         except InputError:
             if np.isfinite(q).all() and np.isfinite(v).all():
                 raise
-            raise DivergenceError(DIVERGED) from None
+            raise DivergenceError(self.undetermined or DIVERGED) from None
         return np.asarray(a if a.ndim == v.ndim else a[0])
 
 
