@@ -62,14 +62,6 @@ def beside(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
     return np.where(stays, q, q1[..., 0]), np.where(stays, v, v1[..., 0])
 
 
-def _third_difference(t: Sequence[float], x: Sequence[float]) -> float:
-    """Return the divided difference of four values: the leading coefficient of the cubic through them."""
-    difference = list(x)
-    for order in range(1, len(t)):
-        difference = [(b - a) / (t[k + order] - t[k]) for k, (a, b) in enumerate(pairwise(difference))]
-    return difference[0]
-
-
 def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:
     """Return a run with its kept states projected onto the constraints; an engine's soft ones keep their drift."""
     if not dyn.projects or not outcome.q.size:

@@ -9,7 +9,9 @@ vanish do so at a rate. At rest they do not, and no equation says which branch c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -239,26 +241,38 @@ class SingularPoses:
 
     def saw(self, t: float, q: Array) -> None:
         """Take in the end of a step."""
-        J = manifold_at(self._dyn, t).jacobian(q)
-        J = J.reshape(-1, J.shape[-1])
-        if not np.isfinite(J).all():
-            return
-        self._seen = [*self._seen[1 - _WINDOW :], (t, float(np.linalg.svd(J, compute_uv=False)[-1]), J)]
-        if len(self._seen) == _WINDOW:
-            self._decide()
+        self.saw_all(np.array([t]), np.reshape(q, (1, -1)))
+
+    def saw_all(self, t: Array, q: Array) -> None:
+        """Take in the ends of steps, (n,) and (n, nq)."""
+        if self._dyn.model.time_parameter is None:
+            J = manifold_at(self._dyn, 0.0).jacobian(q)
+        else:
+            J = np.array([manifold_at(self._dyn, at).jacobian(x) for at, x in zip(t.tolist(), q, strict=True)])
+        J = J.reshape(len(t), -1, J.shape[-1])
+        finite = np.isfinite(J).all(axis=(1, 2))
+        # Without vectors, which would cost far more.
+        sizes = np.linalg.svd(J[finite], compute_uv=False)[:, -1]
+        for at, size, slopes in zip(t[finite].tolist(), sizes.tolist(), J[finite], strict=True):
+            self._seen = [*self._seen[1 - _WINDOW :], (at, size, slopes)]
+            if len(self._seen) == _WINDOW:
+                self._decide()
 
     def _decide(self) -> None:
-        times, sizes = (np.array(x) for x in list(zip(*self._seen, strict=True))[:2])
-        if not (sizes[1] <= sizes[0] and sizes[2] <= sizes[3]) or (self.times and self.times[-1] >= times[0]):
+        (first, s0, _), (_, s1, _), (_, s2, _), (_, s3, _) = self._seen
+        if not (s1 <= s0 and s2 <= s3) or (self.times and self.times[-1] >= first):
             return
-        middle = times - times[1]
-        plain, turned = (np.polyfit(middle, sizes * signs, 3) for signs in (1.0, np.array([1, 1, -1, -1])))
-        roots = np.roots(turned)
+        times = [t for t, *_ in self._seen]
+        plain, turned = _third_difference(times, [s0, s1, s2, s3]), _third_difference(times, [s0, s1, -s2, -s3])
+        if not abs(turned) < _SMOOTHER * abs(plain):
+            return
+        middle = np.array(times) - times[1]
+        roots = np.roots(np.polyfit(middle, [s0, s1, -s2, -s3], 3))
         within = roots[(abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= middle[2])].real
-        if abs(turned[0]) < _SMOOTHER * abs(plain[0]) and len(within):
-            nearest = 1 if sizes[1] < sizes[2] else 2
+        if len(within):
+            nearest = 1 if s1 < s2 else 2
             self._rows = np.flatnonzero(np.abs(np.linalg.svd(self._seen[nearest][2])[0][:, -1]) > _TAKES_PART).tolist()
-            self.times.append(float(times[1] + within[0]))
+            self.times.append(times[1] + float(within[0]))
 
     def describe(self) -> str:
         """Return the poses in a sentence; empty where there are none."""
@@ -271,3 +285,11 @@ class SingularPoses:
             f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
             f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the tolerance"
         )
+
+
+def _third_difference(t: Sequence[float], x: Sequence[float]) -> float:
+    """Return the divided difference of four values: the leading coefficient of the cubic through them."""
+    difference = list(x)
+    for order in range(1, len(t)):
+        difference = [(b - a) / (t[k + order] - t[k]) for k, (a, b) in enumerate(pairwise(difference))]
+    return difference[0]
