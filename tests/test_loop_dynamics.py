@@ -439,8 +439,8 @@ def test_what_would_be_the_trees_alone_is_refused() -> None:
     q = np.zeros(3)
     with pytest.raises(UnsupportedError, match="operational_space: four_bar has loops"):
         mb.operational_space(dyn, q, "coupler")
-    with pytest.raises(UnsupportedError, match="joint_wrenches of four_bar"):
-        dyn.newton_euler_residual(q, q, q, q)
+    with pytest.raises(InputError, match="tau: expected the force under which four_bar moves"):
+        dyn.joint_wrenches(q, q, q)
 
 
 def test_a_whole_comparison_of_a_mechanism_passes_with_its_loops_on() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop, Prescribed
 from tests.random_trees import SOUND, off, random_tree, rotation
@@ -354,14 +354,12 @@ def test_batches_copies_and_wrenches(four_bar):
 
 def test_what_would_be_false_with_loops_is_refused(four_bar):
     model, dyn, q, v = four_bar
-    for call in (dyn.joint_wrenches, lambda *x: dyn.newton_euler_residual(*x, v)):
-        with pytest.raises(UnsupportedError, match="forces in the loops"):
-            call(q, v, v)
-    assert not dyn.supports & {"joint_wrenches", "newton_euler_residual"}
-    assert "constraint_forces" in dyn.supports
+    with pytest.raises(InputError, match="forces in its loops"):
+        dyn.joint_wrenches(q, v, v)
+    assert {"joint_wrenches", "newton_euler_residual", "loop_wrenches", "constraint_forces"} <= dyn.supports
     tree = mb.dynamics(model.without("loops"))
     assert "joint_wrenches" in tree.supports
-    assert "constraint_forces" not in tree.supports
+    assert not tree.supports & {"constraint_forces", "loop_wrenches", "actuator_forces"}
     # A term of the tree, whatever closes it.
     assert np.array_equal(dyn.inverse_dynamics(q, v, v), tree.inverse_dynamics(q, v, v))
     with pytest.raises(UnsupportedError, match="no loops"):

@@ -117,10 +117,10 @@ class BodyMotion:
 
     # Wrenches on frames
 
-    def _from_world(self, body: str, x: Vector) -> Vector:
-        """Return a vector in a body's axes."""
+    def in_body(self, body: str, x: Vector, above: str = "world") -> Vector:
+        """Return a vector in a body's axes, of one in the axes of a body that carries it."""
         branch = []
-        while body != "world":
+        while body != above:
             joint = self.kin.carrier(body)
             branch.append(joint)
             body = joint.parent
@@ -138,7 +138,7 @@ class BodyMotion:
         else:
             if axes == "world":
                 moment = add(moment, cross3(force, self._origin(name)))
-            force, moment = (self._from_world(body, x) for x in (force, moment))
+            force, moment = (self.in_body(body, x) for x in (force, moment))
         return body, (force, add(moment, cross3(f.translation, force)))
 
     def generalized_force(self, names: Sequence[str], axes: str, wrenches: Any) -> Any:
@@ -214,10 +214,20 @@ class BodyMotion:
 
     # Loads
 
-    def joint_wrenches(self, joints: Sequence[str], frames: Sequence[str], axes: str, wrenches: Any) -> Any:
-        """Return the load of each joint about its child's origin, in the child's axes: one row each, (n, 6)."""
+    def joint_wrenches(
+        self,
+        joints: Sequence[str],
+        frames: Sequence[str],
+        axes: str,
+        wrenches: Any,
+        pushes: Sequence[tuple[str, Vector, Vector]] = (),
+    ) -> Any:
+        """Return the load of each joint about its child's origin, in the child's axes: one row each, (n, 6).
+
+        `pushes` are forces and moments on bodies about their origins, in their axes.
+        """
         kin = self.kin
-        outside = self._external(frames, axes, wrenches)
+        outside = self._external(frames, axes, wrenches, pushes)
         gravity = {"world": list(kin.values.gravity)}
         for joint in self.model.tree:
             gravity[joint.child] = kin.from_parent(joint, gravity[joint.parent])
@@ -234,7 +244,9 @@ class BodyMotion:
             rows.append(ca.horzcat(*(ca.SX(x) - y for x, y in zip((*force, *moment), (*push, *turn), strict=True))))
         return ca.vertcat(ca.SX(0, 6), *rows)
 
-    def _external(self, frames: Sequence[str], axes: str, wrenches: Any) -> dict[str, Pair]:
+    def _external(
+        self, frames: Sequence[str], axes: str, wrenches: Any, pushes: Sequence[tuple[str, Vector, Vector]]
+    ) -> dict[str, Pair]:
         """Return the wrench of springs and applied ones on all that a body carries, about its origin."""
         kin = self.kin
         out: dict[str, Pair] = {
@@ -246,6 +258,8 @@ class BodyMotion:
 
         for i, name in enumerate(frames):
             body, (force, moment) = self._on_body(name, wrenches[6 * i : 6 * i + 6], axes)
+            push(body, force, moment)
+        for body, force, moment in pushes:
             push(body, force, moment)
         for spring in self.model.springs:
             values = kin.values.springs[spring.name]
@@ -260,7 +274,7 @@ class BodyMotion:
                 pull = tension / length
             for sign, (body, point) in zip((1.0, -1.0), ends, strict=True):
                 if body != "world":
-                    force = self._from_world(body, [sign * pull * x for x in gap])
+                    force = self.in_body(body, [sign * pull * x for x in gap])
                     push(body, force, cross3(point, force))
         for joint in reversed(self.model.tree):
             force, moment = (kin.to_parent(joint, x, 0.0) for x in out[joint.child])

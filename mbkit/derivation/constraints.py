@@ -18,7 +18,7 @@ which those with the least norm are given, and left out of the equation.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -27,8 +27,9 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
-from mbkit.derivation.kinematics import Kinematics, Vector, add, dot3
+from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, dot3
 from mbkit.derivation.least_constraint import hard_poses
 from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.errors import InputError
@@ -270,14 +271,18 @@ class Constraints:
         A configuration at which all loops are closed, if one was found.
     ways : casadi.SX
         One number for each loop, negative where its frames point opposite ways, though its rows are zero there.
+    every : casadi.SX
+        The Jacobian of all rows, those that say nothing among them.
     """
 
     def __init__(self, kin: Kinematics, time: Any) -> None:
+        self._kin = kin
         rows = _rows(kin, time)
         choice = choose_rows(kin.model)
         kept = [rows[i] for i in choice.kept]
         self.names = tuple(row.name for row in kept)
         self.independent, self.closed = choice.independent, choice.closed
+        self._independent_of_every = tuple(choice.kept[i] for i in choice.independent)
         self.ways = _ways(kin)
         turned = kin.qdot if kin.model.quaternions else None
 
@@ -285,21 +290,56 @@ class Constraints:
             value, speeds = (_column(row.value for row in of if row.moves is moves) for moves in (False, True))
             return ConstraintTerms(value, kin.q, kin.v, time, tuple(row.name for row in of), turned, speeds)
 
+        self.every = terms(rows).jacobian
         #: All rows that say something, and those of the equation.
         self.all = terms(kept)
         all_are = len(self.independent) == len(self.names)
         self.terms = self.all if all_are else terms([kept[i] for i in self.independent])
 
     def spread(self, multipliers: Any) -> Any:
-        """Return the multipliers of all rows with the least norm whose force is that of the independent ones.
+        """Return the multipliers of all rows with the least norm whose force is that of the independent ones."""
+        return self._spread(multipliers, self.all.jacobian, self.independent)
 
-        J_all = C J, so that Jᵀ λ = J_allᵀ μ for every μ with Cᵀ μ = λ.
-        """
-        if self.terms is self.all:
+    def _spread(self, multipliers: Any, rows: Any, independent: tuple[int, ...]) -> Any:
+        # Dependent rows are W J, and the force of all is Jᵀ (μ + Wᵀ μ_dependent).
+        J, m = self.terms.jacobian, len(independent)
+        dependent = [i for i in range(rows.shape[0]) if i not in independent]
+        if not dependent:
             return multipliers
-        J, m = self.terms.jacobian, len(self.independent)
-        C = ca.mtimes(self.all.jacobian, Factors(ca.mtimes(J, J.T), range(m)).solve(J).T)
-        return ca.mtimes(C, Factors(ca.mtimes(C.T, C), range(m)).solve(multipliers))
+        G, W = Factors(ca.mtimes(J, J.T), range(m)), ca.SX(len(dependent), m)
+        for _ in range(1 + _REFINED):
+            W += G.solve(ca.mtimes(J, (rows[dependent, :] - ca.mtimes(W, J)).T)).T
+        own = Factors(ca.SX.eye(m) + ca.mtimes(W.T, W), range(m)).solve(multipliers)
+        out: Any = ca.SX(rows.shape[0], 1)
+        out[list(independent)], out[dependent] = own, ca.mtimes(W, own)
+        return out
+
+    def loop_wrenches(self, multipliers: Any) -> list[tuple[Vector, Vector]]:
+        """Return force and moment that each loop exerts on body a about the origin of its frame, in the carrier's axes.
+
+        `multipliers` are those of the independent rows. All rows carry the load, with the least norm, those that say
+        nothing among them: the load of a loop in a plane is in the plane.
+        """
+        shares = ca.vertsplit(self._spread(multipliers, self.every, self._independent_of_every))
+        out, first = [], 0
+        for loop in self._kin.model.loops:
+            names, rows = LOOP_ROWS[loop.kind]
+            ends = _ends(self._kin, loop)
+            symbols = ca.SX.sym("ends", 12)
+            gap, *axes = (ca.vertsplit(symbols[3 * k : 3 * k + 3]) for k in range(4))
+            # By virtual work: what the rows change by as end a moves.
+            shifted = LoopEnds(gap, axes, ends.b, ends.length)
+            work = sum(x * y for x, y in zip(shares[first:], rows(shifted), strict=False))
+            actual = ca.vertcat(*(ca.SX(x) for part in (ends.gap, *ends.a) for x in part))
+            slopes = ca.vertsplit(ca.substitute(ca.gradient(ca.SX(work), symbols), symbols, actual))
+            turns = (cross3(ends.a[k], slopes[3 * k + 3 : 3 * k + 6]) for k in range(3))
+            out.append((slopes[:3], [sum(x, 0.0) for x in zip(*turns, strict=True)]))
+            first += len(names)
+        return out
+
+    def gap(self, loop: Loop) -> Vector:
+        """Return the way from end b to end a, in the axes of the body that carries both."""
+        return _ends(self._kin, loop).gap
 
 
 # Which rows say something, and which of those are independent: from numbers
@@ -474,6 +514,7 @@ def _pivoted(rows: Array) -> tuple[tuple[int, ...], float, Array]:
 CONSTRAINT_FUNCTIONS: Final = {
     "constraint_residual": ("q",),
     "constraint_jacobian": ("q",),
+    "every_jacobian": ("q",),
     "constraint_rate": ("q", "v"),
     "constraint_rate_gradient": ("q", "v"),
     "constraint_bias": ("q", "v"),
@@ -507,12 +548,60 @@ class ConstraintQuantities:
     loop_ways: Any = ca.SX(0, 1)
     #: A configuration at which all loops are closed, if one is known.
     closed_configuration: Array | None = None
+    model: Model
+    q: ca.SX
+    v: ca.SX
+    a: ca.SX
+    inverse_dynamics: Any
+    named: Callable[..., ca.Function]
     _constrained: Any
 
     @property
     def generalized_constraint_force(self) -> Any:
         """Jᵀ λ."""
         return ca.mtimes(self.constraints.jacobian.T, self._constrained[1])
+
+    def _spread(self, multipliers: Any) -> Any:
+        """Return the multipliers of all rows; none is redundant."""
+        return multipliers
+
+    def actuator_forces(self, actuators: tuple[int, ...]) -> ca.Function:
+        """Return (q, v, a) -> the forces of the actuated velocities, with the least norm, that make a motion.
+
+        One column: τ, λ of all rows, J a + γ, and of its rows the sizes; last what is left of the worst row of J, or of
+        J restricted to the other velocities, once the others are taken away, as a square.
+
+        With f = M a + h - τ_passive, split into the actuated velocities S and the others U, λ minimizes
+        |f_S - J_Sᵀ λ|² where J_Uᵀ λ = f_U. By Lagrange's multipliers μ, since J_S f_S + J_U f_U = J f::
+
+            J Jᵀ λ = J f + J_U μ        J_Uᵀ λ = f_U
+        """
+        c, n = self.constraints, self.model.nv
+        J, f, m = c.jacobian, self.inverse_dynamics, c.jacobian.shape[0]
+        others = [i for i in range(n) if i not in actuators]
+        gram = ca.mtimes(J, J.T)
+        G, rest = Factors(gram, range(m)), J[:, others]
+        Y = G.solve(rest)
+        reduced = ca.mtimes(rest.T, Y)
+        S = Factors(reduced, range(len(others)))
+
+        def holding(force: Any) -> Any:
+            x = G.solve(ca.mtimes(J, force))
+            return x + ca.mtimes(Y, S.solve(force[others] - ca.mtimes(rest.T, x))) if others else x
+
+        multipliers = holding(f)
+        for _ in range(_REFINED):
+            multipliers = multipliers + holding(f - ca.mtimes(J.T, multipliers))
+        tau = f - ca.mtimes(J.T, multipliers)
+        # It vanishes up to rounding.
+        tau[others] = 0.0
+        left: Any = ca.SX(1.0)
+        for matrix, factors in ((gram, G), (reduced, S)):
+            for k, inverse in enumerate(factors.inverse):
+                left = ca.fmin(left, 1.0 / (ca.SX(inverse) * matrix[k, k]))
+        rates = ca.mtimes(J, self.a) + c.gamma
+        out = ca.vertcat(tau, self._spread(multipliers), rates, ca.sqrt(ca.sum2(J**2)), left)
+        return self.named("actuator_forces", ("q", "v", "a"), [self.q, self.v, self.a], out)
 
     @property
     def constraint_residual(self) -> Any:
@@ -552,11 +641,10 @@ class ConstrainedMotion(ConstraintQuantities):
     Every term but the accelerations is that of the tree.
     """
 
-    model: Model
     kin: Kinematics
-    q: ca.SX
-    v: ca.SX
+    motion: BodyMotion
     tau: ca.SX
+    extra_arguments: dict[str, ca.SX]
     mass_matrix: Any
     passive: Any
     nle: Any
@@ -635,7 +723,56 @@ class ConstrainedMotion(ConstraintQuantities):
     @cached_property
     def constraint_forces(self) -> Any:
         """λ of all rows; of redundant ones those with the least norm."""
-        return self.constraint_rows.spread(self._constrained[1])
+        return self._spread(self._constrained[1])
+
+    def _spread(self, multipliers: Any) -> Any:
+        return self.constraint_rows.spread(multipliers)
+
+    @property
+    def every_jacobian(self) -> Any:
+        """J of all rows, those that say nothing among them."""
+        return self.constraint_rows.every
+
+    def loads(self, joints: Sequence[str], frames: Sequence[str], axes: str, moved: bool) -> ca.Function:
+        """Return (q, v, a, τ, wrenches) -> loads of joints, then of loops, (n, 6), and a last row of two forces.
+
+        Where the motion is that of τ (`moved`) there is no argument a. The last row has the part of M a + h - τ that no
+        force of the constraints makes up for, and the size of both forces.
+        """
+        motion, rows = self.motion, self.constraint_rows
+        wrenches = ca.SX.sym("wrenches", 6 * len(frames))
+        pushed = self.tau + motion.generalized_force(frames, axes, wrenches) if frames else self.tau
+        acting = self.inverse_dynamics - pushed
+        J = self.constraints.jacobian
+        G, multipliers = Factors(ca.mtimes(J, J.T), range(J.shape[0])), ca.SX(J.shape[0], 1)
+        for _ in range(1 + _REFINED):
+            multipliers += G.solve(ca.mtimes(J, acting - ca.mtimes(J.T, multipliers)))
+        loops = rows.loop_wrenches(multipliers)
+        outside, own = [], []
+        for loop, (force, moment) in zip(self.model.loops, loops, strict=True):
+            both, at = self.model.carrier(loop), self.kin.values.loops[loop.name]
+            # At the same point on body b, which is a gap away from its frame.
+            back = [-x for x in force], [-x - y for x, y in zip(moment, cross3(rows.gap(loop), force), strict=True)]
+            for body, point, pair in (
+                (loop.body_a, at.translation_a, (force, moment)),
+                (loop.body_b, at.translation_b, back),
+            ):
+                F, N = (motion.in_body(body, x, both) for x in pair)
+                if body == loop.body_a:
+                    R = at.rotation_a
+                    own.append(ca.horzcat(*(ca.SX(y) for x in (F, N) for y in constant_transposed_times(R, x))))
+                outside.append((body, F, add(N, cross3(point, F))))
+        table = motion.joint_wrenches(joints, frames, axes, wrenches, outside)
+        left = acting - ca.mtimes(J.T, multipliers)
+        sizes = ca.horzcat(ca.norm_2(left), ca.norm_2(self.inverse_dynamics) + ca.norm_2(pushed), ca.SX(1, 4))
+        out = ca.vertcat(table, ca.SX(0, 6), *own, sizes)
+        given = {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau, "wrenches": wrenches}
+        if moved:
+            out = ca.substitute(out, self.a, ca.substitute(self.forward_dynamics, self.tau, pushed))
+            del given["a"]
+        if not frames:
+            del given["wrenches"]
+        return self.named("loads", tuple(given), [*given.values()], out)
 
     @cached_property
     def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:

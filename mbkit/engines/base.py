@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, all_finite, batch_of, real, rows
-from mbkit.engines import constrained, frames_and_momenta, loads, regressors
-from mbkit.engines.constrained import Constrained
+from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
+from mbkit.engines.closed_loops.loop_loads import LoopLoads
 from mbkit.engines.frames_and_momenta import LOCAL, FramesAndMomenta, axes_named
 from mbkit.engines.linearization import LinearizationQuantities
-from mbkit.engines.loads import Loads, Wrenches
+from mbkit.engines.loads import Wrenches
 from mbkit.engines.regressors import Regressors
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
@@ -41,14 +41,16 @@ QUANTITIES: Final = (
     *loads.QUANTITIES,
     *regressors.QUANTITIES,
     *constrained.QUANTITIES,
+    *closed_loops.QUANTITIES,
 )
 
 #: What a model that was written as energies does not have.
 _OF_BODIES: Final = frozenset(
-    {*frames_and_momenta.QUANTITIES, *loads.QUANTITIES, *regressors.QUANTITIES} - {"mass_matrix_inverse"}
+    {*frames_and_momenta.QUANTITIES, *loads.QUANTITIES, *regressors.QUANTITIES, *closed_loops.OF_BODIES}
+    - {"mass_matrix_inverse"}
 )
 #: What needs the force on each body.
-_OF_OWN_LOADS: Final = frozenset({"joint_wrenches"})
+_OF_OWN_LOADS: Final = frozenset({"joint_wrenches", "undetermined_loads"})
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
 #: Names in a list of an error message.
@@ -134,7 +136,7 @@ def scalar(value: Array) -> Any:
     return value if value.ndim else float(value)
 
 
-class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors, Constrained):
+class Dynamics(FramesAndMomenta, LoopLoads, LinearizationQuantities, Regressors):
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
     Every method takes one state or a batch with one leading axis, checks shapes, finite numbers and unit quaternions,
@@ -195,11 +197,15 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors, Con
     @property
     def supports(self) -> frozenset[str]:
         """Names of the quantities that this engine can give."""
-        needed = {x: loads.FOLLOWING.get(x, x) for x in QUANTITIES}
+        following = loads.FOLLOWING | closed_loops.FOLLOWING
+        needed = {x: following.get(x, x) for x in QUANTITIES}
         given = {x for x, y in needed.items() if y not in self.refuses and hasattr(self, f"_{y}")}
-        missing = {*(constrained.OF_TREES if self.model.constrained else constrained.QUANTITIES)}
-        missing |= _OF_OWN_LOADS if self.model.forces else set()
-        given = {x for x in given if needed[x] not in missing}
+        if not self.model.constrained:
+            given -= {*constrained.QUANTITIES, *closed_loops.QUANTITIES}
+        elif not self.model.loops:
+            given -= closed_loops.OF_BODIES
+        if self.model.forces or self.model.no_slip:
+            given = {x for x in given if needed[x] not in _OF_OWN_LOADS}
         return frozenset(given if self.model.has_bodies else given - _OF_BODIES)
 
     def __repr__(self) -> str:
@@ -522,13 +528,11 @@ class Dynamics(FramesAndMomenta, Loads, LinearizationQuantities, Regressors, Con
         """Return the adapter's method for a quantity; raise `UnsupportedError` where it has none."""
         if quantity in _OF_BODIES:
             self.model.require_bodies(quantity)
-        if self.model.constrained and quantity in constrained.OF_TREES:
-            reason = constrained.OF_TREES[quantity]
-            raise UnsupportedError(f"{self.engine} cannot give {quantity} of {self.model.name}: {reason}")
-        if self.model.forces and quantity in _OF_OWN_LOADS:
+        if quantity in _OF_OWN_LOADS and (self.model.forces or self.model.no_slip):
+            which, feature = ("forces by functions", "forces") if self.model.forces else ("contacts", "no_slip")
             raise UnsupportedError(
-                f"{self.engine} cannot give {quantity} of {self.model.name}: forces by functions are known by what "
-                "they do to the motion, not to single bodies; model.without('forces') has the loads without them"
+                f"{self.engine} cannot give {quantity} of {self.model.name}: {which} are known by what they do to the "
+                f"motion, not to single bodies; model.without({feature!r}) has the loads without them"
             )
         method = getattr(self, f"_{quantity}", None)
         if method is None or quantity in self.refuses:

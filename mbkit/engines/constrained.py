@@ -25,12 +25,6 @@ QUANTITIES: Final = (
     "generalized_constraint_force",
 )
 
-#: What a model under constraints does not have, and why.
-OF_TREES: Final = {
-    "joint_wrenches": "the load of a joint depends on the forces in the loops, which a motion (q, v, a) does not tell; "
-    "constraint_forces(q, v, tau) has these forces"
-}
-
 
 class Constrained:
     """The part of `Dynamics` for models with loops, prescribed motions, blades, and wheels and spheres that roll.
@@ -50,8 +44,8 @@ class Constrained:
     rolls, and those of its velocities are the forces of friction along these directions. A model without any raises
     `UnsupportedError`.
 
-    Accelerations of `forward_dynamics` hold the constraints; every other term, such as `inverse_dynamics`, is that of
-    the tree, without λ.
+    Accelerations of `forward_dynamics` hold the constraints, and `actuator_forces` and `joint_wrenches` have the forces
+    of the constraints among theirs; every other term, such as `inverse_dynamics`, is that of the tree, without λ.
     """
 
     model: Model

@@ -24,7 +24,7 @@ from mbkit.engines.loads import Wrenches
 from mbkit.engines.step_derivatives import momentum_step_slopes
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
-from mbkit.model import Frame, Model
+from mbkit.model import Frame, Joint, Model
 
 if TYPE_CHECKING:
     from mbkit.derivation.steps.fixed import Part
@@ -344,6 +344,33 @@ class LagrangianDynamics(Dynamics):
     _constraint_rate, _constraint_bias = _term("constraint_rate"), _term("constraint_bias")
     _constraint_forces, _constraint_rate_gradient = _term("constraint_forces"), _term("constraint_rate_gradient")
     _generalized_constraint_force = _term("generalized_constraint_force")
+
+    @property
+    def _mechanism(self) -> Any:
+        """The equations, of those with constraints."""
+        return self.equations
+
+    def _every_jacobian(self, q: Array) -> Array:
+        code = self.code("every_jacobian", make=lambda: self.equations.function("every_jacobian"))
+        return np.asarray(code(q, *self._trailing(q), threads=self.threads)[0])
+
+    def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Array:
+        which = self._moved_by(actuators)
+        code = self.code("actuator_forces", which, make=lambda: self._mechanism.actuator_forces(which))
+        out = code(q, v, a, *self._trailing(q), threads=self.threads)[0][..., 0]
+        return self._judged(out, q, a, which)
+
+    def _loads_of_motion(self, q: Array, v: Array, a: Array, tau: Array, *given: Any) -> Array:
+        return self._loads(False, q, v, a, tau, *given)
+
+    def _loads_under_force(self, q: Array, v: Array, tau: Array, *given: Any) -> Array:
+        return self._loads(True, q, v, tau, *given)
+
+    def _loads(self, moved: bool, *given: Any) -> Array:
+        *states, joints, frames, axes = given
+        names = _names(joints), _names(frames), axes
+        code = self.code("loads", moved, *names, make=lambda: self._mechanism.loads(*names, moved))
+        return np.asarray(code(*states, *self._trailing(states[0]), threads=self.threads)[0])
 
     def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
         """Return dE/dt of kinetic and potential energy along (D v, a), exactly differentiated."""

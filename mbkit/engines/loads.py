@@ -20,6 +20,7 @@ from mbkit._check import Array, batch_of, rows
 from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, Parts, axes_named
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Joint, Model, PointSpring
+from mbkit.model.parts import Loop
 
 #: Wrenches by the names of the frames on which they act.
 Wrenches = Mapping[str, ArrayLike]
@@ -43,6 +44,8 @@ class Loads:
     velocity: Callable[..., Array]
     pose: Callable[..., Array]
     body_poses: Callable[[ArrayLike], Array]
+    loop_wrenches: Callable[..., Array]
+    _loads_under: Callable[..., Array]
 
     @property
     def samples(self) -> int | None:
@@ -103,31 +106,43 @@ class Loads:
         self,
         q: ArrayLike,
         v: ArrayLike,
-        a: ArrayLike,
+        a: ArrayLike | None,
         wrenches: Wrenches | None = None,
         axes: str = LOCAL,
         joints: Sequence[str] | None = None,
+        tau: ArrayLike | None = None,
     ) -> Array:
         """Return the load of each joint: what the parent's side exerts on the child through the joint.
 
         Force, N, then moment, Nm, about the child's origin, in the child's axes. The load is that of the motion
-        (q, v, a): with accelerations of `forward_dynamics` it is the load under a force τ. Its part in the joint's own
-        directions is τ + τ_passive of the joint, less what its rotor takes.
+        (q, v, a), or under a force τ where a is None. Its part in the joint's own directions is τ + τ_passive of the
+        joint, with the force of its drive, less what its rotor takes.
+
+        In a mechanism it depends on τ too, which decides the forces in the loops; `loop_wrenches` has those, and
+        `undetermined_loads` tells which components the laws of rigid bodies do not determine.
 
         Parameters
         ----------
         q : (nq,) or (N, nq) array_like
         v, a : (nv,) or (N, nv) array_like
+            Without a, a is ``forward_dynamics(q, v, tau, wrenches, axes)``.
         wrenches : dict of str to (6,) or (N, 6) array_like, optional
             That act on frames, as in `generalized_force`.
         axes : {"local", "local_world_aligned", "world"}
             Axes of the applied wrenches.
         joints : sequence of str, optional
             By default all that move, in the order of ``model.joints``. Fixed joints may be named.
+        tau : (nv,) or (N, nv) array_like, optional
+            The generalized force under which the motion happens; needed in a mechanism, and where a is None.
 
         Returns
         -------
         (n, 6) or (N, n, 6) array
+
+        Raises
+        ------
+        InputError
+            A mechanism without τ, or a motion that is not the one under τ.
 
         Examples
         --------
@@ -136,6 +151,16 @@ class Loads:
         >>> dyn.joint_wrenches([0.0], [0.0], [0.0]) + 0.0
         array([[ 0.  ,  0.  , 19.62,  0.  ,  0.  ,  0.  ]])
         """
+        if self.model.constrained:
+            return self._loads_under(joints, q, v, a, tau, wrenches, axes)
+        if a is None:
+            if tau is None:
+                raise InputError("tau: expected the force under which the model moves where a is None; give a or tau")
+            a = self.forward_dynamics(q, v, tau, wrenches, axes)
+        elif tau is not None:
+            raise InputError(
+                f"tau: the loads of {self.model.name}, a tree, follow from its motion; give a or tau alone"
+            )
         loaded = self._joints(joints)
         states: dict[str, Any] = {"q": q, "v": v, "a": a}
         frames: tuple[Frame, ...] = ()
@@ -200,9 +225,13 @@ class Loads:
         size = self.samples or batch_of(**states, **pushes)
         q, v, a, tau = (np.broadcast_to(x, (size or 1, x.shape[-1])) for x in states.values())
         names = [joint.name for joint in model.tree]
-        acting = self.forward_dynamics(q, v, tau, wrenches, axes)
-        loads = self.joint_wrenches(q, v, acting, wrenches, axes, names)
+        loads = self.joint_wrenches(q, v, None, wrenches, axes, names, tau)
         balance = _Balance(self, q, v, a)
+        if model.loops:
+            for loop, wrench in zip(
+                model.loops, np.moveaxis(self.loop_wrenches(q, v, tau, wrenches, axes), 1, 0), strict=True
+            ):
+                balance.close(loop, wrench)
         for k, joint in enumerate(model.tree):
             balance.load(joint, loads[:, k])
         for name, wrench in pushes.items():
@@ -261,6 +290,21 @@ class _Balance:
                 moment = moment - np.cross(X[:, :3, 3], force)
             force, moment = _times(R_B, force), _times(R_B, moment)
         self._add(frame.body, force, moment + np.cross(frame.translation, force))
+
+    def close(self, loop: Loop, wrench: Array) -> None:
+        """Add a loop's load to its body a, and the opposite to body b at the same point."""
+        X = self._placed(loop.body_a)
+        arm = _times(X[:, :3, :3], loop.translation_a)
+        force, moment = (_times(X[:, :3, :3] @ loop.rotation_a, x) for x in (wrench[:, :3], wrench[:, 3:]))
+        for sign, body in ((1, loop.body_a), (-1, loop.body_b)):
+            Y = self._placed(body)
+            R, point = Y[:, :3, :3].swapaxes(1, 2), X[:, :3, 3] + arm - Y[:, :3, 3]
+            self._add(body, sign * _times(R, force), sign * _times(R, moment + np.cross(point, force)))
+
+    def _placed(self, body: str) -> Array:
+        if body in self._index:
+            return self._X[:, self._index[body]]
+        return np.broadcast_to(np.eye(4), (len(self._q), 4, 4))
 
     def stretch(self, spring: PointSpring) -> None:
         """Add the pull of a spring to the bodies at its ends."""

@@ -30,7 +30,7 @@ from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS
 from mbkit.engines.base import Dynamics, scalar
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.model import Frame, Model
+from mbkit.model import Frame, Joint, Model
 
 #: Quantity -> its arguments, as in `Dynamics`.
 _ARGUMENTS: Final = {
@@ -294,9 +294,30 @@ class OracleDynamics(Dynamics):
         return of_parameters(self.model, quantity, self._run(("parameter_derivatives", quantity), *states)[0])
 
     _constraint_jacobian, _constraint_rate_gradient = _whole("constraint_jacobian"), _whole("constraint_rate_gradient")
+    _every_jacobian = _whole("every_jacobian")
     _constraint_residual, _constraint_rate = _column("constraint_residual"), _column("constraint_rate")
     _generalized_constraint_force = _column("generalized_constraint_force")
     _constraint_bias, _constraint_forces = _column("constraint_bias"), _column("constraint_forces")
+
+    def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Any:
+        which = self._moved_by(actuators)
+        out = self._run(("actuator_forces", which), q, v, a)[0][:, :, 0]
+        return self._judged(out, q, a, which)
+
+    def _loads_of_motion(self, q: Array, v: Array, a: Array, tau: Array, *given: Any) -> Any:
+        return self._loads(False, q, v, a, tau, *given)
+
+    def _loads_under_force(self, q: Array, v: Array, tau: Array, *given: Any) -> Any:
+        return self._loads(True, q, v, tau, *given)
+
+    def _loads(self, moved: bool, *given: Any) -> Any:
+        *states, joints, frames, axes = given
+        joints, frames = (tuple(x.name for x in parts) for parts in (joints, frames))
+        return self._run(("loads", joints, frames, axes, moved), *states)[0]
+
+    def _only(self, out: Array, first: int, last: int) -> Array:
+        self._last = self._last[:, first:last]
+        return super()._only(out, first, last)
 
     _kinetic_energy, _potential_energy, _energy_rate = map(
         _single, ("kinetic_energy", "potential_energy", "energy_rate")

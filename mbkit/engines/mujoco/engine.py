@@ -223,6 +223,10 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         self._place(q)
         return self._columns(rows.jacobian(self._d)[kept])
 
+    def _every_jacobian(self, q: Array) -> Array:
+        self._place(q)
+        return self._columns(self._rows[0].jacobian(self._d))
+
     def _constraint_rate(self, q: Array, v: Array) -> Array:
         return np.asarray(self._constraint_jacobian(q) @ v)
 

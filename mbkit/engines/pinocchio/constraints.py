@@ -306,11 +306,15 @@ class PinConstraints:
                 moving += seen.moving
         return held, moving
 
-    def rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
-        """Return the rows that say something; `given` are q and v of the description."""
+    def all_rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
+        """Return the rows of loops, motions and contacts; `given` are q and v of the description."""
         loops = self.every(q, v)
         held, moving = self._contacts()
-        return Rows.stacked([loops, *self._motions(*given), *held, *moving])[list(self.choice.kept)]
+        return Rows.stacked([loops, *self._motions(*given), *held, *moving])
+
+    def rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
+        """Return the rows that say something."""
+        return self.all_rows(q, v, given)[list(self.choice.kept)]
 
     @cached_property
     def _laws(self) -> list[Callable[[float], tuple[float, float, float]]]:
@@ -512,6 +516,14 @@ class PinocchioConstrained:
     def _rows(self, q: Array, v: Array | None = None) -> Rows:
         v = np.zeros(self.model.nv) if v is None else v
         return self._held.rows(self._full_q(q), self._full_v(v), (q, v))
+
+    @property
+    def _row_choice(self) -> RowChoice:
+        return self._held.choice
+
+    def _every_jacobian(self, q: Array) -> Array:
+        zero = np.zeros(self.model.nv)
+        return self._held.all_rows(self._full_q(q), self._full_v(zero), (q, zero)).J
 
     def _constraint_residual(self, q: Array) -> Array:
         return self._rows(q).f[: self._held.choice.positions]

@@ -25,7 +25,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.model import Model
 from mbkit.model.base_parameters import STANDARD
 from mbkit.studies.compare.errors import Errors, Scales, acceleration_errors, ratio
-from mbkit.studies.compare.terms import States, Term
+from mbkit.studies.compare.terms import JOINT_LOADS, LoadsUnderForce, States, Term
 
 #: N and Nm on the frame, in its own axes.
 WRENCH: Final = (3.0, -2.0, 5.0, 0.4, 0.7, -0.3)
@@ -142,6 +142,12 @@ def _load_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
     return _forces(error, reference, scales.force, scales.reach)
 
 
+def _mechanism_load_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
+    """Measure loads that follow from the forces in loops, per condition of all equations as these are."""
+    e = _load_errors(error, reference, scales)
+    return Errors(e.absolute, e.relative / scales.of_accelerations, e.per_velocity)
+
+
 def _momentum_rate_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
     return _forces(error[:, None], reference[:, None], scales.curved, scales.reach)
 
@@ -234,9 +240,14 @@ BODY_TERMS: Final = (
     _term("Ȧ_G v", "centroidal_momentum_bias", "q v", _momentum_rate_errors),
     _term("locked inertia", "locked_inertia", "q", _locked_inertia_errors),
     _term("M⁻¹", "mass_matrix_inverse", "q", _inverse_errors),
-    _term("joint loads", "joint_wrenches", "q v a", _load_errors),
+    _term("joint loads", JOINT_LOADS, "q v a", _load_errors),
     _term("Jᵀ wrench", "generalized_force", "q", _pushed_errors, _wrench),
     _term("forward dynamics, wrench", "forward_dynamics", "q v tau", acceleration_errors, _wrench),
     _term("regressor", "regressor", "q v a", _regressor_errors),
     _term("∂ID/∂(q, v, a)", "inverse_dynamics_derivatives", "q v a", _slope_errors),
+)
+#: The same where a force τ decides the loads beside the motion.
+MECHANISM_TERMS: Final = tuple(
+    LoadsUnderForce(x.name, x.quantity, ("q", "v", "tau"), _mechanism_load_errors) if x.quantity == JOINT_LOADS else x
+    for x in BODY_TERMS
 )

@@ -22,12 +22,13 @@ from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.beyond_terms import omissions, rollouts
-from mbkit.studies.compare.body_terms import BODY_TERMS, BodyScales
+from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
 from mbkit.studies.compare.errors import Errors, Scales, condition_under_constraints, interleaved
 from mbkit.studies.compare.result import OWN_LAW, Comparison, Row
 from mbkit.studies.compare.terms import (
     CONSTRAINT_TERMS,
     FORWARD_DYNAMICS,
+    JOINT_LOADS,
     OF_CONSTRAINED_MOTION,
     TERMS,
     States,
@@ -78,7 +79,7 @@ class Judge:
             self.scales = replace(self.scales, constrained=condition)
         self.terms: tuple[Term, ...] = TERMS + (CONSTRAINT_TERMS if model.constrained else ())
         if model.has_bodies and model.mass:
-            self.terms += BODY_TERMS
+            self.terms += MECHANISM_TERMS if model.constrained else BODY_TERMS
             self.scales = BodyScales.around(self.scales, oracle, at)
         self.joint_of = [j.name for j in model.independent_joints for _ in range(j.type.nv)]
 
@@ -148,8 +149,11 @@ class Judge:
             dyn.constraint_law(*state) for state in zip(self.at.q, self.at.v, sum(pushed, self.at.tau), strict=True)
         ]
         self.softness[name] = float(np.median([law.digits for law in laws]))
+        accelerations = np.array([law.acceleration for law in laws])
         if term.quantity == FORWARD_DYNAMICS:
-            return np.array([law.acceleration for law in laws])
+            return accelerations
+        if term.quantity == JOINT_LOADS:
+            return self.oracle.joint_wrenches(self.at.q, self.at.v, accelerations, tau=self.at.tau)
         return np.array([law.jacobian.T @ law.force for law in laws])
 
     def _reference(self, term: Term, values: dict[str, Array]) -> tuple[str, Array, Array]:

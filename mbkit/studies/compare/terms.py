@@ -11,6 +11,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.frames_and_momenta import LOCAL
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.model import Model
 from mbkit.model.manifold import limits_box
@@ -111,9 +112,17 @@ class Term:
     def single(self, dyn: Dynamics, states: States) -> Callable[[], Any]:
         """Return a call at one random state, for timing."""
         method = getattr(dyn, self.quantity)
-        arguments = [np.ascontiguousarray(getattr(states, a)[0]) for a in self.arguments]
-        arguments += self.more(dyn.model)
+        q, v, a, tau = (np.ascontiguousarray(x[0]) for x in (states.q, states.v, states.a, states.tau))
+        arguments = self._given(dyn, States(q, v, a, tau, states.kinds))
         return lambda: method(*arguments)
+
+
+class LoadsUnderForce(Term):
+    """Loads in the joints of a mechanism, which follow from the force τ and its motion."""
+
+    def _given(self, dyn: Dynamics, states: States) -> list[Any]:  # noqa: ARG002  # as for the others
+        # Of accelerations, wrenches, axes and joints none is given.
+        return [states.q, states.v, None, None, LOCAL, None, states.tau]
 
 
 _HEAVY: Final = partial(force_errors, heavy=True)
@@ -131,8 +140,9 @@ TERMS: Final = (
 )
 
 FORWARD_DYNAMICS: Final = "forward_dynamics"
+JOINT_LOADS: Final = "joint_wrenches"
 #: Quantities that depend on how an engine holds constraints.
-OF_CONSTRAINED_MOTION: Final = (FORWARD_DYNAMICS, "generalized_constraint_force")
+OF_CONSTRAINED_MOTION: Final = (FORWARD_DYNAMICS, JOINT_LOADS, "generalized_constraint_force")
 #: Of models with loops and prescribed motions. Jᵀ λ is unique where λ is not.
 CONSTRAINT_TERMS: Final = (
     Term("f", "constraint_residual", ("q",), row_errors),

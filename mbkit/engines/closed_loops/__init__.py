@@ -1,0 +1,10 @@
+"""Forces and motion of mechanisms: of actuators, in joints and loops, and seen from independent coordinates."""
+
+from typing import Final
+
+#: What models with constraints have beside `mbkit.engines.constrained.QUANTITIES`.
+QUANTITIES: Final = ("actuator_forces", "loop_wrenches", "undetermined_loads")
+#: Quantity -> the one that it follows from.
+FOLLOWING: Final = {"loop_wrenches": "loads_under_force", "undetermined_loads": "every_jacobian"}
+#: Of these, what takes loops of bodies.
+OF_BODIES: Final = frozenset({"loop_wrenches", "undetermined_loads"})
