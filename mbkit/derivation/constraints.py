@@ -650,7 +650,6 @@ class ConstrainedMotion(ConstraintQuantities):
     nle: Any
     elimination: Any
     elimination_order: tuple[int, ...]
-    extra_arguments: dict[str, ca.SX]
 
     @property
     def time(self) -> Any:

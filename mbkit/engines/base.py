@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, all_finite, batch_of, real, rows
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
-from mbkit.engines.closed_loops.loop_loads import LoopLoads
+from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
 from mbkit.engines.frames_and_momenta import LOCAL, FramesAndMomenta, axes_named
 from mbkit.engines.linearization import LinearizationQuantities
 from mbkit.engines.loads import Wrenches
@@ -136,7 +136,7 @@ def scalar(value: Array) -> Any:
     return value if value.ndim else float(value)
 
 
-class Dynamics(FramesAndMomenta, LoopLoads, LinearizationQuantities, Regressors):
+class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Regressors):
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
     Every method takes one state or a batch with one leading axis, checks shapes, finite numbers and unit quaternions,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
@@ -163,7 +163,7 @@ class Constrained:
         J, forces = self.constraint_jacobian(q), self.constraint_forces(q, v, tau)
         return (np.swapaxes(J, -1, -2) @ forces[..., None])[..., 0]
 
-    def project(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
+    def project(self, q: ArrayLike, v: ArrayLike, hold: Sequence[str] = ()) -> tuple[Array, Array]:
         """Return the nearest consistent state, in the metric of the mass matrix.
 
         The configuration goes onto f = 0, which rows that hold velocities alone have no part in; then the velocity goes
@@ -173,6 +173,8 @@ class Constrained:
         ----------
         q : (nq,) or (N, nq) array_like
         v : (nv,) or (N, nv) array_like
+        hold : sequence of str, optional
+            Names of coordinates or joints that keep their numbers in q and v, to the bit; the others follow.
 
         Returns
         -------
@@ -182,7 +184,10 @@ class Constrained:
         Raises
         ------
         InputError
-            The constraints contradict each other, or no consistent state is near.
+            The constraints contradict each other or what is held, no consistent state is near, or what is held does
+            not determine the rest at the pose, as at a dead centre.
+        UnknownNameError
+            Nothing of a name that is held.
 
         Examples
         --------
@@ -191,19 +196,67 @@ class Constrained:
         >>> q, v = dyn.project([0.5, -0.2, -0.1], [1.0, 0.0, 0.0])
         >>> bool(abs(dyn.constraint_residual(q)).max() < 1e-14)
         True
+        >>> q, v = dyn.project([0.5, -0.2, -0.1], [1.0, 0.0, 0.0], hold=[dyn.model.coordinate_names[0]])
+        >>> float(q[0]), float(v[0])
+        (0.5, 1.0)
         """
         model = self.model
         q, v = model.check_q(q), model.check_v(v)
         batch_of(q=q, v=v)
-        if not model.constrained:
-            return q, v
         states = self._states_held
+        if not model.constrained:
+            states.held_parts(model, hold)
+            return q, v
         lead = np.broadcast_shapes(q.shape[:-1], v.shape[:-1])
         q, v = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in (q, v))
         if not lead:
-            return states.projected(self, q, v)  # type: ignore[no-any-return]  # by name
-        pairs = [states.projected(self, *pair) for pair in zip(q, v, strict=True)]
+            return states.projected(self, q, v, hold)  # type: ignore[no-any-return]  # by name
+        pairs = [states.projected(self, *pair, hold) for pair in zip(q, v, strict=True)]
         return np.array([x for x, _ in pairs]).reshape(q.shape), np.array([x for _, x in pairs]).reshape(v.shape)
+
+    def project_acceleration(self, q: ArrayLike, v: ArrayLike, a: ArrayLike, hold: Sequence[str] = ()) -> Array:
+        """Return the nearest acceleration that the constraints allow, J a + γ = 0, in the metric of the mass matrix.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        v, a : (nv,) or (N, nv) array_like
+            A consistent state, and any acceleration.
+        hold : sequence of str, optional
+            Names of coordinates or joints that keep their numbers in a, to the bit; the others follow.
+
+        Returns
+        -------
+        (nv,) or (N, nv) array
+
+        Raises
+        ------
+        InputError
+            What is held breaks the constraints.
+
+        Examples
+        --------
+        The crank turns at a constant speed:
+
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.slider_crank(), "lagrangian")
+        >>> crank = dyn.model.joint_names[:1]
+        >>> q, v = dyn.project([0.5, -0.2, -0.1], [1.0, 0.0, 0.0], hold=crank)
+        >>> a = dyn.project_acceleration(q, v, [0.0, 0.0, 0.0], hold=crank)
+        >>> float(a[0]), bool(abs(dyn.constraint_jacobian(q) @ a + dyn.constraint_bias(q, v)).max() < 1e-14)
+        (0.0, True)
+        """
+        model, states = self.model, self._states_held
+        q, v, a = model.check_q(q), model.check_v(v), model.check_v(a, "a")
+        batch_of(q=q, v=v, a=a)
+        if not model.constrained:
+            states.held_parts(model, hold)
+            return a
+        lead = np.broadcast_shapes(q.shape[:-1], v.shape[:-1], a.shape[:-1])
+        q, v, a = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in (q, v, a))
+        if not lead:
+            return states.accelerated(self, q, v, a, hold)  # type: ignore[no-any-return]  # by name
+        return np.array([states.accelerated(self, *one, hold) for one in zip(q, v, a, strict=True)]).reshape(a.shape)
 
     def _pulled(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the consistent states near the ends of a step."""

@@ -7,7 +7,7 @@ pose: a set may have full rank on one branch of a mechanism only (a row of equal
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
@@ -22,7 +22,7 @@ from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.manifold import random_state
 
@@ -273,40 +273,78 @@ class Manifold:
     def _pulled_at_pose(self, q: Array, v: Array) -> tuple[Array, Array]:
         for _ in range(2):
             x = self._terms(q, v)
-            q = self.dyn.model.integrate(q, _least_change(x.W, x.J / x.scale[:, None], -x.f / x.scale, AT_POSE))
+            scale = x.scale[: len(x.f)]
+            q = self.dyn.model.integrate(q, _least_change(x.V, x.held / scale[:, None], -x.f / scale, AT_POSE))
         x = self._terms(q, v)
         return q, v + _least_change(x.W, x.J / x.scale[:, None], -x.rate / x.scale, AT_POSE)
 
-    def project(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the nearest consistent state, in the metric of the mass matrix there; InputError if there is none."""
-        x = self.restored(q, v)
-        M, n, model = self._terms(q, v).M, len(v), self.dyn.model
+    def project(self, q: Array, v: Array, held: Collection[int] = ()) -> tuple[Array, Array]:
+        """Return the nearest consistent state, in the metric of the mass matrix there; InputError if there is none.
+
+        The velocities `held`, and what they move, stay as they are.
+        """
+        free = self._free(held)
+        x = self.restored(q, v, held)
+        M, model = self._terms(q, v).M[np.ix_(free, free)], self.dyn.model
         # Stationary: M (x - q) + Jᵀ μ = 0 with f(x) = 0.
-        last = np.inf
+        last, step = np.inf, np.zeros(model.nv)
         for _ in range(_MOST):
             terms = self._terms(x, v)
-            f, J = terms.f, terms.held
+            f, J = terms.f, terms.held[:, free]
             K = np.block([[M, J.T], [J, np.zeros((len(J), len(J)))]])
-            away = np.concatenate([M @ model.difference(x, q), -f])
-            step = np.linalg.lstsq(K, away, rcond=1e-14)[0][:n]
+            away = np.concatenate([M @ model.difference(x, q)[free], -f])
+            step[free] = np.linalg.lstsq(K, away, rcond=1e-14)[0][: len(free)]
             size = float(np.linalg.norm(step))
             if size <= 1e-12 * (1 + float(np.linalg.norm(x))):
                 break
             # Where the constraints bend strongly, whole steps go to and fro about the foot.
-            x = self.restored(model.integrate(x, step if size < last else 0.5 * step), v)
+            x = self.restored(model.integrate(x, step if size < last else 0.5 * step), v, held)
             last = min(last, size)
         terms = self._terms(x, v)
-        return x, v + _least_change(terms.W, terms.J, -terms.rate)
+        return x, v + _least_change(terms.W, terms.J, -terms.rate, free=free)
 
-    def restored(self, q: Array, v: Array) -> Array:
+    def acceleration(self, q: Array, v: Array, a: Array, held: Collection[int] = ()) -> Array:
+        """Return the nearest a with J a + γ = 0, in the metric of the mass matrix."""
+        free = self._free(held)
+        J, _, gamma, *_ = self.call("embedded", q, v)
+        W = self._terms(q, v).W
+        # Once more for what rounding leaves of large accelerations.
+        for _ in range(2):
+            a = a + _least_change(W, J, -gamma[:, 0] - J @ a, free=free)
+        return a
+
+    def _free(self, held: Collection[int]) -> Array:
+        return np.setdiff1d(np.arange(self.dyn.model.nv), [*held]).astype(int)
+
+    def require_followed(self, q: Array, v: Array, held: Collection[int], names: str) -> None:
+        """Refuse held coordinates that break the constraints at a state, or leave the others undetermined there."""
+        model, terms = self.dyn.model, self._terms(q, v)
+        for what, left, x in (("f", terms.f, q), ("J v + ∂f/∂t", terms.rate, v)):
+            most = _CONSISTENT * terms.scale[: len(left)] * max(1.0, float(np.abs(x).max(initial=0.0)))
+            if len(bad := np.flatnonzero(~(np.abs(left) <= most))):
+                raise InputError(
+                    f"hold: {names} held, the constraints of {model.name} cannot be met: {what} = "
+                    f"{_residuals(left[bad])} is left of {_named(bad, self)}; hold fewer coordinates, or other values"
+                )
+        J = terms.J / np.linalg.norm(terms.J, axis=1, keepdims=True)
+        J = J[:, self._free(held)]
+        moving = np.flatnonzero(np.linalg.norm(J, axis=1) > _DEPENDENT)
+        if len(moving) and len(dependent := _dependent(J[moving])[0]):
+            raise InputError(
+                f"hold: {names} held, the other coordinates of {model.name} are not determined at this pose: "
+                f"{_named(moving[dependent], self)} depends on other rows; hold other coordinates"
+            )
+
+    def restored(self, q: Array, v: Array, held: Collection[int] = ()) -> Array:
         """Return a configuration with f = 0, by steps that are the least in the mass matrix's metric."""
+        free = self._free(held)
         x, terms = q, self._terms(q, v)
         scale = terms.scale[: len(terms.f)]
         best = float(np.linalg.norm(terms.f / scale))
         for _ in range(_MOST):
             if best <= 4 * _EPS * (1 + float(np.abs(x).max())):
                 break
-            step, length = _least_change(terms.V, terms.held, -terms.f), 1.0
+            step, length = _least_change(terms.V, terms.held, -terms.f, free=free), 1.0
             while length > 1e-6:
                 moved = self.dyn.model.integrate(x, length * step)
                 beyond = self._terms(moved, v)
@@ -407,8 +445,15 @@ def states_of(model: Model) -> ConsistentStates:
     return states
 
 
-def _least_change(W: Array, J: Array, change: Array, rounding: float = 1e-12) -> Array:
-    """Return the x with J x = change that is the least in xᵀ W x; the nearest to it where J has dependent rows."""
+def _least_change(W: Array, J: Array, change: Array, rounding: float = 1e-12, *, free: Array | None = None) -> Array:
+    """Return the x with J x = change that is the least in xᵀ W x; the nearest to it where J has dependent rows.
+
+    Only entries that are `free` are other than zero.
+    """
+    if free is not None and len(free) < len(W):
+        out = np.zeros(len(W))
+        out[free] = _least_change(W[np.ix_(free, free)], J[:, free], change, rounding)
+        return out
     try:
         L = np.linalg.cholesky(W)
     except np.linalg.LinAlgError:
@@ -423,16 +468,66 @@ def pulled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
     return manifold_of(dyn).at(t).pulled(q, v)
 
 
-def projected(dyn: Dynamics, q: Array, v: Array) -> tuple[Array, Array]:
+def projected(dyn: Dynamics, q: Array, v: Array, hold: Sequence[str] = ()) -> tuple[Array, Array]:
     """Return the nearest consistent state; an `InputError` where there is none or the constraints are redundant."""
-    manifold = manifold_of(dyn)
+    manifold, (coordinates, held) = manifold_of(dyn), held_parts(dyn.model, hold)
+    names = ", ".join(hold)
     try:
-        state = manifold.project(q, v)
-    except InputError:
+        state = manifold.project(q, v, held)
+    except InputError as error:
         refuse_unreachable(manifold.dyn, q)
-        raise
+        if not held:
+            raise
+        raise InputError(
+            f"hold: with {names} held, {str(error).removeprefix('q: ')}; hold fewer coordinates, or other values"
+        ) from None
+    if held:
+        # The exponential of zero rounds a quaternion.
+        state = state[0].copy(), state[1]
+        state[0][coordinates] = q[coordinates]
+        manifold.require_followed(*state, held, names)
     require_independent(manifold.dyn, state[0], everywhere=True)
     return state
+
+
+def accelerated(dyn: Dynamics, q: Array, v: Array, a: Array, hold: Sequence[str] = ()) -> Array:
+    """Return the nearest consistent acceleration; an `InputError` where what is held breaks the constraints."""
+    manifold, (_, held) = manifold_of(dyn), held_parts(dyn.model, hold)
+    out = manifold.acceleration(q, v, a, held)
+    J, _, gamma, *_ = manifold.call("embedded", q, v)
+    left = J @ out + gamma[:, 0]
+    most = _CONSISTENT * np.maximum(np.abs(J).sum(axis=1), 1.0) * max(1.0, float(np.abs(out).max(initial=0.0)))
+    if len(bad := np.flatnonzero(~(np.abs(left) <= most))):
+        raise InputError(
+            f"hold: {', '.join(hold) or 'nothing'} held, J a + γ = 0 of {dyn.model.name} cannot be met: "
+            f"{_residuals(left[bad])} is left of {_named(bad, manifold)}; hold fewer coordinates, or other values"
+        )
+    return out
+
+
+def held_parts(model: Model, hold: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Return the entries of q and of v of coordinates and joints by name."""
+    if isinstance(hold, str) or not isinstance(hold, Sequence) or not all(isinstance(x, str) for x in hold):
+        raise InputError(f"hold: expected a list of names of coordinates or joints, got {hold!r}")
+    coordinates: set[int] = set()
+    velocities: set[int] = set()
+    for name in hold:
+        if name in model.joint_names:
+            coordinates |= {*range(model.nq)[model.layout.q[name]]}
+            velocities |= {*range(model.nv)[model.layout.v[name]]}
+            continue
+        if name not in model.coordinate_names:
+            raise UnknownNameError("coordinate", name, (*model.coordinate_names, *model.joint_names))
+        k = model.coordinate_names.index(name)
+        joint = next(j for j in model.independent_joints if k in range(model.nq)[model.layout.q[j.name]])
+        if not joint.type.coordinate_velocities:
+            raise InputError(
+                f"hold: {name!r} is a coordinate of {joint.name!r}, whose velocities are not the rates of its "
+                f"coordinates; hold the joint {joint.name!r}"
+            )
+        coordinates.add(k)
+        velocities.add(model.layout.v[joint.name].start + k - model.layout.q[joint.name].start)
+    return sorted(coordinates), sorted(velocities)
 
 
 def names_of(dyn: Dynamics, *, moving: bool = False) -> tuple[str, ...]:
