@@ -100,8 +100,8 @@ def _model(name: str, options: dict[str, Any]) -> Model:
     from mbkit.studies._targets import model_of
 
     model = catalog.systems()[name]() if name in catalog.systems() and not options else None
-    if name in systems.names() and not options and (model is None or model.quaternions or model.loops):
-        if model is not None and model.loops:
+    if name in systems.names() and not options and (model is None or model.quaternions or model.needs.loops):
+        if model is not None and model.needs.loops:
             other = f"the catalog's has bodies and a loop, and mbkit derive mbkit.catalog:{name} takes that one"
             say("note", f"{name} is in independent coordinates here; {other}")
         elif model is not None:

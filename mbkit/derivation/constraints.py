@@ -238,6 +238,10 @@ def _every_row(kin: Kinematics, time: Any) -> Iterator[_Row]:
         names, rows = LOOP_ROWS[loop.kind]
         for name, row in zip(names, rows(_ends(kin, loop)), strict=True):
             yield _Row(loop.name, f"loop {loop.name!r} {name}", row)
+    for coupler in model.couplers:
+        (at,), (leading,) = (kin.coordinates(model.joint(name)) for name in (coupler.joint, coupler.leader))
+        ratio = kin.values.couplers[coupler.name]
+        yield _Row(coupler.name, f"coupler {coupler.name!r}", at - (ratio.ratio * leading + ratio.offset))
     for motion in model.prescribed:
         (at,) = kin.coordinates(model.joint(motion.joint))
         numbers = casadi_arithmetic(kin.values.number)

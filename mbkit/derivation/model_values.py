@@ -107,6 +107,7 @@ _LOOP: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "l
 _FORCE: Final = ("numbers",)
 _BUSHING: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "stiffness", "damping", "numbers")
 _NO_SLIP: Final = ("translation_a", "axis_a", "translation_b", "axis_b", "radius", "speed")
+_COUPLER: Final = ("ratio", "offset")
 # A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum of literal masses could be divided
 # by, and its quotient be rounded to double.
 _DIRECTIONS: Final = frozenset({"rotation", "axes", "rotation_a", "rotation_b", "axis_a", "axis_b", "tangents"})
@@ -133,7 +134,7 @@ class Values:
     Attributes
     ----------
     gravity : list of 3 scalars
-    bodies, joints, springs, couplings, loops, no_slip, prescribed, forces : dict of str to SimpleNamespace
+    bodies, joints, springs, couplings, loops, couplers, no_slip, prescribed, forces : dict of str to SimpleNamespace
         By name; motions by that of their joint. A joint that mimics has `ratio` and `offset` too.
     named : dict of str to casadi.SX
         The parameters' symbols.
@@ -179,6 +180,7 @@ class Values:
             for f in model.forces
         }
         self.no_slip = {x.name: self._contact(x) for x in model.no_slip}
+        self.couplers = {x.name: self._read("couplers", x.name, x, _COUPLER) for x in model.couplers}
         self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}
 
     @property

@@ -1,6 +1,9 @@
 """The engines: one adapter each behind the protocol `Dynamics`, imported when it is first asked for."""
 
 from mbkit.engines.base import QUANTITIES, Dynamics
+from mbkit.engines.closed_loops.actuation import ActuatorForces
+from mbkit.engines.closed_loops.loop_loads import UndeterminedLoads
+from mbkit.engines.closed_loops.reduced_inertia import ReducedInertia
 from mbkit.engines.linearization import DiscreteLinearization, InverseDynamicsSecondDerivatives, Linearization
 from mbkit.engines.registry import ENGINES, EngineInfo, dynamics, register_engine
 from mbkit.engines.versions.engine_version import EngineVersion, engine
@@ -8,12 +11,15 @@ from mbkit.engines.versions.engine_version import EngineVersion, engine
 __all__ = [
     "ENGINES",
     "QUANTITIES",
+    "ActuatorForces",
     "DiscreteLinearization",
     "Dynamics",
     "EngineInfo",
     "EngineVersion",
     "InverseDynamicsSecondDerivatives",
     "Linearization",
+    "ReducedInertia",
+    "UndeterminedLoads",
     "dynamics",
     "engine",
     "register_engine",

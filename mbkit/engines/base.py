@@ -78,6 +78,7 @@ def require_tree(model: Model, user: str, why: str = "it takes the tree alone") 
     """Raise `UnsupportedError` for a model with constraints, in the name of an engine or study."""
     texts = {
         "loops": "loop closures",
+        "couplers": "couplers",
         "prescribed": "motions prescribed in time",
         "no_slip": "blades or rolling contacts, which hold velocities",
     }

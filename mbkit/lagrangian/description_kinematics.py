@@ -19,9 +19,10 @@ from mbkit.errors import InputError
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 from mbkit.lagrangian.trig.shortest_form import number, shortest_form
 from mbkit.model import Joint, Model
+from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.joint_types import cross3
-from mbkit.model.parts import Loop, PointSpring, Prescribed
+from mbkit.model.parts import Coupler, Loop, PointSpring, Prescribed
 
 Vector = list[Any]
 #: The joints from a body down to one that carries it.
@@ -32,7 +33,7 @@ _DUST: Final = Fraction(1, 10**15)
 
 def instead_of_writing(model: Model) -> str:
     """Return the advice of a message for a model that is too large to be written out."""
-    features = [f for f in ("loops", "prescribed", "no_slip") if getattr(model, f)]
+    features = [f for f in CONSTRAINT_FEATURES if getattr(model, f)]
     if not features:
         return 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
     names = ", ".join(map(repr, features))
@@ -264,6 +265,14 @@ def motion(kin: SymbolicKinematics, prescribed: Prescribed, t: sp.Symbol) -> sp.
     turns = bool(kin.model.joint(prescribed.joint).type.angular)
     offset = _read(x.offset) if turns else x.offset
     return offset + x.rate * t + x.amplitude * sp.sin(x.frequency * t + _read(x.phase))
+
+
+def coupled(kin: SymbolicKinematics, coupler: Coupler) -> sp.Expr:
+    """Return q - ratio leader - offset."""
+    x = kin.written.values.couplers[coupler.name]
+    (at,), (leading,) = (kin.symbols_of[name] for name in (coupler.joint, coupler.leader))
+    offset = _read(x.offset) if kin.model.joint(coupler.joint).type.angular and x.offset else x.offset
+    return at - x.ratio * leading - offset
 
 
 def angle(x: float) -> sp.Expr:

@@ -10,7 +10,7 @@ import sympy as sp
 
 from mbkit.derivation.kinematics import dissipation, spring_energy
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.lagrangian.description_kinematics import SymbolicKinematics, closure, instead_of_writing
+from mbkit.lagrangian.description_kinematics import SymbolicKinematics, closure, coupled, instead_of_writing
 from mbkit.lagrangian.elements import acting, law
 from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.energy_model import EnergyModel
@@ -111,6 +111,7 @@ def from_model(
     t = _time({*parameters, *(s.name for s in (*q, *v))})
     moved = {model.coordinate_names.index(p.joint): law(kin, p, t) for p in model.prescribed}
     rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]
+    rows += [(x.name, coupled(kin, x)) for x in model.couplers]
     if drives:
         rows += [(model.coordinate_names[i], q[i] - x) for i, x in moved.items()]
         moved = {}

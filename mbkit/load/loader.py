@@ -83,7 +83,7 @@ def load(
         Whether the base link moves freely, on a joint named ``"root_joint"``.
     mimic : {"reduce", "free"}
         What a URDF's mimic joints become: functions of the joints they follow, without coordinates of their own, or
-        independent joints. An MJCF's equalities of joints are left out, and noted.
+        independent joints. An MJCF's equalities of joints are couplers, with the loops.
     nonphysical : {"error", "warn"}, optional
         What to do about inconsistent inertias: refuse them, or use them as written with a warning. By default robots
         by name warn, and files are refused. A negative mass is always refused.
@@ -93,10 +93,11 @@ def load(
         Whether an MJCF's meshes are read where a body has no other inertia, which MuJoCo's compiler then infers; with
         "never" such bodies are refused.
     loops : bool, path or sequence of Loop or dict
-        Whether an MJCF's active <connect> and <weld> elements become loops, which hold exactly; without, they are left
-        out and noted, as those of joints and tendons are. Or loops beside those of the file: dicts with the arguments
-        of `ModelBuilder.add_loop`, `Loop` objects, or a TOML file with a table ``[[loop]]`` of these arguments for
-        each. A URDF has no loops of its own. Their bodies may be frames too, such as links that were merged.
+        Whether an MJCF's active <connect> and <weld> elements become loops, and those of two joints with a linear
+        polynomial couplers, which hold exactly; without, they are left out and noted, as others always are. Or loops
+        beside those of the file: dicts with the arguments of `ModelBuilder.add_loop`, `Loop` objects, or a TOML file
+        with a table ``[[loop]]`` of these arguments for each. A URDF has no loops of its own. Their bodies may be
+        frames too, such as links that were merged.
 
     Returns
     -------

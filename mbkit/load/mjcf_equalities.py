@@ -1,6 +1,7 @@
 """Equality constraints of an MJCF as loops (XML reference of MuJoCo 4.0, section "equality").
 
-A <connect> becomes a loop of two points, a <weld> one of two frames, both exact where MuJoCo's are soft. What an
+A <connect> becomes a loop of two points, a <weld> one of two frames, and a <joint> whose polynomial is linear a coupler
+of two joints, all exact where MuJoCo's are soft. What an
 element with bodies does not say is measured in the reference configuration, the pose of the file: the second anchor of
 a <connect>, and the relative pose of a <weld>.
 """
@@ -25,6 +26,7 @@ from mbkit.model.validation import listing
 _KINDS: Final = {"connect": "point", "weld": "frame"}
 #: How soft MuJoCo holds an element: nothing of it is left in an exact loop.
 _SOFT: Final = ("solref", "solimp", "torquescale")
+_JOINT: Final = "joint"
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class Equalities:
         self._left_out: list[str] = []
         self._soft: list[str] = []
         self._loops: dict[str, tuple[str, _End, _End]] = {}
+        #: Joint, leader, ratio and offset.
+        self._couplers: dict[str, tuple[str, str, float, float]] = {}
         elements = [(e, element_label(e, k)) for k, e in self._numbered(mujoco)]
         if not elements:
             return
@@ -57,13 +61,17 @@ class Equalities:
         moved = {e.attributes.get("name") for e in mujoco.walk() if e.attributes.get("mocap") == "true"}
         for element, label in elements:
             full = replace(scene.defaults.filled(replace(element, tag="equality"), None), tag=element.tag)
-            why = "" if element.tag in _KINDS else "no loop"
+            why = "" if element.tag in (*_KINDS, _JOINT) else "no loop"
             if off := disabled & {"equality", "constraint"}:
                 why = f"option flag {sorted(off)[0]} is off"
             elif full.attributes.get("active") == "false":
                 why = "it is inactive"
             elif not wanted and not why:
                 why = "loops=False"
+            if not why and element.tag == _JOINT:
+                why = self._couple(full, f"equality {label}")
+                if not why:
+                    continue
             ends = None if why else self._ends(full, f"equality {label}")
             if ends is not None:
                 a, b = (end.body for end in ends)
@@ -79,6 +87,28 @@ class Equalities:
                     continue
             if why:
                 self._left_out.append(f"{label} ({bound_parts(element)}){'' if why == 'no loop' else f': {why}'}")
+
+    def _couple(self, element: Element, item: str) -> str:
+        """Take an equality of two joints, or return why it is left out."""
+        scalars = {j.name: j for body in self._scene.bodies for j in body.joints if j.scalar}
+        first, second = (element.attributes.get(key, "") for key in ("joint1", "joint2"))
+        if not second:
+            return "it holds a single joint"
+        for key, name in (("joint1", first), ("joint2", second)):
+            if name not in scalars:
+                self._read.fault(f"{item}: {key} {name!r} is no hinge or slide of the file", element)
+                return "a joint is missing"
+        shape = self._read.numbers(element, "polycoef", item, count=5, default=(0.0, 1.0, 0.0, 0.0, 0.0))
+        constant, ratio, *higher = shape
+        if any(higher):
+            return f"its polynomial {' '.join(f'{x:g}' for x in shape)} is not linear"
+        follower, leader = scalars[first], scalars[second]
+        if follower is leader:
+            return "it holds a joint against itself"
+        name = unused(element.attributes.get("name") or f"joint{len(self._couplers) + 1}", self._couplers)
+        # MuJoCo's polynomial is of the coordinates less those of the pose of the file.
+        self._couplers[name] = first, second, ratio, follower.ref + constant - ratio * leader.ref
+        return ""
 
     @staticmethod
     def _numbered(mujoco: Element) -> Iterable[tuple[int, Element]]:
@@ -135,6 +165,11 @@ class Equalities:
                 sides[f"translation_{side}"] = end.pose.p - self._anchors[end.body]
                 sides[f"rotation_{side}"] = snap(end.pose.R) if kind == "frame" else None
             b.add_loop(name, kind, **sides)  # type: ignore[arg-type]  # of the kinds
+        for name, (joint, leader, ratio, offset) in self._couplers.items():
+            b.add_coupler(name, joint, leader, ratio=ratio, offset=offset)
+        if self._couplers:
+            held = listing([repr(x) for x in self._couplers], 6)
+            b.note(f"couplers of joints, held exactly where MuJoCo's are soft: {held}")
         if self._loops:
             b.note(f"loops, held exactly where MuJoCo's are soft: {listing([repr(x) for x in self._loops], 6)}")
         if self._soft:

@@ -6,12 +6,13 @@ from mbkit.model.description import Needs
 from mbkit.model.joint_types import KINDS, JointKind, JointType, kind_of, register_joint_type
 from mbkit.model.model import Model
 from mbkit.model.parameters import Expression, Number, Parameter, known, nominal
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring, Prescribed
+from mbkit.model.parts import Body, Coupler, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring, Prescribed
 
 __all__ = [
     "KINDS",
     "BaseParameters",
     "Body",
+    "Coupler",
     "Expression",
     "Frame",
     "Joint",

@@ -19,7 +19,7 @@ from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.loops import LOOP_KINDS, LoopKind
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring
+from mbkit.model.parts import Body, Coupler, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring
 from mbkit.model.rolling import ROLLING_KINDS, RollingKind
 from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
@@ -200,7 +200,7 @@ class ArgumentReader:
 
 #: How the fields of parts are read.
 _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
-    **dict.fromkeys(("parent", "child", "body", "body_a", "body_b"), ArgumentReader.name),
+    **dict.fromkeys(("parent", "child", "body", "body_a", "body_b", "joint", "leader"), ArgumentReader.name),
     **dict.fromkeys(
         ("com", "translation", "point_a", "point_b", "translation_a", "translation_b"), ArgumentReader.place
     ),
@@ -210,7 +210,7 @@ _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
         ("mass", "pitch", "stiffness", "rest_length", "damping", "armature", "length", "radius", "speed"),
         ArgumentReader.quantity,
     ),
-    **dict.fromkeys(("offset", "rate", "amplitude", "frequency", "phase"), ArgumentReader.quantity),
+    **dict.fromkeys(("ratio", "offset", "rate", "amplitude", "frequency", "phase"), ArgumentReader.quantity),
     "inertia": ArgumentReader.inertia,
     "joints": lambda read, name, value: tuple(read.name(name, x) for x in value),
     "factors": lambda read, name, value: read.quantities(name, value, len(value)),
@@ -237,7 +237,7 @@ def shape_of(value: Any) -> tuple[int, ...] | None:
 
 #: Kinds of parts, as a description names them.
 _OF_TREES: Final = ("bodies", "joints", "frames")
-_CONNECTING: Final = ("springs", "couplings", "loops", "prescribed", "forces", "no_slip")
+_CONNECTING: Final = ("springs", "couplings", "loops", "couplers", "prescribed", "forces", "no_slip")
 
 
 class ModelBuilder(ElementBuilder):
@@ -271,17 +271,7 @@ class ModelBuilder(ElementBuilder):
         self._gravity = self._numbers("gravity", "", gravity=self._read.quantities("gravity", gravity, 3))["gravity"]
         self._parts: dict[str, list[Any]] = {
             kind: []
-            for kind in [
-                "bodies",
-                "joints",
-                "frames",
-                "springs",
-                "couplings",
-                "loops",
-                "prescribed",
-                "forces",
-                "no_slip",
-            ]
+            kind: [] for kind in (*_OF_TREES, *_CONNECTING)
         }
         self._notes: list[str] = []
 
@@ -496,6 +486,24 @@ class ModelBuilder(ElementBuilder):
         a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
         self._add(Loop, "loops", "loop", name, a | b | {"length": length}, {"kind": kind})
+
+    def add_coupler(self, name: str, joint: str, leader: str, *, ratio: Number = 1.0, offset: Number = 0.0) -> None:
+        """Hold the coordinates of two joints in a fixed ratio, q = ratio * leader + offset, by a constraint.
+
+        A pair of gears, a belt, or a screw. Each joint keeps its coordinate; the multiplier is the torque on `joint`,
+        between its parent and child, and -ratio times it acts in `leader`. A mimic joint has no coordinate, and is the
+        cheaper one where nothing else closes on it.
+
+        Parameters
+        ----------
+        name : str
+        joint, leader : str
+            Two joints of one velocity each.
+        ratio, offset : float
+            As rad or m of `joint` for rad or m of `leader`.
+        """
+        values = {"joint": joint, "leader": leader, "ratio": ratio, "offset": offset}
+        self._add(Coupler, "couplers", "coupler", name, values)
 
     def add_blade(
         self,

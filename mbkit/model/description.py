@@ -19,10 +19,10 @@ from mbkit.model.elements.forces import Bushing, Force, drives, lost, needs_time
 from mbkit.model.elements.motion_laws import Motion, beyond, interval
 from mbkit.model.joint_types import KINDS
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, NoSlip, PointSpring, read_only
+from mbkit.model.parts import Body, Coupler, Frame, Joint, JointCoupling, Loop, NoSlip, PointSpring, read_only
 
 #: Attributes of a description that bind its coordinates or velocities to each other.
-CONSTRAINT_FEATURES: Final = ("loops", "prescribed", "no_slip")
+CONSTRAINT_FEATURES: Final = ("loops", "couplers", "prescribed", "no_slip")
 
 
 def _plain(value: Any) -> Any:
@@ -78,6 +78,7 @@ class Needs:
         no_slip: Iterable[NoSlip] = (),
         bound: Iterable[str] = (),
         forces: Iterable[Force] = (),
+        couplers: Iterable[Coupler] = (),
     ) -> Needs:
         """Read the flags off the parts of a description.
 
@@ -98,7 +99,7 @@ class Needs:
             limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
             effort_limits=any(np.any(np.isfinite([j.effort_limit, j.velocity_limit])) for j in joints),
             mimic=any(j.mimic is not None for j in joints),
-            loops=bool(tuple(loops)),
+            loops=bool((*loops, *couplers)),
             quaternions=any(j.type.quaternion is not None for j in joints),
             time=bool(tuple(prescribed)) or any(f.of_time for f in forces),
             forces=bool(forces),
@@ -201,6 +202,12 @@ class Layout:
             row[self.full_v[joint]] += factor
         return row
 
+    def coupler_row(self, coupler: Coupler) -> Array:
+        """Return the Jacobian of a coupler's constraint on the full velocities, shape (full nv,)."""
+        row = np.zeros(self.sizes[3])
+        row[self.full_v[coupler.joint]], row[self.full_v[coupler.leader]] = 1.0, -coupler.ratio
+        return row
+
     def expand_q(self, q: Array) -> Array:
         """Return the full coordinates, mimic joints included."""
         return np.asarray(q @ self.G_q.T + self.offsets) if self.reduced else q
@@ -227,6 +234,7 @@ class Description:
     couplings : tuple of JointCoupling
     loops : tuple of Loop
     prescribed : tuple of Prescribed, FormulaMotion or SplineMotion
+    couplers : tuple of Coupler
     no_slip : tuple of NoSlip
         Blades, and discs and spheres that roll.
     notes : tuple of str
@@ -259,6 +267,7 @@ class Description:
     bindings: tuple[Binding, ...] = ()
     source: str = ""
     time: float = 0.0
+    couplers: tuple[Coupler, ...] = ()
     forces: tuple[Force, ...] = ()
     no_slip: tuple[NoSlip, ...] = ()
     layout: Layout = field(init=False, repr=False)
@@ -363,7 +372,9 @@ class Description:
         """What this description needs from an engine."""
         bound = (b.field for b in self.bindings)
         held = self.loops, self.prescribed, self.no_slip
-        return Needs.of(self.gravity, self.joints, self.springs, self.couplings, *held, bound, self.forces)
+        return Needs.of(
+            self.gravity, self.joints, self.springs, self.couplings, *held, bound, self.forces, self.couplers
+        )
 
     @cached_property
     def digest(self) -> str:
@@ -371,7 +382,8 @@ class Description:
         names = ("name", "gravity", "bodies", "joints", "frames", "springs", "loops", "prescribed")
         parts = [getattr(self, name) for name in names]
         types = [KINDS[kind] for kind in sorted({j.kind for j in self.joints})]
-        more = (*self.couplings, *self.no_slip, *self.bindings, *(t.digest for t in types if not t.built_in))
+        own = (t.digest for t in types if not t.built_in)
+        more = (*self.couplings, *self.couplers, *self.no_slip, *self.bindings, *own)
         return digest(*parts, *more, *((type(f).__name__, f) for f in self.forces))
 
     @cached_property
@@ -472,7 +484,7 @@ class Description:
                 part, [(b.field, b.index, x) for b, x in bindings if (b.where, b.part) == (where, name)]
             )
 
-        kinds = ("bodies", "joints", "frames", "springs", "couplings", "loops", "prescribed", "forces", "no_slip")
+        kinds = ("bodies", "joints", "frames", "springs", "couplings", *CONSTRAINT_FEATURES, "forces")
         changes: dict[str, Any] = {kind: tuple(filled(kind, p, p.name) for p in getattr(self, kind)) for kind in kinds}
         expressions = tuple(replace(b, expression=x) for b, x in bindings if isinstance(x, Expression))
         out: Self = replace(filled("gravity", self, ""), **changes, bindings=expressions)

@@ -246,9 +246,9 @@ class Model(Description):
         Parameters
         ----------
         *features : str
-            Any of damping, springs, armature, friction, gravity, limits, loops, prescribed, forces, no_slip.
+            Any of damping, springs, armature, friction, gravity, limits, loops, couplers, prescribed, forces, no_slip.
             Springs and damping are those of joints, point-to-point elements and couplings, armature that of joints
-            and couplings; forces are those given by functions, with bushings.
+            and couplings; forces are those given by functions, with bushings. Couplers go with the loops.
         """
         model = self
         for feature in features:
@@ -299,8 +299,9 @@ class Model(Description):
 
     def _without(self, feature: str) -> Model:
         if feature in ("gravity", "forces", *CONSTRAINT_FEATURES):
-            empty: Any = {feature: np.zeros(3) if feature == "gravity" else ()}
-            return replace(self, bindings=tuple(b for b in self.bindings if b.where != feature), **empty)
+            gone = ("loops", "couplers") if feature == "loops" else (feature,)
+            empty: Any = {name: np.zeros(3) if name == "gravity" else () for name in gone}
+            return replace(self, bindings=tuple(b for b in self.bindings if b.where not in gone), **empty)
         if feature == "limits":
             return replace(self, joints=tuple(_unlimited(j) for j in self.joints))
         name = _PER_VELOCITY[feature]

@@ -267,6 +267,27 @@ class Loop(_Frozen):
 
 
 @dataclass(frozen=True, eq=False)
+class Coupler(_Frozen):
+    """A fixed ratio of two coordinates, as a constraint: q = ratio * leader + offset.
+
+    Both joints keep their coordinates. A joint that mimics has none of its own.
+
+    Attributes
+    ----------
+    name, joint, leader : str
+        The joints have one velocity each.
+    ratio, offset : float
+        As rad or m of `joint` for rad or m of `leader`.
+    """
+
+    name: str
+    joint: str
+    leader: str
+    ratio: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Prescribed(_Frozen):
     """A coordinate moved in time: offset + rate t + amplitude sin(frequency t + phase).
 

@@ -44,7 +44,7 @@ def structure_faults(description: Description) -> Iterator[str]:
     velocities = sum(j.type.nv for j in joints)
     if velocities > _MAX_VELOCITIES:
         yield f"{velocities} velocities; expected up to {_MAX_VELOCITIES}, because M has their square"
-    for what in ("bodies", "joints", "frames", "springs", "couplings", "loops", "no_slip"):
+    for what in ("bodies", "joints", "frames", "springs", "couplings", "loops", "couplers", "no_slip"):
         names = [p.name for p in getattr(description, what)]
         one = {"bodies": "body", "no_slip": "no slip"}.get(what, what[:-1])
         yield from repeated_names(one, names)
@@ -52,12 +52,12 @@ def structure_faults(description: Description) -> Iterator[str]:
             yield f"{one} 'world': that name is the ground's; choose another"
     known, suggestions = {b.name for b in bodies} | {"world"}, Suggestions()
 
-    def unknown(item: str, names: Iterable[str], known: Set[str] = known) -> Iterator[str]:
+    def unknown(item: str, names: Iterable[str], known: Set[str] = known, what: str = "body") -> Iterator[str]:
         for name in names:
             if name not in known:
                 near = suggestions.near(name, known)
                 few = f"; there are: {', '.join(sorted(known))}" if len(known) <= _MAX_NAMES else "; declare it"
-                yield f"{item}: unknown body {name!r}" + (f"; did you mean {near!r}?" if near else few)
+                yield f"{item}: unknown {what} {name!r}" + (f"; did you mean {near!r}?" if near else few)
 
     for joint in joints:
         yield from unknown(f"joint {joint.name!r}", (joint.parent, joint.child))
@@ -85,7 +85,15 @@ def structure_faults(description: Description) -> Iterator[str]:
         yield from _no_slip_faults(part)
     yield from _tree_faults(bodies, joints)
     yield from _mimic_faults(joints)
-    single = {j.name for j in joints if j.type.nv == 1 and not j.mimic}
+    single, sizes = {j.name for j in joints if j.type.nv == 1 and not j.mimic}, {j.name: j.type.nv for j in joints}
+    for coupler in description.couplers:
+        item = f"coupler {coupler.name!r}"
+        yield from unknown(item, (coupler.joint, coupler.leader), sizes.keys(), "joint")
+        for name in (coupler.joint, coupler.leader):
+            if name in sizes and name not in single:
+                yield f"{item}: expected joints of one velocity that mimic none, got {name!r}"
+        if coupler.joint == coupler.leader:
+            yield f"{item}: joint {coupler.joint!r} against itself; name two joints"
     for name, count in Counter(p.joint for p in description.prescribed).items():
         if name not in single:
             there = ", ".join(sorted(single)) or "none"
@@ -327,6 +335,7 @@ def idle_joints(model: Description) -> tuple[list[str], bool]:
         where = ", ".join(map(repr, wild[:20])) or "all joints together"
         raise InputError(f"{model.name}: the mass matrix overflows at {where}; give smaller masses and lengths")
     rows = [sample.held(loop) @ model.layout.G for loop in model.loops]
+    rows += [model.layout.coupler_row(coupler)[None] @ model.layout.G for coupler in model.couplers]
     if rows and (size := float(np.trace(M))):
         held = np.concatenate(rows)
         # M needs an inverse only for motions that the loops allow.

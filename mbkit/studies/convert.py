@@ -110,7 +110,7 @@ def _check_names(model: Model, to: str) -> None:
     """Raise for names that XML 1.0 cannot hold, not even escaped."""
     parts: Sequence[Any] = (
         *(*model.bodies, *model.joints, *model.frames),
-        *(*model.springs, *model.couplings, *model.loops, *model.no_slip),
+        *(*model.springs, *model.couplings, *model.loops, *model.couplers, *model.no_slip),
     )
     bad = [name for name in dict.fromkeys([model.name, *(p.name for p in parts)]) if not xml_holds(name)]
     if bad:
@@ -132,7 +132,7 @@ def _to_mjcf(model: Model) -> Converted:
     notes = []
     if model.layout.reduced:
         notes.append("mimic joints are free joints with equality constraints, which MuJoCo keeps softly")
-    if model.loops:
+    if model.needs.loops:
         notes.append("loops are equality constraints, which MuJoCo keeps softly")
     if model.needs.limits or model.needs.friction:
         notes.append("MuJoCo acts on joint limits and dry friction, softly, which mbkit's terms leave out")
@@ -147,7 +147,7 @@ def _to_mjcf(model: Model) -> Converted:
     at = states_of(model, _STATES, 0)
     back = read_back(model, text)
     values = evaluated(back, at)
-    if model.loops:
+    if model.needs.loops:
         own = dynamics(model, DERIVED, compile=False).constraint_residual(at.q)
         if not np.abs(back.constraint_residual(at.q) - own).max() < _TOLERANCE * max(1.0, np.abs(own).max()):
             raise MbkitError(f"convert: loops of {model.name} read back otherwise; please report this model")

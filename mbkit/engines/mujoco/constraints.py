@@ -39,6 +39,8 @@ _DEFAULT_SOLREF: Final = (0.02, 1.0)
 _DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
 #: MuJoCo's equality for each kind of loop that it holds.
 EQUALITIES: Final = {"point": mujoco.mjtEq.mjEQ_CONNECT, "frame": mujoco.mjtEq.mjEQ_WELD}
+#: And for couplers.
+OF_JOINTS: Final = mujoco.mjtEq.mjEQ_JOINT
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,7 @@ class ConstraintLaw:
     """What MuJoCo's documentation says of one state, by formulas of mbkit's own: `constraints.py` in this folder.
 
     Rows are MuJoCo's: of each loop the gap in world axes, and of a frame the imaginary part of the turn's quaternion.
+    Of each coupler it is the excess of its joint's coordinate.
 
     Attributes
     ----------
@@ -180,6 +183,9 @@ def law(
     for i in range(m.neq):
         own = np.flatnonzero(d.efc_id == i)
         impedance[own] = softness.impedance(float(np.linalg.norm(r[own])))
+        if m.eq_type[i] == OF_JOINTS:
+            estimate[own] = sum(m.dof_invweight0[m.jnt_dofadr[j]] for j in (m.eq_obj1id[i], m.eq_obj2id[i]))
+            continue
         weights = sum(m.body_invweight0[m.site_bodyid[s]] for s in (m.eq_obj1id[i], m.eq_obj2id[i]))
         estimate[own] = np.repeat(weights, 3)[: len(own)]
     R = np.maximum((1 - impedance) / impedance * estimate, _TINY)
@@ -195,7 +201,9 @@ def law(
 
 
 def _bias(m: Any, d: Any, i: int) -> Array:
-    """Return J̇ v of an equality's rows."""
+    """Return J̇ v of an equality's rows; a ratio of coordinates has none."""
+    if m.eq_type[i] == OF_JOINTS:
+        return np.zeros(1)
     (rate_a, a), (rate_b, b) = (_motion(m, d, s) for s in (m.eq_obj1id[i], m.eq_obj2id[i]))
     gap = a[:3] - b[:3]
     if m.eq_type[i] == EQUALITIES["point"]:
@@ -237,10 +245,16 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 class LoopRows:
-    """f, J and γ of the loops, in the axes of the body that carries both ends of each."""
+    """f, J and γ of the loops, in the axes of the body that carries both ends of each, and of couplers."""
 
     def __init__(self, m: Any, description: Model, bodies: Mapping[str, int]) -> None:
         self._m = m
+        #: Equalities of couplers: entries in qpos and qvel of both joints, and the polynomial's first coefficients.
+        self._couplers = [
+            (*(m.jnt_qposadr[j] for j in pair), *(m.jnt_dofadr[j] for j in pair), *m.eq_data[i, :2])
+            for i in np.flatnonzero(m.eq_type == OF_JOINTS)
+            for pair in [(m.eq_obj1id[i], m.eq_obj2id[i])]
+        ]
         self._loops: list[tuple[int, int, int, bool]] = []
         for k, loop in enumerate(description.loops):
             carrier = description.carrier(loop)
@@ -257,6 +271,10 @@ class LoopRows:
         for a, b, carrier, frame in self._loops:
             R, pairs = d.xmat[carrier].reshape(3, 3), self._values(d, a, b, frame)
             out += [R.T @ x for x in pairs]
+        out += [
+            np.array([d.qpos[at] - (ratio * d.qpos[leading] + offset)])
+            for at, leading, _, _, offset, ratio in self._couplers
+        ]
         return np.concatenate(out)
 
     @staticmethod
@@ -276,6 +294,10 @@ class LoopRows:
             changes = [va - vb, *([self._turn(d, a, b, wa, wb)] if frame else [])]
             for x, change in zip(self._values(d, a, b, frame), changes, strict=True):
                 out.append(R.T @ (change - _cross(wc, x[:, None])))
+        for _, _, at, leading, _, ratio in self._couplers:
+            row = np.zeros((1, self._m.nv))
+            row[0, at], row[0, leading] = 1.0, -ratio
+            out.append(row)
         return np.concatenate(out)
 
     @staticmethod
@@ -310,7 +332,7 @@ class LoopRows:
             for x, dx, ddx in zip(self._values(d, a, b, frame), rates, seconds, strict=True):
                 seen = ddx - 2 * np.cross(wc, dx) - np.cross(gc, x) + np.cross(wc, np.cross(wc, x))
                 out.append(R.T @ seen)
-        return np.concatenate(out)
+        return np.concatenate([*out, np.zeros(len(self._couplers))])
 
     def _columns(self, of: Any, d: Any, site: int) -> tuple[Array, Array]:
         return self._jacobian(of, d, d.site_xpos[site], self._m.site_bodyid[site])

@@ -95,7 +95,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         self._d = mujoco.MjData(self._m)
         # Model and data with the loops; all terms but the accelerations are those of the tree.
         self._closed = self._m, self._d
-        if self.model.loops:
+        if self.model.needs.loops:
             self._m = copy.copy(self._m)
             self._m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
             self._d = mujoco.MjData(self._m)
@@ -146,7 +146,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
     @cached_property
     def _kept(self) -> list[int]:
         """The rows that say something; an `InputError` for loops that never meet or that no joint moves."""
-        if not self.model.loops:
+        if not self.model.needs.loops:
             return []
         # The import loads CasADi.
         from mbkit.derivation.constraints import choose_rows
@@ -197,7 +197,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         >>> 0 < said.digits < 3
         True
         """
-        if not self.model.loops:
+        if not self.model.needs.loops:
             raise UnsupportedError(f"constraint_law: {self.model.name} has no loops")
         q, v, tau = self.model.check_q(q), self.model.check_v(v), self.model.check_v(tau, "tau")
         if q.ndim > 1 or v.ndim > 1 or tau.ndim > 1:
@@ -433,7 +433,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         if self._lines:
             self.passive(q0, v0)  # raises where a spring has no direction to start in
         model, _ = copy.copy(self.mj_model), self._kept
-        if self.model.loops and 0 < self.softness.solref[0] < 2 * dt:
+        if self.model.needs.loops and 0 < self.softness.solref[0] < 2 * dt:
             warn(
                 f"{self.model.name}: MuJoCo raises the time constant of its equalities from {self.softness.solref[0]:g}"
                 f" s to two steps, {2 * dt:g} s",

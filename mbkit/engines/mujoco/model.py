@@ -20,7 +20,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.base import STACKS, unknown_joint
 from mbkit.engines.imported import unused
-from mbkit.engines.mujoco.constraints import EQUALITIES, Softness
+from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, Softness
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.validation import static_bodies
@@ -102,7 +102,7 @@ def build(
 
     Raises `UnsupportedError` for a joint or a body that MuJoCo cannot hold, and names it.
     """
-    if description.loops and description.layout.reduced:
+    if description.needs.loops and description.layout.reduced:
         mimics = ", ".join(repr(j.name) for j in description.joints if j.mimic)
         raise UnsupportedError(
             f"mujoco: {description.name} has loops and mimic joints ({mimics}), which MuJoCo's own equations would "
@@ -215,7 +215,7 @@ _OFF_WITHOUT: Final = {
 
 
 def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
-    bits = {need: bit for need, bit in _OFF.items() if not (description.loops and bit in _FOR_LOOPS)}
+    bits = {need: bit for need, bit in _OFF.items() if not (description.needs.loops and bit in _FOR_LOOPS)}
     bits |= dict(pair for need, pair in _OFF_WITHOUT.items() if not getattr(description.needs, need))
     spec.option.disableflags = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}", 0)) for bit in bits.values())
     spec.option.gravity = np.array(description.gravity)
@@ -366,7 +366,12 @@ def _add_loops(spec: Any, description: Model, placed: Placed, softness: Softness
         equality = spec.add_equality(name=loop.name, type=EQUALITIES[loop.kind], objtype=mujoco.mjtObj.mjOBJ_SITE)
         equality.name1, equality.name2 = names
         equality.solref, equality.solimp = softness.solref, softness.solimp
-    if description.loops:
+    for coupler in description.couplers:
+        equality = spec.add_equality(name=coupler.name, type=OF_JOINTS, objtype=mujoco.mjtObj.mjOBJ_JOINT)
+        equality.name1, equality.name2 = placed.joints[coupler.joint][0], placed.joints[coupler.leader][0]
+        equality.data[:5] = [coupler.offset, coupler.ratio, 0.0, 0.0, 0.0]
+        equality.solref, equality.solimp = softness.solref, softness.solimp
+    if description.needs.loops:
         # Newton's solver ends at rounding: equalities alone are linear equations.
         spec.option.solver, spec.option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 0.0
         if softness.solref[0] > 0:

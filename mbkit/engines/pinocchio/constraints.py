@@ -1,9 +1,10 @@
 """Loops, prescribed motions and contacts without slip by Pinocchio. A part of `PinocchioDynamics`.
 
 `pinocchio.constraintDynamics` gives the accelerations where it can: every loop is a "point" or a "frame", no motion is
-prescribed, nothing rolls, as its constraints hold positions, no joint mimics another, no coupling has an armature, and
-no row is redundant but those of a plane that does not move. It factors J M⁻¹ Jᵀ + μ and iterates (Carpentier, Budhiraja
-and Mansard 2021, Proximal and sparse resolution of constrained dynamic equations). Elsewhere the equation
+prescribed, nothing rolls, as its constraints hold positions, no coupler holds two joints, no joint mimics another, no
+coupling has an armature, and no row is redundant but those of a plane that does not move. It factors J M⁻¹ Jᵀ + μ and
+iterates (Carpentier, Budhiraja and Mansard 2021, Proximal and sparse resolution of constrained dynamic equations).
+Elsewhere the equation
 
     M v̇ - Jᵀ λ = τ + τ_passive - h        J v̇ = -γ
 
@@ -307,10 +308,19 @@ class PinConstraints:
         return held, moving
 
     def all_rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
-        """Return the rows of loops, motions and contacts; `given` are q and v of the description."""
+        """Return the rows of loops, couplers, motions and contacts; `given` are q and v of the description."""
         loops = self.every(q, v)
         held, moving = self._contacts()
-        return Rows.stacked([loops, *self._motions(*given), *held, *moving])
+        return Rows.stacked([loops, *self._couplers(*given), *self._motions(*given), *held, *moving])
+
+    def _couplers(self, q: Array, v: Array) -> list[Rows]:
+        layout, out = self._model.layout, []
+        for x in self._model.couplers:
+            i, k = layout.full_q[x.joint].start, layout.full_q[x.leader].start
+            at = layout.G_q[[i, k]] @ q + layout.offsets[[i, k]]
+            to = layout.coupler_row(x) @ layout.G
+            out.append(_row(at[0] - (x.ratio * at[1] + x.offset), to, to @ v, 0.0))
+        return out
 
     def rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
         """Return the rows that say something."""
@@ -345,7 +355,8 @@ class PinConstraints:
     def solver(self) -> str:
         """What gives the accelerations: "constraintDynamics", or "LAPACK" from Pinocchio's terms."""
         model = self._model
-        foreign = model.prescribed or model.no_slip or any(x.kind not in _RIGID for x in model.loops)
+        foreign = model.prescribed or model.couplers or model.no_slip
+        foreign = foreign or any(x.kind not in _RIGID for x in model.loops)
         if foreign or model.layout.reduced or self._rotors:
             return "LAPACK"
         kept, independent = self.choice.kept, self.choice.independent
@@ -481,6 +492,7 @@ class PinConstraints:
         weights = np.linalg.svd(J.T)[2][-1]
         parts = [
             *(f"loop {x.name!r}" for x in self._model.loops for _ in range(LOOP_KINDS[x.kind])),
+            *(f"coupler {x.name!r}" for x in self._model.couplers),
             *(f"motion of {x.joint!r}" for x in self._model.prescribed),
             *(f"no slip {x.name!r}" for k in (0, 1) for x in self._model.no_slip for _ in NO_SLIP_ROWS[x.kind][k]),
         ]

@@ -68,6 +68,7 @@ def described(model: Model) -> Description:
         "springs": _parts(model.springs),
         "couplings": _parts(model.couplings),
         "loops": _parts(model.loops),
+        "couplers": _parts(model.couplers),
         "motions": {m.joint: _part(m, "joint") for m in model.prescribed},
         "forces": _parts(model.forces),
         "no_slip": _parts(model.no_slip),

@@ -140,6 +140,7 @@ def restricted(model: Model, joints: Collection[str]) -> Model:
         springs=tuple(s for s in model.springs if {s.body_a, s.body_b} <= here),
         couplings=tuple(trimmed_couplings(model, joints)),
         loops=tuple(x for x in model.loops if {x.body_a, x.body_b} <= here),
+        couplers=tuple(x for x in model.couplers if {x.joint, x.leader} <= set(joints)),
         prescribed=tuple(p for p in model.prescribed if p.joint in joints),
         no_slip=tuple(x for x in model.no_slip if {x.body_a, x.body_b} <= here),
         nonphysical=tuple(x for x in model.nonphysical if x[0] in bodies),
@@ -166,6 +167,7 @@ def part(model: Model, joints: Collection[str]) -> Model:
         joints=tuple(j if j.parent in bodies else replace(j, parent="world") for j in out.joints),
         couplings=tuple(c for c in model.couplings if set(c.joints) <= set(joints)),
         loops=(),
+        couplers=(),
         prescribed=(),
         no_slip=(),
     )

@@ -1,0 +1,576 @@
+"""Forces of actuators, loads of joints and loops, held coordinates, couplers, and the inertia that a crank feels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.errors import InputError, ModelError, NumericalError, UnknownNameError, UnsupportedError
+from tests.test_loop_dynamics import closed_tree, four_bar
+from validation.four_bar import COUPLER, CRANK, GRAVITY, GROUND, LINE, ROCKER, geometry
+
+OWN = {"compile": False}
+#: Engines with rigid loops.
+RIGID = ("lagrangian", "pinocchio")
+MECHANISMS = [name for name, make in mb.catalog.systems().items() if make().loops]
+#: Of engines to each other, in terms of the largest number.
+CLOSE = 1e-12
+
+
+def dynamics(model: mb.Model, engine: str) -> mb.Dynamics:
+    return mb.dynamics(model, engine, **(OWN if engine == "lagrangian" else {}))
+
+
+def off(x: np.ndarray, exact: np.ndarray) -> float:
+    return float(np.abs(x - exact).max() / np.abs(exact).max())
+
+
+def condition(model: mb.Model, dyn: mb.Dynamics, q: np.ndarray) -> float:
+    """Return the condition of J's independent rows, of unit size each."""
+    J = dyn.constraint_jacobian(q)
+    s = np.linalg.svd(J / np.linalg.norm(J, axis=1, keepdims=True), compute_uv=False)
+    return float(s[0] / s[model.nv - dyn.mobility().degrees_of_freedom - 1])
+
+
+@pytest.mark.parametrize("name", MECHANISMS)
+def test_engines_agree_and_every_body_is_in_balance(name: str) -> None:
+    model = mb.catalog.get(name)()
+    rng = np.random.default_rng(len(name))
+    oracle = dynamics(model, "oracle")
+    q, v = model.random_state(rng)
+    tau = rng.standard_normal(model.nv)
+    a = oracle.forward_dynamics(q, v, tau)
+    exact = oracle.joint_wrenches(q, v, None, tau=tau), oracle.loop_wrenches(q, v, tau)
+    least = oracle.actuator_forces(q, v, a)
+    # The inverse of forward dynamics, and no force makes the motion with a smaller norm than that which does.
+    assert np.linalg.norm(least.tau) <= np.linalg.norm(tau)
+    assert off(oracle.forward_dynamics(q, v, least.tau), a) < 1e-13
+    J, n = oracle.constraint_jacobian(q), condition(model, oracle, q)
+    assert np.abs(np.linalg.lstsq(J.T, least.tau, rcond=None)[0] @ J).max() < 1e-13 * n * np.abs(tau).max()
+    for engine in RIGID:
+        dyn = dynamics(model, engine)
+        loads = dyn.joint_wrenches(q, v, None, tau=tau)
+        assert off(loads, exact[0]) < CLOSE * max(1.0, n / 100)
+        assert off(dyn.loop_wrenches(q, v, tau), exact[1]) < CLOSE * max(1.0, n / 100)
+        assert off(dyn.joint_wrenches(q, v, a, tau=tau), exact[0]) < CLOSE * max(1.0, n / 100)
+        forces = dyn.actuator_forces(q, v, a)
+        assert off(forces.tau, least.tau) < CLOSE * n
+        assert off(forces.constraint_forces, least.constraint_forces) < CLOSE * n
+        # The sum of all that acts on a body is its rate of momentum, whatever solved for the forces.
+        left = dyn.newton_euler_residual(q, v, dyn.forward_dynamics(q, v, tau), tau)
+        assert np.abs(left).max() < CLOSE * np.abs(exact[0]).max()
+
+
+@pytest.mark.parametrize("kind", ["point", "frame", "revolute", "universal", "cylindrical", "prismatic", "distance"])
+def test_random_trees_are_in_balance_with_every_kind_of_loop(kind: str) -> None:
+    model, q = closed_tree(1, kind)
+    rng = np.random.default_rng(3)
+    tau, push = rng.standard_normal(model.nv), {model.bodies[2].name: rng.standard_normal(6)}
+    engines = [dynamics(model, x) for x in ("oracle", *RIGID)]
+    q, v = engines[1].project(q, rng.standard_normal(model.nv))
+    axes = "local_world_aligned"
+    exact = engines[0].joint_wrenches(q, v, None, push, axes, None, tau)
+    for dyn in engines:
+        assert off(dyn.joint_wrenches(q, v, None, push, axes, None, tau), exact) < 1e-11
+        a = dyn.forward_dynamics(q, v, tau, push, axes)
+        assert np.abs(dyn.newton_euler_residual(q, v, a, tau, push, axes)).max() < 1e-11 * np.abs(exact).max()
+        # Loads belong to the force too: with another one the same motion is refused.
+        with pytest.raises(InputError, match="does not move with these accelerations"):
+            dyn.joint_wrenches(q, v, a, push, axes, None, tau + 1.0)
+
+
+def test_actuators_that_are_as_many_as_the_degrees_of_freedom_have_one_answer() -> None:
+    model = mb.catalog.get("planar_3rrr")()
+    names, rng = [f"theta{k}" for k in (1, 2, 3)], np.random.default_rng(0)
+    q, v = model.random_state(rng, 3)
+    places = [model.velocity_names.index(x) for x in names]
+    tau = np.zeros((3, model.nv))
+    tau[:, places] = rng.standard_normal((3, 3))
+    for engine in ("oracle", *RIGID, "mujoco"):
+        dyn = dynamics(model, engine)
+        a = dynamics(model, "lagrangian").forward_dynamics(q, v, tau)
+        forces = dyn.actuator_forces(q, v, a, names)
+        assert np.abs(forces.tau - tau).max() < 1e-11
+        assert (np.delete(forces.tau, places, axis=1) == 0).all()
+        if engine != "mujoco":
+            assert off(forces.constraint_forces, dyn.constraint_forces(q, v, tau)) < 1e-10
+        # A batch is its states.
+        one = dyn.actuator_forces(q[1], v[1], a[1], names)
+        assert np.array_equal(one.tau, forces.tau[1])
+        # One more shares the load: of all such forces the one with the least norm.
+        more = dyn.actuator_forces(q, v, a, [*names, "x"]).tau
+        assert (np.linalg.norm(more, axis=1) < np.linalg.norm(tau, axis=1)).all()
+        assert off(dynamics(model, "lagrangian").forward_dynamics(q, v, more), a) < 1e-11
+
+
+def test_actuators_and_motions_that_do_not_fit_are_refused() -> None:
+    model = mb.catalog.get("five_bar")()
+    q, v = model.random_state(1)
+    for engine in ("oracle", *RIGID):
+        dyn = dynamics(model, engine)
+        a = dyn.forward_dynamics(q, v, np.zeros(model.nv))
+        with pytest.raises(
+            InputError, match=r"5 degrees of freedom|2 degrees of freedom, and with theta1 held still 1"
+        ):
+            dyn.actuator_forces(q, v, a, ["theta1"])
+        with pytest.raises(InputError, match="with no actuator held still 2"):
+            dyn.actuator_forces(q, v, a, [])
+        with pytest.raises(InputError, match=r"J a \+ γ = 0, which is missed: loop"):
+            dyn.actuator_forces(q, v, a + 0.1)
+        with pytest.raises(UnknownNameError):
+            dyn.actuator_forces(q, v, a, ["elbow"])
+        for wrong in ("all", 3):
+            with pytest.raises(InputError, match="actuators: expected a list"):
+                dyn.actuator_forces(q, v, a, wrong)  # type: ignore[arg-type]  # wrong
+    tree = mb.dynamics(mb.catalog.double_pendulum())
+    with pytest.raises(UnsupportedError, match="inverse_dynamics"):
+        tree.actuator_forces([0.0, 0.0], [0.0, 0.0], [0.0, 0.0])
+    gripper = mb.catalog.get("parallel_gripper")()
+    q, v = gripper.random_state(0)
+    with pytest.raises(InputError, match="mimics 'theta1'"):
+        mb.dynamics(gripper).actuator_forces(q, v, v, ["theta2"])
+
+
+def test_a_joint_that_locks_with_the_mechanism_is_no_actuator() -> None:
+    """At its dead centre the slider moves nothing: with it held still the crank turns."""
+    model = crank_with_rod()
+    for engine in RIGID:
+        dyn = dynamics(model, engine)
+        q, v = dyn.project([0.0, CRANK_RADIUS + ROD], np.zeros(2))
+        assert dyn.actuator_forces(q, v, np.zeros(2), ["crank"]).tau[1] == 0.0
+        with pytest.raises(InputError, match="which move crank"):
+            dyn.actuator_forces(q, v, np.zeros(2), ["slider"])
+
+
+def test_energies_on_paper_have_forces_of_actuators_too() -> None:
+    from mbkit.lagrangian import from_model
+
+    model = mb.catalog.slider_crank()
+    paper, own = from_model(model).dynamics(options=OWN), dynamics(model, "lagrangian")
+    q, v = model.random_state(0)
+    a = own.forward_dynamics(q, v, np.ones(model.nv))
+    for actuators in ("least", [model.joint_names[0]]):
+        assert off(paper.actuator_forces(q, v, a, actuators).tau, own.actuator_forces(q, v, a, actuators).tau) < 1e-10
+
+
+# Statics
+
+
+def test_four_bar_at_rest_has_the_torque_and_the_pin_forces_of_statics() -> None:
+    theta = 0.7
+    (phi, psi), (f1, r1), _ = (tuple(float(x) for x in part) for part in geometry(np.longdouble(theta)))
+    model = four_bar()
+    q = [theta, phi - theta, psi]
+    weights = [LINE * x * GRAVITY for x in (CRANK, COUPLER, ROCKER)]
+    # Virtual work of the weights.
+    rates = [CRANK / 2 * np.cos(theta), CRANK * np.cos(theta) + COUPLER / 2 * np.cos(phi) * f1]
+    rates.append(ROCKER / 2 * np.cos(psi) * r1)
+    torque = sum(w * x for w, x in zip(weights, rates, strict=True))
+    # Force and moment of each rod about its lower end; unknowns: forces on crank, coupler and rocker there, that of the
+    # rocker on the coupler, and the torque.
+    A, b = np.zeros((9, 9)), np.zeros(9)
+    for row, (length, angle, own, other) in enumerate(
+        ((CRANK, theta, 0, 2), (COUPLER, phi, 2, 6), (ROCKER, psi, 4, 6))
+    ):
+        sign = -1.0 if row != 1 else 1.0
+        A[3 * row : 3 * row + 2, own : own + 2] = np.eye(2)
+        A[3 * row : 3 * row + 2, other : other + 2] = sign * np.eye(2)
+        A[3 * row + 2, other : other + 2] = sign * length * np.array([-np.sin(angle), np.cos(angle)])
+        b[3 * row + 1], b[3 * row + 2] = weights[row], weights[row] * length / 2 * np.cos(angle)
+    A[2, 8] = 1.0
+    forces = np.linalg.solve(A, b)
+    assert forces[8] == pytest.approx(torque, rel=1e-13)
+    zero = np.zeros(3)
+    for engine in ("oracle", *RIGID, "mujoco"):
+        dyn = dynamics(model, engine)
+        tau, _ = dyn.actuator_forces(q, zero, zero, ["at_crank"])
+        assert tau == pytest.approx([torque, 0.0, 0.0], abs=1e-12)
+        # In child axes: x along the rod, and the angles turn x to z.
+        loads = dyn.joint_wrenches(q, zero, zero, tau=tau)
+        for k, angle in enumerate((theta, phi, psi)):
+            along = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            assert along @ loads[k, [0, 2]] == pytest.approx(forces[2 * k : 2 * k + 2], abs=1e-12)
+            assert loads[k, [1, 3, 5]] == pytest.approx(np.zeros(3), abs=1e-12)
+        if engine != "mujoco":
+            (pin,) = dyn.loop_wrenches(q, zero, tau)
+            turned = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]]) @ pin[[0, 2]]
+            assert turned == pytest.approx(forces[6:8], abs=1e-12)
+            assert pin[3:] == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_loads_of_a_planar_mechanism_are_in_its_plane_in_any_plane() -> None:
+    """A tilted plane keeps two of the three rows of its pin; the load is carried by all three."""
+    from scipy.spatial.transform import Rotation
+
+    flat, R = four_bar(), Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
+    joints = tuple(
+        replace(j, rotation=R @ j.rotation, translation=R @ j.translation) if j.parent == "world" else j
+        for j in flat.joints
+    )
+    tilted = replace(flat, joints=joints, gravity=R @ flat.gravity)
+    q, v = flat.random_state(0)
+    tau = np.array([1.0, 0.0, 0.0])
+    for engine in RIGID:
+        loads = [dynamics(x, engine).joint_wrenches(q, v, None, tau=tau) for x in (flat, tilted)]
+        assert off(loads[1], loads[0]) < 1e-11
+        assert np.abs(loads[1][:, 1]).max() < 1e-11 * np.abs(loads[1]).max()
+
+
+# What is not unique
+
+
+def test_bricard_tells_which_loads_are_not_unique_and_gives_those_with_the_least_norm() -> None:
+    model = mb.catalog.get("bricard")()
+    q, v = model.random_state(0)
+    tau = np.ones(model.nv)
+    for engine in ("oracle", *RIGID, "mujoco"):
+        found = dynamics(model, engine).undetermined_loads(q)
+        assert found.strains == 1
+        assert found.joints.shape == (model.nv, 6)
+        assert found.joints.any()
+        assert found.loops.any()
+    dyn = dynamics(model, "lagrangian")
+    J, forces = dyn.constraint_jacobian(q), dyn.constraint_forces(q, v, tau)
+    strain = np.linalg.svd(J)[0][:, -1]
+    assert np.abs(strain @ J).max() < 1e-12
+    assert abs(strain @ forces) < 1e-12 * np.linalg.norm(forces)
+    # What a joint's own drive takes is unique: a strain does no work on a motion that the joints allow.
+    loads = dyn.joint_wrenches(q, v, None, tau=tau)
+    for k, joint in enumerate(model.independent_joints):
+        axis = joint.axes[0]
+        assert loads[k, 3:] @ axis == pytest.approx(tau[k], abs=1e-11 * np.abs(loads).max())
+    # A spatial mechanism without a redundant row has unique loads.
+    stewart = mb.catalog.get("stewart_platform")()
+    found = mb.dynamics(stewart).undetermined_loads(stewart.random_state(0)[0])
+    assert found.strains == 0
+    assert not found.joints.any()
+
+
+def test_a_pin_in_a_plane_may_be_strained_across_it_and_a_hinge_in_three_ways() -> None:
+    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    hinge = {"kind": "revolute", "rotation_a": upright, "rotation_b": upright}
+    for loop, strains in (({}, 1), (hinge, 3)):
+        model = four_bar(**loop)
+        q, v = model.random_state(0)
+        dyn = mb.dynamics(model)
+        found = dyn.undetermined_loads(q)
+        assert found.strains == strains
+        # In the plane all is unique: forces along x and z, and moments about y.
+        assert not found.joints[:, [0, 2, 4]].any()
+        assert found.joints[:, 1].all()
+        assert np.abs(dyn.joint_wrenches(q, v, None, tau=np.zeros(3))[:, [1, 3, 5]]).max() < 1e-12
+
+
+# MuJoCo
+
+
+def test_mujoco_s_loads_are_its_own_internal_forces_with_soft_loops() -> None:
+    model = four_bar()
+    dyn = mb.dynamics(model, "mujoco")
+    q, v = model.random_state(2)
+    tau = np.array([1.0, 0.5, -0.5])
+    m, d = dyn.mj_model, mujoco.MjData(dyn.mj_model)
+    d.qpos[:], d.qvel[:], d.qfrc_applied[:] = q, v, tau
+    mujoco.mj_forward(m, d)
+    mujoco.mj_rnePostConstraint(m, d)
+    loads = dyn.joint_wrenches(q, v, None, tau=tau)
+    for k, body in enumerate(("crank", "coupler", "rocker")):
+        b = m.body(body).id
+        R, arm = d.xmat[b].reshape(3, 3), d.subtree_com[m.body_rootid[b]] - d.xpos[b]
+        moment, force = d.cfrc_int[b, :3], d.cfrc_int[b, 3:]
+        own = np.concatenate([R.T @ force, R.T @ (moment + np.cross(arm, force))])
+        assert off(loads[k], own) < 1e-11
+    assert (
+        np.abs(dyn.newton_euler_residual(q, v, dyn.forward_dynamics(q, v, tau), tau)).max()
+        < 1e-12 * np.abs(loads).max()
+    )
+
+
+def test_a_comparison_of_mechanisms_has_joint_loads() -> None:
+    result = mb.compare(mb.catalog.four_bar(), samples=4, terms_only=True)
+    rows = {r.engine: r for r in result.rows if r.term == "joint loads"}
+    assert set(rows) == {"pinocchio", "lagrangian", "mujoco"}
+    assert all(r.passed for r in rows.values())
+    assert rows["mujoco"].reference == "own law"
+    assert not [r for r in result.refusals if r.term == "joint loads"]
+
+
+# Held coordinates
+
+
+@pytest.mark.parametrize("name", ["four_bar", "bricard", "stewart_platform", "delta_robot"])
+def test_held_coordinates_stay_to_the_bit_and_the_others_follow(name: str) -> None:
+    model = mb.catalog.get(name)()
+    dyn = dynamics(model, "lagrangian")
+    q, v = model.random_state(3)
+    held = model.joint_names[0]
+    at, moving = model.layout.q[held], model.layout.v[held]
+    q = model.integrate(q, np.full(model.nv, 0.02))
+    q1, v1 = dyn.project(q, v, hold=[held])
+    assert np.array_equal(q1[at], q[at])
+    assert np.array_equal(v1[moving], v[moving])
+    assert np.abs(dyn.constraint_residual(q1)).max() < 1e-14
+    assert np.abs(dyn.constraint_rate(q1, v1)).max() < 1e-13
+    a = dyn.project_acceleration(q1, v1, np.ones(model.nv), hold=[held])
+    assert (a[moving] == 1.0).all()
+    assert np.abs(dyn.constraint_jacobian(q1) @ a + dyn.constraint_bias(q1, v1)).max() < 1e-12
+    # Of all that hold it the nearest: what is left to change is across the motions that are still free.
+    M, J = dyn.mass_matrix(q1), dyn.constraint_jacobian(q1)
+    free = np.setdiff1d(np.arange(model.nv), np.arange(model.nv)[moving])
+    null = np.linalg.svd(J[:, free])[2][np.linalg.matrix_rank(J[:, free], tol=1e-9) :]
+    assert np.abs(null @ (M @ (v1 - v))[free]).max(initial=0.0) < 1e-12 * np.abs(M).max()
+    # A batch, and another engine.
+    both = mb.dynamics(model).project(np.stack([q, q]), np.stack([v, v]), hold=[held])
+    assert off(both[0][1], q1) < 1e-12
+
+
+def test_what_cannot_be_held_is_refused() -> None:
+    model = crank_with_rod()
+    dyn = dynamics(model, "lagrangian")
+    with pytest.raises(InputError, match="hold: with slider held, crank_with_rod has no consistent state near"):
+        dyn.project([0.3, 2.0], [0.0, 0.0], hold=["slider"])
+    # At the dead centre any angle of the crank is as good, to first order, and a speed of the slider asks for none.
+    dead = [0.0, CRANK_RADIUS + ROD]
+    with pytest.raises(InputError, match="not determined at this pose|cannot be met"):
+        dyn.project(dead, [0.0, 0.0], hold=["slider"])
+    with pytest.raises(InputError, match="cannot be met"):
+        dyn.project([0.5, 0.8], [1.0, 1.0], hold=["crank", "slider"])
+    with pytest.raises(UnknownNameError):
+        dyn.project(dead, [0.0, 0.0], hold=["wheel"])
+    with pytest.raises(InputError, match="hold: expected a list"):
+        dyn.project(dead, [0.0, 0.0], hold="crank")
+    q, v = dyn.project([0.5, 0.8], [1.0, 0.0], hold=["crank"])
+    with pytest.raises(InputError, match=r"J a \+ γ = 0 of crank_with_rod cannot be met"):
+        dyn.project_acceleration(q, v, [5.0, 5.0], hold=["crank", "slider"])
+    ball, start = closed_tree(5, "point")
+    quaternion = next(x for x in ball.coordinate_names if x not in ball.velocity_names)
+    with pytest.raises(InputError, match="whose velocities are not the rates"):
+        dynamics(ball, "lagrangian").project(start, np.zeros(ball.nv), hold=[quaternion])
+
+
+# The inertia that a crank feels
+
+CRANK_RADIUS, ROD, INERTIA, SLIDER = 0.3, 0.8, 0.05, 2.0
+
+
+def crank_with_rod() -> mb.Model:
+    """A crank, and a slider along x on a rod without mass."""
+    b = mb.ModelBuilder("crank_with_rod", gravity=(0, 0, 0))
+    b.add_body("wheel", mass=1.0, inertia=(INERTIA,) * 3)
+    b.add_joint("crank", "revolute", parent="world", child="wheel", axis=(0, 0, 1))
+    b.add_body("block", mass=SLIDER, inertia=(0.01,) * 3)
+    b.add_joint("slider", "prismatic", parent="world", child="block", axis=(1, 0, 0))
+    b.add_loop(
+        "rod", "distance", body_a="wheel", translation_a=(CRANK_RADIUS, 0, 0), body_b="block", length=ROD
+    )  # fmt: skip
+    return b.build()
+
+
+def test_reduced_inertia_of_a_slider_crank_is_its_closed_form() -> None:
+    model = crank_with_rod()
+    theta = np.array([0.3, 1.2, -2.0])
+    s, c = np.sin(theta), np.cos(theta)
+    r, root = CRANK_RADIUS, np.sqrt(ROD**2 - (CRANK_RADIUS * s) ** 2)
+    x, first = r * c + root, -r * s - r * r * s * c / root
+    second = -r * c - r * r * (c * c - s * s) / root - r**4 * s * s * c * c / root**3
+    for engine in ("oracle", *RIGID):
+        dyn = dynamics(model, engine)
+        q = np.stack([theta, x], axis=1)
+        J, slope, N = dyn.reduced_inertia(q, "crank")
+        assert pytest.approx(INERTIA + SLIDER * first**2, rel=1e-13) == J
+        assert slope == pytest.approx(2 * SLIDER * first * second, rel=1e-12)
+        assert np.stack([np.ones(3), first], axis=1) == pytest.approx(N, rel=1e-13)
+        one = dyn.reduced_inertia(q[1], "crank")
+        assert (one.inertia, one.derivative) == (J[1], slope[1])
+        with pytest.raises(NumericalError, match="slider of crank_with_rod does not determine"):
+            dyn.reduced_inertia([0.0, r + ROD], "slider")
+
+
+def test_reduced_inertia_of_a_four_bar_is_that_of_its_geometry() -> None:
+    theta = 0.7
+    (phi, psi), (f1, r1), (f2, r2) = geometry(np.longdouble(theta))
+    a, c, r = CRANK, COUPLER, ROCKER
+    first = np.array([-a * np.sin(theta) - c / 2 * np.sin(phi) * f1, a * np.cos(theta) + c / 2 * np.cos(phi) * f1])
+    second = -a * np.array([np.cos(theta), np.sin(theta)])
+    second = second - c / 2 * (
+        np.array([np.cos(phi), np.sin(phi)]) * f1**2 - np.array([-np.sin(phi), np.cos(phi)]) * f2
+    )
+    J = LINE * (a**3 / 3 + c * (first @ first) + c**3 / 12 * f1**2 + r**3 / 3 * r1**2)
+    slope = 2 * LINE * (c * (first @ second) + c**3 / 12 * f1 * f2 + r**3 / 3 * r1 * r2)
+    model = four_bar()
+    q = [theta, float(phi) - theta, float(psi)]
+    for engine in ("oracle", *RIGID, "mujoco"):
+        got = dynamics(model, engine).reduced_inertia(q, "at_crank")
+        assert got.inertia == pytest.approx(float(J), rel=1e-12)
+        assert got.derivative == pytest.approx(float(slope), rel=1e-11)
+    assert GROUND == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "coordinates"), [("bricard", ["q1"]), ("five_bar", ["theta1", "theta2"]), ("andrews_squeezer", ["beta"])]
+)
+def test_reduced_inertia_has_the_energy_and_its_derivatives_are_differences(name: str, coordinates: list[str]) -> None:
+    model = mb.catalog.get(name)()
+    dyn = dynamics(model, "lagrangian")
+    q, v = model.random_state(3)
+    J, slopes, N = dyn.reduced_inertia(q, coordinates)
+    places = [model.coordinate_names.index(x) for x in coordinates]
+    rates = v[places]
+    assert 0.5 * rates @ J @ rates == pytest.approx(dyn.kinetic_energy(q, v), rel=1e-11)
+    assert np.abs(J - J.T).max() < 1e-14 * np.abs(J).max()
+    for k, place in enumerate(places):
+        ends, h = [], 1e-5
+        for sign in (1, -1):
+            near = q + sign * h * N[:, k]
+            near[places] = q[places]
+            near[place] += sign * h
+            ends.append(dyn.reduced_inertia(dyn.project(near, v, hold=coordinates)[0], coordinates).inertia)
+        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(slopes[..., k], abs=1e-6 * np.abs(slopes).max())
+    # The reduced equation of motion: J θ̈ + Γ θ̇² = Nᵀ (τ - g).
+    tau = np.ones(model.nv)
+    a = dyn.forward_dynamics(q, v, tau)
+    if len(places) == 1:
+        pull = N[:, 0] @ (tau + dyn.passive(q, v) - dyn.gravity(q))
+        left = J[0, 0] * a[places[0]] + 0.5 * slopes[0, 0, 0] * rates[0] ** 2
+        assert left == pytest.approx(pull, abs=1e-10 * (abs(pull) + abs(left) + abs(J[0, 0] * a[places[0]])))
+
+
+def test_coordinates_that_are_not_independent_are_refused() -> None:
+    model = mb.catalog.get("five_bar")()
+    dyn = mb.dynamics(model)
+    q, _ = model.random_state(0)
+    for wrong in ("theta1", ["theta1", "theta1"], ["theta1", "theta2", "phi1"]):
+        with pytest.raises(InputError, match="2 degrees of freedom: expected as many different names"):
+            dyn.reduced_inertia(q, wrong)
+    with pytest.raises(UnknownNameError):
+        dyn.reduced_inertia(q, ["theta1", "elbow"])
+    driven, at = closed_tree(1, "point", drive=True)
+    with pytest.raises(UnsupportedError, match="depend on the time"):
+        mb.dynamics(driven).reduced_inertia(at, driven.coordinate_names[0])
+
+
+# Couplers
+
+
+def geared(*, mimic: bool = False, **values: object) -> mb.Model:
+    """A pendulum whose second link and a rack follow the first by gears: as constraints, or as mimic joints."""
+    ratio, offset = ({"ratio": -2.0, "offset": 0.3} | values).values()
+    b = mb.ModelBuilder("geared")
+    follow = {"b": ("a", ratio, offset), "c": ("a", 0.25, 0.0)} if mimic else {"b": None, "c": None}
+    b.add_body("one", mass=1.0, com=(0.1, 0, -0.2), inertia=(0.1, 0.12, 0.05))
+    b.add_joint("a", "revolute", parent="world", child="one", axis=(0, 1, 0))
+    b.add_body("two", mass=0.5, com=(0, 0.05, -0.1), inertia=(0.01, 0.02, 0.015))
+    b.add_joint(
+        "b", "revolute", parent="one", child="two", translation=(0, 0, -0.4), axis=(0, 1, 0), mimic=follow["b"]
+    )  # fmt: skip
+    b.add_body("rack", mass=0.3, com=(0, 0.02, -0.1), inertia=(0.01, 0.02, 0.015))
+    b.add_joint(
+        "c", "prismatic", parent="world", child="rack", translation=(1, 0, 0), axis=(0, 0, 1), mimic=follow["c"]
+    )
+    if not mimic:
+        b.add_coupler("gear", "b", "a", ratio=ratio, offset=offset)  # type: ignore[arg-type]  # by name
+        b.add_coupler("pinion", "c", "a", ratio=0.25)
+    return b.build()
+
+
+def test_couplers_move_as_mimic_joints_do() -> None:
+    model, reduced = geared(), geared(mimic=True)
+    oracle = dynamics(model, "oracle")
+    assert oracle.constraint_names == ("coupler 'gear'", "coupler 'pinion'")
+    assert str(oracle.mobility()) == "geared: degrees of freedom 1, of 2 rows none is redundant"
+    q, v = model.random_state(0, 3)
+    tau = np.random.default_rng(0).standard_normal((3, 3))
+    ratios = np.array([1.0, -2.0, 0.25])
+    a = mb.dynamics(reduced).forward_dynamics(q[:, :1], v[:, :1], tau @ ratios[:, None])
+    for engine in ("oracle", *RIGID):
+        dyn = dynamics(model, engine)
+        assert off(dyn.forward_dynamics(q, v, tau), a * ratios) < 1e-13
+        assert np.abs(dyn.constraint_residual(q)).max() < 1e-14
+        assert off(dyn.constraint_forces(q, v, tau), oracle.constraint_forces(q, v, tau)) < 1e-12
+        left = dyn.newton_euler_residual(q, v, dyn.forward_dynamics(q, v, tau), tau)
+        assert np.abs(left).max() < 1e-12
+        # One drive takes the load of all, and the inertia that it feels is that of the mimic joints.
+        alone = dyn.actuator_forces(q, v, a * ratios, ["a"]).tau
+        assert alone[:, 0] == pytest.approx((tau @ ratios), abs=1e-11)
+        J, _, _ = dyn.reduced_inertia(q, "a")
+        assert pytest.approx(mb.dynamics(reduced).mass_matrix(q[:, :1])[:, 0, 0], rel=1e-13) == J
+    # The multiplier is the torque in the coupled joint beside its own.
+    load = oracle.joint_wrenches(q[0], v[0], None, tau=tau[0])
+    assert load[1, 4] == pytest.approx(tau[0, 1] + oracle.constraint_forces(q[0], v[0], tau[0])[0], rel=1e-12)
+    run = mb.simulate(dynamics(model, "lagrangian"), q[0], v[0], 0.2, dt=1e-3)
+    assert np.abs(oracle.constraint_residual(run.q)).max() < 1e-14
+    with pytest.raises(UnsupportedError, match="geared has no loops"):
+        oracle.loop_wrenches(q, v, tau)
+    assert not model.without("loops").couplers
+    assert model.digest != geared(ratio=3.0).digest
+
+
+def test_couplers_take_parameters_and_close_beside_a_loop() -> None:
+    model = geared(ratio=mb.Parameter("n", -2.0), offset=mb.Parameter("c", 0.3))
+    dyn = dynamics(model, "lagrangian")
+    assert dyn.at(n=3.0).constraint_jacobian([0.1, 0.2, 0.3])[0, 0] == -3.0
+    assert model.with_parameters(n=4.0).couplers[0].ratio == 4.0
+    # Two cranks of a five-bar, geared to each other: one degree of freedom is left.
+    five = mb.catalog.get("five_bar")()
+    closed = replace(five, couplers=geared(ratio=-1.0, offset=0.0).couplers[:1])
+    closed = replace(closed, couplers=(replace(closed.couplers[0], joint="theta1", leader="theta2"),))
+    dyn, exact = (dynamics(closed, x) for x in ("pinocchio", "oracle"))
+    assert exact.mobility().degrees_of_freedom == 1
+    q, v = closed.random_state(0)
+    assert off(dyn.forward_dynamics(q, v, np.ones(4)), exact.forward_dynamics(q, v, np.ones(4))) < 1e-11
+
+
+def test_couplers_in_mujoco_follow_its_written_law_and_survive_mjcf(tmp_path: Path) -> None:
+    model = geared()
+    q, v = model.random_state(1)
+    tau = np.array([1.0, 2.0, 3.0])
+    for options in ({}, {"solref": (-1000.0, -50.0), "solimp": (0.99, 0.999, 0.001, 0.5, 2.0)}):
+        dyn = mb.dynamics(model, "mujoco", **options)
+        for state in (q, q + [0.0, 0.01, -0.02]):
+            said = dyn.constraint_law(state, v, tau)
+            assert off(dyn.forward_dynamics(state, v, tau), said.acceleration) < 1e-11
+    rigid = mb.dynamics(model, "pinocchio").forward_dynamics(q, v, tau)
+    assert off(dyn.constraint_law(q, v, tau).rigid, rigid) < 1e-11
+    path = tmp_path / "geared.xml"
+    path.write_text(mb.convert(model, "mjcf").text)
+    assert mb.load(path).couplers == model.couplers
+    assert not mb.load(path, loops=False).couplers
+    m = mujoco.MjModel.from_xml_path(str(path))
+    d = mujoco.MjData(m)
+    d.qpos[:] = q + [0.0, 0.01, 0.0]
+    mujoco.mj_forward(m, d)
+    assert d.efc_pos[:2] == pytest.approx(mb.dynamics(model, "oracle").constraint_residual(q + [0, 0.01, 0]), abs=1e-14)
+    # Reference angles: MuJoCo's polynomial is of what the joints are away from them.
+    text = path.read_text().replace('name="a"', 'name="a" ref="0.4"').replace('name="b"', 'name="b" ref="0.2"')
+    path.write_text(text)
+    back, m = mb.load(path), mujoco.MjModel.from_xml_path(str(path))
+    d = mujoco.MjData(m)
+    d.qpos[:] = [0.7, -0.1, 0.2]
+    mujoco.mj_forward(m, d)
+    assert mb.dynamics(back, "oracle").constraint_residual(d.qpos) == pytest.approx(d.efc_pos[:2], abs=1e-14)
+    with pytest.raises(UnsupportedError, match="coupler 'gear'"):
+        mb.convert(model, "urdf")
+
+
+@pytest.mark.parametrize(
+    ("joint", "leader", "words"),
+    [
+        ("b", "b", "joint 'b' against itself"),
+        ("b", "d", "unknown joint 'd'"),
+        ("e", "a", "expected joints of one velocity that mimic none, got 'e'"),
+    ],
+)
+def test_faulty_couplers_are_refused(joint: str, leader: str, words: str) -> None:
+    b = mb.ModelBuilder("bad")
+    for name, kind in (("a", "revolute"), ("b", "revolute"), ("e", "ball")):
+        b.add_body(f"of {name}", mass=1.0, com=(0.1, 0.1, 0), inertia=(0.1,) * 3)
+        axis = (0, 1, 0) if kind == "revolute" else None
+        b.add_joint(name, kind, parent="world", child=f"of {name}", axis=axis)
+    b.add_coupler("gear", joint, leader)
+    with pytest.raises(ModelError, match=words):
+        b.build()
