@@ -269,10 +269,7 @@ class ModelBuilder(ElementBuilder):
         self._name = self._read.name("name", name)
         self._bindings: list[Binding] = []
         self._gravity = self._numbers("gravity", "", gravity=self._read.quantities("gravity", gravity, 3))["gravity"]
-        self._parts: dict[str, list[Any]] = {
-            kind: []
-            kind: [] for kind in (*_OF_TREES, *_CONNECTING)
-        }
+        self._parts: dict[str, list[Any]] = {kind: [] for kind in (*_OF_TREES, *_CONNECTING)}
         self._notes: list[str] = []
 
     def add_body(
