@@ -25,7 +25,7 @@ from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.program import program
 from mbkit.codegen.taylor import PRECISIONS, order_of, precision, taylor_system
 from mbkit.derivation import Equations, equations_of
-from mbkit.derivation.steps.onto_constraints import projection
+from mbkit.derivation.steps.onto_constraints import thorough_projection
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import at_time
 from mbkit.engines.constraint_manifold import states_of
@@ -129,7 +129,7 @@ class Motion:
         if not self.model.constrained:
             return (self.q0, 0 * self.q0), (self.v0, 0 * self.v0)
         own = arithmetic()
-        q, v, *_ = Extended(program(projection(self.equations)), own)(
+        q, v, *_ = Extended(program(thorough_projection(self.equations)), own)(
             *(own.array(x[None]) for x in (self.q0, self.v0)), *self._constants(np.zeros(1))
         )
         return own.pair(q[0, :, 0]), own.pair(v[0, :, 0])

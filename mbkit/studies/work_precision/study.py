@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count, finite_array, real
-from mbkit.engines.registry import STANDARD
+from mbkit.engines.registry import STANDARD, find_engine
 from mbkit.errors import InputError, NumericalError
 from mbkit.methods.registry import METHODS
 from mbkit.model import Model
@@ -176,6 +176,10 @@ def work_precision(
     facts = results.model_info(integrated)
     if integrated is not model and model.layout.reduced:
         facts["notes"] = [*facts["notes"], "mimic joints free"]
+    soft = [name for name in methods_of if model.constrained and find_engine(name).load().soft_constraints]
+    if soft:
+        which = " and ".join(soft)
+        facts["notes"] = [*facts["notes"], f"{which}: holds loops by its own law; the curves end at that law's motion"]
 
     def result(*, complete: bool) -> WorkPrecision:
         outcomes = sweep.outcomes()
