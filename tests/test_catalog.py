@@ -206,7 +206,7 @@ def test_registry() -> None:
         "heavy_top gyroscope free_body spacecraft_with_wheels clamped_beam flexible_spacecraft slider_crank "
         "four_bar four_bars inverted_slider_crank five_bar pantograph peaucellier watt chebyshev hoecken scissor "
         "parallel_gripper planar_3rrr andrews_squeezer bricard flyball_governor double_cardan_shaft stewart_platform "
-        "delta_robot"
+        "delta_robot rolling_disc chaplygin_sleigh bicycle"
     )
     assert set(catalog.systems()) == set(names.split())
     assert catalog.get("cart_pole") is catalog.cart_pole
@@ -228,6 +228,20 @@ def test_engines_take_a_system_with_a_loop_or_refuse_it_by_its_name(engine: str)
     q, v = model.random_state(0)
     assert np.abs(dyn.constraint_residual(q)).max() < 1e-12
     assert np.isfinite(dyn.forward_dynamics(q, v, np.zeros(3))).all()
+
+
+@pytest.mark.parametrize("name", ["rolling_disc", "chaplygin_sleigh", "bicycle"])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_engines_take_a_system_that_rolls_or_refuse_it_by_its_name(engine: str, name: str) -> None:
+    model = catalog.get(name)()
+    if ENGINES[engine].name in ("drake", "mujoco"):
+        with pytest.raises(UnsupportedError, match=rf"{name}.*'{model.no_slip[0].name}'.*'lagrangian'"):
+            dynamics(model, engine)
+        return
+    dyn = dynamics(model, engine)
+    q, v = model.random_state(0)
+    assert np.abs(dyn.constraint_rate(q, v)).max() < 1e-12
+    assert np.isfinite(dyn.forward_dynamics(q, v, np.zeros(model.nv))).all()
 
 
 @pytest.mark.parametrize("name", catalog.systems())

@@ -39,7 +39,7 @@ from mbkit.model.joint_types import cross3
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.manifold import random_state
 from mbkit.model.parts import Loop
-from mbkit.model.rolling import NO_SLIP_ROWS, contact
+from mbkit.model.rolling import LIES_FLAT, NO_SLIP_ROWS, Contact, contact
 from mbkit.model.validation import sample_mass_matrix
 
 #: Mass of a coordinate that has none, in terms of the mean one.
@@ -53,6 +53,9 @@ _REFINED: Final = 1
 DEPENDENT: Final = 1e-7
 #: Of a mechanism's size: what a few typed digits leave where ends can meet.
 _MEETS: Final = 1e-9
+#: Height of a disc's centre over its radius below which it lies flat: there its height has a kink, where searches for a
+#: configuration end, and accelerations that grow with its inverse squared have lost 12 digits.
+_LIES: Final = 1e-6
 #: Configurations at which rows are looked at, and random starts from which a closed one is searched.
 _LOOKS: Final = 6
 _STARTS: Final = 12
@@ -213,12 +216,17 @@ def _velocity(kin: Kinematics, body: str, to: str, at: Vector) -> Vector:
     return out
 
 
-def _contact_rows(kin: Kinematics, part: NoSlip) -> tuple[list[Any], list[Any]]:
-    """Return the expressions of the rows that hold positions and of those that hold velocities."""
+def _contact(kin: Kinematics, part: NoSlip) -> Contact:
+    """Return the contact of a part in the axes of the body that carries both its bodies."""
     values, both = kin.values.no_slip[part.name], kin.model.carrier(part)
     a, b = _carried(kin, part.body_a, both, values.axis_a, 0.0), _carried(kin, part.body_b, both, values.axis_b, 0.0)
     along = [_carried(kin, part.body_b, both, row, 0.0) for row in values.tangents]
-    place = contact(part.kind, a, b, along, values.radius, lambda x: kin.length(ca.SX(x)))
+    return contact(part.kind, a, b, along, values.radius, lambda x: kin.length(ca.SX(x)))
+
+
+def _contact_rows(kin: Kinematics, part: NoSlip) -> tuple[list[Any], list[Any]]:
+    """Return the expressions of the rows that hold positions and of those that hold velocities."""
+    values, both, place = kin.values.no_slip[part.name], kin.model.carrier(part), _contact(kin, part)
     centre = _carried(kin, part.body_a, both, values.translation_a, 1.0)
     ground = _carried(kin, part.body_b, both, values.translation_b, 1.0)
     at = add(centre, place.offset)
@@ -258,8 +266,15 @@ def _column(entries: Iterable[Any]) -> Any:
 
 
 def _ways(kin: Kinematics) -> Any:
-    """Return for each loop a number that is negative where its frames point opposite ways."""
-    return ca.vertcat(ca.SX(0, 1), *(ca.SX(_ends(kin, loop).way(loop.kind)) for loop in kin.model.loops))
+    """Return numbers that are negative where a loop's frames point opposite ways, then where a disc lies flat."""
+    loops = (_ends(kin, loop).way(loop.kind) for loop in kin.model.loops)
+    discs = (_contact(kin, x).reach / kin.values.no_slip[x.name].radius - _LIES for x in discs_of(kin.model))
+    return _column((*loops, *discs))
+
+
+def discs_of(model: Model) -> list[NoSlip]:
+    """Return the parts that can lie flat."""
+    return [x for x in model.no_slip if x.kind in LIES_FLAT]
 
 
 class Constraints:
@@ -274,7 +289,8 @@ class Constraints:
     closed : (nq,) array or None
         A configuration at which all loops are closed, if one was found.
     ways : casadi.SX
-        One number for each loop, negative where its frames point opposite ways, though its rows are zero there.
+        One number for each loop, negative where its frames point opposite ways, though its rows are zero there; then
+        one for each disc, negative where it lies flat.
     every : casadi.SX
         The Jacobian of all rows, those that say nothing among them.
     """
@@ -548,7 +564,7 @@ class ConstraintQuantities:
 
     constraints: Any
     all_constraints: Any
-    #: One number for each loop, negative where its frames point opposite ways.
+    #: Numbers that are negative where the frames of a loop point opposite ways, or a disc lies flat.
     loop_ways: Any = ca.SX(0, 1)
     #: A configuration at which all loops are closed, if one is known.
     closed_configuration: Array | None = None
@@ -677,7 +693,7 @@ class ConstrainedMotion(ConstraintQuantities):
 
     @property
     def loop_ways(self) -> Any:
-        """One number for each loop, negative where its frames point opposite ways."""
+        """Numbers that are negative where the frames of a loop point opposite ways, or a disc lies flat."""
         return self.constraint_rows.ways
 
     @property

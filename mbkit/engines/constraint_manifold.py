@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit.derivation.constraints import independent_rows
+from mbkit.derivation.constraints import discs_of, independent_rows
 from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
@@ -168,8 +168,10 @@ class Manifold:
         scale = np.maximum(np.abs(J[: len(f)]).sum(axis=1), 1.0) * max(1.0, float(np.abs(q).max()))
         names = self.equations.all_constraints.names
         rows = [names[k] for k in np.flatnonzero(~(np.abs(f[:, 0]) <= _CONSISTENT * scale))]
-        turned = [loop.name for loop, way in zip(self.dyn.model.loops, ways[:, 0], strict=True) if way < 0]
-        return rows or [f"loop {name!r} half a turn off" for name in turned]
+        model = self.dyn.model
+        turned = [f"loop {x.name!r} half a turn off" for x in model.loops]
+        turned += [f"no slip {x.name!r}, whose disc lies flat" for x in discs_of(model)]
+        return rows or [text for text, way in zip(turned, ways[:, 0], strict=True) if way < 0]
 
     def value(self, q: Array) -> Array:
         """Return f of the rows that hold positions, (k,) or (N, k)."""
