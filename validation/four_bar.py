@@ -79,15 +79,15 @@ def _rates(y):
     return np.array([y[1], acceleration(*y)[0]])
 
 
-def extrapolated(y, h):
+def extrapolated(y, h, rates=_rates):
     """Return the state after a step, by Gragg's, Bulirsch's and Stoer's extrapolation of the midpoint rule."""
     table = []
     for i, n in enumerate(_SUBSTEPS):
         d = h / n
-        before, now = y, y + d * _rates(y)
+        before, now = y, y + d * rates(y)
         for _ in range(n - 1):
-            before, now = now, before + 2 * d * _rates(now)
-        row = [(before + now + d * _rates(now)) / 2]
+            before, now = now, before + 2 * d * rates(now)
+        row = [(before + now + d * rates(now)) / 2]
         for j in range(i):
             row.append(row[j] + (row[j] - table[-1][j]) / ((_LONG(n) / _SUBSTEPS[i - j - 1]) ** 2 - 1))
         table.append(row)
