@@ -641,7 +641,7 @@ class ConstraintQuantities:
     @property
     def constraint_rate_gradient(self) -> Any:
         """Derivative of the rates by q, along the manifold."""
-        q = self.q  # type: ignore[attr-defined]  # of the equations
+        q = self.q
         return ca.mtimes(ca.jacobian(self.constraint_rate, q), self.tangent)
 
     @property

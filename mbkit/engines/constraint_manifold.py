@@ -268,8 +268,9 @@ class Manifold:
     def at_pose(self, q: Array) -> NDArray[np.bool_]:
         """Return whether a configuration, or each of a batch, is a singular pose up to rounding."""
         J = self.jacobian(q)
-        good = np.isfinite(J).all(axis=(-1, -2))
-        sizes = np.linalg.svd(np.where(good[..., None, None], J, 1.0), compute_uv=False)
+        good = np.asarray(np.isfinite(J).all(axis=(-1, -2)))
+        J = np.where(good[..., None, None], J, 1.0)
+        sizes = np.linalg.svd(J, compute_uv=False)
         return np.asarray(good & (sizes[..., -1] <= AT_POSE * sizes[..., 0]))
 
     def _pulled_at_pose(self, q: Array, v: Array) -> tuple[Array, Array]:

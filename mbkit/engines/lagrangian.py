@@ -461,7 +461,8 @@ class LagrangianDynamics(Dynamics):
         if held is not None and held[0] is METHODS.get(method) and dt > 0:
             out: tuple[Array, Array] | None
             if not self._parametric:
-                out, behind = held[1].single(q, v, tau, dt), ()
+                behind: tuple[Array, ...] = ()
+                out = held[1].single(q, v, tau, dt)
             else:
                 behind = self._trailing(q)
                 out = held[1].single(q, v, tau, dt, *behind)

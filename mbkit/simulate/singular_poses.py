@@ -185,9 +185,10 @@ class Approach:
                 manifold = manifold_at(dyn, t + x)
                 states.append(manifold.jacobian(manifold.dyn.model.integrate(q, x * v)))
         J = np.stack(states)
-        good = np.isfinite(J).all(axis=(-1, -2))
+        good = np.asarray(np.isfinite(J).all(axis=(-1, -2)))
         # Without vectors, which would cost far more.
-        sizes = np.linalg.svd(np.where(good[..., None, None], J, 0.0), compute_uv=False)
+        J = np.where(good[..., None, None], J, 0.0)
+        sizes = np.linalg.svd(J, compute_uv=False)
         least, *beside = np.where(good, sizes[..., -1], np.inf)
         known = np.shape(self._sizes) == np.shape(least)
         with np.errstate(invalid="ignore"):

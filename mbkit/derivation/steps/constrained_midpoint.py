@@ -22,7 +22,6 @@ from typing import Any, Final
 
 import casadi as ca
 
-from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import at_time
 from mbkit.derivation.steps.midpoint import Midpoint, is_last, is_lost
 from mbkit.derivation.steps.rosenbrock import Factors
@@ -34,7 +33,9 @@ _TINY: Final = 1e-150
 class ConstrainedMidpoint(Midpoint):
     """The parts of a step under constraints, with the names and arguments of `Midpoint`'s."""
 
-    def __init__(self, equations: Equations) -> None:
+    _equations: Any
+
+    def __init__(self, equations: Any) -> None:
         # Before the parts get their sizes.
         self._rows: int = equations.constraints.value.shape[0]
         super().__init__(equations)
@@ -65,7 +66,8 @@ class ConstrainedMidpoint(Midpoint):
         return at_time(self._equations, part * self._s["dt"]).values()
 
     def _split(self) -> tuple[Any, Any]:
-        return ca.vertsplit(self._s["w"], [0, self._equations.model.nv, self.unknowns])
+        w, multipliers = ca.vertsplit(self._s["w"], [0, self._equations.model.nv, self.unknowns])
+        return w, multipliers
 
     def _whole(self, w: Any, multipliers: Any) -> tuple[Any, Any, Any]:
         """Return the residual of the momentum, of the constraints at the end over the step, and J0ᵀ."""

@@ -145,7 +145,7 @@ class Actuation(Constrained):
         if self.model.has_bodies:
             return choose_rows(self.model)
         every = tuple(range(len(self.constraint_names)))
-        return RowChoice(every, every)
+        return RowChoice(every, len(every) - len(self.velocity_constraint_names), every)
 
     def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Array:
         """Return τ and λ at one state, from the engine's own terms by LAPACK."""

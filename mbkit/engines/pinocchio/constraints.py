@@ -355,9 +355,8 @@ class PinConstraints:
     def solver(self) -> str:
         """What gives the accelerations: "constraintDynamics", or "LAPACK" from Pinocchio's terms."""
         model = self._model
-        foreign = model.prescribed or model.couplers or model.no_slip
-        foreign = foreign or any(x.kind not in _RIGID for x in model.loops)
-        if foreign or model.layout.reduced or self._rotors:
+        foreign = bool(model.prescribed or model.couplers or model.no_slip)
+        if foreign or any(x.kind not in _RIGID for x in model.loops) or model.layout.reduced or self._rotors:
             return "LAPACK"
         kept, independent = self.choice.kept, self.choice.independent
         first = 0

@@ -21,7 +21,8 @@ from mbkit.derivation.steps.constrained_midpoint import ConstrainedMidpoint
 from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import GUESS, LEAST, MOST, SMALL, Midpoint
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import FunctionError
+from mbkit.errors import FunctionError, UnsupportedError
+from mbkit.methods.registry import IMPLICIT_METHODS
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
@@ -63,7 +64,12 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
 
 
 def midpoint_of(dyn: LagrangianDynamics) -> Midpoint:
-    """Return the parts of a step of these dynamics."""
+    """Return the parts of a step of these dynamics; `UnsupportedError` for rows that hold velocities alone."""
+    if dyn.model.no_slip:
+        raise UnsupportedError(
+            f"{dyn.model.name} has contacts without slip, {dyn.model.no_slip[0].name!r} first, whose motion "
+            f"keeps no symplectic form; {IMPLICIT_METHODS} are the implicit methods for it"
+        )
     return (ConstrainedMidpoint if dyn.model.constrained else Midpoint)(dyn.equations)
 
 
