@@ -24,6 +24,11 @@ Ends = Literal["natural", "clamped", "quintic"]
 ENDS: Final[tuple[Ends, ...]] = ("natural", "clamped", "quintic")
 _KNOWN: Final = "a number, a Parameter, a casadi.SX, a SymPy expression, or a function of symbols that returns such"
 
+_INSTEAD: Final = (
+    "write it with arithmetic and NumPy's functions, and casadi.if_else for decisions; a function that needs numbers "
+    "is an argument of mbkit.simulate: torque= or wrenches="
+)
+
 
 def read_formula(
     parts: Sequence[tuple[Any, int | None]], given: Sequence[str | Sequence[str]], things: list[Expression]
@@ -62,6 +67,11 @@ def read_formula(
     operations: list[Operation] = [
         (x.name, x.arguments[1:] if x.name == "input" else x.arguments, float(x.value)) for x in code.operations
     ]
+    if not np.isfinite([value for name, _, value in operations if name == "const"]).all():
+        raise InputError(
+            "expected finite numbers, got an expression that holds one that is not: a case without a value, or a "
+            f"function of Python's math, which cannot take a symbol; {_INSTEAD}"
+        )
     return Formula(names, tuple(operations), tuple(int(i) for i in code.outputs[0].flat))
 
 
@@ -90,9 +100,7 @@ def _called(value: Any, given: Sequence[str | Sequence[str]]) -> Any:
     except Exception as error:
         text = str(error).strip().splitlines()
         raise InputError(
-            f"the function raised {type(error).__name__} for CasADi's symbols: {text[0] if text else ''}; write it "
-            "with arithmetic and NumPy's functions, and casadi.if_else for decisions; a function that needs numbers is "
-            "an argument of mbkit.simulate: torque= or wrenches="
+            f"the function raised {type(error).__name__} for CasADi's symbols: {text[0] if text else ''}; {_INSTEAD}"
         ) from error
 
 
@@ -118,7 +126,8 @@ def _scalar(x: Any, things: list[Expression]) -> Any:
 
         return ca.SX(Conversion({s: ca.SX.sym(s.name) for s in x.free_symbols}, float)(x))
     if isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool):
-        return ca.SX(real("a number", x))
+        # One that is not finite is found in the whole.
+        return ca.SX(float(x) if isinstance(x, float) else real("a number", x))
     if isinstance(x, ca.MX):
         raise InputError(
             "expected a casadi.SX, got an MX; write it with SX, or casadi.Function(...).expand() makes one"

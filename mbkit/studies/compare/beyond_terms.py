@@ -221,10 +221,12 @@ def _coriolis(model: Model, q: Array, v: Array) -> Omission:
     start = time.perf_counter()
     matrix = Machine(equations.function("coriolis_matrix"))
     setup = time.perf_counter() - start
-    times = interleaved({"matrix": lambda: matrix(q, v), "nle": lambda: nle(q, v)})
-    force, M = nle(q, v)[0][:, 0], Machine(equations.function("mass_matrix"))(q)[0]
+    # Of a model with values for all parameters the time is left.
+    held = [np.array(list(model.parameters.values()), dtype=float)] if model.parameters else []
+    times = interleaved({"matrix": lambda: matrix(q, v, *held), "nle": lambda: nle(q, v, *held)})
+    force, M = nle(q, v, *held)[0][:, 0], Machine(equations.function("mass_matrix"))(q, *held)[0]
     scale = max(float(np.linalg.norm(force)), float(np.linalg.norm(M, 2) * (v @ v)))
-    change = float(np.linalg.norm(matrix(q, v)[0] @ v - force)) / scale
+    change = float(np.linalg.norm(matrix(q, v, *held)[0] @ v - force)) / scale
     return Omission(
         "Coriolis matrix",
         False,

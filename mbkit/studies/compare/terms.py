@@ -159,7 +159,9 @@ def power_errors(dyn: Dynamics, oracle: OracleDynamics, at: States, scales: Scal
     So it fails if either the engine's dynamics or the energies are wrong, whatever two engines agree on.
     """
     a = dyn.forward_dynamics(at.q, at.v, at.tau)
-    damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, np.zeros_like(at.v))
+    still = np.zeros_like(at.v)
+    # Of functions without a potential, what acts at rest does work too.
+    damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, still) + dyn._lost_force(at.q, still)
     inertial, rate = oracle.inverse_dynamics(at.q, at.v, a), oracle.energy_rate(at.q, at.v, a)
     # Drives do work, and so do constraints that give way.
     held = dyn.generalized_constraint_force(at.q, at.v, at.tau) if dyn.model.constrained else np.zeros_like(at.v)
