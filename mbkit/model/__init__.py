@@ -3,6 +3,9 @@
 from mbkit.model.base_parameters import BaseParameters
 from mbkit.model.builder import ModelBuilder
 from mbkit.model.description import Needs
+from mbkit.model.elements.forces import Bushing, FrameForce, JointForce
+from mbkit.model.elements.formula import Formula
+from mbkit.model.elements.motion_laws import FormulaMotion, SplineMotion
 from mbkit.model.joint_types import KINDS, JointKind, JointType, kind_of, register_joint_type
 from mbkit.model.model import Model
 from mbkit.model.parameters import Expression, Number, Parameter, known, nominal
@@ -12,11 +15,16 @@ __all__ = [
     "KINDS",
     "BaseParameters",
     "Body",
+    "Bushing",
     "Coupler",
     "Expression",
+    "Formula",
+    "FormulaMotion",
     "Frame",
+    "FrameForce",
     "Joint",
     "JointCoupling",
+    "JointForce",
     "JointKind",
     "JointType",
     "Loop",
@@ -29,6 +37,7 @@ __all__ = [
     "Parameter",
     "PointSpring",
     "Prescribed",
+    "SplineMotion",
     "kind_of",
     "known",
     "nominal",
