@@ -480,13 +480,13 @@ def test_hoeckens_pen_obeys_thales(values: dict[str, float]) -> None:
 def test_scissors_height(values: dict[str, Any]) -> None:
     m = mechanism("scissor", **values)
     n, rod = ({"n": 3, "rod": 0.5} | values).values()
+    dyn, zero = None if values else from_model(m.model).dynamics(options=OWN), np.zeros(m.model.nv)
     for x in (-0.3 * rod, 0.15 * rod):
         q = m.driven(x=x)
         phi = math.acos(0.8 + x / rod)
         assert m.point(q, "top") == pytest.approx([0.0, 0.0, n * rod * math.sin(phi)], abs=1e-12)
         # The force at the roller that holds the rods' weight: virtual work on their middles.
-        if not values:
-            dyn, zero = from_model(m.model).dynamics(options=OWN), np.zeros(m.model.nv)
+        if dyn is not None:
             force = -9.81 * 2 * n * rod * (n / 2) / math.tan(phi)
             assert np.abs(dyn.forward_dynamics(q, zero, [force, *zero[1:]])).max() < 1e-10
 
@@ -596,6 +596,7 @@ def test_governors_sleeve_and_speed(values: dict[str, float]) -> None:
     m = mechanism("flyball_governor", **values)
     L, h, o = ({"arm": 1.0, "height": 1.0, "offset": 0.05} | values).values()
     rho, ball, sleeve, g = 0.3, 5.0, 3.0, 9.81
+    dyn = from_model(m.model).dynamics(options=OWN)
     for alpha in (-0.3, 0.35):
         q = m.driven(alpha1=alpha, alpha2=alpha, turn=0.2)
         y = math.pi / 6 - alpha
@@ -607,7 +608,6 @@ def test_governors_sleeve_and_speed(values: dict[str, float]) -> None:
         slope_I -= rho * L / 2 * (o * L / 2 * sine + 2 * (L / 2) ** 2 * cosine * sine / 3)
         slope_V = -g * cosine * (2 * ball * L + rho * L**2 + 2 * rho * L / 2 * 0.75 * L + sleeve * L)
         omega = math.sqrt(slope_V / slope_I)
-        dyn = from_model(m.model).dynamics(options=OWN)
         v = np.zeros(6)
         v[0] = omega
         assert np.abs(dyn.forward_dynamics(q, v, np.zeros(6))).max() < 1e-10

@@ -22,6 +22,8 @@ EPS = float(np.finfo(float).eps)
 ADAPTIVE = [m.name for m in METHODS.values() if m.kind == "adaptive"]
 ASKING = [m.name for m in METHODS.values() if m.callables]
 END = 0.1
+#: Of first order: steps by the default tolerances are a thousand times those of the others.
+FIRST_ORDER = {"drake_implicit_euler": {"rtol": 1e-3}}
 
 
 def dynamics_for(method: str, model: Any = None) -> Dynamics:
@@ -47,7 +49,7 @@ def saved(method: str, duration: float = END) -> dict[str, Any]:
 def test_every_method_ends_exactly_at_the_end(method: str, duration: float, dt: float) -> None:
     save = [0.0, duration] if duration else [0.0]
     for states in ([0.1], [[0.1], [0.2]]):
-        step = {} if method in ADAPTIVE else {"dt": dt}
+        step = FIRST_ORDER.get(method, {}) if method in ADAPTIVE else {"dt": dt}
         run = simulate(dynamics_for(method), states, [0.3], duration, method, **step, save=save)
         assert run.t.tolist() == save
         assert run.stats.finished
@@ -91,8 +93,8 @@ def test_a_step_and_a_tolerance_are_refused_where_a_method_has_none(method: str)
 def test_a_start_time_shifts_all_times(method: str, start: float) -> None:
     """Nothing here depends on the time, so that states are the same; all times are shifted."""
     dyn = dynamics_for(method)
-    save = np.linspace(0, END, 11)
-    early, late = (simulate(dyn, [0.9], [0.3], END, method, save=t + save, t0=t) for t in (0.0, start))
+    save, more = np.linspace(0, END, 11), FIRST_ORDER.get(method, {})
+    early, late = (simulate(dyn, [0.9], [0.3], END, method, save=t + save, t0=t, **more) for t in (0.0, start))
     assert late.t.tolist() == (start + save).tolist()
     assert late.stats.reached == start + END
     # Times near 3 s have some bits less for the lengths of steps.
@@ -319,7 +321,8 @@ def test_what_a_torque_does_to_its_arguments_does_not_matter(method: str) -> Non
 def test_same_input_same_bits(method: str) -> None:
     model = catalog.pendulum() if method == "mujoco_discrete" or method.startswith("drake") else catalog.heavy_top()
     q, v = model.random_state(np.random.default_rng(0), 3)
-    first, second = (simulate(dynamics_for(method, model), q, v, END, method, **saved(method)) for _ in range(2))
+    more = saved(method) | FIRST_ORDER.get(method, {})
+    first, second = (simulate(dynamics_for(method, model), q, v, END, method, **more) for _ in range(2))
     assert np.array_equal(first.q, second.q)
     assert np.array_equal(first.v, second.v)
     assert first.stats.steps == second.stats.steps

@@ -172,7 +172,8 @@ class Extended:
         last: dict[int, int] = {}
         for k, operation in enumerate(program.operations):
             if operation.name != "input":
-                last.update(dict.fromkeys(operation.arguments, k))
+                for i in operation.arguments:
+                    last[i] = k
         for out in program.outputs:
             last.update((int(k), -1) for k in out.flat)
         dying: list[list[int]] = [[] for _ in program.operations]
@@ -210,7 +211,11 @@ class Extended:
         for k, constant in self._constants:
             values[k] = constant
         for k, function, used, dying in self._steps:
-            values[k] = function(*[values[i] for i in used])
+            # Nearly all have two.
+            if len(used) == 2:
+                values[k] = function(values[used[0]], values[used[1]])
+            else:
+                values[k] = function(values[used[0]])
             for i in dying:
                 values[i] = None
         for out, where in zip(outputs, self.program.outputs, strict=True):

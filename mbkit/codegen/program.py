@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -32,8 +32,7 @@ _BINARY: Final[dict[int, str]] = {getattr(ca, f"OP_{name.upper()}"): name for na
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Operation:
+class Operation(NamedTuple):
     """One scalar operation: an input, a constant, or one of `_NAMES_UNARY` and `_NAMES_BINARY`.
 
     Decisions are 1 or 0; if_else_zero is b where a is not 0, else 0. fmin and fmax propagate NaN; every comparison with
@@ -63,27 +62,24 @@ class Program:
         return sum(o.name not in ("input", "const") for o in self.operations)
 
 
-#: Name, arguments and value of an operation.
-_Entry = tuple[str, tuple[int, ...], float]
-
-
 def program(function: ca.Function) -> Program:
     """Return the operations of an expanded function with dense outputs."""
     where: dict[int, int] = {}
-    entry: _Entry
-    # In the order of their first appearance.
-    known: dict[_Entry, int] = {}
+    # In the order of their first appearance. Plain tuples are quicker to make and to look up than their kind.
+    known: dict[tuple[str, tuple[int, ...], float], int] = {}
     shapes = tuple((function.size1_out(i), function.size2_out(i)) for i in range(function.n_out()))
     outputs = [np.full(rows * columns, -1, dtype=np.intp) for rows, columns in shapes]
     if any(function.nnz_out(i) != out.size for i, out in enumerate(outputs)):
         raise ValueError(f"{function.name()}: expected dense outputs; casadi.densify makes them")
+    code_of, results_of, arguments_of = function.instruction_id, function.instruction_output, function.instruction_input
     for k in range(function.n_instructions()):
-        code = function.instruction_id(k)
-        out, args = function.instruction_output(k), function.instruction_input(k)
-        if code == ca.OP_OUTPUT:
+        code, out, args = code_of(k), results_of(k), arguments_of(k)
+        if code in _BINARY:
+            entry = (_BINARY[code], (where[args[0]], where[args[1]]), 0.0)
+        elif code == ca.OP_OUTPUT:
             outputs[out[0]][out[1]] = where[args[0]]
             continue
-        if code == ca.OP_INPUT:
+        elif code == ca.OP_INPUT:
             entry = ("input", (args[0], args[1]), 0.0)
         elif code == ca.OP_CONST:
             entry = ("const", (), function.instruction_constant(k))
@@ -93,8 +89,6 @@ def program(function: ca.Function) -> Program:
         elif code in _UNARY:
             # CasADi names the argument of some of them twice.
             entry = (_UNARY[code], (where[args[0]],), 0.0)
-        elif code in _BINARY:
-            entry = (_BINARY[code], (where[args[0]], where[args[1]]), 0.0)
         else:
             name = next((n for n in dir(ca) if n.startswith("OP_") and getattr(ca, n) == code), f"number {code}")
             raise UnsupportedError(
@@ -107,7 +101,7 @@ def program(function: ca.Function) -> Program:
     return Program(
         inputs=tuple(function.size1_in(i) for i in range(function.n_in())),
         shapes=shapes,
-        operations=tuple(Operation(*entry) for entry in known),
+        operations=tuple(map(Operation._make, known)),
         # CasADi counts down the columns.
         outputs=tuple(out.reshape(shape, order="F") for out, shape in zip(outputs, shapes, strict=True)),
     )
