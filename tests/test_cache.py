@@ -17,7 +17,10 @@ import pytest
 import mbkit as mb
 from mbkit.codegen import compiled as module
 from mbkit.codegen import disk_cache, step_loop
+from mbkit.codegen.backend import LastUsed
 from mbkit.derivation import fingerprint as sources
+from mbkit.derivation.equations import Equations
+from mbkit.engines.oracle import OracleDynamics
 from tests.random_trees import random_tree, states
 
 
@@ -242,3 +245,64 @@ def test_the_fingerprint_changes_with_every_listed_file(tmp_path):
         with pytest.raises(FileNotFoundError, match=missing):
             sources.fingerprint(tmp_path, ("pack", missing))
     assert sources.fingerprint() == sources.SOURCES
+
+
+# Derived functions in memory
+
+
+def test_the_last_used_stay_up_to_a_number_of_operations():
+    made: list[str] = []
+
+    def derived(kept: LastUsed[str], name: str) -> str:
+        def make() -> str:
+            made.append(name)
+            return name
+
+        return kept.get((name, "f"), make)
+
+    kept: LastUsed[str] = LastUsed(5, len)
+    assert [derived(kept, name) for name in ("aa", "bb", "aa", "cc", "aa", "bb")] == [
+        "aa",
+        "bb",
+        "aa",
+        "cc",
+        "aa",
+        "bb",
+    ]
+    # Of the three with two operations each only the two that were used last.
+    assert made == ["aa", "bb", "cc", "bb"]
+    with disk_cache.force_recompile():
+        derived(kept, "aa")
+        derived(kept, "aa")
+    derived(kept, "aa")
+    assert made[4:] == ["aa"]
+    derived(kept, "too large")
+    derived(kept, "too large")
+    # Nothing else gives way to what does not fit.
+    derived(kept, "aa")
+    assert made[5:] == ["too large", "too large"]
+
+
+def test_a_second_dynamics_of_the_same_description_derives_nothing(monkeypatch):
+    model = mb.catalog.double_pendulum(mass1=1.2345)
+    again = mb.catalog.double_pendulum(mass1=1.2345)
+    q, v, a = np.array([0.3, 0.4]), np.array([0.5, 0.6]), np.array([0.7, 0.8])
+    first = [
+        (dyn.nle(q, v), dyn.center_of_mass(q), dyn.mass_matrix_inverse(q), dyn.inverse_dynamics(q, v, a))
+        for dyn in (mb.dynamics(model, "lagrangian", compile=False), mb.dynamics(model, "oracle"))
+    ]
+
+    def refuse(*_):
+        raise AssertionError("derived again")
+
+    for owner, name in ((Equations, "function"), (Equations, "body_quantity"), (OracleDynamics, "_function_of")):
+        monkeypatch.setattr(owner, name, refuse)
+    for values, dyn in zip(
+        first, (mb.dynamics(again, "lagrangian", compile=False), mb.dynamics(again, "oracle")), strict=True
+    ):
+        second = (dyn.nle(q, v), dyn.center_of_mass(q), dyn.mass_matrix_inverse(q), dyn.inverse_dynamics(q, v, a))
+        assert all(np.array_equal(x, y) for x, y in zip(values, second, strict=True))
+    other = mb.catalog.double_pendulum(mass1=1.2346)
+    for engine in ("lagrangian", "oracle"):
+        with pytest.raises(AssertionError, match="derived again"):
+            mb.dynamics(other, engine).nle(q, v)

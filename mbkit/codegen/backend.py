@@ -48,8 +48,10 @@ class LastUsed(Generic[T]):
             disk.mark_made(key)
             if key in self._kept:
                 self._sum -= self._operations(self._kept.pop(key))
-            self._kept[key] = made
-            self._sum += self._operations(made)
+            # One that is larger would drive out all others.
+            if (size := self._operations(made)) <= self._most:
+                self._kept[key] = made
+                self._sum += size
             while self._sum > self._most:
                 self._sum -= self._operations(self._kept.popitem(last=False)[1])
         return made
