@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from mbkit.studies.explain import explain as explain
     from mbkit.studies.importers import compare_parsers as compare_parsers
     from mbkit.studies.stress.study import stress as stress
+    from mbkit.studies.versions import versions as versions
     from mbkit.studies.work_precision.study import work_precision as work_precision
 
 
@@ -78,6 +79,7 @@ _HOME = {
     "robots": "mbkit.load",
     "sensitivities": "mbkit.simulate",
     "stress": "mbkit.studies",
+    "versions": "mbkit.studies.versions",
     "work_precision": "mbkit.studies",
 }
 # `show` and `simulate` are called too; methods and events are in the second.

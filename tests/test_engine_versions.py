@@ -131,12 +131,10 @@ def test_its_own_runs_are_those_of_the_library():
     model = random_tree(5, 4, ("free", "revolute"), springs=False, damping=False)
     dyn, here = mb.dynamics(model, present("mujoco", installed("mujoco"))), mb.dynamics(model, "mujoco")
     q0, v0 = model.random_state(0)
-    for ours, theirs in zip(
-        dyn.rollout(q0, v0, "rk4", 1e-3, 20), here.rollout("rk4", q0, v0, 1e-3, None, 20), strict=True
-    ):
+    for ours, theirs in zip(dyn.rollout(q0, v0, 1e-3, 20), here.rollout("rk4", q0, v0, 1e-3, None, 20), strict=True):
         assert np.abs(ours - theirs).max() < 1e-12
     with pytest.raises(UnsupportedError, match="rollout"):
-        mb.dynamics(model, present("pinocchio", "4.1.0")).rollout(q0, v0, "rk4", 1e-3, 20)
+        mb.dynamics(model, present("pinocchio", "4.1.0")).rollout(q0, v0, 1e-3, 20)
 
 
 def test_what_does_not_travel_is_refused_by_name():
@@ -276,6 +274,22 @@ def test_what_is_compiled_for_an_older_numpy_gets_it(installer):
     with pytest.raises(UnsupportedError, match="no_such_module cannot be imported: ModuleNotFoundError"):
         environment.interpreter("mujoco", "9.9", "no_such_module", len)
     assert [line.split()[-1] for line in log.read_text().splitlines()] == ["numpy", "numpy<2"]
+
+
+def test_a_dependency_that_is_too_new_is_bounded(installer, tmp_path):
+    """The wanted library is there in another version: the package that brought it is taken a version older."""
+    library = 'raise ImportError("libmine.so.4: cannot open shared object file: No such file or directory")'
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "needs_mine.py").write_text(library)
+    log = installer(
+        'for last; do :; done; root="$(dirname "$(dirname "$6")")"; info="$root/lib/mine-2.0.dist-info"\n'
+        'mkdir -p "$info"; echo "mine.prefix/lib/libmine.so.5,sha,1" > "$info/RECORD"\n'
+        'printf "Name: mine\\nVersion: 2.0\\n" > "$info/METADATA"\n'
+        f'if [ "$last" = "mine<2.0" ]; then echo "" > {tmp_path}/broken/needs_mine.py; fi'
+    )
+    script(tmp_path / "bin" / "python", f'PYTHONPATH={tmp_path}/broken exec "{sys.executable}" "$@"')
+    environment.interpreter("mujoco", "9.9", "needs_mine", len)
+    assert [line.split()[-1] for line in log.read_text().splitlines()] == ["numpy", "mine<2.0"]
 
 
 def test_an_unknown_version_is_answered_with_those_that_there_are(installer):

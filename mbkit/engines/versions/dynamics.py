@@ -49,6 +49,8 @@ class VersionDynamics(MappedDynamics):
         self._build()
         gives = self._call("about")[0]["gives"]
         self._own_passive = "passive" in gives
+        #: Whether the engine has an integrator of its own.
+        self.runs = "rollout" in gives
         vars(self)["refuses"] = {x: why for x, why in _REFUSED.items() if x not in gives}
 
     @property
@@ -172,18 +174,17 @@ class VersionDynamics(MappedDynamics):
 
     # Beside the protocol.
 
-    def rollout(self, q0: Array, v0: Array, method: str, dt: float, steps: int) -> tuple[Array, Array]:
+    def rollout(self, q0: Array, v0: Array, dt: float, steps: int, method: str = "rk4") -> tuple[Array, Array]:
         """Return the states of a run by the engine's own integrator, (steps + 1, nq) and (steps + 1, nv).
 
         Raises `UnsupportedError` for an engine without one, and for mimic joints, which it would not reduce.
         """
         if self.model.layout.reduced:
             raise UnsupportedError(f"{self.engine}: its own runs do not reduce mimic joints")
+        if not self.runs:
+            raise UnsupportedError(f"{self.engine}: it has no rollout of its own here")
         x, u, _ = self._native(self.model.check_q(q0), self.model.check_v(v0))
-        try:
-            xs, us = self._ask("rollout", x, u, method=method, dt=dt, steps=steps)
-        except NumericalError as error:
-            raise UnsupportedError(str(error)) from None
+        xs, us = self._ask("rollout", x, u, method=method, dt=dt, steps=steps)
         q, v = np.empty_like(xs), np.empty_like(us)
         q[:, self._places.q_index] = xs
         for k in range(len(q)):

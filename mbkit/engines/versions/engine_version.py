@@ -16,17 +16,19 @@ _VERSION: Final = re.compile(r"\d+(\.[0-9A-Za-z]+)*")
 
 
 class Package(NamedTuple):
-    """What pip installs of an engine, and the module that is there then."""
+    """What pip installs of an engine, the module that is there then, and what an environment takes, as measured."""
 
     distribution: str
     module: str
+    megabytes: float
+    seconds: float
 
 
 #: Engines with a file of their own in `remote`.
 PACKAGES: Final[Mapping[str, Package]] = {
-    "mujoco": Package("mujoco", "mujoco"),
-    "pinocchio": Package("pin", "pinocchio"),
-    "drake": Package("drake", "pydrake.multibody.plant"),
+    "mujoco": Package("mujoco", "mujoco", 120, 11),
+    "pinocchio": Package("pin", "pinocchio", 430, 25),
+    "drake": Package("drake", "pydrake.multibody.plant", 440, 20),
 }
 
 
@@ -109,6 +111,11 @@ def engine(name: str, *, seconds: float = 60.0) -> EngineVersion:
     if not _VERSION.fullmatch(version):
         raise InputError(f"name: {form}, got {name!r}")
     return EngineVersion(head, version, real("seconds", seconds, positive=True))
+
+
+def order_of(version: str) -> tuple[int, ...]:
+    """Return the numbers of a version, by which versions are in order."""
+    return tuple(int(x) for x in re.findall(r"\d+", version))
 
 
 def versions_of(name: str) -> tuple[str, ...]:

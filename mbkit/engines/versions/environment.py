@@ -28,6 +28,11 @@ _INSTALL, _IMPORT = 1800.0, 120.0
 #: What pip says where a version does not exist, or where it reached no index.
 _VERSIONS: Final = re.compile(r"from versions: ([^)]*)\)")
 _AVAILABLE: Final = re.compile(r"^Available versions: (.+)$", re.MULTILINE)
+#: A shared library that the system does not find.
+_LIBRARY: Final = re.compile(r"(lib[\w+-]+)\.so[.\d]*: cannot open shared object")
+_OLD_NUMPY: Final = "numpy<2"
+#: So many bounds on dependencies are tried, one after the other.
+_MOST_LIMITS: Final = 12
 
 Report = Callable[[str], object]
 
@@ -126,13 +131,14 @@ def _make(path: Path, distribution: str, version: str, module: str, report: Repo
     name, start = f"{distribution} {version}", time.perf_counter()
     report(f"mbkit: making an environment of {name} in {path}")
     try:
-        pip = _empty(half)
-        _install(pip, distribution, version, "numpy")
-        if _import_failure(half, module):
-            # Compiled against an older interface of NumPy.
-            _install(pip, distribution, version, "numpy<2")
-            if reason := _import_failure(half, module):
+        pip, limits = _empty(half), ["numpy"]
+        _install(pip, distribution, version, limits)
+        # Old versions do not say how new their dependencies may be.
+        while reason := _import_failure(half, module):
+            if not (limit := _limit(half, reason, limits)):
                 raise UnsupportedError(f"{name}: installed, but {module} cannot be imported: {reason}")
+            limits.append(limit)
+            _install(pip, distribution, version, limits)
         os.replace(half, path)
     finally:
         shutil.rmtree(half, ignore_errors=True)
@@ -155,10 +161,30 @@ def _empty(path: Path) -> list[str]:
     return [*([python, "-m", "pip"] if own else [sys.executable, "-m", "pip", "--python", python]), "install", "-q"]
 
 
-def _install(pip: Sequence[str], distribution: str, version: str, numpy: str) -> None:
+def _limit(path: Path, reason: str, limits: Sequence[str]) -> str:
+    """Return a bound on a dependency that may mend an import; empty where there is none left.
+
+    A library of another soname than the one that is wanted belongs to a package that is too new. Else the engine may be
+    compiled against an older interface of NumPy.
+    """
+    missing = _LIBRARY.search(reason)
+    if missing is None:
+        return "" if _OLD_NUMPY in limits else _OLD_NUMPY
+    if len(limits) > _MOST_LIMITS:
+        return ""
+    for record in path.rglob("*.dist-info/RECORD"):
+        if re.search(rf"/{re.escape(missing[1])}\.so[.,]", record.read_text(encoding="utf-8")):
+            head = (record.parent / "METADATA").read_text(encoding="utf-8", errors="replace")
+            name, version = (re.search(rf"^{key}: (.+)$", head, re.MULTILINE) for key in ("Name", "Version"))
+            if name and version:
+                return f"{name[1].strip()}<{version[1].strip()}"
+    return ""
+
+
+def _install(pip: Sequence[str], distribution: str, version: str, limits: Sequence[str]) -> None:
     wanted = f"{distribution}=={version}"
     # A compiler would take long, and versions without a wheel are rarely built by one.
-    done = _finished([*pip, "--only-binary=:all:", wanted, numpy], _INSTALL)
+    done = _finished([*pip, "--only-binary=:all:", wanted, *limits], _INSTALL)
     if done.returncode == 0:
         return
     name = f"{distribution} {version}"

@@ -40,6 +40,8 @@ class Engine:
         for name in _OFF:
             m.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, "mjDSBL_" + name, 0))
         m.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+        # Older ones compute no energy without it.
+        m.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
 
     def joints(self) -> dict[str, Any]:
         """Return the places of each joint's numbers in qpos and qvel."""
