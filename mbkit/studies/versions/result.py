@@ -87,8 +87,8 @@ class VersionsResult(ResultTable):
     Attributes
     ----------
     engine : str
-    versions : tuple of str
-        That were measured, oldest first.
+    measured : tuple of str
+        Versions, oldest first.
     rows : tuple of VersionRow
         By robot, term and version.
     changes : tuple of Change
@@ -96,14 +96,22 @@ class VersionsResult(ResultTable):
     missing : tuple of (str, str)
         Versions without an environment or a process, each with the reason.
     settings : dict
+    versions : dict of str to str
+        Of what else took part, such as the oracle.
+    processor : str
+    seconds : float
+        Of the whole.
     """
 
     engine: str
-    versions: tuple[str, ...]
+    measured: tuple[str, ...]
     rows: tuple[VersionRow, ...]
     changes: tuple[Change, ...]
     missing: tuple[tuple[str, str], ...]
     settings: dict[str, Any]
+    versions: dict[str, str]
+    processor: str
+    seconds: float
 
     _derived: ClassVar = ("same", "verdict")
     _csv_columns = columns_of(VersionRow)
@@ -119,9 +127,9 @@ class VersionsResult(ResultTable):
     @property
     def verdict(self) -> str:
         """The outcome in a sentence."""
-        if not self.versions:
+        if not self.measured:
             return f"none of {len(self.missing)} versions of {self.engine} could be measured"
-        span = self.versions[0] if len(self.versions) == 1 else f"{self.versions[0]} to {self.versions[-1]}"
+        span = self.measured[0] if len(self.measured) == 1 else f"{self.measured[0]} to {self.measured[-1]}"
         head = f"{self.engine} {span}: "
         if not self.changes:
             said = f"no number moved by more than {self.settings['tolerance']:g}"
@@ -143,11 +151,11 @@ class VersionsResult(ResultTable):
         cells: dict[tuple[str, tuple[str, ...]], list[str]] = {}
         by = {(r.robot, r.term, r.version): r for r in self.rows}
         for robot, term in dict.fromkeys((r.robot, r.term) for r in self.rows):
-            of = [by.get((robot, term, v)) for v in self.versions]
+            of = [by.get((robot, term, v)) for v in self.measured]
             texts = tuple("" if r is None else digits_text(r.digits, 0) + " *" * r.changed for r in of)
             cells.setdefault((robot, texts), []).append(term)
         rows = [(robot, ", ".join(terms), *texts) for (robot, texts), terms in cells.items()]
-        heads = ("robot", "terms", *self.versions)
+        heads = ("robot", "terms", *self.measured)
         return [Column(head, _at(k), right=k > 1) for k, head in enumerate(heads)], rows
 
     def _blocks(self) -> Iterator[Block]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import partial
@@ -169,6 +170,7 @@ class _Study:
     ) -> None:
         self._cases, self._versions, self._tolerance = cases, versions, tolerance
         self._executor, self._progress = executor, progress
+        self._start = time.perf_counter()
         self._done: dict[int, Measured] = {}
         self._missing: dict[int, str] = {}
         self._truths = {case.name: Truth(case) for case in cases}
@@ -265,6 +267,9 @@ class _Study:
             tuple(changes),
             tuple((self._versions[k].version, self._missing[k]) for k in sorted(self._missing)),
             dict(settings),
+            installed_versions(),
+            processor(),
+            time.perf_counter() - self._start,
         )
 
 
