@@ -460,8 +460,8 @@ class LagrangianDynamics(Dynamics):
         # Another method may have been registered by this name.
         if held is not None and held[0] is METHODS.get(method) and dt > 0:
             out: tuple[Array, Array] | None
+            behind: tuple[Array, ...] = ()
             if not self._parametric:
-                behind: tuple[Array, ...] = ()
                 out = held[1].single(q, v, tau, dt)
             else:
                 behind = self._trailing(q)

@@ -33,6 +33,7 @@ _TINY: Final = 1e-150
 class ConstrainedMidpoint(Midpoint):
     """The parts of a step under constraints, with the names and arguments of `Midpoint`'s."""
 
+    # Equations under constraints have more than `Equations`.
     _equations: Any
 
     def __init__(self, equations: Any) -> None:
