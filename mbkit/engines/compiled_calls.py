@@ -15,7 +15,7 @@ from mbkit._check import Array
 from mbkit.codegen.compiled import Compiled
 from mbkit.codegen.python_call import Step, python_call
 from mbkit.derivation.equations import Equations
-from mbkit.derivation.steps.fixed import Part, march, march_in_stages, velocity_changes
+from mbkit.derivation.steps.fixed import DYNAMICS, Part, march, march_in_stages, velocity_changes
 from mbkit.methods.registry import method_of
 from mbkit.model import Model
 from mbkit.model.manifold import NEAR_UNIT
@@ -87,7 +87,7 @@ class Plan:
         self, equations: Equations, method: str, code: Callable[[Part], Compiled], *, thorough: bool = False
     ) -> None:
         self.parts = march_in_stages(equations, method, thorough=thorough)
-        forward = next(part for part in self.parts if part.name == "forward_dynamics")
+        forward = next(part for part in self.parts if part.name in DYNAMICS)
         if method_of(method).stages * code(forward).operations <= _ONE_PIECE:
             self.parts = march(equations, method, thorough=thorough)
         self.codes = tuple(code(part) for part in self.parts)

@@ -6,7 +6,7 @@ the step.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import groupby
@@ -28,6 +28,8 @@ from mbkit.model.integration_space import Space
 
 _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
+#: Parts that evaluate forward dynamics, without and with constraints.
+DYNAMICS: Final = ("forward_dynamics", "held_dynamics")
 #: Of a step: rounding of a stage's time.
 _SAME_TIME: Final = 1e-12
 
@@ -154,27 +156,43 @@ def march_in_stages(equations: Equations, method: str, *, thorough: bool = False
     prefix = _prefix(method, thorough)
 
     timed = equations.model.time_parameter is not None
-    known |= equations.extra_arguments if equations.model.constrained else {}
+    held = equations.model.constrained
+    known |= equations.extra_arguments if held else {}
+    dependences: list[Any] = []
 
     def acceleration(t: Any, q: Any, w: Any) -> Any:
-        i = sum(part.name == "forward_dynamics" for part in parts)
+        i = sum(part.name in DYNAMICS for part in parts)
         v = space.to_body_velocity(q, w)
         at, more = ("q", "w"), (*equations.extra_arguments,)
         if i or not space.flat:
             at = (f"q_{i}", f"v_{i}")
-            writes = dict(zip(at, (q, v), strict=True))
+            stage = dict(zip(at, (q, v), strict=True))
             if timed:
                 more = (f"parameters_{i}",)
-                writes[more[0]] = at_time(equations, t)["parameters"]
-            parts.append(Part.of(f"{prefix}_stage_{i}", known, writes))
+                stage[more[0]] = at_time(equations, t)["parameters"]
+            parts.append(Part.of(f"{prefix}_stage_{i}", known, stage))
         reads = (*at, "tau", *more)
-        parts.append(Part("forward_dynamics", reads, (f"a_{i}",), lambda: equations.function("forward_dynamics")))
+        if held:
+            writes = f"a_{i}", f"depends_{i}"
+            parts.append(Part("held_dynamics", reads, writes, lambda: _held_dynamics(equations)))
+            known[writes[1]] = ca.SX.sym(writes[1])
+            dependences.append(known[writes[1]])
+        else:
+            parts.append(Part("forward_dynamics", reads, (f"a_{i}",), lambda: equations.function("forward_dynamics")))
         a = known[f"a_{i}"] = ca.SX.sym(f"a_{i}", equations.model.nv)
         return space.acceleration(q, v, a)
 
-    ends = _stepped(equations, method, s, s["w"], acceleration, thorough=thorough)
+    ends = _stepped(equations, method, s, s["w"], acceleration, thorough=thorough, dependences=dependences)
     known["squares"] = s["squares"]
     return (*parts, Part.of(f"{prefix}_end", known, _with_squares(s, *ends)))
+
+
+def _held_dynamics(equations: Equations) -> ca.Function:
+    """Return (q, v, tau, more) -> v̇ and the `dependence` of rows at q, by one factorization."""
+    forward = equations.function("forward_dynamics")
+    q, v, tau, *more = forward.sx_in()
+    outs = {"a": forward(q, v, tau, *more), "depends": dependence(equations)(q, *more)}
+    return function_of("held_dynamics", dict(zip(forward.name_in(), (q, v, tau, *more), strict=True)), outs)
 
 
 def _stepped(
@@ -185,12 +203,13 @@ def _stepped(
     acceleration: Callable[[Any, Any, Any], Any],
     *,
     thorough: bool = True,
+    dependences: Sequence[Any] = (),
 ) -> tuple[Any, Any, Any]:
     """Return q and w after a step from q and this w, and 1 where it is lost to its constraints, else 0.
 
     That is near a singular pose, and where a step is so long that its projection is not done.
 
-    acceleration(t, q, w) is ẇ at a time after the step's start.
+    acceleration(t, q, w) is ẇ at a time after the step's start; it may add the `dependence` at each stage to those.
     """
     formula, space = method_of(method).formula, SymbolicSpace(equations.model)
     if not isinstance(formula, (Tableau, SemiImplicitEuler)) or not formula.explicit:
@@ -206,14 +225,15 @@ def _stepped(
     if not equations.model.constrained:
         return q1, w1, 0.0
     before, behind = equations.extra_arguments.values(), at_time(equations, s["dt"]).values()
-    v1 = space.to_body_velocity(q1, w1)
+    v1, depends = space.to_body_velocity(q1, w1), dependence(equations)
+    first = dependences[0] if dependences else depends(s["q"], *before)
     if thorough or not _ends_at_a_stage(formula):
-        last = [q1]
+        end = depends(q1, *behind)
         q1, v1, far = thorough_projection(equations)(q1, v1, *behind)
     else:
+        end = dependences[-1] if dependences else depends(*last, *behind)
         q1, v1, far = quick_projection(equations)(q1, v1, *last, *behind)
-    depends = dependence(equations)
-    lost = ca.logic_or(far, nears_singular(depends(s["q"], *before), depends(*last, *behind)))
+    lost = ca.logic_or(far, nears_singular(first, end))
     return q1, space.to_integrator_velocity(q1, v1), lost
 
 
