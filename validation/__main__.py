@@ -35,6 +35,7 @@ PARTS = {
         3, ("identification.json",), "identified parameters of two arms, and regressors beside Pinocchio"
     ),
     "energy_drift": Part(1, ("energy_drift.json",), "a million steps of a symplectic method"),
+    "long_loops": Part(1, ("long_loops.json",), "a million steps of mechanisms with loops: gap and energy"),
     "importers": Part(1, ("importers.json", "importers_floating.json"), "one file through three importers"),
     "fuzz": Part(10, ("fuzz.json",), "random and damaged files, random trees"),
     "memory": Part(14, ("memory.json",), "memory that released models leave behind"),
