@@ -27,6 +27,7 @@ from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import DEFAULT_METHOD, Method, explicit_method
 from mbkit.methods.tableaus import Tableau
 from mbkit.model import Frame, Joint, Model
+from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import NEAR_UNIT
 from mbkit.model.rolling import LIES_FLAT
@@ -74,16 +75,18 @@ def unit_quaternions(q: Array, starts: Iterable[int]) -> bool:
     return True
 
 
-def require_tree(model: Model, user: str, why: str = "it takes the tree alone") -> None:
-    """Raise `UnsupportedError` for a model with constraints, in the name of an engine or study."""
+def require_tree(
+    model: Model, user: str, why: str = "it takes the tree alone", features: Iterable[str] = CONSTRAINT_FEATURES
+) -> None:
+    """Raise `UnsupportedError` for a model with constraints, or with some kinds of them, in the name of a user."""
     texts = {
         "loops": "loop closures",
         "couplers": "couplers",
         "prescribed": "motions prescribed in time",
         "no_slip": "blades or rolling contacts, which hold velocities",
     }
-    for feature, text in texts.items():
-        parts = getattr(model, feature)
+    for feature in features:
+        text, parts = texts[feature], getattr(model, feature)
         if parts:
             names = first_names((repr(x.name) for x in parts), ", ...")
             raise UnsupportedError(

@@ -77,7 +77,7 @@ class IndependentMotion(LoopLoads):
         NumericalError
             The coordinates do not determine the others at a pose, as at a dead centre.
         UnsupportedError
-            A model without loops, or with constraints that depend on the time.
+            A model without loops, or with constraints that depend on the time or hold velocities alone.
 
         Examples
         --------
@@ -95,6 +95,11 @@ class IndependentMotion(LoopLoads):
         model = self.model
         if not model.constrained:
             raise UnsupportedError(f"reduced_inertia: {model.name} has no loops and no other constraints")
+        if model.no_slip:
+            raise UnsupportedError(
+                f"reduced_inertia: {model.name} has contacts without slip, whose velocities lead to no path of its "
+                "coordinates; consistent_changes(q, v) has the motions that they allow"
+            )
         if model.time_parameter is not None:
             raise UnsupportedError(
                 f"reduced_inertia: constraints of {model.name} depend on the time, so that its velocities are not "

@@ -23,7 +23,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit._fork import fork_safe
 from mbkit.engines import regressors
-from mbkit.engines.base import MappedDynamics
+from mbkit.engines.base import MappedDynamics, require_tree
 from mbkit.engines.constrained import QUANTITIES as CONSTRAINT_QUANTITIES
 from mbkit.engines.drake.bodies import DrakeBodies
 from mbkit.engines.drake.model import DrakeModel, build
@@ -68,6 +68,7 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
+        require_tree(model, "drake", "its plants have no constraint of velocities", ("no_slip",))
         if model.constrained:
             vars(self)["refuses"] = self.refuses | _WITHOUT_LOOPS
         self._hold(build(model))
