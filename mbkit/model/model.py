@@ -57,7 +57,7 @@ class Model(Description):
 
     @property
     def constraints_do_work(self) -> bool:
-        """Whether constraints may feed energy, as motions prescribed in time and blades with a speed of their own do."""
+        """Whether constraints may feed energy, as motions prescribed in time and blades with a speed do."""
         return self.time_parameter is not None or any(x.speed for x in self.no_slip)
 
     def require_independent(self, q: Array, *, once: bool = False) -> None:
