@@ -171,13 +171,6 @@ class ConstraintFactors:
 # Rows of loops, of prescribed motions and of contacts without slip
 
 
-def _carried(kin: Kinematics, body: str, to: str, x: Vector, weight: float) -> Vector:
-    while body != to:
-        joint = kin.carrier(body)
-        x, body = kin.to_parent(joint, x, weight), joint.parent
-    return x
-
-
 def _ends(kin: Kinematics, loop: Loop) -> LoopEnds:
     values = kin.values.loops[loop.name]
     both = kin.model.carrier(loop)
@@ -185,8 +178,8 @@ def _ends(kin: Kinematics, loop: Loop) -> LoopEnds:
         (loop.body_a, values.translation_a, values.rotation_a),
         (loop.body_b, values.translation_b, values.rotation_b),
     )
-    p, q = (_carried(kin, body, both, list(point), 1.0) for body, point, _ in sides)
-    a, b = ([_carried(kin, body, both, [row[k] for row in R], 0.0) for k in range(3)] for body, _, R in sides)
+    p, q = (kin.carried_to(body, both, list(point), 1.0) for body, point, _ in sides)
+    a, b = ([kin.carried_to(body, both, [row[k] for row in R], 0.0) for k in range(3)] for body, _, R in sides)
     return LoopEnds([x - y for x, y in zip(p, q, strict=True)], a, b, values.length)
 
 
@@ -199,38 +192,21 @@ class _Row(NamedTuple):
     moves: bool = False
 
 
-def _velocity(kin: Kinematics, body: str, to: str, at: Vector) -> Vector:
-    """Return the velocity of the point of a body at a place, seen from the body `to` that carries it, in its axes.
-
-    Joint by joint from there: the wheel's turn about its own axis then stands in no sine.
-    """
-    out: Vector = [0.0] * 3
-    while body != to:
-        joint = kin.carrier(body)
-        values = kin.values.joints[joint.name]
-        twist = joint.type.twist(kin.formulas, values, kin.coordinates(joint), kin.velocities(joint))
-        linear, angular = (_carried(kin, body, to, list(x), 0.0) for x in twist)
-        origin = _carried(kin, body, to, [0.0] * 3, 1.0)
-        out = add(out, add(linear, cross3(angular, [x - y for x, y in zip(at, origin, strict=True)])))
-        body = joint.parent
-    return out
-
-
 def _contact(kin: Kinematics, part: NoSlip) -> Contact:
     """Return the contact of a part in the axes of the body that carries both its bodies."""
     values, both = kin.values.no_slip[part.name], kin.model.carrier(part)
-    a, b = _carried(kin, part.body_a, both, values.axis_a, 0.0), _carried(kin, part.body_b, both, values.axis_b, 0.0)
-    along = [_carried(kin, part.body_b, both, row, 0.0) for row in values.tangents]
+    a, b = kin.carried_to(part.body_a, both, values.axis_a, 0.0), kin.carried_to(part.body_b, both, values.axis_b, 0.0)
+    along = [kin.carried_to(part.body_b, both, row, 0.0) for row in values.tangents]
     return contact(part.kind, a, b, along, values.radius, lambda x: kin.length(ca.SX(x)))
 
 
 def _contact_rows(kin: Kinematics, part: NoSlip) -> tuple[list[Any], list[Any]]:
     """Return the expressions of the rows that hold positions and of those that hold velocities."""
     values, both, place = kin.values.no_slip[part.name], kin.model.carrier(part), _contact(kin, part)
-    centre = _carried(kin, part.body_a, both, values.translation_a, 1.0)
-    ground = _carried(kin, part.body_b, both, values.translation_b, 1.0)
+    centre = kin.carried_to(part.body_a, both, values.translation_a, 1.0)
+    ground = kin.carried_to(part.body_b, both, values.translation_b, 1.0)
     at = add(centre, place.offset)
-    ends = (_velocity(kin, body, both, at) for body in (part.body_a, part.body_b))
+    ends = (kin.velocity_at(body, both, at) for body in (part.body_a, part.body_b))
     velocity, gap = ([x - y for x, y in zip(*two, strict=True)] for two in (ends, (centre, ground)))
     return [dot3(gap, n) - place.reach for n in place.up], [dot3(velocity, t) - values.speed for t in place.along]
 

@@ -135,11 +135,30 @@ class Kinematics:
 
     def to_world(self, body: str, x: Vector, weight: float = 1.0) -> Vector:
         """Return a point (weight 1) or vector (weight 0) of a body in world axes."""
-        while body != "world":
+        return self.carried_to(body, "world", x, weight)
+
+    def carried_to(self, body: str, to: str, x: Vector, weight: float) -> Vector:
+        """Return a point (weight 1) or vector (weight 0) of a body in the axes of one that carries it."""
+        while body != to:
             joint = self._carrier[body]
-            x = self.to_parent(joint, x, weight)
-            body = joint.parent
+            x, body = self.to_parent(joint, x, weight), joint.parent
         return x
+
+    def velocity_at(self, body: str, to: str, at: Vector) -> Vector:
+        """Return the velocity of the point of a body at a place, seen from the body `to` that carries it, in its axes.
+
+        Joint by joint from there: a wheel's turn about its own axis then stands in no sine.
+        """
+        out: Vector = [0.0] * 3
+        while body != to:
+            joint = self._carrier[body]
+            values = self.values.joints[joint.name]
+            twist = joint.type.twist(self.formulas, values, self.coordinates(joint), self.velocities(joint))
+            linear, angular = (self.carried_to(body, to, list(x), 0.0) for x in twist)
+            origin = self.carried_to(body, to, [0.0] * 3, 1.0)
+            out = add(out, add(linear, cross3(angular, [x - y for x, y in zip(at, origin, strict=True)])))
+            body = joint.parent
+        return out
 
     def squared_length(self, spring: PointSpring) -> Any:
         """Return |p_AB|² of the points that a spring joins."""
