@@ -114,9 +114,7 @@ def test_actuators_and_motions_that_do_not_fit_are_refused() -> None:
     for engine in ("oracle", *RIGID):
         dyn = dynamics(model, engine)
         a = dyn.forward_dynamics(q, v, np.zeros(model.nv))
-        with pytest.raises(
-            InputError, match=r"5 degrees of freedom|2 degrees of freedom, and with theta1 held still 1"
-        ):
+        with pytest.raises(InputError, match="2 degrees of freedom, and with theta1 held still 1"):
             dyn.actuator_forces(q, v, a, ["theta1"])
         with pytest.raises(InputError, match="with no actuator held still 2"):
             dyn.actuator_forces(q, v, a, [])
@@ -336,7 +334,7 @@ def test_what_cannot_be_held_is_refused() -> None:
         dyn.project([0.3, 2.0], [0.0, 0.0], hold=["slider"])
     # At the dead centre any angle of the crank is as good, to first order, and a speed of the slider asks for none.
     dead = [0.0, CRANK_RADIUS + ROD]
-    with pytest.raises(InputError, match="not determined at this pose|cannot be met"):
+    with pytest.raises(InputError, match="not determined at this pose"):
         dyn.project(dead, [0.0, 0.0], hold=["slider"])
     with pytest.raises(InputError, match="cannot be met"):
         dyn.project([0.5, 0.8], [1.0, 1.0], hold=["crank", "slider"])
@@ -531,7 +529,7 @@ def test_couplers_in_mujoco_follow_its_written_law_and_survive_mjcf(tmp_path: Pa
     tau = np.array([1.0, 2.0, 3.0])
     for options in ({}, {"solref": (-1000.0, -50.0), "solimp": (0.99, 0.999, 0.001, 0.5, 2.0)}):
         dyn = mb.dynamics(model, "mujoco", **options)
-        for state in (q, q + [0.0, 0.01, -0.02]):
+        for state in (q, q + np.array([0.0, 0.01, -0.02])):
             said = dyn.constraint_law(state, v, tau)
             assert off(dyn.forward_dynamics(state, v, tau), said.acceleration) < 1e-11
     rigid = mb.dynamics(model, "pinocchio").forward_dynamics(q, v, tau)
@@ -542,9 +540,10 @@ def test_couplers_in_mujoco_follow_its_written_law_and_survive_mjcf(tmp_path: Pa
     assert not mb.load(path, loops=False).couplers
     m = mujoco.MjModel.from_xml_path(str(path))
     d = mujoco.MjData(m)
-    d.qpos[:] = q + [0.0, 0.01, 0.0]
+    open_state = q + np.array([0.0, 0.01, 0.0])
+    d.qpos[:] = open_state
     mujoco.mj_forward(m, d)
-    assert d.efc_pos[:2] == pytest.approx(mb.dynamics(model, "oracle").constraint_residual(q + [0, 0.01, 0]), abs=1e-14)
+    assert d.efc_pos[:2] == pytest.approx(mb.dynamics(model, "oracle").constraint_residual(open_state), abs=1e-14)
     # Reference angles: MuJoCo's polynomial is of what the joints are away from them.
     text = path.read_text().replace('name="a"', 'name="a" ref="0.4"').replace('name="b"', 'name="b" ref="0.2"')
     path.write_text(text)
