@@ -564,8 +564,8 @@ class ConstraintQuantities:
     def actuator_forces(self, actuators: tuple[int, ...]) -> ca.Function:
         """Return (q, v, a) -> the forces of the actuated velocities, with the least norm, that make a motion.
 
-        One column: τ, λ of all rows, J a + γ, and of its rows the sizes; last what is left of the worst row of J, or of
-        J restricted to the other velocities, once the others are taken away, as a square.
+        One column: τ, λ of all rows, J a + γ, and of its rows the sizes; last what is left of the worst row of J once
+        the others are taken away, or of a velocity without an actuator in J's rows, as a square.
 
         With f = M a + h - τ_passive, split into the actuated velocities S and the others U, λ minimizes
         |f_S - J_Sᵀ λ|² where J_Uᵀ λ = f_U. By Lagrange's multipliers μ, since J_S f_S + J_U f_U = J f::
@@ -592,9 +592,11 @@ class ConstraintQuantities:
         # It vanishes up to rounding.
         tau[others] = 0.0
         left: Any = ca.SX(1.0)
-        for matrix, factors in ((gram, G), (reduced, S)):
-            for k, inverse in enumerate(factors.inverse):
-                left = ca.fmin(left, 1.0 / (ca.SX(inverse) * matrix[k, k]))
+        for k, inverse in enumerate(G.inverse):
+            left = ca.fmin(left, 1.0 / (ca.SX(inverse) * gram[k, k]))
+        # A part of the projection on J's rows: one at most.
+        for inverse in S.inverse:
+            left = ca.fmin(left, 1.0 / ca.SX(inverse))
         rates = ca.mtimes(J, self.a) + c.gamma
         out = ca.vertcat(tau, self._spread(multipliers), rates, ca.sqrt(ca.sum2(J**2)), left)
         return self.named("actuator_forces", ("q", "v", "a"), [self.q, self.v, self.a], out)

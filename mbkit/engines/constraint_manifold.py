@@ -329,13 +329,15 @@ class Manifold:
                     f"hold: {names} held, the constraints of {model.name} cannot be met: {what} = "
                     f"{_residuals(left[bad])} is left of {_named(bad, self)}; hold fewer coordinates, or other values"
                 )
-        J = terms.J / np.linalg.norm(terms.J, axis=1, keepdims=True)
-        J = J[:, self._free(held)]
-        moving = np.flatnonzero(np.linalg.norm(J, axis=1) > _DEPENDENT)
+        free, rng = self._free(held), np.random.default_rng(0)
+        J = (terms.J / np.linalg.norm(terms.J, axis=1, keepdims=True))[:, free]
+        # A row of held coordinates alone, such as a drive's, says nothing of the others at any pose.
+        beside = [self.jacobian(model.integrate(q, _ASIDE * rng.standard_normal(model.nv))) for _ in range(_BESIDE)]
+        moving = np.flatnonzero(np.max([np.abs(x[:, free]).max(axis=1, initial=0.0) for x in beside], axis=0) > 0)
         if len(moving) and len(dependent := _dependent(J[moving])[0]):
             raise InputError(
                 f"hold: {names} held, the other coordinates of {model.name} are not determined at this pose: "
-                f"{_named(moving[dependent], self)} depends on other rows; hold other coordinates"
+                f"{_named(moving[dependent], self)} has no slope or depends on other rows; hold other coordinates"
             )
 
     def restored(self, q: Array, v: Array, held: Collection[int] = ()) -> Array:

@@ -211,9 +211,10 @@ class Actuation(Constrained):
         others = [i for i in range(n) if i not in which]
         if not others:
             return
-        columns = scaled[:, others]
-        heights = np.linalg.norm(columns, axis=0)
-        _, singular, right = np.linalg.svd(columns / np.where(heights > 0, heights, 1.0), full_matrices=True)
+        heights = np.linalg.norm(scaled, axis=0)
+        # A coordinate that the constraints leave alone, up to rounding.
+        heights = np.where(heights > DEPENDENT * heights.max(), heights, np.inf)[others]
+        _, singular, right = np.linalg.svd(scaled[:, others] / heights, full_matrices=True)
         rank = int(np.count_nonzero(singular > DEPENDENT))
         if rank == len(others):
             return
