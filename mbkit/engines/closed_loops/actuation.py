@@ -176,12 +176,14 @@ class Actuation(Constrained):
         m = (out.shape[-1] - n - kept - 1) // 2
         numbers = np.asarray(out, dtype=np.float64).reshape(-1, out.shape[-1])
         rates, sizes, left = numbers[:, n + kept : n + kept + m], numbers[:, n + kept + m : -1], numbers[:, -1]
-        for k, (state, one) in enumerate(zip(np.atleast_2d(q), np.atleast_2d(a), strict=True)):
-            if not left[k] > _SUSPECT:
-                own = self.of_samples([k])
-                J = own._evaluate("constraint_jacobian", q=state).reshape(kept, n)
-                self._require_determined(J[list(self._row_choice.independent)], which)
-            self._require_consistent(rates[k], sizes[k], one)
+        states, accelerations = np.atleast_2d(q), np.atleast_2d(a)
+        fast = np.maximum(1.0, np.abs(accelerations).max(axis=1, initial=0.0))[:, None]
+        broken = ~(np.abs(rates) <= _CONSISTENT * np.maximum(sizes, 1.0) * fast).all(axis=1)
+        for k in np.flatnonzero(~(left > _SUSPECT) | broken).tolist():
+            own = self.of_samples([k])
+            J = own._evaluate("constraint_jacobian", q=states[k]).reshape(kept, n)
+            self._require_determined(J[list(self._row_choice.independent)], which)
+            self._require_consistent(rates[k], sizes[k], accelerations[k])
         return out[..., : n + kept]
 
     def _require_consistent(self, rates: Array, sizes: Array, a: Array) -> None:
