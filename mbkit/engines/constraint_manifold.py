@@ -104,8 +104,14 @@ class _Terms(NamedTuple):
     @property
     def scale(self) -> Array:
         """What a row changes by when every coordinate changes by 1."""
-        sizes = np.abs(self.J).sum(axis=1)
-        return np.where(sizes > 0, sizes, 1.0)
+        return _scale(self.J)
+
+
+def _scale(J: Array) -> Array:
+    sizes = np.abs(J).sum(axis=-1)
+    # A row that has no slope at a singular pose is as large as the others all the same.
+    sizes = np.maximum(sizes, AT_POSE * sizes.max(axis=-1, keepdims=True, initial=0.0))
+    return np.asarray(np.where(sizes > 0, sizes, 1.0))
 
     @property
     def held(self) -> Array:
@@ -221,8 +227,7 @@ class Manifold:
     def _inconsistent(self, q: Array, v: Array) -> list[int]:
         """Return which states of a batch may be inconsistent."""
         f, J, _, rate, *_ = self.call("constraint", q, v)
-        scale = np.abs(J).sum(axis=-1)
-        scale = np.where(scale > 0, scale, 1.0)
+        scale = _scale(J)
         bad = np.zeros(len(q), dtype=bool)
         for residual, x in ((f, q), (rate, v)):
             size = np.maximum(1.0, np.abs(x).max(axis=1))[:, None]

@@ -117,7 +117,9 @@ class Field:
                 raise DivergenceError(self.undetermined or DIVERGED)
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
-        a = self._at_poses(t, q, v, force) if self.near_singular else None
+        # An implicit method does not look ahead: its step may begin at a pose.
+        looks = self._constrained and (self._approach.near or not self._explicit)
+        a = self._at_poses(t, q, v, force) if looks else None
         if a is None:
             a = self._evaluated(t, q, v, force)
         return a if self._space is None else np.asarray(self._space.acceleration(q, v, a))

@@ -1,0 +1,260 @@
+"""Motions through poses where rows of J depend on each other: judged, passed on their own branch, or stopped by name.
+
+The references are elliptic functions: a row of four-bars of equal rods moves as one pendulum, on either branch.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit import catalog
+from mbkit.errors import NumericalError
+from validation import elliptic
+
+#: Methods that project, with a setting and the error that it leaves after a second.
+METHODS = [
+    ("rk4", {"dt": 1e-3}, 1e-9),
+    ("semi_implicit_euler", {"dt": 1e-4}, 2e-3),
+    ("gauss4", {"dt": 1e-3}, 1e-9),
+    ("rk853", {"rtol": 1e-11}, 1e-10),
+    ("rodas5", {"rtol": 1e-9}, 1e-7),
+    ("dop853", {"rtol": 1e-10}, 1e-8),
+    ("radau", {"rtol": 1e-8}, 1e-6),
+    ("taylor", {"rtol": 1e-13}, 1e-11),
+]
+_NEEDS_OWN = ("rodas5", "radau", "taylor")
+#: θ of four_bars from the upright pose where all rods lie along +x.
+FLAT = -math.pi / 2
+
+
+def row(n: int, engine: str = "lagrangian"):
+    return mb.dynamics(catalog.four_bars(n=n), engine)
+
+
+def parallel(dyn, theta: float, rate: float):
+    """Return the state of a parallelogram: couplers stay level."""
+    side = np.array([-1.0 if name.startswith("phi") else 1.0 for name in dyn.model.coordinate_names])
+    return theta * side, rate * side
+
+
+def motion(n: int, t, theta: float, rate: float):
+    """Return θ, from upright, of n four-bars: the pendulum's angle is from hanging and turns the other way."""
+    g = ((n + 1) / 2 + n) * 9.81 / ((n + 1 + 3 * n) / 3)
+    angle, _ = elliptic.pendulum(t, math.pi - theta, -rate, g=g)
+    return math.pi - angle[:, 0]
+
+
+def simulated(dyn, q, v, duration: float, method: str, **options):
+    """Return a run, and the warning about singular poses."""
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        run = mb.simulate(dyn, q, v, duration, method, **options)
+    return run, " ".join(str(w.message) for w in told if "singular pose" in str(w.message))
+
+
+def skip_without(method: str, engine: str) -> None:
+    if method == "taylor":
+        pytest.importorskip("heyoka")
+    if engine != "lagrangian" and method in _NEEDS_OWN:
+        pytest.skip("this engine has no derivatives or expressions")
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize(("method", "setting", "close"), METHODS)
+def test_rows_of_four_bars_go_on_as_parallelograms(engine, method, setting, close) -> None:
+    skip_without(method, engine)
+    dyn = row(2, engine)
+    q, v = parallel(dyn, -0.5, -4.0)
+    run, told = simulated(dyn, q, v, 1.0, method, save=[0.0, 1.0] if "rtol" in setting else None, **setting)
+    assert run.stats.finished
+    exact = motion(2, [1.0], -0.5, -4.0)
+    # Rods and couplers, all of them on the same branch.
+    assert run.q[-1] == pytest.approx(parallel(dyn, exact[0], 0.0)[0], abs=close)
+    # The pose in which all rods lie flat comes first at the time at which the pendulum is level.
+    assert float(told.split("t = ")[1].split(" ")[0].split(",")[0]) == pytest.approx(_level(2, -0.5, -4.0), abs=1e-3)
+
+
+def _level(n: int, theta: float, rate: float) -> float:
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if motion(n, [middle], theta, rate)[0] > FLAT else (low, middle)
+    return low
+
+
+@pytest.mark.parametrize("n", [1, 3, 6])
+@pytest.mark.parametrize("method", ["rk853", "rodas5", "taylor"])
+def test_tighter_tolerances_are_no_worse(n, method) -> None:
+    skip_without(method, "lagrangian")
+    dyn = row(n)
+    q, v = parallel(dyn, 0.0, -1.0)
+    t = np.arange(1.0, 6.0)
+    exact, errors, drifts = motion(n, t, 0.0, -1.0), [], []
+    for rtol in (1e-6, 1e-8, 1e-10, 1e-12):
+        run, _ = simulated(dyn, q, v, 5.0, method, rtol=rtol, save=[0.0, *t])
+        assert run.stats.finished
+        errors.append(np.abs(run.q[1:, 0] - exact).max())
+        drifts.append(np.ptp(run.energy()))
+    assert errors == sorted(errors, reverse=True)
+    assert drifts == sorted(drifts, reverse=True)
+    # It starts upright and comes back there every second turn: errors grow a thousand times.
+    assert errors[-1] < 2e-9
+    assert drifts[-1] < 1e-8
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize(("method", "setting", "close"), METHODS)
+def test_a_run_starts_in_a_singular_pose_with_a_velocity(engine, method, setting, close) -> None:
+    skip_without(method, engine)
+    dyn = row(2, engine)
+    q, v = parallel(dyn, FLAT, -3.0)
+    run, told = simulated(dyn, q, v, 0.5, method, save=[0.0, 0.5] if "rtol" in setting else None, **setting)
+    assert run.stats.finished
+    assert run.q[-1] == pytest.approx(parallel(dyn, motion(2, [0.5], FLAT, -3.0)[0], 0.0)[0], abs=close)
+    assert "t = 0" in told
+    assert "loop 'pin1' x and loop 'pin2' x" in told
+
+
+@pytest.mark.parametrize(("method", "setting", "close"), METHODS)
+def test_the_velocity_says_on_which_branch_a_run_goes_on(method, setting, close) -> None:
+    """Where a rod's end lies on the next pivot, coupler and next rod turn about it as one, and the rod stays."""
+    skip_without(method, "lagrangian")
+    dyn = row(1)
+    names = dyn.model.coordinate_names
+    q, _ = parallel(dyn, FLAT, 0.0)
+    v = np.array([{"theta0": 0.0}.get(name, -3.0) for name in names])
+    run, _ = simulated(dyn, q, v, 0.5, method, save=[0.0, 0.5] if "rtol" in setting else None, **setting)
+    assert run.stats.finished
+    # Two rods in one: θ̈ = 3/2 g/l sin θ.
+    angle, _ = elliptic.pendulum([0.5], math.pi - FLAT, 3.0, g=1.5 * 9.81)
+    turned = math.pi - angle[0, 0] - FLAT
+    assert run.q[-1] - q == pytest.approx(np.array([{"theta0": 0.0}.get(n, turned) for n in names]), abs=close)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_a_motion_that_is_not_determined_is_refused_by_name(engine) -> None:
+    dyn = row(2, engine)
+    q, v = parallel(dyn, FLAT, 0.0)
+    with pytest.raises(NumericalError, match=r"singular pose, where loop 'pin1' x, loop 'pin2' x .* at rest"):
+        mb.simulate(dyn, q, v, 0.1, "rk4")
+    # Beside the parallelogram's branch and the other one, J v = 0 all the same.
+    names = dyn.model.coordinate_names
+    v = np.array([{"theta0": -1.0, "phi1": 0.0, "theta1": -2.0, "phi2": 2.0, "theta2": -2.0}[n] for n in names])
+    with pytest.raises(NumericalError, match="its velocity is on none of the branches"):
+        mb.simulate(dyn, q, v, 0.1, "rk4")
+    # The first cell moves, the second one is at the crossing of its branches: at rest.
+    v = np.array([{"theta0": 0.0, "phi1": 0.0, "theta1": 0.0, "phi2": -1.0, "theta2": -1.0}[n] for n in names])
+    with pytest.raises(NumericalError, match="does not say on which branch"):
+        mb.simulate(dyn, q, v, 0.1, "rk4")
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize(("method", "setting", "close"), METHODS)
+def test_one_of_a_batch_does_not_stop_the_others(engine, method, setting, close) -> None:
+    skip_without(method, engine)
+    dyn = row(2, engine)
+    starts = [(math.pi - 0.3, 0.0), (-0.5, -4.0), (FLAT, -3.0), (FLAT, 0.0)]
+    q, v = (np.array(x) for x in zip(*(parallel(dyn, *start) for start in starts), strict=True))
+    run, _ = simulated(dyn, q, v, 0.5, method, save=[0.0, 0.5] if "rtol" in setting else None, **setting)
+    assert run.stats.reached == (0.5, 0.5, 0.5, 0.0)
+    assert "singular pose, where loop 'pin1' x, loop 'pin2' x depend on each other, and at rest" in run.stats.message
+    for k, start in enumerate(starts[:3]):
+        assert run.q[k, -1, 0] == pytest.approx(motion(2, [0.5], *start)[0], abs=close)
+
+
+@pytest.mark.parametrize("aside", [1e-2, 1e-4, 1e-5, 1e-6, 1e-7, 1e-9, 0.0])
+@pytest.mark.parametrize(("method", "setting"), [("rk4", {"dt": 1e-3}), ("rk853", {"rtol": 1e-10})])
+def test_any_distance_from_the_pose_is_good_enough(aside, method, setting) -> None:
+    dyn = row(3)
+    q, v = parallel(dyn, FLAT + aside, -3.0)
+    run, _ = simulated(dyn, q, v, 0.3, method, save=[0.0, 0.3] if "rtol" in setting else None, **setting)
+    assert run.q[-1, 0] == pytest.approx(motion(3, [0.3], FLAT + aside, -3.0)[0], abs=1e-8)
+
+
+def test_two_runs_of_a_compiled_batch_are_those_alone() -> None:
+    dyn = row(2)
+    starts = [(math.pi - 0.3, 0.0), (-0.5, -4.0), (math.pi - 0.2, 0.1)]
+    q, v = (np.array(x) for x in zip(*(parallel(dyn, *start) for start in starts), strict=True))
+    together, _ = simulated(dyn, q, v, 0.5, "rk4", dt=1e-3)
+    for k in range(3):
+        alone, _ = simulated(dyn, q[k], v[k], 0.5, "rk4", dt=1e-3)
+        assert np.abs(together.q[k] - alone.q).max() < 1e-12
+
+
+def test_a_motion_that_comes_to_rest_in_the_pose_is_stopped_there() -> None:
+    """All links of this parallelogram hang in one line: where damping ends its swing, every branch is as good."""
+    b = mb.ModelBuilder("hanging")
+    for name, parent, at, length in (("a", "world", 0.0, 1.0), ("b", "a", 1.0, 2.0), ("c", "world", 2.0, 1.0)):
+        b.add_body(name, mass=length, com=(0, 0, -length / 2), inertia=(length**3 / 12, length**3 / 12, 0.0))
+        place = {"parent": parent, "translation": (0, 0, -at)}
+        b.add_joint(name, "continuous", child=name, axis=(0, 1, 0), damping=6.0 if name == "a" else 0.0, **place)
+    ends = {"translation_a": (0, 0, -2), "translation_b": (0, 0, -1)}
+    b.add_loop("pin", "point", body_a="b", body_b="c", **ends)
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    with pytest.raises(NumericalError, match="at rest"):
+        mb.simulate(dyn, np.zeros(3), np.zeros(3), 0.1, "rk4")
+    q, v = np.array([0.3, -0.3, 0.3]), np.zeros(3)
+    run, told = simulated(dyn, q, v, 2.0, "rk853", rtol=1e-8)
+    assert run.stats.finished
+    # A parallelogram all the way.
+    assert np.abs(run.q[:, 0] - run.q[:, 2]).max() < 1e-7
+    assert told or run.q[-1, 0] > 0
+
+
+def test_redundant_rows_are_no_singular_pose() -> None:
+    dyn = mb.dynamics(catalog.bricard(), "lagrangian")
+    run, told = simulated(dyn, np.zeros(6), np.zeros(6), 1.0, "rk853", rtol=1e-10, save=[0.0, 1.0])
+    assert run.stats.finished
+    assert not told
+    assert np.ptp(run.energy()) < 1e-8
+
+
+# Links without mass inside a loop
+
+
+@pytest.mark.parametrize(("crank_mass", "rod_mass"), [(0.2, 0.0), (0.0, 0.0)])
+@pytest.mark.parametrize("theta", [0.4, 1.9, -2.2])
+def test_forces_of_a_massless_rod_go_along_it(crank_mass, rod_mass, theta) -> None:
+    r, length, piston, torque, rate = 0.1, 0.3, 0.4, 0.1, 5.0
+    dyn = mb.dynamics(catalog.slider_crank(crank_mass=crank_mass, rod_mass=rod_mass), "lagrangian")
+    c, s = math.cos(theta), math.sin(theta)
+    root = math.sqrt(length**2 - (r * s) ** 2)
+    # x = r cos θ + root, and its derivatives by θ.
+    by, slope = -r * s - r * r * s * c / root, 0.0
+    slope = -r * c - r * r * (c * c - s * s) / root - (r * r * s * c) ** 2 / root**3
+    alpha = (torque - piston * by * slope * rate**2) / (crank_mass * r**2 / 3 + piston * by**2)
+    x = piston * (by * alpha + slope * rate**2)
+    rod = -math.asin(r * s / length)
+    q = np.array([theta, rod - theta, r * c + root - r - length])
+    v = rate * np.array([1.0, -r * c / root - 1.0, by])
+    tau = np.array([torque, 0.0, 0.0])
+    assert np.abs(dyn.constraint_residual(q)).max() < 1e-15
+    assert dyn.forward_dynamics(q, v, tau)[0] == pytest.approx(alpha, rel=1e-12)
+    # The force on the rod at its pin is against that on the piston, and along the rod.
+    assert dyn.constraint_forces(q, v, tau) == pytest.approx([-x, -x * math.tan(rod)], rel=1e-11)
+
+
+@pytest.mark.parametrize(("method", "setting", "close"), [m for m in METHODS if m[0] != "semi_implicit_euler"])
+def test_runs_with_massless_links_have_the_work_of_their_torque(method, setting, close) -> None:
+    skip_without(method, "lagrangian")
+    dyn = mb.dynamics(catalog.slider_crank(crank_mass=0.2, rod_mass=0.0), "lagrangian")
+    run, _ = simulated(
+        dyn,
+        np.zeros(3),
+        np.zeros(3),
+        0.2,
+        method,
+        torque=np.array([0.1, 0.0, 0.0]),
+        save=[0.0, 0.2] if "rtol" in setting else None,
+        **setting,
+    )
+    theta, rate = run.q[-1, 0], run.v[-1, 0]
+    by = -0.1 * math.sin(theta) * (1 + 0.1 * math.cos(theta) / math.sqrt(0.09 - (0.1 * math.sin(theta)) ** 2))
+    energy = (0.2 * 0.01 / 3 + 0.4 * by**2) * rate**2 / 2
+    assert energy == pytest.approx(0.1 * theta, abs=close)
+    assert theta > 1.0
