@@ -2,9 +2,9 @@
 
 Run ``python -m validation.iftomm``; it writes ``validation/iftomm.json``. The truth is apart from mbkit: elliptic
 functions for the pendulum and for rows of four-bars, which move as one pendulum (`validation.elliptic`); one coordinate
-in numbers of 64 bits of mantissa for Andrews' squeezer (`validation.squeezer`); two coordinates and SciPy's Radau for the
-governor. Bricard's mechanism has its energy. Reference motions of the library are files that are not at hand; the times
-of another code are those of `published`.
+in numbers of 64 bits of mantissa for Andrews' squeezer (`validation.squeezer`); two coordinates and SciPy's Radau for
+the governor. Bricard's mechanism has its energy. Reference motions of the library are files that are not at hand; the
+times of another code are those of `published`.
 """
 
 from __future__ import annotations
@@ -104,12 +104,15 @@ def andrews():
     torque = np.array([told["drive_torque_on_beta"], *[0.0] * 6])
     ways = [("rk853", {"rtol": x}) for x in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)]
     ways += [("taylor", {"rtol": x}) for x in (1e-6, 1e-10, 1e-14)]
-    ways += [(m, {"rtol": x}) for m in ("rodas5", "dop853", "radau") for x in (1e-4, 1e-6, 1e-8, 1e-10)]
-    ways += [(m, {"dt": x}) for m in ("rk4", "gauss4") for x in (4e-5, 2e-5, 1e-5, 5e-6)]
+    ways += [(m, {"rtol": x}) for m in ("rodas5", "dop853", "radau") for x in (1e-4, 1e-6, 1e-8)]
+    ways += [("rk4", {"dt": x}) for x in (4e-5, 2e-5, 1e-5, 5e-6)] + [
+        ("gauss4", {"dt": 1e-4}),
+        ("gauss4", {"dt": 5e-5}),
+    ]
     out = []
     for engine in ("lagrangian", "pinocchio"):
         dyn = mb.dynamics(model, engine)
-        for method, setting in ways:
+        for method, setting in ways if engine == "lagrangian" else ways[:5]:
             try:
                 found = run(dyn, np.zeros(7), np.zeros(7), 0.03, method, torque=torque, save=[0.03], **setting)
             except UnsupportedError:
@@ -128,6 +131,7 @@ def andrews():
                 "from_printed_v": float(np.abs(v - np.array(end["v"])).max()),
             }
             out.append(figures(found, **row))
+            print(out[-1], flush=True)
     printed = np.abs(np.angle(np.exp(1j * (turns(np.array(end["q"])) - turn)))).max()
     printed_rate = np.abs(turns(np.array(end["v"])) - rate).max()
     known = float(np.abs(finer - turn).max())
@@ -214,7 +218,7 @@ def governor():
 
 
 def governor_truth(times):
-    """Return s and the arms' angle, by the two coordinates of the symmetric motion; the turning momentum is constant."""
+    """Return s and the arms' angle, by the two coordinates of the symmetric motion; the angular momentum stays."""
     from scipy.integrate import solve_ivp
 
     across, along = _MASS * (_ARM**2 + 1e-4) / 12, _MASS * 1e-4 / 6

@@ -94,10 +94,7 @@ def shape(beta):
     H = _meet(A, g["u"], E, g["zf"], -1)
     rod = [(x - y) * (1 / g["d"]) for x, y in zip(F, E, strict=True)]
     # E = B + ss (sin γ, -cos γ), and so for the other angles that are measured from -y.
-    third, fourth = (
-        [-1 * w[1], w[0]]
-        for w in ([(x - y) * (1 / r) for x, y in zip(E, o, strict=True)] for o, r in ((B, g["ss"]), (G, g["e"])))
-    )
+    third, fourth = ([-1 * (E[1] - o[1]) * (1 / r), (E[0] - o[0]) * (1 / r)] for o, r in ((B, g["ss"]), (G, g["e"])))
     fifth = [(x - y) * (1 / g["zt"]) for x, y in zip(G, A, strict=True)]
     sixth = [(x - y) * (1 / g["zf"]) for x, y in zip(E, H, strict=True)]
     last = [(x - y) * (1 / g["u"]) for x, y in zip(H, A, strict=True)]

@@ -107,6 +107,13 @@ class _Terms(NamedTuple):
         return _scale(self.J)
 
 
+def singular_values(J: Array) -> Array:
+    """Return the singular values of one or more matrices; NaN where a matrix is not finite."""
+    good = np.asarray(np.isfinite(J).all(axis=(-1, -2)))[..., None]
+    sizes = np.linalg.svd(np.where(good[..., None], J, 0.0), compute_uv=False)
+    return np.where(good, sizes, np.nan)
+
+
 def _scale(J: Array) -> Array:
     sizes = np.abs(J).sum(axis=-1)
     # A row that has no slope at a singular pose is as large as the others all the same.
@@ -272,11 +279,8 @@ class Manifold:
 
     def at_pose(self, q: Array) -> NDArray[np.bool_]:
         """Return whether a configuration, or each of a batch, is a singular pose up to rounding."""
-        J = self.jacobian(q)
-        good = np.asarray(np.isfinite(J).all(axis=(-1, -2)))
-        J = np.where(good[..., None, None], J, 1.0)
-        sizes = np.linalg.svd(J, compute_uv=False)
-        return np.asarray(good & (sizes[..., -1] <= AT_POSE * sizes[..., 0]))
+        sizes = singular_values(self.jacobian(q))
+        return np.asarray(sizes[..., -1] <= AT_POSE * sizes[..., 0])
 
     def _pulled_at_pose(self, q: Array, v: Array) -> tuple[Array, Array]:
         for _ in range(2):

@@ -178,25 +178,21 @@ class Approach:
 
     def saw(self, dyn: Dynamics, t: float, q: Array, v: Array) -> None:
         """Take in the end of a step, of one state or a batch."""
+        from mbkit.engines.constraint_manifold import AT_POSE, singular_values
+
         states, alone = [manifold_at(dyn, t).jacobian(q)], q.ndim == 1 and bool(v.any()) and bool(np.isfinite(v).all())
         apart = _APART / float(np.abs(v).max()) if alone else 0.0
         if alone:
             for x in (apart, -apart):
                 manifold = manifold_at(dyn, t + x)
                 states.append(manifold.jacobian(manifold.dyn.model.integrate(q, x * v)))
-        J = np.stack(states)
-        good = np.asarray(np.isfinite(J).all(axis=(-1, -2)))
         # Without vectors, which would cost far more.
-        J = np.where(good[..., None, None], J, 0.0)
-        sizes = np.linalg.svd(J, compute_uv=False)
-        least, *beside = np.where(good, sizes[..., -1], np.inf)
+        sizes = singular_values(np.stack(states))
+        least, *beside = sizes[..., -1]
         known = np.shape(self._sizes) == np.shape(least)
-        with np.errstate(invalid="ignore"):
-            change = np.abs(least - self._sizes) if known else np.full(np.shape(least), np.inf)
-            self.near, self._sizes, self.ahead = bool((~(least >= _AHEAD * change)).any()), least, np.inf
-        if q.ndim == 1 and good.all():
-            from mbkit.engines.constraint_manifold import AT_POSE
-
+        change = np.abs(least - self._sizes) if known else np.full(np.shape(least), np.inf)
+        self.near, self._sizes, self.ahead = bool((~(least >= _AHEAD * change)).any()), least, np.inf
+        if q.ndim == 1:
             rate = (beside[0] - beside[1]) / (2 * apart) if alone else 0.0
             if least <= AT_POSE * sizes[0, 0]:
                 self.ahead = 0.0
