@@ -45,6 +45,7 @@ _MARKS: Final = (
     b"ritten by mbkit",
     b"engine,method,setting,value,",
     b"case,parameter,unit,value,engine,method,",
+    b"robot,version,term,digits,moved,",
     b"t,q.",
 )
 _HEAD: Final = 4096

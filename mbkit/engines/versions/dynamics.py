@@ -185,6 +185,8 @@ class VersionDynamics(MappedDynamics):
             raise UnsupportedError(f"{self.engine}: it has no rollout of its own here")
         x, u, _ = self._native(self.model.check_q(q0), self.model.check_v(v0))
         xs, us = self._ask("rollout", x, u, method=method, dt=dt, steps=steps)
+        if not (np.isfinite(xs).all() and np.isfinite(us).all()):
+            raise NumericalError(f"{self.engine}: its own run of {self.model.name} is not finite")
         q, v = np.empty_like(xs), np.empty_like(us)
         q[:, self._places.q_index] = xs
         for k in range(len(q)):

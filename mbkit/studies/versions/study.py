@@ -99,11 +99,11 @@ def versions(
     """
     if engine not in PACKAGES:
         raise UnknownNameError("engine with versions", str(engine), PACKAGES)
-    count("most", most)
-    count("samples", samples)
+    count("most", most, least=2)
+    count("samples", samples, least=1)
     real("tolerance", tolerance, positive=True)
-    if keep is not None and (not isinstance(keep, int) or keep < 0):
-        raise InputError(f"keep: expected a number of environments, got {keep!r}")
+    if keep is not None:
+        count("keep", keep)
     chosen = _chosen(engine, versions, first, last)
     cases = tuple(case_of(x, samples, seed) for x in _targets(targets))
     names = [case.name for case in cases]
