@@ -71,6 +71,7 @@ def program(function: ca.Function) -> Program:
     outputs = [np.full(rows * columns, -1, dtype=np.intp) for rows, columns in shapes]
     if any(function.nnz_out(i) != out.size for i, out in enumerate(outputs)):
         raise ValueError(f"{function.name()}: expected dense outputs; casadi.densify makes them")
+    entry: tuple[str, tuple[int, ...], float]
     code_of, results_of, arguments_of = function.instruction_id, function.instruction_output, function.instruction_input
     for k in range(function.n_instructions()):
         code, out, args = code_of(k), results_of(k), arguments_of(k)

@@ -106,6 +106,11 @@ class _Terms(NamedTuple):
         """What a row changes by when every coordinate changes by 1."""
         return _scale(self.J)
 
+    @property
+    def held(self) -> Array:
+        """J of the rows that hold positions."""
+        return self.J[: len(self.f)]
+
 
 def singular_values(J: Array) -> Array:
     """Return the singular values of one or more matrices; NaN where a matrix is not finite."""
@@ -119,11 +124,6 @@ def _scale(J: Array) -> Array:
     # A row that has no slope at a singular pose is as large as the others all the same.
     sizes = np.maximum(sizes, AT_POSE * sizes.max(axis=-1, keepdims=True, initial=0.0))
     return np.asarray(np.where(sizes > 0, sizes, 1.0))
-
-    @property
-    def held(self) -> Array:
-        """J of the rows that hold positions."""
-        return self.J[: len(self.f)]
 
 
 class Manifold:
