@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from importlib import import_module
 from typing import Any
 
 import casadi as ca
@@ -535,7 +536,9 @@ def test_a_state_at_which_a_force_is_not_a_number_is_refused() -> None:
             mb.dynamics(model, engine).forward_dynamics(q, np.zeros(model.nv), np.zeros(model.nv))
 
 
-def test_compare_judges_engines_with_forces() -> None:
+def test_compare_judges_engines_with_forces(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Little time to error against run time, which is not asked for here.
+    monkeypatch.setattr(import_module("mbkit.studies.compare.study"), "_SECONDS", 0.5)
     result = mb.compare(MODEL.with_parameters(k=1.0, M=1.0), engines=("pinocchio", "lagrangian", "mujoco"), samples=8)
     assert result.passed
     assert {"passive", "potential energy", "power balance"} <= {row.term for row in result.rows}
