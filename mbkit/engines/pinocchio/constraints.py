@@ -269,6 +269,8 @@ class PinConstraints:
 
     def at(self, time: float) -> PinConstraints:
         """Return the same at another time."""
+        # A run asks so at every stage: what does not depend on the time is found once.
+        _ = self.choice, self._laws
         out = copy(self)
         out._time = time
         return out
