@@ -7,7 +7,6 @@ quantities that follow from others are here.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from copy import copy
 from functools import cached_property
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self, TypeVar
@@ -253,8 +252,9 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
         """Return the same dynamics, with all that was built, at another time; None for other values."""
         if not values or set(values) - {self.model.time_parameter}:
             return None
-        out = copy(self)
-        out.model = self.model.with_nominal(values)
+        # copy.copy pickles, and so builds again.
+        out = object.__new__(type(self))
+        vars(out).update(vars(self), model=self.model.with_nominal(values))
         return out
 
     def of_samples(self, which: ArrayLike) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
