@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 LOOSEST: Final = 1e-9
 #: Steps ahead in which a pose would be singular at the present pace.
 _AHEAD: Final = 4
-#: A sign change of the smallest singular value makes its third differences smaller than this part of those without.
+#: A sign change of the smallest singular value makes it bend less than this part of how much it bends without.
 _SMOOTHER: Final = 0.5
 #: Steps' ends that decide on one interval.
 _WINDOW: Final = 4
@@ -260,8 +260,8 @@ class SingularPoses:
         if not (s1 <= s0 and s2 <= s3) or (self.times and self.times[-1] >= first):
             return
         times = [t for t, *_ in self._seen]
-        plain, turned = _third_difference(times, [s0, s1, s2, s3]), _third_difference(times, [s0, s1, -s2, -s3])
-        if not abs(turned) < _SMOOTHER * abs(plain):
+        plain, turned = _bend(times, [s0, s1, s2, s3]), _bend(times, [s0, s1, -s2, -s3])
+        if not turned < _SMOOTHER * plain:
             return
         middle = np.array(times) - times[1]
         roots = np.roots(np.polyfit(middle, [s0, s1, -s2, -s3], 3))
@@ -284,9 +284,7 @@ class SingularPoses:
         )
 
 
-def _third_difference(t: Sequence[float], x: Sequence[float]) -> float:
-    """Return the divided difference of four values: the leading coefficient of the cubic through them."""
-    difference = list(x)
-    for order in range(1, len(t)):
-        difference = [(b - a) / (t[k + order] - t[k]) for k, (a, b) in enumerate(pairwise(difference))]
-    return difference[0]
+def _bend(t: Sequence[float], x: Sequence[float]) -> float:
+    """Return how much the slope of a line through points changes, in all."""
+    slopes = [(x1 - x0) / (t1 - t0) for (t0, t1), (x0, x1) in zip(pairwise(t), pairwise(x), strict=True)]
+    return sum(abs(b - a) for a, b in pairwise(slopes))
