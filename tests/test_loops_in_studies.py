@@ -165,3 +165,23 @@ def test_work_precision_of_driven_mechanisms() -> None:
 def by_double(t: float) -> tuple[np.ndarray, np.ndarray]:
     q, v = by_geometry(t)
     return np.asarray(q, dtype=float), np.asarray(v, dtype=float)
+
+
+def test_stress_finds_the_step_that_jumps_over_a_change_point() -> None:
+    """A fixed step finds other speeds beyond it; error control holds to where doubles end."""
+    result = mb.stress(
+        "change_point", ("lagrangian", "mujoco"), ("rk4", "rk853"), values=[0.1, 1e-5], seconds=10.0, rtol=1e-10
+    )
+    (case,) = result.cases
+    outcome = {(row.engine, row.method): [cell.outcome(1e-6) for cell in row.cells] for row in case.rows}
+    assert outcome["lagrangian", "rk853"] == ["held", "held"]
+    assert outcome["lagrangian", "rk4"][0] == "held"
+    assert outcome["lagrangian", "rk4"][1] in ("silent", "warned")
+    # Soft loops lose energy at the mildest value already.
+    assert "held" not in outcome["mujoco", "rk853"]
+
+
+def test_stress_of_a_stiff_drive_is_measured_by_its_closed_form() -> None:
+    result = mb.stress("stiff_drive", ("lagrangian",), ("rk4",), values=[1e2, 1e10], seconds=10.0)
+    (row,) = result.cases[0].rows
+    assert [cell.outcome(1e-6) for cell in row.cells] == ["held", "diverged"]

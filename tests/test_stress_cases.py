@@ -12,6 +12,7 @@ from scipy.integrate._ivp import dop853_coefficients
 
 from mbkit import catalog
 from mbkit.engines import dynamics
+from mbkit.engines.base import at_times
 from mbkit.errors import UnknownNameError
 from mbkit.model.validation import sample_mass_matrix
 from mbkit.simulate import METHODS, simulate
@@ -109,6 +110,12 @@ def test_exact_motions_satisfy_the_equation_of_motion(case: Case) -> None:
     v = (8 * (near[3] - near[1]) - (near[4] - near[0])) / (12 * h)
     a = (16 * (near[3] + near[1]) - (near[4] + near[0])) / (12 * h * h)
     own = dynamics(model, "lagrangian")
+    if model.constrained:
+        # A drive's force is not known: accelerations of the times are compared.
+        held = at_times(own, t).forward_dynamics(middle, v, np.zeros(model.nv))
+        rounding = 32 * np.spacing(np.abs(middle).max()) / h**2
+        assert np.abs(a - held).max() < 1e-6 * np.abs(held).max() + rounding
+        return
     parts = [np.einsum("kij,kj->ki", own.mass_matrix(middle), a), own.nle(middle, v), -own.passive(middle, v)]
     size = sum(np.abs(x) for x in parts).max()
     # Some roundings of q over h², and h⁴ of a sixth derivative.

@@ -6,13 +6,14 @@ from typing import Final
 
 from mbkit.errors import UnknownNameError
 from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.cases import rigid, springs
+from mbkit.studies.stress.cases import loops, rigid, springs
 
 __all__ = ["CASES", "get", "names"]
 
 _FAMILIES: Final = (
-    *(springs.CASES, rigid.MASS_CASES, rigid.LENGTH_CASES, rigid.SPIN_CASES, rigid.SINGULAR_CASES),
-    *(rigid.LARGE_CASES, springs.STEP_CASES, springs.LONG_CASES),
+    *(springs.CASES, loops.DRIVEN_CASES, rigid.MASS_CASES, loops.REDUNDANT_CASES, rigid.LENGTH_CASES),
+    *(rigid.SPIN_CASES, rigid.SINGULAR_CASES, loops.SINGULAR_CASES, rigid.LARGE_CASES, springs.STEP_CASES),
+    *(springs.LONG_CASES, loops.LONG_CASES),
 )
 #: Name -> case: stiff ones first, those that take longest last.
 CASES: Final[dict[str, Case]] = {case.name: case for family in _FAMILIES for case in family}
