@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ import pytest
 import mbkit as mb
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.parts import Prescribed
+from mbkit.model.parts import Loop, Prescribed
+from mbkit.studies.explain.loop_differences import exchanged
 from mbkit.studies.study_runs import start_state
 from mbkit.studies.work_precision import reference as references
 from mbkit.studies.work_precision.reference import reference
+from tests.random_trees import rotation
 from validation import four_bar as bare
 
 TIMES = np.linspace(0.0, 1.0, 11)
@@ -185,3 +188,63 @@ def test_stress_of_a_stiff_drive_is_measured_by_its_closed_form() -> None:
     result = mb.stress("stiff_drive", ("lagrangian",), ("rk4",), values=[1e2, 1e10], seconds=10.0)
     (row,) = result.cases[0].rows
     assert [cell.outcome(1e-6) for cell in row.cells] == ["held", "diverged"]
+
+
+# Explanations
+
+TURN = rotation(np.random.default_rng(0))
+
+
+def said(one: Loop, other: Loop | None) -> list[str]:
+    model = mb.catalog.four_bar()
+    found = mb.explain(replace(model, loops=(one,)), replace(model, loops=() if other is None else (other,)))
+    assert found.agree == (not found.acting)
+    return [cause.says.removeprefix("loop 'pin': second ") for cause in found.causes]
+
+
+def pin(kind: str = "point", **fields: Any) -> Loop:
+    (loop,) = mb.catalog.four_bar().loops
+    frames = {"rotation_a": TURN, "rotation_b": TURN.T}
+    return replace(loop, kind=kind, **frames | fields)
+
+
+def test_what_differs_between_two_loops_is_named() -> None:
+    moved = pin(translation_b=pin().translation_b + np.array([0.0, 0.03, 0.04]))
+    assert said(pin(), moved)[0].startswith("has its point on 'rocker' 0.05 m away, at (")
+    assert said(pin(), pin("revolute")) == ["closes it as revolute for point"]
+    assert said(pin(), replace(pin(), body_b="crank")) == ["ends it on 'crank' for 'rocker'"]
+    assert said(pin("distance", length=0.1), pin("distance", length=0.2)) == ["has a length of 0.2 m for 0.1 m"]
+    assert said(pin(), None) == ["lacks it"]
+    c, s = np.cos(0.1), np.sin(0.1)
+    tilt, spin = np.array([[1, 0, 0], [0, c, -s], [0, s, c]]), np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    for kind in ("revolute", "cylindrical", "universal"):
+        assert said(pin(kind), pin(kind, rotation_a=TURN @ tilt)) == ["has its axis on 'coupler' turned by 5.73°"]
+    assert said(pin("frame"), pin("frame", rotation_a=TURN @ spin)) == ["turns its ends by 5.73° against each other"]
+
+
+def test_what_changes_no_motion_is_no_difference() -> None:
+    at_a, at_b = pin().translation_a, pin().translation_b
+    c, s = np.cos(0.1), np.sin(0.1)
+    spin, flip = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.diag([1.0, -1.0, -1.0])
+    along_a, along_b = TURN[:, 2], TURN.T[:, 2]
+    for kind in ("point", "distance", "revolute", "cylindrical", "universal", "frame", "prismatic"):
+        loop = pin(kind, length=0.1 if kind == "distance" else 0.0)
+        assert said(loop, exchanged(loop)) == []
+        (renamed,) = said(loop, replace(loop, name="other"))
+        assert renamed == "second calls loops otherwise: 'pin' is 'other'"
+    assert said(pin(), pin(rotation_a=np.eye(3))) == []
+    for kind in ("revolute", "cylindrical", "universal"):
+        assert said(pin(kind), pin(kind, rotation_a=TURN @ spin)) == []
+        assert said(pin(kind), pin(kind, rotation_a=TURN @ flip, rotation_b=TURN.T @ flip)) == []
+    # Of a hinge one axis alone turned round is another mechanism.
+    assert said(pin("revolute"), pin("revolute", rotation_a=TURN @ flip)) != []
+    together = {"translation_a": at_a + 0.1 * along_a, "translation_b": at_b + 0.1 * along_b}
+    assert said(pin("revolute"), pin("revolute", **together)) == []
+    assert said(pin("revolute"), pin("revolute", translation_a=together["translation_a"])) != []
+    assert said(pin("cylindrical"), pin("cylindrical", translation_a=together["translation_a"])) == []
+    # A weld at another point of the welded bodies, in other common axes.
+    point = np.array([0.1, -0.2, 0.3])
+    weld = {"translation_a": at_a + TURN @ point, "translation_b": at_b + TURN.T @ point}
+    axes = {"rotation_a": TURN @ spin, "rotation_b": TURN.T @ spin}
+    assert said(pin("frame"), pin("frame", **weld, **axes)) == []
+    assert said(pin("frame"), pin("frame", translation_a=weld["translation_a"])) != []

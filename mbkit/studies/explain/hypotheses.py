@@ -18,6 +18,8 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Joint, Mimic, Model
+from mbkit.model.parts import Loop
+from mbkit.studies.explain.loop_differences import loop_differences, same_loop
 from mbkit.studies.explain.merged_model import LinkInBody, MergedModel, Tolerances, composite
 
 #: Kinds that act on the motion through no term, but through constraints.
@@ -30,11 +32,12 @@ _MJCF: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 #: Numbers per velocity, and what they are called.
 _NUMBERS: Final = {"armature": "armature", "damping": "damping", "friction": "friction", "stiffness": "spring"}
 _LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
+_LOOPS: Final = "loops"
 #: Parts of the whole: section, key, kind of the difference, noun.
 _SECTIONS: Final = (
     ("springs", "name", "point spring", "spring"),
     ("couplings", "name", "joint coupling", "coupling"),
-    ("loops", "name", "loop", "loop"),
+    (_LOOPS, "name", "loop", "loop"),
     ("prescribed", "joint", "prescribed motion", "motion of"),
     ("no_slip", "name", "contact without slip", "no slip"),
 )
@@ -503,10 +506,15 @@ def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis
         out.append(_hypothesis(mistake, "", lambda x, values: x.with_fields(**values), a, b))
     for section, key, kind, what in _SECTIONS:
         ours, theirs = ({getattr(x, key): x for x in getattr(m, section)} for m in (a, b))
+        if section == _LOOPS:
+            called = {x: y for x in ours if x not in theirs for y in theirs if same_loop(ours[x], theirs[y], near)}
+            others = ", ".join(f"{x!r} is {y!r}" for x, y in called.items())
+            out += [Hypothesis("renamed", "", f"calls loops otherwise: {others}")] if called else []
+            ours, theirs = _without(ours, called), _without(theirs, called.values())
         for name in dict.fromkeys([*ours, *theirs]):
             one, other = ours.get(name), theirs.get(name)
-            if one is None or other is None or not _alike(one, other, near):
-                says = "lacks it" if other is None else "has it besides" if one is None else "has other numbers for it"
+            if one is None or other is None or (says := _other_numbers(one, other, near)):
+                says = "lacks it" if other is None else "has it besides" if one is None else says
                 put = partial(_with_parts, section=section, key=key)
                 out.append(Hypothesis(kind, f"{what} {name!r}", says, put, {name: one}, {name: other}))
     return out
@@ -516,6 +524,17 @@ def _with_parts(x: MergedModel, parts: Mapping[str, Any], section: str, key: str
     """Exchange springs, couplings or constraints by name; None takes one away."""
     kept = [p for p in getattr(x.model, section) if getattr(p, key) not in parts]
     return x.with_fields(**{section: (*kept, *(p for p in parts.values() if p is not None))})
+
+
+def _without(parts: Mapping[str, Any], names: Container[str]) -> dict[str, Any]:
+    return {name: part for name, part in parts.items() if name not in names}
+
+
+def _other_numbers(a: Any, b: Any, near: Tolerances) -> str:
+    """Return what differs between two parts of one name; empty where nothing does."""
+    if isinstance(a, Loop):
+        return ", and ".join(loop_differences(a, b, near))
+    return "" if _alike(a, b, near) else "has other numbers for it"
 
 
 def _alike(a: Any, b: Any, near: Tolerances) -> bool:

@@ -102,7 +102,7 @@ def stiff_drive(stiffness: float) -> Problem:
     size = np.array([_AMPLITUDE, bent])
 
     def exact(t: Array) -> Array:
-        return np.multiply.outer(np.sin(_FREQUENCY * t), size)
+        return np.asarray(np.multiply.outer(np.sin(_FREQUENCY * t), size))
 
     facts = {"fastest frequency, rad/s": math.sqrt(stiffness)}
     source = "steady motion of a linear system"

@@ -1,0 +1,102 @@
+"""What differs between two loops, in sentences: kind, bodies, points, axes and length, but for what changes no motion.
+
+Ends may be exchanged. Of a hinge's frames the axis counts alone, of welded ones their turn against each other, and a
+slider's point may be anywhere along its axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.model.parts import Loop
+from mbkit.studies.explain.merged_model import Tolerances
+
+#: Kinds whose frames' z-axes lie along each other; those whose frames do not turn against each other; those that slide.
+_HINGED: Final = ("revolute", "cylindrical")
+_WELDED: Final = ("frame", "prismatic")
+_SLIDING: Final = ("cylindrical", "prismatic")
+_CROSSED: Final = "universal"
+
+
+def exchanged(loop: Loop) -> Loop:
+    """Return a loop with its ends exchanged, which holds the same."""
+    ends = {f"{name}_{side}": getattr(loop, f"{name}_{other}") for side, other in ("ab", "ba") for name in _OF_END}
+    return replace(loop, **ends)
+
+
+_OF_END: Final = ("body", "rotation", "translation")
+
+
+def same_loop(a: Loop, b: Loop, near: Tolerances) -> bool:
+    """Return whether two loops hold the same, whatever they are called."""
+    return not loop_differences(a, b, near)
+
+
+def loop_differences(a: Loop, b: Loop, near: Tolerances) -> list[str]:
+    """Return what `b` has otherwise than `a`, in sentences that begin with a verb; empty where they hold the same."""
+    return min((list(_differences(a, x, near)) for x in (b, exchanged(b))), key=len)
+
+
+def _differences(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
+    if a.kind != b.kind:
+        yield f"closes it as {b.kind} for {a.kind}"
+    shifts = _shifts(a, b)
+    for side in "ab":
+        body, own = getattr(b, f"body_{side}"), getattr(a, f"body_{side}")
+        if body != own:
+            yield f"ends it on {body!r} for {own!r}"
+        elif not near.point(shifts[side], np.zeros(3)):
+            away = f"{np.linalg.norm(shifts[side]):.6g} m away, at {_text(b, side)} for {_text(a, side)}"
+            yield f"has its point on {body!r} {away}"
+    if not near.number(a.length, b.length):
+        yield f"has a length of {b.length:.6g} m for {a.length:.6g} m"
+    if a.kind == b.kind and (a.body_a, a.body_b) == (b.body_a, b.body_b):
+        yield from _turned(a, b, near)
+
+
+def _shifts(a: Loop, b: Loop) -> dict[str, Array]:
+    """Return how far each end's point is moved, less what both ends may move together without a change."""
+    out = {side: getattr(b, f"translation_{side}") - getattr(a, f"translation_{side}") for side in "ab"}
+    axes = {side: getattr(a, f"rotation_{side}")[:, 2] for side in "ab"}
+    if a.kind != b.kind:
+        return out
+    if a.kind in _SLIDING:
+        return {side: x - axes[side] * (axes[side] @ x) for side, x in out.items()}
+    if a.kind == _HINGED[0]:
+        along = axes["a"] @ out["a"]
+        return {side: x - axes[side] * along for side, x in out.items()}
+    if a.kind == _WELDED[0]:
+        # Any point of two bodies that are welded may be called theirs.
+        return {"a": out["a"] - a.rotation_a @ a.rotation_b.T @ out["b"], "b": np.zeros(3)}
+    return out
+
+
+def _turned(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
+    if a.kind in _WELDED and not near.vector(a.rotation_a @ a.rotation_b.T, b.rotation_a @ b.rotation_b.T):
+        R = (a.rotation_a @ a.rotation_b.T).T @ b.rotation_a @ b.rotation_b.T
+        yield f"turns its ends by {_degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))} against each other"
+    if a.kind not in (*_HINGED, *_SLIDING, _CROSSED):
+        return
+    own, other = ([getattr(x, f"rotation_{side}")[:, 2] for side in "ab"] for x in (a, b))
+    # An axis has no direction; of a hinge's two both turn round together, of a cross each by itself.
+    signs = [np.sign(x @ y) or 1.0 for x, y in zip(own, other, strict=True)]
+    if a.kind in _HINGED:
+        signs = [signs[0], signs[0]]
+    for side, x, y, sign in zip("ab", own, other, signs, strict=True):
+        if not near.vector(x, sign * y):
+            angle = np.arccos(np.clip(abs(x @ y), 0.0, 1.0))
+            yield f"has its axis on {getattr(a, f'body_{side}')!r} turned by {_degrees(angle)}"
+
+
+def _text(loop: Loop, side: str) -> str:
+    point: Array = getattr(loop, f"translation_{side}")
+    return f"({', '.join(f'{x:.6g}' for x in point)})"
+
+
+def _degrees(angle: float) -> str:
+    return f"{np.degrees(angle):.4g}°"
