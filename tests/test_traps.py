@@ -315,3 +315,25 @@ def test_versions_are_in_every_result():
     assert {"pin", "mujoco", "casadi", "numpy", "mbkit", "python", "example-robot-data"} <= set(result.versions)
     assert "not installed" not in result.versions.values()
     assert result.processor
+
+
+def test_pinocchio_s_reader_of_equalities_takes_anchors_of_joints_and_inactive_ones(tmp_path):
+    """mbkit reads these elements itself; a version of Pinocchio that reads them otherwise fails here."""
+    inertial = '<inertial pos=".2 0 0" mass="1" diaginertia=".1 .1 .1"/>'
+    text = (
+        '<mujoco><compiler inertiafromgeom="false"/><worldbody><body name="a"><joint name="j" axis="1 0 0" '
+        f'pos="0 0 .2"/>{inertial}</body></worldbody>'
+        '<equality><connect name="x" body1="a" anchor=".3 .2 .1" active="{}"/></equality></mujoco>'
+    )
+    points = {}
+    for active in ("true", "false"):
+        path = tmp_path / f"{active}.xml"
+        path.write_text(text.format(active))
+        _, read, _ = pin.buildModelAndConstraintsFromMJCF(str(path))
+        points[active] = [np.array(one.joint1_placement.translation) for one in read]
+    # The anchor is in the body's axes, whose origin is 0.2 m below the joint.
+    (loop,) = mb.load(tmp_path / "true.xml").loops
+    assert np.abs(loop.translation_a - [0.3, 0.2, -0.1]).max() < 1e-15
+    assert np.abs(points["true"][0] - [0.3, 0.2, 0.1]).max() < 1e-15
+    assert len(points["false"]) == 1
+    assert not mb.load(tmp_path / "false.xml").loops
