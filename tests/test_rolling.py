@@ -462,6 +462,28 @@ def test_writers_and_paper_refuse_them_by_name() -> None:
             call()
 
 
+def test_loads_and_reduced_inertia_do_not_leave_contact_forces_out_in_silence() -> None:
+    model = mb.catalog.bicycle()
+    still = np.zeros(9)
+    for engine in ("lagrangian", "pinocchio", "oracle"):
+        dyn = mb.dynamics(model, engine)
+        with pytest.raises(UnsupportedError, match=r"'rear', 'front'.*constraint_forces"):
+            dyn.joint_wrenches(still, still, still, tau=still)
+        with pytest.raises(UnsupportedError, match=r"contacts without slip.*consistent_changes"):
+            dyn.reduced_inertia(still, "lean")
+
+
+def test_wheels_carry_the_weight() -> None:
+    """At rest and upright, by the levers of the masses about both contacts."""
+    model = mb.catalog.bicycle()
+    dyn = mb.dynamics(model, "pinocchio")
+    forces = dyn.constraint_forces(np.zeros(9), np.zeros(9), np.zeros(9))
+    moment = 0.3 * 85 + 0.9 * 4 + 1.02 * 3
+    # It begins to fall about its wheels, straight to one side: the normal forces are those of rest.
+    assert forces[1] == pytest.approx(9.81 * moment / 1.02, rel=1e-12)
+    assert forces[0] + forces[1] == pytest.approx(9.81 * 94, rel=1e-12)
+
+
 def test_every_fault_is_in_the_one_error() -> None:
     b = mb.ModelBuilder("faults")
     b.add_body("a", mass=1.0, inertia=(1, 1, 1))

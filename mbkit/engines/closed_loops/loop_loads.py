@@ -119,6 +119,13 @@ class LoopLoads(Actuation, Loads):
     def _loaded(
         self, joints: tuple[Joint, ...], q: ArrayLike, v: ArrayLike, a: Any, tau: Any, wrenches: Any, axes: str
     ) -> Array:
+        if self.model.no_slip:
+            names = ", ".join(repr(x.name) for x in self.model.no_slip)
+            raise UnsupportedError(
+                f"loads of joints and loops: {self.model.name} has contacts without slip ({names}), whose forces act "
+                "on bodies beside those of loops; constraint_forces(q, v, tau) has them, and joint_wrenches of "
+                "model.without('no_slip') takes them as wrenches"
+            )
         states: dict[str, Any] = {"q": q, "v": v, "a": a, "tau": tau}
         frames: tuple[Frame, ...] = ()
         if wrenches:
