@@ -57,6 +57,22 @@ RUNNING = (
     ("-3.72016840437287", "10.90681139476287", "0.16105338653172", "-24.62459635017404"),
 )
 
+#: A state in full motion and its accelerations without any force: Basu-Mandal, Chatterjee and Papadopoulos 2007,
+#: Hands-free circular motions of a benchmark bicycle, Proceedings of the Royal Society A 463, 1983-2003, table 1, as
+#: the dissertation of Moore 2012 transcribes it with the meaning of its coordinates. Here they are mbkit's: x and y of
+#: that table point the other way, so do lean and steer; its lean and pitch are from other zeros.
+FULL_MOTION = {
+    "x": ("0", "2.8069345714545", "0.5041626315047"),
+    "y": ("0", "0.1480982396001", "0.3449706619454"),
+    "z": ("0.2440472102925", "0.1058778746261", "-1.4604528332980"),
+    "yaw": ("0", "0.7830033527065", "0.8353281706379"),
+    "lean": ("0.9501292851472", "-0.6068425835418", "7.8555281128244"),
+    "pitch": ("3.1257073014894", "-0.0119185528069", "0.1205543897884"),
+    "rear_spin": ("0", "8.9129896614890", "1.8472554144217"),
+    "steer": ("-0.2311385135743", "-0.4859824687093", "4.6198904039403"),
+    "front_spin": ("0", "8.0133620584155", "2.4548072904550"),
+}
+
 
 def parameters(cast=mp.mpf):
     """Return the benchmark's numbers and the steering axis's tilt, λ = π/10."""
@@ -202,6 +218,29 @@ def in_double(dyn, v):
     return [mp.mpc(complex(x)) for x in np.linalg.eigvals((A @ N)[free] @ np.linalg.inv(N[free]))]
 
 
+def full_motion(model):
+    """Return q, v and the printed v̇ of the state in full motion, in the order of a model's coordinates."""
+    import numpy as np
+
+    q, v, a = (np.array([float(FULL_MOTION[k][i]) for k in model.velocity_names]) for i in range(3))
+    at = model.coordinate_names.index
+    # Of the table: the rear wheel's height, the lean from lying, and the pitch from half a turn.
+    q[at("z")] -= 0.3
+    q[at("lean")] = np.pi / 2 - q[at("lean")]
+    q[at("pitch")] -= np.pi
+    return q, v, a
+
+
+def in_full_motion(dyn):
+    """Return how far the state of the print is from the constraints, and v̇ from the print, in units of 1e-13."""
+    import numpy as np
+
+    q, v, a = full_motion(dyn.model)
+    left = np.concatenate([dyn.constraint_residual(q), dyn.constraint_rate(q, v)])
+    off = dyn.forward_dynamics(q, v, np.zeros(dyn.model.nv)) - a
+    return float(np.abs(left).max() * 1e13), float(np.abs(off).max() * 1e13)
+
+
 def critical(m, g):
     """Return the weave and capsize speeds: where the pair's real part and the determinant of g K0 + v² K2 are zero."""
 
@@ -262,9 +301,10 @@ def main():
         name: {"value": mp.nstr(x, 16), "from_print_in_last_digits": float(as_printed(x, SPEEDS[name]))}
         for name, x in critical(m, g).items()
     }
-    off = matrices_from_print(m)
-    print(off, speeds)
+    off, moving = matrices_from_print(m), in_full_motion(oracle)
+    print(off, speeds, moving)
     data = {**stamp(), "matrices_from_print_in_last_digits": off, "critical_speeds": speeds, "rows": rows}
+    data["full_motion"] = dict(zip(("constraints_in_last_digits", "accelerations_in_last_digits"), moving, strict=True))
     (HERE / "bicycle.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
