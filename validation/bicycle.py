@@ -59,8 +59,8 @@ RUNNING = (
 
 #: A state in full motion and its accelerations without any force: Basu-Mandal, Chatterjee and Papadopoulos 2007,
 #: Hands-free circular motions of a benchmark bicycle, Proceedings of the Royal Society A 463, 1983-2003, table 1, as
-#: the dissertation of Moore 2012 transcribes it with the meaning of its coordinates. Here they are mbkit's: x and y of
-#: that table point the other way, so do lean and steer; its lean and pitch are from other zeros.
+#: software of Moore's transcribes it, with the meaning of its coordinates. Here they are mbkit's: x and y of that table
+#: point the other way, so do lean and steer; its lean and pitch are from other zeros.
 FULL_MOTION = {
     "x": ("0", "2.8069345714545", "0.5041626315047"),
     "y": ("0", "0.1480982396001", "0.3449706619454"),
