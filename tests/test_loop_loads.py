@@ -576,3 +576,42 @@ def test_faulty_couplers_are_refused(joint: str, leader: str, words: str) -> Non
     b.add_coupler("gear", joint, leader)
     with pytest.raises(ModelError, match=words):
         b.build()
+
+
+# What else acts
+
+
+def test_forces_by_functions_enter_the_forces_of_actuators_and_have_no_load_on_single_bodies() -> None:
+    b = mb.ModelBuilder("closer", gravity=(0, 0, -9.81))
+    for name in ("one", "two"):
+        b.add_body(name, mass=1.0, com=(0.1, 0, -0.2), inertia=(0.1, 0.12, 0.05))
+    b.add_joint("a", "revolute", parent="world", child="one", axis=(0, 1, 0))
+    b.add_joint("b", "revolute", parent="one", child="two", translation=(0, 0, -0.4), axis=(0, 1, 0))
+    b.add_joint_force("drag", "b", lambda t, q, v: -2.0 * v**3 - q)  # noqa: ARG005
+    b.add_coupler("gear", "b", "a", ratio=0.5)
+    model = b.build()
+    q, v = model.random_state(0)
+    tau = np.array([1.0, 0.0])
+    for engine in ("oracle", *RIGID):
+        dyn = dynamics(model, engine)
+        a = dyn.forward_dynamics(q, v, tau)
+        assert dyn.actuator_forces(q, v, a, ["a"]).tau == pytest.approx(tau, abs=1e-12)
+        with pytest.raises(UnsupportedError, match="forces by functions are known by what they do"):
+            dyn.joint_wrenches(q, v, None, tau=tau)
+        assert not dyn.supports & {"joint_wrenches", "loop_wrenches", "newton_euler_residual"}
+
+
+def test_contacts_without_slip_have_forces_of_actuators_and_no_loads() -> None:
+    for name in ("rolling_disc", "chaplygin_sleigh"):
+        model = mb.catalog.get(name)()
+        q, v = model.random_state(0)
+        for engine in ("oracle", *RIGID):
+            dyn = dynamics(model, engine)
+            a = dyn.forward_dynamics(q, v, np.ones(model.nv))
+            forces = dyn.actuator_forces(q, v, a)
+            assert off(dyn.forward_dynamics(q, v, forces.tau), a) < 1e-12
+            assert not dyn.supports & {"joint_wrenches", "newton_euler_residual", "undetermined_loads"}
+            with pytest.raises(UnsupportedError, match="contacts are known by what they do"):
+                dyn.joint_wrenches(q, v, None, tau=forces.tau)
+            with pytest.raises(UnsupportedError, match="contacts without slip, which hold velocities"):
+                dyn.reduced_inertia(q, model.coordinate_names[0])

@@ -50,7 +50,7 @@ _OF_BODIES: Final = frozenset(
     - {"mass_matrix_inverse"}
 )
 #: What needs the force on each body.
-_OF_OWN_LOADS: Final = frozenset({"joint_wrenches", "undetermined_loads"})
+_OF_OWN_LOADS: Final = frozenset({"joint_wrenches", "undetermined_loads", "loads_under_force", "loads_of_motion"})
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
 #: Names in a list of an error message.
@@ -208,7 +208,7 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
         elif not self.model.loops:
             given -= closed_loops.OF_BODIES
         if self.model.forces or self.model.no_slip:
-            given = {x for x in given if needed[x] not in _OF_OWN_LOADS}
+            given = {x for x in given if not {x, needed[x]} & _OF_OWN_LOADS}
         return frozenset(given if self.model.has_bodies else given - _OF_BODIES)
 
     def __repr__(self) -> str:

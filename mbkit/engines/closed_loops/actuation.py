@@ -57,6 +57,7 @@ class Actuation(Constrained):
     engine: ClassVar[str]
     # Of the other parts of `Dynamics`.
     of_samples: Callable[..., Any]
+    _method: Callable[[str], Callable[..., Any]]
     _inverse_dynamics: Callable[..., Array]
     _constraint_jacobian: Callable[[Array], Array]
     _constraint_bias: Callable[[Array, Array], Array]
@@ -150,7 +151,9 @@ class Actuation(Constrained):
     def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Array:
         """Return τ and λ at one state, from the engine's own terms by LAPACK."""
         which = self._moved_by(actuators)
-        J, gamma, f = self._constraint_jacobian(q), self._constraint_bias(q, v), self._inverse_dynamics(q, v, a)
+        J, gamma = self._constraint_jacobian(q), self._constraint_bias(q, v)
+        # With the forces that functions give, where there are some.
+        f = self._method("inverse_dynamics")(q, v, a)
         own = list(self._row_choice.independent)
         rows = J[own]
         sizes = np.linalg.norm(rows, axis=1)

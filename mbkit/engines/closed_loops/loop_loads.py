@@ -242,6 +242,11 @@ class LoopLoads(Actuation, Loads):
         model = self.model
         if not model.loops:
             raise UnsupportedError(f"undetermined_loads: {model.name} has no loops")
+        if model.no_slip:
+            raise UnsupportedError(
+                f"undetermined_loads: {model.name} has contacts without slip, whose forces on single bodies are not "
+                "known; model.without('no_slip') has the loads without them"
+            )
         q = model.check_q(q)
         if q.ndim > 1:
             raise InputError(f"undetermined_loads: expected one configuration, got shape {q.shape}")
