@@ -10,7 +10,7 @@ import pytest
 
 #: Packages -> modules of mbkit that are about nothing else.
 OPTIONAL = {
-    ("pydrake", "heyoka", "distributed", "cvxpy", "clarabel"): ("mbkit.engines.drake.",),
+    ("pydrake", "heyoka", "distributed", "cvxpy", "clarabel"): ("mbkit.engines.drake.", "remote.on_drake"),
     ("llvmlite",): ("mbkit.codegen.", "_compiled", "compiled_"),
 }
 #: Packages that an installation has, unless somebody removed one -> what fails without, in a script.

@@ -54,7 +54,8 @@ class VersionRow:
 class Change:
     """A number that moved between two versions.
 
-    `next_to_it` says whether no version lies between them; then `version` is the first with the new number.
+    `next_to_it` says whether none of the versions of the study lies between them; then `version` is its first with the
+    new number.
     """
 
     robot: str
