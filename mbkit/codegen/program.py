@@ -65,7 +65,6 @@ class Program:
 def program(function: ca.Function) -> Program:
     """Return the operations of an expanded function with dense outputs."""
     where: dict[int, int] = {}
-    entry: tuple[str, tuple[int, ...], float]
     # In the order of their first appearance. Plain tuples are quicker to make and to look up than their kind.
     known: dict[tuple[str, tuple[int, ...], float], int] = {}
     shapes = tuple((function.size1_out(i), function.size2_out(i)) for i in range(function.n_out()))
