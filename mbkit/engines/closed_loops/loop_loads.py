@@ -248,8 +248,9 @@ class LoopLoads(Actuation, Loads):
                 "known; model.without('no_slip') has the loads without them"
             )
         q = model.check_q(q)
-        if q.ndim > 1:
-            raise InputError(f"undetermined_loads: expected one configuration, got shape {q.shape}")
+        if q.ndim > 1 or self.samples is not None:
+            got = f"shape {q.shape}" if q.ndim > 1 else f"parameters of {self.samples} samples"
+            raise InputError(f"undetermined_loads: expected one configuration, got {got}")
         held = sum(len(LOOP_ROWS[loop.kind][0]) for loop in model.loops)
         # Drives are single, and take no strain from each other.
         J = np.asarray(self._evaluate("every_jacobian", q=q))[:held]
