@@ -9,7 +9,6 @@ vanish do so at a rate. At rest they do not, and no equation says which branch c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
