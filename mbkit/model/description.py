@@ -348,7 +348,7 @@ class Description:
 
     @cached_property
     def driven_by_forces(self) -> bool:
-        """Whether a force of the model may add energy: one that is given by more than a potential."""
+        """Whether a force of the model may add energy, as one that is given by more than a potential does."""
         return drives(self)
 
     @cached_property

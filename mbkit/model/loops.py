@@ -45,9 +45,9 @@ class LoopEnds:
 
     def way(self, kind: str) -> Any:
         """Return a number that is negative where the frames of a closed loop of this kind point opposite ways."""
-        if kind in ("revolute", "cylindrical"):
+        if kind in HINGED:
             return _dot(self.a[2], self.b[2])
-        if kind in ("frame", "prismatic"):
+        if kind in WELDED:
             return sum((_dot(a, b) for a, b in zip(self.a, self.b, strict=True)), 0.0)
         return 0.0
 
@@ -73,6 +73,13 @@ LOOP_ROWS: Final[dict[str, tuple[tuple[str, ...], Callable[[LoopEnds], list[Any]
 LoopKind = Literal["point", "frame", "revolute", "universal", "cylindrical", "prismatic", "distance"]
 #: What a loop holds together -> how many equations it has.
 LOOP_KINDS: Final = {kind: len(names) for kind, (names, _) in LOOP_ROWS.items()}
+
+#: Kinds whose frames' z-axes lie along each other, those whose frames do not turn against each other, those that slide,
+#: and the one whose axes cross.
+HINGED: Final = ("revolute", "cylindrical")
+WELDED: Final = ("frame", "prismatic")
+SLIDING: Final = ("cylindrical", "prismatic")
+CROSSED: Final = "universal"
 
 
 def held_directions(kind: str, A: Array, B: Array) -> tuple[Array, Array]:

@@ -283,7 +283,7 @@ class SingularPoses:
         )
 
 
-def _bend(t: Sequence[float], x: Sequence[float]) -> float:
+def _bend(t: list[float], x: list[float]) -> float:
     """Return how much the slope of a line through points changes, in all."""
     slopes = [(x1 - x0) / (t1 - t0) for (t0, t1), (x0, x1) in zip(pairwise(t), pairwise(x), strict=True)]
     return sum(abs(b - a) for a, b in pairwise(slopes))

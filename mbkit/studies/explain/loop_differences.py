@@ -13,14 +13,9 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.model.loops import CROSSED, HINGED, SLIDING, WELDED
 from mbkit.model.parts import Loop
 from mbkit.studies.explain.merged_model import Tolerances
-
-#: Kinds whose frames' z-axes lie along each other; those whose frames do not turn against each other; those that slide.
-_HINGED: Final = ("revolute", "cylindrical")
-_WELDED: Final = ("frame", "prismatic")
-_SLIDING: Final = ("cylindrical", "prismatic")
-_CROSSED: Final = "universal"
 
 
 def exchanged(loop: Loop) -> Loop:
@@ -65,27 +60,27 @@ def _shifts(a: Loop, b: Loop) -> dict[str, Array]:
     axes = {side: getattr(a, f"rotation_{side}")[:, 2] for side in "ab"}
     if a.kind != b.kind:
         return out
-    if a.kind in _SLIDING:
+    if a.kind in SLIDING:
         return {side: x - axes[side] * (axes[side] @ x) for side, x in out.items()}
-    if a.kind == _HINGED[0]:
+    if a.kind == HINGED[0]:
         along = axes["a"] @ out["a"]
         return {side: x - axes[side] * along for side, x in out.items()}
-    if a.kind == _WELDED[0]:
+    if a.kind == WELDED[0]:
         # Any point of two bodies that are welded may be called theirs.
         return {"a": out["a"] - a.rotation_a @ a.rotation_b.T @ out["b"], "b": np.zeros(3)}
     return out
 
 
 def _turned(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
-    if a.kind in _WELDED and not near.vector(a.rotation_a @ a.rotation_b.T, b.rotation_a @ b.rotation_b.T):
+    if a.kind in WELDED and not near.vector(a.rotation_a @ a.rotation_b.T, b.rotation_a @ b.rotation_b.T):
         R = (a.rotation_a @ a.rotation_b.T).T @ b.rotation_a @ b.rotation_b.T
         yield f"turns its ends by {_degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))} against each other"
-    if a.kind not in (*_HINGED, *_SLIDING, _CROSSED):
+    if a.kind not in (*HINGED, *SLIDING, CROSSED):
         return
     own, other = ([getattr(x, f"rotation_{side}")[:, 2] for side in "ab"] for x in (a, b))
     # An axis has no direction; of a hinge's two both turn round together, of a cross each by itself.
     signs = [np.sign(x @ y) or 1.0 for x, y in zip(own, other, strict=True)]
-    if a.kind in _HINGED:
+    if a.kind in HINGED:
         signs = [signs[0], signs[0]]
     for side, x, y, sign in zip("ab", own, other, signs, strict=True):
         if not near.vector(x, sign * y):
