@@ -75,6 +75,21 @@ def read_formula(
     return Formula(names, tuple(operations), tuple(int(i) for i in code.outputs[0].flat))
 
 
+class _Symbol(ca.SX):
+    """A symbol that is no number: CasADi's own becomes NaN, with which a search in a table goes wrong in silence."""
+
+    def _refused(self, *_: Any, **__: Any) -> Any:
+        raise TypeError("a symbol is no number")
+
+    __float__ = __int__ = __array__ = _refused
+
+
+def _symbol(name: str) -> Any:
+    x = ca.SX.sym(name)
+    x.__class__ = _Symbol
+    return x
+
+
 def _sympy() -> Any:
     """Return SymPy where somebody has loaded it; without, no object is its."""
     return sys.modules.get("sympy")
@@ -89,7 +104,7 @@ def _called(value: Any, given: Sequence[str | Sequence[str]]) -> Any:
     """Return what a function returns for symbols; other objects as they are."""
     if not callable(value) or isinstance(value, (Expression, ca.SX, ca.MX, ca.DM)) or _is_sympy(value):
         return value
-    symbols = [ca.SX.sym(n) if isinstance(n, str) else ca.vertcat(*(ca.SX.sym(x) for x in n)) for n in given]
+    symbols = [_symbol(n) if isinstance(n, str) else ca.vertcat(*(ca.SX.sym(x) for x in n)) for n in given]
     try:
         # CasADi warns of NumPy's functions on its symbols, which give the expression that is meant.
         with warnings.catch_warnings():
