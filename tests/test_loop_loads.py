@@ -613,5 +613,5 @@ def test_contacts_without_slip_have_forces_of_actuators_and_no_loads() -> None:
             assert not dyn.supports & {"joint_wrenches", "newton_euler_residual", "undetermined_loads"}
             with pytest.raises(UnsupportedError, match="contacts are known by what they do"):
                 dyn.joint_wrenches(q, v, None, tau=forces.tau)
-            with pytest.raises(UnsupportedError, match="contacts without slip, which hold velocities"):
+            with pytest.raises(UnsupportedError, match="contacts without slip, whose velocities lead to no path"):
                 dyn.reduced_inertia(q, model.coordinate_names[0])

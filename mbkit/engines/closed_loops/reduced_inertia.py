@@ -105,11 +105,6 @@ class IndependentMotion(LoopLoads):
                 f"reduced_inertia: constraints of {model.name} depend on the time, so that its velocities are not "
                 "N θ̇ alone; model.without('prescribed') leaves its coordinates free"
             )
-        if model.no_slip:
-            raise UnsupportedError(
-                f"reduced_inertia: {model.name} has contacts without slip, which hold velocities: no coordinates are "
-                "independent of each other in them"
-            )
         q = model.check_q(q)
         names = [coordinates] if isinstance(coordinates, str) else coordinates
         _, which = self._states_held.held_parts(model, names)
