@@ -7,8 +7,10 @@ import os
 import pickle
 import signal
 import stat
+import subprocess
 import sys
 import threading
+from importlib.metadata import entry_points
 from importlib.metadata import version as installed
 from pathlib import Path
 
@@ -114,6 +116,7 @@ def test_an_engine_says_what_it_is_and_what_it_cannot_give():
     model = mb.catalog.double_pendulum()
     dyn = mb.dynamics(model, present("mujoco", "4.0.0"))
     assert dyn.engine == "mujoco==4.0.0"
+    assert mb.dynamics(model, "mujoco==4.0.0").engine == dyn.engine
     with pytest.raises(UnsupportedError, match="without the matrix"):
         dyn.coriolis_matrix([0.1, 0.2], [1.0, 2.0])
     with pytest.raises(InputError, match="q: expected shape"):
@@ -230,8 +233,8 @@ def installer(tmp_path, monkeypatch):
     log.touch()
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
 
-    def does(install: str) -> Path:
-        script(tmp_path / "bin" / "uv", INSTALLER.format(python=sys.executable, log=log, install=install))
+    def does(install: str, python: Path | str = sys.executable) -> Path:
+        script(tmp_path / "bin" / "uv", INSTALLER.format(python=python, log=log, install=install))
         return log
 
     return does
@@ -282,12 +285,12 @@ def test_a_dependency_that_is_too_new_is_bounded(installer, tmp_path):
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "needs_mine.py").write_text(library)
     log = installer(
-        'for last; do :; done; root="$(dirname "$(dirname "$6")")"; info="$root/lib/mine-2.0.dist-info"\n'
+        'for last; do :; done; root="$(dirname "$(dirname "$5")")"; info="$root/lib/mine-2.0.dist-info"\n'
         'mkdir -p "$info"; echo "mine.prefix/lib/libmine.so.5,sha,1" > "$info/RECORD"\n'
         'printf "Name: mine\\nVersion: 2.0\\n" > "$info/METADATA"\n'
-        f'if [ "$last" = "mine<2.0" ]; then echo "" > {tmp_path}/broken/needs_mine.py; fi'
+        f'if [ "$last" = "mine<2.0" ]; then echo "" > {tmp_path}/broken/needs_mine.py; fi',
+        script(tmp_path / "bin" / "mine", f'cd {tmp_path}/broken; exec "{sys.executable}" "$@"'),
     )
-    script(tmp_path / "bin" / "python", f'PYTHONPATH={tmp_path}/broken exec "{sys.executable}" "$@"')
     environment.interpreter("mujoco", "9.9", "needs_mine", len)
     assert [line.split()[-1] for line in log.read_text().splitlines()] == ["numpy", "mine<2.0"]
 
@@ -351,3 +354,25 @@ def test_a_real_old_version(monkeypatch, tmp_path_factory):
     for value, truth in ((dyn.mass_matrix(q), oracle.mass_matrix(q)), (dyn.nle(q, v), oracle.nle(q, v))):
         assert np.abs(value - truth).max() < 1e-12 * np.abs(truth).max()
     assert "4.0.0" in versions_of("mujoco")
+
+
+def test_versions_are_parameters_of_tests(tmp_path):
+    present("mujoco", "4.0.0")
+    (tmp_path / "test_mine.py").write_text(
+        "import mbkit as mb, pytest\n\n"
+        '@pytest.mark.mbkit(robots=["pendulum"], engines=["mujoco==4.0.0", "mujoco==9.9", "mujoco"])\n'
+        "def test_mass(mbkit_dynamics):\n"
+        '    truth = mb.dynamics(mbkit_dynamics.model, "oracle").mass_matrix([0.3])\n'
+        "    assert abs(mbkit_dynamics.mass_matrix([0.3]) - truth).max() < 1e-12\n"
+    )
+    # An installer that has no network.
+    script(tmp_path / "bin" / "uv", 'echo "ERROR: no connection" >&2; exit 1')
+    env = os.environ | {"PATH": f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"}
+    env["PYTHONPATH"] = os.pathsep.join([str(Path(mb.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    plugin = [] if "mbkit" in {p.name for p in entry_points(group="pytest11")} else ["-p", "mbkit.pytest_plugin"]
+    command = [sys.executable, "-m", "pytest", *plugin, "-p", "no:cacheprovider", "-p", "no:xdist", "-rs", "-v"]
+    done = subprocess.run([*command, "test_mine.py"], cwd=tmp_path, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 passed, 1 skipped" in done.stdout
+    assert "test_mass[pendulum-mujoco==4.0.0] PASSED" in done.stdout
+    assert "no connection" in done.stdout

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from mbkit.engines.base import Dynamics
 from mbkit.engines.versions.engine_version import EngineVersion
+from mbkit.engines.versions.engine_version import engine as named_version
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
@@ -245,7 +246,8 @@ def dynamics(model: Model, engine: str | EngineVersion = PINOCCHIO, **options: A
     engine : {"pinocchio", "lagrangian", "mujoco", "drake", "oracle"}
         Rigid-body algorithms of Pinocchio, mbkit's own derivation from energies,
         MuJoCo, Drake (``pip install mbkit[drake]``), or the own derivation at 34 digits, for
-        measuring the others; or an engine of `register_engine`; or another version of an engine, from `mbkit.engine`.
+        measuring the others; or an engine of `register_engine`; or another version of an engine, from
+        `mbkit.engine` or by its name, such as ``"mujoco==3.12.0"``.
     **options
         The lagrangian engine's ``compile=`` (True or False) and ``threads=``; MuJoCo's ``solref=`` and ``solimp=`` of
         the soft constraints that hold loops; other engines have none.
@@ -262,6 +264,8 @@ def dynamics(model: Model, engine: str | EngineVersion = PINOCCHIO, **options: A
         The engine is not installed, or cannot hold this model; with the reason.
     """
     expect_model(model)
+    if isinstance(engine, str) and "==" in engine:
+        engine = named_version(engine)
     if isinstance(engine, EngineVersion):
         # The import is for few.
         from mbkit.engines.versions.dynamics import VersionDynamics

@@ -16,6 +16,7 @@ from typing import Any, Final
 from mbkit import catalog
 from mbkit._check import real
 from mbkit.engines.registry import ENGINES, REFERENCE, compared
+from mbkit.engines.versions.engine_version import engine as named_version
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import load
 from mbkit.load.loader import find
@@ -235,6 +236,13 @@ def not_installed(engines: Iterable[str]) -> dict[str, str]:
     """Return the engines that are not installed, each with how to get it; unknown names are left to others."""
     out = {}
     for name in engines:
+        if "==" in name:
+            # Another version has an environment, or gets one.
+            try:
+                named_version(name).interpreter()
+            except UnsupportedError as error:
+                out[name] = str(error)
+            continue
         if name not in ENGINES:
             continue
         try:
