@@ -451,3 +451,12 @@ def test_a_whole_comparison_of_a_mechanism_passes_with_its_loops_on() -> None:
     assert loops.present
     assert "needed" in loops.what
     assert type(result).from_json(result.to_json()).softness == result.softness
+
+
+def test_loops_that_never_close_have_no_mobility() -> None:
+    b = mb.ModelBuilder("short_arm")
+    b.add_body("arm", mass=1.0, com=(0.5, 0, 0), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("shoulder", "revolute", parent="world", child="arm", axis=(0, 1, 0))
+    b.add_loop("pin", "point", body_a="arm", translation_a=(1, 0, 0), translation_b=(5, 0, 0), body_b="world")
+    with pytest.raises(InputError, match="no configuration satisfies them all"):
+        mb.dynamics(b.build(), "lagrangian", compile=False).mobility()

@@ -147,6 +147,25 @@ def test_runs_tend_to_the_rigid_motion_in_first_order(kind: str, seed: int) -> N
     assert gaps[0] > 1.8 * gaps[1] > 3.2 * gaps[2]
 
 
+def test_couplers_are_held_in_runs() -> None:
+    b = mb.ModelBuilder("gears")
+    for k in (1, 2):
+        b.add_body(f"wheel{k}", mass=1.0, com=(0.1, 0, 0), inertia=(0.1, 0.1, 0.1))
+        b.add_joint(f"axle{k}", "revolute", parent="world", child=f"wheel{k}", axis=(0, 1, 0))
+    b.add_coupler("pair", "axle1", "axle2", ratio=-2.0, offset=0.3)
+    model = b.build()
+    exact = mb.simulate(
+        mb.dynamics(model, "lagrangian", compile=False), [0.3, 0.0], [0.0, 0.0], 0.1, "rk853", rtol=1e-12
+    )
+    errors = []
+    for dt in (1e-3, 5e-4):
+        run = mb.simulate(mb.dynamics(model, "drake"), [0.3, 0.0], [0.0, 0.0], 0.1, "drake_sap", dt=dt)
+        errors.append(np.abs(run.q[-1] - exact.q[-1]).max())
+    # To first order in the step. Without the coupler the second wheel would turn the other way.
+    assert errors[1] < 1e-3
+    assert errors[0] / errors[1] == pytest.approx(2.0, abs=0.3)
+
+
 def test_a_batch_a_torque_and_a_shortened_last_step() -> None:
     dyn, q, v = four_bar()
     torque = np.array([0.5, 0.0, -0.2])

@@ -579,7 +579,8 @@ class Mobility:
         freedoms = f"{self.degrees_of_freedom}"
         if self.configuration_freedoms != self.degrees_of_freedom:
             freedoms += f" of velocity and {self.configuration_freedoms} of configuration"
-        return f"{self.model}: degrees of freedom {freedoms}, of {len(self.rows)} rows {which}"
+        rows = f"{len(self.rows)} row{'s' if len(self.rows) != 1 else ''}"
+        return f"{self.model}: degrees of freedom {freedoms}, of {rows} {which}"
 
 
 def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
@@ -590,6 +591,9 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
     names, equations = names_of(dyn), manifold_of(dyn).equations
     held = equations.all_constraints.positions
     if q is None:
+        if model.has_bodies and equations.closed_configuration is None:
+            # No rank is that of a mechanism whose loops never close.
+            refuse_unreachable(dyn)
         independent: Collection[int] = equations.independent_constraints
     else:
         independent, _ = independent_rows(np.asarray(dyn.constraint_jacobian(q)), held)

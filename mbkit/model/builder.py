@@ -536,7 +536,7 @@ class ModelBuilder(ElementBuilder):
         >>> b.add_joint("glide", "planar", parent="world", child="skate")
         >>> b.add_blade("edge", body_a="skate", axis_a=(0, 1, 0))
         >>> print(mb.dynamics(b.build(), "lagrangian").mobility())
-        skate: degrees of freedom 2 of velocity and 3 of configuration, of 1 rows none is redundant
+        skate: degrees of freedom 2 of velocity and 3 of configuration, of 1 row none is redundant
         """
         a = {"body_a": body_a, "translation_a": translation_a, "axis_a": axis_a}
         b = {"body_b": body_b, "axis_b": axis_b, "speed": speed}

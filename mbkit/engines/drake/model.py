@@ -74,6 +74,10 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True, st
     for loop in description.loops if step else ():
         with _refusal(f"drake: refuses loop {loop.name!r}"):
             CONSTRAINTS[loop.kind](plant, loop, bodies[loop.body_a], bodies[loop.body_b])
+    for coupler in description.couplers if step else ():
+        (follower,), (leader,) = added[coupler.joint], added[coupler.leader]
+        with _refusal(f"drake: refuses coupler {coupler.name!r}"):
+            plant.AddCouplerConstraint(follower, leader, coupler.ratio, coupler.offset)
     with _refusal(f"drake: refuses {description.name}"):
         plant.Finalize()
     return mapped(plant, description, added, bodies, bushings_)
