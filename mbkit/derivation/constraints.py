@@ -430,7 +430,7 @@ def _chosen_rows(model: Model) -> RowChoice:
     closed = [x for x in (numbers.closed(q, held) for q in tried) if x is not None]
     closed = [q for q in closed if np.isfinite(numbers(q)[1]).all()]
     if not closed:
-        # The state that a user gives tells more: it is refused there, with what is left of each row.
+        # The state that a user gives tells more: it is refused there, with the residual of each row.
         return RowChoice(tuple(kept), len(held), tuple(range(len(kept))))
     found = [(*independent_rows(numbers(q)[1][kept], len(held)), q) for q in closed]
     rows, _, q = max(found, key=lambda x: (len(x[0]), x[1]))
@@ -478,7 +478,7 @@ def _with_something_to_say(numbers: _Numbers, poses: list[Array]) -> list[int]:
 
 
 def independent_rows(J: Array, first: int | None = None) -> tuple[tuple[int, ...], float]:
-    """Return the largest set of rows that are independent, and what is left of the last one, by pivoting.
+    """Return the largest set of rows that are independent, and the remainder of the last one, by pivoting.
 
     Of the first rows as many are taken as are independent among themselves, then others: a position that the rates of
     others imply has to be held all the same.
@@ -495,7 +495,7 @@ def independent_rows(J: Array, first: int | None = None) -> tuple[tuple[int, ...
 
 
 def _pivoted(rows: Array) -> tuple[tuple[int, ...], float, Array]:
-    """Return independent rows of unit size, what is left of the last one, and a basis of what they span, (n, k)."""
+    """Return independent rows of unit size, the remainder of the last one, and a basis of what they span, (n, k)."""
     from scipy.linalg import qr
 
     if not len(rows):
@@ -564,7 +564,7 @@ class ConstraintQuantities:
     def actuator_forces(self, actuators: tuple[int, ...]) -> ca.Function:
         """Return (q, v, a) -> the forces of the actuated velocities, with the least norm, that make a motion.
 
-        One column: τ, λ of all rows, J a + γ, and of its rows the sizes; last what is left of the worst row of J once
+        One column: τ, λ of all rows, J a + γ, and of its rows the sizes; last the remainder of the worst row of J once
         the others are taken away, or of a velocity without an actuator in J's rows, as a square.
 
         With f = M a + h - τ_passive, split into the actuated velocities S and the others U, λ minimizes

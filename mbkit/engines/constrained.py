@@ -184,8 +184,8 @@ class Constrained:
         Raises
         ------
         InputError
-            The constraints contradict each other or what is held, no consistent state is near, or what is held does
-            not determine the rest at the pose, as at a dead centre.
+            The constraints contradict each other or the held numbers, no consistent state is near, or the held numbers
+            do not determine the rest at the pose, as at a dead centre.
         UnknownNameError
             Nothing of a name that is held.
 
@@ -232,7 +232,7 @@ class Constrained:
         Raises
         ------
         InputError
-            What is held breaks the constraints.
+            The held numbers break the constraints.
 
         Examples
         --------

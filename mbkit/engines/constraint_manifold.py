@@ -505,7 +505,7 @@ def projected(dyn: Dynamics, q: Array, v: Array, hold: Sequence[str] = ()) -> tu
 
 
 def accelerated(dyn: Dynamics, q: Array, v: Array, a: Array, hold: Sequence[str] = ()) -> Array:
-    """Return the nearest consistent acceleration; an `InputError` where what is held breaks the constraints."""
+    """Return the nearest consistent acceleration; an `InputError` where held numbers break the constraints."""
     manifold, (_, held) = manifold_of(dyn), held_parts(dyn.model, hold)
     out = manifold.acceleration(q, v, a, held)
     J, _, gamma, *_ = manifold.call("embedded", q, v)

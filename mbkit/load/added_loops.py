@@ -41,7 +41,7 @@ def add_loops(model: Model, loops: Loops) -> Model:
     LoadError
         A file that is missing, or is no TOML file of loops.
     ModelError
-        What is wrong with the loops: unknown bodies, kinds and wrong numbers, all of them listed.
+        All faults of the loops in one list: unknown bodies, kinds and wrong numbers.
     """
     given: Sequence[Any]
     if isinstance(loops, (str, os.PathLike)):
@@ -113,6 +113,6 @@ def _moved(frame: Frame, one: dict[str, Any], side: str) -> dict[str, Any]:
         point = frame.translation + frame.rotation @ np.array(p, dtype=np.float64)
         axes = frame.rotation if R is None else frame.rotation @ np.array(R, dtype=np.float64)
     except (TypeError, ValueError):
-        # The builder says what is wrong with them.
+        # The builder names their faults.
         return {f"body_{side}": frame.body}
     return {f"body_{side}": frame.body, f"translation_{side}": point, f"rotation_{side}": axes}

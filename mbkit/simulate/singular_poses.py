@@ -35,7 +35,7 @@ _WINDOW: Final = 4
 _TAKES_PART: Final = 0.1
 #: Of the rows' size, 1/s: what typed digits leave of a velocity that is zero, as in `independent_rows`.
 _STILL: Final = 1e-7
-#: Of γ: what is left of it at a velocity of rounded digits that stays on a branch.
+#: Of γ: its rest at a velocity of rounded digits that stays on a branch.
 _ON_BRANCH: Final = 1e-6
 #: Of the motion's time scale: the difference of times by which J's rate is found.
 _APART: Final = 1e-4

@@ -88,7 +88,7 @@ class ConstrainedMidpoint(Midpoint):
     def _newton(self) -> tuple[Any, Any]:
         s, eq = self._s, self._equations
         w, multipliers = self._split()
-        # λ enters linearly, and is solved for anew: the residual without it is that of w.
+        # λ enters linearly, and each iteration solves for it: the residual without it is that of w.
         momentum, end, pushes = self._whole(w, 0 * multipliers)
         by_w, slopes = ca.jacobian(momentum, s["w"])[:, : eq.model.nv], ca.jacobian(end, s["w"])[:, : eq.model.nv]
         if eq.constraint_factors.careful:

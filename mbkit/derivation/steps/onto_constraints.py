@@ -43,7 +43,7 @@ def quick_projection(equations: Any) -> ca.Function:
         near, by = ca.SX.sym("near", *q.shape), ca.SX.sym("by", *v.shape)
         more, shift, change = [*extra.values()], _shift(equations), _change(equations)
         du = ca.densify(shift(near, c.value, *more))
-        # To first order in the move: what is left is its square times the velocity.
+        # To first order in the move: the rest is its square times the velocity.
         rate = ca.substitute(c.rate + c.rate_along(by), by, du)
         dv = change(near, rate, *more)
         size, apart = ca.sumsqr(du), ca.sumsqr(q - near)

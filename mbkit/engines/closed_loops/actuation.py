@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 LEAST: Final = "least"
 #: Of a row's size times the acceleration's: what rounding and a few typed digits leave of a consistent one.
 _CONSISTENT: Final = 1e-8
-#: Square of what is left of a row beside the others, from which on it is looked at again by singular values. The square
-#: of `mbkit.derivation.constraints.DEPENDENT` with four digits to spare.
+#: Square of the remainder of a row beside the others, from which on singular values look at it again. The square of
+#: `mbkit.derivation.constraints.DEPENDENT` with four digits to spare.
 _SUSPECT: Final = 1e-10
 
 
@@ -89,7 +89,7 @@ class Actuation(Constrained):
         ------
         InputError
             Accelerations that break the constraints, or actuators that leave the mechanism free to move while they
-            hold still; both with what is left.
+            hold still; both with the residual.
         NumericalError
             A singular pose.
         UnsupportedError

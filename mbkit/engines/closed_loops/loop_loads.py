@@ -26,7 +26,7 @@ from mbkit.model import Frame, Joint, Model
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.parts import Loop
 
-#: Of the forces' size: what is left of them after the constraints' own, up to which a motion is that of a force.
+#: Of the forces' size: their rest after the constraints' own, up to which a motion is that of a force.
 _MEANT: Final = 1e-8
 #: Singular values of J with rows of unit size below which a force in the loops moves nothing, and the part of a strain
 #: that counts. What closing a loop to rounding leaves is far below.

@@ -51,7 +51,7 @@ _RIGID: Final = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.C
 _MU: Final = 1e-10
 _ITERATIONS: Final = 20
 _ACCURACY: Final = 1e-14
-#: Pivot of a row that depends on the others, in terms of the largest one. It is the square of what is left of the row.
+#: Pivot of a row that depends on the others, in terms of the largest one. It is the square of the row's remainder.
 _NO_PIVOT: Final = 1e-12
 #: Disagreement of the ends' accelerations in terms of these, up to which an answer is taken.
 _AGREES: Final = 1e-11

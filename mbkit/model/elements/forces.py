@@ -74,7 +74,7 @@ class Force(_Frozen):
         return self.positions(model) + self.velocities(model)
 
     def misplaced(self, model: _Model) -> Iterator[str]:
-        """Yield what is wrong with where the element acts, and with its numbers."""
+        """Yield the faults of the element's place and of its numbers."""
         raise NotImplementedError
 
 

@@ -164,7 +164,7 @@ def beyond(motions: tuple[Motion, ...], *times: float) -> str:
 
 
 def motion_faults(motions: tuple[Motion, ...]) -> Iterator[str]:
-    """Yield what is wrong with each law, and with tables that have no time in common."""
+    """Yield the faults of each law, and tables that have no time in common."""
     ends = [(*interval(part), part.joint) for part in motions]
     if ends and max(ends)[0] >= (least := min(ends, key=lambda x: x[1]))[1]:
         first, _, joint = max(ends)

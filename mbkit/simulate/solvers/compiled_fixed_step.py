@@ -304,7 +304,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     if len(suspects) and dyn.model.constrained:
         suspects = suspects_of(dyn.step_plan(method, thorough=True), suspects)
         if len(suspects):
-            # Near a singular pose stages are projected too, and the pose is told. The others of a batch are done.
+            # Near a singular pose stages are projected too, and the pose is named. The others of a batch are done.
             return run_fixed(problem, record, suspects)
     for first in range(0, len(suspects), _widest(plan)):
         members = suspects[first : first + _widest(plan)]

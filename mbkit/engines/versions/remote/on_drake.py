@@ -161,7 +161,7 @@ class Engine:
         for _ in range(5):
             start = time.perf_counter()
             for _ in range(repeats):
-                # A state that is set anew empties Drake's cache.
+                # A state that is set again empties Drake's cache.
                 self._set(q, v)
                 self._accelerations.Eval(self._context)
             best = min(best, (time.perf_counter() - start) / repeats)
