@@ -10,6 +10,7 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 from importlib.metadata import entry_points
 from importlib.metadata import version as installed
 from pathlib import Path
@@ -196,6 +197,26 @@ def test_a_fork_has_a_process_of_its_own():
         os._exit(0 if np.array_equal(dyn.mass_matrix([0.3]), before) else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     assert np.array_equal(dyn.mass_matrix([0.3]), before)
+
+
+def test_a_process_ends_with_its_parent_and_leaves_nothing():
+    version = present("mujoco", "4.0.0")
+    script_ = (
+        "import os, mbkit as mb\n"
+        "from mbkit.engines.versions import process\n"
+        f"version = mb.engine({version.name!r})\n"
+        "dyn = mb.dynamics(mb.catalog.pendulum(), version)\n"
+        "own = process.process_of(version)\n"
+        "print(own._process.pid, own._folder, flush=True)\n"
+        "os._exit(0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script_], capture_output=True, text=True, check=True)
+    pid, folder = done.stdout.split()
+    deadline = time.monotonic() + 20
+    while time.monotonic() < deadline and (Path(folder).exists() or Path(f"/proc/{pid}").exists()):
+        time.sleep(0.05)
+    assert not Path(folder).exists()
+    assert not Path(f"/proc/{pid}").exists()
 
 
 @pytest.mark.parametrize("name", ["mujoco", "mujoco==", "mujoco==3.1 --pre", "mujoco==../x", 3, None])

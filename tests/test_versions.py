@@ -35,7 +35,7 @@ import on_mujoco as engine
 import serve
 E = engine.Engine
 {alter}
-serve.serve(int(sys.argv[2]), "mujoco")
+serve.serve(int(sys.argv[2]), "mujoco", sys.argv[4])
 """
 GRAVITY = "old = E.gravity; E.gravity = lambda self, q: {factor} * old(self, q)"
 

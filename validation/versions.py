@@ -19,7 +19,9 @@ from typing import Any
 import numpy as np
 
 import mbkit as mb
+from mbkit.engines.versions import process
 from mbkit.engines.versions.engine_version import versions_of
+from mbkit.engines.versions.importer import VersionImport
 from mbkit.spatial import matrix_from_rpy, rpy_from_matrix
 from mbkit.studies.results import to_plain
 from tests.random_trees import random_tree
@@ -29,8 +31,11 @@ HERE = Path(__file__).parent
 #: Engine -> its versions.
 VERSIONS: dict[str, tuple[str, ...]] = {
     "mujoco": (
-        *("3.1.0", "3.1.3", "3.1.6", "3.2.0", "3.2.7", "3.3.0", "3.3.7", "3.6.0", "3.9.0", "3.11.0", "3.12.0"),
-        *("3.13.0", "3.14.0", "3.15.0", "3.16.0", "3.17.0", "4.0.0"),
+        *(f"3.1.{k}" for k in range(7)),
+        *("3.2.0", "3.2.7"),
+        *(f"3.3.{k}" for k in range(8)),
+        *(f"3.{k}.0" for k in (4, 5, 6, 7, 9, *range(10, 18))),
+        "4.0.0",
     ),
     "pinocchio": (
         *("2.6.18", "2.6.20", "2.6.21", "2.7.0", "3.3.1", "3.4.0", "3.7.0", "3.8.0", "3.9.0", "4.0.0", "4.1.0"),
@@ -154,6 +159,41 @@ def study(engine: str, targets: list[Any]) -> dict[str, Any]:
     return kept | {"digits": digits, "time_ratios": ratios, "reasons": reasons}
 
 
+#: The smallest files that a version reads wrongly: one hinge about x, whose M is a number.
+SMALLEST = {
+    "inertial_turned": (
+        link("arm", 1.0, (0, 0, 0), np.diag([1.0, 1.5, 2.0]), (0.0, np.pi / 2, 0.0)),
+        joint("hinge", "continuous", "base", "arm", (0, 0, 0), (0, 0, 0), (1, 0, 0)),
+    ),
+    "weld_turned": (
+        link("arm", 1.0, (0, 0, 0), np.eye(3)),
+        link("weight", 1.0, (0, 1, 0), np.eye(3)),
+        joint("hinge", "continuous", "base", "arm", (0, 0, 0), (0, 0, 0), (1, 0, 0)),
+        joint("weld", "fixed", "arm", "weight", (0, 0, 0), (0.0, 0.0, np.pi / 2)),
+    ),
+}
+
+
+def smallest(engine: str) -> dict[str, Any]:
+    """Return M of each smallest file as each version reads it, and as the oracle says."""
+    out: dict[str, Any] = {}
+    for name, elements in SMALLEST.items():
+        text = f'<robot name="{name}">\n<link name="base"/>\n' + "\n".join(elements) + "\n</robot>\n"
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "robot.urdf"
+            path.write_text(text, encoding="utf-8")
+            model = mb.load(path)
+        right = float(mb.dynamics(model, "oracle").mass_matrix([0.0])[0, 0])
+        values = {}
+        for version in VERSIONS[engine]:
+            read = VersionImport(mb.engine(f"{engine}=={version}"), text, "urdf", model)
+            values[version] = float(read.term("mass_matrix", np.zeros((1, 1)), np.zeros((1, 1)))[0, 0, 0])
+        out[name] = {"urdf": text, "right": right, "M": values}
+    for version in VERSIONS[engine]:
+        process.end(mb.engine(f"{engine}=={version}"))
+    return out
+
+
 def main() -> None:
     path = HERE / "versions.json"
     names = sys.argv[1:] or list(VERSIONS)
@@ -164,6 +204,7 @@ def main() -> None:
         models = [*written(Path(folder)), *trees]
         for engine in names:
             out.setdefault("engines", {})[engine] = study(engine, [*ROBOTS, *models])
+            out.setdefault("smallest", {})[engine] = smallest(engine)
             print(out["engines"][engine]["verdict"])
     path.write_text(json.dumps(to_plain(out), indent=1) + "\n", encoding="utf-8")
 

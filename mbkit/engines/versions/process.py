@@ -93,7 +93,7 @@ class EngineProcess:
         ours, its = socket.socketpair()
         self._folder = Path(tempfile.mkdtemp(prefix="mbkit-"))
         environment = {k: x for k, x in os.environ.items() if not k.startswith("PYTHON")}
-        command = [str(python), "-E", "-s", str(_SERVE), str(its.fileno()), self.version.engine]
+        command = [str(python), "-E", "-s", str(_SERVE), str(its.fileno()), self.version.engine, str(self._folder)]
         try:
             with its, (self._folder / "output").open("wb") as output:
                 self._process = subprocess.Popen(

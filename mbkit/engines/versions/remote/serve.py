@@ -1,7 +1,8 @@
 """Messages of arrays, and the loop of a process that answers them.
 
 A message is two lengths, a head in JSON and float64 arrays in NumPy's own file format, without pickles. It may come
-from any version of NumPy. The process is started as ``python serve.py HANDLE ENGINE``, with an inherited socket.
+from any version of NumPy. The process is started as ``python serve.py HANDLE ENGINE FOLDER``, with an
+inherited socket, in a folder of its own.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import importlib
 import io
 import json
 import os
+import shutil
 import signal
 import socket
 import struct
@@ -75,8 +77,8 @@ def _answer(adapter: Any, held: dict[int, Any], head: dict[str, Any], arrays: li
     return packed({}, out if isinstance(out, (list, tuple)) else [out])
 
 
-def serve(handle: int, engine: str) -> None:
-    """Answer calls until the caller is gone."""
+def serve(handle: int, engine: str, folder: str) -> None:
+    """Answer calls until the caller is gone; then remove the folder."""
     # Ctrl-C is the caller's.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = socket.socket(fileno=handle)
@@ -97,10 +99,10 @@ def serve(handle: int, engine: str) -> None:
             channel.sendall(answer)
     except (EOFError, OSError):
         pass
-    sys.stdout.flush()
+    shutil.rmtree(folder, ignore_errors=True)
     # Destructors of loaded libraries could only fail.
     os._exit(0)
 
 
 if __name__ == "__main__":
-    serve(int(sys.argv[1]), sys.argv[2])
+    serve(int(sys.argv[1]), *sys.argv[2:4])
