@@ -118,6 +118,8 @@ def _mjcf(model: Model) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
     from mbkit.engines.mujoco.mjcf_writer import mjcf_text
     from mbkit.engines.mujoco.model import specified
 
+    # `Dynamics` adds these to an engine's own terms.
+    model = model.without("forces") if model.forces else model
     text = mjcf_text(model, "for another version")
     return {"text": text}, {name: tuple(own) for name, own in specified(model)[1].joints.items()}
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.base import MappedDynamics
+from mbkit.engines.base import MappedDynamics, require_no_forces
 from mbkit.engines.frames_and_momenta import seen_from
 from mbkit.engines.versions.description import CONVENTIONS, joint_passive, places, spring_energy, travelling
 from mbkit.engines.versions.engine_version import EngineVersion
@@ -177,10 +177,12 @@ class VersionDynamics(MappedDynamics):
     def rollout(self, q0: Array, v0: Array, dt: float, steps: int, method: str = "rk4") -> tuple[Array, Array]:
         """Return the states of a run by the engine's own integrator, (steps + 1, nq) and (steps + 1, nv).
 
-        Raises `UnsupportedError` for an engine without one, and for mimic joints, which it would not reduce.
+        Raises `UnsupportedError` for an engine without one, for forces by functions, and for mimic joints, which it
+        would not reduce.
         """
         if self.model.layout.reduced:
             raise UnsupportedError(f"{self.engine}: its own runs do not reduce mimic joints")
+        require_no_forces(self.model, self.engine)
         if not self.runs:
             raise UnsupportedError(f"{self.engine}: it has no rollout of its own here")
         x, u, _ = self._native(self.model.check_q(q0), self.model.check_v(v0))

@@ -35,7 +35,7 @@ _OF_FILE: Final = {"M": "mass_matrix", "g": "gravity", "nle": "nle"}
 #: Before the name of a term of the version's own parser.
 FILE: Final = "file "
 #: The state after a short run by the engine's own Runge-Kutta method, and that run's step, s, and steps.
-RUN, _DT, _STEPS = "own RK4", 1e-2, 10
+RUN, _DT, _STEPS = "own RK4", 2e-2, 5
 #: Of the truth of that run.
 _RTOL: Final = 1e-13
 #: Times that the two versions are timed in turn.
