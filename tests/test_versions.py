@@ -19,7 +19,7 @@ from mbkit.errors import InputError, UnknownNameError
 from mbkit.report.page import render
 from mbkit.report.versions_view import versions_view
 from mbkit.studies.versions import VersionsResult
-from mbkit.studies.versions.result import AWAY, GIVEN, REFUSED, TOWARDS
+from mbkit.studies.versions.result import ASIDE, AWAY, GIVEN, REFUSED, TOWARDS
 from mbkit.studies.versions.study import _spread
 from tests.test_engine_versions import script
 
@@ -239,6 +239,12 @@ def test_versions_are_chosen_by_where_they_begin_and_end(monkeypatch):
         study._chosen("mujoco", None, "5", "latest")
     with pytest.raises(InputError, match="first"):
         study._chosen("mujoco", None, "new", "latest")
+
+
+def test_a_number_that_is_as_wrong_as_before_goes_nowhere():
+    names = [made("1.0", wrong(1.001)), made("1.1", wrong(0.999)), made("1.2", wrong(0.9))]
+    result = mb.versions(pendulum(), "mujoco", names, samples=1)
+    assert found(result) == [("g", "1.1", ASIDE), ("g", "1.2", AWAY)]
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 40])

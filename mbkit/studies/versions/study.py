@@ -29,7 +29,8 @@ from mbkit.studies.versions.measure import Case, Measured, Truth, case_of, measu
 from mbkit.studies.versions.result import ASIDE, AWAY, GIVEN, REFUSED, TOWARDS, Change, VersionRow, VersionsResult
 from mbkit.studies.worker import describe, run
 
-#: More than a value that moved towards or away from the truth is nearer to it, or farther from it, by this factor.
+#: A number moved towards the truth where its error fell by more than this factor, and away where it grew by more: from
+#: one build to the next rounding alone changes a worst error by less.
 _CLEAR: Final = 2.0
 #: Digits of a double.
 _MOST_DIGITS: Final = -math.log10(np.finfo(float).eps)
