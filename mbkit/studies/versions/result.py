@@ -136,8 +136,8 @@ class VersionsResult(ResultTable):
             said = f"no number moved by more than {self.settings['tolerance']:g}"
         else:
             away = sum(c.direction in (AWAY, REFUSED) for c in self.changes)
-            said = f"{len(self.changes)} changes, {away} of them away from the truth or to no value"
-        lost = f"; {len(self.missing)} versions could not be measured" if self.missing else ""
+            said = f"{_counted(len(self.changes), 'change')}, {away} of them away from the truth or to no value"
+        lost = f"; {_counted(len(self.missing), 'version')} could not be measured" if self.missing else ""
         return head + said + lost
 
     def row(self, robot: str, version: str, term: str) -> VersionRow:
@@ -170,6 +170,10 @@ class VersionsResult(ResultTable):
 
     def __repr__(self) -> str:
         return f"<VersionsResult: {self.verdict}>"
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}{'s' * (n != 1)}"
 
 
 def _at(k: int) -> Any:
