@@ -16,7 +16,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.codegen import compiled as module
-from mbkit.codegen import disk_cache, step_loop
+from mbkit.codegen import disk_cache, python_call, step_loop
 from mbkit.codegen.backend import LastUsed
 from mbkit.derivation import fingerprint as sources
 from mbkit.derivation.equations import Equations
@@ -26,7 +26,8 @@ from tests.random_trees import random_tree, states
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A cache of this test's own, and a process that holds no functions."""
+    """A cache of this test's own, and a process that holds no functions but the one that Python calls."""
+    python_call._definition()
     monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(module, "_HELD", {})
     module._batch_object.cache_clear()

@@ -31,7 +31,11 @@ VECTORS = {
 }
 #: Every quantity of a state, with the argument names that the protocol documents.
 ARGUMENTS = {
-    name: tuple(x for x in inspect.signature(getattr(Dynamics, name)).parameters if x in ("q", "v", "a", "tau"))
+    name: tuple(
+        name
+        for name, x in inspect.signature(getattr(Dynamics, name)).parameters.items()
+        if name in ("q", "v", "a", "tau") and x.default is x.empty
+    )
     for name in QUANTITIES
     if name != "function"
 }
@@ -501,7 +505,7 @@ def test_a_loop_that_no_joint_can_open_is_refused_and_not_ignored(engine):
     b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0))
     b.add_loop("closed", "point", body_a="a", body_b="world")
     model = b.build()
-    with pytest.raises((InputError, UnsupportedError), match="loop"):
+    with pytest.raises((InputError, UnsupportedError), match=r"loop|constraints between bodies"):
         mb.dynamics(model, engine).forward_dynamics([0.0], [0.0], [0.0])
     mb.dynamics(model.without("loops"), engine)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.engines import ENGINES, QUANTITIES, constrained
+from mbkit.engines import ENGINES, QUANTITIES, closed_loops, constrained
 from mbkit.engines.frames_and_momenta import AXES, CLASSICAL, SPATIAL
 from mbkit.errors import KnownDefectWarning, UnsupportedError
 from mbkit.model import KINDS, Model, kind_of
@@ -61,7 +61,7 @@ def value(dyn, quantity: str, at: dict[str, np.ndarray], axes: tuple[str, ...] =
     more |= {"wrenches": {frame: WRENCH}} if "wrenches" in takes else {}
     options = [{"axes": x} for x in axes] if "axes" in takes else [{}]
     options = [x | {"kind": kind} for x in options for kind in (SPATIAL, CLASSICAL)] if "kind" in takes else options
-    given = [at[name[0]] for name in takes if name in ("q", "v", "a", "tau")]
+    given = [at[name[0]] for name, x in takes.items() if name in ("q", "v", "a", "tau") and x.default is x.empty]
     return np.stack([np.asarray(method(*given, **more, **x)) for x in options], axis=-1)
 
 
@@ -75,7 +75,7 @@ def test_each_quantity_is_right_or_refused(kind):
     size = 1.0 + np.abs(M).max() * max(1.0, float(at["v"] @ at["v"])) + np.abs(oracle.nle(at["q"], at["v"])).max()
     tolerance = 2000 * EPS * size
     refused: dict = {}
-    others = {"function", "coriolis_matrix", *constrained.QUANTITIES}
+    others = {"function", "coriolis_matrix", *constrained.QUANTITIES, *closed_loops.QUANTITIES}
     quantities = [x for x in (*QUANTITIES, *DERIVATIVES) if x not in others]
     right = {quantity: value(oracle, quantity, at) for quantity in quantities}
     for engine in ENGINES:
@@ -137,7 +137,7 @@ def test_one_state_has_the_values_of_its_row_in_a_batch(engine, feature):
     M = dyn.mass_matrix(batch["q"])
     # Derivatives as machine code are compiled for seconds, and tests/test_derivatives.py has their batches.
     for quantity in (*QUANTITIES, *DERIVATIVES[: 0 if compiled else 2]):
-        if quantity == "function":
+        if quantity in ("function", *closed_loops.QUANTITIES):
             continue
         try:
             whole = value(dyn, quantity, batch, AXES[:1])

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from scipy.interpolate import BSpline, CubicSpline, PchipInterpolator, PPoly, make_interp_spline
 
 import mbkit as mb
-from mbkit.cli import main
+from mbkit.cli import cli
 from mbkit.errors import InputError, ModelError, UnsupportedError
 
 MASS, LENGTH, MOMENT, G = 2.0, 0.7, 0.05, 9.81
@@ -350,11 +350,11 @@ def test_the_command_simulates_from_a_time(tmp_path: Any, monkeypatch: Any) -> N
     monkeypatch.syspath_prepend(str(tmp_path))
     x = CubicSpline([1.0, 2.0, 3.0, 4.0], [0.0, 0.2, 0.1, 0.3], bc_type="natural")
     given = ["late_model:late", "--engine", "lagrangian", "--q0", str(x(1.5)), "--v0", str(x(1.5, 1)), "--t0", "1.5"]
-    done = CliRunner().invoke(main, ["simulate", *given, "--save", "4", "--out", str(tmp_path)])
+    done = CliRunner().invoke(cli, ["simulate", *given, "--save", "4", "--out", str(tmp_path)])
     assert done.exit_code == 0, done.output
     rows = np.genfromtxt(next(tmp_path.glob("*-trajectory.csv")), delimiter=",", skip_header=1)
     assert np.allclose(rows[:, 0], [1.5, 1.75, 2.0, 2.25, 2.5])
     assert np.abs(rows[:, 1] - x(rows[:, 0])).max() < 1e-12
-    late = CliRunner().invoke(main, ["simulate", *given, "--duration", "9", "--out", str(tmp_path)])
+    late = CliRunner().invoke(cli, ["simulate", *given, "--duration", "9", "--out", str(tmp_path)])
     assert late.exit_code == 2
     assert "not known at 10.5 s" in late.output

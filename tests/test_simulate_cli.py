@@ -114,7 +114,7 @@ BAD = [
     (["simulate", "pendulum", "--rtol", "1e-8"], "rtol"),
     (["simulate", "pendulum", "--save", "7"], "is not a step of dt"),
     (["simulate", "pendulum", "--save", "0"], "--save"),
-    (["simulate", "slider_crank", "--engine", "drake"], "loop"),
+    (["simulate", "slider_crank", "--engine", "drake"], "constraints"),
     (["simulate", "pendulum", "--out", "regular/below"], "regular is not a folder"),
     (["plot"], "FILE"),
     (["plot", "missing.json"], "cannot read missing.json"),

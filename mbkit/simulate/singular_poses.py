@@ -51,6 +51,12 @@ def manifold_at(dyn: Dynamics, t: float) -> Manifold:
     return manifold_of(dyn).at(t)
 
 
+def _known(dyn: Dynamics, t: float) -> float:
+    """Return a time beside one of a run, or the last one before it of which tables of motions know."""
+    first, last = dyn.model.interval
+    return min(max(t, first), last)
+
+
 class _Slopes(NamedTuple):
     """J, γ, M and the force of gravity, springs and velocities at a state, and how J and γ change from there.
 
@@ -75,7 +81,9 @@ def _slopes(manifold: Manifold, t: float, q: Array, v: Array) -> _Slopes:
     J, _, gamma, M, force = (x[0] for x in here)
     both = []
     for side in (apart, -apart):
-        J1, _, gamma1, *_ = manifold.at(t + side).call("embedded", model.integrate(q, side * v), v)
+        J1, _, gamma1, *_ = manifold.at(_known(manifold.dyn, t + side)).call(
+            "embedded", model.integrate(q, side * v), v
+        )
         both.append((J1, gamma1[:, 0]))
     (J1, g1), (J0, g0) = both
     by_velocity = (here[2][1 : n + 1, :, 0] - here[2][n + 1 :, :, 0]).T / (2 * around[0, 0])
@@ -183,7 +191,7 @@ class Approach:
         apart = _APART / float(np.abs(v).max()) if alone else 0.0
         if alone:
             for x in (apart, -apart):
-                manifold = manifold_at(dyn, t + x)
+                manifold = manifold_at(dyn, _known(dyn, t + x))
                 states.append(manifold.jacobian(manifold.dyn.model.integrate(q, x * v)))
         # Without vectors, which would cost far more.
         sizes = singular_values(np.stack(states))

@@ -108,6 +108,7 @@ class LoopLoads(Actuation, Loads):
         self, joints: Sequence[str] | None, q: ArrayLike, v: ArrayLike, a: Any, tau: Any, wrenches: Any, axes: str
     ) -> Array:
         """Return the loads of joints of a mechanism whose motion is that of a force."""
+        self.model.require_bodies("joint_wrenches")
         if tau is None:
             raise InputError(
                 f"tau: expected the force under which {self.model.name} moves, got none: a motion (q, v, a) does not "

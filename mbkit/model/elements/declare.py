@@ -87,8 +87,8 @@ class ElementBuilder:
         >>> t, w = ca.SX.sym("t"), ca.SX.sym("w")
         >>> b.prescribe("hinge", 0.5 * (1 - ca.cos(w * t)), parameters={"w": mb.Parameter("w", 2.0)})
         >>> dyn = mb.dynamics(b.build(), "lagrangian")
-        >>> dyn.at(t=1.5).project([0.0], [0.0])[0].round(12).tolist()
-        [0.994996248301]
+        >>> dyn.at(t=1.5).project([0.0], [0.0])[0].round(9).tolist()
+        [0.994996248]
         """
         harmonic = {"offset": offset, "rate": rate, "amplitude": amplitude, "frequency": frequency, "phase": phase}
         if law is None:
@@ -208,8 +208,8 @@ class ElementBuilder:
         ...     return -0.1 * speed * twist[:3]
         >>> b.add_force("drag", "ball", force=drag)
         >>> dyn = mb.dynamics(b.build())
-        >>> dyn.passive([0, 0, 0, 0, 0, 0, 1], [2.0, 0, 0, 0, 0, 0]).round(12).tolist()
-        [-0.4, 0.0, 0.0, 0.0, 0.0, 0.0]
+        >>> dyn.passive([0, 0, 0, 0, 0, 0, 1], [2.0, 0, 0, 0, 0, 0])[:1].round(9).tolist()
+        [-0.4]
         """
         item = f"force {shown(name)}"
         if not isinstance(axes, str) or axes not in _AXES:
