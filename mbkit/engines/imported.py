@@ -16,7 +16,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.errors import UnsupportedError
 from mbkit.load.xml_reader import unused as unused
-from mbkit.model import Body, Joint, Model
+from mbkit.model import Body, Joint, Loop, Model
 from mbkit.model.joint_types import kind_of
 
 
@@ -72,6 +72,9 @@ class Imported:
     #: The importer's messages, and parts of its model that are in none of the terms.
     notes: tuple[str, ...]
     beside: tuple[Beside, ...] = ()
+    #: Points and frames of its bodies that the importer holds together, outside of all terms; where the engine does
+    #: not give them, why.
+    loops: tuple[Loop, ...] | str = ()
 
 
 def joint_of(

@@ -64,7 +64,9 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     notes += [text for text in dict.fromkeys(messages) if not any(x in text for x in _IDLE)]
     if plant.num_constraints():
         notes.append(f"{plant.num_constraints()} constraints, outside M and nle")
-    return Imported(model, dyn.terms, tuple(notes))
+    # A plant counts its constraints.
+    loops = "pydrake does not give the bodies and points of constraints" if plant.num_constraints() else ()
+    return Imported(model, dyn.terms, tuple(notes), loops=loops)
 
 
 @contextmanager

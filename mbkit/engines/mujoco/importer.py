@@ -23,7 +23,7 @@ from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings, mapped,
 from mbkit.errors import UnsupportedError
 from mbkit.load.mjcf_couplings import with_couplings
 from mbkit.load.urdf_reader import BASE_JOINT
-from mbkit.model import JointCoupling, Model, PointSpring
+from mbkit.model import JointCoupling, Loop, Model, PointSpring
 from mbkit.model.joint_types import kind_of
 
 _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
@@ -54,7 +54,7 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     dyn = _Read.of(checked("mujoco", described.model), m, described.numbers, {x.key: y for x, y in extras})
     notes = (*_constraints(m), *(" ".join(w.split()) for w in heard))
     beside = tuple(x._replace(without=described.without(x.key)) if x.key in described.parts else x for x, _ in extras)
-    return Imported(described.model, dyn.terms, notes, beside)
+    return Imported(described.model, dyn.terms, notes, beside, described.loops())
 
 
 def _floating(text: str) -> Any:
@@ -217,6 +217,28 @@ class _Description:
         kept = [part for name, part in self.parts.items() if name != key]
         springs = tuple(x for x in kept if isinstance(x, PointSpring))
         return with_couplings(replace(self._tree, springs=springs), [x for x in kept if isinstance(x, JointCoupling)])
+
+    def loops(self) -> tuple[Loop, ...]:
+        """Return the active equalities of two bodies or sites, in the bodies' axes."""
+        m, kinds = self.m, {int(mujoco.mjtEq.mjEQ_CONNECT): "point", int(mujoco.mjtEq.mjEQ_WELD): "frame"}
+        if self._off("EQUALITY") or self._off("CONSTRAINT"):
+            return ()
+        out = []
+        for i in range(m.neq):
+            kind = kinds.get(int(m.eq_type[i]))
+            if kind is None or not m.eq_active0[i]:
+                continue
+            objects, data, still = (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])), np.array(m.eq_data[i]), np.eye(3)
+            if m.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:
+                ends = [(int(m.site_bodyid[s]), matrix_of(m.site_quat[s]), np.array(m.site_pos[s])) for s in objects]
+            elif kind == "point":
+                ends = [(objects[0], still, data[:3]), (objects[1], still, data[3:6])]
+            else:
+                # The relative pose is of the second body's axes, at its anchor.
+                ends = [(objects[0], matrix_of(data[6:10]), data[3:6]), (objects[1], still, data[:3])]
+            a, b = ((self.names[k], R, p - self.anchors[k]) for k, R, p in ends)
+            out.append(Loop(m.eq(i).name, kind, *a, *b))
+        return tuple(out)
 
     def _off(self, flag: str) -> bool:
         return bool(self.m.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")))

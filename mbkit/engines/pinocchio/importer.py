@@ -17,16 +17,18 @@ from mbkit.engines.imported import Imported, Parts, checked, written
 from mbkit.errors import UnsupportedError
 from mbkit.load.urdf import joint_kind, joint_numbers
 from mbkit.load.urdf_reader import BASE_JOINT
+from mbkit.model import Loop
 
 
 def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
     """Return what Pinocchio's parser makes of a text; an MJCF says by itself that its base floats."""
     try:
-        raw = _urdf(text, floating_base) if format_ == "urdf" else _mjcf(text, files or {})
+        raw, held = (_urdf(text, floating_base), []) if format_ == "urdf" else _mjcf(text, files or {})
     except Exception as error:
         raise UnsupportedError(f"pinocchio: {' '.join(str(error).split())}") from None
     described = _Description(raw)
-    return Imported(checked("pinocchio", described.model), described.terms, tuple(_beside(raw)))
+    loops = described.loops(held)
+    return Imported(checked("pinocchio", described.model), described.terms, tuple(_beside(raw)), loops=loops)
 
 
 def _urdf(text: str, floating_base: bool) -> Any:
@@ -35,10 +37,12 @@ def _urdf(text: str, floating_base: bool) -> Any:
     return pin.buildModelFromXML(text)
 
 
-def _mjcf(text: str, files: dict[str, bytes]) -> Any:
+def _mjcf(text: str, files: dict[str, bytes]) -> tuple[Any, list[tuple[str, Any]]]:
+    """Return a model, and its constraints with their kinds."""
     # Only files are read as MJCF.
     with written(text, files) as path:
-        return pin.buildModelFromMJCF(str(path))
+        raw, points, frames = pin.buildModelAndConstraintsFromMJCF(str(path))
+    return raw, [("point", x) for x in points] + [("frame", x) for x in frames]
 
 
 def _beside(raw: Any) -> list[str]:
@@ -60,7 +64,7 @@ class _Description:
             # A moving body is named after the first link on its joint: the one that the joint carries.
             if frame.type == pin.BODY and frame.parentJoint:
                 frames.setdefault(int(frame.parentJoint), str(frame.name))
-        bodies = ["world"]
+        self._bodies = bodies = ["world"]
         if raw.inertias[0].mass:
             _add_body(parts, "universe", raw.inertias[0])
             parts.joint("universe_fixed", "fixed", "world", "universe", np.eye(3), np.zeros(3))
@@ -80,6 +84,15 @@ class _Description:
                 parent, X = child, pin.SE3.Identity()
             bodies.append(body)
         self.model = parts.model("pinocchio", np.array(raw.gravity.linear))
+
+    def loops(self, held: list[tuple[str, Any]]) -> tuple[Loop, ...]:
+        """Return constraints of two frames, each in the axes of the joint that carries it."""
+        out = []
+        for kind, x in held:
+            ends = (x.joint1_id, x.joint1_placement), (x.joint2_id, x.joint2_placement)
+            a, b = ((self._bodies[i], np.array(X.rotation), np.array(X.translation)) for i, X in ends)
+            out.append(Loop(str(x.name), kind, *a, *b))
+        return tuple(out)
 
     def _steps(self, joint: Any) -> list[tuple[Any, str, Array | None, Any]]:
         """Return a joint as steps: Pinocchio's joint, kind, axis, and where it stands in the one before."""

@@ -56,7 +56,7 @@ class Parsed:
 
     @property
     def agrees(self) -> bool:
-        """Whether it moves as the reference does, mimic joints left free."""
+        """Whether it moves as the reference does, mimic joints left free and loops open."""
         return bool(self.stages) and all(s.same for s in self.stages if s.name in DECIDING)
 
 

@@ -24,7 +24,7 @@ from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_reader import urdf_links
-from mbkit.model import Model
+from mbkit.model import Loop, Model
 from mbkit.studies import results
 from mbkit.studies.explain.hypotheses import angle_of, number_text
 from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_sets, rename_joints
@@ -32,6 +32,7 @@ from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of, velocity_joints
+from mbkit.studies.importers.loops import WrittenLoops, activated, closures, loop_differences
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import WALL_PER_CPU, Worker, WorkerDiedError, WorkerStartError, WorkerTimeoutError, describe
@@ -82,8 +83,8 @@ class Reading:
 
     def result(self) -> Imported:
         """Return the reading that was begun; raises `ImporterError`."""
-        model, notes, beside = self._finish()
-        return Imported(model, self._terms, notes, beside)
+        model, *rest = self._finish()
+        return Imported(model, self._terms, *rest)
 
     def _terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> Values:
         self._begin(_terms_of_held, q, v, without)
@@ -116,12 +117,12 @@ class Reading:
 
 def _read(
     module: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes]
-) -> tuple[Model, tuple[str, ...], tuple[Beside, ...]]:
+) -> tuple[Model, tuple[str, ...], tuple[Beside, ...], tuple[Loop, ...] | str]:
     global _held
     # The file before can be as large.
     _held = None
     _held = reader(module)(text, format_, floating_base, files)
-    return _held.model, _held.notes, _held.beside
+    return _held.model, _held.notes, _held.beside, _held.loops
 
 
 def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
@@ -133,7 +134,7 @@ def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
 
 
 def stages(
-    reference: Model | Imported, imported: Imported, samples: int, seed: int, tolerance: float
+    reference: Model | Imported, loops: WrittenLoops, imported: Imported, samples: int, seed: int, tolerance: float
 ) -> tuple[Stage, ...]:
     """Compare an importer's model with the reference, from the tree to the terms, which its own engine computes."""
     described = reference.model if isinstance(reference, Imported) else reference
@@ -148,9 +149,8 @@ def stages(
     for name, some in _differences(one, there, near).items():
         if name == "total mass":
             out.append(_missing("mimic", mimics, "left free"))
-        size, where, says = max(some, key=itemgetter(0), default=(0.0, "", ""))
-        more = f" (and {len(some) - 1} more)" if len(some) > 1 else ""
-        out.append(Stage(name, not some, size, where, f"{where}: {says}{more}" if some else ""))
+        out.append(_worst(name, some))
+    out.append(_loop_stage(loops, imported, {m.b: m.a for m in matching.pairs}, near))
     apart = Gaps(comparable=False)
     if not structural:
         at = states_of(one.model, samples, seed)
@@ -167,6 +167,21 @@ def stages(
         else:
             out.append(Stage(name, None, math.nan, "", "not computed" if apart.comparable else "other coordinates"))
     return tuple(out)
+
+
+def _worst(name: str, some: list[tuple[float, str, str]]) -> Stage:
+    size, where, says = max(some, key=itemgetter(0), default=(0.0, "", ""))
+    more = f" (and {len(some) - 1} more)" if len(some) > 1 else ""
+    return Stage(name, not some, size, where, f"{where}: {says}{more}" if some else "")
+
+
+def _loop_stage(loops: WrittenLoops, imported: Imported, names: Mapping[str, str], near: Tolerances) -> Stage:
+    """Compare an importer's loops with the file's; `names` has the file's joint for each of the importer's."""
+    if loops.faults or isinstance(imported.loops, str):
+        return Stage("loops", None, math.nan, "", loops.faults or str(imported.loops))
+    some = loop_differences(loops, closures(imported.model, imported.loops, names), near)
+    every = "; ".join(f"{where}: {says}" for _, where, says in some)
+    return replace(_worst("loops", some), says=every)
 
 
 def _missing(name: str, missing: list[str], what: str) -> Stage:
@@ -305,11 +320,12 @@ def compare_parsers(
     ends: a crash or an endless loop there is reported like any other refusal.
 
     The readings are compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses, centres of
-    mass, inertias, armature, damping, friction, limits, and M, g, nle and passive by joint name, by the engine itself
-    on its own model, with all that it holds beside bodies and joints: flags, tendons, actuators at zero control, fluid,
-    gravity compensation. Links that an importer fuses are fused on the other side too. Why one differs is in its
-    ``explanation``. Where mbkit does not read the file, an MJCF is compared with MuJoCo's own reading, and any other
-    file with nothing: the importers that read it are only listed.
+    mass, inertias, armature, damping, friction, limits, the loops of an MJCF, and M, g, nle and passive by joint name,
+    by the engine itself on its own model, with all that it holds beside bodies and joints: flags, tendons, actuators at
+    zero control, fluid, gravity compensation. Links that an importer fuses are fused on the other side too. Why one
+    differs is in its ``explanation``. Loops are in no term, and decide nothing. Where mbkit does not read the file, an
+    MJCF is compared with MuJoCo's own reading, and any other file with nothing: the importers that read it are only
+    listed.
 
     Parameters
     ----------
@@ -351,13 +367,14 @@ def compare_parsers(
     with _lock:
         read, refused = _readings(stripped, engines, floating_base, seconds)
         reference, label, faults = _reference(stripped, read, floating_base)
+        loops = _written_loops(stripped, reference, floating_base)
         for engine, imported in read.items():
             if reference is None or engine == label:
                 notes = (*imported.notes, *(x.says for x in imported.beside))
                 parsed[engine] = Parsed(engine, _version(engine), notes=notes)
                 continue
             try:
-                parsed[engine] = _compared(engine, imported, reference, label, samples, seed, tolerance)
+                parsed[engine] = _compared(engine, imported, reference, loops, label, samples, seed, tolerance)
             except ImporterError as error:
                 refused[engine] = str(error)
     parsed |= {engine: Parsed(engine, _version(engine), why) for engine, why in refused.items()}
@@ -400,14 +417,21 @@ def _readings(
 
 
 def _compared(
-    engine: str, imported: Imported, reference: Model | Imported, label: str, samples: int, seed: int, tolerance: float
+    engine: str,
+    imported: Imported,
+    reference: Model | Imported,
+    loops: WrittenLoops,
+    label: str,
+    samples: int,
+    seed: int,
+    tolerance: float,
 ) -> Parsed:
     """Return an importer's reading, compared with the reference."""
     described = reference.model if isinstance(reference, Imported) else reference
     explanation = explain(
         described, imported.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine)
     )
-    compared = stages(reference, imported, samples, seed, tolerance)
+    compared = stages(reference, loops, imported, samples, seed, tolerance)
     causes, idle, held = own_terms(engine, imported, samples, seed, tolerance)
     if isinstance(reference, Imported):
         theirs, _, also = own_terms(label, reference, samples, seed, tolerance)
@@ -434,7 +458,7 @@ def _path(source: str | os.PathLike[str]) -> Path:
     return Path(os.fspath(source))
 
 
-def _written(stripped: Stripped, floating_base: bool) -> Model:
+def _written(stripped: Stripped, floating_base: bool, *, loops: bool = False) -> Model:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MbkitWarning)
         if stripped.format == "urdf":
@@ -446,8 +470,7 @@ def _written(stripped: Stripped, floating_base: bool) -> Model:
             nonphysical="warn",
             gravity=None,
             meshes="auto",
-            # Of other importers the tree alone is read.
-            loops=False,
+            loops=loops,
         )
 
 
@@ -462,6 +485,24 @@ def _reference(
     if stripped.format == "mjcf" and MUJOCO in read:
         return read[MUJOCO], MUJOCO, faults
     return None, "", faults
+
+
+def _written_loops(stripped: Stripped, reference: Model | Imported | None, floating_base: bool) -> WrittenLoops:
+    """Return the loops that importers are compared with: of the file, else of the reading that is the reference."""
+    if isinstance(reference, Imported):
+        if isinstance(reference.loops, str):
+            return WrittenLoops(faults=reference.loops)
+        return WrittenLoops(closures(reference.model, reference.loops))
+    if reference is None or stripped.format == "urdf":
+        return WrittenLoops()
+    try:
+        active, every = (
+            _written(replace(stripped, root=root), floating_base, loops=True)
+            for root in (stripped.root, activated(stripped.root))
+        )
+    except MbkitError as error:
+        return WrittenLoops(faults=f"mbkit does not read the loops: {error}")
+    return WrittenLoops(closures(active, active.loops), closures(every, every.loops))
 
 
 def _notes(stripped: Stripped) -> list[str]:
