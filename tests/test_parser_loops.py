@@ -121,11 +121,15 @@ def test_drake_loses_welds_and_does_not_give_its_points(tmp_path: Path) -> None:
     assert connect.says
 
 
-def test_pinocchio_refuses_the_world_by_name(tmp_path: Path) -> None:
+def test_pinocchio_refuses_a_loop_to_the_world_by_name_and_its_tree_is_compared(tmp_path: Path) -> None:
     result = compared(tmp_path, "0 0 0", "", CONNECT.replace("/>", ' body2="world"/>'))
     pinocchio, mujoco, _ = result.importers
-    assert "world" in pinocchio.refused
-    assert next(s for s in mujoco.stages if s.name == "loops").same is True
+    ours, theirs = (next(s for s in p.stages if s.name == "loops") for p in (pinocchio, mujoco))
+    assert theirs.same is True
+    assert ours.same is None
+    assert "world" in ours.says
+    assert pinocchio.agrees
+    assert any("reader of constraints refuses" in note for note in pinocchio.notes)
 
 
 def test_a_body_without_a_joint_of_its_own(tmp_path: Path) -> None:

@@ -27,8 +27,9 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     except Exception as error:
         raise UnsupportedError(f"pinocchio: {' '.join(str(error).split())}") from None
     described = _Description(raw)
-    loops = described.loops(held)
-    return Imported(checked("pinocchio", described.model), described.terms, tuple(_beside(raw)), loops=loops)
+    loops = held if isinstance(held, str) else described.loops(held)
+    notes = (*_beside(raw), *([held] if isinstance(held, str) else []))
+    return Imported(checked("pinocchio", described.model), described.terms, notes, loops=loops)
 
 
 def _urdf(text: str, floating_base: bool) -> Any:
@@ -37,11 +38,16 @@ def _urdf(text: str, floating_base: bool) -> Any:
     return pin.buildModelFromXML(text)
 
 
-def _mjcf(text: str, files: dict[str, bytes]) -> tuple[Any, list[tuple[str, Any]]]:
-    """Return a model, and its constraints with their kinds."""
+def _mjcf(text: str, files: dict[str, bytes]) -> tuple[Any, list[tuple[str, Any]] | str]:
+    """Return a model, and its constraints with their kinds, or why its reader of constraints refuses."""
     # Only files are read as MJCF.
     with written(text, files) as path:
-        raw, points, frames = pin.buildModelAndConstraintsFromMJCF(str(path))
+        raw = pin.buildModelFromMJCF(str(path))
+        try:
+            _, points, frames = pin.buildModelAndConstraintsFromMJCF(str(path))
+        except Exception as error:
+            # Of body2="world", say: the tree is read all the same.
+            return raw, f"its reader of constraints refuses: {' '.join(str(error).split())}"
     return raw, [("point", x) for x in points] + [("frame", x) for x in frames]
 
 
