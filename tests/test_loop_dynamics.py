@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from importlib import import_module
 
 import casadi as ca
 import numpy as np
@@ -443,7 +444,9 @@ def test_what_would_be_the_trees_alone_is_refused() -> None:
         dyn.joint_wrenches(q, q, q)
 
 
-def test_a_whole_comparison_of_a_mechanism_passes_with_its_loops_on() -> None:
+def test_a_whole_comparison_of_a_mechanism_passes_with_its_loops_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Little time to error against run time, which tests/test_loops_in_studies.py has.
+    monkeypatch.setattr(import_module("mbkit.studies.compare.study"), "_SECONDS", 0.5)
     result = mb.compare(mb.catalog.four_bar(), samples=4)
     assert result.passed, result.verdict
     assert {r.engine for r in result.rollouts} == {"mujoco"}
