@@ -33,6 +33,7 @@ from typing import Any, Final, TypeVar
 from weakref import WeakSet
 
 from mbkit import _interrupt
+from mbkit._child_process import kill_child, start_child
 from mbkit.engines.registry import registered_engines
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.methods.registry import METHODS, registered_methods
@@ -204,18 +205,7 @@ class Worker:
         arguments = (self._home or self._folder, its.fileno(), self._memory, int(self._follow))
         command = [sys.executable, "-c", _PROGRAM, *map(str, arguments), *map(os.path.abspath, sys.path)]
         try:
-            with its, (self._folder / "output").open("wb") as output:
-                self._process = subprocess.Popen(
-                    command,
-                    cwd=self._folder,
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=output,
-                    pass_fds=[its.fileno()],
-                    env=self._environment,
-                    # Ctrl-C is for its parent, and what it starts ends with it.
-                    start_new_session=True,
-                )
+            self._process = start_child(command, self._folder, its, self._environment)
         except OSError as error:
             ours.close()
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -265,9 +255,7 @@ class Worker:
         return WorkerClosedError() if self._closed.is_set() else _death(code, output.decode("utf-8", "replace"))
 
     def _kill(self) -> None:
-        if (process := self._process) is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+        kill_child(self._process)
 
     def close(self) -> None:
         """End the process for good, from any thread; a call that is under way raises `WorkerClosedError`."""

@@ -23,6 +23,7 @@ from typing import Any, Final
 
 from mbkit import _interrupt
 from mbkit._check import Array
+from mbkit._child_process import kill_child, start_child
 from mbkit._fork import fork_safe
 from mbkit.engines.versions.engine_version import EngineVersion
 from mbkit.engines.versions.remote import serve
@@ -95,18 +96,7 @@ class EngineProcess:
         environment = {k: x for k, x in os.environ.items() if not k.startswith("PYTHON")}
         command = [str(python), "-E", "-s", str(_SERVE), str(its.fileno()), self.version.engine, str(self._folder)]
         try:
-            with its, (self._folder / "output").open("wb") as output:
-                self._process = subprocess.Popen(
-                    command,
-                    cwd=self._folder,
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=output,
-                    pass_fds=[its.fileno()],
-                    env=environment,
-                    # Ctrl-C is for its parent, and what it starts ends with it.
-                    start_new_session=True,
-                )
+            self._process = start_child(command, self._folder, its, environment)
         except OSError as error:
             ours.close()
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -173,9 +163,7 @@ class EngineProcess:
         return EngineProcessError(f"{self.version}: its process {how}" + (f" ({lines[-1][:300]})" if lines else ""))
 
     def _kill(self) -> None:
-        if (process := self._process) is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+        kill_child(self._process)
 
     def end(self) -> None:
         """End the process and remove its folder; the next call starts another."""
@@ -183,8 +171,7 @@ class EngineProcess:
         self._process = self._channel = self._read = None
         if process is None or channel is None:
             return
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
+        kill_child(process)
         _interrupt.at_end(self._kill, remove=True)
         process.wait()
         channel.close()
