@@ -2,17 +2,18 @@
 
 Through views, copies and ctypes a call costs two microseconds more than the small kernels themselves. The function here
 is a built-in one, as of an extension module (METH_FASTCALL of Python's C API). It reads the addresses of arrays from
-NumPy's objects, as every extension does, and runs compiled functions on them one after another. It keeps nothing
-between calls: each takes its work space from Python's allocator, so that threads, forks and calls within calls need no
-lock. It holds the interpreter's lock, because a thread that lets go of it for a microsecond may get it back only after
-milliseconds.
+NumPy's objects, as every extension does, runs compiled functions on them one after another, and makes the arrays of the
+results by NumPy's C API. It keeps nothing between calls: each takes its work space from Python's allocator, so that
+threads, forks and calls within calls need no lock. It holds the interpreter's lock, because a thread that lets go of it
+for a microsecond may get it back only after milliseconds.
 
 Each vector of numbers has a place in the work space, every entry in all lanes of a register, as the compiled functions
 take it without copies of their own. The plan of the function is an array of 64-bit numbers, its own object::
 
-    addresses of types and functions, numbers of arguments and of inputs, bytes of work space, place of the table in it,
+    addresses of types and functions, numbers of inputs and of results, bytes of work space, place of the table in it,
     numbers of quaternions and of compiled functions; then for each
-      argument: its entries, or -1 for a Python float, and its place
+      input: its entries, or -1 for a Python float, or -2 for a positive one, and its place
+      result: its entries, its place, its axes, and the lengths of up to four axes
       quaternion: the place of its first entry
       compiled function: address of its loop, inputs, outputs, share of the work space, places and rows of all of them
 
@@ -24,6 +25,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from math import prod
 from typing import Any, Final
 
 import numpy as np
@@ -45,9 +47,14 @@ _DATA, _RANK, _SHAPE, _STRIDES, _DTYPE = _HEAD, _HEAD + 1, _HEAD + 2, _HEAD + 3,
 _KIND: Final = _HEAD + 1
 _TABLE: Final = 3 + 4 * 2 * MOST_ARRAYS
 # Places in the array of numbers: what holds of every function in this process, then what is its own.
-(_ARRAY, _FLOAT, _DOUBLE_KIND, _TAKE, _GIVE, _BOOL) = range(6)
-(_ARGUMENTS, _INPUTS, _BYTES, _TABLE_AT, _QUATERNIONS, _CALLS, _LISTS) = range(6, 13)
+(_ARRAY, _FLOAT, _DOUBLE_KIND, _TAKE, _GIVE, _NONE, _KEEP, _DROP, _NEW_ARRAY, _NEW_FLOAT, _NEW_TUPLE, _SET) = range(12)
+(_INPUTS, _RESULTS, _BYTES, _TABLE_AT, _QUATERNIONS, _CALLS, _LISTS) = range(12, 19)
+_MOST_AXES: Final = 4
+#: Entries of a Python float, and of one that must be positive.
+FLOAT, POSITIVE = -1, -2
 _METH_FASTCALL: Final = 0x80
+# PyArray_Type and PyArray_New in the table of NumPy's C API, the same since NumPy 1.0; NPY_DOUBLE.
+_API_TYPE, _API_NEW, _NPY_DOUBLE = 2, 93, 12
 _I32, _I64, _F64, _PTR = ir.IntType(32), ir.IntType(64), ir.DoubleType(), ir.PointerType()
 
 
@@ -67,31 +74,34 @@ class _Numbers(np.ndarray):
 
 
 def python_call(
-    steps: Sequence[Step], inputs: Mapping[str, int], results: Sequence[str], quaternions: Sequence[int] = ()
-) -> Callable[..., bool]:
-    """Return a function of the inputs and then of arrays for the results that fills these.
+    steps: Sequence[Step],
+    inputs: Mapping[str, int],
+    results: Mapping[str, Sequence[int]],
+    quaternions: Sequence[int] = (),
+) -> Callable[..., Any]:
+    """Return a function of the inputs that returns arrays of the results.
 
     Parameters
     ----------
     steps : sequence
         Functions to run in this order, each with the names of the vectors that it reads and writes.
     inputs : dict
-        Entries of each input, in the order of the arguments; -1 is a Python float.
-    results : sequence of str
-        Vectors that the caller gets, each in a contiguous float64 array of as many entries. They are not checked.
+        Entries of each input, in the order of the arguments; `FLOAT` is a Python float, `POSITIVE` one above zero.
+    results : dict
+        Vectors that the caller gets -> their shapes, of up to four axes; one without axes is a float.
     quaternions : sequence of int
         Where quaternions begin in the first input.
 
     Returns
     -------
     callable
-        It returns False, and leaves the results as they are, where an input is not a float64 array of this very
-        shape, with words aligned, or a quaternion is not of unit length, or a number read or written on the way is not
-        finite.
+        Of one result it returns this, of several a tuple. It returns None where an input is not a float64 array of this
+        very shape, with words aligned, or a quaternion is not of unit length, or a number read or written on the way is
+        not finite.
     """
     if not _layout_is_known():
-        return lambda *_: False
-    rows = {name: abs(n) for name, n in inputs.items()}
+        return lambda *_: None
+    rows = {name: abs(n) if n > FLOAT else 1 for name, n in inputs.items()}
     for code, _, writes in steps:
         rows |= {name: r * c for name, (r, c) in zip(writes, code.shapes, strict=True)}
     width, place, places = jit.host().width, max(code.share for code, _, _ in steps), {}
@@ -105,15 +115,20 @@ def python_call(
         calls += [x for name in (*reads, *writes) for x in (places[name], rows[name])]
     # The work space begins at a cache line.
     size = 8 * (place + _TABLE) + 64
-    counts = [len(inputs) + len(results), len(inputs), size, place, len(quaternions), len(steps)]
-    arguments = [x for name, n in (*inputs.items(), *((r, rows[r]) for r in results)) for x in (n, places[name])]
+    counts = [len(inputs), len(results), size, place, len(quaternions), len(steps)]
+    given = [x for name, n in inputs.items() for x in (n, places[name])]
+    made = []
+    for name, shape in results.items():
+        if prod(shape) != rows[name] or len(shape) > _MOST_AXES:
+            raise ValueError(f"{name}: {rows[name]} numbers have no shape {tuple(shape)}")
+        made += [rows[name], places[name], len(shape), *shape, *[1] * (_MOST_AXES - len(shape))]
     turns = [places[next(iter(inputs))] + start * width for start in quaternions]
-    lists = [*arguments, *turns, *calls]
+    lists = [*given, *made, *turns, *calls]
     numbers = np.array([*_process(), *counts, *lists], dtype=np.int64).view(_Numbers)
     numbers.kept = [code for code, _, _ in steps]
     new = ctypes.pythonapi.PyCFunction_NewEx
     new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p]
-    call: Callable[..., bool] = new(ctypes.addressof(_definition()[0]), numbers, None)
+    call: Callable[..., Any] = new(ctypes.addressof(_definition()[0]), numbers, None)
     return call
 
 
@@ -127,10 +142,24 @@ def _definition() -> tuple[_Definition, Any]:
 
 @cache
 def _process() -> tuple[int, ...]:
-    """Return addresses of Python's and NumPy's types and functions, in the order of `_ARRAY` to `_BOOL`."""
-    api = (getattr(ctypes.pythonapi, name) for name in ("PyMem_RawMalloc", "PyMem_RawFree", "PyBool_FromLong"))
-    functions = (ctypes.cast(f, ctypes.c_void_p).value or 0 for f in api)
-    return id(np.ndarray), id(float), _word(id(np.dtype(np.float64)), _KIND), *functions
+    """Return addresses of Python's and NumPy's objects and functions, in the order of `_ARRAY` to `_SET`."""
+    heads = id(np.ndarray), id(float), _word(id(np.dtype(np.float64)), _KIND)
+    python = ("PyFloat_FromDouble", "PyTuple_New", "PyTuple_SetItem")
+    memory = (_address(name) for name in ("PyMem_RawMalloc", "PyMem_RawFree"))
+    counts = (_address(name) for name in ("Py_IncRef", "Py_DecRef"))
+    return *heads, *memory, id(None), *counts, _api(_API_NEW), *map(_address, python)
+
+
+def _address(name: str) -> int:
+    return ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p).value or 0
+
+
+def _api(place: int) -> int:
+    """Return an entry of the table that NumPy hands to every extension module."""
+    get = ctypes.pythonapi.PyCapsule_GetPointer
+    get.restype, get.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+    table: int = get(np._core._multiarray_umath._ARRAY_API, None)  # type: ignore[attr-defined]  # no public name
+    return _word(table, place)
 
 
 def _word(address: int, place: int) -> int:
@@ -141,6 +170,10 @@ def _word(address: int, place: int) -> int:
 def _layout_is_known() -> bool:
     """Return whether NumPy's objects are as this file reads them."""
     x = np.arange(6.0)[::2]
+    try:
+        array_type = _api(_API_TYPE)
+    except (AttributeError, ValueError):
+        return False
     words = [_word(id(x), i) for i in range(_DTYPE + 1)]
     return (
         words[_HEAD - 1] == id(np.ndarray)
@@ -151,6 +184,8 @@ def _layout_is_known() -> bool:
         and words[_DTYPE] == id(x.dtype)
         and _word(words[_DTYPE], _KIND) >> 32 == x.dtype.num
         and _word(id(1.0), _HEAD) == int(np.float64(1.0).view(np.int64))
+        and array_type == id(np.ndarray)
+        and np.dtype(np.float64).num == _NPY_DOUBLE
     )
 
 
@@ -176,25 +211,25 @@ def _code() -> str:
     several = _I64(width)
     lanes = ir.VectorType(_F64, width)
     entries = b.at(numbers, _I64(_LISTS), _I64)
-    starts = b.at(entries, b.mul(number(_ARGUMENTS), _I64(2)), _I64)
+    made = b.at(entries, b.mul(number(_INPUTS), _I64(2)), _I64)
+    starts = b.at(made, b.mul(number(_RESULTS), _I64(3 + _MOST_AXES)), _I64)
     calls = b.at(starts, number(_QUATERNIONS), _I64)
-    refused, refused_late = (f.append_basic_block(n) for n in ("refused", "refused_late"))
+    refused, refused_late, no_memory = (f.append_basic_block(n) for n in ("refused", "refused_late", "no_memory"))
+    nothing = ir.Constant(_PTR, None)
+
+    def is_there(pointer: Any) -> Any:
+        return b.icmp_unsigned("!=", b.ptrtoint(pointer, _I64), _I64(0))
 
     def require(condition: Any, otherwise: Any = refused_late) -> None:
         yes = f.append_basic_block("yes")
         b.cbranch(condition, yes, otherwise)
         b.position_at_end(yes)
 
-    require(b.icmp_signed("==", count, number(_ARGUMENTS)), refused)
+    require(b.icmp_signed("==", count, number(_INPUTS)), refused)
     block = call(number(_TAKE), _PTR, number(_BYTES))
-    require(b.icmp_unsigned("!=", b.ptrtoint(block, _I64), _I64(0)), refused)
+    require(is_there(block), refused)
     work = b.inttoptr(b.and_(b.add(b.ptrtoint(block, _I64), _I64(63)), _I64(-64)), _PTR)
     table = b.at(work, number(_TABLE_AT))
-
-    def described(i: Any) -> tuple[Any, Any, Any]:
-        """Return argument i, its entries, and its place."""
-        size, place = (b.get(entries, b.add(b.mul(i, _I64(2)), _I64(k)), _I64) for k in (0, 1))
-        return b.get(arguments, i, _PTR), size, b.at(work, place)
 
     def spread(x: Any, place: Any) -> None:
         one = b.insert_element(ir.Constant(lanes, ir.Undefined), x, _I32(0))
@@ -202,12 +237,16 @@ def _code() -> str:
         b.store(b.shuffle_vector(one, one, zeros), place, align=8)
 
     def one_input(i: Any) -> None:
-        given, size, place = described(i)
+        size, at = (b.get(entries, b.add(b.mul(i, _I64(2)), _I64(k)), _I64) for k in (0, 1))
+        given, place = b.get(arguments, i, _PTR), b.at(work, at)
         kind = b.get(given, _I64(_HEAD - 1), _I64)
-        with b.if_else(b.icmp_signed("==", size, _I64(-1))) as (is_float, is_array):
+        with b.if_else(b.icmp_signed("<", size, _I64(0))) as (is_float, is_array):
             with is_float:
                 require(b.icmp_signed("==", kind, number(_FLOAT)))
-                spread(b.get(given, _I64(_HEAD)), place)
+                x = b.get(given, _I64(_HEAD))
+                positive = b.fcmp_ordered(">", x, _F64(0.0))
+                require(b.or_(b.icmp_signed("==", size, _I64(FLOAT)), positive))
+                spread(x, place)
             with is_array:
                 require(b.icmp_signed("==", kind, number(_ARRAY)))
                 require(b.icmp_signed("==", b.load(b.at(given, _I64(_RANK)), typ=_I32, align=4), _I32(1)))
@@ -261,17 +300,48 @@ def _code() -> str:
     b.count(_I64(0), number(_CALLS), 1, one_call)
     require(b.fcmp_ordered("==", b.get(work, _I64(0)), _F64(0.0)))
 
-    def one_result(i: Any) -> None:
-        given, size, place = described(i)
-        data = b.get(given, _I64(_DATA), _PTR)
-        b.count(_I64(0), size, 1, lambda j: b.set(b.get(place, b.mul(j, several)), data, j))
+    out, value, several_out = b.room(_PTR, 1), b.room(_PTR, 1), b.icmp_signed(">", number(_RESULTS), _I64(1))
+    b.store(nothing, out)
+    with b.if_then(several_out):
+        b.store(call(number(_NEW_TUPLE), _PTR, number(_RESULTS)), out)
+        require(is_there(b.load(out, typ=_PTR)), no_memory)
 
-    b.count(number(_INPUTS), number(_ARGUMENTS), 1, one_result)
+    def one_result(i: Any) -> None:
+        result = b.at(made, b.mul(i, _I64(3 + _MOST_AXES)), _I64)
+        size, place, axes = (b.get(result, _I64(k), _I64) for k in range(3))
+        values = b.at(work, place)
+        with b.if_else(b.icmp_signed("==", axes, _I64(0))) as (is_float, is_array):
+            with is_float:
+                b.store(call(number(_NEW_FLOAT), _PTR, b.get(values, _I64(0))), value)
+                require(is_there(b.load(value, typ=_PTR)), no_memory)
+            with is_array:
+                kind, shape = b.inttoptr(number(_ARRAY), _PTR), b.at(result, _I64(3), _I64)
+                given = (b.trunc(axes, _I32), shape, _I32(_NPY_DOUBLE), nothing, nothing, _I32(0), _I32(0), nothing)
+                array = call(number(_NEW_ARRAY), _PTR, kind, *given)
+                b.store(array, value)
+                require(is_there(array), no_memory)
+                data = b.get(array, _I64(_DATA), _PTR)
+                b.count(_I64(0), size, 1, lambda j: b.set(b.get(values, b.mul(j, several)), data, j))
+        with b.if_else(several_out) as (is_many, is_one):
+            with is_many:
+                call(number(_SET), _I32, b.load(out, typ=_PTR), i, b.load(value, typ=_PTR))
+            with is_one:
+                b.store(b.load(value, typ=_PTR), out)
+
+    b.count(_I64(0), number(_RESULTS), 1, one_result)
     call(number(_GIVE), ir.VoidType(), block)
-    b.ret(call(number(_BOOL), _PTR, _I64(1)))
+    b.ret(b.load(out, typ=_PTR))
+    b.position_at_end(no_memory)
+    # Python's error is set.
+    call(number(_GIVE), ir.VoidType(), block)
+    with b.if_then(is_there(b.load(out, typ=_PTR))):
+        call(number(_DROP), ir.VoidType(), b.load(out, typ=_PTR))
+    b.ret(nothing)
     b.position_at_end(refused_late)
     call(number(_GIVE), ir.VoidType(), block)
     b.branch(refused)
     b.position_at_end(refused)
-    b.ret(call(number(_BOOL), _PTR, _I64(0)))
+    none = b.inttoptr(number(_NONE), _PTR)
+    call(number(_KEEP), ir.VoidType(), none)
+    b.ret(none)
     return str(module)

@@ -134,9 +134,9 @@ def _finite_rows(q: Array, v: Array) -> Array:
     return np.asarray(np.isfinite(q).all(axis=-1) & np.isfinite(v).all(axis=-1))
 
 
-def scalar(value: Array) -> Any:
+def scalar(value: Array | float) -> Any:
     """Return one state's number as a float, a batch's as an array."""
-    return value if value.ndim else float(value)
+    return value if np.ndim(value) else float(value)
 
 
 class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Regressors):

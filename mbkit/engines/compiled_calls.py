@@ -13,7 +13,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.codegen.compiled import Compiled
-from mbkit.codegen.python_call import Step, python_call
+from mbkit.codegen.python_call import FLOAT, POSITIVE, Step, python_call
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import DYNAMICS, Part, march, march_in_stages, velocity_changes
 from mbkit.methods.registry import method_of
@@ -29,13 +29,12 @@ _ONE_PIECE: Final = 20_000
 
 
 class QuantityCall(NamedTuple):
-    """Calls for float64 arrays: `single` of one state fills an array of `shape`, `batch` returns its result or None.
+    """Calls for float64 arrays: `single` of one state and `batch` return the result, or None.
 
-    `turned` gives the filled array the quantity's shape, which it has already unless entries change places.
+    `turned` gives what `single` returns the quantity's shape, which it has already unless entries change places.
     """
 
-    single: Callable[..., bool]
-    shape: tuple[int, ...]
+    single: Call
     batch: Call
     turned: Callable[[Array], Array]
 
@@ -48,7 +47,12 @@ def quantity_call(model: Model, code: Compiled, trim: Callable[[Array], Array], 
     """
     sizes, starts = code.inputs, tuple(start for start, _ in model.quaternions)
     inputs = {f"argument {i}": n for i, n in enumerate(sizes)}
-    single = python_call([(code, [*inputs], ["result"])], inputs, ["result"], starts)
+    raw = np.empty(code.shapes[0])
+    shape = trim(raw).shape
+    # More axes than before are a view with the entries in another order.
+    ordered = len(shape) <= raw.ndim
+    results = {"result": shape if ordered else raw.shape}
+    single = python_call([(code, [*inputs], [*results])], inputs, results, starts)
 
     def batch(*given: Any) -> Any:
         if not _is_batch(given, sizes, starts):
@@ -56,11 +60,7 @@ def quantity_call(model: Model, code: Compiled, trim: Callable[[Array], Array], 
         results, finite = code.call_checked(*given, threads=threads)
         return trim(results[0]) if finite else None
 
-    raw = np.empty(code.shapes[0])
-    shape = trim(raw).shape
-    # More axes than before are a view with the entries in another order.
-    ordered = len(shape) <= raw.ndim
-    return QuantityCall(single, shape if ordered else raw.shape, batch, (lambda x: x) if ordered else trim)
+    return QuantityCall(single, batch, (lambda x: x) if ordered else trim)
 
 
 def _is_batch(given: Sequence[Any], sizes: Sequence[int], starts: Sequence[int]) -> bool:
@@ -100,8 +100,8 @@ class Plan:
 class CompiledStep:
     """A step from (q, v) to (q, v) by the code of a plan, which carries along the integrators' own velocity.
 
-    `single` and `batch` take q, v, tau, dt as a Python float, and the parameters' values if there are some, for one
-    state or many. They return None for arguments that they do not take, and where a number is not finite.
+    `single` and `batch` take q, v, tau, dt as a Python float above zero, and the parameters' values if there are some,
+    for one state or many. They return None for arguments that they do not take, and where a number is not finite.
     """
 
     def __init__(self, model: Model, equations: Equations, plan: Plan, code: Callable[[Part], Compiled]) -> None:
@@ -112,22 +112,12 @@ class CompiledStep:
             (own, [same.get(name, name) for name in part.reads], [same.get(name, name) for name in part.writes])
             for part, own in zip((*before, *plan.parts, *behind), codes, strict=True)
         ]
-        nq, nv, empty = model.nq, model.nv, np.empty
-        inputs = {"q": nq, "v": nv, "tau": equations.force.numel(), "dt": -1, "squares": -1}
+        nq, nv = model.nq, model.nv
+        inputs = {"q": nq, "v": nv, "tau": equations.force.numel(), "dt": POSITIVE, "squares": FLOAT}
         inputs |= {name: x.numel() for name, x in equations.extra_arguments.items()}
         self._starts = tuple(start for start, _ in model.quaternions)
-        run = python_call(self._steps, inputs, ["q1", "v1"], self._starts)
-
-        def single(q: Any, v: Any, tau: Any, dt: float, *behind: Any) -> Any:
-            q1, v1 = empty(nq), empty(nv)
-            return (q1, v1) if run(q, v, tau, dt, 0.0, *behind, q1, v1) else None
-
-        def plain(q: Any, v: Any, tau: Any, dt: float) -> Any:
-            # A call with *arguments costs a tenth of a small step.
-            q1, v1 = empty(nq), empty(nv)
-            return (q1, v1) if run(q, v, tau, dt, 0.0, q1, v1) else None
-
-        self.single: Call = single if equations.extra_arguments else plain
+        #: Of q, v, tau, dt, 0.0 and the extra arguments.
+        self.single: Call = python_call(self._steps, inputs, {"q1": (nq,), "v1": (nv,)}, self._starts)
         self._extra = [*equations.extra_arguments]
         self._sizes = [inputs[name] for name in ("q", "v", "tau", *self._extra)]
 

@@ -85,15 +85,14 @@ def _quick(checked: _Function) -> _Function:
     rest = "".join(f", {x.name}" for x in given if x.default is not x.empty)
     text = f"""
 def {name}(self, {arguments}{loads}):
-    short = self._short.get(("{name}",)){" if wrenches is None else None" if loads else ""}
-    if short is not None and not self._parametric:
-        single, shape, batch, _ = short
-        out = empty(shape)
-        if single({arguments}, out) or (out := batch({arguments})) is not None:
-            return {"scalar(out)" if name.endswith("energy") else "out"}
+    call = self._direct.get("{name}"){" if wrenches is None else None" if loads else ""}
+    if call is not None:
+        out = call[0]({arguments})
+        if out is not None or (out := call[1]({arguments})) is not None:
+            return out
     return checked(self, {arguments}{rest})
 """
-    scope: dict[str, Any] = {"checked": checked, "empty": np.empty, "scalar": scalar, "__name__": __name__}
+    scope: dict[str, Any] = {"checked": checked, "__name__": __name__}
     exec(text, scope)
     return wraps(checked)(scope[name])  # type: ignore[return-value]  # of the same signature
 
@@ -175,6 +174,8 @@ class LagrangianDynamics(Dynamics):
         self._batched: dict[str, Array] = {}
         self._machines: dict[tuple[str, ...], Any] = {}
         self._short: dict[tuple[str, ...], QuantityCall] = {}
+        #: Of those the quantities whose arguments are the state alone.
+        self._direct: dict[str, QuantityCall] = {}
         self._steps: dict[str, tuple[Method, CompiledStep]] = {}
         #: For steps that the others lose to their constraints.
         self._thorough_steps: dict[str, tuple[Method, CompiledStep]] = {}
@@ -221,8 +222,11 @@ class LagrangianDynamics(Dynamics):
                 # Loads LLVM, which interpreting never needs.
                 from mbkit.engines.compiled_calls import quantity_call
 
+                short = quantity_call(self.model, code, _TRIM[name], self.threads)
                 # Derivatives go by the name of what they are of.
-                self._short[key[key[0] == _STACKED :]] = quantity_call(self.model, code, _TRIM[name], self.threads)
+                self._short[key[key[0] == _STACKED :]] = short
+                if not (extra or self._parametric):
+                    self._direct[name] = short
             self._machines[key] = code
         return self._machines[key]
 
@@ -318,8 +322,8 @@ class LagrangianDynamics(Dynamics):
                 self._short[quantity, *more] = short
         if short is not None:
             own = (*arguments.values(), *self._trailing(arguments["q"])) if self._parametric else arguments.values()
-            one = np.empty(short.shape)
-            if short.single(*own, one):
+            one: Array | None = short.single(*own)
+            if one is not None:
                 return short.turned(one)
             many: Array | None = short.batch(*own)
             if many is not None:
@@ -454,19 +458,21 @@ class LagrangianDynamics(Dynamics):
         axes: str = LOCAL,
     ) -> tuple[Array, Array]:
         """Return (q, v) after one step, as `Dynamics.step` does; as machine code where `simulate` compiles the step."""
-        held = self._steps.get(method) if type(method) is str and not wrenches else None
-        if type(dt) is not float:
-            dt = real("dt", dt)
-        # Another method may have been registered by this name.
-        if held is not None and held[0] is METHODS.get(method) and dt > 0:
-            out: tuple[Array, Array] | None
-            behind: tuple[Array, ...] = ()
-            if not self._parametric:
-                out = held[1].single(q, v, tau, dt)
-            else:
-                behind = self._trailing(q)
-                out = held[1].single(q, v, tau, dt, *behind)
-            if out is not None or (out := held[1].batch(q, v, tau, dt, *behind, threads=self.threads)) is not None:
+        try:
+            held = self._steps[method]
+            # Another method may have been registered by this name.
+            known = held[0] is METHODS[method] and not wrenches
+        except (KeyError, TypeError):
+            known = False
+        if known:
+            single, behind = held[1].single, self._trailing(q) if self._parametric else ()
+            # A call with *arguments costs a tenth of a small step.
+            out: tuple[Array, Array] | None = single(q, v, tau, dt, 0.0) if not behind else None
+            if out is None and (dt := real("dt", dt)) > 0:
+                out = single(q, v, tau, dt, 0.0, *behind)
+                if out is None:
+                    out = held[1].batch(q, v, tau, dt, *behind, threads=self.threads)
+            if out is not None:
                 return out
         return super().step(q, v, tau, dt, method, wrenches, axes)
 
