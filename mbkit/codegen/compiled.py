@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, Final, NamedTuple
 from weakref import WeakValueDictionary
 
@@ -20,6 +20,7 @@ from mbkit.codegen import disk_cache as disk
 from mbkit.codegen import jit
 from mbkit.codegen.batch_loop import RUN
 from mbkit.codegen.program import program
+from mbkit.codegen.python_call import Kernel, python_call
 from mbkit.derivation.fingerprint import SOURCES
 
 #: Operations on which a second thread is worth its start: about 100 µs.
@@ -82,6 +83,8 @@ class Compiled:
     def call_checked(self, *arguments: Array, threads: int | None = None) -> tuple[list[Array], bool]:
         """Return the results, and whether all that was read and written is finite."""
         single = arguments[0].ndim == 1
+        if single and (out := self._single(*arguments)) is not None:
+            return [*out] if len(self.shapes) > 1 else [out], True
         args = [x[None] for x in arguments] if single else list(arguments)
         n = args[0].shape[0]
         for i, (x, size) in enumerate(zip(args, self.inputs, strict=True)):
@@ -96,6 +99,14 @@ class Compiled:
             for x, (r, c) in zip(flat, self.shapes, strict=True)
         ]
         return ([x[0] for x in results] if single else results), finite
+
+    @cached_property
+    def _single(self) -> Callable[..., Any]:
+        # With `self` inside, only the collector would release it.
+        kernel = Kernel(self.loaded, self.share, self.shapes)
+        inputs = {f"argument {i}": n for i, n in enumerate(self.inputs)}
+        results = {f"result {i}": shape for i, shape in enumerate(self.shapes)}
+        return python_call([(kernel, [*inputs], [*results])], inputs, results)
 
     def run(self, inputs: Sequence[Array], outputs: Sequence[Array], threads: int | None = None) -> bool:
         """Fill (N, n) outputs of any strides, without checks; return whether all read and written is finite."""
@@ -148,17 +159,7 @@ class Compiled:
 
 @cache
 def _batch_object() -> bytes:
-    return shared_object("batch", jit.batch_object)
-
-
-def shared_object(name: str, make: Callable[[], bytes]) -> bytes:
-    """Return an object file that depends on no model, from disk or compiled now."""
-    key = disk.key_of(name, SOURCES, *map(str, jit.host()))
-    if (entry := disk.read(key)) is not None:
-        return entry[1]
-    code = make()
-    disk.write(key, {}, code)
-    return code
+    return jit.shared_object("batch", jit.batch_object)
 
 
 _POOLS: dict[int, ThreadPoolExecutor] = {}
@@ -251,4 +252,4 @@ class KernelSequence:
 
 @cache
 def _runner() -> jit.Loaded:
-    return jit.load(shared_object("sequence", lambda: jit.object_code(_CODE)))
+    return jit.load(jit.shared_object("sequence", lambda: jit.object_code(_CODE)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
+from collections.abc import Callable
 from functools import cache
 from typing import Any, Final, NamedTuple
 
@@ -11,9 +12,11 @@ import llvmlite
 from llvmlite import binding as llvm
 
 from mbkit._fork import fork_safe
+from mbkit.codegen import disk_cache as disk
 from mbkit.codegen.batch_loop import MOST_ARRAYS, RUN, batch_code
 from mbkit.codegen.program import Program
 from mbkit.codegen.simd_kernel import vector_code
+from mbkit.derivation.fingerprint import SOURCES
 
 _SIGNATURE: Final = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 
@@ -101,3 +104,13 @@ def load(*objects: bytes) -> Loaded:
             engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
         return Loaded(engine)
+
+
+def shared_object(name: str, make: Callable[[], bytes]) -> bytes:
+    """Return an object file that depends on no model, from disk or compiled now."""
+    key = disk.key_of(name, SOURCES, *map(str, host()))
+    if (entry := disk.read(key)) is not None:
+        return entry[1]
+    code = make()
+    disk.write(key, {}, code)
+    return code

@@ -26,18 +26,26 @@ import ctypes
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from math import prod
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from llvmlite import ir
 
 from mbkit.codegen import jit
 from mbkit.codegen.batch_loop import MOST_ARRAYS, RUN, Builder
-from mbkit.codegen.compiled import Compiled, shared_object
 from mbkit.model.manifold import NEAR_UNIT
 
-#: A compiled function, and the names of the vectors that it reads and writes.
-Step = tuple[Compiled, Sequence[str], Sequence[str]]
+
+class Kernel(NamedTuple):
+    """Machine code, the doubles of work space that its body needs, and rows and columns of each result."""
+
+    loaded: jit.Loaded
+    share: int
+    shapes: tuple[tuple[int, int], ...]
+
+
+#: A compiled function, as `Kernel` or as an object with these attributes, and the vectors that it reads and writes.
+Step = tuple[Any, Sequence[str], Sequence[str]]
 
 #: Words of Python's own part of an object; the last one is its type.
 _HEAD: Final = object.__basicsize__ // 8
@@ -135,7 +143,7 @@ def python_call(
 @cache
 def _definition() -> tuple[_Definition, Any]:
     """Return what Python knows of the function, and its code; both live as long as the process."""
-    loaded = jit.load(shared_object(f"python call {_HEAD}", lambda: jit.object_code(_code(), optimize=True)))
+    loaded = jit.load(jit.shared_object(f"python call {_HEAD}", lambda: jit.object_code(_code(), optimize=True)))
     address = ctypes.cast(loaded.run, ctypes.c_void_p).value
     return _Definition(b"evaluate", address, _METH_FASTCALL, None), loaded
 

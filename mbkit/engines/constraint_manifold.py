@@ -114,7 +114,10 @@ class _Terms(NamedTuple):
 
 def singular_values(J: Array) -> Array:
     """Return the singular values of one or more matrices; NaN where a matrix is not finite."""
-    good = np.asarray(np.isfinite(J).all(axis=(-1, -2)))[..., None]
+    finite = np.isfinite(J)
+    if finite.all():
+        return np.asarray(np.linalg.svd(J, compute_uv=False))
+    good = np.asarray(finite.all(axis=(-1, -2)))[..., None]
     sizes = np.linalg.svd(np.where(good[..., None], J, 0.0), compute_uv=False)
     return np.where(good, sizes, np.nan)
 

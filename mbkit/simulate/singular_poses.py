@@ -158,6 +158,8 @@ def at_singular_poses(dyn: Dynamics, t: float, q: Array, v: Array, tau: Array) -
     """
     manifold = manifold_at(dyn, t)
     which, a, why = manifold.at_pose(q) & np.isfinite(v).all(axis=-1), np.full(v.shape, np.nan), ""
+    if not which.any():
+        return which, a, why
     for i in map(tuple, np.argwhere(which)):
         own = manifold.member(i[0]) if i else manifold
         here = Passage(own, t, q[i], v[i], singular=True)
