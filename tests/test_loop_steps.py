@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -156,3 +158,68 @@ def test_independence_is_judged_once_for_all_times(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(constraint_manifold, "require_independent", counted)
     mb.simulate(dyn, *start, 0.02, "rk4", dt=1e-3)
     assert len(asked) <= 3
+
+
+def stiff_four_bar() -> mb.Model:
+    """Return the four-bar with a damper at the rocker that brings it to rest within nanoseconds."""
+    model = mb.catalog.four_bar()
+    joints = [replace(j, damping=(1e8,)) if j.name == "psi" else j for j in model.joints]
+    return replace(model, joints=tuple(joints))
+
+
+MODELS = {
+    "stiff four-bar": stiff_four_bar,
+    **{name: getattr(mb.catalog, name) for name in ("four_bar", "flyball_governor", "bricard", "rolling_disc")},
+    "links without mass": lambda: mb.catalog.slider_crank(crank_mass=0.0, rod_mass=0.0),
+}
+
+
+@pytest.mark.parametrize("method", ["rodas5", "auto"])
+@pytest.mark.parametrize("name", MODELS)
+def test_stiff_methods_take_the_same_steps_in_machine_code(name: str, method: str) -> None:
+    model = MODELS[name]()
+    q, v = mb.dynamics(model, "lagrangian").project(*model.random_state(np.random.default_rng(3)))
+    runs = []
+    for compiled in (True, False):
+        dyn = mb.dynamics(model, "lagrangian", compile=compiled)
+        runs.append(mb.simulate(dyn, q, 0.3 * v, 0.15, method, rtol=1e-8, doubt=False))
+        assert runs[-1].stats.finished
+        assert np.abs(dyn.constraint_residual(runs[-1].q)).max() < 2e-14
+        # Attempts in machine code are kept with the equations.
+        assert ("lanes" in dyn.equations.kept) is compiled
+    # Their checks cost other shares of a run, so that `auto` may turn to rodas5 at another step.
+    assert runs[0].stats.steps == pytest.approx(runs[1].stats.steps, abs=1 if method == "rodas5" else 64)
+    assert np.abs(runs[0].q[-1] - runs[1].q[-1]).max() < 1e-7 * max(1.0, np.abs(q).max())
+    if name == "stiff four-bar" and method == "auto":
+        assert all("rodas5" in run.stats.chosen for run in runs)
+
+
+@pytest.mark.parametrize(("seed", "kind"), [(1, "revolute"), (2, "distance")])
+def test_rodas5_keeps_its_tolerance_on_random_loops(seed: int, kind: str) -> None:
+    """Of random trees with free and ball joints; the linear system of a stage has all their derivatives."""
+    model, q = closed_tree(seed, kind)
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    q, v = dyn.project(q, 0.2 * np.random.default_rng(seed).standard_normal(model.nv))
+    exact = mb.simulate(dyn, q, v, 0.05, "rk853", rtol=1e-12, doubt=False).q[-1]
+    errors, steps = [], []
+    for rtol in (1e-5, 1e-10):
+        run = mb.simulate(dyn, q, v, 0.05, "rodas5", rtol=rtol, atol=rtol, doubt=False)
+        errors.append(float(np.abs(run.q[-1] - exact).max()))
+        steps.append(run.stats.steps)
+    assert "lanes" in dyn.equations.kept
+    assert errors[1] < 1e-8
+    # Of order five at least: a wrong derivative would leave a method of order one or two, with thousands of steps.
+    assert steps[1] < 12 * max(steps[0], 4)
+
+
+def test_rodas5_in_machine_code_gives_way_near_a_singular_pose() -> None:
+    model = mb.catalog.four_bars(n=1)
+    for method in ("rodas5", "auto"):
+        runs = []
+        for compiled in (True, False):
+            dyn = mb.dynamics(model, "lagrangian", compile=compiled)
+            q, v = dyn.project([1.0, -1.0, 1.0], [2.0, -2.0, 2.0])
+            with pytest.warns(mb.errors.DoubtfulRunWarning, match="singular pose"):
+                runs.append(mb.simulate(dyn, q, v, 1.0, method, rtol=1e-9, atol=1e-9))
+        assert runs[0].stats.steps == pytest.approx(runs[1].stats.steps, abs=3)
+        assert np.abs(runs[0].q[-1] - runs[1].q[-1]).max() < 1e-6

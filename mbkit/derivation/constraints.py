@@ -515,6 +515,7 @@ CONSTRAINT_FUNCTIONS: Final = {
     "constraint_rate_gradient": ("q", "v"),
     "constraint_bias": ("q", "v"),
     "constraint_forces": ("q", "v", "tau"),
+    "independent_multipliers": ("q", "v", "tau"),
     "generalized_constraint_force": ("q", "v", "tau"),
 }
 
@@ -556,6 +557,11 @@ class ConstraintQuantities:
     def generalized_constraint_force(self) -> Any:
         """Jᵀ λ."""
         return ca.mtimes(self.constraints.jacobian.T, self._constrained[1])
+
+    @property
+    def independent_multipliers(self) -> Any:
+        """λ of the independent rows."""
+        return self._constrained[1]
 
     def _spread(self, multipliers: Any) -> Any:
         """Return the multipliers of all rows; none is redundant."""

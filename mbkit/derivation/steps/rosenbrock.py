@@ -11,15 +11,22 @@ K = ∂F/∂u and D = ∂F/∂w, and with u_i eliminated, S = (1 - g L)⁻¹ and
 
     (M + g D + g² K S) w_i = M b - g K S a        u_i = S (a + g w_i)
 
-The matrix has the zeros of the tree's mass matrix: it is factorized once a step, from the leaves to the root, without
-fill-in and without pivoting. Where that meets a zero, the error is no number and the step is tried again, shorter.
+Under constraints F has the force -Jᵀ λ too, whose λ joins the unknowns, and the rows J v̇ + γ = 0. They are
+differentiated like F, with λ held: of these rows M is J, and D and K have the index c ::
+
+    (M + g D + g² K S) w_i - Jᵀ μ_i = M b - g K S a        (J + g D_c + g² K_c S) w_i = J b - g K_c S a
+
+The first matrix has the zeros of the tree's mass matrix but for those that Jᵀ λ fills in: it is factorized once a step,
+from the leaves to the root, without pivoting, and the constraints' part after it. Where that meets a zero, the error is
+no number and the step is tried again, shorter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from typing import Any, Final
 
 import casadi as ca
 
@@ -42,38 +49,24 @@ def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[P
     s, space = parts.symbols, _Space(equations.model)
     s |= {name: ca.SX.sym(name, nv) for name in ("k", "r", "sum_u", "sum_w")}
     gamma, stages, increments = tableau.gamma, SymbolicStages(nv), dict[str, Any]()
-    linear: list[tuple[Any, Any, Any]] = []
 
-    def system() -> tuple[Any, Any, Any]:
-        if not linear:
-            linear.append(_linear_system(equations, space, s["q"], s["w"], s["k"], s["tau"]))
-        return linear[0]
+    @cache
+    def system() -> _StageSystem:
+        return _StageSystem(equations, space, s, gamma)
 
     def matrix() -> ca.Function:
-        M, D, K = system()
-        g = gamma * s["step"]
-        pull = g * ca.mtimes(K, space.spun(s["w"], g))
-        factors = Factors.of(M + g * D + g * pull, equations.elimination_order)
-        results = {"mass": _entries(M), "pull": _entries(pull), "factors": ca.vertcat(*factors.values)}
-        return function_of(
-            "matrix", {**parts.named("q", "w", "k", "tau", "step"), **equations.extra_arguments}, results
-        )
+        given = {**parts.named("q", "w", "k", "tau", "step"), **equations.extra_arguments}
+        return function_of("matrix", given, system().results)
 
     solved = ("w", "k", "r", "sum_u", "sum_w", "step")
 
     def solve() -> ca.Function:
-        M, D, K = system()
+        known = {name: ca.SX.sym(name, x.numel()) for name, x in system().results.items()}
         g = gamma * s["step"]
-        spun = space.spun(s["w"], g)
-        pattern = ca.mtimes(K, spun)
-        factors = Factors.of(M + D + pattern, equations.elimination_order)
-        # Symbols with the same zeros.
-        sizes = {"mass": M.nnz(), "pull": pattern.nnz(), "factors": len(factors.values)}
-        known = {name: ca.SX.sym(name, n) for name, n in sizes.items()}
         a, b = g * s["r"] + gamma * s["sum_u"], g * s["k"] + gamma * s["sum_w"]
-        pulled = ca.mtimes(ca.SX(pattern.sparsity(), known["pull"]), a)
-        dw = factors.applied(ca.vertsplit(known["factors"]), ca.mtimes(ca.SX(M.sparsity(), known["mass"]), b) - pulled)
-        return function_of("solve", {**parts.named(*solved), **known}, {"du": ca.mtimes(spun, a + g * dw), "dw": dw})
+        dw = system().solution(a, b, **known)
+        du = ca.mtimes(space.spun(s["w"], g), a + g * dw)
+        return function_of("solve", {**parts.named(*solved), **known}, {"du": du, "dw": dw})
 
     def go(name: str, weights: Array, more: dict[str, Any]) -> None:
         u, dw = stages.sums(weights)
@@ -89,9 +82,9 @@ def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[P
         parts.add_field("k", "r")
         if not i:
             reads = ("q", "w", "k", "tau", "step", *equations.extra_arguments)
-            parts.parts.append(Part("matrix", reads, ("mass", "pull", "factors"), matrix))
+            parts.parts.append(Part("matrix", reads, _StageSystem.NAMES, matrix))
         stage = {name: ca.SX.sym(name, nv) for name in (f"du_{i}", f"dw_{i}")}
-        parts.parts.append(Part("solve", (*solved, "mass", "pull", "factors"), tuple(stage), solve))
+        parts.parts.append(Part("solve", (*solved, *_StageSystem.NAMES), tuple(stage), solve))
         increments |= stage
         stages.append(*stage.values())
     go("arrive", tableau.b, {})
@@ -106,6 +99,8 @@ def rosenbrock_parts(equations: Equations, tableau: RosenbrockTableau) -> list[P
     slope_u, slope_w = stages.sums(tableau.b - tableau.dense.sum(axis=0))
     defect = norm(s["step"] * s["r"] - slope_u, s["step"] * s["k"] - slope_w)
     error = with_defect(SYMBOLS, norm(*stages.sums(tableau.error)), defect)
+    if equations.model.constrained:
+        q1, w1, error = parts.onto_constraints(q1, w1, error)
     rates = {**parts.at, **parts.named("k", "r"), **increments}
     parts.decide(rates, q1, w1, error, elementary_factors(SYMBOLS, error, s["last"]))
     return parts.parts
@@ -122,23 +117,75 @@ class _Space(SymbolicSpace):
         return out
 
 
-def _linear_system(eq: Equations, space: SymbolicSpace, q: Any, w: Any, k: Any, force: Any) -> tuple[Any, Any, Any]:
-    """Return M, D and K at a state, without entries that are zeros after all."""
-    u, a = ca.SX.sym("u", eq.model.nv), ca.SX.sym("a", eq.model.nv)
+class _StageSystem:
+    """The linear system of a step's stages: `results` are its entries and factors at the start, as columns by name."""
+
+    NAMES: Final = ("mass", "pull", "factors", "rows")
+
+    def __init__(self, eq: Any, space: _Space, symbols: dict[str, Any], gamma: float) -> None:
+        w, g, nv = symbols["w"], gamma * symbols["step"], eq.model.nv
+        M, D, K, self._columns = _linear_system(eq, space, symbols["q"], w, symbols["k"], symbols["tau"])
+        self._mass, self._pull = M, g * ca.mtimes(K, space.spun(w, g))
+        whole = M + g * D + g * self._pull
+        A, self._rows = whole[:nv, :], whole[nv:, :]
+        # Of zero once the rows are satisfied; without it, a link without mass has no pivot.
+        self._stiff = ca.SX(nv, 0)
+        if eq.model.constrained and eq.constraint_factors.careful:
+            s = ca.substitute(eq.constraints.stiffening(eq.mass_matrix), eq.q, symbols["q"])
+            self._stiff = ca.sparsify(ca.mtimes(self._columns, ca.diag(s)))
+            A = A + ca.mtimes(self._stiff, self._rows)
+        self._tree = Factors.of(A, eq.elimination_order)
+        many = [self._tree.applied(self._tree.values, x) for x in ca.horzsplit(self._columns)]
+        self._ways = ca.sparsify(ca.horzcat(ca.SX(nv, 0), *many))
+        held = ca.sparsify(ca.mtimes(self._rows, self._ways))
+        self._held = Factors.of(held, range(held.shape[0]))
+        factors = ca.vertcat(ca.SX(0, 1), *self._tree.values, *self._held.values)
+        rows = ca.vertcat(*map(_entries, (self._rows, self._ways, self._stiff)))
+        columns = (_entries(self._mass), _entries(self._pull), factors, rows)
+        self.results = dict(zip(self.NAMES, columns, strict=True))
+
+    def solution(self, a: Any, b: Any, mass: Any, pull: Any, factors: Any, rows: Any) -> Any:
+        """Return w_i for right-hand sides, from numbers in the place of `results`."""
+        nv, matrices, first = len(self._tree.rows), [], 0
+        for x in (self._rows, self._ways, self._stiff):
+            matrices.append(ca.SX(x.sparsity(), rows[first : first + x.nnz()]))
+            first += x.nnz()
+        G, Y, stiff = matrices
+        right = ca.mtimes(ca.SX(self._mass.sparsity(), mass), b) - ca.mtimes(ca.SX(self._pull.sparsity(), pull), a)
+        force, rates = right[:nv], right[nv:]
+        tree, held = (ca.vertsplit(x) for x in ca.vertsplit(factors, [0, len(self._tree.values), factors.numel()]))
+        free = self._tree.applied(tree, force + ca.mtimes(stiff, rates) if stiff.nnz() else force)
+        if not Y.nnz():
+            return free
+        return free + ca.mtimes(Y, self._held.applied(held, rates - ca.mtimes(G, free)))
+
+
+def _linear_system(eq: Any, space: SymbolicSpace, q: Any, w: Any, k: Any, force: Any) -> tuple[Any, Any, Any, Any]:
+    """Return M, D and K at a state, with the constraints' rows below, and Jᵀ; without entries that are zeros."""
+    u, a, extra = ca.SX.sym("u", eq.model.nv), ca.SX.sym("a", eq.model.nv), eq.extra_arguments.values()
     v, moved = space.to_body_velocity(q, w), space.retract(q, u)
     by_w = ca.jacobian(v, w)
     # v̇ of ẇ: the axes may turn below it.
     qdot = ca.substitute(eq.kin.qdot, ca.vertcat(eq.q, eq.v), ca.vertcat(q, v))
     rate = ca.mtimes(by_w, k) + ca.jtimes(v, q, qdot)
     there = space.to_body_velocity(moved, w)
-    rest = eq.function("inverse_dynamics")(moved, there, a, *eq.extra_arguments.values()) - eq.applied(moved, force)
+    rest = eq.function("inverse_dynamics")(moved, there, a, *extra) - eq.applied(moved, force)
+    M, columns, at = ca.substitute(eq.mass_matrix, eq.q, q), ca.SX(eq.model.nv, 0), [(u, 0 * u), (a, rate)]
+    if eq.model.constrained:
+        c = eq.constraints
+        rows = ca.Function("rows", [eq.q, eq.v, *extra], [c.jacobian, c.gamma])
+        here, (J, gamma) = rows(q, v, *extra)[0], rows(moved, there, *extra)
+        multipliers = ca.SX.sym("multipliers", J.shape[0])
+        at.append((multipliers, eq.function("independent_multipliers")(q, v, force, *extra)))
+        rest = ca.vertcat(rest - ca.mtimes(J.T, multipliers), ca.mtimes(J, a) + gamma)
+        M, columns = ca.vertcat(M, here), ca.sparsify(here.T)
     led = space.acceleration(moved, there, a)
-    M = ca.mtimes(ca.substitute(eq.mass_matrix, eq.q, q), by_w)
+    M = ca.mtimes(M, by_w)
     K = ca.jacobian(rest, u) - ca.mtimes(M, ca.jacobian(led, u))
     D = ca.jacobian(rest, w) - ca.mtimes(M, ca.jacobian(led, w))
-    at = ca.vertcat(u, a), ca.vertcat(ca.SX.zeros(eq.model.nv), rate)
-    K, D = (ca.sparsify(ca.substitute(x, *at)) for x in (K, D))
-    return ca.sparsify(M), D, K
+    symbols, values = (ca.vertcat(*x) for x in zip(*at, strict=True))
+    K, D = (ca.sparsify(ca.substitute(x, symbols, values)) for x in (K, D))
+    return ca.sparsify(M), D, K, columns
 
 
 def _entries(A: Any) -> Any:
@@ -147,9 +194,9 @@ def _entries(A: Any) -> Any:
 
 @dataclass(frozen=True)
 class Factors:
-    """Factors of a matrix with the zeros of a tree's mass matrix, eliminated from the leaves to the root.
+    """Factors of a sparse matrix, eliminated from the last row of an order to the first, without pivoting.
 
-    There is no fill-in and no pivoting.
+    A matrix with the zeros of a tree's mass matrix is not filled in.
     """
 
     # The factors of `steps`, the entries of `rest`, and the pivots' inverses.

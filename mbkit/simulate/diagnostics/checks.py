@@ -310,6 +310,9 @@ def massless_joints(dyn: Dynamics, q: Array) -> str:
     try:
         there = dyn.mass_matrix(model.random_state(np.random.default_rng(0))[0])
         scale = np.sqrt(np.diag(there))
+        if not (scale > 0).all():
+            # A link without mass inside a loop.
+            return ""
         values, vectors = np.linalg.eigh(dyn.mass_matrix(unit_quaternions(model, q)[0]) / scale[:, None] / scale)
     except (MbkitError, np.linalg.LinAlgError, NotImplementedError):
         # A user's engine may lack the mass matrix.

@@ -396,16 +396,21 @@ def run_embedded(problem: IntegrationProblem) -> SolverResult:
     Where the own derivation is compiled and the torque is no function, the steps run as machine code; elsewhere stage
     by stage, by the same formulas. Torques held as an array start a new step at each interval.
     """
-    if _compiles(problem, problem.method):
+    return compiled_or_not(problem, problem.method, partial(_run, problem))
+
+
+def compiled_or_not(problem: IntegrationProblem, method: str, run: Callable[[bool], SolverResult]) -> SolverResult:
+    """Return run(True), in machine code; run(False) where there is none, or where it ends near a singular pose."""
+    if _compiles(problem, method):
         # Loads LLVM, which interpreting never needs.
         from mbkit.simulate.solvers.adaptive_compiled import NearSingularPoseError
 
         with suppress(NearSingularPoseError):
-            return _run(problem, compiled=True)
-    return _run(problem, compiled=False)
+            return run(True)
+    return run(False)
 
 
-def _run(problem: IntegrationProblem, *, compiled: bool) -> SolverResult:
+def _run(problem: IntegrationProblem, compiled: bool) -> SolverResult:
     space, stops = Space(problem.dyn.model), problem.stops
     attempts = make_attempts(problem, problem.method, space, problem.tolerances, compiled=compiled)
     records = [TrajectoryRecord(problem, i, space) for i in range(len(problem.q))]
@@ -464,8 +469,8 @@ def make_attempts(
 def _compiles(problem: IntegrationProblem, method: str) -> bool:
     """Return whether there can be machine code of an attempt."""
     dyn, stiff = problem.dyn, isinstance(method_of(method).formula, RosenbrockTableau)
-    # A compiled step has one value of the time, and the linear system of a stiff one no constraints.
-    plain = not problem.torque.callable and not dyn.model.time_parameter and not (stiff and dyn.model.constrained)
+    # A compiled step has one value of the time.
+    plain = not problem.torque.callable and not dyn.model.time_parameter
     if not (dyn.derived and plain and dyn.model.nv):
         return False
     # Other engines need no CasADi.
