@@ -34,6 +34,14 @@ def test_the_version_is_the_same_everywhere():
     assert {"CHANGELOG.md", "CITATION.cff"} <= set(packed)
 
 
+def test_the_top_level_holds_what_a_newcomer_looks_for_and_no_more():
+    folders = {"mbkit", "notebooks", "tests", "validation"}
+    files = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "README.md", "pyproject.toml"}
+    passing = [line.rstrip("/") for line in read(".gitignore").split()]
+    found = {path.name for path in TOP.iterdir() if not path.name.startswith(".")}
+    assert {name for name in found if not any(map(Path(name).match, passing))} == folders | files
+
+
 def test_every_file_of_results_is_made_by_a_part():
     written = {name for part in PARTS.values() for name in part.writes}
     kept = {path.name for path in (TOP / "validation").glob("*.json")}
