@@ -15,7 +15,7 @@ from mbkit.errors import BaselineError, InputError, MbkitError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
-    from mbkit.studies.baseline import Baseline, BaselineResult
+    from mbkit.studies.baseline import Baseline, BaselineResult, BisectResult
 
 _FILE = click.Path(path_type=Path)
 
@@ -99,10 +99,7 @@ def check(
     what --rebaseline recorded.
     """
     files = _files(paths)
-    if target is not None and len(files) != 1:
-        raise click.UsageError(f"--target goes with one file, and there are {len(files)}")
-    if options and target is None:
-        raise click.UsageError("options of loading go with --target; what was recorded is loaded as it was then")
+    _check_target(files, target, options)
     statuses = []
     results: list[BaselineResult] = []
     for file in files:
@@ -128,13 +125,10 @@ def _check_one(
     from mbkit.report.explain_view import baseline_view
     from mbkit.simulate.progress import Bar
     from mbkit.studies import baseline as baselines
-    from mbkit.studies._targets import kept, kept_options, model_of, resolved_options
+    from mbkit.studies._targets import kept_options
 
     recorded = baselines.read(file)
-    # A target of other options is recorded with them.
-    options = {**resolved_options(recorded.options, file), **options}
-    model = _model(recorded, file) if target is None else model_of(target, options)
-    new_target = None if target is None else kept(target, file)
+    model, new_target, options = _loaded(recorded, file, target, options)
     with Bar(f"check {file.name}") as bar:
         result = baselines.check(model, file, strict=strict, target=new_target, progress=bar)
     if table:
@@ -170,6 +164,49 @@ def _confirmed(file: Path) -> bool:
     return there and click.confirm(f"Record {file} again with these versions?", default=False)
 
 
+@shared.command("mbkit baseline bisect panda.toml", "mbkit baseline bisect baselines --json")
+@click.argument("paths", metavar="FILE...", nargs=-1, required=True, type=_FILE)
+@click.option("--target", help="What `mbkit baseline check` has as --target; with one file.")
+@shared.load_options
+@shared.json_option
+def bisect(paths: tuple[Path, ...], target: str | None, options: dict[str, Any], as_json: bool) -> None:
+    """Find where what fails of each FILE began: a version of an engine, or a commit of the description.
+
+    A changed description is looked for in the commits of its file in git; a number that moved, in the versions of its
+    engine from the recorded to the installed one. Each version runs in an environment of its own, which is made with uv
+    or pip and kept in the user's cache folder, or in MBKIT_ENVIRONMENTS. Exit status: 0 the baseline passes, 1 where it
+    began was found, 2 misuse, a file that cannot be read, or where it began was not found.
+    """
+    files = _files(paths)
+    _check_target(files, target, options)
+    statuses, results = [], []
+    for file in files:
+        try:
+            result = _bisect_one(file, target, options, table=not as_json)
+        except MbkitError as error:
+            shared.say("error", shared.in_options(str(error)))
+            statuses.append(MISUSE)
+            continue
+        results.append(result)
+        statuses.append(AGREE if result.passed else DIFFER if result.onsets else MISUSE)
+    if as_json:
+        shared.tell("[" + ",\n".join(r.to_json() for r in results) + "]")
+    shared.leave(max(statuses))
+
+
+def _bisect_one(file: Path, target: str | None, options: dict[str, Any], *, table: bool) -> BisectResult:
+    from mbkit.report.explain_view import bisect_view
+    from mbkit.simulate.progress import Bar
+    from mbkit.studies import baseline as baselines
+
+    model, new_target, options = _loaded(baselines.read(file), file, target, options)
+    with Bar(f"bisect {file.name}") as bar:
+        result = baselines.bisect(model, file, target=new_target, options=options, progress=bar)
+    if table:
+        shared.show(bisect_view(result), as_json=False)
+    return result
+
+
 @shared.command(
     "mbkit baseline diff old.toml new.toml",
 )
@@ -190,11 +227,18 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     shared.leave(AGREE if result.passed else DIFFER)
 
 
-for _command in (record, check, diff):
+for _command in (record, check, bisect, diff):
     baseline.add_command(_command)
 
 
 # Targets and files.
+
+
+def _check_target(files: list[Path], target: str | None, options: dict[str, Any]) -> None:
+    if target is not None and len(files) != 1:
+        raise click.UsageError(f"--target goes with one file, and there are {len(files)}")
+    if options and target is None:
+        raise click.UsageError("options of loading go with --target; what was recorded is loaded as it was then")
 
 
 def _name(target: str) -> str:
@@ -205,6 +249,19 @@ def _name(target: str) -> str:
     robot = canonical(target)
     path = robot is None and (Path(target).is_file() or "/" in target)
     return f"{file_stem(Path(target).stem if path else robot or target.rpartition(':')[2])}.toml"
+
+
+def _loaded(
+    recorded: Baseline, file: Path, target: str | None, options: dict[str, Any]
+) -> tuple[Model, str | None, dict[str, Any]]:
+    """Return the model that a baseline is held against, its target where that is another, and options of loading."""
+    from mbkit.studies._targets import kept, model_of, resolved_options
+
+    # A target of other options is recorded with them.
+    options = {**resolved_options(recorded.options, file), **options}
+    if target is None:
+        return _model(recorded, file), None, options
+    return model_of(target, options), kept(target, file), options
 
 
 def _model(recorded: Baseline, file: Path) -> Model:

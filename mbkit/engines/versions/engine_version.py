@@ -121,3 +121,8 @@ def order_of(version: str) -> tuple[int, ...]:
 def versions_of(name: str) -> tuple[str, ...]:
     """Return the versions of an engine that can be installed here, oldest first."""
     return environment.available(PACKAGES[name].distribution)
+
+
+def made_of(name: str) -> tuple[str, ...]:
+    """Return the versions of an engine that have an environment, oldest first."""
+    return tuple(sorted(environment.made(PACKAGES[name].distribution), key=order_of))

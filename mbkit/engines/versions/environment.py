@@ -61,6 +61,13 @@ def python_of(environment: Path) -> Path:
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
+def made(distribution: str) -> list[str]:
+    """Return the versions that have an environment, in any order."""
+    names = (path.name for path in folder().glob(place(distribution, "*").name))
+    versions = [name.removeprefix(f"{distribution}-").rpartition("-")[0] for name in names]
+    return [version for version in versions if exists(distribution, version)]
+
+
 def exists(distribution: str, version: str) -> bool:
     """Return whether the environment is there."""
     return python_of(place(distribution, version)).exists()

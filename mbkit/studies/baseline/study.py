@@ -24,6 +24,7 @@ from mbkit._check import Array, count
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import ENGINES, REFERENCE, compared, find_engine
+from mbkit.engines.versions.dynamics import VersionDynamics
 from mbkit.errors import (
     BaselineError,
     KnownDefectWarning,
@@ -57,6 +58,7 @@ _DECIMALS: Final = 6
 #: The description and the states come from these, whatever the engine.
 _SHARED: Final = ("mbkit", "pin", "numpy")
 _ABSENT: Final = "not installed"
+Versions = tuple[VersionChange, ...]
 _OTHER_COORDINATES: Final = "the coordinates are others, so no number can be compared"
 
 
@@ -129,7 +131,7 @@ def record(
         raise UnsupportedError(f"no engine holds {model.name}, so there is nothing to record: {why}")
     at = _states(plain, samples, seed)
     tell(0.1, "34 digits")
-    terms, absent = _evaluate(OracleDynamics(plain), at, _ROLLOUT)
+    terms, absent = evaluate(OracleDynamics(plain), at, _ROLLOUT)
     recorded = Baseline(
         model=model.name,
         digest=model.digest,
@@ -146,11 +148,11 @@ def record(
         terms=terms,
         errors={name: {} for name in built},
     )
-    comparator = _Comparator(recorded)
+    comparator = Comparator(recorded)
     left_out = [*refused, *absent]
     for k, (name, dyn) in enumerate(built.items()):
         tell(0.6 + 0.4 * k / len(built), name)
-        values, without = _evaluate(dyn, at, _ROLLOUT)
+        values, without = evaluate(dyn, at, _ROLLOUT)
         left_out += [r for r in without if r.term in terms]
         for term in [t for t in values if t in terms]:
             error = comparator.error(term, values[term], terms[term])
@@ -221,7 +223,7 @@ def check(
     tell = progress or silent
     moved = _version_changes(recorded.versions, _versions_of(recorded.engines))
     processor = results.processor()
-    changed = _changes(recorded, model, recorded.target if target is None else target, where)
+    changed = description_changes(recorded, model, recorded.target if target is None else target, where)
     meant = tuple(c for c in changed if not c.rounding)
     if not meant and not moved and processor == recorded.processor:
         # Another parser or processor may round otherwise; neither is another, so somebody wrote another number.
@@ -248,7 +250,7 @@ def check(
     worst = 0.0
     for k, (name, dyn) in enumerate(built.items()):
         tell(0.1 + 0.9 * k / len(built), name)
-        some, error = _differences(recorded, name, dyn, moved)
+        some, error = differences(recorded, name, *evaluate(dyn, recorded.states, recorded.rollout), moved)
         rows += some
         worst = max(worst, error)
     tell(1.0, "done")
@@ -313,8 +315,8 @@ def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> Base
     )
 
 
-def _moved_numbers(a: Baseline, b: Baseline, moved: tuple[VersionChange, ...]) -> tuple[ChangedNumber, ...]:
-    comparator = _Comparator(a)
+def _moved_numbers(a: Baseline, b: Baseline, moved: Versions) -> tuple[ChangedNumber, ...]:
+    comparator = Comparator(a)
     rows = [comparator.moved(REFERENCE, t, b.terms[t], x, FINE) for t, x in a.terms.items() if t in b.terms]
     for engine, terms in a.own.items():
         for term, x in terms.items():
@@ -375,7 +377,7 @@ def _build_engines(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynami
     return engines, refused, missing
 
 
-def _evaluate(dyn: Dynamics, at: States, rollout: Rollout) -> tuple[dict[str, Array], list[Refusal]]:
+def evaluate(dyn: Dynamics, at: States, rollout: Rollout) -> tuple[dict[str, Array], list[Refusal]]:
     """Return every term that an engine gives, and why it does not give the others."""
     values: dict[str, Array] = {}
     refusals = []
@@ -395,7 +397,13 @@ def _rollout_end(dyn: Dynamics, at: States, rollout: Rollout) -> Array:
     """Return q and v at the end of a rollout from the first state, one after the other."""
     # MuJoCo's own steps make a mimic joint a soft equality, which is another system.
     # The same formula everywhere, by an engine's own steps where it has them.
-    method = DEFAULT_METHOD if dyn.model.layout.reduced else find_engine(dyn.engine).rk4
+    if isinstance(dyn, VersionDynamics):
+        if dyn.runs and not dyn.model.layout.reduced:
+            q, v = dyn.rollout(at.q[0], at.v[0], rollout.dt, rollout.steps)
+            return np.concatenate([q[-1], v[-1]])
+        method = DEFAULT_METHOD
+    else:
+        method = DEFAULT_METHOD if dyn.model.layout.reduced else find_engine(dyn.engine).rk4
     run = quiet_simulate(dyn, at.q[0], at.v[0], rollout.dt * rollout.steps, method, rollout.dt)
     if run.stats.ended != "finished":
         raise NumericalError(f"{dyn.engine}: {method}: {run.stats.message}")
@@ -405,7 +413,7 @@ def _rollout_end(dyn: Dynamics, at: States, rollout: Rollout) -> Array:
 # Numbers against recorded ones.
 
 
-class _Comparator:
+class Comparator:
     """Measures values of any term against others, on the scales of a baseline's values."""
 
     def __init__(self, b: Baseline) -> None:
@@ -463,12 +471,11 @@ def _allowed(baseline: Baseline, engine: str, term: str) -> float:
     return _FACTOR * max(recorded, FINE)
 
 
-def _differences(
-    recorded: Baseline, name: str, dyn: Dynamics, moved: tuple[VersionChange, ...]
+def differences(
+    recorded: Baseline, name: str, values: Mapping[str, Array], refusals: Iterable[Refusal], moved: Versions = ()
 ) -> tuple[list[ChangedNumber], float]:
     """Return one engine's changed numbers, and the worst error of the unchanged ones."""
-    comparator = _Comparator(recorded)
-    values, refusals = _evaluate(dyn, recorded.states, recorded.rollout)
+    comparator = Comparator(recorded)
     before, own = recorded.errors[name], recorded.own.get(name, {})
     rows = [_unavailable(recorded, r, moved) for r in refusals if r.term in before]
     worst = 0.0
@@ -492,7 +499,7 @@ def _differences(
     return rows, worst
 
 
-def _unavailable(recorded: Baseline, refusal: Refusal, moved: tuple[VersionChange, ...]) -> ChangedNumber:
+def _unavailable(recorded: Baseline, refusal: Refusal, moved: Versions) -> ChangedNumber:
     """Return the failure of an engine that gives no number any more."""
     cause = _cause(refusal.engine, recorded.versions, moved)
     numbers = np.nan, np.nan, np.inf, 0.0
@@ -504,7 +511,7 @@ def _unavailable(recorded: Baseline, refusal: Refusal, moved: tuple[VersionChang
 # The description and the versions against recorded ones.
 
 
-def _changes(recorded: Baseline, model: Model, target: str, path: Path) -> tuple[Change, ...]:
+def description_changes(recorded: Baseline, model: Model, target: str, path: Path) -> tuple[Change, ...]:
     """Return what differs in the descriptions, by the links' own names where a file tells them."""
     old, new = recorded.description, described(model)
     changed = changes({k: x for k, x in old.items() if k not in description.LINK_SECTIONS}, new)
@@ -522,7 +529,8 @@ def _effect(recorded: Baseline, model: Model, changed: tuple[Change, ...]) -> st
         return ""
     for name in recorded.engines:
         for dyn in _build_engines(model, [name])[0].values():
-            rows = [r for r in _differences(recorded, name, dyn, ())[0] if np.isfinite(r.error)]
+            evaluated = evaluate(dyn, recorded.states, recorded.rollout)
+            rows = [r for r in differences(recorded, name, *evaluated)[0] if np.isfinite(r.error)]
             if not rows:
                 return f"no term moves ({name})"
             worst = max(rows, key=lambda r: r.error)
@@ -532,24 +540,24 @@ def _effect(recorded: Baseline, model: Model, changed: tuple[Change, ...]) -> st
     return ""
 
 
-def _package(engine: str) -> str:
+def package_of(engine: str) -> str:
     return (ENGINES[engine].distribution if engine in ENGINES else "") or "mbkit"
 
 
 def _versions_of(engines: Iterable[str]) -> dict[str, str]:
     """Return the versions that can move numbers of these engines."""
     now = results.versions()
-    return {p: now[p] for p in dict.fromkeys([*_SHARED, *map(_package, engines)])}
+    return {p: now[p] for p in dict.fromkeys([*_SHARED, *map(package_of, engines)])}
 
 
-def _version_changes(old: Mapping[str, str], new: Mapping[str, str]) -> tuple[VersionChange, ...]:
+def _version_changes(old: Mapping[str, str], new: Mapping[str, str]) -> Versions:
     """Return the packages whose versions differ; a missing package has no version."""
     return tuple(VersionChange(p, x, new[p]) for p, x in old.items() if new.get(p, _ABSENT) not in (x, _ABSENT))
 
 
 def _cause(engine: str, old: Mapping[str, str], changed: Iterable[VersionChange]) -> str:
     """Return which version of an engine moved, or that none did, for a failure."""
-    package = _package(engine)
+    package = package_of(engine)
     own = [str(m) for m in changed if m.package == package]
     others = [str(m) for m in changed if m.package in _SHARED and m.package != package]
     return "; ".join([*(own or [f"{package} {old.get(package, '?')}, as recorded"]), *others])

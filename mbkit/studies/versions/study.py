@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import partial
 from itertools import pairwise
@@ -157,6 +157,16 @@ def _spread(n: int, most: int) -> list[int]:
     return sorted({round(x) for x in np.linspace(0, n - 1, min(n, max(most, 2)))})
 
 
+def middles(done: Iterable[int], missing: Container[int], differ: Callable[[int, int], bool]) -> list[int]:
+    """Return the numbers in the middle between neighbours of `done` that differ: the next step of a bisection."""
+    out = []
+    for i, j in pairwise(sorted(done)):
+        between = [k for k in range(i + 1, j) if k not in missing]
+        if between and differ(i, j):
+            out.append(between[len(between) // 2])
+    return out
+
+
 class _Study:
     """What was measured so far."""
 
@@ -226,13 +236,11 @@ class _Study:
 
     def undecided(self) -> list[int]:
         """Return versions in the middle between two that differ and are not neighbours."""
-        done = sorted(self._done)
-        out = []
-        for i, j in pairwise(done):
-            between = [k for k in range(i + 1, j) if k not in self._missing]
-            if between and any(self._moved(key, i, j) > self._tolerance for key in self._keys()):
-                out.append(between[len(between) // 2])
-        return out
+
+        def differ(i: int, j: int) -> bool:
+            return any(self._moved(key, i, j) > self._tolerance for key in self._keys())
+
+        return middles(self._done, self._missing, differ)
 
     def result(self, engine: str, settings: Mapping[str, Any]) -> VersionsResult:
         """Return rows and changes."""
@@ -246,14 +254,14 @@ class _Study:
                 moved = math.nan if before is None else self._moved(key, before, k)
                 direction = ""
                 if before is not None and moved > self._tolerance:
-                    direction = _direction(errors[before], errors[k])
+                    direction = direction_of(errors[before], errors[k])
                     names = self._versions[before].version, self._versions[k].version
-                    both = _digits(errors[before]), _digits(errors[k])
+                    both = digits_of(errors[before]), digits_of(errors[k])
                     changes.append(Change(*key, *names, *both, direction, k == before + 1))
                 ratio = self._done[k].ratios.get(key[0], math.nan)
                 reason = self._done[k].reasons.get(key, "")
                 apart = moved if math.isfinite(moved) else math.nan
-                digits = _digits(errors[k])
+                digits = digits_of(errors[k])
                 version = self._versions[k].version
                 rows.append(
                     VersionRow(key[0], version, key[1], digits, apart, bool(direction), direction, ratio, reason)
@@ -287,11 +295,13 @@ def _one_by_one(calls: Mapping[str, Any]) -> Iterable[tuple[str, Measured | Exce
             yield name, error
 
 
-def _digits(error: float) -> float:
+def digits_of(error: float) -> float:
+    """Return the digits that a relative error leaves right; NaN for NaN."""
     return math.nan if math.isnan(error) else min(_MOST_DIGITS, max(0.0, -math.log10(max(error, 1e-300))))
 
 
-def _direction(old: float, new: float) -> str:
+def direction_of(old: float, new: float) -> str:
+    """Return where a number went, by its errors before and after; NaN is no number."""
     if math.isnan(old) or math.isnan(new):
         return REFUSED if math.isnan(new) else GIVEN
     return TOWARDS if new * _CLEAR < old else AWAY if old * _CLEAR < new else ASIDE
