@@ -1,24 +1,22 @@
-"""Where a failing baseline began: commits in repositories of the tests' own, and versions that are altered on purpose."""
+"""Where a failing baseline began: commits in the tests' own repositories, and versions altered on purpose."""
 
 from __future__ import annotations
 
 import json
 import os
 import subprocess
-from importlib.metadata import version as installed
 from pathlib import Path
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.engines.versions import environment, process
+from mbkit.engines.versions import process
 from mbkit.engines.versions.engine_version import versions_of
 from mbkit.errors import UnsupportedError
 from mbkit.studies import results
-from mbkit.studies.baseline import BisectResult, bisection
+from mbkit.studies.baseline import BisectResult, bisection, study
 from mbkit.studies.versions.result import AWAY, TOWARDS
 from tests.test_baseline import ARM
 from tests.test_engine_versions import script
@@ -195,7 +193,8 @@ def test_files_that_an_mjcf_includes_and_files_of_loops_are_read_as_they_were(re
 
 
 def test_files_of_loops_are_read_as_they_were(repository):
-    rod = '[[loop]]\nname = "rod"\nkind = "distance"\nbody_a = "world"\nbody_b = "lower"\npoint_a = [{}, 0, 0.1]\n'
+    head = '[[loop]]\nname = "rod"\nkind = "distance"\nbody_a = "world"\nbody_b = "lower"\n'
+    rod = head + "translation_a = [{}, 0, 0.1]\nlength = 0.35\n"
     loops = repository.write(rod.format(0.2), "loops.toml")
     repository.commit("First", ARM)
     path = repository.folder / "arm.toml"
@@ -269,7 +268,7 @@ def numbers(tmp_path, monkeypatch):
 
         now = results.versions()
         say(old, then)
-        mb.baseline.record(mb.catalog.double_pendulum(), path, ["mujoco"], target="double_pendulum")
+        mb.baseline.record(mb.catalog.double_pendulum(), path, ["mujoco"], target="mbkit.catalog:double_pendulum")
         say(new, factor)
         return path
 
@@ -377,7 +376,7 @@ def test_the_command_says_where_and_by_its_status(repository, numbers, tmp_path)
 
 
 def test_a_real_version_is_found(monkeypatch, tmp_path):
-    """MuJoCo's own Runge-Kutta steps of quaternions, second order before 4.0, by two real versions."""
+    """MuJoCo's own Runge-Kutta steps of quaternions, which are of fourth order since 4.0."""
     kept = os.environ.get("MBKIT_TEST_ENVIRONMENTS")
     if not kept:
         pytest.skip("set MBKIT_TEST_ENVIRONMENTS to a folder for environments")
@@ -385,11 +384,13 @@ def test_a_real_version_is_found(monkeypatch, tmp_path):
     b = mb.ModelBuilder("top")
     b.add_body("rotor", mass=1.0, com=(0.0, 0.0, 0.1), inertia=(0.3, 0.4, 0.5))
     b.add_joint("ball", "ball", parent="world", child="rotor")
-    model, path = b.build(), tmp_path / "top.toml"
-    now = installed("mujoco")
-    mb.baseline.record(model, path, ["mujoco"])
-    monkeypatch.setattr(bisection, "versions_of", lambda _: ("3.3.0", "3.17.0", now))
-    assert versions_of("mujoco")
-    text = path.read_text()
-    body = text.rpartition("# sha256 ")[0].replace(f'mujoco = "{now}"', 'mujoco = "3.3.0"')
-    del body, np, environment
+    model, path, now, old = b.build(), tmp_path / "top.toml", results.versions(), "3.3.7"
+    with monkeypatch.context() as m:
+        m.setattr(results, "versions", lambda: now | {"mujoco": old})
+        m.setattr(study, "dynamics", lambda model, name, **_: mb.dynamics(model, f"{name}=={old}"))
+        mb.baseline.record(model, path, ["mujoco"])
+    (onset,) = mb.baseline.bisect(model, path).onsets
+    assert [r.term for r in onset.moved] == ["rollout"]
+    assert onset.direction == TOWARDS
+    known = versions_of("mujoco")
+    assert known.index(onset.first_bad) == known.index(onset.last_good) + 1

@@ -212,9 +212,9 @@ def baseline_view(result: BaselineResult, again: str = "") -> Document:
 
 def bisect_view(result: BisectResult) -> Document:
     """Return the document of a search for where a failure began."""
-    bullets = [Bullet(what, line, *_MARKS.get(what, ("✗", "bad"))) for what, line in result.lines()]  # type: ignore[arg-type]
+    bullets = [Bullet(what, line, *_MARKS.get(what, ("✗", "bad"))) for what, line in result.lines()]
     name = f"{result.model} ({result.path})"
-    looked_at = [Bullet(x.name, x.outcome, *_OUTCOMES[x.failed]) for x in result.examined]  # type: ignore[arg-type]
+    looked_at = [Bullet(x.name, x.outcome, *_OUTCOMES[x.failed]) for x in result.examined]
     return Document(
         name=name,
         verdict=result.verdict,

@@ -13,6 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Generic, TypeVar
 
@@ -115,7 +116,9 @@ class _Search(Generic[Item]):
     def __init__(
         self, items: Sequence[Item], examine: Callable[[Item], Failures], tell: Callable[[int, str], object]
     ) -> None:
-        self.items, self._examine, self._tell = items, examine, tell
+        self.items: Sequence[Item] = items
+        self._examine: Callable[[Item], Failures] = examine
+        self._tell = tell
         self.failures: dict[int, Failures] = {}
         self.missing: dict[int, str] = {}
 
@@ -330,7 +333,7 @@ def _by_versions(result: BisectResult, model: Model, recorded: Baseline, tell: P
         if not lines:
             continue
         study = _EngineStudy(engine, model, recorded, [r for r in result.check.moved if r.engine == engine])
-        search = _Search(lines, study.examine, lambda done, name, n=n: tell(_share(n, len(engines), done), name))
+        search = _Search(lines, study.examine, partial(_watch, tell, n, len(engines)))
         _announce(lines)
         first, last = search.nearest(range(len(lines))), search.nearest(range(len(lines) - 1, -1, -1))
         if first is None or last is None or first == last:
@@ -344,8 +347,8 @@ def _by_versions(result: BisectResult, model: Model, recorded: Baseline, tell: P
     return replace(result, onsets=tuple(onsets), examined=tuple(examined), notes=tuple(notes))
 
 
-def _share(n: int, engines: int, done: int) -> float:
-    return 0.1 + 0.9 * (n + min(0.95, 0.15 * done)) / engines
+def _watch(tell: Progress, n: int, engines: int, done: int, name: str) -> None:
+    tell(0.1 + 0.9 * (n + min(0.95, 0.15 * done)) / engines, name)
 
 
 def _versions_between(engine: str, recorded: Baseline, now: BaselineResult) -> tuple[list[EngineVersion], list[str]]:

@@ -67,7 +67,9 @@ class History:
         try:
             done = subprocess.run(command, input=stdin, capture_output=True, timeout=_LIMIT, env=environment)
         except FileNotFoundError:
-            raise UnsupportedError(f"git is not installed, so no earlier version of {self._file.name} is known") from None
+            raise UnsupportedError(
+                f"git is not installed, so no earlier version of {self._file.name} is known"
+            ) from None
         except subprocess.TimeoutExpired:
             raise UnsupportedError(f"git {words[0]} was stopped after {_LIMIT:.0f} s in {self._top}") from None
         if done.returncode:
@@ -139,7 +141,7 @@ class History:
         content = memoryview(self._git("cat-file", "--batch", stdin=b"".join(blob + b"\n" for _, blob in files)))
         for path, blob in files:
             # A line of hash, kind and size; the content; an end of line.
-            head, _, _ = bytes(content[: _HEAD]).partition(b"\n")
+            head, _, _ = bytes(content[:_HEAD]).partition(b"\n")
             if not head.startswith(blob) or b" blob " not in head:
                 raise UnsupportedError(f"git has no content of {path} at {commit}")
             size = int(head.split()[-1])

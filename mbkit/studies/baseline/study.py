@@ -541,6 +541,7 @@ def _effect(recorded: Baseline, model: Model, changed: tuple[Change, ...]) -> st
 
 
 def package_of(engine: str) -> str:
+    """Return the package whose version can move an engine's numbers."""
     return (ENGINES[engine].distribution if engine in ENGINES else "") or "mbkit"
 
 
