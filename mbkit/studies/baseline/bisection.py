@@ -38,7 +38,7 @@ from mbkit.studies.versions.study import digits_of, direction_of, middles
 from mbkit.studies.worker import describe
 
 _AS_RECORDED: Final = "as recorded"
-_NOT_COMMITTED: Final = "changes that are not committed"
+_PRESENT: Final = "the files as they are"
 
 Item = TypeVar("Item", EngineVersion, Commit | None)
 #: What fails: a term, or a section, part and field of the description.
@@ -184,7 +184,7 @@ class _Search(Generic[Item]):
 
 
 def _name(item: EngineVersion | Commit | None) -> str:
-    return _NOT_COMMITTED if item is None else str(item)
+    return _PRESENT if item is None else str(item)
 
 
 def _identity(item: EngineVersion | Commit | None) -> str:
