@@ -322,6 +322,21 @@ def test_an_unknown_version_is_answered_with_those_that_there_are(installer):
         mb.dynamics(mb.catalog.pendulum(), mb.engine("mujoco==9.9"))
 
 
+def test_where_uv_does_not_say_which_versions_there_are_pip_is_asked(installer, monkeypatch):
+    said = "No solution found\n  cause: Because there is no version\n  of mujoco==9.9, it cannot be installed"
+    installer(f'echo "error: {said}" >&2; exit 1')
+    monkeypatch.setattr(environment, "available", lambda _: ("3.1.0", "4.0.0"))
+    with pytest.raises(UnknownNameError, match=r"version of mujoco '9\.9'.*4\.0\.0, 3\.1\.0"):
+        mb.dynamics(mb.catalog.pendulum(), mb.engine("mujoco==9.9"))
+
+    def unknown(_):
+        raise UnsupportedError("no connection")
+
+    monkeypatch.setattr(environment, "available", unknown)
+    with pytest.raises(UnsupportedError, match="no environment.*there is no version"):
+        mb.dynamics(mb.catalog.pendulum(), mb.engine("mujoco==9.9"))
+
+
 def test_without_a_network_the_reason_is_that_of_the_installer(installer, environments):
     installer(
         'echo "WARNING: Retrying: Failed to establish a new connection: Name or service not known" >&2\n'

@@ -74,7 +74,9 @@ def engine(name: str, *, seconds: float = 60.0) -> EngineVersion:
     """Return an engine of a version, for `mbkit.dynamics`, in an environment of its own.
 
     The first `mbkit.dynamics` makes the environment, with uv where it is on the path and else with pip: the engine and
-    NumPy, some 100 to 450 MB, below the user's cache folder or ``MBKIT_ENVIRONMENTS``. Later ones need no network.
+    NumPy, some 100 to 450 MB, below the user's cache folder or ``MBKIT_ENVIRONMENTS``. Later ones need no network. It
+    also refuses a version that does not exist, with those that do, as far as pip knows: without a network the error is
+    that there is none.
 
     Parameters
     ----------

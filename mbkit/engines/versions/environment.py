@@ -27,6 +27,7 @@ from mbkit.errors import OutputError, UnknownNameError, UnsupportedError
 _INSTALL, _IMPORT = 1800.0, 120.0
 #: What pip says where a version does not exist, or where it reached no index.
 _VERSIONS: Final = re.compile(r"from versions: ([^)]*)\)")
+_NO_VERSION: Final = "there is no version of"
 _AVAILABLE: Final = re.compile(r"^Available versions: (.+)$", re.MULTILINE)
 #: A shared library that the system does not find.
 _LIBRARY: Final = re.compile(r"(lib[\w+-]+)\.so[.\d]*: cannot open shared object")
@@ -197,6 +198,10 @@ def _install(pip: Sequence[str], distribution: str, version: str, limits: Sequen
     name = f"{distribution} {version}"
     found = _VERSIONS.search(done.stderr)
     known = [] if found is None else [x for x in map(str.strip, found[1].split(",")) if x and x != "none"]
+    if _NO_VERSION in " ".join(done.stderr.split()):
+        # uv does not say which there are.
+        with contextlib.suppress(UnsupportedError):
+            known = list(available(distribution))
     if known and version not in known:
         raise UnknownNameError(f"version of {distribution}", version, known, f"there are {', '.join(reversed(known))}")
     raise UnsupportedError(f"{name}: no environment of it can be made here; {_reason(done.stderr)}")
@@ -217,11 +222,11 @@ def available(distribution: str) -> tuple[str, ...]:
 
 
 def _reason(said: str) -> str:
-    """Return what pip gave as the cause, in a line: a connection that failed, or its last error."""
+    """Return what pip gave as the cause, in a line: a connection that failed, the cause that uv gives, or an error."""
     lines = [" ".join(line.split()) for line in said.splitlines() if line.strip()]
     broken = [x for x in lines if "connection" in x.lower() or "resolve" in x.lower()]
-    errors = [x for x in lines if x.lower().startswith("error")]
-    line = (broken[-1:] or errors[:1] or lines[-1:] or ["it says nothing"])[0]
+    causes, errors = ([x for x in lines if x.lower().startswith(word)] for word in ("cause: ", "error"))
+    line = (broken[-1:] or causes[:1] or errors[:1] or lines[-1:] or ["it says nothing"])[0]
     return f"pip: {line[:400]}"
 
 
