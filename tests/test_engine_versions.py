@@ -333,7 +333,7 @@ def test_where_uv_does_not_say_which_versions_there_are_pip_is_asked(installer, 
         raise UnsupportedError("no connection")
 
     monkeypatch.setattr(environment, "available", unknown)
-    with pytest.raises(UnsupportedError, match="no environment.*there is no version"):
+    with pytest.raises(UnsupportedError, match=r"no environment.*there is no version"):
         mb.dynamics(mb.catalog.pendulum(), mb.engine("mujoco==9.9"))
 
 
