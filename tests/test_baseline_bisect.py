@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from mbkit.engines.versions.engine_version import versions_of
 from mbkit.errors import UnsupportedError
 from mbkit.studies import results
 from mbkit.studies.baseline import BisectResult, bisection, study
+from mbkit.studies.baseline.history import Commit, History
 from mbkit.studies.versions.result import AWAY, TOWARDS
 from tests.test_baseline import ARM
 from tests.test_engine_versions import script
@@ -145,6 +147,40 @@ def test_a_change_that_came_with_a_merge_is_found_inside_of_it(repository):
     assert [o.first_bad for o in bisected(path).onsets] == [bad, evil]
 
 
+def test_a_branch_that_began_before_a_change_does_not_hide_it(repository):
+    repository.commit("First", ARM)
+    path = repository.record()
+    repository.commit("Recorded", ARM)
+    repository.git("checkout", "-q", "-b", "side")
+    repository.commit("A comment", ARM + "<!-- side -->")
+    repository.git("checkout", "-q", "main")
+    bad = repository.commit("Heavier", heavier(0.41))
+    repository.git("checkout", "-q", "side")
+    repository.commit("Another comment", ARM + "<!-- more -->")
+    repository.git("checkout", "-q", "main")
+    repository.git("merge", "-q", "--no-ff", "-m", "Merged", "side")
+    assert [o.first_bad for o in bisected(path).onsets] == [bad]
+
+
+def test_rounding_is_not_where_an_edit_began(repository):
+    repository.commit("First", ARM)
+    path = repository.record()
+    repository.commit("Recorded", ARM)
+    repository.commit("Rounded", heavier(0.4 + 1e-16))
+    bad = repository.commit("Heavier", heavier(0.41))
+    repository.commit("A comment", heavier(0.41) + "<!-- x -->")
+    assert [o.first_bad for o in bisected(path).onsets] == [bad]
+
+
+def test_a_hook_of_another_repository_is_no_hindrance(repository, tmp_path, monkeypatch):
+    repository.commit("First", ARM)
+    path = repository.record()
+    repository.commit("Recorded", ARM)
+    bad = repository.commit("Heavier", heavier(0.41))
+    monkeypatch.setenv("GIT_DIR", str(Repository(tmp_path / "other").folder / ".git"))
+    assert [o.first_bad for o in bisected(path).onsets] == [bad]
+
+
 def test_what_is_not_committed_and_what_is_not_in_the_file_are_told(repository):
     repository.commit("First", ARM)
     path = repository.record()
@@ -230,19 +266,16 @@ def test_without_a_history_the_reason_is_given(repository, tmp_path, monkeypatch
     assert "git is not installed" in bisected(path).notes[0]
 
 
-def test_a_tree_cannot_write_outside_of_its_folder(repository):
+def test_a_tree_cannot_write_outside_of_its_folder(repository, tmp_path, monkeypatch):
     """A tree object may hold any name; git refuses it on checkout alone."""
-    from mbkit.studies.baseline.history import Commit, History
-
     repository.commit("First", ARM)
     history = History(repository.folder / "arm.urdf")
-    history._parts = ["arm.urdf", "evil"]
     blob = repository.git("hash-object", "-w", "arm.urdf")
     raw = b"100644 ..evil\0" + bytes.fromhex(blob) + b"40000 ..\0" + bytes.fromhex(repository.git("write-tree"))
     (repository.folder / "tree").write_bytes(raw)
     tree = repository.git("hash-object", "-w", "--literally", "-t", "tree", "tree")
-    history._parts = [""]
-    history._git, plain = (lambda *w, **k: plain(*[x for x in w if x], **k)), history._git
+    history._parts = []
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with history.files_at(Commit(tree, (), "", "")) as folder:
         assert sorted(p.name for p in folder.rglob("*")) == ["..evil"]
         assert not (folder.parent / "arm.urdf").exists()

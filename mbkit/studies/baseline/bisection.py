@@ -56,7 +56,7 @@ def bisect(
     """Find where what fails of a baseline began: the version of an engine, or the commit of the description.
 
     Where `check` finds another description, the commits of its file in git are searched, from the one that has the
-    baseline as it is, or the latest that is as recorded. Else the versions of each engine whose numbers moved, from the
+    baseline, or the latest that is as recorded. Else the versions of each engine whose numbers moved, from the
     recorded one to the installed one, each in an environment of its own as `mbkit.engine` makes them; what that takes
     is said on stderr before it begins.
 

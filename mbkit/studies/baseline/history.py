@@ -61,8 +61,7 @@ class History:
 
     def _git(self, *words: str, stdin: bytes = b"") -> bytes:
         """Return what git prints on a repository that may be anybody's; raise `UnsupportedError` with its reason."""
-        command = ["git", "-C", str(self._top), "--literal-pathspecs", "-c", "log.showSignature=false"]
-        command += ["-c", "core.fsmonitor=false", *words]
+        command = ["git", "-C", str(self._top), "--literal-pathspecs", "-c", "log.showSignature=false", *words]
         environment = {k: x for k, x in os.environ.items() if k not in _HOOKS} | {"LC_ALL": "C"}
         try:
             done = subprocess.run(command, input=stdin, capture_output=True, timeout=_LIMIT, env=environment)
@@ -107,11 +106,9 @@ class History:
         return self._log(f"^{first}", *others, parts=self._parts) if others else []
 
     def last_of(self, path: Path) -> Commit | None:
-        """Return the commit that holds a file as it is now; None for a file that is not committed as it is."""
+        """Return the last commit that touched a file; None for a file that is not committed."""
         name = self._inside(path)
-        if name is None or self._git("status", "--porcelain", "--ignored", "-z", "--", name):
-            return None
-        return next(iter(self._log("-1", "HEAD", parts=[name])), None)
+        return None if name is None else next(iter(self._log("-1", "HEAD", parts=[name])), None)
 
     @contextmanager
     def files_at(self, commit: Commit | None) -> Iterator[Path]:
