@@ -235,7 +235,7 @@ class Onset:
 
     @property
     def what(self) -> tuple[str, ...]:
-        """What began there, in words: the first few."""
+        """The first few things that began there, in words."""
         out = [c.text for c in self.changes[:_MOST_CHANGES]]
         if self.moved:
             digits = ""
