@@ -147,7 +147,7 @@ class _Search(Generic[Item]):
         return None
 
     def run(self) -> None:
-        """Examine what is between neighbours that differ, until none is left."""
+        """Examine the middle between neighbours that differ, until none is left."""
         while some := middles(self.failures, self.missing, self._differ):
             for k in some:
                 self.at(k)
@@ -395,7 +395,7 @@ class _EngineStudy:
         self._errors: dict[str, dict[str, float]] = {}
 
     def examine(self, version: EngineVersion) -> Failures:
-        """Return what fails now and in a version; raise where the version does not give what is a number now."""
+        """Return what fails now and in a version; raise where it gives no number and there is one now."""
         version.interpreter()
         recorded = self._recorded
         try:
