@@ -41,9 +41,10 @@ HERE = Path(__file__).parent
 VERSIONS: dict[str, tuple[str, ...]] = {
     "mujoco": (
         *(f"3.1.{k}" for k in range(7)),
-        *("3.2.0", "3.2.7"),
+        *(f"3.2.{k}" for k in range(8)),
         *(f"3.3.{k}" for k in range(8)),
-        *(f"3.{k}.0" for k in (4, 5, 6, 7, 9, *range(10, 18))),
+        *("3.4.0", "3.5.0", "3.6.0", "3.7.0", "3.8.0", "3.8.1"),
+        *(f"3.{k}.0" for k in range(9, 18)),
         "4.0.0",
     ),
     "pinocchio": (
@@ -199,6 +200,12 @@ SMALLEST = {
         link("weight", 1.0, (0, 1, 0), np.eye(3)),
         joint("hinge", "continuous", "base", "arm", (0, 0, 0), (0, 0, 0), (1, 0, 0)),
         joint("weld", "fixed", "arm", "weight", (0, 0, 0), (0.0, 0.0, np.pi / 2)),
+    ),
+    "weld_without_mass": (
+        link("arm", 1.0, (0, 0, 0), np.eye(3)),
+        link("flywheel", 0.0, (0, 0, 0), np.eye(3)),
+        joint("hinge", "continuous", "base", "arm", (0, 0, 0), (0, 0, 0), (1, 0, 0)),
+        joint("weld", "fixed", "arm", "flywheel", (0, 0, 0), (0, 0, 0)),
     ),
 }
 
