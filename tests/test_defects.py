@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from dataclasses import replace
 from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import mbkit as mb
+from mbkit.engines import known_defects
 from mbkit.errors import KnownDefectWarning
 from mbkit.model.joint_types import KINDS
 from mbkit.report.compare_view import headline, view
@@ -59,7 +62,7 @@ def test_a_comparison_fails_the_coriolis_defect_by_name(kind):
     assert not result.passed
     failed = [r for r in result.rows if not r.passed]
     assert [(r.term, r.engine) for r in failed] == [(term, "pinocchio") for term in TURNING_AXES]
-    assert all("known defect of pinocchio 4.1.0" in r.reason and "odd" in r.reason for r in failed)
+    assert all("known defect of pinocchio 2.6.18 to 4.1.0" in r.reason and "odd" in r.reason for r in failed)
     assert "pinocchio differs in C v" in result.verdict
 
 
@@ -182,3 +185,17 @@ def test_a_defect_of_the_whole_engine_is_in_its_rows():
     assert {r.term for r in failed} > {"M", "power balance"}
     assert all(r.engine == "pinocchio" and "sum of two inertias" in r.defect for r in failed)
     assert result.only_known_defects
+
+
+@pytest.mark.parametrize(
+    ("defect", "robot", "term"),
+    [
+        (known_defects.CORIOLIS, "spherical_zyx", "C v"),
+        (known_defects.KINETIC_ENERGY, "rotors", "kinetic energy"),
+    ],
+)
+def test_the_versions_of_a_defect_are_those_of_the_record(defect, robot, term):
+    path = Path(__file__).parents[1] / "validation" / "versions.json"
+    found = json.loads(path.read_text(encoding="utf-8"))["engines"]["pinocchio"]
+    (since,) = [x["since"] for x in found["wrong"] if (x["robot"], x["term"]) == (robot, term)]
+    assert f"pinocchio {since} to {found['measured'][-1]}, " in defect

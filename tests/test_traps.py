@@ -337,3 +337,26 @@ def test_pinocchio_s_reader_of_equalities_takes_anchors_of_joints_and_inactive_o
     assert np.abs(points["true"][0] - [0.3, 0.2, 0.1]).max() < 1e-15
     assert len(points["false"]) == 1
     assert not mb.load(tmp_path / "false.xml").loops
+
+
+def test_pinocchio_loses_the_place_of_a_body_fixed_to_the_world_and_equalities_of_joints(tmp_path):
+    inertial = '<inertial pos=".2 0 0" mass="1" diaginertia=".1 .1 .1"/>'
+    path = tmp_path / "m.xml"
+    path.write_text(
+        '<mujoco><compiler inertiafromgeom="false"/><worldbody><body name="root" pos=".5 0 .1" quat=".6 .8 0 0">'
+        f'{inertial}<body name="a"><joint name="j" axis="0 1 0"/>{inertial}<body name="b">'
+        f'<joint name="k" axis="0 1 0"/>{inertial}</body></body></body></worldbody>'
+        '<equality><joint joint1="j" joint2="k" polycoef="0 2 0 0 0"/></equality></mujoco>'
+    )
+    read, *constraints = pin.buildModelAndConstraintsFromMJCF(str(path))
+    assert not any(len(some) for some in constraints)
+    assert np.abs(read.jointPlacements[1].homogeneous - np.eye(4)).max() == 0.0
+    model = mb.load(path)
+    (coupler,) = model.couplers
+    assert (coupler.joint, coupler.leader, coupler.ratio) == ("j", "k", 2.0)
+    theirs = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(theirs)
+    mujoco.mj_forward(theirs, data)
+    g = mb.dynamics(model.without("couplers"), "pinocchio").gravity(np.zeros(2))
+    assert np.abs(g - data.qfrc_bias).max() < 1e-14
+    assert np.abs(pin.computeGeneralizedGravity(read, read.createData(), np.zeros(2)) - g).max() > 1.0

@@ -38,7 +38,7 @@ PARTS = {
     "long_loops": Part(1, ("long_loops.json",), "a million steps of mechanisms with loops: gap and energy"),
     "importers": Part(1, ("importers.json", "importers_floating.json"), "one file through three importers"),
     "versions": Part(
-        30, ("versions.json",), "versions of MuJoCo, Pinocchio and Drake; makes some 7 GB of environments"
+        35, ("versions.json",), "versions of MuJoCo, Pinocchio and Drake; makes some 18 GB of environments"
     ),
     "fuzz": Part(10, ("fuzz.json",), "random and damaged files, random trees"),
     "memory": Part(14, ("memory.json",), "memory that released models leave behind"),

@@ -1,19 +1,25 @@
 """Versions of MuJoCo, Pinocchio and Drake against the oracle: which changed which number, and when.
 
 Run ``python -m validation.versions``; it writes ``validation/versions.json``. Environments are made below the user's
-cache folder, or below ``MBKIT_ENVIRONMENTS``: 7 GB, and an hour where none is there yet.
+cache folder, or below ``MBKIT_ENVIRONMENTS``: 18 GB, and twenty minutes where none is there yet.
 
-The arm is one description written in seven ways that say the same; a parser that reads one of them otherwise is wrong.
-That all say the same is checked with mbkit's own reader and the oracle before anything is measured.
+All robots of example-robot-data are measured, random trees, and one arm that is written in eight ways. Seven say the
+same, the eighth in other units; a parser that reads one of them otherwise is wrong. That they do is checked with
+mbkit's own reader and the oracle before anything is measured.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import re
 import sys
 import tempfile
+import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -22,9 +28,12 @@ import mbkit as mb
 from mbkit.engines.versions import process
 from mbkit.engines.versions.engine_version import versions_of
 from mbkit.engines.versions.importer import VersionImport
-from mbkit.spatial import matrix_from_rpy, rpy_from_matrix
+from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.studies.results import to_plain
+from mbkit.studies.versions.measure import FILE, RUN
+from mbkit.studies.versions.result import Change, VersionRow
 from tests.random_trees import random_tree
+from validation.arms import joint, link, urdf, written
 from validation.stamp import stamp
 
 HERE = Path(__file__).parent
@@ -32,17 +41,18 @@ HERE = Path(__file__).parent
 VERSIONS: dict[str, tuple[str, ...]] = {
     "mujoco": (
         *(f"3.1.{k}" for k in range(7)),
-        *("3.2.0", "3.2.7"),
+        *(f"3.2.{k}" for k in range(8)),
         *(f"3.3.{k}" for k in range(8)),
-        *(f"3.{k}.0" for k in (4, 5, 6, 7, 9, *range(10, 18))),
+        *("3.4.0", "3.5.0", "3.6.0", "3.7.0", "3.8.0", "3.8.1"),
+        *(f"3.{k}.0" for k in range(9, 18)),
         "4.0.0",
     ),
     "pinocchio": (
-        *("2.6.18", "2.6.20", "2.6.21", "2.7.0", "3.3.1", "3.4.0", "3.7.0", "3.8.0", "3.9.0", "4.0.0", "4.1.0"),
+        *("2.6.18", "2.6.19", "2.6.20", "2.6.21", "2.7.0"),
+        *("3.3.1", "3.4.0", "3.7.0", "3.8.0", "3.9.0", "4.0.0", "4.1.0"),
     ),
-    "drake": ("1.35.0", "1.36.0", "1.38.0", "1.41.0", "1.44.0", "1.47.0", "1.50.0", "1.51.1"),
+    "drake": (*(f"1.{k}.0" for k in range(35, 52)), "1.51.1"),
 }
-ROBOTS = ("ur5", "panda")
 BARE = {"springs": False, "damping": False}
 TREES = {
     "turning": lambda: random_tree(5, 6, ("revolute", "free", "ball", "planar"), armature=False, **BARE),
@@ -51,112 +61,132 @@ TREES = {
     "rotors": lambda: random_tree(6, 5, ("revolute", "prismatic"), armature=True, **BARE),
 }
 
-# Seven ways to write one arm.
-
-#: Link -> mass, kg; centre of mass, m; Ixx, Iyy, Izz, Ixy, Ixz, Iyz about it, kg m².
-LINKS = {
-    "base": (3.0, (0.0, 0.1, 0.2), (0.3, 0.4, 0.5, 0.0, 0.0, 0.0)),
-    "upper": (2.0, (0.1, -0.2, 0.3), (0.2, 0.3, 0.25, 0.02, -0.03, 0.04)),
-    "lower": (1.5, (0.05, 0.1, 0.4), (0.1, 0.12, 0.15, -0.01, 0.02, 0.03)),
-    "side": (1.0, (-0.1, 0.0, 0.2), (0.1, 0.08, 0.09, 0.01, 0.01, -0.02)),
-}
-#: Joint -> parent, child, place and axis.
-JOINTS = {
-    "shoulder": ("base", "upper", (0.0, 0.0, 0.4), (0.2, -0.1, 0.3), (0, 0, 1)),
-    "elbow": ("upper", "lower", (0.3, 0.0, 0.5), (0.0, 0.4, 0.1), (0, 1, 0)),
-    "wing": ("upper", "side", (-0.2, 0.1, 0.1), (0.5, 0.0, 0.0), (0.6, 0, 0.8)),
-}
+#: Fewer digits are wrong.
+RIGHT = 8.0
+#: What a reason says of one robot alone: its name, its parts.
+OF_ONE = re.compile(
+    r"^\S+:\d+: | of \S+(?= is not finite)| at index .*| (?:Object|Element) name.*|: (?:body|joint) .*|; suspect: .*|"
+    r"\. mass = .*"
+)
 
 
-def tensor(moments: tuple[float, ...]) -> np.ndarray:
-    xx, yy, zz, xy, xz, yz = moments
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-def numbers(values: Any) -> str:
-    return " ".join(repr(float(x)) for x in values)
-
-
-def link(name: str, mass: float, com: Any, I: np.ndarray, rpy: Any = (0.0, 0.0, 0.0)) -> str:
-    names = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
-    moments = " ".join(f'{key}="{I[at]!r}"' for key, at in names.items()).replace("np.float64(", "").replace(")", "")
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{numbers(com)}" rpy="{numbers(rpy)}"/><mass value="{mass!r}"/>'
-        f"<inertia {moments}/></inertial></link>"
-    )
-
-
-def joint(name: str, kind: str, parent: str, child: str, xyz: Any, rpy: Any, axis: Any = (0, 0, 1)) -> str:
-    return (
-        f'<joint name="{name}" type="{kind}"><origin xyz="{numbers(xyz)}" rpy="{numbers(rpy)}"/>'
-        f'<parent link="{parent}"/><child link="{child}"/><axis xyz="{numbers(axis)}"/>'
-        '<limit lower="-3" upper="3" effort="1" velocity="1"/></joint>'
-    )
-
-
-def arms() -> dict[str, list[str]]:
-    """Return the elements of each way to write the arm."""
-    links = [link(name, m, com, tensor(I)) for name, (m, com, I) in LINKS.items()]
-    joints = [joint(name, "revolute", *of) for name, of in JOINTS.items()]
-    R = matrix_from_rpy(0.3, -0.5, 0.7)
-    turned = [link(n, m, com, R.T @ tensor(I) @ R, rpy_from_matrix(R)) for n, (m, com, I) in LINKS.items()]
-    principal = []
-    for name, (m, com, I) in LINKS.items():
-        moments, axes = np.linalg.eigh(tensor(I))
-        axes = axes * np.sign(np.linalg.det(axes))
-        principal.append(link(name, m, com, np.diag(moments), rpy_from_matrix(axes)))
-    mass, com, I = LINKS["upper"][0] / 2, np.array(LINKS["upper"][1]), tensor(LINKS["upper"][2]) / 2
-    p = np.array([0.2, 0.3, -0.1])
-    halves = [link("upper", mass, com, I), link("upper_half", mass, R.T @ (com - p), R.T @ I @ R)]
-    split = [*links[:1], *halves, *links[2:], joint("weld", "fixed", "upper", "upper_half", p, rpy_from_matrix(R))]
-    other = {"base": "z", "upper": "y", "lower": "a", "side": "b"}
-    renamed = [link(other[n], m, com, tensor(I)) for n, (m, com, I) in LINKS.items()]
-    renamed += [joint(n, "revolute", other[a], other[b], *of) for n, (a, b, *of) in JOINTS.items()]
-    tool = ['<link name="tool"/>', joint("mount", "fixed", "lower", "tool", (0.1, 0.2, 0.3), (0.1, 0.2, 0.3))]
-    return {
-        "arm_as_written": links + joints,
-        "arm_inertial_turned": turned + joints,
-        "arm_principal_axes": principal + joints,
-        "arm_link_split": split + joints,
-        "arm_order_reversed": [*reversed(joints), *reversed(links)],
-        "arm_links_renamed": renamed,
-        "arm_frame_added": links + joints + tool,
-    }
-
-
-def written(folder: Path) -> list[mb.Model]:
-    """Write the arms, and return them as mbkit reads them; raises where they do not say the same."""
+def robots() -> list[str]:
+    """Return the robots of example-robot-data that mbkit reads."""
     out = []
-    for name, elements in arms().items():
-        path = folder / f"{name}.urdf"
-        path.write_text(f'<robot name="{name}">\n' + "\n".join(elements) + "\n</robot>\n", encoding="utf-8")
-        out.append(mb.load(path))
-    rng = np.random.default_rng(0)
-    angles = dict(zip(JOINTS, rng.standard_normal(len(JOINTS)), strict=True))
-    truth = None
-    for model in out:
-        order = [model.joint_names.index(name) for name in JOINTS]
-        M = mb.dynamics(model, "oracle").mass_matrix([angles[name] for name in model.joint_names])[np.ix_(order, order)]
-        truth = M if truth is None else truth
-        if not np.abs(M - truth).max() < 1e-14 * np.abs(truth).max():
-            raise AssertionError(f"{model.name} does not say what the others say")
+    for robot in mb.robots():
+        try:
+            mb.load(robot.name)
+        except MbkitError:
+            continue
+        out.append(robot.name)
     return out
 
 
 def study(engine: str, targets: list[Any]) -> dict[str, Any]:
+    """Return what moved, one row a robot, what is wrong in the last version, and what has no number."""
     result = mb.versions(targets, engine, VERSIONS[engine], most=100, samples=2)
-    data, known = result.to_dict(), versions_of(engine)
-    for change in data["changes"]:
-        # Whether none of those that pip has lies between.
-        change["next_to_it"] = known.index(change["version"]) == known.index(change["before"]) + 1
-    digits: dict[str, dict[str, list[Any]]] = {}
-    ratios: dict[str, dict[str, float]] = {}
+    data, last = result.to_dict(), result.measured[-1]
+    by_robot: dict[str, list[VersionRow]] = {}
     for r in result.rows:
-        digits.setdefault(r.robot, {}).setdefault(r.term, []).append(None if np.isnan(r.digits) else round(r.digits, 1))
-        ratios.setdefault(r.robot, {})[r.version] = r.time_ratio
-    reasons = sorted({(r.robot, r.term, r.version, r.reason) for r in result.rows if r.reason})
-    kept = {k: data[k] for k in ("engine", "measured", "changes", "missing", "settings", "seconds", "verdict")}
-    return kept | {"digits": digits, "time_ratios": ratios, "reasons": reasons}
+        by_robot.setdefault(r.robot, []).append(r)
+    kept = {k: data[k] for k in ("engine", "measured", "missing", "settings", "seconds", "verdict")}
+    return kept | {
+        "changes": together(result.changes, versions_of(engine)),
+        "robots": {name: summary(rows, last) for name, rows in by_robot.items()},
+        "wrong": wrong(result.rows, last),
+        "times": times_of(result.rows),
+        "reasons": reasons(result.rows),
+    }
+
+
+def together(changes: Iterable[Change], known: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Return changes of the same terms of the same robots between two versions as one."""
+    groups: dict[tuple[str, str, str, str], list[Change]] = {}
+    for c in changes:
+        groups.setdefault((c.before, c.version, c.direction, c.term), []).append(c)
+    out: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for (before, version, direction, term), some in groups.items():
+        robots = tuple(c.robot for c in some)
+        new = {
+            "before": before,
+            "version": version,
+            # Whether none of those that pip has lies between.
+            "next_to_it": known.index(version) == known.index(before) + 1,
+            "direction": direction,
+            "robots": robots,
+            "terms": [],
+            "digits_before": [],
+            "digits": [],
+        }
+        one = out.setdefault((before, version, direction, robots), new)
+        one["terms"].append(term)
+        for c in some:
+            one["digits_before"].append(c.digits_before)
+            one["digits"].append(c.digits)
+    order = list(known).index
+    for one in out.values():
+        for name in ("digits_before", "digits"):
+            one[name] = ends(one[name])
+    return sorted(out.values(), key=lambda x: (order(x["version"]), x["direction"], x["terms"]))
+
+
+def ends(values: Iterable[float]) -> list[float] | None:
+    """Return the least and the largest, None without a number."""
+    some = [round(x, 1) for x in values if not math.isnan(x)]
+    return [min(some), max(some)] if some else None
+
+
+def summary(rows: list[VersionRow], last: str) -> dict[str, Any]:
+    """Return a robot's row: its fewest digits in the last version, and the largest move of a number."""
+    now = [r for r in rows if r.version == last and r.term != RUN]
+    lists = ([r.digits for r in now if r.term.startswith(FILE) is of_file] for of_file in (False, True))
+    own, file = (ends(x) for x in lists)
+    moves = [r.moved for r in rows if not math.isnan(r.moved)]
+    return {
+        "digits": own and own[0],
+        "file_digits": file and file[0],
+        "moved": float(f"{max(moves, default=0.0):.1e}"),
+        "changes": sum(r.changed for r in rows),
+    }
+
+
+def wrong(rows: Iterable[VersionRow], last: str) -> list[dict[str, Any]]:
+    """Return terms that are wrong in the last version, and since which measured one they are."""
+    of: dict[tuple[str, str], list[VersionRow]] = {}
+    for r in rows:
+        of.setdefault((r.robot, r.term), []).append(r)
+    out = []
+    for (robot, term), some in of.items():
+        if term == RUN or some[-1].version != last or not some[-1].digits < RIGHT:
+            continue
+        since = last
+        for r in reversed(some):
+            if not r.digits < RIGHT:
+                break
+            since = r.version
+        out.append({"robot": robot, "term": term, "digits": round(some[-1].digits, 1), "since": since})
+    return out
+
+
+def times_of(rows: Iterable[VersionRow]) -> dict[str, list[float]]:
+    """Return each version's time over the last one's, the median of robots, and of how many."""
+    of: dict[str, dict[str, float]] = {}
+    for r in rows:
+        if not math.isnan(r.time_ratio):
+            of.setdefault(r.version, {})[r.robot] = r.time_ratio
+    return {version: [round(median(x.values()), 2), len(x)] for version, x in of.items()}
+
+
+def reasons(rows: Iterable[VersionRow]) -> list[dict[str, Any]]:
+    """Return why terms have no number: each reason once, with its robots, terms and versions."""
+    of: dict[str, dict[str, list[str]]] = {}
+    for r in rows:
+        if r.reason:
+            one = of.setdefault(OF_ONE.sub("", r.reason), {"robots": [], "terms": [], "versions": []})
+            for name, value in zip(one, (r.robot, r.term, r.version), strict=True):
+                if value not in one[name]:
+                    one[name].append(value)
+    return [{"reason": text, **one} for text, one in of.items()]
 
 
 #: The smallest files that a version reads wrongly: one hinge about x, whose M is a number.
@@ -171,6 +201,12 @@ SMALLEST = {
         joint("hinge", "continuous", "base", "arm", (0, 0, 0), (0, 0, 0), (1, 0, 0)),
         joint("weld", "fixed", "arm", "weight", (0, 0, 0), (0.0, 0.0, np.pi / 2)),
     ),
+    "weld_without_mass": (
+        link("arm", 1.0, (0, 0, 0), np.eye(3)),
+        link("flywheel", 0.0, (0, 0, 0), np.eye(3)),
+        joint("hinge", "continuous", "base", "arm", (0, 0, 0), (0, 0, 0), (1, 0, 0)),
+        joint("weld", "fixed", "arm", "flywheel", (0, 0, 0), (0, 0, 0)),
+    ),
 }
 
 
@@ -178,7 +214,7 @@ def smallest(engine: str) -> dict[str, Any]:
     """Return M of each smallest file as each version reads it, and as the oracle says."""
     out: dict[str, Any] = {}
     for name, elements in SMALLEST.items():
-        text = f'<robot name="{name}">\n<link name="base"/>\n' + "\n".join(elements) + "\n</robot>\n"
+        text = urdf(name, ['<link name="base"/>', *elements])
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "robot.urdf"
             path.write_text(text, encoding="utf-8")
@@ -199,11 +235,12 @@ def main() -> None:
     names = sys.argv[1:] or list(VERSIONS)
     out: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if sys.argv[1:] and path.exists() else {}
     out |= stamp()
+    warnings.simplefilter("ignore", MbkitWarning)
     with tempfile.TemporaryDirectory() as folder:
         trees = [replace(make(), name=name) for name, make in TREES.items()]
         models = [*written(Path(folder)), *trees]
         for engine in names:
-            out.setdefault("engines", {})[engine] = study(engine, [*ROBOTS, *models])
+            out.setdefault("engines", {})[engine] = study(engine, [*robots(), *models])
             out.setdefault("smallest", {})[engine] = smallest(engine)
             print(out["engines"][engine]["verdict"])
     path.write_text(json.dumps(to_plain(out), indent=1) + "\n", encoding="utf-8")

@@ -11,29 +11,31 @@ from typing import Final
 from mbkit._warn import warn
 from mbkit.errors import KnownDefectWarning
 
-# Engine, version in which it was reproduced, quantity; the wrong value; the right one.
+# Engine, the first and the last version in which it was reproduced, quantity; the wrong value; the right one. The
+# first is the oldest that was tried, or the one that brought what is wrong: Pinocchio's wheels have an armature since
+# 3.3.1, MuJoCo's tendons since 3.3.1.
 CORIOLIS: Final = (
-    "known defect of pinocchio 4.1.0, coriolis_matrix: computeCoriolisMatrix leaves C v + g different from nle for "
-    "some joint types (pinocchio#2053); nle is right"
+    "known defect of pinocchio 2.6.18 to 4.1.0, coriolis_matrix: computeCoriolisMatrix leaves C v + g different from "
+    "nle for some joint types (pinocchio#2053); nle is right"
 )
 KINETIC_ENERGY: Final = (
-    "known defect of pinocchio 4.1.0, kinetic_energy: computeKineticEnergy leaves out the armature of some joint "
-    "types; half vᵀ M v is right"
+    "known defect of pinocchio 3.3.1 to 4.1.0, kinetic_energy: computeKineticEnergy leaves out the armature of some "
+    "joint types; half vᵀ M v is right"
 )
 JACOBIAN_RATE: Final = (
-    "known defect of pinocchio 4.1.0, jacobian_dot_v and centroidal_momentum_bias: computeJointJacobiansTimeVariation "
-    "and dccrba take the axes of a joint for fixed in its child (pinocchio#2053); "
+    "known defect of pinocchio 2.6.18 to 4.1.0, jacobian_dot_v and centroidal_momentum_bias: "
+    "computeJointJacobiansTimeVariation and dccrba take the axes of a joint for fixed in its child (pinocchio#2053); "
     "acceleration at a = 0 is right"
 )
 TINY_MASS: Final = (
-    "known defect of pinocchio 4.1.0, mass_matrix: the sum of two inertias has a wrong centre of mass where they weigh "
-    "less than 2.2e-16 kg together, and with it M, nle and accelerations; the lagrangian engine is right; or take a "
-    "larger unit of mass"
+    "known defect of pinocchio 2.6.18 to 4.1.0, mass_matrix: the sum of two inertias has a wrong centre of mass where "
+    "they weigh less than 2.2e-16 kg together, and with it M, nle and accelerations; the lagrangian engine is right; "
+    "or take a larger unit of mass"
 )
 TENDON_ARMATURE: Final = (
-    "known defect of mujoco 4.0.0, mass_matrix: the armature of a tendon over joints of different branches is left out "
-    "of M's entries between the branches, and with them out of accelerations and the kinetic energy; the lagrangian "
-    "and pinocchio engines have all of a c cᵀ"
+    "known defect of mujoco 3.3.1 to 4.0.0, mass_matrix: the armature of a tendon over joints of different branches is "
+    "left out of M's entries between the branches, and with them out of accelerations and the kinetic energy; the "
+    "lagrangian and pinocchio engines have all of a c cᵀ"
 )
 
 

@@ -1,1 +1,1 @@
-"""Forces given by functions, for engines that have none of their own."""
+"""Force elements, for engines that have none of their own."""

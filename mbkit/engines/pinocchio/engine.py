@@ -18,10 +18,11 @@ import pinocchio as pin
 from mbkit._check import Array
 from mbkit.engines import known_defects
 from mbkit.engines.base import Dynamics, first_names, unit_quaternions
+from mbkit.engines.elements.passive import JointPassive
 from mbkit.engines.frames_and_momenta import LOCAL
 from mbkit.engines.pinocchio.bodies import PinocchioBodies
 from mbkit.engines.pinocchio.constraints import PinConstraints, PinocchioConstrained
-from mbkit.engines.pinocchio.model import JointPassive, PinModel, PointSprings, build
+from mbkit.engines.pinocchio.model import PinModel, PointSprings, build
 from mbkit.engines.pinocchio.regressors import PinRegressors
 from mbkit.engines.regressors import with_losses
 from mbkit.model import Model

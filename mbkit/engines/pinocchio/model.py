@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from mbkit._check import Array
 from mbkit.engines.base import unknown_joint
+from mbkit.engines.elements.passive import pull
 from mbkit.model import Body, Joint, Model, PointSpring
 
 _X, _Y, _Z = np.eye(3)
@@ -145,16 +146,16 @@ class PointSprings:
     def force(self, m: Any, d: Any, q: Array, v: Array) -> Array:
         """Return the generalized force, by the points' Jacobians."""
         out = np.zeros(m.nv)
-        for J, pull in self._pulls(m, d, q, v):
-            out -= J.T @ pull
+        for J, force in self._pulls(m, d, q, v):
+            out -= J.T @ force
         return out
 
     def forces(self, m: Any, d: Any, q: Array, v: Array) -> list[OnBody]:
         """Return the pulls on the bodies at the ends."""
         out = []
-        for (spring, *ends), (_, pull) in zip(self._ends, self._pulls(m, d, q, v), strict=True):
+        for (spring, *ends), (_, on_first) in zip(self._ends, self._pulls(m, d, q, v), strict=True):
             for sign, body, (joint, point) in zip((1, -1), (spring.body_a, spring.body_b), ends, strict=True):
-                force = sign * d.oMi[joint].rotation.T @ pull
+                force = sign * d.oMi[joint].rotation.T @ on_first
                 out.append((body, pin.Force(force, pin.skew(point) @ force)))
         return out
 
@@ -164,16 +165,7 @@ class PointSprings:
         for spring, (i, a), (j, b) in self._ends:
             gap = d.oMi[j].act(b) - d.oMi[i].act(a)
             J = self._point_jacobian(m, d, j, b) - self._point_jacobian(m, d, i, a)
-            length = float(np.linalg.norm(gap))
-            # k (l - l0) / l written so that l0 = 0 needs no direction at l = 0. Where one is needed and there is none,
-            # the answer is NaN, which the caller finds.
-            pull = spring.stiffness * gap
-            with np.errstate(invalid="ignore", divide="ignore"):
-                if spring.stiffness and spring.rest_length:
-                    pull = pull - spring.stiffness * spring.rest_length * (gap / length)
-                if spring.damping:
-                    pull = pull + spring.damping * (gap / length) * float(gap @ (J @ v)) / np.float64(length)
-            yield J, pull
+            yield J, pull(spring, gap, J @ v)
 
     @staticmethod
     def _point_jacobian(m: Any, d: Any, joint: int, point: Array) -> Array:
@@ -183,61 +175,3 @@ class PointSprings:
         J = pin.getJointJacobian(m, d, joint, pin.LOCAL).reshape(6, m.nv)
         R = d.oMi[joint].rotation
         return np.asarray(R @ (J[:3] - pin.skew(point) @ J[3:]))
-
-
-# Springs and dampers at joints and between them, which Pinocchio's algorithms leave out.
-
-
-class JointPassive:
-    """Springs and dampers at the joints, and joint couplings; entry i is full coordinate q_order[i].
-
-    `armature` is the couplings' part of M, None without one. `stiffness_matrix` and `damping_matrix` are the
-    derivatives of the force by q and by v, with the other sign.
-    """
-
-    def __init__(self, model: Model, q_order: np.ndarray, v_order: np.ndarray) -> None:
-        layout = model.layout
-        lengths, rates = np.eye(layout.sizes[2]), np.eye(layout.sizes[3])
-        damping = np.zeros(layout.sizes[3])
-        # Each row is a length, linear in q, with its rate, stiffness, rest length, damping and armature.
-        rows: list[tuple[Any, ...]] = []
-        for joint in model.joints:
-            iq, iv = layout.full_q[joint.name], layout.full_v[joint.name]
-            damping[iv] = joint.damping
-            # A joint spring acts on one coordinate per velocity.
-            rows += [
-                (lengths[iq.start + k], rates[iv.start + k], joint.stiffness[k], joint.rest[k], 0.0, 0.0)
-                for k in range(joint.type.nv)
-                if joint.stiffness[k]
-            ]
-        for c in model.couplings:
-            rate = layout.coupling_row(c)
-            length = sum(
-                rate[layout.full_v[x].start] * lengths[layout.full_q[x].start] for x in dict.fromkeys(c.joints)
-            )
-            rows.append((length, rate, c.stiffness, c.rest_length, c.damping, c.armature))
-        self.damping = damping[v_order]
-        self._against = -self.damping
-        self._lengths, rates = (
-            np.array([row[i] for row in rows]).reshape(len(rows), order.size)[:, order]
-            for i, order in enumerate((q_order, v_order))
-        )
-        self._stiffness, self._rest, dampers, armature = (np.array([row[i] for row in rows]) for i in range(2, 6))
-        self._pull = rates.T * self._stiffness
-        self.stiffness_matrix = self._pull @ rates
-        self.armature = (rates.T * armature) @ rates if armature.any() else None
-        self._coupled_damping = (rates.T * dampers) @ rates if dampers.any() else None
-        self.damping_matrix = np.diag(self.damping) + (rates.T * dampers) @ rates
-
-    def force(self, q: Array, v: Array) -> Array:
-        """Return the generalized force."""
-        out: Array = self._against * v
-        if self._rest.size:
-            out -= self._pull @ (self._lengths @ q - self._rest)
-        if self._coupled_damping is not None:
-            out -= self._coupled_damping @ v
-        return out
-
-    def energy(self, q: Array) -> float:
-        """Return the energy stored in the springs."""
-        return float(0.5 * np.sum(self._stiffness * (self._lengths @ q - self._rest) ** 2))

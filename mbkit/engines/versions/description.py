@@ -12,8 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mbkit._check import Array
-from mbkit.engines.base import STACKS, first_names
+from mbkit.engines.base import STACKS
 from mbkit.errors import UnsupportedError
 from mbkit.model import Joint, Model
 from mbkit.model.validation import static_bodies
@@ -73,10 +72,6 @@ def travelling(engine: str, model: Model) -> tuple[dict[str, Any], dict[str, Seq
     """
     if engine not in _STEPS:
         return _mjcf(model)
-    for what, parts in (("springs between points", model.springs), ("couplings", model.couplings)):
-        if parts:
-            names = first_names(repr(x.name) for x in parts)
-            raise UnsupportedError(f"{engine} of other versions: {model.name} has {what} ({names}), which are not sent")
     static, steps = static_bodies(model.joints), _STEPS[engine]
     for joint in model.joints:
         if joint.kind not in steps:
@@ -160,23 +155,3 @@ def places(engine: str, model: Model, names: Mapping[str, Sequence[str]], joints
         q_index[at_q] = layout.full_q[joint.name].start + np.array(order_q, int)
         v_index[at_v] = layout.full_v[joint.name].start + np.array(order_v, int)
     return Places(q_index, v_index, tuple(turning))
-
-
-def joint_passive(model: Model, q: Array, v: Array) -> Array:
-    """Return the force of springs and dampers at joints, (nv,), for engines whose algorithms leave it out."""
-    layout = model.layout
-    full_q, out = layout.expand_q(q), np.zeros(layout.sizes[3])
-    for joint in layout.joints:
-        at_q, at_v = layout.full_q[joint.name], layout.full_v[joint.name]
-        out[at_v] = -joint.damping * layout.expand_v(v)[at_v]
-        if joint.stiffness.any():
-            out[at_v] -= joint.stiffness * (full_q[at_q] - joint.rest)
-    return np.asarray(layout.G.T @ out)
-
-
-def spring_energy(model: Model, q: Array) -> float:
-    """Return the energy of the springs at joints, J."""
-    layout = model.layout
-    full_q = layout.expand_q(q)
-    sprung = [j for j in layout.joints if j.stiffness.any()]
-    return 0.5 * sum(float(j.stiffness @ (full_q[layout.full_q[j.name]] - j.rest) ** 2) for j in sprung)

@@ -10,8 +10,9 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.base import MappedDynamics, require_no_forces
-from mbkit.engines.frames_and_momenta import seen_from
-from mbkit.engines.versions.description import CONVENTIONS, joint_passive, places, spring_energy, travelling
+from mbkit.engines.elements.passive import JointPassive, pull
+from mbkit.engines.frames_and_momenta import ALIGNED, seen_from
+from mbkit.engines.versions.description import CONVENTIONS, places, travelling
 from mbkit.engines.versions.engine_version import EngineVersion
 from mbkit.engines.versions.process import RemoteError, new_key, process_of
 from mbkit.errors import NumericalError, UnsupportedError
@@ -35,9 +36,9 @@ class VersionDynamics(MappedDynamics):
 
     Notes
     -----
-    A call takes some 0.2 ms more than the engine: the state goes to another process and the value comes back. Springs
-    and dampers at the joints are mbkit's own where the engine's algorithms know none (Pinocchio) and where they are not
-    sent (Drake); MuJoCo's are its own.
+    A call takes some 0.2 ms more than the engine: the state goes to another process and the value comes back. Springs,
+    dampers and couplings are mbkit's own, from the engine's poses and Jacobians, where the engine's algorithms know
+    none (Pinocchio) and where they are not sent (Drake); MuJoCo's are its own.
     """
 
     def __init__(self, model: Model, version: EngineVersion) -> None:
@@ -48,7 +49,16 @@ class VersionDynamics(MappedDynamics):
         weakref.finalize(self, self._process.unneeded.append, self._key)
         self._build()
         gives = self._call("about")[0]["gives"]
-        self._own_passive = "passive" in gives
+        layout = self.model.layout
+        orders = (np.arange(n) for n in layout.sizes[2:])
+        #: What the engine does not know of.
+        self._beside = None if "passive" in gives else JointPassive(self.model, *orders)
+        rotors = None if self._beside is None else self._beside.armature
+        self._rotors = None if rotors is None else layout.G.T @ rotors @ layout.G
+        self._ends = {
+            s: tuple(Frame(s.name, b, np.eye(3), p) for b, p in ((s.body_a, s.point_a), (s.body_b, s.point_b)))
+            for s in self.model.springs
+        }
         #: Whether the engine has an integrator of its own.
         self.runs = "rollout" in gives
         vars(self)["refuses"] = {x: why for x, why in _REFUSED.items() if x not in gives}
@@ -110,7 +120,8 @@ class VersionDynamics(MappedDynamics):
 
     def _mass_matrix(self, q: Array) -> Array:
         x, _, _ = self._native(q)
-        return self._columns(self._columns(self._ask("mass_matrix", x)[0]).T)
+        own = self._columns(self._columns(self._ask("mass_matrix", x)[0]).T)
+        return own if self._rotors is None else own + self._rotors
 
     def _coriolis_matrix(self, q: Array, v: Array) -> Array:
         x, u, _ = self._native(q, v)
@@ -132,33 +143,50 @@ class VersionDynamics(MappedDynamics):
         return self._force(self._ask("gravity", self._native(q)[0])[0])
 
     def _passive(self, q: Array, v: Array) -> Array:
-        if not self._own_passive:
-            return joint_passive(self.model, q, v)
+        if self._beside is not None:
+            return self._passive_beside(q, v)
         x, u, _ = self._native(q, v)
         return self._force(self._ask("passive", x, u)[0])
 
-    def _beside(self, q: Array, v: Array) -> Array | float:
+    def _passive_beside(self, q: Array, v: Array) -> Array:
         """Return the passive force that the engine does not know of."""
-        return 0.0 if self._own_passive else joint_passive(self.model, q, v)
+        if self._beside is None:
+            return np.zeros(self.model.nv)
+        layout = self.model.layout
+        out = np.asarray(layout.G.T @ self._beside.force(layout.expand_q(q), layout.expand_v(v)))
+        for spring, ends in self._ends.items():
+            a, b = self._jacobian(q, ends, ALIGNED)[:, :3]
+            out -= (b - a).T @ pull(spring, self._gap(q, ends), (b - a) @ v)
+        return out
+
+    def _gap(self, q: Array, ends: tuple[Frame, ...]) -> Array:
+        a, b = (self._placement(q, end)[1] for end in ends)
+        return b - a
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         x, u, b = self._native(q, v)
         out = self._force(self._ask("inverse_dynamics", x, u, self._to_engine(a) + b)[0])
-        return np.asarray(out - self._beside(q, v))
+        rotors = 0.0 if self._rotors is None else self._rotors @ a
+        return np.asarray(out + rotors - self._passive_beside(q, v))
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        if self.model.layout.reduced:
+        if self.model.layout.reduced or self._rotors is not None:
             rest = self._inverse_dynamics(q, v, np.zeros(self.model.nv))
             return np.asarray(np.linalg.solve(self._mass_matrix(q), tau - rest))
-        x, u, b = self._native(q, v)
-        return self._force(self._ask("forward_dynamics", x, u, self._to_engine(tau + self._beside(q, v)))[0] - b)
+        tau, (x, u, b) = tau + self._passive_beside(q, v), self._native(q, v)
+        return self._force(self._ask("forward_dynamics", x, u, self._to_engine(tau))[0] - b)
 
     def _kinetic_energy(self, q: Array, v: Array) -> Any:
-        return self._ask("kinetic_energy", *self._native(q, v)[:2])[0]
+        own = self._ask("kinetic_energy", *self._native(q, v)[:2])[0]
+        return own if self._rotors is None else own + 0.5 * v @ self._rotors @ v
 
     def _potential_energy(self, q: Array) -> Any:
         own = self._ask("potential_energy", self._native(q)[0])[0]
-        return own if self._own_passive else own + spring_energy(self.model, q)
+        if self._beside is None:
+            return own
+        lengths = ((s, np.linalg.norm(self._gap(q, ends))) for s, ends in self._ends.items())
+        between = sum(0.5 * s.stiffness * (length - s.rest_length) ** 2 for s, length in lengths)
+        return own + self._beside.energy(self.model.layout.expand_q(q)) + between
 
     def _of_frame(self, q: Array, frame: Frame) -> tuple[Array, Array, Array, Array]:
         """Return R_WF and p_WF, and the Jacobians of the origin and of turning in world axes."""
