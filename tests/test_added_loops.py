@@ -134,7 +134,7 @@ def test_loops_of_an_mjcf_stay_beside_those_that_are_added(tmp_path: Path) -> No
         (
             [{"name": "pin", "kind": "pointt"}],
             InputError,
-            r"unknown kind 'pointt'.*'point', 'frame'.*body_a, body_b miss",
+            r"unknown kind 'pointt'.*'frame'.*body_a, body_b missing",
         ),
         ([3], InputError, r"loops\[0\]: expected a Loop or a dict"),
         (3, InputError, "loops: expected True, False"),
