@@ -131,6 +131,11 @@ def test_loops_of_an_mjcf_stay_beside_those_that_are_added(tmp_path: Path) -> No
         ([PIN | {"rotation_b": np.ones((3, 3))}], ModelError, "rotation_b is not a rotation matrix"),
         ([PIN | {"body_c": "x"}], InputError, r"loops\[0\]: unknown argument 'body_c'"),
         ([{"name": "pin"}], InputError, r"loops\[0\]: kind, body_a, body_b missing"),
+        (
+            [{"name": "pin", "kind": "pointt"}],
+            InputError,
+            r"unknown kind 'pointt'.*'frame'.*body_a, body_b missing",
+        ),
         ([3], InputError, r"loops\[0\]: expected a Loop or a dict"),
         (3, InputError, "loops: expected True, False"),
         ("no.toml", LoadError, r"no\.toml: No such file"),

@@ -467,6 +467,10 @@ t_, q_, v_, x_ = (ca.SX.sym(n) for n in ("t", "q", "v", "stray"))
         (lambda b: b.add_joint_force("f", "elbow", -q_, parameters={"q": 1.0}), ["symbol 'q' stands for", "rename"]),
         (lambda b: b.add_joint_force("f", "elbow", ca.MX.sym("q")), ["expected a casadi.SX, got an MX"]),
         (lambda b: b.add_joint_force("f", "elbow", lambda _t, q, _v: math.sin(q)), ["the function raised", "torque="]),
+        (
+            lambda b: b.add_joint_force("f", "elbow", lambda _t, q, _v: np.interp(q, [0.0, 1.0], [0.0, 2.0])),
+            ["calls numpy.interp, which takes numbers alone", "casadi.pw_lin", "torque="],
+        ),
         (lambda b: b.add_joint_force("f", "elbow", lambda _t, q, _v: 1.0 if q > 0 else 2.0), ["the function raised"]),
         (lambda b: b.add_joint_force("f", "elbow", sp.gamma(sp.Symbol("q"))), ["gamma"]),
         (lambda b: b.add_joint_force("f", "elbow", math.nan), ["finite"]),

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
 from typing import Any, Final, Literal
@@ -25,8 +26,8 @@ ENDS: Final[tuple[Ends, ...]] = ("natural", "clamped", "quintic")
 _KNOWN: Final = "a number, a Parameter, a casadi.SX, a SymPy expression, or a function of symbols that returns such"
 
 _INSTEAD: Final = (
-    "write it with arithmetic and NumPy's functions, and casadi.if_else for decisions; a function that needs numbers "
-    "is an argument of mbkit.simulate: torque= or wrenches="
+    "write it with arithmetic and NumPy's functions, casadi.if_else for decisions and casadi.pw_lin for tables; "
+    "a function that needs numbers is an argument of mbkit.simulate: torque= or wrenches="
 )
 
 
@@ -113,10 +114,19 @@ def _called(value: Any, given: Sequence[str | Sequence[str]]) -> Any:
     except MbkitError:
         raise
     except Exception as error:
-        text = str(error).strip().splitlines()
-        raise InputError(
-            f"the function raised {type(error).__name__} for CasADi's symbols: {text[0] if text else ''}; {_INSTEAD}"
-        ) from error
+        raise InputError(f"the function {_failure(error)}; {_INSTEAD}") from error
+
+
+def _failure(error: Exception) -> str:
+    """Return what a function did to CasADi's symbols."""
+    if isinstance(error, RecursionError):
+        # A function of NumPy that CasADi does not have goes from one to the other until the stack ends.
+        for frame, _ in traceback.walk_tb(error.__traceback__):
+            if frame.f_code.co_name == "__array_function__" and callable(func := frame.f_locals.get("func")):
+                name = f"{func.__module__}.{func.__name__}"
+                return f"calls {name}, which takes numbers alone, so that no expression comes of it"
+    text = str(error).strip().splitlines()
+    return f"raised {type(error).__name__} for CasADi's symbols: {text[0] if text else ''}"
 
 
 def _entries(value: Any) -> list[Any]:

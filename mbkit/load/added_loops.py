@@ -16,6 +16,7 @@ from mbkit._check import shown
 from mbkit.errors import InputError, LoadError, ModelError, nearest
 from mbkit.model import Frame, Model, ModelBuilder
 from mbkit.model.builder import with_loops
+from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop
 
 #: What `loads(..., loops=)` takes beside True and False.
@@ -91,7 +92,11 @@ def _arguments(one: Any, what: str) -> dict[str, Any]:
             near = nearest(name, _PARAMETERS) if isinstance(name, str) else []
             raise InputError(f"{what}: unknown argument {shown(name)}; add_loop takes {', '.join(near or _PARAMETERS)}")
     if missing := [name for name, needed in _PARAMETERS.items() if needed and name not in one]:
-        raise InputError(f"{what}: {', '.join(missing)} missing")
+        kind, absent = one.get("kind"), f"{', '.join(missing)} missing"
+        if "kind" in one and not (isinstance(kind, str) and kind in LOOP_KINDS):
+            there = ", ".join(map(repr, LOOP_KINDS))
+            raise InputError(f"{what}: unknown kind {shown(kind)}; there are {there}; and {absent}")
+        raise InputError(f"{what}: {absent}")
     return dict(one)
 
 

@@ -93,7 +93,7 @@ class Model(Description):
         -------
         q : (nq,) or (size, nq) array
             Uniform within the limits, clipped to ±π rad; ±1 m where a length has none; uniform rotations. Under
-            constraints the nearest consistent state, and not a singular pose.
+            constraints the nearest consistent state, also beyond the limits, and not a singular pose.
         v : (nv,) or (size, nv) array
             Standard normal.
         """

@@ -109,7 +109,8 @@ class LoopLoads(Actuation, Loads):
     ) -> Array:
         """Return the loads of joints of a mechanism whose motion is that of a force."""
         self.model.require_bodies("joint_wrenches")
-        if tau is None:
+        # Contacts without slip are refused below, with a force or without.
+        if tau is None and not self.model.no_slip:
             raise InputError(
                 f"tau: expected the force under which {self.model.name} moves, got none: a motion (q, v, a) does not "
                 "tell the forces in its loops; give joint_wrenches(..., tau=tau)"

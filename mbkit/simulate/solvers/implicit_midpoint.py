@@ -67,8 +67,8 @@ def midpoint_of(dyn: LagrangianDynamics) -> Midpoint:
     """Return the parts of a step of these dynamics; `UnsupportedError` for rows that hold velocities alone."""
     if dyn.model.no_slip:
         raise UnsupportedError(
-            f"{dyn.model.name} has contacts without slip, {dyn.model.no_slip[0].name!r} first, whose motion "
-            f"keeps no symplectic form; {IMPLICIT_METHODS} are the implicit methods for it"
+            f"implicit_midpoint: {dyn.model.name} has contacts without slip, {dyn.model.no_slip[0].name!r} first, "
+            f"whose motion keeps no symplectic form; {IMPLICIT_METHODS} are the implicit methods for it"
         )
     return (ConstrainedMidpoint if dyn.model.constrained else Midpoint)(dyn.equations)
 

@@ -51,6 +51,8 @@ _MAX_WITHOUT_GAIN: Final = 2
 _FINER: Final = 1.2
 #: Larger errors may still fall again, as those of steps that are too large do.
 _CONVERGED: Final = 1e-6
+#: Errors that differ by less than this part are one: that of an engine's own law, such as soft loops, at any step.
+_SETTLED: Final = 0.01
 #: Parts of the time allowed until which compilation may begin, and until which every setting has run once.
 _COMPILED: Final = 0.5
 _EXPLORED: Final = 0.65
@@ -328,8 +330,9 @@ class CurveMeasurement:
                 counted.append(one)
         errors = [one.error for one in counted]
         least = min(filter(math.isfinite, errors[:-_MAX_WITHOUT_GAIN]), default=math.inf)
+        last = errors[-_MAX_WITHOUT_GAIN - 1 :]
         if least > _CONVERGED:
-            return False
+            return len(last) > _MAX_WITHOUT_GAIN and max(last) - min(last) < _SETTLED * min(last)
         return all(not e < max(0.5 * least, floor) or e <= floor for e in errors[-_MAX_WITHOUT_GAIN:])
 
     def give_up(self, reason: str) -> None:
