@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import mbkit as mb
 from mbkit.errors import ModelError
 from mbkit.studies.explain.merged_model import Tolerances
 from mbkit.studies.importers import study
-from mbkit.studies.importers.loops import Closure, WrittenLoops, difference, loop_differences
+from mbkit.studies.importers.loops import Closure, WrittenLoops, coupler_differences, difference, loop_differences
 from mbkit.studies.importers.result import ParserComparison, Stage
 
 BODY = '<inertial pos=".2 0 0" mass="1" diaginertia=".1 .1 .1"/>'
@@ -179,3 +180,51 @@ def test_loops_are_paired_with_the_nearest_and_the_rest_is_named() -> None:
         "inactive, read as active",
         "not in the file",
     ]
+
+
+COUPLED = '<joint name="c" joint1="jb" joint2="ja" polycoef="0.1 {0} 0 0 0" {1}/>'
+
+
+def couplers(result: ParserComparison) -> dict[str, Stage]:
+    return {p.engine: next(s for s in p.stages if s.name == "couplers") for p in result.importers}
+
+
+def test_couplers_of_joints_are_compared(tmp_path: Path) -> None:
+    """MuJoCo reads them, the other two lose them in silence."""
+    result = compared(tmp_path, "0 0 0", "", COUPLED.format("-0.5", ""))
+    found = couplers(result)
+    assert found["mujoco"].same is True
+    for engine in ("pinocchio", "drake"):
+        assert found[engine].same is False
+        assert "'c' (of 'ja' and 'jb'): missing" in found[engine].says
+        assert "missing" in result.to_markdown()
+
+
+def test_a_coupler_that_is_switched_off_is_none(tmp_path: Path) -> None:
+    found = couplers(compared(tmp_path, "0 0 0", "", COUPLED.format("-0.5", 'active="false"')))
+    assert all(stage.same is True for stage in found.values())
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_coupler_s_numbers_are_those_of_either_of_its_joints(swapped: bool) -> None:
+    written = mb.model.Coupler("c", "a", "b", -0.5, 0.1)
+    read = mb.model.Coupler("", "y", "x", -2.0, 0.2) if swapped else mb.model.Coupler("", "x", "y", -0.5, 0.1)
+    names = {"x": "a", "y": "b"}
+    loops = WrittenLoops(couplers=[written], every_coupler=[written])
+    assert coupler_differences(loops, [read], names, 1e-12) == []
+    for change in ({"ratio": read.ratio * (1 + 1e-6)}, {"offset": read.offset + 1e-6}):
+        ((size, where, says),) = coupler_differences(loops, [replace(read, **change)], names, 1e-9)
+        assert 1e-7 < size < 1e-5
+        assert where == "'c' (of 'a' and 'b')"
+        assert "ratio" in says
+    ((_, _, says),) = coupler_differences(loops, [read, read], names, 1e-9)
+    assert says == "not in the file"
+    off = WrittenLoops(every_coupler=[written])
+    ((_, _, says),) = coupler_differences(off, [read], names, 1e-9)
+    assert says == "inactive, read as active"
+
+
+def test_mujoco_s_polynomial_is_of_the_coordinates_less_those_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "m.xml"
+    path.write_text(CHAIN.format("0 0 0", "", COUPLED.format("2", "")).replace('name="ja"', 'name="ja" ref="30"'))
+    assert couplers(mb.compare_parsers(path))["mujoco"].same is True

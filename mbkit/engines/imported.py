@@ -16,7 +16,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.errors import UnsupportedError
 from mbkit.load.xml_reader import unused as unused
-from mbkit.model import Body, Joint, Loop, Model
+from mbkit.model import Body, Coupler, Joint, Loop, Model
 from mbkit.model.joint_types import kind_of
 
 
@@ -75,6 +75,8 @@ class Imported:
     #: Points and frames of its bodies that the importer holds together, outside of all terms; where the engine does
     #: not give them, why.
     loops: tuple[Loop, ...] | str = ()
+    #: Fixed ratios of two coordinates that it holds, outside of all terms.
+    couplers: tuple[Coupler, ...] = ()
 
 
 def joint_of(

@@ -23,7 +23,7 @@ from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings, mapped,
 from mbkit.errors import UnsupportedError
 from mbkit.load.mjcf_couplings import with_couplings
 from mbkit.load.urdf_reader import BASE_JOINT
-from mbkit.model import JointCoupling, Loop, Model, PointSpring
+from mbkit.model import Coupler, JointCoupling, Loop, Model, PointSpring
 from mbkit.model.joint_types import kind_of
 
 _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
@@ -54,7 +54,7 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     dyn = _Read.of(checked("mujoco", described.model), m, described.numbers, {x.key: y for x, y in extras})
     notes = (*_constraints(m), *(" ".join(w.split()) for w in heard))
     beside = tuple(x._replace(without=described.without(x.key)) if x.key in described.parts else x for x, _ in extras)
-    return Imported(described.model, dyn.terms, notes, beside, described.loops())
+    return Imported(described.model, dyn.terms, notes, beside, described.loops(), described.couplers())
 
 
 def _floating(text: str) -> Any:
@@ -221,12 +221,10 @@ class _Description:
     def loops(self) -> tuple[Loop, ...]:
         """Return the active equalities of two bodies or sites, in the bodies' axes."""
         m, kinds = self.m, {int(mujoco.mjtEq.mjEQ_CONNECT): "point", int(mujoco.mjtEq.mjEQ_WELD): "frame"}
-        if self._off("EQUALITY") or self._off("CONSTRAINT"):
-            return ()
         out = []
-        for i in range(m.neq):
+        for i in self._equalities():
             kind = kinds.get(int(m.eq_type[i]))
-            if kind is None or not m.eq_active0[i]:
+            if kind is None:
                 continue
             objects, data, still = (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])), np.array(m.eq_data[i]), np.eye(3)
             if m.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:
@@ -239,6 +237,25 @@ class _Description:
             a, b = ((self.names[k], R, p - self.anchors[k]) for k, R, p in ends)
             out.append(Loop(m.eq(i).name, kind, *a, *b))
         return tuple(out)
+
+    def couplers(self) -> tuple[Coupler, ...]:
+        """Return the active equalities of two joints whose polynomial is linear."""
+        m, out = self.m, []
+        names = {j: name for name, j in self.numbers.items()}
+        for i in self._equalities():
+            if m.eq_type[i] != mujoco.mjtEq.mjEQ_JOINT or m.eq_obj2id[i] < 0 or np.any(m.eq_data[i][2:5]):
+                continue
+            joint, leader = int(m.eq_obj1id[i]), int(m.eq_obj2id[i])
+            constant, ratio = (float(x) for x in m.eq_data[i][:2])
+            # The polynomial is of the coordinates less those of the pose of the file.
+            start, other = (float(m.qpos0[m.jnt_qposadr[j]]) for j in (joint, leader))
+            out.append(Coupler(m.eq(i).name, names[joint], names[leader], ratio, start + constant - ratio * other))
+        return tuple(out)
+
+    def _equalities(self) -> list[int]:
+        if self._off("EQUALITY") or self._off("CONSTRAINT"):
+            return []
+        return [i for i in range(self.m.neq) if self.m.eq_active0[i]]
 
     def _off(self, flag: str) -> bool:
         return bool(self.m.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")))

@@ -1,4 +1,4 @@
-"""Loops that an importer reads out of a file, against those of the file, end by end.
+"""Loops and couplers that an importer reads out of a file, against those of the file, end by end.
 
 Bodies have other frames, names and fused parts in every importer. Ends are therefore compared by the joint that carries
 them, and by their poses in the world where all coordinates are zero.
@@ -14,7 +14,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.load.xml_reader import Element
-from mbkit.model import Loop, Model
+from mbkit.model import Coupler, Loop, Model
 from mbkit.studies.explain.hypotheses import angle_of
 from mbkit.studies.explain.merged_model import Tolerances
 
@@ -49,13 +49,15 @@ class Closure:
 
 
 class WrittenLoops(NamedTuple):
-    """The loops that importers are compared with."""
+    """The loops and couplers that importers are compared with."""
 
     active: Sequence[Closure] = ()
     #: With those that the file has switched off.
     every: Sequence[Closure] = ()
     #: Why they are unknown; empty where they are known.
     faults: str = ""
+    couplers: Sequence[Coupler] = ()
+    every_coupler: Sequence[Coupler] = ()
 
 
 def closures(model: Model, loops: Sequence[Loop], names: Mapping[str, str] | None = None) -> list[Closure]:
@@ -111,6 +113,46 @@ def loop_differences(written: WrittenLoops, read: Sequence[Closure], near: Toler
     wrong, _ = _paired(inactive, left)
     out += [(1.0, a.says(), "inactive, read as active") for a, _ in wrong]
     return out + [(1.0, b.says(), "not in the file") for b in left]
+
+
+def coupler_differences(
+    written: WrittenLoops, read: Sequence[Coupler], names: Mapping[str, str], tolerance: float
+) -> list[tuple[float, str, str]]:
+    """Return the same of couplers; `names` has the file's joint for each of the importer's."""
+    out: list[tuple[float, str, str]] = []
+    left = [_ordered(replace(x, joint=names.get(x.joint, ""), leader=names.get(x.leader, ""))) for x in read]
+    inactive = list(map(_ordered, written.every_coupler))
+    for a in map(_ordered, written.couplers):
+        for some in (left, inactive):
+            near = [(abs(a.ratio - b.ratio) + abs(a.offset - b.offset), k) for k, b in enumerate(some) if _key(a, b)]
+            if not near:
+                if some is left:
+                    out.append((1.0, _says(a), "missing"))
+                continue
+            far, k = min(near)
+            b = some.pop(k)
+            if some is left and far > tolerance * max(1.0, abs(a.ratio) + abs(a.offset)):
+                says = f"ratio {b.ratio:.6g} and offset {b.offset:.6g} for {a.ratio:.6g} and {a.offset:.6g}"
+                out.append((far, _says(a), says))
+    for b in left:
+        off = any(_key(a, b) for a in inactive)
+        out.append((1.0, _says(b), "inactive, read as active" if off else "not in the file"))
+    return out
+
+
+def _ordered(x: Coupler) -> Coupler:
+    """Return a coupler with its joints in the order of their names, which its equation has either way."""
+    if x.joint <= x.leader or not x.ratio:
+        return x
+    return replace(x, joint=x.leader, leader=x.joint, ratio=1 / x.ratio, offset=-x.offset / x.ratio)
+
+
+def _key(a: Coupler, b: Coupler) -> bool:
+    return (a.joint, a.leader) == (b.joint, b.leader)
+
+
+def _says(x: Coupler) -> str:
+    return f"{repr(x.name) if x.name else 'a coupler'} (of {x.joint!r} and {x.leader!r})"
 
 
 def _paired(some: Sequence[Closure], left: list[Closure]) -> tuple[list[tuple[Closure, Closure]], list[Closure]]:

@@ -7,7 +7,7 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import metadata
 from operator import itemgetter
@@ -24,7 +24,7 @@ from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_reader import urdf_links
-from mbkit.model import Loop, Model
+from mbkit.model import Coupler, Loop, Model
 from mbkit.studies import results
 from mbkit.studies.explain.hypotheses import angle_of, number_text
 from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_sets, rename_joints
@@ -32,7 +32,7 @@ from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of, velocity_joints
-from mbkit.studies.importers.loops import WrittenLoops, activated, closures, loop_differences
+from mbkit.studies.importers.loops import WrittenLoops, activated, closures, coupler_differences, loop_differences
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import WALL_PER_CPU, Worker, WorkerDiedError, WorkerStartError, WorkerTimeoutError, describe
@@ -117,12 +117,12 @@ class Reading:
 
 def _read(
     module: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes]
-) -> tuple[Model, tuple[str, ...], tuple[Beside, ...], tuple[Loop, ...] | str]:
+) -> tuple[Model, tuple[str, ...], tuple[Beside, ...], tuple[Loop, ...] | str, tuple[Coupler, ...]]:
     global _held
     # The file before can be as large.
     _held = None
     _held = reader(module)(text, format_, floating_base, files)
-    return _held.model, _held.notes, _held.beside, _held.loops
+    return _held.model, _held.notes, _held.beside, _held.loops, _held.couplers
 
 
 def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
@@ -150,7 +150,7 @@ def stages(
         if name == "total mass":
             out.append(_missing("mimic", mimics, "left free"))
         out.append(_worst(name, some))
-    out.append(_loop_stage(loops, imported, {m.b: m.a for m in matching.pairs}, near))
+    out += _loop_stages(loops, imported, {m.b: m.a for m in matching.pairs}, near, tolerance)
     apart = Gaps(comparable=False)
     if not structural:
         at = states_of(one.model, samples, seed)
@@ -175,13 +175,23 @@ def _worst(name: str, some: list[tuple[float, str, str]]) -> Stage:
     return Stage(name, not some, size, where, f"{where}: {says}{more}" if some else "")
 
 
-def _loop_stage(loops: WrittenLoops, imported: Imported, names: Mapping[str, str], near: Tolerances) -> Stage:
+def _loop_stages(
+    loops: WrittenLoops, imported: Imported, names: Mapping[str, str], near: Tolerances, tolerance: float
+) -> Iterator[Stage]:
     """Compare an importer's loops with the file's; `names` has the file's joint for each of the importer's."""
-    if loops.faults or isinstance(imported.loops, str):
-        return Stage("loops", None, math.nan, "", loops.faults or str(imported.loops))
-    some = loop_differences(loops, closures(imported.model, imported.loops, names), near)
-    every = "; ".join(f"{where}: {says}" for _, where, says in some)
-    return replace(_worst("loops", some), says=every)
+    unknown = loops.faults or (imported.loops if isinstance(imported.loops, str) else "")
+    if unknown or isinstance(imported.loops, str):
+        yield Stage("loops", None, math.nan, "", unknown)
+    else:
+        yield _every("loops", loop_differences(loops, closures(imported.model, imported.loops, names), near))
+    if loops.faults:
+        yield Stage("couplers", None, math.nan, "", loops.faults)
+    else:
+        yield _every("couplers", coupler_differences(loops, imported.couplers, names, tolerance))
+
+
+def _every(name: str, some: list[tuple[float, str, str]]) -> Stage:
+    return replace(_worst(name, some), says="; ".join(f"{where}: {says}" for _, where, says in some))
 
 
 def _missing(name: str, missing: list[str], what: str) -> Stage:
@@ -320,12 +330,12 @@ def compare_parsers(
     ends: a crash or an endless loop there is reported like any other refusal.
 
     The readings are compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses, centres of
-    mass, inertias, armature, damping, friction, limits, the loops of an MJCF, and M, g, nle and passive by joint name,
-    by the engine itself on its own model, with all that it holds beside bodies and joints: flags, tendons, actuators at
-    zero control, fluid, gravity compensation. Links that an importer fuses are fused on the other side too. Why one
-    differs is in its ``explanation``. Loops are in no term, and decide nothing. Where mbkit does not read the file, an
-    MJCF is compared with MuJoCo's own reading, and any other file with nothing: the importers that read it are only
-    listed.
+    mass, inertias, armature, damping, friction, limits, the loops and couplers of an MJCF, and M, g, nle and passive by
+    joint name, by the engine itself on its own model, with all that it holds beside bodies and joints: flags, tendons,
+    actuators at zero control, fluid, gravity compensation. Links that an importer fuses are fused on the other side
+    too. Why one differs is in its ``explanation``. Loops and couplers are in no term, and decide nothing. Where mbkit
+    does not read the file, an MJCF is compared with MuJoCo's own reading, and any other file with nothing: the
+    importers that read it are only listed.
 
     Parameters
     ----------
@@ -492,7 +502,7 @@ def _written_loops(stripped: Stripped, reference: Model | Imported | None, float
     if isinstance(reference, Imported):
         if isinstance(reference.loops, str):
             return WrittenLoops(faults=reference.loops)
-        return WrittenLoops(closures(reference.model, reference.loops))
+        return WrittenLoops(closures(reference.model, reference.loops), couplers=reference.couplers)
     if reference is None or stripped.format == "urdf":
         return WrittenLoops()
     try:
@@ -502,7 +512,8 @@ def _written_loops(stripped: Stripped, reference: Model | Imported | None, float
         )
     except MbkitError as error:
         return WrittenLoops(faults=f"mbkit does not read the loops: {error}")
-    return WrittenLoops(closures(active, active.loops), closures(every, every.loops))
+    some = closures(active, active.loops), closures(every, every.loops)
+    return WrittenLoops(*some, couplers=active.couplers, every_coupler=every.couplers)
 
 
 def _notes(stripped: Stripped) -> list[str]:
