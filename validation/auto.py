@@ -1,4 +1,4 @@
-"""Method auto beside the best method found by hand, on every stiff case.
+"""Method auto beside the best single method, on every stiff case.
 
 Run ``python -m validation.auto``; it takes about five minutes on two cores and writes validation/auto.json. The
 cases are those of `mbkit.studies.stress`, at hard values, with the closed forms they bring along; where there is none,
@@ -178,7 +178,7 @@ def ahead(method, error, settings):
 
 
 def measured(task, best):
-    """Return auto's error, choice and time, and the time of the best by hand, measured in turns."""
+    """Return auto's error, choice and time, and the time of the best single method, measured in turns."""
     task.warm("auto")
     try:
         run, first = task.run("auto", patience=12 * max(best["s"], 0.1) if best else PATIENCE[task.engine], rtol=RTOL)
@@ -221,7 +221,7 @@ def costs():
 def table(rows):
     """Return the rows in Markdown."""
     lines = [
-        "| case | value | engine | best by hand | ms | auto, ms | ratio | error of auto | auto's choice |",
+        "| case | value | engine | best fixed choice | ms | auto, ms | ratio | error of auto | auto's choice |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:

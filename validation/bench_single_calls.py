@@ -54,7 +54,7 @@ def calls(dyn, m, d, model, q, v, a):
     Q, V, A = model.layout.expand_q(q), model.layout.expand_v(v), model.layout.expand_v(a)
     D = np.concatenate([j.damping for j in model.joints])
     if D.any():
-        # The same number by hand: Pinocchio's rnea and aba know no damping.
+        # The same number in another way: Pinocchio's rnea and aba know no damping.
         inverse, forward = lambda: pin.rnea(m, d, Q, V, A) + D * V, lambda: pin.aba(m, d, Q, V, A - D * V)
     else:
         inverse, forward = lambda: pin.rnea(m, d, Q, V, A), lambda: pin.aba(m, d, Q, V, A)

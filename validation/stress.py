@@ -61,7 +61,7 @@ def _plain(b: Breaking) -> dict[str, Any]:
 def table(cases: Iterable[CaseResult], rows: list[Breaking]) -> list[str]:
     """Return a line of Markdown for each case in which something moves."""
     out = [
-        "| case | swept | `auto` holds to | best by hand | to | MuJoCo's own, best | to |",
+        "| case | swept | `auto` holds to | best fixed choice | to | MuJoCo's own, best | to |",
         "|---|---|---:|---|---:|---|---:|",
     ]
     for case in cases:
