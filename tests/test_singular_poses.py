@@ -258,3 +258,27 @@ def test_runs_with_massless_links_have_the_work_of_their_torque(method, setting,
     energy = (0.2 * 0.01 / 3 + 0.4 * by**2) * rate**2 / 2
     assert energy == pytest.approx(0.1 * theta, abs=close)
     assert theta > 1.0
+
+
+@pytest.mark.parametrize(
+    ("method", "setting"),
+    [
+        *((name, {"dt": 2e-3}) for name in ("rk4", "semi_implicit_euler", "implicit_midpoint", "gauss4")),
+        *((name, {"rtol": 1e-8, "save": [0.0, 0.45]}) for name in ("rk853", "rodas5", "auto")),
+    ],
+)
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_batch_tells_how_many_passed_a_pose_and_when_the_first_did(method, setting, compiled) -> None:
+    model = catalog.four_bars(n=1)
+    dyn = mb.dynamics(model, "lagrangian", compile=compiled)
+    q, v = dyn.project([1.0, -1.0, 1.0], [2.0, -2.0, 2.0])
+    # The first one moves away from the pose.
+    speeds = np.array([-0.5, 1.0, 0.8])
+    with pytest.warns(mb.errors.DoubtfulRunWarning) as told:
+        mb.simulate(dyn, q[None].repeat(3, axis=0), speeds[:, None] * v, 0.45, method, **setting)
+    (text,) = (str(x.message) for x in told)
+    with pytest.warns(mb.errors.DoubtfulRunWarning) as alone:
+        mb.simulate(dyn, q, v, 0.45, method, **setting)
+    (one,) = (str(x.message) for x in alone)
+    assert "2 of 3 trajectories passed singular poses; trajectory 1 passed a singular pose at t = 0.18" in text
+    assert text.endswith(one.partition("passed")[2])

@@ -9,6 +9,7 @@ vanish do so at a rate. At rest they do not, and no equation says which branch c
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -260,9 +261,13 @@ class SingularPoses:
         # Without vectors, which would cost far more.
         sizes = np.linalg.svd(J[finite], compute_uv=False)[:, -1]
         for at, size, slopes in zip(t[finite].tolist(), sizes.tolist(), J[finite], strict=True):
-            self._seen = [*self._seen[1 - _WINDOW :], (at, size, slopes)]
-            if len(self._seen) == _WINDOW:
-                self._decide()
+            self.take(at, size, slopes)
+
+    def take(self, t: float, size: float, slopes: Array) -> None:
+        """Take in the end of a step by J's smallest singular value and J."""
+        self._seen = [*self._seen[1 - _WINDOW :], (t, size, slopes)]
+        if len(self._seen) == _WINDOW:
+            self._decide()
 
     def _decide(self) -> None:
         (first, s0, _), (_, s1, _), (_, s2, _), (_, s3, _) = self._seen
@@ -291,6 +296,39 @@ class SingularPoses:
             f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
             f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the tolerance"
         )
+
+
+class SingularPosesOfBatch:
+    """The singular poses that trajectories pass which step together, by their numbers."""
+
+    def __init__(self, dyn: Dynamics, t: float, q: Array) -> None:
+        self._members = {i: SingularPoses(dyn.of_samples([i])) for i in range(len(q))}
+        for poses, start in zip(self._members.values(), q, strict=True):
+            poses.began(t, start)
+
+    def saw(self, dyn: Dynamics, t: float, q: Array, members: Iterable[int]) -> None:
+        """Take in the ends of the steps of these members, whose dynamics are `dyn`."""
+        from mbkit.engines.constraint_manifold import singular_values
+
+        J = manifold_at(dyn, t).jacobian(q)
+        for i, size, slopes in zip(members, singular_values(J)[..., -1].tolist(), J, strict=True):
+            if size == size:
+                self._members[int(i)].take(t, size, slopes)
+
+    def describe(self, batch: int | None) -> str:
+        """Return the poses in a sentence; empty where there are none."""
+        return describe_poses(self._members, batch)
+
+
+def describe_poses(members: Mapping[int, SingularPoses], batch: int | None) -> str:
+    """Return the poses that one trajectory, or some of a batch, passed in a sentence; empty where there are none."""
+    passed = {i: poses for i, poses in members.items() if poses.times}
+    if not passed:
+        return ""
+    first, poses = min(passed.items())
+    if batch is None:
+        return poses.describe()
+    return f"{len(passed)} of {batch} trajectories passed singular poses; trajectory {first} {poses.describe()}"
 
 
 def _bend(t: list[float], x: list[float]) -> float:

@@ -19,7 +19,7 @@ from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.singular_poses import SingularPoses
+from mbkit.simulate.singular_poses import SingularPosesOfBatch
 from mbkit.simulate.solvers.gauss import CollocationStep
 from mbkit.simulate.solvers.vector_field import ALL, DIVERGED, DivergenceError, Field, are_bounded
 from mbkit.simulate.time_grid import Indices
@@ -107,12 +107,14 @@ class Stepper:
 
 
 class _FieldStepper(Stepper):
-    """Steps of a method that only evaluates ẇ; it looks for singular poses of constraints on the way of one state."""
+    """Steps of a method that only evaluates ẇ; it looks for singular poses of constraints on the way."""
 
     def __init__(self, problem: IntegrationProblem) -> None:
-        self._poses = SingularPoses(problem.dyn) if problem.dyn.projects and problem.batch is None else None
-        if self._poses is not None:
-            self._poses.began(problem.start, problem.q0)
+        self._poses: SingularPosesOfBatch | None = None
+        if problem.dyn.projects:
+            self._poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
+        self._members: Indices = np.arange(len(problem.q))
+        self._batch = problem.batch
         self.space = Space(problem.dyn.model)
         self.field = Field(problem.dyn, self.space)
         self._step = make_step(problem.method, self.field, self.space)
@@ -121,12 +123,13 @@ class _FieldStepper(Stepper):
         return self._step(t, h, q, w, force)
 
     def only(self, members: Indices, good: NDArray[np.bool_] | None = None) -> None:  # noqa: ARG002
+        self._members = members
         self.field.only(members)
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         q, w = self.field.settled(t, q, w)
         if self._poses is not None:
-            self._poses.saw(t, q)
+            self._poses.saw(self.field.dyn, t, np.atleast_2d(q), self._members)
         return q, w
 
     def reason(self, q: Array, w: Array) -> str:
@@ -135,7 +138,7 @@ class _FieldStepper(Stepper):
     @property
     def doubts(self) -> tuple[str, ...]:
         """The singular poses on the way, in a sentence."""
-        return (self._poses.describe(),) if self._poses is not None and self._poses.times else ()
+        return (text,) if self._poses is not None and (text := self._poses.describe(self._batch)) else ()
 
     def to_body_velocity(self, q: Array, w: Array) -> Array:
         return np.asarray(self.space.to_body_velocity(q, w))

@@ -8,6 +8,7 @@ converges linearly, at the rate of the step times the torque's derivative.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final
 
@@ -26,6 +27,7 @@ from mbkit.methods.registry import IMPLICIT_METHODS
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
+from mbkit.simulate.singular_poses import SingularPoses, describe_poses
 from mbkit.simulate.solvers.fixed_step import GridRecord, SteppedRun, Stepper
 from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED
 from mbkit.simulate.time_grid import Indices
@@ -60,7 +62,20 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
         _to_velocities(dyn, midpoint, problem, record)
     # Each iteration is an evaluation, and so is the end of each step.
     evaluations = iterations + int(record.steps.sum())
-    return record.result(why, evaluations, iterations, error)
+    result = record.result(why, evaluations, iterations, error)
+    return replace(result, doubts=_poses(problem, record)) if dyn.projects else result
+
+
+def _poses(problem: IntegrationProblem, record: GridRecord) -> tuple[str, ...]:
+    """Return the singular poses on the way, in a sentence; none where steps are left out of what is kept."""
+    if len(record.kept) <= problem.grid.steps:
+        return ()
+    times, found = np.array([problem.grid.time(int(k)) for k in record.kept]), dict[int, SingularPoses]()
+    for i, last in enumerate(record.steps.tolist()):
+        found[i] = SingularPoses(problem.dyn.of_samples([i]))
+        found[i].saw_all(times[: last + 1], record.q[i, : last + 1])
+    text = describe_poses(found, problem.batch)
+    return (text,) if text else ()
 
 
 def midpoint_of(dyn: LagrangianDynamics) -> Midpoint:

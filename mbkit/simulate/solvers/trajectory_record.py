@@ -16,7 +16,7 @@ from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import Hit, State, Watch
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
-from mbkit.simulate.singular_poses import SingularPoses
+from mbkit.simulate.singular_poses import SingularPoses, describe_poses
 from mbkit.simulate.solvers.vector_field import DIVERGED, are_bounded
 from mbkit.simulate.time_grid import Indices
 
@@ -295,7 +295,7 @@ def assemble_result(
         for i, (own, *state) in enumerate(states):
             q[i, : len(own)], v[i, : len(own)] = state
     ended, message = _end(records, batch)
-    poses = [record.poses.describe() for record in records if record.poses and record.poses.times]
+    poses = describe_poses({i: record.poses for i, record in enumerate(records) if record.poses}, batch)
     return SolverResult(
         t=np.array(t, dtype=np.float64),
         q=q,
@@ -310,7 +310,7 @@ def assemble_result(
         events=tuple(hit for record in records for hit in record.events),
         error=next((record.error for record in records if record.error), None),
         last=next((record.last for record in records if record.ended in ("diverged", "step_too_small")), None),
-        doubts=tuple(dict.fromkeys(poses)),
+        doubts=(poses,) if poses else (),
     )
 
 

@@ -67,6 +67,11 @@ class Field:
         self._approach, self._constrained = Approach(), own.projects
 
     @property
+    def dyn(self) -> Dynamics:
+        """The dynamics of the members of the batch that go on."""
+        return self._own
+
+    @property
     def projects(self) -> bool:
         """Whether states are projected onto constraints."""
         return self._constrained
