@@ -211,16 +211,21 @@ def test_a_coupler_s_numbers_are_those_of_either_of_its_joints(swapped: bool) ->
     read = mb.model.Coupler("", "y", "x", -2.0, 0.2) if swapped else mb.model.Coupler("", "x", "y", -0.5, 0.1)
     names = {"x": "a", "y": "b"}
     loops = WrittenLoops(couplers=[written], every_coupler=[written])
-    assert coupler_differences(loops, [read], names, 1e-12) == []
+    assert coupler_differences(loops, [], [read], names, 1e-12) == []
     for change in ({"ratio": read.ratio * (1 + 1e-6)}, {"offset": read.offset + 1e-6}):
-        ((size, where, says),) = coupler_differences(loops, [replace(read, **change)], names, 1e-9)
+        ((size, where, says),) = coupler_differences(loops, [], [replace(read, **change)], names, 1e-9)
         assert 1e-7 < size < 1e-5
         assert where == "'c' (of 'a' and 'b')"
         assert "ratio" in says
-    ((_, _, says),) = coupler_differences(loops, [read, read], names, 1e-9)
+    ((_, _, says),) = coupler_differences(loops, [], [read, read], names, 1e-9)
     assert says == "not in the file"
+    # A mimic joint of the file may be held by a coupler, of its own numbers.
+    assert coupler_differences(WrittenLoops(), [written], [read], names, 1e-9) == []
+    assert coupler_differences(WrittenLoops(), [written], [], names, 1e-9) == []
+    ((_, _, says),) = coupler_differences(WrittenLoops(), [replace(written, ratio=0.5)], [read], names, 1e-9)
+    assert says == "ratio -0.5 and offset 0.1 for 0.5 and 0.1"
     off = WrittenLoops(every_coupler=[written])
-    ((_, _, says),) = coupler_differences(off, [read], names, 1e-9)
+    ((_, _, says),) = coupler_differences(off, [], [read], names, 1e-9)
     assert says == "inactive, read as active"
 
 
@@ -228,3 +233,8 @@ def test_mujoco_s_polynomial_is_of_the_coordinates_less_those_of_the_file(tmp_pa
     path = tmp_path / "m.xml"
     path.write_text(CHAIN.format("0 0 0", "", COUPLED.format("2", "")).replace('name="ja"', 'name="ja" ref="30"'))
     assert couplers(mb.compare_parsers(path))["mujoco"].same is True
+
+
+def test_mujoco_holds_a_mimic_joint_by_a_coupler_of_the_file() -> None:
+    found = couplers(mb.compare_parsers("panda"))
+    assert {engine: stage.same for engine, stage in found.items()} == dict.fromkeys(found, True)

@@ -116,28 +116,47 @@ def loop_differences(written: WrittenLoops, read: Sequence[Closure], near: Toler
 
 
 def coupler_differences(
-    written: WrittenLoops, read: Sequence[Coupler], names: Mapping[str, str], tolerance: float
+    written: WrittenLoops,
+    mimics: Sequence[Coupler],
+    read: Sequence[Coupler],
+    names: Mapping[str, str],
+    tolerance: float,
 ) -> list[tuple[float, str, str]]:
-    """Return the same of couplers; `names` has the file's joint for each of the importer's."""
+    """Return the same of couplers; `names` has the file's joint for each of the importer's.
+
+    An importer may hold the file's mimic joints by couplers, or leave them free, which is not counted here.
+    """
     out: list[tuple[float, str, str]] = []
     left = [_ordered(replace(x, joint=names.get(x.joint, ""), leader=names.get(x.leader, ""))) for x in read]
-    inactive = list(map(_ordered, written.every_coupler))
-    for a in map(_ordered, written.couplers):
-        for some in (left, inactive):
-            near = [(abs(a.ratio - b.ratio) + abs(a.offset - b.offset), k) for k, b in enumerate(some) if _key(a, b)]
-            if not near:
-                if some is left:
-                    out.append((1.0, _says(a), "missing"))
-                continue
-            far, k = min(near)
-            b = some.pop(k)
-            if some is left and far > tolerance * max(1.0, abs(a.ratio) + abs(a.offset)):
-                says = f"ratio {b.ratio:.6g} and offset {b.offset:.6g} for {a.ratio:.6g} and {a.offset:.6g}"
-                out.append((far, _says(a), says))
+    active, free, inactive = (list(map(_ordered, x)) for x in (written.couplers, mimics, written.every_coupler))
+    for a in [*active, *free]:
+        b = _taken(a, left)
+        if a in active:
+            _taken(a, inactive)
+        if b is None:
+            out += [(1.0, _says(a), "missing")] if a in active else []
+        elif (far := _apart(a, b)) > tolerance * max(1.0, abs(a.ratio) + abs(a.offset)):
+            says = f"ratio {b.ratio:.6g} and offset {b.offset:.6g} for {a.ratio:.6g} and {a.offset:.6g}"
+            out.append((far, _says(a), says))
     for b in left:
-        off = any(_key(a, b) for a in inactive)
+        off = _taken(b, inactive) is not None
         out.append((1.0, _says(b), "inactive, read as active" if off else "not in the file"))
     return out
+
+
+def mimic_couplers(model: Model) -> list[Coupler]:
+    """Return the couplers that hold what a description's mimic joints do."""
+    return [Coupler(j.name, j.name, j.mimic.joint, j.mimic.ratio, j.mimic.offset) for j in model.joints if j.mimic]
+
+
+def _taken(a: Coupler, some: list[Coupler]) -> Coupler | None:
+    """Take the nearest coupler of the same joints out of some."""
+    near = [(_apart(a, b), k) for k, b in enumerate(some) if (a.joint, a.leader) == (b.joint, b.leader)]
+    return some.pop(min(near)[1]) if near else None
+
+
+def _apart(a: Coupler, b: Coupler) -> float:
+    return abs(a.ratio - b.ratio) + abs(a.offset - b.offset)
 
 
 def _ordered(x: Coupler) -> Coupler:
@@ -145,10 +164,6 @@ def _ordered(x: Coupler) -> Coupler:
     if x.joint <= x.leader or not x.ratio:
         return x
     return replace(x, joint=x.leader, leader=x.joint, ratio=1 / x.ratio, offset=-x.offset / x.ratio)
-
-
-def _key(a: Coupler, b: Coupler) -> bool:
-    return (a.joint, a.leader) == (b.joint, b.leader)
 
 
 def _says(x: Coupler) -> str:

@@ -7,7 +7,7 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import metadata
 from operator import itemgetter
@@ -32,7 +32,14 @@ from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of, velocity_joints
-from mbkit.studies.importers.loops import WrittenLoops, activated, closures, coupler_differences, loop_differences
+from mbkit.studies.importers.loops import (
+    WrittenLoops,
+    activated,
+    closures,
+    coupler_differences,
+    loop_differences,
+    mimic_couplers,
+)
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import WALL_PER_CPU, Worker, WorkerDiedError, WorkerStartError, WorkerTimeoutError, describe
@@ -150,7 +157,9 @@ def stages(
         if name == "total mass":
             out.append(_missing("mimic", mimics, "left free"))
         out.append(_worst(name, some))
-    out += _loop_stages(loops, imported, {m.b: m.a for m in matching.pairs}, near, tolerance)
+    back = {m.b: m.a for m in matching.pairs}
+    out.append(_loop_stage(loops, imported, back, near))
+    out.append(_coupler_stage(loops, mimic_couplers(described), imported, back, tolerance))
     apart = Gaps(comparable=False)
     if not structural:
         at = states_of(one.model, samples, seed)
@@ -175,19 +184,20 @@ def _worst(name: str, some: list[tuple[float, str, str]]) -> Stage:
     return Stage(name, not some, size, where, f"{where}: {says}{more}" if some else "")
 
 
-def _loop_stages(
-    loops: WrittenLoops, imported: Imported, names: Mapping[str, str], near: Tolerances, tolerance: float
-) -> Iterator[Stage]:
+def _loop_stage(loops: WrittenLoops, imported: Imported, names: Mapping[str, str], near: Tolerances) -> Stage:
     """Compare an importer's loops with the file's; `names` has the file's joint for each of the importer's."""
-    unknown = loops.faults or (imported.loops if isinstance(imported.loops, str) else "")
-    if unknown or isinstance(imported.loops, str):
-        yield Stage("loops", None, math.nan, "", unknown)
-    else:
-        yield _every("loops", loop_differences(loops, closures(imported.model, imported.loops, names), near))
+    if loops.faults or isinstance(imported.loops, str):
+        return Stage("loops", None, math.nan, "", loops.faults or str(imported.loops))
+    return _every("loops", loop_differences(loops, closures(imported.model, imported.loops, names), near))
+
+
+def _coupler_stage(
+    loops: WrittenLoops, mimics: Sequence[Coupler], imported: Imported, names: Mapping[str, str], tolerance: float
+) -> Stage:
+    """Compare an importer's couplers with the file's."""
     if loops.faults:
-        yield Stage("couplers", None, math.nan, "", loops.faults)
-    else:
-        yield _every("couplers", coupler_differences(loops, imported.couplers, names, tolerance))
+        return Stage("couplers", None, math.nan, "", loops.faults)
+    return _every("couplers", coupler_differences(loops, mimics, imported.couplers, names, tolerance))
 
 
 def _every(name: str, some: list[tuple[float, str, str]]) -> Stage:
