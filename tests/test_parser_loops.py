@@ -209,23 +209,18 @@ def test_a_coupler_that_is_switched_off_is_none(tmp_path: Path) -> None:
 def test_a_coupler_s_numbers_are_those_of_either_of_its_joints(swapped: bool) -> None:
     written = mb.model.Coupler("c", "a", "b", -0.5, 0.1)
     read = mb.model.Coupler("", "y", "x", -2.0, 0.2) if swapped else mb.model.Coupler("", "x", "y", -0.5, 0.1)
-    names = {"x": "a", "y": "b"}
+    names, plain = {"x": "a", "y": "b"}, mb.catalog.double_pendulum()
     loops = WrittenLoops(couplers=[written], every_coupler=[written])
-    assert coupler_differences(loops, [], [read], names, 1e-12) == []
+    assert coupler_differences(loops, plain, [read], names, 1e-12) == []
     for change in ({"ratio": read.ratio * (1 + 1e-6)}, {"offset": read.offset + 1e-6}):
-        ((size, where, says),) = coupler_differences(loops, [], [replace(read, **change)], names, 1e-9)
+        ((size, where, says),) = coupler_differences(loops, plain, [replace(read, **change)], names, 1e-9)
         assert 1e-7 < size < 1e-5
         assert where == "'c' (of 'a' and 'b')"
         assert "ratio" in says
-    ((_, _, says),) = coupler_differences(loops, [], [read, read], names, 1e-9)
+    ((_, _, says),) = coupler_differences(loops, plain, [read, read], names, 1e-9)
     assert says == "not in the file"
-    # A mimic joint of the file may be held by a coupler, of its own numbers.
-    assert coupler_differences(WrittenLoops(), [written], [read], names, 1e-9) == []
-    assert coupler_differences(WrittenLoops(), [written], [], names, 1e-9) == []
-    ((_, _, says),) = coupler_differences(WrittenLoops(), [replace(written, ratio=0.5)], [read], names, 1e-9)
-    assert says == "ratio -0.5 and offset 0.1 for 0.5 and 0.1"
     off = WrittenLoops(every_coupler=[written])
-    ((_, _, says),) = coupler_differences(off, [], [read], names, 1e-9)
+    ((_, _, says),) = coupler_differences(off, plain, [read], names, 1e-9)
     assert says == "inactive, read as active"
 
 
@@ -235,6 +230,26 @@ def test_mujoco_s_polynomial_is_of_the_coordinates_less_those_of_the_file(tmp_pa
     assert couplers(mb.compare_parsers(path))["mujoco"].same is True
 
 
-def test_mujoco_holds_a_mimic_joint_by_a_coupler_of_the_file() -> None:
-    found = couplers(mb.compare_parsers("panda"))
+LINK = (
+    '<link name="{0}"><inertial><origin xyz="0.1 0 0.2"/><mass value="1"/>'
+    '<inertia ixx="1" iyy="1.2" izz="1.1" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+HINGE = (
+    '<joint name="j{0}" type="revolute"><parent link="{1}"/><child link="{0}"/><axis xyz="0 1 0"/>'
+    '<limit lower="-3" upper="3" effort="1" velocity="1"/>{2}</joint>'
+)
+FOLLOWS = '<mimic joint="{0}" multiplier="{1}" offset="{2}"/>'
+
+
+def test_mimic_joints_may_be_held_by_couplers_also_in_a_chain(tmp_path: Path) -> None:
+    second, third = FOLLOWS.format("ja", 2, 0.1), FOLLOWS.format("jb", -0.5, 0.2)
+    joints = HINGE.format("a", "base", "") + HINGE.format("b", "a", second) + HINGE.format("c", "b", third)
+    path = tmp_path / "chain.urdf"
+    path.write_text(f'<robot name="r"><link name="base"/>{"".join(map(LINK.format, "abc"))}{joints}</robot>')
+    found = couplers(mb.compare_parsers(path))
     assert {engine: stage.same for engine, stage in found.items()} == dict.fromkeys(found, True)
+    model, names = mb.load(path), {x: x for x in ("ja", "jb", "jc")}
+    for ratio, offset, right in ((-0.5, 0.2, True), (0.5, 0.2, False), (-0.5, 0.3, False)):
+        read = mb.model.Coupler("", "jc", "jb", ratio, offset)
+        some = coupler_differences(WrittenLoops(), model, [read], names, 1e-9)
+        assert [says for _, _, says in some] == ([] if right else ["other numbers than the file's mimic joints"])

@@ -14,7 +14,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.load.xml_reader import Element
-from mbkit.model import Coupler, Loop, Model
+from mbkit.model import Coupler, Loop, Mimic, Model
 from mbkit.studies.explain.hypotheses import angle_of
 from mbkit.studies.explain.merged_model import Tolerances
 
@@ -116,11 +116,7 @@ def loop_differences(written: WrittenLoops, read: Sequence[Closure], near: Toler
 
 
 def coupler_differences(
-    written: WrittenLoops,
-    mimics: Sequence[Coupler],
-    read: Sequence[Coupler],
-    names: Mapping[str, str],
-    tolerance: float,
+    written: WrittenLoops, file: Model, read: Sequence[Coupler], names: Mapping[str, str], tolerance: float
 ) -> list[tuple[float, str, str]]:
     """Return the same of couplers; `names` has the file's joint for each of the importer's.
 
@@ -128,25 +124,32 @@ def coupler_differences(
     """
     out: list[tuple[float, str, str]] = []
     left = [_ordered(replace(x, joint=names.get(x.joint, ""), leader=names.get(x.leader, ""))) for x in read]
-    active, free, inactive = (list(map(_ordered, x)) for x in (written.couplers, mimics, written.every_coupler))
-    for a in [*active, *free]:
-        b = _taken(a, left)
-        if a in active:
-            _taken(a, inactive)
-        if b is None:
-            out += [(1.0, _says(a), "missing")] if a in active else []
+    inactive = list(map(_ordered, written.every_coupler))
+    for a in map(_ordered, written.couplers):
+        _taken(a, inactive)
+        if (b := _taken(a, left)) is None:
+            out.append((1.0, _says(a), "missing"))
         elif (far := _apart(a, b)) > tolerance * max(1.0, abs(a.ratio) + abs(a.offset)):
             says = f"ratio {b.ratio:.6g} and offset {b.offset:.6g} for {a.ratio:.6g} and {a.offset:.6g}"
             out.append((far, _says(a), says))
+    mimics = {j.name: j.mimic for j in file.joints if j.mimic}
     for b in left:
+        (root, r1, o1), (other, r2, o2) = (_from_root(name, mimics) for name in (b.joint, b.leader))
+        far = abs(r1 - b.ratio * r2) + abs(o1 - b.ratio * o2 - b.offset)
+        if root == other and far <= tolerance * max(1.0, abs(r1) + abs(o1)):
+            continue
         off = _taken(b, inactive) is not None
-        out.append((1.0, _says(b), "inactive, read as active" if off else "not in the file"))
+        unlike = "other numbers than the file's mimic joints" if root == other else "not in the file"
+        out.append((far if root == other else 1.0, _says(b), "inactive, read as active" if off else unlike))
     return out
 
 
-def mimic_couplers(model: Model) -> list[Coupler]:
-    """Return the couplers that hold what a description's mimic joints do."""
-    return [Coupler(j.name, j.name, j.mimic.joint, j.mimic.ratio, j.mimic.offset) for j in model.joints if j.mimic]
+def _from_root(name: str, mimics: Mapping[str, Mimic]) -> tuple[str, float, float]:
+    """Return the joint that leads in the end, with ratio and offset."""
+    ratio, offset = 1.0, 0.0
+    while mimic := mimics.get(name):
+        name, ratio, offset = mimic.joint, ratio * mimic.ratio, offset + ratio * mimic.offset
+    return name, ratio, offset
 
 
 def _taken(a: Coupler, some: list[Coupler]) -> Coupler | None:

@@ -38,7 +38,6 @@ from mbkit.studies.importers.loops import (
     closures,
     coupler_differences,
     loop_differences,
-    mimic_couplers,
 )
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
@@ -159,7 +158,7 @@ def stages(
         out.append(_worst(name, some))
     back = {m.b: m.a for m in matching.pairs}
     out.append(_loop_stage(loops, imported, back, near))
-    out.append(_coupler_stage(loops, mimic_couplers(described), imported, back, tolerance))
+    out.append(_coupler_stage(loops, described, imported, back, tolerance))
     apart = Gaps(comparable=False)
     if not structural:
         at = states_of(one.model, samples, seed)
@@ -192,12 +191,12 @@ def _loop_stage(loops: WrittenLoops, imported: Imported, names: Mapping[str, str
 
 
 def _coupler_stage(
-    loops: WrittenLoops, mimics: Sequence[Coupler], imported: Imported, names: Mapping[str, str], tolerance: float
+    loops: WrittenLoops, file: Model, imported: Imported, names: Mapping[str, str], tolerance: float
 ) -> Stage:
     """Compare an importer's couplers with the file's."""
     if loops.faults:
         return Stage("couplers", None, math.nan, "", loops.faults)
-    return _every("couplers", coupler_differences(loops, mimics, imported.couplers, names, tolerance))
+    return _every("couplers", coupler_differences(loops, file, imported.couplers, names, tolerance))
 
 
 def _every(name: str, some: list[tuple[float, str, str]]) -> Stage:
