@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.engines.base import first_names
+from mbkit.engines.base import at_times, first_names
 
 if TYPE_CHECKING:
     from mbkit.engines.constraint_manifold import Manifold
@@ -252,11 +252,9 @@ class SingularPoses:
 
     def saw_all(self, t: Array, q: Array) -> None:
         """Take in the ends of steps, (n,) and (n, nq)."""
-        if self._dyn.model.time_parameter is None:
-            J = manifold_at(self._dyn, 0.0).jacobian(q)
-        else:
-            J = np.array([manifold_at(self._dyn, at).jacobian(x) for at, x in zip(t.tolist(), q, strict=True)])
-        J = J.reshape(len(t), -1, J.shape[-1])
+        from mbkit.engines.constraint_manifold import manifold_of
+
+        J = manifold_of(at_times(manifold_of(self._dyn).dyn, t, 1)).jacobian(q)
         finite = np.isfinite(J).all(axis=(1, 2))
         # Without vectors, which would cost far more.
         sizes = np.linalg.svd(J[finite], compute_uv=False)[:, -1]
@@ -314,6 +312,10 @@ class SingularPosesOfBatch:
         for i, size, slopes in zip(members, singular_values(J)[..., -1].tolist(), J, strict=True):
             if size == size:
                 self._members[int(i)].take(t, size, slopes)
+
+    def saw_run(self, member: int, t: Array, q: Array) -> None:
+        """Take in the ends of all steps of one member, (n,) and (n, nq)."""
+        self._members[member].saw_all(t, q)
 
     def describe(self, batch: int | None) -> str:
         """Return the poses in a sentence; empty where there are none."""

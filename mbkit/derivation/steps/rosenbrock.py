@@ -124,30 +124,30 @@ class _StageSystem:
 
     def __init__(self, eq: Any, space: _Space, symbols: dict[str, Any], gamma: float) -> None:
         w, g, nv = symbols["w"], gamma * symbols["step"], eq.model.nv
-        M, D, K, self._columns = _linear_system(eq, space, symbols["q"], w, symbols["k"], symbols["tau"])
+        M, D, K, self._transposed = _linear_system(eq, space, symbols["q"], w, symbols["k"], symbols["tau"])
         self._mass, self._pull = M, g * ca.mtimes(K, space.spun(w, g))
         whole = M + g * D + g * self._pull
         A, self._rows = whole[:nv, :], whole[nv:, :]
-        # Of zero once the rows are satisfied; without it, a link without mass has no pivot.
+        # A multiple of the rows, which the right-hand side takes back; without it a link without mass has no pivot.
         self._stiff = ca.SX(nv, 0)
         if eq.model.constrained and eq.constraint_factors.careful:
             s = ca.substitute(eq.constraints.stiffening(eq.mass_matrix), eq.q, symbols["q"])
-            self._stiff = ca.sparsify(ca.mtimes(self._columns, ca.diag(s)))
+            self._stiff = ca.sparsify(ca.mtimes(self._transposed, ca.diag(s)))
             A = A + ca.mtimes(self._stiff, self._rows)
         self._tree = Factors.of(A, eq.elimination_order)
-        many = [self._tree.applied(self._tree.values, x) for x in ca.horzsplit(self._columns)]
-        self._ways = ca.sparsify(ca.horzcat(ca.SX(nv, 0), *many))
-        held = ca.sparsify(ca.mtimes(self._rows, self._ways))
-        self._held = Factors.of(held, range(held.shape[0]))
-        factors = ca.vertcat(ca.SX(0, 1), *self._tree.values, *self._held.values)
-        rows = ca.vertcat(*map(_entries, (self._rows, self._ways, self._stiff)))
+        many = [self._tree.applied(self._tree.values, x) for x in ca.horzsplit(self._transposed)]
+        self._responses = ca.sparsify(ca.horzcat(ca.SX(nv, 0), *many))
+        held = ca.sparsify(ca.mtimes(self._rows, self._responses))
+        self._constraint_factors = Factors.of(held, range(held.shape[0]))
+        factors = ca.vertcat(ca.SX(0, 1), *self._tree.values, *self._constraint_factors.values)
+        rows = ca.vertcat(*map(_entries, (self._rows, self._responses, self._stiff)))
         columns = (_entries(self._mass), _entries(self._pull), factors, rows)
         self.results = dict(zip(self.NAMES, columns, strict=True))
 
     def solution(self, a: Any, b: Any, mass: Any, pull: Any, factors: Any, rows: Any) -> Any:
         """Return w_i for right-hand sides, from numbers in the place of `results`."""
         nv, matrices, first = len(self._tree.rows), [], 0
-        for x in (self._rows, self._ways, self._stiff):
+        for x in (self._rows, self._responses, self._stiff):
             matrices.append(ca.SX(x.sparsity(), rows[first : first + x.nnz()]))
             first += x.nnz()
         G, Y, stiff = matrices
@@ -157,7 +157,7 @@ class _StageSystem:
         free = self._tree.applied(tree, force + ca.mtimes(stiff, rates) if stiff.nnz() else force)
         if not Y.nnz():
             return free
-        return free + ca.mtimes(Y, self._held.applied(held, rates - ca.mtimes(G, free)))
+        return free + ca.mtimes(Y, self._constraint_factors.applied(held, rates - ca.mtimes(G, free)))
 
 
 def _linear_system(eq: Any, space: SymbolicSpace, q: Any, w: Any, k: Any, force: Any) -> tuple[Any, Any, Any, Any]:

@@ -27,7 +27,7 @@ from mbkit.methods.registry import IMPLICIT_METHODS
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.singular_poses import SingularPoses, describe_poses
+from mbkit.simulate.singular_poses import SingularPosesOfBatch
 from mbkit.simulate.solvers.fixed_step import GridRecord, SteppedRun, Stepper
 from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED
 from mbkit.simulate.time_grid import Indices
@@ -70,11 +70,11 @@ def _poses(problem: IntegrationProblem, record: GridRecord) -> tuple[str, ...]:
     """Return the singular poses on the way, in a sentence; none where steps are left out of what is kept."""
     if len(record.kept) <= problem.grid.steps:
         return ()
-    times, found = np.array([problem.grid.time(int(k)) for k in record.kept]), dict[int, SingularPoses]()
+    times = np.array([problem.grid.time(int(k)) for k in record.kept])
+    poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
     for i, last in enumerate(record.steps.tolist()):
-        found[i] = SingularPoses(problem.dyn.of_samples([i]))
-        found[i].saw_all(times[: last + 1], record.q[i, : last + 1])
-    text = describe_poses(found, problem.batch)
+        poses.saw_run(i, times[1 : last + 1], record.q[i, 1 : last + 1])
+    text = poses.describe(problem.batch)
     return (text,) if text else ()
 
 
