@@ -6,7 +6,8 @@ Every message names the argument or the body, says what was expected and what ca
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, Final
 
 from mbkit import _escape
@@ -96,20 +97,23 @@ class UnknownNameError(MbkitError, LookupError):
     known : iterable of str
     hint : str
         What else the caller can do.
+    every : bool
+        Whether to list all known names, however many there are.
     """
 
-    def __init__(self, what: str, name: str, known: Iterable[str], hint: str = "") -> None:
-        self.what, self.name, self.known, self.hint = what, name, tuple(known), hint
+    def __init__(self, what: str, name: str, known: Iterable[str], hint: str = "", *, every: bool = False) -> None:
+        self.what, self.name, self.known, self.hint, self.every = what, name, tuple(known), hint, every
+        listed = f"there are: {', '.join(self.known) or 'none'}"
         if near := nearest(name, self.known):
-            advice = f"did you mean {' or '.join(repr(n) for n in near)}?"
-        elif len(self.known) <= 40:
-            advice = f"there are: {', '.join(self.known) or 'none'}"
+            advice = f"did you mean {' or '.join(repr(n) for n in near)}?" + (f" {listed}" if every else "")
+        elif every or len(self.known) <= 40:
+            advice = listed
         else:
             advice = f"none of the {len(self.known)} known names is near"
         super().__init__(f"unknown {what} {_shortened(repr(name), 200)}; {advice}" + (f" {hint}" if hint else ""))
 
-    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
-        return type(self), (self.what, self.name, self.known, self.hint)
+    def __reduce__(self) -> tuple[Callable[..., UnknownNameError], tuple[object, ...]]:
+        return partial(type(self), every=self.every), (self.what, self.name, self.known, self.hint)
 
 
 class ModelError(MbkitError, ValueError):

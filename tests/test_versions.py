@@ -235,7 +235,7 @@ def test_versions_are_chosen_by_where_they_begin_and_end(monkeypatch):
     chosen = [x.version for x in study._chosen("mujoco", None, "3.1", "3.11")]
     assert chosen == ["3.1.0", "3.10.0", "3.11.2"]
     assert [x.version for x in study._chosen("mujoco", None, "", "latest")][-1] == "4.0.0"
-    with pytest.raises(UnknownNameError, match=r"there are 2\.9\.1"):
+    with pytest.raises(UnknownNameError, match=r"there are: 2\.9\.1"):
         study._chosen("mujoco", None, "5", "latest")
     with pytest.raises(InputError, match="first"):
         study._chosen("mujoco", None, "new", "latest")

@@ -203,7 +203,7 @@ def _install(pip: Sequence[str], distribution: str, version: str, limits: Sequen
         with contextlib.suppress(UnsupportedError):
             known = list(available(distribution))
     if known and version not in known:
-        raise UnknownNameError(f"version of {distribution}", version, known, f"there are {', '.join(reversed(known))}")
+        raise UnknownNameError(f"version of {distribution}", version, reversed(known), every=True)
     raise UnsupportedError(f"{name}: no environment of it can be made here; {_reason(done.stderr)}")
 
 

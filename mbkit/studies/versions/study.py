@@ -147,8 +147,7 @@ def _chosen(engine: str, versions: Iterable[str] | None, first: str, last: str) 
     low, high = order_of(first), () if last == LATEST else order_of(last)
     out = [x for x in known if low <= order_of(x) and order_of(x)[: len(high)] <= high]
     if not out:
-        there = f"there are {', '.join(known)}"
-        raise UnknownNameError(f"version of {engine}", f"{first or 'the first'} to {last}", known, there)
+        raise UnknownNameError(f"version of {engine}", f"{first or 'the first'} to {last}", known, every=True)
     return [named_version(f"{engine}=={x}") for x in out]
 
 
