@@ -60,6 +60,22 @@ def test_pages_name_files_and_parts_that_exist():
     assert set(re.findall(r"\borigin\(\w+, \"(\w+)\"\)", text)) == set(PARTS)
 
 
+def test_versions_that_the_page_explains_are_those_of_the_record():
+    """Where a span begins or ends, a number of that engine changed, or the record does."""
+    engines = json.loads(read("validation/versions.json"))["engines"]
+    text = read("notebooks/numbers/versions.md").partition("## Why they changed")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (MuJoCo|Pinocchio|Drake)\b([^|]*)\|", text, re.MULTILINE)
+    assert len(rows) > 10
+    for engine, spans in rows:
+        found = engines[engine.lower()]
+        ends = {
+            found["measured"][0],
+            found["measured"][-1],
+            *(c[k] for c in found["changes"] for k in ("before", "version")),
+        }
+        assert set(re.findall(r"\d+\.\d+[.\d]*", spans)) <= ends, (engine, spans)
+
+
 def test_parts_are_listed_and_chosen_by_name():
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "validation", *arguments]
