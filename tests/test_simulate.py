@@ -9,6 +9,8 @@ import os
 import pickle
 import subprocess
 import sys
+from fractions import Fraction
+from operator import add, mul
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,16 @@ from mbkit.errors import (
     UnknownNameError,
     UnsupportedError,
 )
-from mbkit.methods.tableaus import rooted_trees
+from mbkit.methods.tableaus import (
+    RosenbrockTableau,
+    _stage_weights,
+    density,
+    dormand_prince_853,
+    gauss_legendre,
+    rodas5p,
+    rooted_trees,
+    rounding_of_condition,
+)
 from mbkit.model import Model, ModelBuilder, quaternions
 from mbkit.model.integration_space import Space
 from mbkit.simulate import METHODS, RK4, Tableau, Trajectory, simulate
@@ -88,6 +99,85 @@ def test_tableaus_check_themselves() -> None:
     with pytest.raises(InputError, match=r"expected A \(s, s\)"):
         Tableau("ragged", [[0.0]], [0.5, 0.5], 1)
     assert np.array_equal(pickle.loads(pickle.dumps(RK4)).A, RK4.A)
+
+
+def fractions(matrix: np.ndarray) -> list[list[Fraction]]:
+    return [[Fraction(x) for x in row] for row in matrix.tolist()]
+
+
+def exact_weights(alpha: list[list[Fraction]], beta: list[list[Fraction]], tree: Any) -> list[Fraction]:
+    out = [Fraction(1)] * len(alpha)
+    for branch in tree:
+        inner = exact_weights(alpha, beta, branch)
+        rows = beta if len(tree) == 1 else alpha
+        out = [x * sum(map(mul, row, inner)) for x, row in zip(out, rows, strict=True)]
+    return out
+
+
+def rosenbrock_form(own: RosenbrockTableau, weights: np.ndarray) -> tuple[Any, Any, list[Fraction]]:
+    """α, α + Γ and b of a Rosenbrock method in exact arithmetic, from its published coefficients."""
+    s, gamma, C, A = own.stages, Fraction(own.gamma), fractions(own.C), fractions(own.A)
+    coupling = [[Fraction(0)] * s for _ in range(s)]
+    for i in range(s):
+        for j in range(i + 1):
+            coupling[i][j] = gamma * ((i == j) + sum(C[i][k] * coupling[k][j] for k in range(j, i)))
+    columns = list(zip(*coupling, strict=True))
+    alpha = [[sum(map(mul, row, column)) for column in columns] for row in A]
+    b = [Fraction(x) for x in weights.tolist()]
+    beta = [list(map(add, *rows)) for rows in zip(alpha, coupling, strict=True)]
+    return alpha, beta, [sum(map(mul, b, column)) for column in columns]
+
+
+PAIR, ROSENBROCK = dormand_prince_853(), rodas5p()
+
+
+@pytest.mark.parametrize(
+    ("tableau", "weights", "order"),
+    [
+        (RK4, RK4.b, 4),
+        (gauss_legendre(2), gauss_legendre(2).b, 4),
+        (gauss_legendre(3), gauss_legendre(3).b, 6),
+        (PAIR, PAIR.b, 8),
+        (PAIR, PAIR.b - PAIR.errors[0], 5),
+        (PAIR, PAIR.b - PAIR.errors[1], 3),
+        (ROSENBROCK, ROSENBROCK.b, 5),
+        (ROSENBROCK, ROSENBROCK.b - ROSENBROCK.error, 4),
+    ],
+    ids=lambda x: getattr(x, "name", ""),
+)
+def test_the_coefficients_of_ours_fulfil_their_order_in_exact_arithmetic(
+    tableau: Tableau | RosenbrockTableau, weights: np.ndarray, order: int
+) -> None:
+    """They are the doubles nearest to numbers that fulfil it: what is left is half an eps for each node of a tree."""
+    if isinstance(tableau, RosenbrockTableau):
+        alpha, beta, b = rosenbrock_form(tableau, weights)
+    else:
+        alpha = beta = fractions(tableau.A)
+        b = [Fraction(x) for x in weights.tolist()]
+    for p in range(1, order + 1):
+        for tree in rooted_trees(p):
+            rest = sum(map(mul, b, exact_weights(alpha, beta, tree))) - Fraction(1, density(tree))
+            big = ([[abs(x) for x in row] for row in matrix] for matrix in (alpha, beta))
+            size = sum(map(mul, map(abs, b), exact_weights(*big, tree)))
+            # The doubles of a Rosenbrock method pass through an inverse, whose condition is 2.6e3.
+            assert abs(rest) <= Fraction(EPS) / 2 * (p + 1) * size * (10 if alpha is not beta else 1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_order_of_summation_lets_a_tableau_of_ones_own_fail(seed: int) -> None:
+    """Another BLAS sums in another order, as a permutation of the stages does: the bound holds for all of them."""
+    A, b, rng = PAIR.A, PAIR.b, np.random.default_rng(seed)
+    for _ in range(20):
+        order = rng.permutation(len(b))
+        for tree in rooted_trees(8)[:: 5 + seed]:
+            got = b[order] @ _stage_weights(A[np.ix_(order, order)], A[np.ix_(order, order)], tree)
+            assert abs(got - 1 / density(tree)) <= rounding_of_condition(A, A, b, tree)
+    assert Tableau("of one's own", A, b, 8).order == 8
+    # A digit that is wrong shows all the same.
+    wrong = b.copy()
+    wrong[int(np.argmax(np.abs(b)))] *= 1 + 1e-12
+    with pytest.raises(InputError, match="order"):
+        Tableau("misprint", A, wrong, 8)
 
 
 # Rotations and the space

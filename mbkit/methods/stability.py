@@ -18,7 +18,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.methods.tableaus import Tableau
 
-#: Coefficients of a stability function below this part of the largest are rounding.
+#: A coefficient of |D|² - |N|² below this part of the sum of its terms' sizes is rounding.
 _ROUNDING: Final = 1e-13
 
 
@@ -94,11 +94,13 @@ class TableauStability:
 
     def _limit(self, direction: complex) -> float:
         # |D|² - |N|² along a ray is a polynomial in the distance, and the method is stable where it is not negative.
-        squares = [_square(p * direction ** np.arange(len(p))) for p in self._polynomials]
-        size = max(map(len, squares))
-        above, below = (np.pad(x, (0, size - len(x))) for x in squares)
+        turned = [p * direction ** np.arange(len(p)) for p in self._polynomials]
+        length = 2 * max(map(len, turned)) - 1
+        above, below = (_padded(np.convolve(x, x.conj()).real, length) for x in turned)
+        # A coefficient may be a sum that cancels: its rounding is that of the terms.
+        terms = sum(_padded(np.convolve(np.abs(x), np.abs(x)), length) for x in turned)
         gap = below - above
-        gap[np.abs(gap) <= _ROUNDING * np.maximum(np.abs(above), np.abs(below))] = 0.0
+        gap[np.abs(gap) <= _ROUNDING * terms] = 0.0
         roots = np.roots(gap[::-1])
         edges = np.sort(roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-9)].real)
         inside = 0.0
@@ -110,9 +112,8 @@ class TableauStability:
         return math.inf
 
 
-def _square(coefficients: Array) -> Array:
-    """Return the coefficients of |p(x)|² for real x."""
-    return np.asarray(np.convolve(coefficients, coefficients.conj()).real)
+def _padded(coefficients: Array, length: int) -> Array:
+    return np.pad(coefficients, (0, length - len(coefficients)))
 
 
 def _at_matrix(coefficients: Array, Z: Array) -> Array:
