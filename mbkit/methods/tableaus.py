@@ -105,7 +105,7 @@ def _digest(*arrays: Array) -> str:
 
 def _unchecked(kind: type, **attributes: Any) -> Any:
     """Return a tableau that has been checked already: one of mbkit's own, or one that was pickled."""
-    out = object.__new__(kind)
+    out: Any = object.__new__(kind)
     for name, value in attributes.items():
         if isinstance(value, (np.ndarray, list)):
             value = _numbers(attributes["name"], name, value)
