@@ -15,7 +15,7 @@ import mbkit as mb
 from mbkit.engines import Dynamics, compiled_calls
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
-from mbkit.lagrangian import from_model, systems
+from mbkit.lagrangian import systems
 from mbkit.model import Model
 from mbkit.simulate import METHODS, Tableau, register_method, simulate
 from tests.random_trees import ALL, SOUND, random_tree
@@ -293,23 +293,6 @@ def test_unknown_methods_have_a_suggestion(ready: Dynamics) -> None:
 def test_methods_without_an_explicit_step_name_those_with_one(ready: Dynamics, method: str) -> None:
     with pytest.raises(UnsupportedError, match=f"step: {method} has no explicit fixed step; use rk4"):
         ready.step(*states(ready.model), H, method)
-
-
-@pytest.mark.parametrize("method", FIXED)
-@pytest.mark.parametrize("compiled", [True, False])
-def test_constraints_and_prescribed_motions_too(method: str, compiled: bool) -> None:
-    for lag in (from_model(mb.catalog.slider_crank()), systems.driven_pendulum()):
-        dyn = lag.dynamics(options={"compile": compiled})
-        q, v = dyn.model.random_state(3)
-        run = mb.simulate(dyn, q, v, 3 * H, method, dt=H)
-        t = 0.0
-        for k in range(1, 4):
-            now = dyn.at(t=t) if dyn.model.time_parameter else dyn
-            q, v = now.step(q, v, np.zeros(dyn.model.nv), H, method)
-            t += H
-            # Accelerations of 1e3 are rounded another way in the step that goes to its end in one piece.
-            assert np.allclose(q, run.q[k], rtol=1e-11, atol=1e-11)
-            assert np.allclose(v, run.v[k], rtol=1e-11, atol=1e-11)
 
 
 def test_quasi_velocities_too() -> None:

@@ -27,6 +27,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._independence import pivoted
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, dot3
@@ -66,6 +67,8 @@ _SINGULAR: Final = 1e-9
 #: constraints in the matrix for these to be worth their operations.
 _LOSES: Final = 1e-5
 _BETTER: Final = 1e3
+#: Remainder of the last independent row, of 1, at a closed configuration that is far from singular poses.
+_WELL: Final = 0.01
 #: Residual of a closed configuration, m or rad.
 _CLOSED: Final = 1e-10
 
@@ -433,7 +436,10 @@ def _chosen_rows(model: Model) -> RowChoice:
         # The state that a user gives tells more: it is refused there, with the residual of each row.
         return RowChoice(tuple(kept), len(held), tuple(range(len(kept))))
     found = [(*independent_rows(numbers(q)[1][kept], len(held)), q) for q in closed]
-    rows, _, q = max(found, key=lambda x: (len(x[0]), x[1]))
+    most = max(len(rows) for rows, *_ in found)
+    found = [x for x in found if len(x[0]) == most]
+    # The first that is far from singular poses; the search for the others may end elsewhere on another processor.
+    rows, _, q = next((x for x in found if x[1] > _WELL), max(found, key=lambda x: x[1]))
     return RowChoice(tuple(kept), len(held), rows, q)
 
 
@@ -487,23 +493,9 @@ def independent_rows(J: Array, first: int | None = None) -> tuple[tuple[int, ...
     scale = np.where(size > DEPENDENT * size.max(initial=0.0), size, np.inf)
     scaled = J / scale[:, None]
     first = len(J) if first is None else first
-    rows, least, basis = _pivoted(scaled[:first])
-    if first == len(J):
-        return rows, least
-    more, less, _ = _pivoted(scaled[first:] - scaled[first:] @ basis @ basis.T)
-    return (*rows, *(first + k for k in more)), min(least, less) if rows and more else least + less
-
-
-def _pivoted(rows: Array) -> tuple[tuple[int, ...], float, Array]:
-    """Return independent rows of unit size, the remainder of the last one, and a basis of what they span, (n, k)."""
-    from scipy.linalg import qr
-
-    if not len(rows):
-        return (), 0.0, np.zeros((rows.shape[1], 0))
-    Q, R, order = qr(rows.T, mode="economic", pivoting=True)
-    left = np.abs(np.diag(R))
-    rank = int(np.count_nonzero(left > DEPENDENT))
-    return tuple(sorted(order[:rank].tolist())), float(left[rank - 1]) if rank else 0.0, np.asarray(Q[:, :rank])
+    rows, sizes, basis = pivoted(scaled[:first], DEPENDENT)
+    more, others, _ = pivoted(scaled[first:] - scaled[first:] @ basis @ basis.T, DEPENDENT)
+    return (*sorted(rows), *(first + k for k in sorted(more))), min([*sizes, *others], default=0.0)
 
 
 #: Name of each quantity of constraints -> the arguments of its function.

@@ -19,6 +19,7 @@ DECISIVE: Final = (
     "engines/constraint_manifold.py",
     "spatial.py",
     "_check.py",
+    "_independence.py",
 )
 _ROOT: Final = Path(__file__).parent.parent
 

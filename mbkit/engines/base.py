@@ -492,18 +492,33 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
         clock = self.model.time_parameter
         start = 0.0 if clock is None else float(self.model.parameters[clock] or 0.0)
 
-        def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
-            v = space.to_body_velocity(q, w)
-            if not (good := _finite_rows(q, v)).all():
-                raise _NotFiniteError(good)
-            try:
-                a = at_time(self, t).forward_dynamics(q, v, tau)
-            except NumericalError:
-                # Its message would blame the model for a state that has grown beyond all bounds.
-                raise _NotFiniteError(np.array(False)) from None
-            return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
+        def take(near: bool) -> tuple[Array, Array, Array] | None:
+            last = [q]
 
-        q1, w1, _ = formula.step(space, rates, ArrayStages(method.stages, v.shape), start, dt, q, w)
+            def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
+                last[0], v = q, space.to_body_velocity(q, w)
+                if near:
+                    q, v = self._onto_constraints(t, q, v)
+                    w = space.to_integrator_velocity(q, v)
+                if not (good := _finite_rows(q, v)).all():
+                    raise _NotFiniteError(good)
+                try:
+                    a = at_time(self, t).forward_dynamics(q, v, tau)
+                except NumericalError:
+                    # Its message would blame the model for a state that has grown beyond all bounds.
+                    raise _NotFiniteError(np.array(False)) from None
+                return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
+
+            try:
+                q1, w1, _ = formula.step(space, rates, ArrayStages(method.stages, v.shape), start, dt, q, w)
+            except _NotFiniteError:
+                if near or not self.projects:
+                    raise
+                return None
+            return q1, w1, last[0]
+
+        taken: Any = self._explicit_step(formula, start, dt, q, take) if self.projects else take(False)
+        q1, w1, *_ = taken
         v1 = space.to_body_velocity(q1, w1)
         return self._pulled(start + dt, q1, v1) if self.projects else (q1, v1)
 

@@ -7,8 +7,7 @@ pose: a set may have full rank on one branch of a mechanism only (a row of equal
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -17,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
+from mbkit._independence import pivoted
 from mbkit.derivation.constraints import discs_of, independent_rows
 from mbkit.derivation.mass_matrix_solve import solve
+from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
@@ -29,8 +30,8 @@ from mbkit.model.manifold import random_state
 _EPS: Final = float(np.finfo(float).eps)
 #: Of each row's scale: what rounding and a few typed digits leave of a consistent state.
 _CONSISTENT: Final = 1e-8
-# Newton's iteration squares the residual: from here it ends at rounding.
-_NEAR: Final = 1e-8
+#: Rounds of the projection's iterations.
+_ROUNDS: Final = 8
 # How far Newton's iteration may move a state before it is looked whether its factors are of rounding.
 _FLUNG: Final = 1e-4
 #: Of the largest singular value of J, the smallest one at a singular pose: there v̇ from the equation of motion loses as
@@ -38,14 +39,12 @@ _FLUNG: Final = 1e-4
 AT_POSE: Final = 6e-6
 _MOST: Final = 60
 _TWIN: Final = "_constrained_twin"
-#: Random states that are drawn, each of which may be too far from the constraints, and how many of them anywhere.
-_DRAWS: Final = 50
-_ANYWHERE: Final = 10
-_NEARER: Final = 0.9
 
 
 def _function(eq: Any, name: str) -> ca.Function:
     """Return a compiled function of (q), (q, v) or (q, v, τ), and the parameters."""
+    if name in (projection.__name__, dependence.__name__):
+        return {"projection": projection, "dependence": dependence}[name](eq)
     c, m, k = eq.constraints, eq.constraints.jacobian.shape[0], eq.constraints.positions
     inputs = {"q": eq.q, "v": eq.v}
     if name == "constraint_rows":
@@ -57,7 +56,7 @@ def _function(eq: Any, name: str) -> ca.Function:
         # That of positions alone.
         outputs["V"] = c.weight(M, k)
     elif name == "constraint_step":
-        # q after a step of Newton's, v consistent there, f before it and its scale.
+        # q after a step of Newton's, and v consistent there.
         space = SymbolicSpace(eq.model)
         Y = solve(c.weight(eq.mass_matrix), c.jacobian.T, eq.elimination_order)
         S = ca.mtimes(c.jacobian, Y)
@@ -68,7 +67,7 @@ def _function(eq: Any, name: str) -> ca.Function:
             q1 = space.retract(eq.q, space.to_integrator_velocity(eq.q, moved))
         Y1, S1, rate1 = (ca.substitute(x, eq.q, q1) for x in (Y, S, c.rate))
         v1 = eq.v - ca.mtimes(Y1, solve(S1, rate1, range(m)))
-        outputs = {"q1": q1, "v1": v1, "f": c.value, "scale": ca.sqrt(ca.sum2(held**2))}
+        outputs = {"q1": q1, "v1": v1}
     elif name == "all_rows":
         del inputs["v"]
         outputs = {"f": eq.constraint_residual, "J": eq.constraint_jacobian, "ways": eq.loop_ways}
@@ -265,20 +264,31 @@ class Manifold:
     def pulled(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the consistent state beside one that has drifted a little, or of each of a batch.
 
-        A state that is far from the constraints or not finite comes back as it is or as NaN. One at a singular pose,
-        where the factors are of rounding, is pulled by the rows that are independent there.
+        The formula is that of `mbkit.derivation.steps.onto_constraints`. A state that is far from the constraints or
+        not finite comes back as it is or as NaN. One at a singular pose, where the factors are of rounding, is pulled
+        by the rows that are independent there.
         """
-        first = q, v
-        for _ in range(4):
-            q, v, f, scale = (x[..., 0] for x in self.call("constraint_step", q, v))
-            if not bool((np.abs(f) / scale > _NEAR).any()):
+        q1, v1, moved = q, v, np.zeros(v.shape)
+        for _ in range(_ROUNDS):
+            q1, v1, moved, far = (x[..., 0] for x in self.call("projection", q, v1, moved))
+            if not far.any():
                 break
-        moved = np.maximum(*(np.abs(x - x0).max(axis=-1) for x, x0 in zip((q, v), first, strict=True)))
-        if bool((moved <= _FLUNG).all()):
-            return q, v
-        for i in map(tuple, np.argwhere(self.at_pose(first[0]) & ~(moved <= _FLUNG))):
-            q[i], v[i] = self._pulled_at_pose(first[0][i], first[1][i])
-        return q, v
+        change = np.maximum(*(np.abs(x - x0).max(axis=-1) for x, x0 in ((q1, q), (v1, v))))
+        if bool((change <= _FLUNG).all()):
+            return q1, v1
+        for i in map(tuple, np.argwhere(self.at_pose(q) & ~(change <= _FLUNG))):
+            q1[i], v1[i] = self._pulled_at_pose(q[i], v[i])
+        return q1, v1
+
+    def beside(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the state after one step of Newton's iteration onto the constraints; at a singular pose as it is."""
+        q1, v1, *_ = self.call("constraint_step", q, v)
+        stays = self.at_pose(q)[..., None]
+        return np.where(stays, q, q1[..., 0]), np.where(stays, v, v1[..., 0])
+
+    def dependence(self, q: Array) -> Array:
+        """Return how nearly rows of J depend on each other, of one state or each of a batch."""
+        return self.call("dependence", q)[0][..., 0, 0]
 
     def at_pose(self, q: Array) -> NDArray[np.bool_]:
         """Return whether a configuration, or each of a batch, is a singular pose up to rounding."""
@@ -289,9 +299,9 @@ class Manifold:
         for _ in range(2):
             x = self._terms(q, v)
             scale = x.scale[: len(x.f)]
-            q = self.dyn.model.integrate(q, _least_change(x.V, x.held / scale[:, None], -x.f / scale, AT_POSE))
+            q = self.dyn.model.integrate(q, least_change(x.V, x.held / scale[:, None], -x.f / scale, AT_POSE))
         x = self._terms(q, v)
-        return q, v + _least_change(x.W, x.J / x.scale[:, None], -x.rate / x.scale, AT_POSE)
+        return q, v + least_change(x.W, x.J / x.scale[:, None], -x.rate / x.scale, AT_POSE)
 
     def project(self, q: Array, v: Array, held: Collection[int] = ()) -> tuple[Array, Array]:
         """Return the nearest consistent state, in the metric of the mass matrix there; InputError if there is none.
@@ -316,7 +326,11 @@ class Manifold:
             x = self.restored(model.integrate(x, step if size < last else 0.5 * step), v, held)
             last = min(last, size)
         terms = self._terms(x, v)
-        return x, v + _least_change(terms.W, terms.J, -terms.rate, free=free)
+        return x, v + least_change(terms.W, terms.J, -terms.rate, free=free)
+
+    def apartness(self, q: Array) -> float:
+        """Return the smallest singular value of J with rows of unit size over the largest one."""
+        return float(np.divide(*by_size(self.jacobian(q))[2][[-1, 0]]))
 
     def acceleration(self, q: Array, v: Array, a: Array, held: Collection[int] = ()) -> Array:
         """Return the nearest a with J a + γ = 0, in the metric of the mass matrix."""
@@ -325,7 +339,7 @@ class Manifold:
         W = self._terms(q, v).W
         # Once more for what rounding leaves of large accelerations.
         for _ in range(2):
-            a = a + _least_change(W, J, -gamma[:, 0] - J @ a, free=free)
+            a = a + least_change(W, J, -gamma[:, 0] - J @ a, free=free)
         return a
 
     def _free(self, held: Collection[int]) -> Array:
@@ -361,7 +375,7 @@ class Manifold:
         for _ in range(_MOST):
             if best <= 4 * _EPS * (1 + float(np.abs(x).max())):
                 break
-            step, length = _least_change(terms.V, terms.held, -terms.f, free=free), 1.0
+            step, length = least_change(terms.V, terms.held, -terms.f, free=free), 1.0
             while length > 1e-6:
                 moved = self.dyn.model.integrate(x, length * step)
                 beyond = self._terms(moved, v)
@@ -385,6 +399,13 @@ class Manifold:
         return np.asarray(x)
 
 
+def by_size(J: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the sizes of J's rows, and the singular value decomposition of J with rows of unit size."""
+    size = np.linalg.norm(J, axis=-1)
+    size = np.where(size > 0, size, 1.0)
+    return size, *np.linalg.svd(J / size[..., None], full_matrices=False)
+
+
 def _residuals(x: Array) -> str:
     return f"[{', '.join(f'{e:.3g}' for e in x)}]"
 
@@ -401,75 +422,14 @@ def manifold_of(dyn: Dynamics) -> Manifold:
     return Manifold(vars(dyn)[_TWIN])
 
 
-class ConsistentStates:
-    """What a model asks of its constraints, by equations that are interpreted and derived once."""
-
-    def __init__(self, model: Model) -> None:
-        self.manifold = Manifold(LagrangianDynamics(model, compile=False))
-
-    def at(self, model: Model) -> ConsistentStates:
-        """Return the same for other values of the model's parameters."""
-        out = object.__new__(type(self))
-        out.manifold = Manifold(self.manifold.dyn._with(model, {}))
-        return out
-
-    def require_independent(self, q: Array, *, once: bool = False) -> None:
-        """Refuse constraints that depend on each other at q; with `once`, if that was never looked at."""
-        if not (once and self.manifold.judged):
-            require_independent(self.manifold.dyn, np.atleast_2d(q)[0])
-
-    def random(self, rng: np.random.Generator, size: int | None) -> tuple[Array, Array]:
-        """Return random consistent states that are no singular poses."""
-        drawn = [self._drawn(rng) for _ in range(1 if size is None else size)]
-        model = self.manifold.dyn.model
-        sizes = (model.nq, model.nv)
-        q, v = (np.array([state[k] for state in drawn]).reshape(-1, n) for k, n in enumerate(sizes))
-        return (q[0], v[0]) if size is None else (q, v)
-
-    def _drawn(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        dyn = self.manifold.dyn
-        for k in range(_DRAWS):
-            # From some places there is no way to the constraints; on some branches they depend on each other.
-            with suppress(InputError, NumericalError):
-                q, v = random_state(dyn.model, rng, None)
-                if k >= _ANYWHERE:
-                    # Of many loops few configurations are near a closed one: nearer and nearer to one that is known.
-                    model, known = dyn.model, self.manifold.equations.closed_configuration
-                    known = model.neutral() if known is None else known
-                    q = model.integrate(known, _NEARER ** (k - _ANYWHERE) * model.difference(known, q))
-                # Some pose is far cheaper than the nearest one, and on such a branch refused all the same.
-                require_independent(dyn, self.manifold.restored(q, v))
-                state = self.manifold.project(q, v)
-                require_independent(dyn, state[0])
-                return state
-        refuse_unreachable(dyn)
-        return self.manifold.project(*random_state(dyn.model, rng, None))
-
-
-#: The name under which a model keeps its own.
-_STATES: Final = "_consistent_states"
-
-
-def states_of(model: Model) -> ConsistentStates:
-    """Return the consistent states of a model under constraints, derived once for it."""
-    kept = vars(model)
-    if _STATES not in kept:
-        kept[_STATES] = ConsistentStates(model)
-    states: ConsistentStates = kept[_STATES]
-    if states.manifold.dyn.model is not model:
-        # The same constraints at other values of parameters, or at another time.
-        states = kept[_STATES] = states.at(model)
-    return states
-
-
-def _least_change(W: Array, J: Array, change: Array, rounding: float = 1e-12, *, free: Array | None = None) -> Array:
+def least_change(W: Array, J: Array, change: Array, rounding: float = 1e-12, *, free: Array | None = None) -> Array:
     """Return the x with J x = change that is the least in xᵀ W x; the nearest to it where J has dependent rows.
 
     Only entries that are `free` are other than zero.
     """
     if free is not None and len(free) < len(W):
         out = np.zeros(len(W))
-        out[free] = _least_change(W[np.ix_(free, free)], J[:, free], change, rounding)
+        out[free] = least_change(W[np.ix_(free, free)], J[:, free], change, rounding)
         return out
     try:
         L = np.linalg.cholesky(W)
@@ -478,6 +438,37 @@ def _least_change(W: Array, J: Array, change: Array, rounding: float = 1e-12, *,
     A = np.linalg.solve(L, J.T).T
     y = np.linalg.lstsq(A, change, rcond=rounding)[0]
     return np.asarray(np.linalg.solve(L.T, y))
+
+
+#: take(near) -> (q1, w1, last): a step and the configuration of its last stage. Where it is near a singular pose, its
+#: stages are projected. None where it fails.
+Attempt = Callable[[bool], "tuple[Array, Array, Array] | None"]
+
+
+def explicit_step(
+    dyn: Dynamics, formula: Any, t: float, h: float, q: Array, take: Attempt
+) -> tuple[Array, Array] | None:
+    """Take an explicit step under constraints, of one state or a batch; its end is still to be projected.
+
+    The formula of `mbkit.derivation.steps.fixed`: near a singular pose f̈ = 0 divides the stages' errors by J's smallest
+    singular value, and they are projected. What decides is the state at the step's start and end alone, so that one
+    step is the same wherever it is taken.
+    """
+    plain = take(False)
+    if plain is None:
+        near = np.full(q.shape[:-1], True)
+    else:
+        q1, w1, last = plain
+        end = last if formula.ends_at_a_stage else q1
+        states = manifold_of(dyn)
+        near = nears_singular(states.at(t).dependence(q), states.at(t + h).dependence(end))
+        if not near.any():
+            return q1, w1
+    careful = take(True)
+    if careful is None or plain is None:
+        return None if careful is None else careful[:2]
+    which = near[..., None]
+    return np.where(which, careful[0], q1), np.where(which, careful[1], w1)
 
 
 def pulled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
@@ -740,7 +731,7 @@ def _nearest(manifold: Manifold, q: Array, scale: Array) -> tuple[Array, Array]:
     scale = scale[: len(f)]
     f = f / scale
     for _ in range(_STEPS):
-        step = _least_change(np.eye(manifold.dyn.model.nv), manifold.position_jacobian(q) / scale[:, None], -f)
+        step = least_change(np.eye(manifold.dyn.model.nv), manifold.position_jacobian(q) / scale[:, None], -f)
         length = 1.0
         while length > 1e-9:
             moved = manifold.dyn.model.integrate(q, length * step)
@@ -758,12 +749,9 @@ def _nearest(manifold: Manifold, q: Array, scale: Array) -> tuple[Array, Array]:
 
 def _dependent(J: Array) -> tuple[Array, Array]:
     """Return the rows that the others imply, and those others that are needed for it."""
-    from scipy.linalg import qr
-
-    _, R, order = qr(J.T, mode="economic", pivoting=True)
-    rank = int(np.count_nonzero(np.abs(np.diag(R)) > _DEPENDENT))
-    kept, dependent = order[:rank], np.sort(order[rank:])
-    if not len(dependent) or not rank:
+    order, *_ = pivoted(J, _DEPENDENT)
+    kept, dependent = np.array(order, dtype=int), np.setdiff1d(np.arange(len(J)), order)
+    if not len(dependent) or not len(kept):
         return dependent, np.empty(0, dtype=int)
     # As a combination of those that were kept.
     weights = np.linalg.lstsq(J[kept].T, J[dependent].T, rcond=None)[0]

@@ -13,6 +13,7 @@ import numpy as np
 import sympy as sp
 
 from mbkit._check import Array
+from mbkit._independence import pivoted
 from mbkit.derivation.kinematics import Kinematics, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError
@@ -384,9 +385,6 @@ def _at_rest(way: _Way) -> Array:
 
 def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], message: str) -> list[sp.Expr]:
     """Return those of three sums that the others do not imply."""
-    # This loads SciPy.
-    from scipy.linalg import qr
-
     sums = [kin.zero + x for x in sums]
     kin.drop_dust(sums)
     keys = list(dict.fromkeys(key for x in sums for key in x.terms))
@@ -395,9 +393,7 @@ def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], message: s
     largest = float(np.abs(A).max(initial=0.0))
     kept: list[int] = []
     if moving.any():
-        _, R, order = qr(A[:, moving].T, mode="economic", pivoting=True)
-        sizes = np.abs(np.diag(R))
-        kept = sorted(order[: int(np.count_nonzero(sizes > _DEPENDENT * sizes[0]))].tolist())
+        kept = sorted(pivoted(A[:, moving], _DEPENDENT * float(np.linalg.norm(A[:, moving], axis=1).max()))[0])
     for i in set(range(3)) - set(kept):
         weights = np.linalg.lstsq(A[kept][:, moving].T, A[i, moving], rcond=None)[0]
         left = A[i] - weights @ A[kept]

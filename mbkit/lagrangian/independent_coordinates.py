@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit._escape import one_line
+from mbkit._independence import pivoted
 from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.engines.constraint_manifold import Manifold, require_few
 from mbkit.engines.lagrangian import LagrangianDynamics
@@ -241,12 +242,13 @@ class Embedded:
 
     def chart(self, q: Array, t: float) -> Chart:
         """Return the chart to start with at a configuration: the pivots of J, or what the user chose."""
-        from scipy.linalg import qr
-
         names = self.model.coordinate_names
         if self.independent is None:
             J = self.manifold.at(t).jacobian(q)
-            independent = np.sort(qr(J, mode="economic", pivoting=True)[2][len(J) :])
+            first = pivoted(J.T, 0.0)[0]
+            # At a singular pose fewer columns have a remainder than there are rows.
+            order = [*first, *np.setdiff1d(np.arange(J.shape[1]), first)]
+            independent = np.sort(order[len(J) :])
         else:
             independent = np.array([names.index(n) for n in self.independent], dtype=np.intp)
         return Chart(independent, np.setdiff1d(np.arange(len(names)), independent))

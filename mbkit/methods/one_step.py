@@ -80,6 +80,7 @@ class SemiImplicitEuler:
     name: ClassVar[str] = "semi_implicit_euler"
     stages: ClassVar[int] = 1
     explicit: ClassVar[bool] = True
+    ends_at_a_stage: ClassVar[bool] = False
 
     def step(
         self, space: Space, rates: StageRates, _stages: Stages, t: Any, h: Any, q: Any, w: Any

@@ -60,6 +60,8 @@ def _stage_weights(alpha: Array, beta: Array, tree: Tree) -> Array:
     return out
 
 
+#: Of a step: rounding of a stage's time.
+_SAME_TIME: Final = 1e-12
 #: What the sixteen digits of published coefficients leave of a sum of a Rosenbrock method.
 _DIGITS: Final = 1e-12
 
@@ -168,6 +170,11 @@ class Tableau:
     def stages(self) -> int:
         """Number of stages."""
         return len(self.b)
+
+    @property
+    def ends_at_a_stage(self) -> bool:
+        """Whether the last stage is at the end of the step, near the state there."""
+        return self.stages > 1 and bool(abs(self.c[-1] - 1) < _SAME_TIME)
 
     @cached_property
     def _rows(self) -> list[tuple[float, Array]]:

@@ -93,7 +93,8 @@ class Model(Description):
         -------
         q : (nq,) or (size, nq) array
             Uniform within the limits, clipped to ±π rad; ±1 m where a length has none; uniform rotations. Under
-            constraints the nearest consistent state, also beyond the limits, and not a singular pose.
+            constraints the consistent state to which Newton's flow leads from there, also beyond the limits, away from
+            singular poses. A seed gives the same state on every processor, to rounding.
         v : (nv,) or (size, nv) array
             Standard normal.
         """
@@ -346,7 +347,7 @@ class Model(Description):
 def _states_of(model: Model) -> Any:
     """Return the consistent states of a model under constraints."""
     # By name: a description knows no derivation, and asks for it only here.
-    return import_module("mbkit.engines.constraint_manifold").states_of(model)
+    return import_module("mbkit.engines.consistent.random_states").states_of(model)
 
 
 def _unlimited(joint: Joint) -> Joint:

@@ -56,10 +56,7 @@ def settled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
 
 def beside(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
     """Return the state after one step of Newton's iteration onto the constraints; at a singular pose as it is."""
-    manifold = manifold_at(dyn, t)
-    q1, v1, *_ = manifold.call("constraint_step", q, v)
-    stays = manifold.at_pose(q)[..., None]
-    return np.where(stays, q, q1[..., 0]), np.where(stays, v, v1[..., 0])
+    return manifold_at(dyn, t).beside(q, v)
 
 
 def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:

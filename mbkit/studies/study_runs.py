@@ -16,7 +16,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.engines.constraint_manifold import states_of
+from mbkit.engines.consistent.random_states import states_of
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, MbkitError, MbkitWarning
 from mbkit.model import Model

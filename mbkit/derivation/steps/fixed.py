@@ -2,6 +2,11 @@
 
 The formulas are those of `mbkit.methods`, on the space of `mbkit.model.integration_space`. The torque is held over
 the step.
+
+Under constraints the stages are those of the method, and the end is projected as in
+`mbkit.derivation.steps.onto_constraints`. Its first stage and its last one, or its end where no stage is there, tell
+whether a step is near a singular pose (`nears_singular`). Such a step is lost here, and taken by
+`mbkit.engines.constraint_manifold.explicit_step`, which projects the stages too.
 """
 
 from __future__ import annotations
@@ -30,8 +35,6 @@ _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
 #: Parts that evaluate forward dynamics, without and with constraints.
 DYNAMICS: Final = ("forward_dynamics", "held_dynamics")
-#: Of a step: rounding of a stage's time.
-_SAME_TIME: Final = 1e-12
 
 
 class SymbolicStages:
@@ -227,19 +230,16 @@ def _stepped(
     before, behind = equations.extra_arguments.values(), at_time(equations, s["dt"]).values()
     v1, depends = space.to_body_velocity(q1, w1), dependence(equations)
     first = dependences[0] if dependences else depends(s["q"], *before)
-    if thorough or not _ends_at_a_stage(formula):
+    if formula.ends_at_a_stage:
+        end = dependences[-1] if dependences else depends(*last, *behind)
+    else:
         end = depends(q1, *behind)
+    if thorough or not formula.ends_at_a_stage:
         q1, v1, far = thorough_projection(equations)(q1, v1, *behind)
     else:
-        end = dependences[-1] if dependences else depends(*last, *behind)
         q1, v1, far = quick_projection(equations)(q1, v1, *last, *behind)
     lost = ca.logic_or(far, nears_singular(first, end))
     return q1, space.to_integrator_velocity(q1, v1), lost
-
-
-def _ends_at_a_stage(formula: Tableau | SemiImplicitEuler) -> bool:
-    """Return whether the last stage is near the end of the step, so that its factors are good enough there."""
-    return isinstance(formula, Tableau) and formula.stages > 1 and bool(abs(formula.c[-1] - 1) < _SAME_TIME)
 
 
 def _symbols(equations: Equations) -> dict[str, Any]:

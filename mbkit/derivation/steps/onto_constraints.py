@@ -1,13 +1,18 @@
 """The end of a step under constraints: positions projected onto f = 0, velocities onto all rows, as CasADi expressions.
 
-The equation of motion holds J v̇ + γ = 0 only, so that f and the rates drift by the step's own error. Newton's iteration
-in the metric of the mass matrix takes both to rounding, and the order of the method stays (Hairer, Lubich, Wanner 2006,
-Geometric Numerical Integration, ch. IV.4). Rows that hold velocities alone move no position: the coordinates go where
-the velocities led them.
+The equation of motion holds J v̇ + γ = 0 only, so that f and the rates drift by the step's own error. With (q, v) at the
+end of the step, Y = M⁻¹ Jᵀ there, and the drift taken away in the metric of the mass matrix ::
 
-As a rule one iteration is enough, with the factors that the last stage has left: the drift is that of a step, and the
-stage is near the end. `quick_projection` says where it was not, and the step is then taken again with
-`thorough_projection`, three iterations with factors of its own.
+    q1 = q ⊕ Y λ      f(q1) = 0      v1 = v + Y μ      J(q1) v1 + c(q1) = 0
+
+the order of the method stays (Hairer, Lubich, Wanner 2006, Geometric Numerical Integration, algorithm IV.4.2). Rows
+that hold velocities alone move no position: the coordinates go where the velocities led them.
+
+λ and μ are found by the simplified Newton iteration, with the factors of S = J Y at q. As a rule one iteration is
+enough, even with the factors that the last stage has left: the drift is that of a step, and the stage is near the end.
+`quick_projection` says where that leaves more than rounding, and the step is then taken again with
+`thorough_projection`. Both have the same result, to rounding, as `mbkit.engines.constraint_manifold.Manifold.pulled`,
+which goes on for as long as it takes.
 """
 
 from __future__ import annotations
@@ -24,10 +29,12 @@ from mbkit.model.manifold import random_state
 
 #: A pose is singular ahead where J's rows would depend on each other within so many steps at the present pace.
 _AHEAD: Final = 4
-#: Of the coordinates: what the last of three iterations may move. The next one would move it times the first one's.
-_LAST: Final = 1e-11
-#: Of the coordinates and velocities: about what one iteration may leave, if rows bend as much as they slope.
+#: Iterations of the thorough projection.
+_ITERATIONS: Final = 4
+#: Of the coordinates and velocities: about what an iteration may leave, if rows bend as much as they slope.
 _LEFT: Final = 1e-16
+#: Of the size of J and of the state: what rounding leaves of a residual.
+_ROUNDING: Final = 4e-16
 #: Configurations at which the usual size of a row is found.
 _POSES: Final = 8
 
@@ -55,23 +62,55 @@ def quick_projection(equations: Any) -> ca.Function:
     return out
 
 
-def thorough_projection(equations: Any) -> ca.Function:
-    """Return (q, v, more) -> (q1, v1, far): the consistent state near a step's end, and 1 where it is too far."""
-    if "thorough projection" not in equations.kept:
+def thorough_projection(equations: Any, *, exact: bool = False) -> ca.Function:
+    """Return (q, v, more) -> (q1, v1, far): the consistent state near a step's end, and 1 where it is too far.
+
+    In more digits than double precision has, `exact` takes all iterations.
+    """
+    name = "thorough_projection" + ("_exact" if exact else "")
+    if name not in equations.kept:
+        q, v, extra = equations.q, equations.v, equations.extra_arguments
+        q1, v1, _, far = projection(equations, exact=exact)(q, v, ca.SX(v.shape[0], 1), *extra.values())
+        equations.kept[name] = ca.Function(name, [q, v, *extra.values()], [q1, v1, far])
+    out: ca.Function = equations.kept[name]
+    return out
+
+
+def projection(equations: Any, *, exact: bool = False) -> ca.Function:
+    """Return (q, v, moved, more) -> (q1, v1, moved1, far): some iterations onto the constraints from a step's end.
+
+    They begin with q ⊕ moved and end with q1 = q ⊕ moved1; far is 1 where others would change more than rounding.
+    """
+    name = "projection" + ("_exact" if exact else "")
+    if name not in equations.kept:
         c: ConstraintTerms = equations.constraints
         q, v, extra = equations.q, equations.v, equations.extra_arguments
         more, shift, change = [*extra.values()], _shift(equations), _change(equations)
         rows = ca.Function("rows", [q, v, *more], [c.value, c.rate])
-        q1 = _moved(equations, q, shift(q, c.value, *more))
-        q1 = _moved(equations, q1, shift(q, rows(q1, v, *more)[0], *more))
-        residual, rate = rows(q1, v, *more)
-        v1 = v + change(q, rate, *more)
-        v1 = v1 + change(q, rows(q1, v1, *more)[1], *more)
-        last = shift(q, residual, *more)
-        far = ca.sumsqr(last) > _LAST**2 * (1 + ca.sumsqr(q1))
-        outs = [_moved(equations, q1, last), v1, far]
-        equations.kept["thorough projection"] = ca.Function("thorough_projection", [q, v, *more], outs)
-    out: ca.Function = equations.kept["thorough projection"]
+        start = moved = ca.SX.sym("moved", *v.shape)
+        q1, v1 = _moved(equations, q, start), v
+        f, _ = rows(q1, v, *more)
+        # A residual of rounding stays: the factors of a singular pose nearby would make a change of state of it.
+        slopes = ca.sumsqr(c.jacobian)
+        left = ca.sumsqr(f) > _ROUNDING**2 * slopes * (1 + ca.sumsqr(q))
+        # What is left later is about the product of the last change and of the way from q, where the factors are, if
+        # rows bend as much as they slope.
+        for _ in range(_ITERATIONS):
+            by = shift(q, rows(q1, v, *more)[0], *more)
+            by = by if exact else ca.if_else(left, by, 0)
+            moved = moved + by
+            q1 = _moved(equations, q, moved)
+            left = ca.sumsqr(moved) * ca.sumsqr(by) > _LEFT**2 * (1 + ca.sumsqr(q1))
+        far, (_, rate) = left, rows(q1, v, *more)
+        left = ca.sumsqr(rate) > _ROUNDING**2 * slopes * ca.sumsqr(v)
+        for _ in range(_ITERATIONS):
+            by = change(q, rows(q1, v1, *more)[1], *more)
+            by = by if exact else ca.if_else(left, by, 0)
+            v1 = v1 + by
+            left = ca.sumsqr(moved) * ca.sumsqr(by) > _LEFT**2 * (1 + ca.sumsqr(v1))
+        far = ca.logic_or(far, left)
+        equations.kept[name] = ca.Function(name, [q, v, start, *more], [q1, v1, moved, far])
+    out: ca.Function = equations.kept[name]
     return out
 
 
@@ -143,4 +182,5 @@ def nears_singular(before: Any, behind: Any) -> Any:
     With r = 1/√dependence, as far from such a pose: r1 < n abs(r1 - r0), or r1 > n/(n - 1) r0, or r1 < n/(n + 1) r0.
     """
     nearer, farther = (_AHEAD + 1) ** 2 / _AHEAD**2, (_AHEAD - 1) ** 2 / _AHEAD**2
-    return ca.logic_or(behind > nearer * before, behind < farther * before)
+    # A sum, which NumPy and CasADi both know.
+    return (behind > nearer * before) + (behind < farther * before) > 0

@@ -259,8 +259,12 @@ def make_step(method: str, field: Field, space: Space) -> Step:
     assert isinstance(formula, (Tableau, SemiImplicitEuler))
     explicit, stages = formula, ArrayStages(formula.stages, (space.nv,))
 
-    def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+    def attempt(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array, Array]:
+        last = q
+
         def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
+            nonlocal last
+            last = q
             return w if u is None else space.rate(u, w), field.consistent(t, q, w, force)
 
         nonlocal stages
@@ -268,6 +272,26 @@ def make_step(method: str, field: Field, space: Space) -> Step:
             stages = ArrayStages(explicit.stages, w.shape)
         stages.keep(0)
         q, w, _ = explicit.step(space, rates, stages, t, h, q, w)
-        return q, w
+        return q, w, last
+
+    def step(t: float, h: float, q: Array, w: Array, force: Force) -> tuple[Array, Array]:
+        field.near = False
+        if not field.projects:
+            return attempt(t, h, q, w, force)[:2]
+
+        def take(near: bool) -> tuple[Array, Array, Array] | None:
+            field.near = near
+            try:
+                return attempt(t, h, q, w, force)
+            except DivergenceError:
+                if near:
+                    raise
+                return None
+
+        from mbkit.engines.constraint_manifold import explicit_step
+
+        taken = explicit_step(field.dyn, explicit, t, h, q, take)
+        assert taken is not None
+        return taken
 
     return step

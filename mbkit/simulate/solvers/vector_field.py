@@ -47,8 +47,12 @@ def are_bounded(q: Array, w: Array) -> NDArray[np.bool_]:
 class Field:
     """ẇ of the integrators' state, from an engine's forward dynamics; `evaluations` are summed over a batch.
 
-    Without a space, w is mbkit's v. Under constraints an `explicit` method's stages near a singular pose are projected.
+    Without a space, w is mbkit's v. Under constraints an `explicit` method's stages near a singular pose are projected:
+    a fixed step says by `near` whether it is, and an adaptive run looks ahead.
     """
+
+    #: Whether this step is near a singular pose; None where the run looks ahead.
+    near: bool | None = None
 
     def __init__(self, dyn: Dynamics, space: Space | None, *, explicit: bool = True) -> None:
         self._dyn, self._space, self._explicit = dyn, None if space is None or space.flat else space, explicit
@@ -79,7 +83,8 @@ class Field:
     @property
     def near_singular(self) -> bool:
         """Whether constraints may soon depend on each other."""
-        return self._constrained and self._explicit and self._approach.near
+        near = self._approach.near if self.near is None else self.near
+        return self._constrained and self._explicit and near
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a step led to, on its constraints if there are some."""
@@ -91,7 +96,7 @@ class Field:
 
     def look(self, t: float, q: Array, w: Array) -> None:
         """Look how near a singular pose the run is, at the start or the end of a step."""
-        if self._constrained and self._explicit:
+        if self._constrained and self._explicit and self.near is None:
             self._approach.saw(self._own, t, q, w if self._space is None else self._space.to_body_velocity(q, w))
 
     @property
@@ -123,7 +128,7 @@ class Field:
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
         # An implicit method does not look ahead: its step may begin at a pose.
-        looks = self._constrained and (self._approach.near or not self._explicit)
+        looks = self._constrained and (self.near_singular or not self._explicit)
         a = self._at_poses(t, q, v, force) if looks else None
         if a is None:
             a = self._evaluated(t, q, v, force)

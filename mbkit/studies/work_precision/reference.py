@@ -28,7 +28,7 @@ from mbkit.derivation import Equations, equations_of
 from mbkit.derivation.steps.onto_constraints import thorough_projection
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import at_time
-from mbkit.engines.constraint_manifold import states_of
+from mbkit.engines.consistent.random_states import states_of
 from mbkit.engines.registry import DERIVED, INDEPENDENT
 from mbkit.errors import InputError, MbkitError, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, METHODS, SCIPY_METHOD, SERIES_METHOD
@@ -129,7 +129,7 @@ class Motion:
         if not self.model.constrained:
             return (self.q0, 0 * self.q0), (self.v0, 0 * self.v0)
         own = arithmetic()
-        q, v, *_ = Extended(program(thorough_projection(self.equations)), own)(
+        q, v, *_ = Extended(program(thorough_projection(self.equations, exact=True)), own)(
             *(own.array(x[None]) for x in (self.q0, self.v0)), *self._constants(np.zeros(1))
         )
         return own.pair(q[0, :, 0]), own.pair(v[0, :, 0])

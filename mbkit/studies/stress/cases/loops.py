@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from mbkit import catalog
 from mbkit._check import Array
-from mbkit.engines.constraint_manifold import states_of
+from mbkit.engines.consistent.random_states import states_of
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.parts import Prescribed
 from mbkit.studies.stress.case import Case, Problem

@@ -1,0 +1,1 @@
+"""States that constraints allow."""
