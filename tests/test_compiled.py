@@ -27,6 +27,7 @@ from mbkit.codegen.compiled import Call, Compiled, KernelSequence, compiled
 from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.program import program
 from mbkit.codegen.python_call import python_call
+from mbkit.errors import InputError
 from tests.random_trees import random_tree, states
 from validation.memory import allocated
 
@@ -570,3 +571,28 @@ def test_more_arrays_than_the_loop_has_room_for_are_refused():
                 built(function)
         else:
             assert built(function)(*[np.ones((20, 1))] * n)[0][19, 0, 0] == n
+
+
+# A level that many processors share
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="levels are those of x86-64")
+def test_code_for_any_x86_64_has_the_same_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = random_tree(4, n=4, kinds=("free", "ball", "revolute", "helical"))
+    q, v = model.random_state(0, 9)
+    expected = mb.dynamics(model, "lagrangian", compile=False).forward_dynamics(q, v, 0 * v)
+    for level in ("x86-64", "x86-64-v2"):
+        monkeypatch.setenv("MBKIT_CPU", level)
+        assert (jit.host().cpu, jit.host().width) == (level, 2)
+        got = mb.dynamics(model, "lagrangian", compile=True).forward_dynamics(q, v, 0 * v)
+        # Code without FMA differs from this processor's own in the last bits alone.
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e3 * np.finfo(float).eps * np.abs(expected).max())
+
+
+def test_levels_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MBKIT_CPU", "x86-64-v9")
+    with pytest.raises(InputError, match=r"MBKIT_CPU: expected a level that this processor has, .*, got 'x86-64-v9'"):
+        jit.host()
+    monkeypatch.setattr(jit, "LEVELS", {**jit.LEVELS, "x86-64-v9": (frozenset({"no such feature"}), 8)})
+    with pytest.raises(InputError, match="MBKIT_CPU: expected a level that this processor has"):
+        jit.host()

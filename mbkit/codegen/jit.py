@@ -1,8 +1,9 @@
-"""Machine code for this processor, by LLVM (llvmlite): object files, to be loaded on the same kind of processor."""
+"""Machine code for this processor, or for a level of x86-64 that others share, by LLVM (llvmlite): object files."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import threading
 from collections.abc import Callable
 from functools import cache
@@ -17,6 +18,7 @@ from mbkit.codegen.batch_loop import MOST_ARRAYS, RUN, batch_code
 from mbkit.codegen.program import Program
 from mbkit.codegen.simd_kernel import vector_code
 from mbkit.derivation.fingerprint import SOURCES
+from mbkit.errors import InputError
 
 _SIGNATURE: Final = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 
@@ -47,15 +49,43 @@ if hasattr(llvm.ffi.lib, "_lock"):
     fork_safe(llvm.ffi.lib._lock)
 
 
-@cache
+#: Levels of x86-64 (System V ABI, AMD64 supplement, table 3.1): what a processor needs for each, and the doubles in
+#: one of its registers.
+LEVELS: Final[dict[str, tuple[frozenset[str], int]]] = {
+    "x86-64": (frozenset(), 2),
+    "x86-64-v2": (frozenset({"sse4.2", "popcnt"}), 2),
+    "x86-64-v3": (frozenset({"avx2", "bmi2", "f16c", "fma"}), 4),
+    "x86-64-v4": (frozenset({"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}), 8),
+}
+
+
 def host() -> Host:
-    """Return what this machine's code depends on."""
+    """Return what machine code depends on: this processor, or the level that ``MBKIT_CPU`` names.
+
+    Raises
+    ------
+    InputError
+        ``MBKIT_CPU`` names no level, or one that this processor has not.
+    """
+    return _host(os.environ.get("MBKIT_CPU", ""))
+
+
+@cache
+def _host(level: str) -> Host:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    flags = llvm.get_host_cpu_features()
-    width = 8 if flags.get("avx512f") else 4 if flags.get("avx") else 2
+    flags, triple = llvm.get_host_cpu_features(), llvm.get_process_triple()
     version = f"llvmlite {llvmlite.__version__}, LLVM {'.'.join(map(str, llvm.llvm_version_info))}"
-    return Host(llvm.get_process_triple(), llvm.get_host_cpu_name(), flags.flatten(), width, version)
+    if not level:
+        width = 8 if flags.get("avx512f") else 4 if flags.get("avx") else 2
+        return Host(triple, llvm.get_host_cpu_name(), flags.flatten(), width, version)
+    have = [name for name, (needs, _) in LEVELS.items() if triple.startswith("x86_64") and all(map(flags.get, needs))]
+    if level not in have:
+        raise InputError(
+            f"MBKIT_CPU: expected a level that this processor has, {', '.join(have) or 'of which there is none'}, got "
+            f"{level!r}; unset it to compile for this processor"
+        )
+    return Host(triple, level, "", LEVELS[level][1], version)
 
 
 def _target() -> Any:
