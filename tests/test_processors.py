@@ -42,8 +42,8 @@ def mechanism(name: str, compiled: bool = False) -> Any:
 
 
 def states(seeds: int) -> dict[str, Any]:
-    """Return states of all mechanisms for some seeds, and the rows that are kept."""
-    out: dict[str, Any] = {}
+    """Return states of all mechanisms for some seeds, the rows that are kept, and the digests of all systems."""
+    out: dict[str, Any] = {f"{name}, digest": make().digest for name, make in mb.catalog.systems().items()}
     for name in (*MECHANISMS, PAPER):
         model = mechanism(name).model
         q, v = zip(*(model.random_state(seed) for seed in range(seeds)), strict=True)
@@ -56,7 +56,7 @@ def states(seeds: int) -> dict[str, Any]:
 def assert_same(got: dict[str, Any], expected: dict[str, Any]) -> None:
     assert got.keys() == expected.keys()
     for name, value in expected.items():
-        if name.endswith("rows"):
+        if name.endswith(("rows", "digest")):
             assert got[name] == value, name
             continue
         for x, y in zip(got[name], value, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -177,7 +178,9 @@ class ArgumentReader:
         largest = float(np.abs(vector).max())
         if largest and not 1e-100 < largest < 1e100:
             vector = vector / largest
-        length = float(np.linalg.norm(vector))
+        # By BLAS a dot product has other last bits, and the description another digest, on another processor.
+        x, y, z = vector.tolist()
+        length = math.sqrt(x * x + y * y + z * z)
         if not length:
             self.faults.append(f"{name} is zero; expected a direction")
             vector, length = np.array([1.0, 0.0, 0.0]), 1.0

@@ -92,7 +92,9 @@ def tangents(normal: Array) -> Array:
 
     The first is as near as can be to the axis that is farthest from the normal.
     """
-    first = np.eye(3)[np.argmin(np.abs(normal))]
+    sizes = np.abs(normal)
+    # Of components that are equal but for rounding the first.
+    first = np.eye(3)[np.argmax(sizes <= sizes.min() + 1e-9)]
     first = first - (first @ normal) * normal
     first = first / np.linalg.norm(first)
     return np.array([first, np.cross(normal, first)])
