@@ -101,6 +101,12 @@ def _numbers(tableau: str, name: str, value: ArrayLike) -> Array:
     return array
 
 
+def _times(rows: Array) -> Array:
+    sums = np.array([fsum(row) for row in rows])
+    # No stage lies behind the end of the step by a rounding.
+    return np.where(np.abs(sums - 1.0) < _SAME_TIME, 1.0, sums)
+
+
 def _digest(*arrays: Array) -> str:
     return hashlib.sha256(b"".join(x.tobytes() for x in arrays)).hexdigest()[:8]
 
@@ -164,7 +170,7 @@ class Tableau:
     @property
     def c(self) -> Array:
         """Stage times as fractions of the step, shape (s,)."""
-        return np.array([fsum(row) for row in self.A])
+        return _times(self.A)
 
     @property
     def stages(self) -> int:
@@ -398,9 +404,7 @@ class RosenbrockTableau:
     @property
     def c(self) -> Array:
         """Stage times as fractions of the step, shape (s,)."""
-        sums = np.array([fsum(row) for row in self._alpha])
-        # No stage lies behind the end of the step by a rounding.
-        return np.where(np.abs(sums - 1.0) < _DIGITS, 1.0, sums)
+        return _times(self._alpha)
 
     @property
     def d(self) -> Array:
