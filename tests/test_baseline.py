@@ -224,7 +224,7 @@ def test_damping_limits_and_mimic_are_parameters_too():
     assert "upper of joint panda_joint1: 2.8973 → inf" in told
     freed = mb.baseline.check(mb.load("panda", mimic="free"), path)
     assert [c.text for c in freed.changes] == ["mimic of joint panda_finger_joint2: panda_finger_joint1 → none"]
-    assert "coordinates are others" in freed.effect
+    assert "other joints or another order than recorded" in freed.effect
 
 
 def test_named_parameters_and_energies_are_told_by_name(tmp_path):
@@ -631,3 +631,33 @@ def test_a_target_is_a_text_and_options_are_plain(pendulum, target):
         with pytest.raises(InputError, match="options"):
             mb.baseline.record(model, pendulum, ["lagrangian"], options=options)
     assert mb.baseline.check(model, pendulum).passed
+
+
+def test_a_frame_that_moved_is_no_word_of_rest(tmp_path: Path) -> None:
+    """Whoever uses the tool has another pose and another Jacobian, though no term of the tree moves."""
+    model = mb.load("ur5")
+    mb.baseline.record(model, tmp_path / "ur5.toml", engines=["pinocchio"])
+    frames = tuple(
+        replace(f, translation=f.translation + np.array([0, 0, 0.02])) if f.name == "tool0" else f for f in model.frames
+    )
+    result = mb.baseline.check(replace(model, frames=frames), tmp_path / "ur5.toml")
+    assert not result.passed
+    assert result.effect.startswith("moves the pose of 1 frame, tool0 most, by 0.02 m and 0 rad, with their Jacobians")
+    texts = [c.text for c in result.changes]
+    assert texts[0] == "translation of frame tool0: z 0 → 0.02"
+    assert not any("same" in text for text in texts)
+
+
+def test_a_coupler_is_recorded(tmp_path: Path) -> None:
+    def pair(ratio: float) -> mb.Model:
+        b = mb.ModelBuilder("pair")
+        for k in (0, 1):
+            b.add_body(f"rod{k}", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+            b.add_joint(f"j{k}", "revolute", parent="world", child=f"rod{k}", axis=(0, 1, 0))
+        b.add_coupler("gear", "j0", "j1", ratio=ratio)
+        return b.build()
+
+    mb.baseline.record(pair(2.0), tmp_path / "pair.toml", engines=["lagrangian"])
+    assert mb.baseline.check(pair(2.0), tmp_path / "pair.toml").passed
+    result = mb.baseline.check(pair(3.0), tmp_path / "pair.toml")
+    assert [c.text for c in result.changes] == ["ratio of coupler gear: 2 → 3"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 
 import numpy as np
@@ -17,8 +17,11 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.model import Body, Joint, Loop, Mimic, Model
+from mbkit.studies.baseline.description import SECTIONS, changes, described
+from mbkit.studies.explain import hypotheses
 from mbkit.studies.explain.merged_model import merge
 from mbkit.studies.importers.study import written
+from mbkit.testing import assert_same_dynamics
 from tests.random_trees import random_tree
 
 ROBOTS = ("panda", "ur5", "solo8", "so100", "kinova")
@@ -358,7 +361,7 @@ def test_two_robots_are_explained_to_the_last_digit(one: str, two: str, read: Ca
     found = mb.explain(a, b, samples=1)
     assert not found.agree
     assert found.explained
-    assert {g.term for g in found.left} == {"M", "g", "nle", "passive"}
+    assert {g.term for g in found.left} == {"M", "g", "nle", "passive", "accelerations"}
     assert found.remainder < 1e-12
     # A mass that no term holds turns about a vertical axis through it.
     first = next(j.child for j in a.tree if j.type.nv)
@@ -625,3 +628,104 @@ def test_bad_input_is_refused() -> None:
     unknown = mb.catalog.pendulum(mass=mb.Parameter("m"))
     with pytest.raises(InputError, match="no value for parameter 'm'"):
         mb.explain(unknown, unknown)
+
+
+# Nothing is said to move as another thing that does not
+
+#: Fields of a description that move nothing: names, where things are drawn, and what the loader says.
+SAYS = {"name", "frames", "notes", "nonphysical", "bindings", "source", "time", "layout"}
+
+
+def coupled(ratio: float, offset: float = 0.0) -> Model:
+    b = mb.ModelBuilder("pair")
+    for k, mass in enumerate((1.0, 2.0)):
+        b.add_body(f"rod{k}", mass=mass, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+        b.add_joint(f"j{k}", "revolute", parent="world", child=f"rod{k}", axis=(0, 1, 0), translation=(k, 0, 0))
+    b.add_coupler("gear", "j0", "j1", ratio=ratio, offset=offset)
+    return b.build()
+
+
+def test_another_ratio_of_a_coupler_is_another_motion() -> None:
+    for other in (coupled(3.0), coupled(2.0, 0.1)):
+        found = mb.explain(coupled(2.0), other)
+        assert not found.agree
+        (cause,) = found.acting
+        assert cause.kind == "coupler"
+        assert found.explained
+    assert "has j0 = 3 j1 for j0 = 2 j1" in repr(mb.explain(coupled(2.0), coupled(3.0)))
+    assert mb.explain(coupled(2.0), coupled(2.0)).agree
+    assert not mb.explain(coupled(2.0), replace(coupled(2.0), couplers=())).agree
+    with pytest.raises(AssertionError, match="coupler 'gear'"):
+        assert_same_dynamics(coupled(2.0), coupled(3.0))
+
+
+def test_what_no_list_of_mistakes_knows_is_no_agreement(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The accelerations of the whole systems are compared, whatever parts are looked at one by one."""
+    known = [x for x in hypotheses._SECTIONS if x[0] not in ("couplers", "prescribed", "loops")]
+    monkeypatch.setattr(hypotheses, "_SECTIONS", tuple(known))
+    moved = mb.catalog.four_bar()
+    (loop,) = moved.loops
+    longer = replace(moved, loops=(replace(loop, translation_b=loop.translation_b + np.array([0.01, 0, 0])),))
+    for a, b in ((coupled(2.0), coupled(3.0)), (moved, longer), (coupled(2.0), replace(coupled(2.0), couplers=()))):
+        found = mb.explain(a, b)
+        assert not found.agree
+        assert not found.explained
+        assert "moves as" not in found.verdict
+
+
+def test_every_part_that_moves_something_is_compared() -> None:
+    parts = {section for section, *_ in hypotheses._SECTIONS}
+    # Forces by functions are refused: they have no numbers to match.
+    assert {f.name for f in fields(Model)} - SAYS == parts | {"gravity", "joints", "bodies", "forces"}
+    assert {*described(coupled(2.0))} <= {*SECTIONS}
+    for name in ("four_bar", "rolling_disc", "bicycle"):
+        assert {*described(mb.catalog.get(name)())} <= {*SECTIONS}
+    (change,) = changes(described(coupled(2.0)), described(coupled(3.0)))
+    assert change.text == "ratio of coupler gear: 2 → 3"
+
+
+def test_one_motion_by_two_formulas_is_no_difference() -> None:
+    def driven(amplitude: float, phase: float) -> Model:
+        b = mb.ModelBuilder("driven")
+        b.add_body("rod", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+        b.add_body("bob", mass=1.0)
+        b.add_joint("crank", "revolute", parent="world", child="rod", axis=(0, 1, 0))
+        b.add_joint("slide", "prismatic", parent="rod", child="bob", axis=(0, 0, 1))
+        b.prescribe("crank", amplitude=amplitude, frequency=3.0, phase=phase)
+        return b.build()
+
+    assert mb.explain(driven(1.0, 0.0), driven(-1.0, np.pi)).agree
+    assert [c.kind for c in mb.explain(driven(1.0, 0.0), driven(1.0, 0.1)).acting] == ["prescribed motion"]
+
+
+def test_an_inertia_along_another_axis_is_no_misread_quaternion() -> None:
+    """A capsule that lies along y and not along z: no file has a quaternion for that."""
+    for moments in ((0.3, 0.3, 0.1), (0.3, 0.25, 0.1)):
+        b = mb.ModelBuilder("capsule")
+        b.add_body("limb", mass=2.0, com=(0.1, 0, 0), inertia=moments)
+        b.add_joint("hinge", "revolute", parent="world", child="limb", axis=(1, 1, 1))
+        model = b.build()
+        (limb,) = model.bodies
+        turned = replace(limb, inertia=np.diag([limb.inertia[0, 0], limb.inertia[2, 2], limb.inertia[1, 1]]))
+        (cause,) = mb.explain(model, replace(model, bodies=(turned,))).causes
+        assert cause.kind == "inertia axes"
+        assert "->" in cause.says
+
+
+def test_a_joint_that_the_other_side_has_not_is_not_held_still() -> None:
+    def arm(fingers: int) -> Model:
+        b = mb.ModelBuilder("arm")
+        for k, name in enumerate(("upper", "lower", "finger")[: 2 + fingers]):
+            b.add_body(name, mass=1.0 - 0.3 * k, com=(0, 0, -0.2), inertia=(1e-2, 1e-2, 1e-3))
+            parent = ("world", "upper", "lower")[k]
+            b.add_joint(
+                f"to {name}", "revolute", parent=parent, child=name, axis=(0, 1, 0), translation=(0, 0, -0.4 * k)
+            )
+        return b.build()
+
+    for a, c, kind, says in (
+        (arm(1), arm(0), "lost joint", "lacks it"),
+        (arm(0), arm(1), "added joint", "has it besides"),
+    ):
+        (cause,) = (x for x in mb.explain(a, c).causes if x.subject == "joint 'to finger'")
+        assert (cause.kind, says in cause.says) == (kind, True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -37,8 +38,8 @@ def diff(
 ) -> None:
     """Say why SECOND moves otherwise than FIRST, and name the causes.
 
-    Both are what `mbkit check` takes. A file is read link by link, as it is written, so that links which are
-    fused wrongly are named. With two engines they are compared on one description, or each on its own.
+    Both are what `mbkit check` takes, with q and v as `mbkit.load` has them. A URDF is compared link by link, so that
+    links which are fused wrongly are named. With two engines they are compared on one description, or each on its own.
     """
     if engines:
         shared.check_engines(engines, least=2)
@@ -64,15 +65,22 @@ def diff(
 
 
 def _model(target: str, options: Mapping[str, Any]) -> Model:
-    """Return a file as it is written if there are no options, and any other target as it loads."""
+    """Return what `mbkit.load` makes of a target; of a URDF link by link, with joints in the order that it loads."""
     from mbkit import catalog
     from mbkit.load.loader import find
     from mbkit.studies._targets import model_of
     from mbkit.studies.importers.study import written
 
+    loaded = model_of(target, options)
     # `model_of` says which one it takes where a robot is also a catalog system.
-    if not options and (os.path.isfile(target) or (find(target) is not None and target not in catalog.systems())):
-        # The loader has the better message, or reads it after all.
-        with suppress(MbkitError):
-            return written(target)
-    return model_of(target, options)
+    robot = None if target in catalog.systems() else find(target)
+    path = target if os.path.isfile(target) else str(robot.path) if robot is not None else ""
+    if options or not path.lower().endswith(".urdf"):
+        return loaded
+    # The loader has the better message, or reads it after all.
+    with suppress(MbkitError):
+        links, places = written(path), {name: k for k, name in enumerate(loaded.joint_names)}
+        if places.keys() == {*links.joint_names}:
+            order = sorted(links.joints, key=lambda joint: places.get(joint.name, -1))
+            return replace(links, joints=tuple(order))
+    return loaded

@@ -42,6 +42,7 @@ SECTIONS: Final = {
     "springs": "spring",
     "couplings": "coupling",
     "loops": "loop",
+    "couplers": "coupler",
     "motions": "prescribed motion of joint",
     "forces": "force",
     "no_slip": "no slip",
@@ -193,6 +194,10 @@ def changes(old: Description, new: Description) -> tuple[Change, ...]:
 
 def _section(section: str, old: Description, new: Description) -> Iterator[Change]:
     before, after = old.get(section, {}), new.get(section, {})
+    if section == "frames":
+        # One that stood where another does, and now stands elsewhere, is told by its own place.
+        apart = [n for n in before if n in after and before[n].get("same_as") != after[n].get("same_as")]
+        before, after = ({**x, **{n: x[x[n].get("same_as", n)] for n in apart}} for x in (before, after))
     noun = SECTIONS[section]
     added = [n for n in after if n not in before and n]
     for name in [n for n in before if n not in after and n]:

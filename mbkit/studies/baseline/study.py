@@ -20,6 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from mbkit import spatial
 from mbkit._check import Array, count
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
@@ -58,8 +59,10 @@ _DECIMALS: Final = 6
 #: The description and the states come from these, whatever the engine.
 _SHARED: Final = ("mbkit", "pin", "numpy")
 _ABSENT: Final = "not installed"
+#: m and rad: what another parser's rounding moves a frame by.
+_FRAME_STAYS: Final = 1e-12
 Versions = tuple[VersionChange, ...]
-_OTHER_COORDINATES: Final = "the coordinates are others, so no number can be compared"
+_OTHER_COORDINATES: Final = "q and v have other joints or another order than recorded, so no number can be compared"
 
 
 def record(
@@ -243,7 +246,7 @@ def check(
         return replace(result, effect=_effect(recorded, plain, meant))
     notes = [f"only rounding: {c.text}" for c in changed]
     if not changed and model.digest != recorded.digest:
-        notes = ["the digest is another, though no parameter is"]
+        notes = ["the description has another digest, by something that the baseline does not record"]
     tell(0.0, "building")
     built, refused, missing = _build_engines(plain, recorded.engines)
     rows = [_unavailable(recorded, r, moved) for r in refused]
@@ -513,6 +516,9 @@ def _unavailable(recorded: Baseline, refusal: Refusal, moved: Versions) -> Chang
 
 def description_changes(recorded: Baseline, model: Model, target: str, path: Path) -> tuple[Change, ...]:
     """Return what differs in the descriptions, by the links' own names where a file tells them."""
+    if model.digest == recorded.digest:
+        # A file may be older than a section of descriptions.
+        return ()
     old, new = recorded.description, described(model)
     changed = changes({k: x for k, x in old.items() if k not in description.LINK_SECTIONS}, new)
     if not changed or "links" not in old:
@@ -531,13 +537,46 @@ def _effect(recorded: Baseline, model: Model, changed: tuple[Change, ...]) -> st
         for dyn in _build_engines(model, [name])[0].values():
             evaluated = evaluate(dyn, recorded.states, recorded.rollout)
             rows = [r for r in differences(recorded, name, *evaluated)[0] if np.isfinite(r.error)]
+            frames = _moved_frames(recorded, model)
             if not rows:
-                return f"no term moves ({name})"
+                return (
+                    f"{frames}, with their Jacobians; no other term moves ({name})"
+                    if frames
+                    else f"no term moves ({name})"
+                )
             worst = max(rows, key=lambda r: r.error)
             at = f" at {worst.joint}" if worst.joint else ""
             most = f"{worst.term}{at} most, by {worst.error:.1e} ({name})"
-            return f"moves {len(rows)} of {len(recorded.errors[name])} terms, {most}"
+            more = f"; {frames}, with their Jacobians" if frames else ""
+            return f"moves {len(rows)} of {len(recorded.errors[name])} terms, {most}{more}"
     return ""
+
+
+def _moved_frames(recorded: Baseline, model: Model) -> str:
+    """Return how far the poses of named frames moved on their bodies; empty where none did."""
+    far: dict[str, tuple[float, float]] = {}
+    old, new = recorded.description.get("frames", {}), described(model).get("frames", {})
+    for name in [n for n in old if n in new]:
+        before, after = (_placed(side, name) for side in (old, new))
+        if before[0] != after[0]:
+            far[name] = np.inf, np.inf
+        turn = spatial.log_quaternion(spatial.quaternion_from_matrix(before[2].T @ after[2]))
+        moved = float(np.linalg.norm(after[1] - before[1])), float(np.linalg.norm(turn))
+        if max(moved) > _FRAME_STAYS:
+            far.setdefault(name, moved)
+    if not far:
+        return ""
+    most = max(far, key=far.__getitem__)
+    by, about = far[most]
+    how = "which is on another body" if np.isinf(by) else f"by {by:.3g} m and {about:.3g} rad"
+    return f"moves the pose of {len(far)} frame{'s' * (len(far) > 1)}, {most} most, {how}"
+
+
+def _placed(frames: Mapping[str, Mapping[str, Any]], name: str) -> tuple[str, Array, Array]:
+    """Return body, translation and rotation of a recorded frame, also of one that stands where another does."""
+    part = frames[frames[name].get("same_as", name)]
+    translation = np.array(part.get("translation", np.zeros(3)), dtype=np.float64)
+    return part["body"], translation, np.array(part.get("rotation", np.eye(3)), dtype=np.float64).reshape(3, 3)
 
 
 def package_of(engine: str) -> str:

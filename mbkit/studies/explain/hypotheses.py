@@ -18,12 +18,14 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Joint, Mimic, Model
-from mbkit.model.parts import Loop
+from mbkit.model.elements.formula import NUMPY
+from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
+from mbkit.model.parts import Coupler, Loop
 from mbkit.studies.explain.loop_differences import loop_differences, same_loop
 from mbkit.studies.explain.merged_model import LinkInBody, MergedModel, Tolerances, composite
 
 #: Kinds that act on the motion through no term, but through constraints.
-CONSTRAINTS: Final = frozenset({"loop", "prescribed motion", "contact without slip"})
+CONSTRAINTS: Final = frozenset({"loop", "coupler", "prescribed motion", "contact without slip"})
 _WATER: Final = 1000.0  # kg/m³
 _DEGREE: Final = np.pi / 180
 #: URDF's order of an inertia's six numbers, and MuJoCo's.
@@ -38,6 +40,7 @@ _SECTIONS: Final = (
     ("springs", "name", "point spring", "spring"),
     ("couplings", "name", "joint coupling", "coupling"),
     (_LOOPS, "name", "loop", "loop"),
+    ("couplers", "name", "coupler", "coupler"),
     ("prescribed", "joint", "prescribed motion", "motion of"),
     ("no_slip", "name", "contact without slip", "no slip"),
 )
@@ -232,7 +235,7 @@ def _body_differences(
         if not same:
             ours, theirs = getattr(a, name), getattr(b, name)
             wanted = replace(a, **{name: theirs})
-            says = f"has the {what} {number_text(theirs)} {unit} for {number_text(ours)}"
+            says = f"has the {what} {number_text(ours)} -> {number_text(theirs)} {unit}"
             fitting = (x for x in mistakes if near.mass_properties(replace(a, **x.fields), wanted))
             out.append(next(fitting, Mistake(what, says, {}))._replace(fields={name: theirs}))
     if not near.inertia(a.inertia, b.inertia, a.mass):
@@ -252,17 +255,25 @@ def _inertia_difference(
     if near.inertia(np.diag(moments[0]), np.diag(moments[1]), a.mass):
         if _has_reordered_axes(a.inertia, b.inertia, a.mass, near):
             return "quaternion order", "has the inertia in axes whose quaternion was read in the wrong order"
-        axes = f"{number_text(b.inertia)} for {number_text(a.inertia)}"
+        axes = f"{number_text(a.inertia)} -> {number_text(b.inertia)} kg m²"
         return "inertia axes", f"has the same principal moments in other axes: {axes}"
     factor = np.trace(b.inertia) / np.trace(a.inertia) if np.trace(a.inertia) else 0.0
     if near.inertia(factor * a.inertia, b.inertia, a.mass):
         return "inertia", f"has {number_text(float(factor))} times the inertia"
-    return "inertia", f"has the inertia {number_text(b.inertia)} kg m² for {number_text(a.inertia)}"
+    return "inertia", f"has the inertia {number_text(a.inertia)} -> {number_text(b.inertia)} kg m²"
 
 
 def _has_reordered_axes(a: Array, b: Array, mass: float, near: Tolerances) -> bool:
-    """Return whether b is a in principal axes whose quaternion was read in another order."""
+    """Return whether b is a in principal axes whose quaternion was read in another order.
+
+    That shows where the axes are known, and not merely exchanged, as those of a cylinder that lies along another one.
+    """
     moments, axes = np.linalg.eigh(a)
+    if near.number(moments[0], moments[1]) or near.number(moments[1], moments[2]):
+        return False
+    across = np.abs(axes.T @ np.linalg.eigh(b)[1])
+    if near.vector(across, np.round(across)):
+        return False
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         Q = axes[:, order] * signs
         for R in _reordered(Q) if np.linalg.det(Q) > 0 else ():
@@ -534,7 +545,26 @@ def _other_numbers(a: Any, b: Any, near: Tolerances) -> str:
     """Return what differs between two parts of one name; empty where nothing does."""
     if isinstance(a, Loop):
         return ", and ".join(loop_differences(a, b, near))
+    if isinstance(a, Coupler) and not _alike(a, b, near):
+        one, other = (
+            f"{x.joint} = {number_text(x.ratio)} {x.leader}" + (f" + {number_text(x.offset)}" if x.offset else "")
+            for x in (a, b)
+        )
+        return f"has {other} for {one}"
+    if type(a) in MOTION_LAWS:
+        return "" if _same_motion(a, b, near) else "moves it otherwise"
     return "" if _alike(a, b, near) else "has other numbers for it"
+
+
+def _same_motion(a: Motion, b: Motion, near: Tolerances) -> bool:
+    """Return whether two laws have the same coordinate at every time, whatever their formulas."""
+    first, last = interval(a)
+    if interval(b) != (first, last):
+        return False
+    # Times without a common period.
+    t = np.maximum(first, -50.0) + (np.minimum(last, 50.0) - np.maximum(first, -50.0)) * np.linspace(0, 1, 257) ** 1.37
+    x, y = (np.broadcast_to(position(part, t, NUMPY), t.shape) for part in (a, b))
+    return near.vector(x, y, max(1.0, float(np.abs(x).max())))
 
 
 def _alike(a: Any, b: Any, near: Tolerances) -> bool:

@@ -308,7 +308,10 @@ def reconcile_joint_sets(
             for still, x in options.items()
         }
         still = min(options, key=costs.__getitem__)
-        causes.append(_structural_cause(still, name, model, below, side))
+        # A loader that merges links keeps a frame where each was.
+        there = (b, a)[side]
+        fixed = name in {*(j.name for j in there.joints if not j.type.nv), *(f.name for f in there.frames)}
+        causes.append(_structural_cause(still, name, model, below, side, fixed=fixed))
         alone[side].append(name)
         sides[side] = options[still]
 
@@ -338,11 +341,14 @@ def _count_differences(a: Model, b: Model, near: Tolerances) -> float:
     return count
 
 
-def _structural_cause(still: bool, name: str, model: Model, below: Collection[str], side: int) -> Hypothesis:
-    if still:
+def _structural_cause(
+    still: bool, name: str, model: Model, below: Collection[str], side: int, *, fixed: bool
+) -> Hypothesis:
+    """Return that one side has a joint alone; `fixed`: the other side has it, or its link, without motion."""
+    if fixed:
         says = "lets it move, which stands still on the other side" if side else "holds it still"
         return Hypothesis("joint held still", f"joint {name!r}", says)
-    count = sum(1 for j in model.joints if j.name in below and j.type.nv)
-    more = f" and the {count - 1} joints below it" if count > 1 else ""
+    count = 1 if still else sum(1 for j in model.joints if j.name in below and j.type.nv)
+    more = f" and the {count - 1} joint{'s' * (count > 2)} below it" if count > 1 else ""
     kind, says = ("added joint", f"has it{more} besides") if side else ("lost joint", f"lacks it{more}")
     return Hypothesis(kind, f"joint {name!r}", says)

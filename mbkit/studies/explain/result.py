@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from mbkit._escape import one_line
 from mbkit.studies.explain.joint_matching import Match
-from mbkit.studies.explain.terms import Gap
+from mbkit.studies.explain.terms import WHOLE, Gap
 from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
 
 #: More causes of one kind than this are one line.
@@ -25,8 +25,9 @@ class Cause:
     body or joint, empty for the whole; `says` is a sentence about the second side; `a` and `b` are the numbers of the
     two sides, where they are numbers. `effects` has for each term the relative difference of this cause alone: the
     larger of two, where it is added to the first side, and where it is removed from the second. It is infinite where
-    the coordinates then differ, and empty where no term can show it: other names, matter that stands still, a
-    constraint. `acts` says whether an effect is above the tolerance, or the cause is a constraint.
+    the coordinates then differ, and empty where no term can show it: other names, matter that stands still. A
+    constraint acts on the accelerations of the whole system, or on its configurations. `acts` says whether an effect is
+    above the tolerance.
     """
 
     kind: str
@@ -98,7 +99,7 @@ class Explanation(ResultTable):
             return f"{self.b} moves as {self.a} does (to {self.worst:.1e}){cancel}{beside}"
         apart = "in its coordinates"
         if self.comparable:
-            apart = f"by {self.worst:.1e}" if self.worst > self.tolerance else "in its constraints"
+            apart = f"by {self.worst:.1e}" if self.tolerance < self.worst < math.inf else "in its constraints"
         head = f"{self.b} differs from {self.a} {apart}"
         if self.massless:
             return f"{self.b} and {self.a} are not compared: the mass matrix is zero on both sides{beside}"
@@ -126,7 +127,9 @@ class Explanation(ResultTable):
         yield Items(self.notes)
 
     def __repr__(self) -> str:
-        return f"<Explanation: {one_line(self.verdict)}>"
+        reasons = [f"{c.says} ({effect(c)})" for c in self.acting]
+        more = [f"and {len(reasons) - _MAX_LINES} more"] if len(reasons) > _MAX_LINES else []
+        return f"<Explanation: {one_line('; '.join([self.verdict, *reasons[:_MAX_LINES], *more]))}>"
 
 
 def _counted(n: int, what: str) -> str:
@@ -137,10 +140,10 @@ def effect(cause: Cause) -> str:
     """Return the effect of a cause, in a few words."""
     if not cause.acts:
         return "changes no term"
-    if not cause.effects:
-        return "a constraint, which no term holds"
     term, largest = max(cause.effects.items(), key=lambda x: x[1])
-    return "other coordinates" if math.isinf(largest) else f"{term} by {largest:.1e}"
+    if math.isinf(largest):
+        return "other configurations" if term == WHOLE else "other coordinates"
+    return f"{term} by {largest:.1e}"
 
 
 def grouped(causes: Iterable[Cause]) -> list[tuple[str, str, str]]:

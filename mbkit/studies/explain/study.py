@@ -25,7 +25,7 @@ from mbkit.studies.explain.hypotheses import (
 from mbkit.studies.explain.joint_matching import Match, Matching, align_frames, reconcile_joint_sets, rename_joints
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import Gaps, model_terms, states_of
+from mbkit.studies.explain.terms import WHOLE, Gap, Gaps, model_terms, states_of
 from mbkit.studies.results import to_plain
 
 #: Relative difference of numbers written with five digits.
@@ -135,6 +135,7 @@ class _Descriptions:
         if moved_frames and self._gaps(theirs.model, target.model).worst > self.tolerance:
             target, moved_frames = theirs, ()
         before = by_name or self._gaps(one.model, theirs.model)
+        whole = self._whole(one.model, theirs.model) if before.worst <= self.tolerance else 0.0
         one, target = links_in_common_axes(one, target, near)
         hypotheses = _summarized_differences(one, target, near) if one.model.nv else []
         changed = one
@@ -147,10 +148,17 @@ class _Descriptions:
             *(self._measured_cause(h, one, target) for h in hypotheses),
             *self._ground_causes(one, target, near),
         )
-        constrained = any(c.kind in CONSTRAINTS for c in causes)
+        constrained = any(c.kind in CONSTRAINTS and c.acts for c in causes)
         massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)
-        agree = not (structural or constrained or massless) and before.worst <= self.tolerance
+        alike = before.worst <= self.tolerance and whole <= self.tolerance
+        agree = not (structural or constrained or massless) and alike
         explained = after.worst <= self.tolerance and (agree or massless or any(c.acts for c in causes))
+        if explained and not agree and not massless:
+            left = self._whole(changed.model, target.model)
+            explained = left <= self.tolerance
+            after = replace(after, terms=(*after.terms, Gap(WHOLE, left, "")))
+        if not whole <= self.tolerance:
+            before = replace(before, terms=(*before.terms, Gap(WHOLE, whole, "")))
 
         def differs(joints: set[str]) -> bool:
             one, other = (terms.part(x.model, joints) for x in (changed, target))
@@ -194,17 +202,24 @@ class _Descriptions:
         pairs = tuple(Match(n, n, "name") for n in ours)
         return self._gaps(one.model, rename_joints(other, one.model, Matching(pairs, (), ())).model)
 
+    def _whole(self, a: Model, b: Model) -> float:
+        """Return the difference between the accelerations of two whole systems; 0 where nothing can be compared."""
+        if a.velocity_names != b.velocity_names or not a.nv:
+            return 0.0
+        return terms.whole_gap(a, b, self.samples, self.seed)
+
     def _cause(self, h: Hypothesis, effects: dict[str, float]) -> Cause:
-        acts = h.kind in CONSTRAINTS or any(not x <= self.tolerance for x in effects.values())
+        acts = any(not x <= self.tolerance for x in effects.values())
         head = f"{h.subject}: " if h.subject else ""
         return Cause(h.kind, h.subject, f"{head}{self.names[1]} {h.says}", to_plain(h.a), to_plain(h.b), effects, acts)
 
     def _measured_cause(self, h: Hypothesis, one: MergedModel, target: MergedModel) -> Cause:
         """Return a difference with the larger of its two effects, added alone to one side or removed from the other."""
-        if h.kind in CONSTRAINTS:
-            return self._cause(h, {})
         effects: dict[str, float] = {}
         for model, changed in ((one.model, h.apply(one).model), (target.model, h.revert(target).model)):
+            if h.kind in CONSTRAINTS:
+                effects[WHOLE] = max(self._whole(model, changed), effects.get(WHOLE, 0.0))
+                continue
             for term, relative in self._gaps(model, changed).effects.items():
                 effects[term] = max(relative, effects.get(term, 0.0))
         return self._cause(h, effects)
@@ -244,7 +259,7 @@ class _Descriptions:
             links = ", ".join(f"link {name!r} {x.says}" for name, x in some or ())
             says = f"has other matter of the same mass standing still{': ' if links else ''}{links}"
         else:
-            says = f"has {number_text(b.mass)} kg standing still for {number_text(a.mass)} kg"
+            says = f"has {number_text(a.mass)} -> {number_text(b.mass)} kg standing still"
         yield self._cause(Hypothesis("base mass", "the base", says, a=a.mass, b=b.mass), {})
 
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
-from mbkit.errors import KnownDefectWarning, MbkitError, NonPhysicalWarning
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NonPhysicalWarning, NumericalError
 from mbkit.model import JointCoupling, Model
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
@@ -23,6 +24,11 @@ TERMS: Final = (
     ("nle", "nle", "qv"),
     ("passive", "passive", "qv"),
 )
+_TINY: Final = 1e-300
+#: Of each row's size: what rounded digits of a description leave of a state that keeps its constraints.
+_OPEN: Final = 1e-6
+#: Of two whole systems, with their constraints and all forces.
+WHOLE: Final = "accelerations"
 Values = dict[str, Array]
 
 
@@ -122,6 +128,53 @@ def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
         # A NaN would be lost in a maximum.
         out.append(Gap(term, np.inf if np.isnan(largest) else largest, joint))
     return Gaps(tuple(out))
+
+
+def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
+    """Return the largest difference between the accelerations of two whole systems with the same coordinates.
+
+    At random consistent states of either, under random forces, with constraints and all forces that the descriptions
+    hold: M Δv̇ relative to the forces at play. Infinite where a state of one is none of the other.
+    """
+    sides = [_moving(x) for x in (a, b)]
+    worst, rng = 0.0, np.random.default_rng(seed)
+    for own, other in (sides, sides[::-1]):
+        try:
+            q, v = own.model.random_state(rng, samples)
+        except (InputError, NumericalError):
+            # It has no state in which it could move.
+            continue
+        try:
+            for k in range(samples):
+                tau = np.linalg.norm(own.gravity(q[k])) * rng.standard_normal(a.nv)
+                M, first = own.mass_matrix(q[k]), own.forward_dynamics(q[k], v[k], tau)
+                if other.model.constrained and not _consistent(other, q[k], v[k]):
+                    return np.inf
+                apart = M @ (other.forward_dynamics(q[k], v[k], tau) - first)
+                size = np.abs(M) @ np.abs(first) + np.abs(own.nle(q[k], v[k])) + np.abs(tau)
+                worst = max(worst, float(np.abs(apart).max() / max(float(size.max()), _TINY)))
+        except NumericalError:
+            # A mass that moves nothing: the terms tell.
+            continue
+        except InputError:
+            return np.inf
+        if not (own.model.constrained or other.model.constrained):
+            break
+    return worst if np.isfinite(worst) else np.inf
+
+
+def _moving(model: Model) -> Dynamics:
+    fits = all(np.all(j.lower <= j.upper) for j in model.joints)
+    return LagrangianDynamics(model if fits else model.without("limits"), compile=False)
+
+
+def _consistent(dyn: Dynamics, q: Array, v: Array) -> bool:
+    """Return whether a state keeps the constraints, to what a description's digits leave."""
+    J = np.abs(dyn.constraint_jacobian(q)).sum(axis=1)
+    open_, rates = dyn.constraint_residual(q), dyn.constraint_rate(q, v)
+    sizes = max(1.0, float(np.abs(q).max())), max(1.0, float(np.abs(v).max()))
+    most = [_OPEN * np.maximum(J[: len(x)], 1.0) * size for x, size in zip((open_, rates), sizes, strict=True)]
+    return all(bool((np.abs(x) <= y).all()) for x, y in zip((open_, rates), most, strict=True))
 
 
 # Parts of a description.
