@@ -9,6 +9,7 @@ import pickle
 from dataclasses import FrozenInstanceError, fields, replace
 from decimal import Decimal
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -589,3 +590,34 @@ def test_parts_of_a_model_are_short_to_look_at():
             assert len(repr(part)) < 160
     assert "\n" not in repr(model.layout)
     assert len(repr(model.layout)) < 160
+
+
+# A single number is no vector
+
+
+@pytest.mark.parametrize("x", [0.5, np.float64(0.5), np.array(0.5)])
+def test_a_single_number_is_no_vector(x: Any) -> None:
+    """Repeated, it would be a direction along (1, 1, 1) that nobody meant."""
+    with pytest.raises(ModelError, match=r"gravity: expected shape \(3,\), got the single number"):
+        mb.load("ur5", gravity=x)
+    b = mb.ModelBuilder("scalars", gravity=x)
+    b.add_body("a", mass=1.0, com=x, inertia=(1, 1, 1))
+    b.add_joint("one", "revolute", parent="world", child="a", axis=x, translation=x, rpy=x)
+    b.add_body("b", mass=1.0, inertia=(1, 1, 1))
+    b.add_joint("two", "universal", parent="a", child="b", axis=(1, 0, 0), axis2=x, translation=(x, x, x))
+    b.add_frame("tool", body="b", translation=x, rpy=x)
+    b.add_spring("spring", body_a="a", body_b="b", point_a=x, point_b=x)
+    b.add_loop("pin", "point", body_a="a", body_b="b", translation_a=x, translation_b=x)
+    b.add_blade("blade", body_a="a", translation_a=x, axis_a=x)
+    with pytest.raises(ModelError) as told:
+        b.build()
+    faults = [line for line in str(told.value).splitlines() if "got the single number" in line]
+    assert len(faults) == 14
+    assert not any("is zero" in line for line in str(told.value).splitlines())
+
+
+def test_a_single_number_stands_for_each_velocity_of_a_joint() -> None:
+    b = mb.ModelBuilder("ball")
+    b.add_body("a", mass=1.0, inertia=(1, 1, 1))
+    b.add_joint("cross", "universal", parent="world", child="a", axis=(1, 0, 0), axis2=(0, 1, 0), damping=0.5)
+    assert b.build().joints[0].damping.tolist() == [0.5, 0.5]

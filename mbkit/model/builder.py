@@ -50,11 +50,14 @@ class ArgumentReader:
             self.faults.append(f"{what}: expected up to {longest} characters, got {len(text)}")
         return text[:longest]
 
-    def array(self, name: str, value: Any, shape: tuple[int, ...]) -> Array:
-        """Return finite numbers; a single one in place of a vector is repeated."""
+    def array(self, name: str, value: Any, shape: tuple[int, ...], *, each: bool = False) -> Array:
+        """Return finite numbers; a single one stands for `each` of a vector that says so, as of velocities."""
         try:
-            if len(shape) == 1 and shape_of(value) == ():
-                value = np.full(shape, real(name, value))
+            if shape_of(value) == () and not _has_expressions(value):
+                number = real(name, value)
+                if not each:
+                    raise InputError(f"{name}: expected shape {shape}, got the single number {number:g}")
+                value = np.full(shape, number)
             return finite_array(name, value, shape)
         except InputError as error:
             self._refuse(error, value)
@@ -83,12 +86,12 @@ class ArgumentReader:
             return 0.0
         return value
 
-    def quantities(self, name: str, value: Any, n: int) -> Array:
-        """Return n finite numbers or expressions, of dtype object where there are any; a single one is repeated."""
+    def quantities(self, name: str, value: Any, n: int, *, each: bool = False) -> Array:
+        """Return n finite numbers or expressions, of dtype object where there are any; `each` as of `array`."""
         if not _has_expressions(value):
-            return self.array(name, value, (n,))
+            return self.array(name, value, (n,), each=each)
         array = np.array(value, dtype=object)
-        if array.ndim == 0:
+        if each and array.ndim == 0:
             array = np.full(n, value, dtype=object)
         if array.shape != (n,):
             self.faults.append(f"{name}: expected shape ({n},), got {array.shape}")
@@ -173,7 +176,10 @@ class ArgumentReader:
         """Return a unit vector; zeros for None."""
         if value is None:
             return np.zeros(3)
+        known = len(self.faults)
         vector = self.array(name, value, (3,))
+        if len(self.faults) > known:
+            return np.array([1.0, 0.0, 0.0])
         # The square of a component may overflow, or vanish.
         largest = float(np.abs(vector).max())
         if largest and not 1e-100 < largest < 1e100:
@@ -369,9 +375,9 @@ class ModelBuilder(ElementBuilder):
             "upper": read.limits(f"{item}: upper", upper, type_.nq, np.inf),
             "velocity_limit": read.limits(f"{item}: velocity_limit", velocity_limit, type_.nv, np.inf),
             "effort_limit": read.limits(f"{item}: effort_limit", effort_limit, type_.nv, np.inf),
-            "friction": read.array(f"{item}: friction", friction, (type_.nv,)),
+            "friction": read.array(f"{item}: friction", friction, (type_.nv,), each=True),
             "mimic": follows and Mimic(follows[0], **self._numbers("joints", name, **follows[1])),
-            **{n: read.quantities(f"{item}: {n}", x, type_.nv) for n, x in per_velocity.items()},
+            **{n: read.quantities(f"{item}: {n}", x, type_.nv, each=True) for n, x in per_velocity.items()},
         }
         values = {"parent": parent, "child": child, "translation": translation, "pitch": pitch}
         self._add(Joint, "joints", "joint", name, values, ready)

@@ -314,7 +314,7 @@ class ElementBuilder:
                 return np.array(matrix, dtype=object if any(x.dtype == object for x in matrix) else float)
             self._read.faults.append(f"{name}: expected a number, shape (6,) or (6, 6), got {np.shape(value)}")
             return np.zeros((6, 6))
-        diagonal = self._read.quantities(name, value, 6)
+        diagonal = self._read.quantities(name, value, 6, each=True)
         out: Array = np.zeros((6, 6), dtype=diagonal.dtype)
         out[range(6), range(6)] = diagonal
         return out
