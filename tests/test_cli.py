@@ -87,7 +87,7 @@ def test_everything_from_a_cold_start(tmp_path):
     )
     text = made.stdout.decode("utf-8")
     assert made.returncode == 0, text + made.stderr.decode()
-    for wanted in ("✓ fingeredu", "Rollouts", "Error against run time", "Left out", "contacts"):
+    for wanted in ("✓ fingeredu", "Rollouts", "Error against run time", "What a call leaves out", "contacts"):
         assert wanted in text
     assert made.stderr == b""
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"finger_edu.html", "finger_edu.json"}

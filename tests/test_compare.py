@@ -22,10 +22,13 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.engines.registry import find_engine
 from mbkit.errors import InputError, NumericalError, OutputError, UnknownNameError
+from mbkit.report import compare_view
+from mbkit.studies.compare import beyond_terms
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.beyond_terms import rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS
 from mbkit.studies.compare.errors import Scales, acceleration_errors, force_errors, interleaved, matrix_errors
+from mbkit.studies.compare.findings import findings
 from mbkit.studies.compare.terms import TERMS
 from mbkit.studies.compare.terms import states as study_states
 from mbkit.testing import assert_engines_agree
@@ -244,7 +247,9 @@ def test_a_stiff_scene_ends_and_is_not_judged_by_what_it_cannot_show():
         )
     result = mb.compare(b.build(), samples=4)
     unjudged = [r for r in result.rollouts if not r.judged]
-    assert all("not judged" in r.note for r in unjudged)
+    assert all("not judged" in r.note for r in unjudged if not r.informs)
+    assert all(r.passed is None for r in unjudged)
+    assert {x.kind for x in result.findings} == {"stiff joint"}
     assert unjudged or any(r.term == "rollouts" for r in result.refusals)
     if result.precision is None:
         assert any("no reference holds for even" in r.reason for r in result.refusals)
@@ -352,7 +357,7 @@ def test_a_wrong_integrator_is_found(monkeypatch):
     made = {n: mb.dynamics(model, n) for n in ("pinocchio", "lagrangian", "mujoco")}
     rows = [r for r in rollouts(model, made, 0, "") if math.isfinite(r.tolerance)]
     assert rows
-    assert not any(r.passed for r in rows)
+    assert all(r.passed is False for r in rows)
 
 
 # The panda's wrist whirls when it falls limp: its rollouts are conditioned worst.
@@ -413,7 +418,7 @@ def test_a_whole_comparison_has_rollouts_run_times_and_omissions(monkeypatch):
         "loops",
         "Coriolis matrix",
     }
-    assert all(o.unchanged for o in result.omissions)
+    assert not any(o.fault for o in result.omissions)
     study = result.precision
     assert study.complete
     assert study.floor < 1e-12
@@ -424,6 +429,69 @@ def test_a_whole_comparison_has_rollouts_run_times_and_omissions(monkeypatch):
     rk4 = next(c for c in study.curves if c.method == "mujoco_rk4")
     assert rk4.order == pytest.approx(4, abs=0.2)
     assert json.loads(result.to_json())["precision"]["front"]
+
+
+@pytest.mark.usefixtures("brief")
+def test_what_the_file_has_and_no_engine_uses_is_told_and_is_no_difference():
+    """A wrist whose friction is ten times its weight, and whose damper stops it within 0.1 ms."""
+    b = mb.ModelBuilder("arm")
+    hinge = {"axis": (0, 1, 0), "lower": -2.0, "upper": 2.0, "effort_limit": 9.0}
+    inertia = (0.01, 0.01, 0.01)
+    b.add_body("arm", mass=1.0, com=(0, 0, -0.1), inertia=inertia)
+    b.add_joint("shoulder", "revolute", parent="world", child="arm", **hinge)
+    b.add_body("hand", mass=1.0, com=(0, 0, -0.1), inertia=inertia)
+    wrist = {"friction": 10.0, "damping": 200.0, "translation": (0, 0, -0.2)}
+    b.add_joint("wrist", "revolute", parent="arm", child="hand", **hinge, **wrist)
+    model = b.build()
+    result = mb.compare(model, samples=4)
+    assert result.passed, result.verdict
+    friction, limits, stiff = result.findings
+    assert [x.kind for x in result.findings] == ["dry friction", "limits", "stiff joint"]
+    assert friction.joints == stiff.joints == ("wrist",)
+    # With the shoulder free the wrist moves the inertia det M / M₁₁.
+    q = np.zeros((1, 2))
+    M = mb.dynamics(model).mass_matrix(q)
+    moved = np.linalg.det(M[0]) / M[0, 0, 0]
+    assert findings(model, np.ones((1, 2)), M)[2].size == pytest.approx(moved / 200.0)
+    assert findings(model, np.full((3, 2), 4.0), M)[0].size == pytest.approx(2.5)
+    assert "position of 2 joints, effort of 2 joints" in limits.says
+    (changed,) = (o for o in result.omissions if o.need == "dry friction")
+    assert changed.change > 0.1
+    assert not changed.unchanged
+    assert not changed.fault
+    unjudged = [r for r in result.rollouts if not r.judged and not r.informs]
+    assert unjudged
+    assert all("wrist: damping over inertia" in r.note for r in unjudged)
+    shown = " ".join(result.shortened)
+    assert f"none of {len(unjudged)} rollouts judged" in shown
+    assert "cut" not in shown
+
+
+GRIPPER = """<mujoco><compiler angle="radian"/><worldbody><body name="base"><inertial pos="0 0 0" mass="1"
+diaginertia="1 1 1"/>
+<body name="a"><joint name="a" axis="0 1 0" range="0 0.8" limited="true"/><inertial pos="0 0 .1" mass=".1"
+diaginertia="1e-3 1e-3 1e-3"/></body>
+<body name="b" pos=".1 0 0"><joint name="b" axis="0 1 0" range="0 0.8" limited="true"/><inertial pos="0 0 .1" mass=".1"
+diaginertia="1e-3 1e-3 1e-3"/></body></body></worldbody>
+<equality><connect body1="a" body2="b" anchor=".05 0 .2"/></equality></mujoco>"""
+
+
+def test_a_limit_at_which_a_mechanism_stands_is_no_difference_of_engines(tmp_path):
+    """A gripper that rests on its stops: MuJoCo's limits would act, and no engine has them on."""
+    file = tmp_path / "gripper.xml"
+    file.write_text(GRIPPER)
+    model = mb.load(file)
+    dyn = mb.dynamics(model, "mujoco")
+    rows = beyond_terms._in_mujoco(model, dyn, np.array([-0.3, -0.3]), np.zeros(2))
+    (limits,) = (o for o in rows if o.need == "limits")
+    assert limits.change > 1e-3
+    assert not limits.unchanged
+    assert not limits.fault
+    result = replace(mb.compare(model, ("lagrangian", "mujoco"), 2, terms_only=True), omissions=tuple(rows))
+    assert result.passed, result.verdict
+    assert "agree" in compare_view.headline(result)
+    absent = replace(result, omissions=(replace(limits, present=False),))
+    assert not absent.passed
 
 
 def test_what_was_left_out_would_show_if_it_mattered():

@@ -58,7 +58,9 @@ def row(
 
 
 def rollout(error: float, tolerance: float, *, passed: bool = True, note: str = "") -> RolloutRow:
-    return RolloutRow("rk4", "pinocchio", "mujoco_rk4", 1e-3, 1.0, error, 5.0, tolerance, 1000, 0.1, 0.2, passed, note)
+    judged = math.isfinite(tolerance)
+    ends = (1000, 0.1, 0.2, passed if judged else None, note, judged)
+    return RolloutRow("rk4", "pinocchio", "mujoco_rk4", 1e-3, 1.0, error, 5.0, tolerance, *ends)
 
 
 def point(value: float, error: float, seconds: float, *, energy: float = 1e-9, note: str = "") -> PrecisionPoint:
@@ -288,8 +290,9 @@ def test_what_a_study_left_out_is_said_first():
         assert "1 curve left out: pinocchio taylor" in head
         assert "horizon cut from 1 s to 0.5 s" in head
     assert "1 of 1 rollouts cut, to 0.25 s" in headline(cut)
-    unjudged = replace(AGREEING, rollouts=(replace(rollout(1e-13, 1e-12), judged=False),))
-    assert "1 of 1 rollouts not judged" in headline(unjudged)
+    unjudged = replace(AGREEING, rollouts=(replace(rollout(1e-13, 1e-12), judged=False, passed=None),))
+    assert unjudged.passed
+    assert "; the rollout not judged" in headline(unjudged)
     assert "no rollouts" in headline(replace(AGREEING, rollouts=(), refusals=(Refusal("", "rollouts", "it fell"),)))
     early = replace(STUDY, curves=(replace(STUDY.curves[0], ended="time"),), refusals=(), asked=0.5)
     assert early.shortened == ("1 curve ended by time: pinocchio rk4",)

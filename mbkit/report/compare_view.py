@@ -39,7 +39,7 @@ def view(result: Comparison, target: str = "") -> doc.Document:
     size = f"nq {facts.get('nq', '?')}, nv {facts.get('nv', '?')}" + (f", {mass:.4g} kg" if mass is not None else "")
     outcome = "agree" if result.passed else "not compared" if result.nothing else "differ"
     precision = result.precision
-    steps = " or ".join(dict.fromkeys(time_text(r.dt) for r in _judged(result)))
+    steps = " or ".join(dict.fromkeys(time_text(r.dt) for r in _compared(result)))
     return doc.Document(
         name=f"{result.model} ({target})" if target else result.model,
         heading=result.model,
@@ -56,7 +56,8 @@ def view(result: Comparison, target: str = "") -> doc.Document:
             doc.Section(_ROLLOUTS.format(steps), _rollouts(result)),
             *(work_precision_view.sections(precision, whole=False) if precision is not None else []),
             doc.Section(
-                "Left out because the scene does not need it: change is that of the accelerations", _omissions(result)
+                "What a call leaves out, and the time that this saves; change is that of the accelerations",
+                _omissions(result),
             ),
             doc.Section("Notes", _notes(result)),
             doc.Section(
@@ -81,11 +82,11 @@ def headline(result: Comparison) -> str:
         return result.verdict
     # Rows are measured by the oracle: the engine that differs fails. Rollouts are measured by MuJoCo's own.
     rows = [r for r in result.rows if not r.passed]
-    runs = [r for r in result.rollouts if not r.passed]
-    omissions = [o for o in result.omissions if not o.unchanged]
+    runs = [r for r in result.rollouts if r.passed is False]
+    omissions = [o for o in result.omissions if o.fault]
     counts = (
         (rows, result.rows, "comparisons of terms"),
-        (runs, _judged(result), "rollouts"),
+        (runs, [r for r in result.rollouts if r.judged], "rollouts"),
         (omissions, result.omissions, "omissions"),
     )
     parts = [f"{len(failed)} of {len(every)} {what}" for failed, every, what in counts if failed]
@@ -120,11 +121,11 @@ def failures(result: Comparison) -> list[doc.Bullet]:
             state = f"the state of the worst error ({r.worst_kind})", f"q = [{q}]\nv = [{v}]"
             out.append(doc.Bullet(f"{r.term}, {r.engine}", r.reason or "differs", "✗", "bad", folded=state))
     for run in result.rollouts:
-        if not run.passed:
+        if run.passed is False:
             reason = f"differs from {run.against} by {error_text(run.error)} in q, {run.tolerance:.0e} expected"
             reason += f"; {run.note}" if run.note else ""
             out.append(doc.Bullet(f"rollout {run.method}, {run.engine}", reason, "✗", "bad"))
-    changed = [o for o in result.omissions if not o.unchanged]
+    changed = [o for o in result.omissions if o.fault]
     what = "changes the accelerations by {}"
     return out + [doc.Bullet(f"leaving out {o.need}", what.format(error_text(o.change)), "✗", "bad") for o in changed]
 
@@ -239,14 +240,14 @@ _COLUMNS: Final = (
 # Rollouts.
 
 
-def _judged(result: Comparison) -> list[RolloutRow]:
-    """Return the rollouts that can fail; the others, with an infinite tolerance, are there for information."""
-    return [r for r in result.rollouts if math.isfinite(r.tolerance)]
+def _compared(result: Comparison) -> list[RolloutRow]:
+    """Return the rollouts of one formula; the others are there for information."""
+    return [r for r in result.rollouts if not r.informs]
 
 
 def _rollouts(result: Comparison) -> list[doc.Block]:
-    judged = _judged(result)
-    notes = {note: k for k, note in enumerate(dict.fromkeys(r.note for r in judged if r.note), 1)}
+    shown = _compared(result)
+    notes = {note: k for k, note in enumerate(dict.fromkeys(r.note for r in shown if r.note), 1)}
     columns = (
         doc.Column("integrator", lambda r: r.method),
         doc.Column("engine", lambda r: r.engine),
@@ -254,16 +255,16 @@ def _rollouts(result: Comparison) -> list[doc.Block]:
         doc.Column("step", lambda r: time_text(r.dt), right=True, on="page"),
         doc.Column("horizon", lambda r: time_text(r.duration), right=True),
         doc.Column("condition", lambda r: count_text(r.condition), right=True),
-        doc.Column("difference", lambda r: mark(r.passed if r.judged else None, error_text(r.error)), right=True),
+        doc.Column("difference", lambda r: mark(r.passed, error_text(r.error)), right=True),
         doc.Column("tolerance", lambda r: f"{r.tolerance:.2g}", right=True, on="page"),
         doc.Column("run time", lambda r: time_text(r.seconds), right=True),
         doc.Column("MuJoCo's", lambda r: time_text(r.seconds_against), right=True),
         doc.Column("", lambda r: doc.Span(f"[{notes[r.note]}]" if r.note else "", "muted")),
     )
     out: list[doc.Block] = []
-    if judged:
+    if shown:
         out.append(doc.Paragraph("The same integrator with the same step, step for step.", on="page"))
-        out.append(doc.Table(columns, judged, dense=True))
+        out.append(doc.Table(columns, shown, dense=True))
         about = (
             "Condition is how far q moves when the forces are disturbed in every step, per relative disturbance: "
             "rounding disturbs them so, in any engine, by some eps."
@@ -277,7 +278,7 @@ def _rollouts(result: Comparison) -> list[doc.Block]:
             "i",
         )
         for r in result.rollouts
-        if not math.isfinite(r.tolerance)
+        if r.informs
     ]
     return [*out, doc.Items(below)]
 
@@ -289,7 +290,7 @@ def omission_state(omission: Omission) -> Literal["on", "same", "chosen", "chang
     """Return whether the thing was on, off without effect, off by choice, or off to an effect."""
     if math.isnan(omission.change):
         return "on"
-    if not omission.unchanged:
+    if omission.fault:
         return "changed"
     return "chosen" if omission.present and omission.change > _VISIBLE else "same"
 

@@ -2,7 +2,7 @@
 
 from mbkit.studies import stress
 from mbkit.studies._checkpoint import InterruptedSweepError
-from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
+from mbkit.studies.compare.result import Comparison, Finding, Omission, RolloutRow, Row
 from mbkit.studies.compare.study import compare
 from mbkit.studies.results import Refusal
 from mbkit.studies.stress.result import StressResult
@@ -14,6 +14,7 @@ from mbkit.studies.work_precision.study import work_precision
 __all__ = [
     "Comparison",
     "Curve",
+    "Finding",
     "InterruptedSweepError",
     "Omission",
     "PrecisionPoint",

@@ -79,7 +79,7 @@ class RolloutRow:
     of q over the horizon, on the manifold. `condition` says how far q moves per relative disturbance of the forces,
     see `mbkit.studies.compare.beyond_terms`; `tolerance` is 1e-12, or a multiple of eps times the condition if that is
     more. `seconds` and `seconds_against` are the run times of the two. `judged` is False where too few steps are well
-    conditioned to say anything.
+    conditioned to say anything, and of a row for information, whose tolerance is infinite; `passed` is None there.
     """
 
     method: str
@@ -93,7 +93,7 @@ class RolloutRow:
     steps: int
     seconds: float
     seconds_against: float
-    passed: bool
+    passed: bool | None
     note: str = ""
     judged: bool = True
     asked: float = math.nan
@@ -103,6 +103,26 @@ class RolloutRow:
         """Whether the compared horizon is shorter than the one wanted."""
         return self.duration < self.asked * (1 - 1e-9)
 
+    @property
+    def informs(self) -> bool:
+        """Whether the row is for information, since it compares another formula and cannot fail."""
+        return math.isinf(self.tolerance)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the description has that no engine of the comparison uses, or that asks for other methods.
+
+    `kind` is ``"dry friction"``, ``"limits"`` or ``"stiff joint"``; `says` tells it in words, and `joints` has its
+    joints. `size` of friction is its ratio to the other forces at that joint and the median state, the largest of all
+    joints; of a stiff joint its time constant, s; of limits NaN.
+    """
+
+    kind: str
+    says: str
+    joints: tuple[str, ...]
+    size: float = math.nan
+
 
 @dataclass(frozen=True)
 class Omission:
@@ -111,7 +131,8 @@ class Omission:
     `present` says whether the description has it, and `what` what was off. `saved_ns` are the nanoseconds saved per
     evaluation, the difference of two medians, NaN where nothing was timed; `saved_spread` is half the interquartile
     range of that difference; `saved_setup` are the seconds of set-up saved, NaN where none. `change` is the largest
-    relative change of the accelerations with the thing on, and `unchanged` says whether it is within rounding.
+    relative change of the accelerations with the thing on, and `unchanged` says whether it is within rounding. What
+    the description has and no engine uses may change them; what it has not may not, so that is a `fault`.
     """
 
     need: str
@@ -124,7 +145,12 @@ class Omission:
     unchanged: bool
     note: str = ""
 
-    _derived: ClassVar = ("measurable",)
+    _derived: ClassVar = ("measurable", "fault")
+
+    @property
+    def fault(self) -> bool:
+        """Whether leaving out what the description has not changes the accelerations."""
+        return not self.unchanged and not self.present
 
     @property
     def measurable(self) -> bool:
@@ -154,9 +180,10 @@ class Comparison(ResultTable):
 
     `facts` has nq, nv, mass, digest, needs and notes of the model. `reference` is what the terms of all `engines` were
     measured by: the oracle. Accelerations of an engine with soft constraints are measured by its own written law
-    instead, and `softness` has the digits that it keeps of the rigid ones, at the median state. `precision` is the
-    error against run time of a few methods on a short horizon. `setup` has the seconds to build each engine; the
-    derivation works when first called. `seconds` is the time of the whole study.
+    instead, and `softness` has the digits that it keeps of the rigid ones, at the median state. `findings` are what the
+    description has that no engine uses, and its stiff joints. `precision` is the error against run time of a few
+    methods on a short horizon. `setup` has the seconds to build each engine; the derivation works when first called.
+    `seconds` is the time of the whole study.
     """
 
     model: str
@@ -171,6 +198,7 @@ class Comparison(ResultTable):
     precision: WorkPrecision | None = None
     omissions: tuple[Omission, ...] = ()
     refusals: tuple[Refusal, ...] = ()
+    findings: tuple[Finding, ...] = ()
     setup: dict[str, float] = field(default_factory=dict)
     softness: dict[str, float] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
@@ -179,9 +207,12 @@ class Comparison(ResultTable):
 
     @property
     def passed(self) -> bool:
-        """Whether at least two engines were compared, in terms that are not all zero, and nothing differed."""
+        """Whether at least two engines were compared, in terms that are not all zero, and nothing differed.
+
+        What the description has and no engine uses (`findings`) is no difference between engines.
+        """
         agreed = bool(self.rows) and not self.nothing and all(r.passed for r in self.rows)
-        return agreed and all(r.passed for r in self.rollouts) and all(o.unchanged for o in self.omissions)
+        return agreed and not self._beyond
 
     @property
     def worst(self) -> Row | None:
@@ -206,8 +237,12 @@ class Comparison(ResultTable):
             return f"{'; '.join(parts)}; all else agrees to {self.digits:.1f} digits{missing}"
         failed = [r for r in self.rows if not r.passed and not r.defect]
         parts += [f"{r.engine} differs in {r.term}" + (f" at {r.joint}" if r.joint else "") for r in failed]
-        parts += [f"rollout {r.method} on {r.engine} differs" for r in self.rollouts if not r.passed]
-        parts += [f"leaving out {o.need} changes the accelerations" for o in self.omissions if not o.unchanged]
+        parts += [
+            f"rollout {x.method} on {x.engine} differs"
+            if isinstance(x, RolloutRow)
+            else f"leaving out {x.need} changes the accelerations"
+            for x in self._beyond
+        ]
         return "; ".join(parts) + missing
 
     @property
@@ -226,8 +261,12 @@ class Comparison(ResultTable):
     def only_known_defects(self) -> bool:
         """Whether something differs, and all of it by known defects of engines."""
         failed = [r for r in self.rows if not r.passed]
-        beyond = all(r.passed for r in self.rollouts) and all(o.unchanged for o in self.omissions)
-        return bool(failed) and all(r.defect for r in failed) and beyond
+        return bool(failed) and all(r.defect for r in failed) and not self._beyond
+
+    @property
+    def _beyond(self) -> list[RolloutRow | Omission]:
+        """What failed beyond the terms."""
+        return [*(r for r in self.rollouts if r.passed is False), *(o for o in self.omissions if o.fault)]
 
     @property
     def shortened(self) -> tuple[str, ...]:
@@ -237,15 +276,19 @@ class Comparison(ResultTable):
         out += [f"{', '.join(absent)} left out"] if absent else []
         out += [f"no {r.term}" for r in self.refusals if not r.engine]
         out += [
-            f"{name} holds loops softly, by its own law, with {x:.1f} digits of the rigid acceleration"
+            f"{name} holds loops softly, and agrees with its own law of them; its accelerations are "
+            f"{100 * 10**-x:.2g} % off the rigid ones at the median state"
             for name, x in self.softness.items()
         ]
-        unjudged = [r for r in self.rollouts if not r.judged]
-        cut = [r for r in self.rollouts if r.judged and r.cut]
-        out += [f"{len(unjudged)} of {len(self.rollouts)} rollouts not judged"] if unjudged else []
-        if cut:
+        rows = [r for r in self.rollouts if not r.informs]
+        judged = [r for r in rows if r.judged]
+        if rows and not judged:
+            out.append(f"none of {len(rows)} rollouts judged" if len(rows) > 1 else "the rollout not judged")
+        elif len(judged) < len(rows):
+            out.append(f"{len(rows) - len(judged)} of {len(rows)} rollouts not judged")
+        if cut := [r for r in judged if r.cut]:
             least = min(r.duration for r in cut)
-            out.append(f"{len(cut)} of {len(self.rollouts)} rollouts cut, to {least:.3g} s at the least")
+            out.append(f"{len(cut)} of {len(rows)} rollouts cut, to {least:.3g} s at the least")
         if self.precision is not None:
             out += [f"error against run time: {x}" for x in self.precision.shortened]
         return tuple(out)

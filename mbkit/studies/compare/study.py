@@ -24,6 +24,7 @@ from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.beyond_terms import omissions, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
 from mbkit.studies.compare.errors import Errors, Scales, condition_under_constraints, interleaved
+from mbkit.studies.compare.findings import findings
 from mbkit.studies.compare.result import OWN_LAW, Comparison, Row
 from mbkit.studies.compare.terms import (
     CONSTRAINT_TERMS,
@@ -66,17 +67,20 @@ class Judge:
         self.refusals: list[Refusal] = []
         #: Of each engine with soft constraints the digits of the rigid acceleration that are left, at the median state.
         self.softness: dict[str, float] = {}
-        acting = np.abs(at.tau)
+        #: Gravity, velocity and passive forces at all states, as sums of their sizes.
+        self.forces = np.zeros_like(at.tau)
         for quantity in (oracle.nle, oracle.passive):
             # Where a term has no value, its own row says so.
             with contextlib.suppress(NumericalError):
-                acting = acting + np.abs(quantity(at.q, at.v))
+                self.forces = self.forces + np.abs(quantity(at.q, at.v))
+        acting = np.abs(at.tau) + self.forces
         gravity = float(np.linalg.norm(model.gravity))
         heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
         self.scales: Scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
-        if model.constrained:
-            condition = condition_under_constraints(self.scales.M, oracle.constraint_jacobian(at.q))
-            self.scales = replace(self.scales, constrained=condition)
+        J = oracle.constraint_jacobian(at.q) if model.constrained else None
+        if J is not None:
+            self.scales = replace(self.scales, constrained=condition_under_constraints(self.scales.M, J))
+        self.findings = findings(model, self.forces, self.scales.M, J)
         self.terms: tuple[Term, ...] = TERMS + (CONSTRAINT_TERMS if model.constrained else ())
         if model.has_bodies and model.mass:
             self.terms += MECHANISM_TERMS if model.constrained else BODY_TERMS
@@ -284,7 +288,7 @@ def compare(
         study = Judge(model, built, OracleDynamics(model), states(model, samples, seed), tolerance, defects)
         rows, refused = study.rows(lambda f, text: tell(0.05 + f * (0.85 if terms_only else 0.35), text))
         refusals += refused
-        result["softness"] = study.softness
+        result |= {"softness": study.softness, "findings": study.findings}
     # Without mass nothing can be simulated.
     massless = any(r.term == "M" and r.zero for r in rows)
     if enough and not terms_only and not massless:
