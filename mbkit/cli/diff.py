@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mbkit.cli import _shared as shared
-from mbkit.errors import MbkitError
+from mbkit.errors import MbkitError, ModelError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
@@ -71,13 +71,18 @@ def _model(target: str, options: Mapping[str, Any]) -> Model:
     from mbkit.studies._targets import model_of
     from mbkit.studies.importers.study import written
 
-    loaded = model_of(target, options)
     # `model_of` says which one it takes where a robot is also a catalog system.
     robot = None if target in catalog.systems() else find(target)
     path = target if os.path.isfile(target) else str(robot.path) if robot is not None else ""
+    try:
+        loaded = model_of(target, options)
+    except ModelError:
+        # Matter that cannot be is compared as it is written.
+        if options or not path:
+            raise
+        return written(path)
     if options or not path.lower().endswith(".urdf"):
         return loaded
-    # The loader has the better message, or reads it after all.
     with suppress(MbkitError):
         links, places = written(path), {name: k for k, name in enumerate(loaded.joint_names)}
         if places.keys() == {*links.joint_names}:

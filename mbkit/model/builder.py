@@ -18,7 +18,7 @@ from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
 from mbkit.model.elements.declare import ElementBuilder
 from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.loops import LOOP_KINDS, LoopKind
-from mbkit.model.model import Model
+from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
 from mbkit.model.parts import Body, Coupler, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring
 from mbkit.model.rolling import ROLLING_KINDS, RollingKind
@@ -124,6 +124,7 @@ class ArgumentReader:
         matrix = np.array([self.quantities(name, row, 3) for row in np.array(value, dtype=object)], dtype=object)
         if any(matrix[i, j] != matrix[j, i] for i, j in ((0, 1), (0, 2), (1, 2))):
             self.faults.append(f"{name} is not symmetric; expected the same expression on both sides of the diagonal")
+            return np.eye(3)
         return matrix
 
     def limits(self, name: str, value: ArrayLike | None, n: int, default: float) -> Array:
@@ -665,7 +666,8 @@ class ModelBuilder(ElementBuilder):
             warnings.warn(message, NonPhysicalWarning, stacklevel=2)
         notes = (*model.notes, *(f"never moves, so this cannot act: {text}" for text in idle))
         # Tables of motions need not begin at time 0.
-        return replace(model, notes=notes, nonphysical=inconsistent, time=float(np.clip(0.0, *model.interval)))
+        with unchecked():
+            return replace(model, notes=notes, nonphysical=inconsistent, time=float(np.clip(0.0, *model.interval)))
 
     def _add(
         self,
@@ -698,9 +700,11 @@ class ModelBuilder(ElementBuilder):
 
     def _assemble(self, joints: Iterable[Joint], bindings: Iterable[Binding]) -> Model:
         parts: dict[str, Any] = {kind: tuple(parts) for kind, parts in self._parts.items()} | {"joints": tuple(joints)}
-        return Model(
-            name=self._name, gravity=self._gravity, notes=tuple(self._notes), bindings=tuple(bindings), **parts
-        )
+        # `build` tells all faults at once.
+        with unchecked():
+            return Model(
+                name=self._name, gravity=self._gravity, notes=tuple(self._notes), bindings=tuple(bindings), **parts
+            )
 
 
 def with_loops(model: Model, loops: Iterable[Mapping[str, Any]]) -> Model:
@@ -712,7 +716,8 @@ def with_loops(model: Model, loops: Iterable[Mapping[str, Any]]) -> Model:
     for one in loops:
         b.add_loop(**one)
     bindings = (*model.bindings, *b._bindings)
-    added = replace(model, loops=(*model.loops, *b._parts["loops"]), bindings=bindings)
+    with unchecked():
+        added = replace(model, loops=(*model.loops, *b._parts["loops"]), bindings=bindings)
     if faults := [*b._read.faults, *structure_faults(added)]:
         raise ModelError(model.name, faults)
     return added

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from importlib import import_module
 from os import PathLike
@@ -13,13 +15,13 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, generator, real, rows
 from mbkit._escape import html
-from mbkit.errors import UnknownNameError, UnsupportedError
+from mbkit.errors import ModelError, UnknownNameError, UnsupportedError
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
 from mbkit.model.description import CONSTRAINT_FEATURES, Description, expect_name
 from mbkit.model.parameters import Parameter
 from mbkit.model.parts import Joint
-from mbkit.model.validation import check_substituted
+from mbkit.model.validation import check_substituted, model_faults
 
 _PER_VELOCITY: Final = {"damping": "damping", "springs": "stiffness", "armature": "armature", "friction": "friction"}
 #: Elements between joints or points, and the numbers that make them act.
@@ -27,11 +29,31 @@ _ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness"
 _FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "forces", *CONSTRAINT_FEATURES)
 
 
+_checked: Final = ContextVar("checked", default=True)
+
+
+@contextmanager
+def unchecked() -> Iterator[None]:
+    """Let models come into being unchecked: within a builder that checks them, or as a mistake that is looked for."""
+    token = _checked.set(False)
+    try:
+        yield
+    finally:
+        _checked.reset(token)
+
+
 class Model(Description):
     """A multibody system: a tree of bodies and what acts on it.
 
-    `ModelBuilder.build` and `mbkit.load` make and check it. Its attributes are those of `Description`.
+    `ModelBuilder.build` and `mbkit.load` make it. Its attributes are those of `Description`. It is checked whenever one
+    comes into being, by `dataclasses.replace` too: a `ModelError` has every fault. A body whose inertia no matter has
+    is one, unless `nonphysical` lists it.
     """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if _checked.get() and type(self) is Model and (faults := model_faults(self)):
+            raise ModelError(self.name, faults)
 
     # Questions to every model, of bodies or of energies
 

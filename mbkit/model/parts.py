@@ -10,8 +10,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import Array, shown
+from mbkit.errors import ModelError
 from mbkit.model.joint_types import JointType, kind_of, register_joint_type
+
+_ONE: Final = np.eye(3)
+#: Of a matrix: what digits of a file leave of its orthogonality and symmetry.
+_TURNED: Final = 1e-6
+
+
+def _turns(R: Array) -> bool:
+    """Return whether a matrix is a rotation; one of unknown numbers may be."""
+    return not np.isfinite(R).all() or bool(np.abs(R @ R.T - _ONE).max() <= _TURNED and np.linalg.det(R) > 0)
 
 
 def read_only(array: Array) -> Array:
@@ -26,11 +36,31 @@ class _Frozen:
     def __post_init__(self) -> None:
         for f in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
             value = getattr(self, f.name)
-            if isinstance(value, np.ndarray):
+            if f.type not in ("Array", "float"):
+                continue
+            try:
                 # + 0.0 makes one of the two zeros, which are equal and hash apart.
-                object.__setattr__(self, f.name, read_only(np.array(value, dtype=np.float64) + 0.0))
-            elif f.type == "float":
-                object.__setattr__(self, f.name, float(value) + 0.0)
+                number = np.array(value, dtype=np.float64) + 0.0
+            except (TypeError, ValueError):
+                raise self._fault(f"{f.name}: expected numbers, got {shown(value)}") from None
+            wanted = () if f.type == "float" else self._shape(f.name)
+            if wanted is not None and number.shape != wanted:
+                raise self._fault(f"{f.name}: expected shape {wanted}, got {number.shape}")
+            if f.name.startswith("rotation") and not _turns(number):
+                raise self._fault(f"{f.name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
+            if f.name == "inertia" and np.abs(number - number.T).max() > _TURNED * np.abs(number).max():
+                raise self._fault("inertia is not symmetric; expected I = Iᵀ")
+            object.__setattr__(self, f.name, float(number) if f.type == "float" else read_only(number))
+
+    def _fault(self, text: str) -> ModelError:
+        what = type(self).__name__.lower()
+        return ModelError(f"{what} {getattr(self, 'name', '')!r}" if hasattr(self, "name") else what, [text])
+
+    def _shape(self, name: str) -> tuple[int, ...] | None:
+        """Return the shape of an array; None where any will do."""
+        if name.startswith("rotation") or name == "inertia":
+            return 3, 3
+        return (3,) if name == "com" or name.startswith(("translation", "point_", "axis_")) else None
 
     def _values(self) -> tuple[Any, ...]:
         return tuple(getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]
@@ -88,6 +118,9 @@ class Mimic(_Frozen):
     offset: float = 0.0
 
 
+_PER_VELOCITY: Final = ("velocity_limit", "effort_limit", "armature", "damping", "friction", "stiffness", "rest")
+
+
 @dataclass(frozen=True, eq=False)
 class Joint(_Frozen):
     """A joint between `parent` and `child`; the child's frame is the joint's moving frame.
@@ -137,6 +170,14 @@ class Joint(_Frozen):
     def type(self) -> JointType:
         """The formulas of this joint's type."""
         return kind_of(self.kind)
+
+    def _shape(self, name: str) -> tuple[int, ...] | None:
+        type_ = self.type
+        if name == "axes":
+            return type_.n_axes, 3
+        if name in ("lower", "upper"):
+            return (type_.nq,)
+        return (type_.nv,) if name in _PER_VELOCITY else super()._shape(name)
 
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
         # Another process may not have registered the type.

@@ -281,6 +281,18 @@ def suspects(model: Description, *, point_masses: bool) -> tuple[tuple[str, str]
     return tuple(reasons.items())
 
 
+def model_faults(model: Description) -> list[str]:
+    """Return one sentence per fault of a model that is made of parts: its structure, and bodies that cannot be."""
+    faults = [*structure_faults(model)]
+    accepted = {name for name, _ in model.nonphysical}
+    impossible = body_faults(model.bodies, point_masses=True)
+    static = static_bodies(model.joints)
+    faults += [
+        f"body {n!r}: {why}" for n, why in impossible if not (n in accepted or n in static) or model.body(n).mass < 0
+    ]
+    return faults
+
+
 _D = TypeVar("_D", bound=Description)
 
 

@@ -12,6 +12,7 @@ from mbkit._check import count, real
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
+from mbkit.model.model import unchecked
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.engine_differences import engine_causes
 from mbkit.studies.explain.hypotheses import (
@@ -86,10 +87,12 @@ def explain(
     count("samples", samples, least=1)
     count("seed", seed)
     real("tolerance", tolerance, positive=True)
-    out = _Descriptions(model_a, model_b, names or _names(a, b), samples, seed, tolerance).explain()
-    if not isinstance(a, Dynamics) and not isinstance(b, Dynamics):
-        return out
-    return engine_causes(a, b, out)
+    # Mistakes that are tried on a description may leave one that cannot be.
+    with unchecked():
+        out = _Descriptions(model_a, model_b, names or _names(a, b), samples, seed, tolerance).explain()
+        if not isinstance(a, Dynamics) and not isinstance(b, Dynamics):
+            return out
+        return engine_causes(a, b, out)
 
 
 def _model(x: Model | Dynamics, which: str) -> Model:
