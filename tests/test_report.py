@@ -23,7 +23,9 @@ from mbkit.report.formatting import count_text, error_text, refusals, time_text
 from mbkit.report.output_folder import check_writable, file_stem, write
 from mbkit.simulate.progress import Bar
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
-from mbkit.studies.compare.result import Comparison, Omission, RolloutRow, Row
+from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS
+from mbkit.studies.compare.result import Comparison, Finding, Omission, RolloutRow, Row
+from mbkit.studies.compare.terms import CONSTRAINT_TERMS, TERMS
 from mbkit.studies.results import Refusal
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.result import WorkPrecision
@@ -203,8 +205,8 @@ def sweep_page(result: Sweep, data: str = "") -> str:
     return pages.render(compare_view.robots_view(result), data=data)
 
 
-def check_table(result: Comparison, asked: str = "") -> object:
-    return tables.render(compare_view.view(result, asked))
+def check_table(result: Comparison, asked: str = "", *, full: bool = True) -> object:
+    return tables.render(compare_view.view(result, asked, full=full))
 
 
 def bench_table(result: WorkPrecision, asked: str = "") -> object:
@@ -298,6 +300,64 @@ def test_what_a_study_left_out_is_said_first():
     assert early.shortened == ("1 curve ended by time: pinocchio rk4",)
     assert replace(early, curves=STUDY.curves).shortened == ()
     assert WorkPrecision.from_json(early.to_json()).shortened == early.shortened
+
+
+def test_the_first_screen_has_the_verdict_what_acts_nowhere_and_the_worst_rows():
+    found = (Finding("dry friction", "no engine applies it: 3 N m at j1", ("j1",), 5.0),)
+    for result in (replace(AGREEING, findings=found), replace(DIFFERING, findings=found)):
+        lines = printed(check_table(result, full=False), 160).splitlines()
+        assert len(lines) <= 24
+        text, page = (" ".join(x.split()) for x in ("\n".join(lines), Tags(check_page(result)).text))
+        first = page[: page.index("The model")]
+        for told in (
+            "dry friction is in no engine (5 times the other forces)",
+            "dry friction: no engine applies it: 3 N m at j1",
+            "no curve of pinocchio taylor: needs the own derivation",
+            "drake: not installed",
+            "worst row of",
+            "3.0e-14",
+        ):
+            assert told in text, told
+            assert told in first, told
+        assert "--full" in text
+        assert "--full" not in page
+        assert "Rollouts against" not in text
+        assert "Rollouts against" in page
+        assert Comparison.from_json(result.to_json()).findings == found
+        assert "no engine applies it" in result.to_markdown()
+
+
+def test_every_term_of_the_table_has_a_line_on_the_page():
+    every = {t.name for t in (*TERMS, *CONSTRAINT_TERMS, *BODY_TERMS, *MECHANISM_TERMS)} | {"power balance"}
+    assert every == set(compare_view.MEANINGS)
+    words = Tags(check_page(replace(AGREEING, rows=(*AGREEING.rows, row("A_G", "mujoco", 0.0))))).text
+    assert "A_G v is the momentum of all bodies" in words
+    assert "as if every joint were locked" not in words
+
+
+def test_a_method_of_which_no_run_came_to_an_end_is_named_with_its_reason():
+    """A curve all of whose runs failed has points, and no error: it is no curve."""
+    broken = Curve("lagrangian", "rk853", (point(0.1, NAN, NAN, note="order 7 condition"),), NAN, 0, NAN, 0.1)
+    study = replace(STUDY, curves=(*STUDY.curves, broken))
+    assert study.failed[-1] == Refusal("lagrangian", "rk853", "order 7 condition")
+    assert "2 curves left out: pinocchio taylor, lagrangian rk853" in repr(study)
+    assert json.loads(study.to_json())["failed"][-1]["reason"] == "order 7 condition"
+    whole = replace(AGREEING, precision=study)
+    shown = [study.to_markdown(), printed(bench_table(study)), Tags(bench_page(study)).text]
+    shown += [Tags(check_page(whole)).text, *(printed(check_table(whole, full=full), 200) for full in (False, True))]
+    for text in shown:
+        assert "lagrangian rk853: order 7 condition" in " ".join(text.replace("\\", "").split())
+    assert json.loads(whole.to_json())["precision"]["failed"][-1]["method"] == "rk853"
+
+
+def test_an_engine_that_comes_next_stands_once_whatever_lies_between():
+    first, pin, mujoco = (Curve(e, "rk4", (), NAN, 0, 4.0, 0.1) for e in ("lagrangian", "pinocchio", "mujoco"))
+    behind = ((pin, 1.3), (mujoco, 4.0), (pin, 5.0))
+    found = [
+        work_precision_view.Level(10.0**-k, first, point(0.1, 1e-9, 1.0), (curve, point(0.1, 1e-9, seconds)))
+        for k, (curve, seconds) in enumerate(behind)
+    ]
+    assert work_precision_view.Lead(tuple(found)).nexts == [("pinocchio", "rk4", "1.3 to 5"), ("mujoco", "rk4", "4")]
 
 
 def test_a_run_that_is_the_fastest_for_several_errors_is_one_row():
@@ -441,7 +501,7 @@ def test_a_page_holds_what_an_expert_asks_for():
         "not installed",
         "‖e‖ / max(‖x‖, ‖M‖‖v‖²)",
         "cond(M)",
-        "known to 1.0e-13",
+        "its own error is at most 1.0e-13 rad or m",
         "time of one call, ns",
         "Who reaches an error first",
         "digits of agreement",
@@ -574,7 +634,7 @@ def test_a_bench_page_holds_what_an_expert_asks_for():
     for wanted in (
         "fastest of 4 curves: lagrangian rk4 for an error of 1e-02 to 1e-06",
         "cut from 1 s where the reference stops holding",
-        "two engines at 1e-13; known to 1.0e-13",
+        "two engines at 1e-13; its own error is at most 1.0e-13",
         "first run",
         "510 ms",
         "needs the own derivation",
@@ -609,7 +669,7 @@ def test_the_table_of_a_study_fits_the_terminal(width):
     long = replace(STUDY, curves=(*STUDY.curves, curve("lagrangian", "semi_implicit_euler", 0.01, 1.0)))
     text = printed(bench_table(long), width)
     assert max(map(len, text.splitlines())) <= width
-    for wanted in ("semi_implicit_euler", "1e-06", "510 ms", "mujoco × 2", "known to 1.0e-13", "cut from 1 s"):
+    for wanted in ("semi_implicit_euler", "1e-06", "510 ms", "mujoco × 2", "1.0e-13", "cut from 1 s"):
         assert wanted in text, wanted
 
 

@@ -25,6 +25,7 @@ from mbkit.cli._shared import AGREE, DIFFER, INTERRUPTED, MISUSE, Report
 @shared.states_options(64)
 @shared.load_options
 @click.option("--no-rollouts", is_flag=True, help="Terms only: no trajectories, run times or omissions.")
+@click.option("--full", is_flag=True, help="Print all tables, not only the verdict and the worst rows.")
 @click.option("--own-parsers", is_flag=True, help="Compare what each engine's own importer makes of the file.")
 @click.option("--jobs", type=click.IntRange(min=1), help="With --all: processes.  [default: one per processor]")
 @shared.report_options
@@ -33,6 +34,7 @@ def check(
     everything: bool,
     options: dict[str, Any],
     no_rollouts: bool,
+    full: bool,
     own_parsers: bool,
     jobs: int | None,
     report: Report,
@@ -41,9 +43,10 @@ def check(
     """Compare engines on TARGET, and write a page and JSON.
 
     TARGET is a robot (mbkit robots lists them), a catalog system, a path to a URDF or
-    MJCF file, or package.module:function for a function that returns a Model. With --own-parsers
-    it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves; --floating-base then lets
-    its base go in all of them.
+    MJCF file, or package.module:function for a function that returns a Model. Printed are the verdict, what the
+    file has that no engine uses, faults, and each engine's worst row; --full and the page have the rest. With
+    --own-parsers it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves; --floating-base then
+    lets its base go in all of them.
     """
     if own_parsers and (everything or target is None or no_rollouts or options.keys() - {"floating_base"}):
         raise click.UsageError(
@@ -51,6 +54,8 @@ def check(
         )
     if everything and (target is not None or "nonphysical" in options):
         raise click.UsageError("--all takes every robot as it is: without a TARGET and without --nonphysical")
+    if full and (everything or own_parsers):
+        raise click.UsageError("--full goes with one TARGET; --all and --own-parsers print everything")
     if not everything and jobs is not None:
         raise click.UsageError("--jobs goes with --all")
     if not own_parsers:
@@ -63,10 +68,10 @@ def check(
     elif own_parsers:
         _check_parsers(report, target, seed=settings["seed"], **options)
     else:
-        _check_one(report, target, options, terms_only=no_rollouts, **settings)
+        _check_one(report, target, options, full=full, terms_only=no_rollouts, **settings)
 
 
-def _check_one(report: Report, target: str, options: dict[str, Any], **settings: Any) -> None:
+def _check_one(report: Report, target: str, options: dict[str, Any], *, full: bool, **settings: Any) -> None:
     from mbkit.report import compare_view
     from mbkit.simulate.progress import Bar
     from mbkit.studies import compare
@@ -77,7 +82,7 @@ def _check_one(report: Report, target: str, options: dict[str, Any], **settings:
     report.prepare(stem, "json", "html")
     with Bar(f"check {model.name}") as bar:
         result = compare(model, **settings, progress=bar)
-    written = report.write(compare_view.view(result, target), stem)
+    written = report.write(compare_view.view(result, target, full=full), stem)
     if result.nothing:
         needed = "" if result.rows else "; two engines that hold the model are needed"
         shared.say("error", f"{result.verdict}{needed}")

@@ -15,6 +15,38 @@ from mbkit.studies.compare.result import OWN_LAW, Comparison, Omission, RolloutR
 # Rounding stays far below this, and anything that acts is far above.
 _VISIBLE: Final = 1e-6
 _MAX_FAILURES: Final = 12
+#: What stands behind the name of a term.
+MEANINGS: Final = {
+    "M": "mass matrix",
+    "g": "gravity force",
+    "nle": "gravity and velocity forces together: M a + nle = τ without passive forces",
+    "C v": "velocity (Coriolis and centrifugal) forces",
+    "passive": "forces of springs, dampers and other elements",
+    "inverse dynamics": "the force τ that an acceleration needs",
+    "forward dynamics": "the acceleration that a force τ causes",
+    "kinetic energy": "½ vᵀ M v",
+    "potential energy": "of gravity and springs",
+    "pose": "position and orientation of the frame at the end of the longest chain",
+    "Jacobian": "J, by which v gives that frame's velocity",
+    "velocity": "of that frame",
+    "acceleration": "of that frame",
+    "J̇ v": "the part of that frame's acceleration that v alone causes",
+    "centre of mass": "of all bodies together",
+    "A_G": "centroidal momentum matrix: A_G v is the momentum of all bodies about their common centre of mass",
+    "Ȧ_G v": "the part of that momentum's rate that v alone causes",
+    "locked inertia": "inertia of all bodies about their common centre of mass, as if every joint were locked",
+    "M⁻¹": "inverse of the mass matrix",
+    "joint loads": "force and moment that each joint carries",
+    "Jᵀ wrench": "the joint forces that stand for a force and moment on that frame",
+    "forward dynamics, wrench": "the acceleration with a force and moment on that frame",
+    "regressor": "Y, in which τ = Y p is linear in the masses and inertias p",
+    "∂ID/∂(q, v, a)": "derivatives of inverse dynamics",
+    "f": "constraint equations, zero where loops are closed",
+    "J": "Jacobian of the constraint equations",
+    "J̇ v rows": "the part of the constraints' acceleration that v alone causes",
+    "Jᵀ λ": "joint forces of the constraints",
+    "power balance": "rate of the energy against the power of the forces",
+}
 _ROLLOUTS: Final = "Rollouts against MuJoCo's own, step {}: largest difference of q (rad or m)"
 _MEASURED: Final = (
     "At each state a vector x of the reference and its error e give ‖e‖ / max(‖x‖, ‖M‖‖v‖²): a term that happens to be "
@@ -30,8 +62,12 @@ _MEASURED: Final = (
 )
 
 
-def view(result: Comparison, target: str = "") -> doc.Document:
-    """Return the document of a comparison; `target` is the name by which a person called the model."""
+def view(result: Comparison, target: str = "", *, full: bool = False) -> doc.Document:
+    """Return the document of a comparison; `target` is the name by which a person called the model.
+
+    A terminal shows what the page begins with: verdict, what the file has that no engine used, faults, and each
+    engine's worst row. With `full` it shows the tables too.
+    """
     target = target if target != result.model else ""
     facts = result.facts
     mass = facts.get("mass")
@@ -40,6 +76,8 @@ def view(result: Comparison, target: str = "") -> doc.Document:
     outcome = "agree" if result.passed else "not compared" if result.nothing else "differ"
     precision = result.precision
     steps = " or ".join(dict.fromkeys(time_text(r.dt) for r in _compared(result)))
+    on: doc.On = "both" if full else "page"
+    terms = dict.fromkeys(r.term for r in result.rows)
     return doc.Document(
         name=f"{result.model} ({target})" if target else result.model,
         heading=result.model,
@@ -49,17 +87,19 @@ def view(result: Comparison, target: str = "") -> doc.Document:
         good=result.passed,
         summary=f"{size} · {samples} states (seed {result.seed}) · tolerance {result.tolerance:.0e}"
         f" · {result.seconds:.1f} s",
-        opening=[doc.Items(failures(result), most=_MAX_FAILURES)],
+        opening=_first_screen(result, full=full),
         sections=[
             doc.Section("The model", [doc.Facts(list(model_facts(facts, target, result.setup)))], on="page"),
-            doc.Section("Terms: worst relative error, time per call", _terms(result) if result.rows else []),
-            doc.Section(_ROLLOUTS.format(steps), _rollouts(result)),
-            *(work_precision_view.sections(precision, whole=False) if precision is not None else []),
+            doc.Section("Terms: worst relative error, time per call", _terms(result) if result.rows else [], on),
+            doc.Section(_ROLLOUTS.format(steps), _rollouts(result), on),
+            *(work_precision_view.sections(precision, whole=False, on=on) if precision is not None else []),
             doc.Section(
                 "What a call leaves out, and the time that this saves; change is that of the accelerations",
                 _omissions(result),
+                on,
             ),
-            doc.Section("Notes", _notes(result)),
+            doc.Section("Notes", _notes(result), on),
+            doc.Section("What the terms are", [doc.Facts([(t, x) for t in terms if (x := MEANINGS.get(t))])], "page"),
             doc.Section(
                 "How errors are measured",
                 [doc.Paragraph(_MEASURED[0]), doc.Items([doc.Bullet("", text) for text in _MEASURED[1]])],
@@ -69,6 +109,46 @@ def view(result: Comparison, target: str = "") -> doc.Document:
         result=result,
         basis=_basis(result),
     )
+
+
+def _first_screen(result: Comparison, *, full: bool) -> list[doc.Block]:
+    """Return what a reader needs to know before any table."""
+    beside = [doc.Bullet(x.kind, x.says, "!", "allowed") for x in result.findings]
+    beside += [
+        doc.Bullet(r.engine or f"no {r.term}", r.reason, "!", "allowed")
+        for r in result.refusals
+        if not r.engine or (not r.term and r.engine not in result.engines)
+    ]
+    notes = dict.fromkeys(r.note for r in result.rollouts if r.passed is None and not r.informs)
+    beside += [doc.Bullet("rollouts", note, "!", "allowed") for note in notes]
+    if result.precision is not None:
+        failed = result.precision.failed
+        beside += [
+            doc.Bullet(f"no curve of {b.head}", b.text, "!", "allowed") for b in work_precision_view.named(failed)
+        ]
+    return [
+        doc.Items(failures(result), most=_MAX_FAILURES),
+        doc.Items(beside, most=_MAX_FAILURES),
+        doc.Table(_WORST, _worst_rows(result)),
+        *([] if full else [doc.Paragraph(doc.Span(_MORE, "muted"), on="terminal")]),
+    ]
+
+
+_MORE: Final = "All terms, rollouts, run times and notes: with --full, and on the page."
+_WORST: Final = (
+    doc.Column("worst row of", lambda r: r.engine),
+    doc.Column("term", lambda r: r.term),
+    doc.Column("error", lambda r: _error(r), right=True),
+    doc.Column("allowed", lambda r: error_text(r.allowed), right=True),
+    doc.Column("in a state", lambda r: r.worst_kind),
+    doc.Column("most at joint", lambda r: doc.Span(r.joint, "mono")),
+)
+
+
+def _worst_rows(result: Comparison) -> list[Row]:
+    """Return each engine's worst row; one that failed comes first."""
+    rows = [[r for r in result.rows if r.engine == engine and r.reference != engine] for engine in result.engines]
+    return [max(some, key=lambda r: (not r.passed, r.relative)) for some in rows if some]
 
 
 def _basis(result: Comparison | Sweep) -> dict[str, doc.Text]:

@@ -10,7 +10,8 @@ from typing import Final, NamedTuple
 
 from mbkit.report import document as doc
 from mbkit.report.figures import PAGE, image, page_style, svg
-from mbkit.report.formatting import brief, choice, count_text, error_text, model_facts, refusals, time_text
+from mbkit.report.formatting import brief, choice, count_text, error_text, model_facts, time_text
+from mbkit.studies.results import Refusal
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from mbkit.studies.work_precision.figure import USEFUL, figure
 from mbkit.studies.work_precision.result import WorkPrecision
@@ -55,11 +56,12 @@ class Lead:
     def nexts(self) -> list[tuple[str, str, str]]:
         """Engine, methods and times as long of the fastest of other engines, which may change with the error."""
         out = []
-        for engine, group in itertools.groupby(self.levels, key=lambda x: x.next[0].engine if x.next else "none"):
-            alike = list(group)
+        for engine in dict.fromkeys(x.next[0].engine if x.next else "none" for x in self.levels):
+            alike = [x for x in self.levels if (x.next[0].engine if x.next else "none") == engine]
             methods = ", ".join(dict.fromkeys(x.next[0].method for x in alike if x.next))
-            factors = dict.fromkeys(count_text(x.factor) for x in (alike[0], alike[-1]))
-            out.append((engine, methods, " to ".join(factors)))
+            factors = [x.factor for x in alike]
+            ends = dict.fromkeys(count_text(x) for x in (min(factors), max(factors)))
+            out.append((engine, methods, " to ".join(ends)))
         return out
 
 
@@ -176,11 +178,24 @@ def view(result: WorkPrecision, target: str = "") -> doc.Document:
     )
 
 
-def sections(result: WorkPrecision, whole: bool) -> list[doc.Section]:
-    """Return the sections of a study; unless `whole`, a terminal shows the fastest only."""
+def named(failed: Sequence[Refusal]) -> list[doc.Bullet]:
+    """Return the methods that gave no curve, those of one reason together."""
+    of: dict[str, list[str]] = {}
+    for r in failed:
+        of.setdefault(r.reason, []).append(f"{r.engine} {r.term}".strip())
+    return [doc.Bullet(", ".join(dict.fromkeys(names)), reason) for reason, names in of.items()]
+
+
+def sections(result: WorkPrecision, whole: bool, on: doc.On = "both") -> list[doc.Section]:
+    """Return the sections of a study, shown on `on`; unless `whole`, a terminal shows the fastest only."""
     missing = brief(result.shortened).removeprefix("; ") if not whole else ""
     cut = f", cut from {result.asked:g} s where the reference stops holding" if result.duration < result.asked else ""
-    known = f"known to {error_text(result.floor)}" if math.isfinite(result.floor) else "known to an unknown error"
+    of = "rad or m (a smaller error of a run cannot be told)"
+    known = (
+        f"its own error is at most {error_text(result.floor)} {of}"
+        if math.isfinite(result.floor)
+        else "its own error is unknown"
+    )
     front = "Lower left is better. On the front, fastest first: {}. Names beside the grey band are the methods that "
     front += (
         "join it there, in their engine’s colour. Run times are without deriving and compiling, first runs with both."
@@ -189,7 +204,7 @@ def sections(result: WorkPrecision, whole: bool) -> list[doc.Section]:
     fastest = leads(result)
     about = f"Error against run time, {result.duration:g} s of motion: errors of q in rad or m"
     start = [(n, f"{n} = [{choice(getattr(result, n))}]") for n in ("q0", "v0")]
-    on: doc.On = "both" if whole else "page"
+    lists: doc.On = on if whole else "page"
     return [
         doc.Section(
             about,
@@ -201,16 +216,21 @@ def sections(result: WorkPrecision, whole: bool) -> list[doc.Section]:
                 doc.Paragraph(f"Reference: {result.reference}; {known}."),
                 *([drawn] if result.front else []),
             ],
+            on,
         ),
         doc.Section(
             "Who reaches an error first",
             [doc.Table(_LEADS, fastest) if fastest else doc.Paragraph(doc.Span("no run reached 1e-02", "muted"))],
+            on,
             level=3,
         ),
         doc.Section(
-            "Engine by engine, method by method; the run time is that of the least error", _curves(result), on, level=3
+            "Engine by engine, method by method; the run time is that of the least error",
+            _curves(result),
+            lists,
+            level=3,
         ),
-        doc.Section("What could not be measured", [doc.Items(refusals(result.refusals))], on, level=3),
+        doc.Section("What could not be measured", [doc.Items(named(result.failed))], on, level=3),
         doc.Section("", [doc.Details("the motion", [doc.Facts(start)])], on="page", level=3),
     ]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.model import Model
-from mbkit.studies.compare.result import Finding
+from mbkit.studies.compare.result import FRICTION, LIMITS, STIFF, Finding
 
 #: The step of the rollouts, s.
 STEP: Final = 1e-3
@@ -45,7 +45,7 @@ def _friction(model: Model, forces: Array) -> Finding | None:
         f"no engine applies it: {friction[worst]:.3g} {_unit(model, worst)} at {owners[worst]}, {beside} (gravity, "
         f"velocities, springs and dampers, at the median state); {_counted(len(joints))} in all"
     )
-    return Finding("dry friction", says, joints, float(ratio[worst]))
+    return Finding(FRICTION, says, joints, float(ratio[worst]))
 
 
 def _limits(model: Model) -> Finding | None:
@@ -54,11 +54,16 @@ def _limits(model: Model) -> Finding | None:
         kind: [j.name for j in model.joints if any(np.isfinite(getattr(j, name)).any() for name in names)]
         for kind, names in kinds.items()
     }
-    parts = [f"{kind} of {_counted(len(joints))}" for kind, joints in having.items() if joints]
+    # Kinds that the same joints have stand together.
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for kind, joints in having.items():
+        if joints:
+            alike.setdefault(tuple(joints), []).append(kind)
+    parts = [f"{', '.join(some)} of {_counted(len(joints))}" for joints, some in alike.items()]
     if not parts:
         return None
-    joints = tuple(dict.fromkeys(name for some in having.values() for name in some))
-    return Finding("limits", f"no engine applies them: {', '.join(parts)}", joints)
+    every = tuple(dict.fromkeys(name for some in alike for name in some))
+    return Finding(LIMITS, f"no engine applies them: {'; '.join(parts)}", every)
 
 
 def stiff_joints(model: Model, M: Array, J: Array | None = None) -> list[Finding]:
@@ -81,7 +86,7 @@ def stiff_joints(model: Model, M: Array, J: Array | None = None) -> list[Finding
                     f"{joint}: {of}, a time constant of {1e3 / rate:.2g} ms ({what} {value:.3g}); take a shorter step, "
                     "or a method for stiff systems"
                 )
-                out.append(Finding("stiff joint", says, (joint,), 1 / rate))
+                out.append(Finding(STIFF, says, (joint,), 1 / rate))
     return sorted(out, key=lambda x: x.size)
 
 

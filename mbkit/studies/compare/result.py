@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 
 #: The reference of terms of an engine whose constraints are soft.
 OWN_LAW: Final = "own law"
+#: Kinds of findings.
+FRICTION: Final = "dry friction"
+LIMITS: Final = "limits"
+STIFF: Final = "stiff joint"
 #: Where an error of exactly zero stands on an axis of digits.
 _SAME: Final = 17.0
 
@@ -280,6 +284,11 @@ class Comparison(ResultTable):
             f"{100 * 10**-x:.2g} % off the rigid ones at the median state"
             for name, x in self.softness.items()
         ]
+        out += [
+            f"dry friction is in no engine ({x.size:.2g} times the other forces)"
+            for x in self.findings
+            if x.kind == FRICTION
+        ]
         rows = [r for r in self.rollouts if not r.informs]
         judged = [r for r in rows if r.judged]
         if rows and not judged:
@@ -330,6 +339,7 @@ class Comparison(ResultTable):
 
     def _blocks(self) -> Iterator[Block]:
         yield Title(self.model, f": {self.verdict}")
+        yield Items(f"{x.kind}: {x.says}" for x in self.findings)
         yield Table(_COLUMNS, self.rows)
         yield Items(f"{r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in self.refusals)
 

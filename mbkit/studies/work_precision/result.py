@@ -86,16 +86,28 @@ class WorkPrecision(ResultTable):
                 yield curve, point
 
     @property
+    def failed(self) -> tuple[Refusal, ...]:
+        """Engines and methods that gave no error at all, with the reason."""
+        empty = [c for c in self.curves if not any(math.isfinite(p.error) for p in c.points)]
+        why = [next((p.note for p in c.points if p.note), c.ended or "no run came to an end") for c in empty]
+        mute = [Refusal(c.engine, c.method, reason) for c, reason in zip(empty, why, strict=True)]
+        return (
+            *self.refusals,
+            *(r for r in mute if (r.engine, r.term) not in {(x.engine, x.term) for x in self.refusals}),
+        )
+
+    @property
     def shortened(self) -> tuple[str, ...]:
         """What is missing, such as curves that failed, curves that time ended, a horizon that was cut."""
         out = [] if self.complete else ["interrupted"]
-        if self.refusals:
-            names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in self.refusals))
+        if failed := self.failed:
+            names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in failed))
             out.append(f"{_counted(len(names), 'curve')} left out: {', '.join(names)}")
         ended = [f"{c.engine} {c.method}" for c in self.curves if c.ended]
         if ended:
             out.append(f"{_counted(len(ended), 'curve')} ended by time: {', '.join(ended)}")
-        lost = sum(math.isnan(p.seconds) for _, p in self.rows())
+        none = {(r.engine, r.term) for r in self.failed}
+        lost = sum(math.isnan(p.seconds) for c, p in self.rows() if (c.engine, c.method) not in none)
         if lost:
             out.append(f"{_counted(lost, 'setting')} not run")
         if self.duration < self.asked * (1 - 1e-9):
@@ -115,7 +127,8 @@ class WorkPrecision(ResultTable):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data, with the front and the first-run times."""
-        out = super().to_dict() | {"shortened": list(self.shortened)}
+        failed = [{"engine": r.engine, "method": r.term, "reason": r.reason} for r in self.failed]
+        out = super().to_dict() | {"shortened": list(self.shortened), "failed": failed}
         for data, curve in zip(out["curves"], self.curves, strict=True):
             for p, point in zip(data["points"], curve.points, strict=True):
                 p["first_run"] = curve.compile + point.seconds
@@ -140,7 +153,7 @@ class WorkPrecision(ResultTable):
         last = {id(x[1]): (f"1e{exponent}", *x) for exponent, x in fastest.items() if x}
         yield Table((Column("error ≤", itemgetter(0), right=True), *_run_columns("fastest", 1)), last.values())
         yield Table(_CURVE_COLUMNS, self.curves)
-        notes = [f"{r.engine} {r.term}: {r.reason}" for r in self.refusals]
+        notes = [f"{r.engine} {r.term}: {r.reason}" for r in self.failed]
         yield Items([*notes, *([] if self.complete else ["Interrupted: this is what was finished."])])
 
     def plot(self, ax: Axes | None = None) -> Figure:
