@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from functools import cache
 
@@ -206,6 +207,25 @@ def test_wrenches_do_the_work_of_their_generalized_force(name):
     for axes in AXES:
         power = sum(np.sum(w * dyn.velocity(q, v, frame, axes), axis=1) for frame, w in on.items())
         assert off(np.sum(dyn.generalized_force(q, on, axes) * v, axis=1), power) < CLOSE
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.filterwarnings("ignore::mbkit.errors.KnownDefectWarning")
+def test_wrenches_and_jacobians_have_one_default(engine):
+    """Jᵀ w with defaults is the generalized force, and what acts in dynamics, steps and runs."""
+    model, (q, v, a, tau) = tree("floating"), (x[0] for x in at("floating").values())
+    dyn, w = mb.dynamics(model, engine), np.arange(1.0, 7.0)
+    on = {"tip": w}
+    pushed = dyn.jacobian(q, "tip").T @ w
+    assert off(dyn.generalized_force(q, on), pushed) < CLOSE
+    assert off(dyn.inverse_dynamics(q, v, a, on), dyn.inverse_dynamics(q, v, a) - pushed) < CLOSE
+    assert off(dyn.forward_dynamics(q, v, tau, on), dyn.forward_dynamics(q, v, tau + pushed)) < CLOSE
+    takers = [getattr(type(dyn), name) for name in dir(type(dyn)) if not name.startswith("_")]
+    signatures = [inspect.signature(x).parameters for x in takers if inspect.isfunction(x)]
+    defaults = [x["axes"].default for x in signatures if "axes" in x]
+    defaults.append(inspect.signature(mb.simulate).parameters["wrench_axes"].default)
+    assert len(defaults) > 9
+    assert set(defaults) == {ALIGNED}
 
 
 def test_a_load_along_the_joint_is_its_force():

@@ -99,7 +99,9 @@ def test_what_is_held_is_the_wrench_and_not_its_generalized_force() -> None:
     dyn = mb.dynamics(b.build(), "lagrangian")
     for method in ("rk4", "rk853"):
         grid = {"dt": 2.0} if METHODS[method].kind == "fixed" else {"save": [2.0]}
-        run = mb.simulate(dyn, [0.0], [0.0], 2.0, method, wrenches={"end": [0, 3.0, 0, 0, 0, 0]}, **grid)  # type: ignore[arg-type]
+        run = mb.simulate(
+            dyn, [0.0], [0.0], 2.0, method, wrenches={"end": [0, 3.0, 0, 0, 0, 0]}, wrench_axes="local", **grid
+        )  # type: ignore[arg-type]
         assert run.q[-1, 0] == pytest.approx(3.0 / (2.0 * 0.5) * 2.0**2 / 2, abs=100 * EPS)
     # In the world's axes the force stands still: its energy is F Δy, for which a long step must see the turn.
     run = mb.simulate(

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, all_finite, batch_of, real, rows
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
 from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
-from mbkit.engines.frames_and_momenta import LOCAL, FramesAndMomenta, axes_named
+from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, FramesAndMomenta, axes_named
 from mbkit.engines.linearization import LinearizationQuantities
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.regressors import Regressors
@@ -295,7 +295,7 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
         return self._evaluate("passive", q=q, v=v)
 
     def inverse_dynamics(
-        self, q: ArrayLike, v: ArrayLike, a: ArrayLike, wrenches: Wrenches | None = None, axes: str = LOCAL
+        self, q: ArrayLike, v: ArrayLike, a: ArrayLike, wrenches: Wrenches | None = None, axes: str = ALIGNED
     ) -> Array:
         """Return τ = M a + nle - τ_passive - Σ Jᵀ w, shape (nv,) or (N, nv).
 
@@ -307,7 +307,7 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
         return self._evaluate("inverse_dynamics_with_wrenches", frames, axes_named(axes), q=q, v=v, a=a, wrenches=w)
 
     def forward_dynamics(
-        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: Wrenches | None = None, axes: str = LOCAL
+        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: Wrenches | None = None, axes: str = ALIGNED
     ) -> Array:
         """Return v̇ = M⁻¹ (τ + τ_passive - nle + Σ Jᵀ w), shape (nv,) or (N, nv).
 
@@ -399,7 +399,7 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
         dt: float,
         method: str = DEFAULT_METHOD,
         wrenches: Wrenches | None = None,
-        axes: str = LOCAL,
+        axes: str = ALIGNED,
     ) -> tuple[Array, Array]:
         """Return (q, v) after one step of length dt, with the force τ held: for control loops and environments.
 
@@ -420,7 +420,7 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
             That act on frames, as in `generalized_force`. The wrench is held over the step, and Σ Jᵀ w follows the
             configuration from stage to stage.
         axes : {"local", "local_world_aligned", "world"}
-            Axes of the wrenches.
+            Axes of the wrenches, as in `generalized_force`.
 
         Returns
         -------
@@ -686,7 +686,7 @@ class WrenchedDynamics(Dynamics):
         v: ArrayLike,
         tau: ArrayLike,
         wrenches: Wrenches | None = None,
-        axes: str = LOCAL,  # noqa: ARG002  # the wrenches are in tau
+        axes: str = ALIGNED,  # noqa: ARG002  # the wrenches are in tau
     ) -> Array:
         assert not wrenches
         force, n = np.asarray(tau), self.model.nv

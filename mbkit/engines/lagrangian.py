@@ -18,7 +18,7 @@ from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_o
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity
 from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import Dynamics, scalar
-from mbkit.engines.frames_and_momenta import LOCAL
+from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.step_derivatives import momentum_step_slopes
@@ -455,7 +455,7 @@ class LagrangianDynamics(Dynamics):
         dt: float,
         method: str = DEFAULT_METHOD,
         wrenches: Wrenches | None = None,
-        axes: str = LOCAL,
+        axes: str = ALIGNED,
     ) -> tuple[Array, Array]:
         """Return (q, v) after one step, as `Dynamics.step` does; as machine code where `simulate` compiles the step."""
         try:

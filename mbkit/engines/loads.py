@@ -66,7 +66,7 @@ class Loads:
             given = {name: np.broadcast_to(x, (size, 6)) for name, x in given.items()}
         return frames, np.concatenate(list(given.values()), axis=-1)
 
-    def generalized_force(self, q: ArrayLike, wrenches: Wrenches, axes: str = LOCAL) -> Array:
+    def generalized_force(self, q: ArrayLike, wrenches: Wrenches, axes: str = ALIGNED) -> Array:
         """Return Σ Jᵀ w of wrenches on frames, shape (nv,) or (N, nv).
 
         Parameters
@@ -75,8 +75,18 @@ class Loads:
         wrenches : dict of str to (6,) or (N, 6) array_like
             Frame or body -> force, N, then moment, Nm, about the frame's origin.
         axes : {"local", "local_world_aligned", "world"}
-            Axes in which they are written: the frame's own, or the world's. ``"world"`` has the moment about the
-            world's origin.
+            Axes in which they are written, the same ones and the same default as in `jacobian`: the world's axes, or
+            the frame's own (``"local"``). ``"world"`` has the moment about the world's origin.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0), "lagrangian")
+        >>> weight = np.array([0.0, 0.0, -10.0, 0.0, 0.0, 0.0])
+        >>> force = dyn.generalized_force([0.5], {"tip": weight})
+        >>> bool(np.allclose(force, dyn.jacobian([0.5], "tip").T @ weight))
+        True
         """
         if isinstance(wrenches, Mapping) and not wrenches:
             q = self.model.check_q(q)
@@ -108,7 +118,7 @@ class Loads:
         v: ArrayLike,
         a: ArrayLike | None,
         wrenches: Wrenches | None = None,
-        axes: str = LOCAL,
+        axes: str = ALIGNED,
         joints: Sequence[str] | None = None,
         tau: ArrayLike | None = None,
     ) -> Array:
@@ -129,7 +139,7 @@ class Loads:
         wrenches : dict of str to (6,) or (N, 6) array_like, optional
             That act on frames, as in `generalized_force`.
         axes : {"local", "local_world_aligned", "world"}
-            Axes of the applied wrenches.
+            Axes of the applied wrenches, as in `generalized_force`.
         joints : sequence of str, optional
             By default all that move, in the order of ``model.joints``. Fixed joints may be named.
         tau : (nv,) or (N, nv) array_like, optional
@@ -194,7 +204,7 @@ class Loads:
         a: ArrayLike,
         tau: ArrayLike,
         wrenches: Wrenches | None = None,
-        axes: str = LOCAL,
+        axes: str = ALIGNED,
     ) -> Array:
         """Return Σ F - m a_G and Σ M_G - d/dt (I ω) of every body: how far a motion is from the laws of mechanics.
 

@@ -14,7 +14,7 @@ from mbkit._check import Array, batch_of, real
 from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
-from mbkit.engines.frames_and_momenta import LOCAL, axes_named
+from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
@@ -52,7 +52,7 @@ def integrate(
     doubt: bool = False,
     t0: float | None = None,
     wrenches: RunWrenches | None = None,
-    wrench_axes: str = LOCAL,
+    wrench_axes: str = ALIGNED,
 ) -> tuple[RunData, FunctionError | None]:
     """Return a run's data, and the error of the torque or event function that ended it.
 

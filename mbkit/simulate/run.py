@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import no_dynamics
-from mbkit.engines.frames_and_momenta import LOCAL
+from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.errors import DoubtfulRunWarning, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.simulate.events import Event
@@ -39,7 +39,7 @@ def simulate(
     doubt: bool = True,
     t0: float | None = None,
     wrenches: RunWrenches | None = None,
-    wrench_axes: str = LOCAL,
+    wrench_axes: str = ALIGNED,
 ) -> Trajectory:
     """Integrate v̇ = forward_dynamics(q, v, τ), q̇ = D(q) v from one state or a batch.
 
@@ -95,7 +95,8 @@ def simulate(
         trajectory; (steps, 6) or (N, steps, 6), held over each step as `torque` is; or a function of (t, q, v) that
         returns (6,). What is held is the wrench: its generalized force Jᵀ w follows the configuration at every stage.
     wrench_axes : {"local", "local_world_aligned", "world"}
-        Axes of the wrenches: the frame's own, or the world's. ``"world"`` has moments about the world's origin.
+        Axes of the wrenches, with the default of `Dynamics.jacobian` and `Dynamics.generalized_force`: the world's
+        axes. ``"local"`` are the frame's own. ``"world"`` has moments about the world's origin.
 
     Returns
     -------

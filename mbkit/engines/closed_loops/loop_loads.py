@@ -60,7 +60,7 @@ class LoopLoads(Actuation, Loads):
     _every_jacobian: Callable[[Array], Array]
 
     def loop_wrenches(
-        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: Any = None, axes: str = LOCAL
+        self, q: ArrayLike, v: ArrayLike, tau: ArrayLike, wrenches: Any = None, axes: str = ALIGNED
     ) -> Array:
         """Return the load of each loop under τ: what it exerts on its body a.
 

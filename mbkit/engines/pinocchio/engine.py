@@ -19,7 +19,7 @@ from mbkit._check import Array
 from mbkit.engines import known_defects
 from mbkit.engines.base import Dynamics, first_names, unit_quaternions
 from mbkit.engines.elements.passive import JointPassive
-from mbkit.engines.frames_and_momenta import LOCAL
+from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.pinocchio.bodies import PinocchioBodies
 from mbkit.engines.pinocchio.constraints import PinConstraints, PinocchioConstrained
 from mbkit.engines.pinocchio.model import PinModel, PointSprings, build
@@ -61,7 +61,7 @@ def _factory(name: str, arguments: str) -> Callable[[Call, Call, Sound], Call]:
     finite = "(x := out.ravel('K')).dot(x) < inf" if name == "mass_matrix" else "isfinite(sum(out.tolist()))"
     text = f"""
 def factory(bare, checked, sound):
-    def {name}({arguments}{", wrenches=None, axes=" + repr(LOCAL) if loads else ""}):
+    def {name}({arguments}{", wrenches=None, axes=" + repr(ALIGNED) if loads else ""}):
         try:
             if {plain}:
                 out = bare({arguments})

@@ -189,7 +189,8 @@ class ElementBuilder:
             ``vx, vy, vz, wx, wy, wz`` in `axes`, m/s and rad/s; and names of coordinates and velocities, as in
             `add_joint_force`.
         axes : {"local", "local_world_aligned", "world"}
-            Of force, moment and velocity, as in `Dynamics.generalized_force`.
+            Of force, moment and velocity, as in `Dynamics.generalized_force`, but with the frame's own axes as the
+            default: a part of the description, such as a thruster, moves with its body.
         potential : object, optional
             An energy V(x, y, z), also of coordinates, J: the force is less its gradient; a function is one of p.
         parameters : dict of str to float, optional
