@@ -7,6 +7,7 @@ import os
 import tempfile
 from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 # A slow or busy machine fails no test.
@@ -23,6 +24,21 @@ os.environ["HEYOKA_CACHE_DIR"] = os.environ["MBKIT_CACHE_DIR"] + "-heyoka"
 # The workers share the cores already: a matrix of 100 rows takes OpenBLAS's threads,
 # which wait for each other, a hundred times as long as one of them.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+#: What another processor's arithmetic can change: linear algebra, seeds, methods, loops, machine code. `.ci/run` runs
+#: these under another kernel of BLAS and with code for any x86-64 too (``-m processors``).
+PROCESSORS = {
+    *("test_processors", "test_step", "test_constraints", "test_loop_steps", "test_embedded", "test_new_method"),
+    *("test_base_parameters", "test_operational_space", "test_linearization", "test_python_call", "test_rodas"),
+}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of a processor's arithmetic."""
+    for item in items:
+        if item.path.stem in PROCESSORS:
+            item.add_marker(pytest.mark.processors)
 
 
 def pytest_collection_finish() -> None:

@@ -295,9 +295,10 @@ def test_held_torques_jump_where_they_should(kind: str) -> None:
     dyn = both(b.build())[kind]
     grid = np.array([0.0, 0.3, 0.35, 1.0])
     run = simulate(dyn, [0.0], [0.0], 1.0, "rk853", rtol=1e-12, save=grid, torque=[[2.0], [-40.0], [0.0]])
-    assert np.abs(run.v[:, 0] - [0.0, 0.3, -0.7, -0.7]).max() < 4 * EPS
+    # Between the jumps of -20 m/s² a dozen stages are summed, in an order that is the processor's.
+    assert np.abs(run.v[:, 0] - [0.0, 0.3, -0.7, -0.7]).max() < 12 * EPS
     x = [0.0, 0.045, 0.045 + 0.3 * 0.05 - 10 * 0.05**2]
-    assert np.abs(run.q[:, 0] - [*x, x[2] - 0.7 * 0.65]).max() < 4 * EPS
+    assert np.abs(run.q[:, 0] - [*x, x[2] - 0.7 * 0.65]).max() < 12 * EPS
 
 
 def test_parameters_differ_between_lanes() -> None:

@@ -518,8 +518,8 @@ def test_couplers_take_parameters_and_close_beside_a_loop() -> None:
     assert model.with_parameters(n=4.0).couplers[0].ratio == 4.0
     # Two cranks of a five-bar, geared to each other: one degree of freedom is left.
     five = mb.catalog.get("five_bar")()
-    closed = replace(five, couplers=geared(ratio=-1.0, offset=0.0).couplers[:1])
-    closed = replace(closed, couplers=(replace(closed.couplers[0], joint="theta1", leader="theta2"),))
+    (gear, *_) = geared(ratio=-1.0, offset=0.0).couplers
+    closed = replace(five, couplers=(replace(gear, joint="theta1", leader="theta2"),))
     dyn, exact = (dynamics(closed, x) for x in ("pinocchio", "oracle"))
     assert exact.mobility().degrees_of_freedom == 1
     q, v = closed.random_state(0)

@@ -667,6 +667,9 @@ def test_structure_is_checked_by_replace_too() -> None:
         replace(joint, damping=[1.0, 2.0])
     with pytest.raises(ModelError, match="bodies"):
         replace(model, bodies=())
+    for gravity in (-9.81, (0, -9.81), (0, 0, np.nan), (0, 0, np.inf)):
+        with pytest.raises(ModelError, match="gravity: expected three finite numbers"):
+            replace(model, gravity=gravity)
     # What a list gives is numbers as well.
     assert replace(model.bodies[0], com=[1, 2, 3]).com.tolist() == [1.0, 2.0, 3.0]
 

@@ -59,19 +59,22 @@ LEVELS: Final[dict[str, tuple[frozenset[str], int]]] = {
 }
 
 
+@cache
 def host() -> Host:
     """Return what machine code depends on: this processor, or the level that ``MBKIT_CPU`` names.
+
+    It is the same for the whole process: parts that are compiled once have registers of one width.
 
     Raises
     ------
     InputError
         ``MBKIT_CPU`` names no level, or one that this processor has not.
     """
-    return _host(os.environ.get("MBKIT_CPU", ""))
+    return host_of(os.environ.get("MBKIT_CPU", ""))
 
 
-@cache
-def _host(level: str) -> Host:
+def host_of(level: str) -> Host:
+    """Return the same of a level, or of this processor where it is empty."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     flags, triple = llvm.get_host_cpu_features(), llvm.get_process_triple()

@@ -14,7 +14,7 @@ from typing import Any, Final, Self, TypeVar
 import numpy as np
 
 from mbkit._check import Array, shown
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.errors import InputError, ModelError, UnknownNameError
 from mbkit.model.elements.forces import Bushing, Force, drives, lost, needs_time
 from mbkit.model.elements.motion_laws import Motion, beyond, interval
 from mbkit.model.joint_types import KINDS
@@ -273,7 +273,11 @@ class Description:
     layout: Layout = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "gravity", read_only(np.array(self.gravity, dtype=np.float64)))
+        gravity = np.array(self.gravity, dtype=np.float64)
+        # A parameter without a value is NaN.
+        if gravity.shape != (3,) or not (np.isfinite(gravity) | (np.isnan(gravity) & bool(self.bindings))).all():
+            raise ModelError(self.name, [f"gravity: expected three finite numbers, got {shown(self.gravity)}"])
+        object.__setattr__(self, "gravity", read_only(gravity))
         object.__setattr__(self, "layout", Layout(self.joints))
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
