@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -397,3 +398,13 @@ def test_functions_serve_in_an_optimal_control_expression():
     # q after two steps depends on the torque of the first alone: h² M(q0)⁻¹.
     inverse = h * h * np.linalg.inv(dyn.mass_matrix(q0))
     assert np.linalg.norm(J - inverse) < 256 * EPS * np.linalg.cond(dyn.mass_matrix(q0)) * np.linalg.norm(inverse)
+
+
+def test_the_header_holds_what_the_functions_hold() -> None:
+    b = mb.ModelBuilder("rubbing")
+    b.add_body("rod", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+    limits = {"friction": 0.5, "lower": -1.0, "upper": 1.0, "effort_limit": 3.0}
+    b.add_joint("hinge", "revolute", parent="world", child="rod", axis=(0, 1, 0), damping=0.1, **limits)
+    header = export_c(b.build(), ["mass_matrix"]).header
+    (holds,) = re.findall(r"Holds +(.*)", header)
+    assert holds == "gravity, damping"

@@ -52,6 +52,8 @@ _INPUTS: Final = {
     "parameters": "parameters",
 }
 
+#: Data of a description that no function holds.
+_LEFT_OUT: Final = ("friction", "limits", "effort_limits")
 #: The comment at the head of the header.
 _DESCRIPTION: Final = Path(__file__).with_name("c_header.txt")
 
@@ -104,7 +106,7 @@ def _declaration(f: CFunction, macro: str, nv: int) -> str:
 
 def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_line: str) -> str:
     macro = prefix.upper()
-    present = [need.replace("_", " ") for need, on in model.needs.as_dict().items() if on]
+    present = [need.replace("_", " ") for need, on in model.needs.as_dict().items() if on and need not in _LEFT_OUT]
     q_units, v_units = _units(model)
     parameters = followers = ""
     if model.parameters:

@@ -3,9 +3,9 @@
 The formulas are derivatives of the energies, those of the lagrangian engine's elimination "mass matrix"; that they are
 right is shown apart, by a Newton–Euler recursion in `validation/`, to 30 digits.
 
-Every number of the description and of the state is the double that it is, exactly. A quaternion stands for its
-rotation: it is divided by its norm, which misses one by about an eps, and an engine that uses it as it is shows that
-eps as error. Rotation matrices and axes, orthonormal to rounding only, enter the formulas as they stand.
+The oracle takes every number of the description and of the state as exactly the double that is stored. A quaternion
+stands for its rotation: it is divided by its norm, which misses one by about an eps. An engine that uses it as it is
+shows that eps as error. Rotation matrices and axes, orthonormal to rounding only, enter the formulas as they stand.
 """
 
 from __future__ import annotations
