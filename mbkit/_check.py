@@ -30,6 +30,13 @@ def needed(package: str, by: str) -> Iterator[None]:
         raise UnsupportedError(f"{by} needs {package}, which is not installed; pip install {package}") from error
 
 
+def arrays_shown(value: Any) -> str:
+    """Return a short repr of a result that holds arrays: their names and shapes, and numbers as they are."""
+    fields = value._asdict() if hasattr(value, "_asdict") else vars(value)
+    shapes = (f"{k} {x.shape}" if isinstance(x, np.ndarray) else f"{k} {x!r}" for k, x in fields.items())
+    return f"<{type(value).__name__}: {', '.join(shapes)}>"
+
+
 def all_finite(array: Array) -> bool:
     """Return whether an array holds only finite numbers."""
     # A plain sum of few numbers is several times cheaper than isfinite; huge finite ones

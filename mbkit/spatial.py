@@ -17,10 +17,12 @@ __all__ = [
     "left_jacobian",
     "left_jacobian_inverse",
     "log_quaternion",
+    "log_se3",
     "matrix_from_quaternion",
     "matrix_from_rpy",
     "multiply",
     "normalized",
+    "pose_error",
     "quaternion_from_matrix",
     "rotate",
     "rpy_from_matrix",
@@ -179,3 +181,54 @@ def exp_se3(xi: Array) -> tuple[Array, Array]:
     """Return translation (..., 3) and quaternion (..., 4) of exp of twists (..., 6), linear then angular."""
     u, w = xi[..., :3], xi[..., 3:]
     return np.einsum("...ij,...j->...i", left_jacobian(w), u), exp_quaternion(w)
+
+
+def log_se3(p: Array, quaternion: Array) -> Array:
+    """Return the twists (..., 6), linear then angular, whose `exp_se3` are these rigid motions.
+
+    Parameters
+    ----------
+    p : (..., 3) array
+        Translations.
+    quaternion : (..., 4) array
+        Unit quaternions. The turn is at most π, and near π its axis is that of the quaternion.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mbkit import spatial
+    >>> xi = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    >>> bool(np.allclose(spatial.log_se3(*spatial.exp_se3(xi)), xi))
+    True
+    """
+    w = log_quaternion(quaternion)
+    return np.concatenate([np.einsum("...ij,...j->...i", left_jacobian_inverse(w), p), w], axis=-1)
+
+
+def pose_error(X: Array, X_goal: Array) -> Array:
+    """Return what is missing from a pose to a goal, (..., 6), as controllers in task space use it.
+
+    Linear first: p_goal - p, m. Then angular: the rotation vector that turns the pose's axes into the goal's, rad. Both
+    are in the axes of the world, those of a Jacobian in ``"local_world_aligned"`` axes, so that
+    ``v = J⁺ k pose_error`` goes straight to the goal.
+
+    Parameters
+    ----------
+    X, X_goal : (4, 4) or (..., 4, 4) array
+        Poses such as those of `Dynamics.pose`.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0))
+    >>> mb.spatial.pose_error(dyn.pose([0.0], "tip"), dyn.pose([0.1], "tip"))[3:].round(12) + 0.0
+    array([ 0. , -0.1,  0. ])
+    """
+    R = np.einsum("...ij,...kj->...ik", X_goal[..., :3, :3], X[..., :3, :3])
+    flat = R.reshape(-1, 3, 3)
+    turn = np.array([log_quaternion(quaternion_from_matrix(one)) for one in flat]).reshape(*R.shape[:-2], 3)
+    return np.concatenate([X_goal[..., :3, 3] - X[..., :3, 3], turn], axis=-1)
+
+
+def __dir__() -> list[str]:
+    return __all__

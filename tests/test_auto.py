@@ -192,7 +192,7 @@ def test_torques_held_or_of_a_function_act_on_both_sides_of_the_change(way: str)
     run, truth = simulate(WAYS[way], *START, "auto", rtol=1e-8, torque=tau, save=SAVE), tight(torque=tau, save=SAVE)
     assert "rodas5" in run.stats.chosen
     assert np.abs(run.q - truth.q).max() < 1e-7
-    assert np.array_equal(run.tau()[:-1], tau)
+    assert np.array_equal(run.tau[:-1], tau)
 
     def steer(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         return np.array([3 * np.sin(4 * t) - 0.2 * v[0], 0.0])

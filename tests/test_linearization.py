@@ -370,3 +370,15 @@ def test_systems_on_paper_have_them_too():
     first = dyn.inverse_dynamics_derivatives
     close(got.qq, columns(lambda e: first(dyn.model.integrate(q, e), v, a).q, 2), 1e-9)
     close(got.qv, columns(lambda e: first(q, v + e, a).q, 2), 1e-9)
+
+
+def test_results_that_hold_arrays_are_shown_in_a_line() -> None:
+    dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
+    q, v, tau = [0.1, 0.2], [0.3, 0.4], [0.0, 0.0]
+    along = dyn.linearize(q, v, tau)
+    assert repr(along) == "<Linearization: A (4, 4), B (4, 2), f (4,), A_fixed (4, 4)>"
+    assert repr(along.discretize(0.01)) == "<DiscreteLinearization: A (4, 4), B (4, 2), f (4,)>"
+    assert repr(dyn.inverse_dynamics_derivatives(q, v, tau)).endswith("Derivatives: q (2, 2), v (2, 2), a (2, 2)>")
+    assert repr(dyn.forward_dynamics_derivatives(q, v, tau)).endswith("Derivatives: q (2, 2), v (2, 2), tau (2, 2)>")
+    assert "qq (2, 2, 2)" in repr(dyn.inverse_dynamics_second_derivatives(q, v, tau))
+    assert "inertia (1, 1)" in repr(mb.operational_space(dyn, q, dyn.model.bodies[-1].name, rows=[0]))

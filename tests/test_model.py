@@ -679,3 +679,31 @@ def test_what_a_loader_took_as_written_stays_so() -> None:
         model = mb.load("romeo_small")
     assert replace(model, name="other").nonphysical == model.nonphysical
     assert pickle.loads(pickle.dumps(model)) == model
+
+
+def test_limits_stand_in_the_order_of_velocities_and_log_undoes_exp() -> None:
+    """Limits of the model are those of its joints; a twist of less than half a turn is the log of its exp."""
+    model = mb.load("panda", floating_base=True)
+    for joint in model.independent_joints:
+        own = model.layout.v[joint.name]
+        assert np.array_equal(model.effort_limits[own], joint.effort_limit)
+        assert np.array_equal(model.velocity_limits[own], joint.velocity_limit)
+    assert np.isinf(model.effort_limits[:6]).all()
+    xi = np.random.default_rng(0).uniform(-1.5, 1.5, (50, 6))
+    xi[:10] *= 1e-6
+    # V and its inverse amplify rounding by their norms, which are below 4 here.
+    assert np.abs(mb.spatial.log_se3(*mb.spatial.exp_se3(xi)) - xi).max() < 200 * np.finfo(float).eps
+    assert set(dir(mb.spatial)) == set(mb.spatial.__all__)
+    assert "/site-packages" not in repr(mb.robots())
+
+
+def test_a_velocity_by_the_pose_error_goes_straight_to_the_goal() -> None:
+    dyn = mb.dynamics(mb.load("ur5"), "lagrangian")
+    q = np.array([0.3, -1.2, 1.4, -0.6, 0.8, 0.2])
+    goal = dyn.pose(q + 0.2, "tool0")
+    for _ in range(8):
+        step = np.linalg.solve(dyn.jacobian(q, "tool0"), mb.spatial.pose_error(dyn.pose(q, "tool0"), goal))
+        q = q + step
+    assert np.abs(dyn.pose(q, "tool0") - goal).max() < 1e-12
+    batch = mb.spatial.pose_error(dyn.pose(np.stack([q, q]), "tool0"), goal)
+    assert batch.shape == (2, 6)

@@ -288,8 +288,8 @@ def test_functions_do_work_too_and_survive_a_pickle() -> None:
     again = pickle.loads(pickle.dumps(run))
     np.testing.assert_array_equal(again.wrenches()["brick"], run.wrenches()["brick"])
     np.testing.assert_allclose(again.work(), run.work(), rtol=0, atol=1e-12)
-    assert not run.tau().any()
-    assert run.tau().shape == run.v.shape
+    assert not run.tau.any()
+    assert run.tau.shape == run.v.shape
 
 
 def test_a_pushed_run_raises_no_doubts_of_its_energy() -> None:
@@ -343,7 +343,7 @@ def test_functions_stand_beside_samples() -> None:
     for run in runs:
         close(run, runs[0])
         np.testing.assert_array_equal(run.wrenches()[tip(model)], rows[[0, 1, 2, 3, 4, 4]])
-        np.testing.assert_array_equal(run.tau(), -run.v)
+        np.testing.assert_array_equal(run.tau, -run.v)
 
 
 # Bad input

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +18,11 @@ from mbkit._check import Array, all_finite, batch_of, real, rows
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
 from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
 from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, FramesAndMomenta, axes_named
-from mbkit.engines.linearization import LinearizationQuantities
+from mbkit.engines.linearization import (
+    ForwardDynamicsDerivatives,
+    InverseDynamicsDerivatives,
+    LinearizationQuantities,
+)
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.regressors import Regressors
 from mbkit.errors import InputError, NumericalError, UnsupportedError
@@ -102,28 +106,6 @@ def require_no_forces(model: Model, engine: str) -> None:
             f"{engine}: its own integrators do not know the forces of {model.name} by functions ({names}); use a "
             "method that any engine has, such as rk4, or model.without('forces')"
         )
-
-
-class InverseDynamicsDerivatives(NamedTuple):
-    """Derivatives of τ = M a + nle - τ_passive, each (nv, nv) or (N, nv, nv)."""
-
-    #: ∂τ/∂q along the manifold; column k is that of q ⊕ t e_k.
-    q: Array
-    #: ∂τ/∂v.
-    v: Array
-    #: ∂τ/∂a, the mass matrix.
-    a: Array
-
-
-class ForwardDynamicsDerivatives(NamedTuple):
-    """Derivatives of v̇ = M⁻¹ (τ + τ_passive - nle), each (nv, nv) or (N, nv, nv)."""
-
-    #: ∂v̇/∂q along the manifold; column k is that of q ⊕ t e_k.
-    q: Array
-    #: ∂v̇/∂v.
-    v: Array
-    #: ∂v̇/∂τ, the inverse of the mass matrix.
-    tau: Array
 
 
 class _NotFiniteError(Exception):

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, real, shown
+from mbkit._check import Array, arrays_shown, real, shown
 from mbkit.engines.step_derivatives import Slopes, differentiable_method, step_derivatives
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, Method
@@ -54,6 +54,9 @@ class DiscreteLinearization(NamedTuple):
     #: The step of the state itself, (2nv,) or (N, 2nv): it leads to ``model.integrate(q, f[:nv])`` and ``v + f[nv:]``.
     f: Array
 
+    def __repr__(self) -> str:
+        return arrays_shown(self)
+
 
 class Linearization(NamedTuple):
     """Small changes of a state (q, v) under a force τ: ẋ = A x + B δτ.
@@ -71,6 +74,9 @@ class Linearization(NamedTuple):
     #: Of the same changes measured at this very state, which stays: y = (difference(q, q(t)), v(t) - v) follows
     #: ẏ = f + A_fixed y + B δτ. It differs from A at moving free and ball joints, which have half of -ad_v and -ω̂ here.
     A_fixed: Array
+
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
     def discretize(self, dt: float, method: Literal["zoh"] = "zoh") -> DiscreteLinearization:
         """Return the linear system's exact solution over dt seconds, with the force held.
@@ -110,6 +116,34 @@ class Linearization(NamedTuple):
         return out
 
 
+class InverseDynamicsDerivatives(NamedTuple):
+    """Derivatives of τ = M a + nle - τ_passive, each (nv, nv) or (N, nv, nv)."""
+
+    #: ∂τ/∂q along the manifold; column k is that of q ⊕ t e_k.
+    q: Array
+    #: ∂τ/∂v.
+    v: Array
+    #: ∂τ/∂a, the mass matrix.
+    a: Array
+
+    def __repr__(self) -> str:
+        return arrays_shown(self)
+
+
+class ForwardDynamicsDerivatives(NamedTuple):
+    """Derivatives of v̇ = M⁻¹ (τ + τ_passive - nle), each (nv, nv) or (N, nv, nv)."""
+
+    #: ∂v̇/∂q along the manifold; column k is that of q ⊕ t e_k.
+    q: Array
+    #: ∂v̇/∂v.
+    v: Array
+    #: ∂v̇/∂τ, the inverse of the mass matrix.
+    tau: Array
+
+    def __repr__(self) -> str:
+        return arrays_shown(self)
+
+
 class InverseDynamicsSecondDerivatives(NamedTuple):
     """Second derivatives of τ = M a + nle - τ_passive, each (nv, nv, nv) or (N, nv, nv, nv).
 
@@ -126,6 +160,9 @@ class InverseDynamicsSecondDerivatives(NamedTuple):
     vv: Array
     #: ∂²τ_i/∂q_j ∂a_k, the derivatives of the mass matrix's column k.
     qa: Array
+
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
 
 def of_second_order(out: Any) -> Any:

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, real
+from mbkit._check import Array, arrays_shown, real
 from mbkit._warn import warn
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
@@ -52,6 +52,9 @@ class OperationalSpace:
     null_space: Array
     reciprocal_condition: Any
     damped: Any
+
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
 
 def operational_space(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mbkit._check import needed
 from mbkit.codegen.c_source import CSource, export_c
 from mbkit.derivation import FUNCTIONS, Equations
-from mbkit.engines.base import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
+from mbkit.engines.linearization import ForwardDynamicsDerivatives, InverseDynamicsDerivatives
 
 if TYPE_CHECKING:
     from mbkit.lagrangian import systems as systems

@@ -208,6 +208,9 @@ class Robot:
     aliases: tuple[str, ...]
     path: Path
 
+    def __repr__(self) -> str:
+        return f"<Robot {self.aliases[0] if self.aliases else self.name}: {self.name}>"
+
     @cached_property
     def _facts(self) -> tuple[int | None, int | None, float | None, str | None]:
         try:

@@ -460,6 +460,25 @@ class Description:
         """Upper limits, shape (nq,)."""
         return _joined([j.upper for j in self.independent_joints])
 
+    @cached_property
+    def velocity_limits(self) -> Array:
+        """Largest velocities by amount, shape (nv,), m/s or rad/s; infinite where there is no limit."""
+        return _joined([j.velocity_limit for j in self.independent_joints])
+
+    @cached_property
+    def effort_limits(self) -> Array:
+        """Largest forces of the actuators by amount, shape (nv,), N or Nm; infinite where there is no limit.
+
+        They do not act in a run.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> mb.load("ur5").effort_limits
+        array([150., 150., 150.,  28.,  28.,  28.])
+        """
+        return _joined([j.effort_limit for j in self.independent_joints])
+
     def body(self, name: str) -> Body:
         """Return the body of this name."""
         return _by_name("body", self.bodies, name)

@@ -102,14 +102,17 @@ class RunData:
         """Return the energy of gravity and springs in J, shape (K,) or (N, K)."""
         return along(self._by(engine), (), lambda own, q: own.potential_energy(q), self.q)
 
+    @property
     def tau(self) -> Array:
-        """Return the generalized force that acted at each state, of the shape of v.
+        """The generalized force that acted at each state, of the shape of v; read-only.
 
         Of an array: the row that acts from there on, at the end the last one. A function is called once more at the
         saved states (when the trajectory is pickled, then); TorqueError where it fails now and did not before. Where
         the function ended the run, the last state has NaN.
         """
-        return self._force()[..., : self.v.shape[-1]]
+        out = self._force()[..., : self.v.shape[-1]]
+        out.setflags(write=False)
+        return out
 
     def wrenches(self) -> dict[str, Array]:
         """Return the wrench on each frame at each state, (K, 6) or (N, K, 6), in the run's axes, as `tau` does.

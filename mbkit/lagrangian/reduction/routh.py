@@ -265,7 +265,7 @@ def _read(
     """Return t, q, v and the numbers of the reduced model's parameters without the time."""
     model, held = routhian._model, {}
     if hasattr(run, "tau") and hasattr(run, "model"):
-        if np.any(run.tau()):
+        if np.any(run.tau):
             raise UnsupportedError(
                 "run: a torque acted on it, which is not known between its states; write it as one of the "
                 "Lagrangian's forces"
