@@ -29,7 +29,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 #: What another processor's arithmetic can change: linear algebra, seeds, methods, loops, machine code. `.ci/run` runs
 #: these under another kernel of BLAS and with code for any x86-64 too (``-m processors``).
 PROCESSORS = {
-    *("test_processors", "test_step", "test_constraints", "test_loop_steps", "test_embedded", "test_new_method"),
+    *("test_processors", "test_step", "test_constraints", "test_embedded", "test_new_method"),
     *("test_base_parameters", "test_operational_space", "test_linearization", "test_python_call", "test_rodas"),
 }
 

@@ -729,3 +729,15 @@ def test_a_joint_that_the_other_side_has_not_is_not_held_still() -> None:
     ):
         (cause,) = (x for x in mb.explain(a, c).causes if x.subject == "joint 'to finger'")
         assert (cause.kind, says in cause.says) == (kind, True)
+
+
+def test_two_that_cannot_move_are_not_said_to_move_alike() -> None:
+    """A loop whose hinge is turned out of the plane of a four-bar is never closed."""
+    (loop,) = mb.catalog.four_bar().loops
+    tilt = spatial.matrix_from_rpy(0.3, 0.2, 0.1)
+    locked = replace(mb.catalog.four_bar(), loops=(replace(loop, kind="revolute", rotation_a=tilt),))
+    found = mb.explain(locked, replace(locked, name="other"))
+    assert found.agree
+    assert not found.compared
+    assert "is described as" in found.verdict
+    assert "moves as" not in found.verdict

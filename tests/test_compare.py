@@ -691,3 +691,14 @@ def test_timings_are_medians_per_call_by_one_clock(monkeypatch):
     )
     assert times["fast"] == pytest.approx((1e4, 0.0), abs=1e-3)
     assert times["slow"] == pytest.approx((1e6, 1e6), rel=1e-9)
+
+
+def test_the_friction_of_a_mimic_joint_goes_by_the_size_of_its_ratio() -> None:
+    b = mb.ModelBuilder("pair")
+    for k in (0, 1):
+        b.add_body(f"rod{k}", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
+        more = {"mimic": ("j0", -3.0, 0.0), "friction": 2.0} if k else {"friction": 1.0}
+        b.add_joint(f"j{k}", "revolute", parent="world", child=f"rod{k}", axis=(0, 1, 0), **more)
+    (friction, *_) = findings(b.build(), np.ones((1, 1)), np.ones((1, 1, 1)))
+    # |q̇₀| + 2 |3 q̇₀| is the power that friction takes.
+    assert friction.size == pytest.approx(1.0 + 2.0 * 3.0)

@@ -103,9 +103,14 @@ def _mobility(M: Array, J: Array | None) -> Array:
 
 
 def _per_velocity(model: Model, name: str) -> Array:
-    """Return numbers of joints per independent velocity; a mimic joint's count by the square of its ratio."""
+    """Return numbers of joints per independent velocity.
+
+    A mimic joint's count by the square of its ratio, as those of springs and dampers do, whose force grows with the
+    ratio too; of dry friction by its size alone.
+    """
     full = np.concatenate([np.zeros(0), *(getattr(j, name) for j in model.joints)])
-    return np.asarray(np.square(model.layout.G).T @ full if model.layout.reduced else full)
+    ratios = np.abs(model.layout.G) if name == "friction" else np.square(model.layout.G)
+    return np.asarray(ratios.T @ full if model.layout.reduced else full)
 
 
 def _owners(model: Model) -> list[str]:

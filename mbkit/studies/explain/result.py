@@ -53,7 +53,9 @@ class Explanation(ResultTable):
     frames drawn elsewhere. `explained` says whether the difference vanishes with all `causes` applied to one side, and
     `left` has the remaining difference of each term, empty where the coordinates differ; then `subtree` has the joints
     of the smallest part that still differs. Two sides differ where a term differs by more than `tolerance`. `massless`
-    says whether M is zero on both sides at every state, so that equal terms are no agreement.
+    says whether M is zero on both sides at every state, so that equal terms are no agreement. `compared` says whether
+    accelerations of the whole systems were: there are none without a state that keeps the constraints, nor where the
+    mass matrix is singular.
     """
 
     a: str
@@ -73,6 +75,7 @@ class Explanation(ResultTable):
     seed: int
     tolerance: float
     massless: bool = False
+    compared: bool = True
 
     @property
     def acting(self) -> tuple[Cause, ...]:
@@ -96,6 +99,9 @@ class Explanation(ResultTable):
         beside = f"; {_counted(silent, 'difference')} that change{'s' * (silent == 1)} no term" if silent else ""
         if self.agree:
             cancel = f"; {_counted(count, 'difference')} that cancel" if count else ""
+            if not self.compared:
+                none = "no motion was compared: no state keeps the constraints, or the mass matrix is singular"
+                return f"{self.b} is described as {self.a} is (to {self.worst:.1e}); {none}{cancel}{beside}"
             return f"{self.b} moves as {self.a} does (to {self.worst:.1e}){cancel}{beside}"
         apart = "in its coordinates"
         if self.comparable:

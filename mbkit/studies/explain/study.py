@@ -153,14 +153,15 @@ class _Descriptions:
         )
         constrained = any(c.kind in CONSTRAINTS and c.acts for c in causes)
         massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)
-        alike = before.worst <= self.tolerance and whole <= self.tolerance
+        compared = massless or not np.isnan(whole)
+        alike = before.worst <= self.tolerance and not whole > self.tolerance
         agree = not (structural or constrained or massless) and alike
         explained = after.worst <= self.tolerance and (agree or massless or any(c.acts for c in causes))
         if explained and not agree and not massless:
             left = self._whole(changed.model, target.model)
-            explained = left <= self.tolerance
+            explained = not left > self.tolerance
             after = replace(after, terms=(*after.terms, Gap(WHOLE, left, "")))
-        if not whole <= self.tolerance:
+        if whole > self.tolerance:
             before = replace(before, terms=(*before.terms, Gap(WHOLE, whole, "")))
 
         def differs(joints: set[str]) -> bool:
@@ -185,6 +186,7 @@ class _Descriptions:
             seed=self.seed,
             tolerance=self.tolerance,
             massless=massless,
+            compared=compared,
         )
 
     def _is_massless(self, model: Model) -> bool:
@@ -221,7 +223,7 @@ class _Descriptions:
         effects: dict[str, float] = {}
         for model, changed in ((one.model, h.apply(one).model), (target.model, h.revert(target).model)):
             if h.kind in CONSTRAINTS:
-                effects[WHOLE] = max(self._whole(model, changed), effects.get(WHOLE, 0.0))
+                effects[WHOLE] = max(np.nan_to_num(self._whole(model, changed), nan=np.inf), effects.get(WHOLE, 0.0))
                 continue
             for term, relative in self._gaps(model, changed).effects.items():
                 effects[term] = max(relative, effects.get(term, 0.0))

@@ -134,10 +134,11 @@ def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
     """Return the largest difference between the accelerations of two whole systems with the same coordinates.
 
     At random consistent states of either, under random forces, with constraints and all forces that the descriptions
-    hold: M Δv̇ relative to the forces at play. Infinite where a state of one is none of the other.
+    hold: M Δv̇ relative to the forces at play. Infinite where a state of one is none of the other, NaN where neither has
+    a state in which it could move.
     """
     sides = [_moving(x) for x in (a, b)]
-    worst, rng = 0.0, np.random.default_rng(seed)
+    worst, rng = np.nan, np.random.default_rng(seed)
     for own, other in (sides, sides[::-1]):
         try:
             q, v = own.model.random_state(rng, samples)
@@ -152,7 +153,8 @@ def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
                     return np.inf
                 apart = M @ (other.forward_dynamics(q[k], v[k], tau) - first)
                 size = np.abs(M) @ np.abs(first) + np.abs(own.nle(q[k], v[k])) + np.abs(tau)
-                worst = max(worst, float(np.abs(apart).max() / max(float(size.max()), _TINY)))
+                gap = float(np.abs(apart).max() / max(float(size.max()), _TINY))
+                worst = np.inf if np.isnan(gap) else float(np.fmax(worst, gap))
         except NumericalError:
             # A mass that moves nothing: the terms tell.
             continue
@@ -160,7 +162,7 @@ def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
             return np.inf
         if not (own.model.constrained or other.model.constrained):
             break
-    return worst if np.isfinite(worst) else np.inf
+    return worst
 
 
 def _moving(model: Model) -> Dynamics:
