@@ -6,6 +6,8 @@ angles take one at a time. Series replace closed forms near zero where those los
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from mbkit._check import Array
@@ -104,7 +106,7 @@ def quaternion_from_matrix(R: Array) -> Array:
 
 def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     """Return Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3), of angles in radians: URDF's convention."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    (cr, cp, cy), (sr, sp, sy) = (tuple(map(f, (roll, pitch, yaw))) for f in (math.cos, math.sin))
     return np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],

@@ -604,3 +604,12 @@ def test_levels_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(jit, "LEVELS", {**jit.LEVELS, "x86-64-v9": (frozenset({"no such feature"}), 8)})
     with pytest.raises(InputError, match="MBKIT_CPU: expected a level that this processor has"):
         jit.host_of("x86-64-v9")
+
+
+def test_a_command_refuses_a_level_that_is_none() -> None:
+    """It is no engine that failed: a comparison without it would be a success of less than was asked."""
+    code = "from mbkit.cli import main; main()"
+    env = {**os.environ, "MBKIT_CPU": "x86-64-v9"}
+    done = subprocess.run([sys.executable, "-c", code, "robots"], env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "MBKIT_CPU: expected a level" in done.stderr

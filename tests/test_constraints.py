@@ -407,7 +407,7 @@ def row_of_bars(N):
     return lag, one, np.r_[np.full(N + 1, np.pi / 2), np.zeros(N)], np.r_[-np.ones(N + 1), np.zeros(N)]
 
 
-def test_independence_is_judged_where_the_motion_is():
+def test_reproducible_is_judged_where_the_motion_is():
     # Random poses of such a row all close on branches where the constraints depend on each other.
     lag, one, q, v = row_of_bars(6)
     tau = np.zeros(13)

@@ -145,7 +145,7 @@ def test_compiled_attempts_give_way_near_a_singular_pose() -> None:
     assert np.abs(runs[0].q[-1] - runs[1].q[-1]).max() < 1e-6
 
 
-def test_independence_is_judged_once_for_all_times(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reproducible_is_judged_once_for_all_times(monkeypatch: pytest.MonkeyPatch) -> None:
     model, q = closed_tree(1, "point", drive=True)
     dyn = mb.dynamics(model, "lagrangian", compile=False)
     start, asked = dyn.project(q, np.zeros(model.nv)), []

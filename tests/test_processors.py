@@ -10,14 +10,16 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit._independence import pivoted
+from mbkit._reproducible import length, pivoted, product, turned
 from mbkit.derivation.constraints import choose_rows, independent_rows
 from mbkit.engines.constraint_manifold import Manifold
 from mbkit.errors import UnsupportedError
@@ -25,6 +27,22 @@ from mbkit.lagrangian import from_model, systems
 from mbkit.simulate import METHODS
 
 EPS = float(np.finfo(float).eps)
+#: Frames, shapes and joints turned and moved against each other, whose numbers are sums of products.
+MJCF = """<mujoco><compiler angle="radian"/><worldbody>
+<body name="a" pos=".1 .2 .3" euler=".4 -.7 1.1"><joint axis=".3 .5 .7" pos=".1 .2 .05" ref=".3"/>
+<geom type="box" size=".1 .2 .3" pos=".1 0 .2" euler="1 2 3"/>
+<geom type="capsule" size=".05" fromto="0 .1 .2 .3 .1 .7"/>
+<body name="b" pos=".3 .1 .2" xyaxes=".6 .8 .1 -.7 .5 .2"><joint type="slide" axis=".2 .9 .1"/>
+<inertial pos=".1 .2 .1" mass="1" diaginertia=".1 .2 .25" axisangle=".3 .2 .9 .7"/></body></body>
+</worldbody></mujoco>"""
+URDF = """<robot name="turned"><link name="base"/>
+<link name="a"><inertial><origin xyz=".1 .2 .3" rpy=".4 .5 .6"/><mass value="1"/>
+<inertia ixx=".3" ixy=".01" ixz=".02" iyy=".4" iyz=".03" izz=".5"/></inertial></link>
+<link name="b"><inertial><origin xyz=".3 .1 .2" rpy="1 .2 .3"/><mass value="2"/>
+<inertia ixx=".2" ixy=".02" ixz=".01" iyy=".3" iyz=".02" izz=".4"/></inertial></link>
+<joint name="j" type="continuous"><parent link="base"/><child link="a"/><origin rpy=".1 .2 .3"/><axis xyz=".3 .5 .7"/>
+</joint><joint name="f" type="fixed"><parent link="a"/><child link="b"/><origin xyz=".1 .3 .2" rpy=".7 .1 .4"/></joint>
+</robot>"""
 
 
 MECHANISMS = [name for name, make in mb.catalog.systems().items() if make().constrained]
@@ -44,6 +62,11 @@ def mechanism(name: str, compiled: bool = False) -> Any:
 def states(seeds: int) -> dict[str, Any]:
     """Return states of all mechanisms for some seeds, the rows that are kept, and the digests of all systems."""
     out: dict[str, Any] = {f"{name}, digest": make().digest for name, make in mb.catalog.systems().items()}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, text in {"turned.xml": MJCF, "turned.urdf": URDF}.items():
+            path = Path(folder, name)
+            path.write_text(text)
+            out[f"{name}, digest"] = mb.load(path).digest
     for name in (*MECHANISMS, PAPER):
         model = mechanism(name).model
         q, v = zip(*(model.random_state(seed) for seed in range(seeds)), strict=True)
@@ -96,6 +119,19 @@ def test_of_equal_rows_the_first_are_kept_whatever_the_last_bits_are() -> None:
     order, sizes, found = pivoted(np.diag([1.0, 3.0, 2.0, 0.0]), 1e-12)
     assert (order, sizes) == ([1, 2, 0], [3.0, 2.0, 1.0])
     assert np.abs(found.T @ found - np.eye(3)).max() < 4 * EPS
+
+
+def test_products_in_one_order_are_products() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        A, B, x = rng.standard_normal((3, 3)), rng.standard_normal((3, 4)), rng.standard_normal(3)
+        assert np.abs(product(A, B) - A @ B).max() < 16 * EPS
+        assert np.abs(product(A, x) - A @ x).max() < 16 * EPS
+        assert np.abs(turned(A, A + A.T) - A @ (A + A.T) @ A.T).max() < 64 * EPS * np.abs(A).max() ** 3
+        assert abs(length(x) - np.linalg.norm(x)) < 4 * EPS * length(x)
+    for bad in (np.ones(2), np.ones((2, 3)), np.array(1.0)):
+        with pytest.raises(ValueError, match="do not fit"):
+            product(np.eye(3), bad)
 
 
 # One formula

@@ -327,6 +327,13 @@ def test_the_first_screen_has_the_verdict_what_acts_nowhere_and_the_worst_rows()
         assert "no engine applies it" in result.to_markdown()
 
 
+def test_many_stiff_joints_do_not_fill_the_first_screen():
+    found = tuple(Finding("stiff joint", f"j{k}: too fast", (f"j{k}",), 1e-6 * (k + 1)) for k in range(9))
+    text = " ".join(printed(check_table(replace(AGREEING, findings=found), full=False), 160).split())
+    assert [f"j{k}: too fast" in text for k in range(9)] == [True] * 3 + [False] * 6
+    assert "stiff joints: 6 more, less stiff: j3, j4, j5, j6, j7, j8" in text
+
+
 def test_every_term_of_the_table_has_a_line_on_the_page():
     every = {t.name for t in (*TERMS, *CONSTRAINT_TERMS, *BODY_TERMS, *MECHANISM_TERMS)} | {"power balance"}
     assert every == set(compare_view.MEANINGS)

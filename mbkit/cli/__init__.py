@@ -25,6 +25,11 @@ from mbkit.cli._shared import CommandGroup
 @click.version_option(__version__, prog_name="mbkit")
 def cli() -> None:
     """Equations of motion that can be trusted: Pinocchio, MuJoCo and an own derivation, compared."""
+    if os.environ.get("MBKIT_CPU"):
+        # A study would take it for an engine that failed, and go on without it.
+        from mbkit.codegen import jit
+
+        jit.host()
 
 
 for _command in (

@@ -77,10 +77,12 @@ def _model(target: str, options: Mapping[str, Any]) -> Model:
     try:
         loaded = model_of(target, options)
     except ModelError:
-        # Matter that cannot be is compared as it is written.
         if options or not path:
             raise
-        return written(path)
+        # Matter that cannot be is compared as it is written; the loader has the better message.
+        with suppress(MbkitError):
+            return written(path)
+        raise
     if options or not path.lower().endswith(".urdf"):
         return loaded
     with suppress(MbkitError):

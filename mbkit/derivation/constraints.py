@@ -27,7 +27,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit._independence import pivoted
+from mbkit._reproducible import pivoted
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, dot3

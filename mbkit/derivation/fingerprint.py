@@ -19,7 +19,7 @@ DECISIVE: Final = (
     "engines/constraint_manifold.py",
     "spatial.py",
     "_check.py",
-    "_independence.py",
+    "_reproducible.py",
 )
 _ROOT: Final = Path(__file__).parent.parent
 

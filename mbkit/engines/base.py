@@ -407,8 +407,8 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
         Returns
         -------
         q, v : (nq,) and (nv,), or (N, nq) and (N, nv) arrays
-            New ones. They are those of ``mbkit.simulate(dyn, q, v, dt, method, dt, torque=tau)``: the same bits, but on
-            the lagrangian engine with a free joint or quasi-velocities the same up to rounding.
+            New ones. They are those of ``mbkit.simulate(dyn, q, v, dt, method, dt, torque=tau)``: the same bits; with
+            constraints, and on the lagrangian engine with a free joint or quasi-velocities, the same up to rounding.
 
         Raises
         ------

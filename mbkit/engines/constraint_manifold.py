@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit._independence import pivoted
+from mbkit._reproducible import pivoted
 from mbkit.derivation.constraints import discs_of, independent_rows
 from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
@@ -749,6 +749,9 @@ def _nearest(manifold: Manifold, q: Array, scale: Array) -> tuple[Array, Array]:
 
 def _dependent(J: Array) -> tuple[Array, Array]:
     """Return the rows that the others imply, and those others that are needed for it."""
+    if len(J) and len(J) <= J.shape[1] and singular_values(J)[-1] > _DEPENDENT:
+        # No remainder is smaller than the smallest singular value; this is the quicker answer.
+        return np.empty(0, dtype=int), np.empty(0, dtype=int)
     order, *_ = pivoted(J, _DEPENDENT)
     kept, dependent = np.array(order, dtype=int), np.setdiff1d(np.arange(len(J)), order)
     if not len(dependent) or not len(kept):

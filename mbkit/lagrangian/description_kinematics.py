@@ -13,7 +13,7 @@ import numpy as np
 import sympy as sp
 
 from mbkit._check import Array
-from mbkit._independence import pivoted
+from mbkit._reproducible import pivoted
 from mbkit.derivation.kinematics import Kinematics, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError

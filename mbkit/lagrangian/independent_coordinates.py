@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit._escape import one_line
-from mbkit._independence import pivoted
+from mbkit._reproducible import pivoted
 from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.engines.constraint_manifold import Manifold, require_few
 from mbkit.engines.lagrangian import LagrangianDynamics

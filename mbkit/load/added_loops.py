@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import shown
+from mbkit._reproducible import product
 from mbkit.errors import InputError, LoadError, ModelError, nearest
 from mbkit.model import Frame, Model, ModelBuilder
 from mbkit.model.builder import with_loops
@@ -115,8 +116,8 @@ def _on_bodies(model: Model, one: dict[str, Any]) -> dict[str, Any]:
 def _moved(frame: Frame, one: dict[str, Any], side: str) -> dict[str, Any]:
     p, R = one.get(f"translation_{side}", np.zeros(3)), one.get(f"rotation_{side}")
     try:
-        point = frame.translation + frame.rotation @ np.array(p, dtype=np.float64)
-        axes = frame.rotation if R is None else frame.rotation @ np.array(R, dtype=np.float64)
+        point = frame.translation + product(frame.rotation, np.array(p, dtype=np.float64))
+        axes = frame.rotation if R is None else product(frame.rotation, np.array(R, dtype=np.float64))
     except (TypeError, ValueError):
         # The builder names their faults.
         return {f"body_{side}": frame.body}

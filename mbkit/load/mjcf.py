@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array
+from mbkit._reproducible import length, product
 from mbkit.errors import ModelError
 from mbkit.load.mjcf_attributes import Compiler, Defaults, about, check_names
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, name_list
@@ -131,7 +132,7 @@ class _Tree:
                 if joint.kind == "free":
                     R, p = np.eye(3), np.zeros(3)
                 else:
-                    p = p + R @ (joint.anchor - before)
+                    p = p + product(R, joint.anchor - before)
                 self._add_joint(joint, parent, child, R, p)
                 if not last:
                     b.add_body(child)
@@ -157,11 +158,11 @@ class _Tree:
             values["stiffness"], values["damping"] = self.springs[joint.name]
         rest = angle * read.number(element, "springref", item, 0.0) if joint.scalar else 0.0
         if joint.scalar:
-            axis = values["axis"] = self.snap(joint.axis / np.linalg.norm(joint.axis))
+            axis = values["axis"] = self.snap(joint.axis / length(joint.axis))
             if joint.ref and joint.kind == "hinge":
-                R = R @ about(axis, -joint.ref)
+                R = product(R, about(axis, -joint.ref))
             elif joint.ref:
-                p = p - R @ (joint.ref * axis)
+                p = p - product(R, joint.ref * axis)
             if limits := _range(element, "range", "limited", item, scene):
                 values["lower"], values["upper"] = (angle * x for x in limits)
             if force := _range(element, "actuatorfrcrange", "actuatorfrclimited", item, scene):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit._reproducible import length, product
 from mbkit.errors import nearest
 from mbkit.load.xml_reader import MOST_BYTES, Element, Reader
 from mbkit.model.validation import listing
@@ -31,7 +33,7 @@ class Pose:
     p: Array
 
     def __matmul__(self, other: Pose) -> Pose:
-        return Pose(self.R @ other.R, self.p + self.R @ other.p)
+        return Pose(product(self.R, other.R), self.p + product(self.R, other.p))
 
 
 HERE: Final = Pose(np.eye(3), np.zeros(3))
@@ -191,15 +193,15 @@ def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
         R = np.eye(3)
         for letter, angle in zip(compiler.eulerseq, compiler.angle * x, strict=True):
             turn = about(np.eye(3)["xyz".index(letter.lower())], float(angle))
-            R = R @ turn if letter.islower() else turn @ R
+            R = product(R, turn) if letter.islower() else product(turn, R)
         return R
     if name == "zaxis":
         return z_to(x) if has_length(x) else None
     if not has_length(x[:3]):
         return None
     first = spatial.normalized(x[:3])
-    second = x[3:] - first * (first @ x[3:])
-    if not np.linalg.norm(second) > 1e-10:
+    second = x[3:] - first * product(first[None], x[3:])
+    if not length(second) > 1e-10:
         return None
     second = spatial.normalized(second)
     return np.column_stack([first, second, np.cross(first, second)])
@@ -207,13 +209,13 @@ def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
 
 def has_length(x: Array) -> bool:
     """Return whether a direction can be normalized; the squares of numbers below 1e-162 vanish."""
-    return bool(np.linalg.norm(x) > 0)
+    return length(x) > 0
 
 
 def about(axis: Array, angle: float) -> Array:
     """Return the rotation about an axis of any length."""
     half = angle / 2
-    quaternion = np.array([*(np.sin(half) * spatial.normalized(axis)), np.cos(half)])
+    quaternion = np.array([*(math.sin(half) * spatial.normalized(axis)), math.cos(half)])
     return spatial.matrix_from_quaternion(quaternion)
 
 
@@ -221,10 +223,10 @@ def z_to(direction: Array) -> Array:
     """Return the shortest rotation that takes z to a direction."""
     z = spatial.normalized(direction)
     axis = np.array([-z[1], z[0], 0.0])
-    sine = float(np.linalg.norm(axis))
+    sine = length(axis)
     if sine < 1e-10:
         axis = np.array([1.0, 0.0, 0.0])
-    return about(axis, float(np.arctan2(sine, z[2])))
+    return about(axis, math.atan2(sine, z[2]))
 
 
 # Names that MuJoCo's schema does not have.

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import spatial
+from mbkit._reproducible import turned
 from mbkit.load.mjcf_attributes import mesh_assets, read_mesh
 from mbkit.load.mjcf_reader import Scene
 from mbkit.load.shapes import MassProperties
@@ -169,7 +170,7 @@ def _mass_properties(body: Any) -> MassProperties:
     """Return the inertia of a compiled body in its own axes."""
     w, x, y, z = (float(c) for c in body.iquat)
     axes = spatial.matrix_from_quaternion(np.array([x, y, z, w]))
-    return MassProperties(float(body.mass[0]), np.array(body.ipos), axes @ np.diag(body.inertia) @ axes.T)
+    return MassProperties(float(body.mass[0]), np.array(body.ipos), turned(axes, np.diag(body.inertia)))
 
 
 def name_list(names: Iterable[str]) -> str:

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import spatial
+from mbkit._reproducible import product
 from mbkit.load.mjcf_attributes import HERE, Pose, has_length
 from mbkit.load.mjcf_couplings import bound_parts, element_label
 from mbkit.load.mjcf_reader import Scene
@@ -179,4 +180,4 @@ class Equalities:
 
 
 def _inverse(X: Pose) -> Pose:
-    return Pose(X.R.T, -X.R.T @ X.p)
+    return Pose(X.R.T, -product(X.R.T, X.p))

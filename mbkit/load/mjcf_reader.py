@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._reproducible import length, product, turned
 from mbkit.load.mjcf_attributes import HERE, ORIENTATIONS, Compiler, Defaults, Pose, has_length, pose, z_to
 from mbkit.load.shapes import NOTHING, SIZES, MassProperties, solid, together
 from mbkit.load.urdf_reader import BASE_JOINT
@@ -215,13 +216,13 @@ def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: 
         read.fault(f"{item}: align moves the body's frame; set it to false", element)
     joint = MjcfJoint(name, full, type_ if type_ in KINDS else "hinge", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
     if joint.kind != "free":
-        joint.anchor = X.p + X.R @ np.array(read.numbers(full, "pos", item, count=3, default=(0, 0, 0)))
+        joint.anchor = X.p + product(X.R, np.array(read.numbers(full, "pos", item, count=3, default=(0, 0, 0))))
     if joint.scalar:
         axis = np.array(read.numbers(full, "axis", item, count=3, default=(0, 0, 1)))
         if not has_length(axis):
             read.fault(f"{item}: axis is zero; expected a direction, such as 0 0 1", element)
             axis = joint.axis
-        joint.axis = X.R @ axis
+        joint.axis = product(X.R, axis)
         joint.ref = read.number(full, "ref", item, 0.0) * (scene.compiler.angle if joint.kind == "hinge" else 1.0)
     return joint
 
@@ -275,7 +276,7 @@ def _bounded(
     moments, axes = np.linalg.eigh(inertia)
     if moments[0] < compiler.boundinertia > 0:
         moments = np.maximum(moments, compiler.boundinertia)
-        inertia = axes @ np.diag(moments) @ axes.T
+        inertia = turned(axes, np.diag(moments))
         changed.append("boundinertia")
     if compiler.balanceinertia and moments[0] + moments[1] < moments[2] * (1 - slack):
         inertia = float(np.mean(moments)) * np.eye(3)
@@ -348,7 +349,7 @@ def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, item:
         if not has_length(along):
             read.fault(f"{item}: a geom's fromto has no length", element)
             return size, Pose(np.eye(3), ends[:3])
-        half = float(np.linalg.norm(along)) / 2
+        half = length(along) / 2
         size = (size[0], half) if needed == 2 else (size[0], size[0], half)
         placed = Pose(z_to(along), (ends[:3] + ends[3:]) / 2)
     if min(size) <= 0:

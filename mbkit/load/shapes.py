@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._reproducible import product, turned
 from mbkit.spatial import skew
 
 # Number of sizes of each shape: half lengths and radii.
@@ -25,7 +26,7 @@ class MassProperties:
 
     def moved(self, R: Array, p: Array) -> MassProperties:
         """Return the same mass properties in another frame, in which this one has the pose R, p."""
-        return MassProperties(self.mass, p + R @ self.com, R @ self.inertia @ R.T)
+        return MassProperties(self.mass, p + product(R, self.com), turned(R, self.inertia))
 
     def scaled(self, factor: float) -> MassProperties:
         """Return the same shape with `factor` times the density."""
@@ -68,5 +69,5 @@ def together(masses: list[MassProperties]) -> MassProperties:
     inertia = np.zeros((3, 3))
     for x in masses:
         d = skew(x.com - com)
-        inertia += x.inertia - x.mass * d @ d
+        inertia += x.inertia - x.mass * product(d, d)
     return MassProperties(mass, com, inertia)

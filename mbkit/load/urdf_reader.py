@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit._reproducible import turned
 from mbkit.errors import ModelError, Suggestions
 from mbkit.load import xml_reader
 from mbkit.load.xml_reader import Element, Reader, element_text, misspelt, unused
@@ -475,8 +476,8 @@ def urdf_links(root: Element, source: str, *, floating_base: bool = False) -> Mo
             b.add_body(link.name)
             continue
         R, I = snap(spatial.matrix_from_rpy(*link.rpy)), link.inertia
-        turned = I if np.array_equal(R, np.eye(3)) else R @ I @ R.T
-        b.add_body(link.name, mass=link.mass, com=link.com, inertia=0.5 * (turned + turned.T))
+        own = I if np.array_equal(R, np.eye(3)) else turned(R, I)
+        b.add_body(link.name, mass=link.mass, com=link.com, inertia=0.5 * (own + own.T))
     if floating_base:
         b.add_joint(BASE_JOINT, "free", parent="world", child=urdf.root)
     elif urdf.root != "world":

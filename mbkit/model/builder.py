@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -14,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from mbkit import spatial
 from mbkit._check import Array, _as_float, finite_array, real, shown
+from mbkit._reproducible import length
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
 from mbkit.model.elements.declare import ElementBuilder
 from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
@@ -185,14 +185,12 @@ class ArgumentReader:
         largest = float(np.abs(vector).max())
         if largest and not 1e-100 < largest < 1e100:
             vector = vector / largest
-        # By BLAS a dot product has other last bits, and the description another digest, on another processor.
-        x, y, z = vector.tolist()
-        length = math.sqrt(x * x + y * y + z * z)
-        if not length:
+        size = length(vector)
+        if not size:
             self.faults.append(f"{name} is zero; expected a direction")
-            vector, length = np.array([1.0, 0.0, 0.0]), 1.0
+            vector, size = np.array([1.0, 0.0, 0.0]), 1.0
         # A unit vector to rounding keeps its bits.
-        return vector if abs(length - 1) < 1e-15 else np.asarray(vector / length)
+        return vector if abs(size - 1) < 1e-15 else np.asarray(vector / size)
 
     def mimic(self, item: str, value: Mimic | Iterable[Any]) -> tuple[str, dict[str, Number]] | None:
         """Return the leader of a mimic joint, and ratio and offset; None after a fault."""

@@ -19,6 +19,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._reproducible import length, product
 from mbkit.model.joint_types import cross3
 
 Vector = list[Any]
@@ -95,6 +96,6 @@ def tangents(normal: Array) -> Array:
     sizes = np.abs(normal)
     # Of components that are equal but for rounding the first.
     first = np.eye(3)[np.argmax(sizes <= sizes.min() + 1e-9)]
-    first = first - (first @ normal) * normal
-    first = first / np.linalg.norm(first)
+    first = first - product(first[None], normal) * normal
+    first = first / length(first)
     return np.array([first, np.cross(normal, first)])

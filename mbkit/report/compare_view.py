@@ -10,11 +10,13 @@ from mbkit.report import document as doc
 from mbkit.report import figures, work_precision_view
 from mbkit.report.formatting import brief, count_text, error_text, mark, model_facts, refusals, time_text
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
-from mbkit.studies.compare.result import OWN_LAW, Comparison, Omission, RolloutRow, Row
+from mbkit.studies.compare.result import OWN_LAW, STIFF, Comparison, Omission, RolloutRow, Row
 
 # Rounding stays far below this, and anything that acts is far above.
 _VISIBLE: Final = 1e-6
 _MAX_FAILURES: Final = 12
+#: Stiff joints that have a line of their own on the first screen.
+_MAX_STIFF: Final = 3
 #: What stands behind the name of a term.
 MEANINGS: Final = {
     "M": "mass matrix",
@@ -113,7 +115,11 @@ def view(result: Comparison, target: str = "", *, full: bool = False) -> doc.Doc
 
 def _first_screen(result: Comparison, *, full: bool) -> list[doc.Block]:
     """Return what a reader needs to know before any table."""
-    beside = [doc.Bullet(x.kind, x.says, "!", "allowed") for x in result.findings]
+    stiff = [x for x in result.findings if x.kind == STIFF]
+    beside = [doc.Bullet(x.kind, x.says, "!", "allowed") for x in result.findings if x not in stiff[_MAX_STIFF:]]
+    if len(stiff) > _MAX_STIFF:
+        rest = ", ".join(name for x in stiff[_MAX_STIFF:] for name in x.joints)
+        beside.append(doc.Bullet("stiff joints", f"{len(stiff) - _MAX_STIFF} more, less stiff: {rest}", "!", "allowed"))
     beside += [
         doc.Bullet(r.engine or f"no {r.term}", r.reason, "!", "allowed")
         for r in result.refusals

@@ -160,7 +160,8 @@ class _Descriptions:
         if explained and not agree and not massless:
             left = self._whole(changed.model, target.model)
             explained = not left > self.tolerance
-            after = replace(after, terms=(*after.terms, Gap(WHOLE, left, "")))
+            if not np.isnan(left):
+                after = replace(after, terms=(*after.terms, Gap(WHOLE, left, "")))
         if whole > self.tolerance:
             before = replace(before, terms=(*before.terms, Gap(WHOLE, whole, "")))
 
@@ -208,9 +209,9 @@ class _Descriptions:
         return self._gaps(one.model, rename_joints(other, one.model, Matching(pairs, (), ())).model)
 
     def _whole(self, a: Model, b: Model) -> float:
-        """Return the difference between the accelerations of two whole systems; 0 where nothing can be compared."""
+        """Return the difference between the accelerations of two whole systems; NaN where nothing can be compared."""
         if a.velocity_names != b.velocity_names or not a.nv:
-            return 0.0
+            return float("nan")
         return terms.whole_gap(a, b, self.samples, self.seed)
 
     def _cause(self, h: Hypothesis, effects: dict[str, float]) -> Cause:

@@ -1,0 +1,76 @@
+"""Small linear algebra that is the same on every processor: products, lengths, and which rows are independent.
+
+BLAS sums in an order, and with fused operations, that are those of the processor. The digest of a description must not
+hang on the last bits of these, and a choice of rows must not hang on which of two equal ones they make the larger.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+
+#: Of the largest remainder: those that differ by less are equal but for rounding and the digits of a description.
+_TIE: Final = 1e-6
+
+
+def product(A: Array, B: Array) -> Array:
+    """Return A B of a matrix (m, n) and a vector (n,) or a matrix (n, k), summed from the first column on."""
+    if B.ndim not in (1, 2) or A.shape[1:] != B.shape[:1]:
+        raise ValueError(f"product: shapes {A.shape} and {B.shape} do not fit")
+    columns = A if B.ndim == 1 else A[..., None]
+    out = columns[:, 0] * B[0]
+    for k in range(1, len(B)):
+        out = out + columns[:, k] * B[k]
+    return np.asarray(out)
+
+
+def turned(R: Array, inertia: Array) -> Array:
+    """Return R I Rᵀ, the inertia (3, 3) in the axes in which its own have the rotation R."""
+    return product(product(R, inertia), R.T)
+
+
+def length(x: Array) -> float:
+    """Return the Euclidean length of a vector, (n,)."""
+    total = 0.0
+    for component in x.tolist():
+        total += component * component
+    return math.sqrt(total)
+
+
+def pivoted(rows: Array, dependent: float) -> tuple[list[int], list[float], Array]:
+    """Return independent rows in the order of their choice, the size of each remainder, and a basis of them.
+
+    Gram and Schmidt's orthogonalization, twice for each row, with pivoting (Golub, Van Loan 2013, Matrix Computations,
+    5.4.2): the next row is the first one whose remainder is the largest, up to a tie.
+
+    Parameters
+    ----------
+    rows : (m, n) array
+    dependent : float
+        Size of a remainder up to which a row follows from the others.
+
+    Returns
+    -------
+    order : list of int, sizes : list of float, basis : (n, k) array
+    """
+    left, most = np.array(rows, dtype=np.float64), min(rows.shape)
+    basis, order, sizes = np.zeros((most, rows.shape[1])), list[int](), list[float]()
+    while len(order) < most:
+        norms = np.sqrt((left * left).sum(axis=1))
+        norms[order] = 0.0
+        largest = float(norms.max())
+        if not largest > dependent:
+            break
+        k = int((norms >= (1 - _TIE) * largest).argmax())
+        known = basis[: len(order)]
+        unit = left[k] - (known @ left[k]) @ known
+        unit /= math.sqrt(unit @ unit)
+        basis[len(order)] = unit
+        order.append(k)
+        sizes.append(float(norms[k]))
+        left -= (left @ unit)[:, None] * unit
+    return order, sizes, basis[: len(order)].T
