@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import warnings
 from itertools import pairwise
 from typing import Any
 
@@ -24,6 +25,7 @@ from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Event, Trajectory, at_section, simulate
+from mbkit.simulate.solvers.taylor import rounded
 from tests.random_trees import random_tree
 
 hy = pytest.importorskip("heyoka")
@@ -380,3 +382,10 @@ def test_forces_of_the_time_alone_are_no_jumps() -> None:
         run = simulate(lag.dynamics(engine), [0.0], [0.0], 1.0, "taylor", rtol=1e-14, save=[1.0])
         assert run.stats.finished
         assert abs(run.q[0, 0] - exact.q[0, 0]) < 1e-12
+
+
+@pytest.mark.skipif(not hasattr(hy, "real128"), reason="heyoka was built without quadruple numbers")
+def test_a_number_beyond_all_doubles_is_infinite_without_a_warning() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert rounded(np.array([1e300, 2.0]).astype(hy.real128) ** 2).tolist() == [np.inf, 4.0]

@@ -83,8 +83,9 @@ def _reason(dyn: LagrangianDynamics | OracleDynamics, t: float, y: Array, force:
 
 
 def rounded(y: Any) -> Array:
-    """Return numbers of any format as doubles."""
-    return np.asarray(y, dtype=np.float64)
+    """Return numbers of any format as doubles; what no double holds is infinite, and ends a run by its own message."""
+    with np.errstate(over="ignore"):
+        return np.asarray(y, dtype=np.float64)
 
 
 #: Tolerance of a step across a singular pose: what rounding lets a step of rk853 hold.
