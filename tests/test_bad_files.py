@@ -770,3 +770,28 @@ def test_damaged_values_never_crash(tmp_path, data):
             for floating in (False, True):
                 with contextlib.suppress(MbkitError):
                     load(path, nonphysical=policy, floating_base=floating)
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        ("~/no_such_file_here.urdf", str(Path.home() / "no_such_file_here.urdf")),
+        ("robot.sdf", "this is SDF; export it"),
+        (Path("scene.usda"), "this is OpenUSD"),
+        ("arm.urdf.xacro", "run xacro"),
+        (" <robot name='x'/>", "the text of a file"),
+        ("ur5_description", "did you mean 'ur_description/ur5_robot'"),
+        ("panda_mj_description", "did you mean 'panda_description/panda'"),
+    ],
+)
+def test_a_source_that_is_no_urdf_or_mjcf_is_named(source, words):
+    with pytest.raises(MbkitError, match=re.escape(words)):
+        load(source)
+
+
+def test_a_folder_names_the_robots_near_its_top(tmp_path):
+    (tmp_path / "below" / "deep").mkdir(parents=True)
+    for name in ("a.urdf", "b.xml", "below/c.urdf", "below/deep/d.urdf"):
+        (tmp_path / name).touch()
+    with pytest.raises(LoadError, match=r"it holds a.urdf, b.xml, below.c.urdf$"):
+        load(tmp_path)

@@ -139,7 +139,7 @@ def mujoco_terms(text: str, q: Any, v: Any) -> tuple[Any, Any, Any]:
 def test_random_tendons_and_actuators_are_what_mujoco_makes_of_them(seed, tmp_path):
     text = random_transmissions(seed)
     (tmp_path / "robot.xml").write_text(text)
-    model = mb.load(tmp_path / "robot.xml")
+    model = mb.load(tmp_path / "robot.xml", actuators=True)
     q, v = model.random_state(np.random.default_rng(seed))
     M, force, a = mujoco_terms(text, q, v)
     dyn = mb.dynamics(model, "pinocchio")
@@ -153,7 +153,7 @@ def test_random_tendons_and_actuators_are_what_mujoco_makes_of_them(seed, tmp_pa
 def loaded(folder: Path, text: str) -> Model:
     path = folder / "robot.xml"
     path.write_text(text)
-    return mb.load(path)
+    return mb.load(path, actuators=True)
 
 
 BODY = '<inertial pos="0 0 -.5" mass="1" diaginertia=".1 .1 .1"/>'
@@ -161,6 +161,38 @@ PLAIN = (
     f'<worldbody><body><joint name="a" axis="0 1 0" damping=".5"/>{BODY}<body pos="0 0 -1"><joint name="b" axis="0 1 0"/>'
     f'{BODY}<site name="s"/></body></body><body><joint name="c" type="ball"/>{BODY}<site name="t"/></body></worldbody>'
 )
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_by_default_the_servos_of_a_file_do_not_act(seed, tmp_path):
+    """As in MuJoCo where the flag of actuation is off: rotors and the damping of transmissions are left."""
+    text = random_transmissions(seed).replace(' actuation="disable"', "")
+    path = tmp_path / "robot.xml"
+    path.write_text(text)
+    model = mb.load(path)
+    q, v = model.random_state(np.random.default_rng(seed))
+    M, force, _ = mujoco_terms(text.replace("<flag ", '<flag actuation="disable" '), q, v)
+    dyn = mb.dynamics(model, "pinocchio")
+    np.testing.assert_allclose(dyn.mass_matrix(q), M, rtol=0, atol=1e4 * EPS * np.abs(M).max())
+    np.testing.assert_allclose(dyn.passive(q, v), force, rtol=0, atol=1e4 * EPS * max(1, np.abs(force).max()))
+
+
+def test_the_repr_and_check_say_whether_servos_act(tmp_path):
+    servo = '<actuator><position name="servo" joint="b" kp="5" kv="2"/><motor name="drive" joint="a"/></actuator>'
+    path = tmp_path / "robot.xml"
+    path.write_text(f"<mujoco>{PLAIN}{servo}</mujoco>")
+    without, acting = mb.load(path), mb.load(path, actuators=True)
+    assert "servos left out" in repr(without)
+    assert "servos act at zero control" in repr(acting)
+    assert (without.joint("b").stiffness, acting.joint("b").stiffness, acting.joint("b").damping) == (0, 5, 2)
+    note = next(n for n in without.notes if n.startswith("servos"))
+    assert note.endswith("with actuators=True they act at zero control: 'servo' on b: stiffness 5, damping 2")
+    found = mb.compare(without, ["pinocchio", "lagrangian"], samples=2, terms_only=True).findings
+    assert [x.says for x in found if x.kind == "actuators"] == [note]
+    path.write_text(f'<mujoco>{PLAIN}<actuator><motor joint="a"/></actuator></mujoco>')
+    assert "servos" not in repr(mb.load(path))
+    with pytest.raises(mb.errors.InputError, match="actuators: expected True or False, got 'yes'"):
+        mb.load(path, actuators="yes")
 
 
 def test_what_acts_and_what_is_left_out_is_named(tmp_path):

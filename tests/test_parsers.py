@@ -202,7 +202,7 @@ def acting(case: str) -> str:
 def test_the_verdict_on_mujoco_is_that_of_its_own_terms(case: str, tmp_path: Path) -> None:
     path = write(tmp_path, acting(case), "m.xml")
     made = mujoco.MjModel.from_xml_path(str(path))
-    model = mb.load(path)
+    model = mb.load(path, actuators=True)
     pinocchio = mb.dynamics(model)
     data, M = mujoco.MjData(made), np.empty((made.nv, made.nv))
     worst = 0.0

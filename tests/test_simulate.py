@@ -9,6 +9,7 @@ import os
 import pickle
 import subprocess
 import sys
+import warnings
 from fractions import Fraction
 from operator import add, mul
 from pathlib import Path
@@ -905,3 +906,22 @@ def test_warnings_point_at_the_line_that_called(call):
         call(dynamics(b.build(), "pinocchio"), [2.0], [1e155], 0.01, "rk4")
     assert len(heard) == 2
     assert {warning.filename for warning in heard} == {__file__}
+
+
+def test_a_run_says_that_dry_friction_does_not_act():
+    """With its size beside the other forces: an arm of 2 kg at 0.5 m, held at the horizontal, has 9.81 Nm."""
+    b = mb.ModelBuilder("arm")
+    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), friction=4.905)
+    b.add_body("a", mass=2.0, com=(0.5, 0, 0), inertia=np.eye(3) * 0.1)
+    model = b.build()
+    for name in ("lagrangian", "pinocchio"):
+        with pytest.warns(
+            mb.errors.MbkitWarning, match=r"dry friction .* 4.91 N m at j, 0.5 times the other forces there"
+        ):
+            mb.simulate(mb.dynamics(model, name), [0.0], [0.0], 0.01)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mb.simulate(mb.dynamics(model), [0.0], [0.0], 0.01, doubt=False)
+        mb.simulate(mb.dynamics(model.without("friction")), [0.0], [0.0], 0.01)
+    assert "dry friction (in no engine)" in repr(model)
+    assert "friction" not in repr(model.without("friction")).split("without")[0]

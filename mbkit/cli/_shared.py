@@ -38,6 +38,7 @@ _OPTIONS: Final = {
     'nonphysical="warn"': "--nonphysical warn",
     "mimic='free'": "--mimic free",
     "floating_base=True": "--floating-base",
+    "actuators=True": "--actuators",
 }
 
 # Options that several commands have.
@@ -106,9 +107,16 @@ def load_options(command: Command) -> Command:
 
     @functools.wraps(command)
     def with_options(
-        *args: Any, floating_base: bool, mimic: str | None, nonphysical: str | None, loops: str | None, **more: Any
+        *args: Any,
+        floating_base: bool,
+        actuators: bool,
+        mimic: str | None,
+        nonphysical: str | None,
+        loops: str | None,
+        **more: Any,
     ) -> None:
         options = {"floating_base": floating_base or None, "mimic": mimic, "nonphysical": nonphysical, "loops": loops}
+        options["actuators"] = actuators or None
         command(*args, options={k: v for k, v in options.items() if v is not None}, **more)
 
     bodies, mimics = click.Choice(["error", "warn"]), click.Choice(["reduce", "free"])
@@ -116,7 +124,8 @@ def load_options(command: Command) -> Command:
     mimic = click.option("--mimic", type=mimics, help="What mimic joints become.  [default: reduce]")
     nonphysical = click.option("--nonphysical", type=bodies, help="Refuse impossible bodies, or take them.")
     loops = click.option("--loops", metavar="FILE", help="TOML file of loops to add, a table [[loop]] for each.")
-    return base(mimic(nonphysical(loops(with_options))))
+    servos = click.option("--actuators", is_flag=True, help="Let the servos of an MJCF act, at zero control.")
+    return base(mimic(nonphysical(loops(servos(with_options)))))
 
 
 def stem_of(target: str, name: str) -> str:

@@ -7,6 +7,7 @@ import os
 import re
 import warnings
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -28,6 +29,14 @@ from mbkit.model.validation import scale_doubts
 # `Path` drops one of the two slashes.
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
 _PACKAGE: Final = "example-robot-data"
+_USD: Final = "this is OpenUSD; export it as one of them"
+#: What is said of files of other formats.
+_OTHERS: Final = {
+    ".sdf": "this is SDF; export it as one of them",
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
+    ".xacro": "this is a xacro file; run xacro, and load the URDF that it writes",
+    ".mjb": "this is a compiled MuJoCo model; save it as XML (mujoco.mj_saveLastXML)",
+}
 
 # Common names of files with another stem: folder and stem.
 _SHORT: Final = {
@@ -67,12 +76,13 @@ def load(
     gravity: ArrayLike | None = None,
     meshes: Literal["auto", "never"] = "auto",
     loops: bool | Loops = True,
+    actuators: bool = False,
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
     No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF its
-    inertia. The model's ``notes`` name all decisions. Tendons and actuators of an MJCF act as springs, dampers and
-    rotors where their forces at zero control are linear.
+    inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers where their forces
+    are linear, and the rotors of its actuators as armature. Dry friction and limits are data: no engine applies them.
 
     Parameters
     ----------
@@ -98,6 +108,11 @@ def load(
         beside those of the file: dicts with the arguments of `ModelBuilder.add_loop`, `Loop` objects, or a TOML file
         with a table ``[[loop]]`` of these arguments for each. A URDF has no loops of its own. Their bodies may be
         frames too, such as links that were merged.
+    actuators : bool
+        Whether the actuators of an MJCF exert their force at zero control. By default they do not: τ is the whole
+        force of the drives, so that ``inverse_dynamics`` at rest is gravity. With True a position servo becomes a
+        spring of stiffness `kp` about zero and a damper `kv`, as MuJoCo computes at ``ctrl = 0``. Their rotors'
+        inertia acts in both cases.
 
     Returns
     -------
@@ -137,6 +152,7 @@ def load(
         ("nonphysical", nonphysical, ("error", "warn", None), "'error', 'warn' or None"),
         ("floating_base", floating_base, (True, False), "True or False"),
         ("meshes", meshes, ("auto", "never"), "'auto' or 'never'"),
+        ("actuators", actuators, (True, False), "True or False"),
     ):
         if not isinstance(value, (str, bool, np.bool_, NoneType)) or value not in allowed:
             raise InputError(f"{name}: expected {expected}, got {shown(value)}")
@@ -156,7 +172,8 @@ def load(
         from mbkit.load.mjcf import model_of_mjcf
 
         whole = xml_reader.with_includes(root, path)
-        model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes, added is not None or bool(loops))
+        wanted = added is not None or bool(loops)
+        model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes, wanted, bool(actuators))
     else:
         raise xml_reader.unknown_root(path, root)
     if added is not None:
@@ -164,7 +181,15 @@ def load(
     doubts = scale_doubts(model)
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)
-    return replace(model, notes=(*root.notes, *model.notes), source=str(path.absolute()))
+    return replace(model, notes=(*root.notes, *model.notes, *_friction(model)), source=str(path.absolute()))
+
+
+def _friction(model: Model) -> Iterator[str]:
+    """Yield a note on dry friction."""
+    if having := [j for j in model.joints if j.friction.any()]:
+        worst = max(having, key=lambda j: float(j.friction.max()))
+        of = f"{len(having)} joint{'s' * (len(having) > 1)}"
+        yield f"dry friction is data, and acts in no engine: {of}, up to {worst.friction.max():g} at {worst.name}"
 
 
 def _locate(source: str | os.PathLike[str]) -> tuple[Path, bool]:
@@ -176,8 +201,13 @@ def _locate(source: str | os.PathLike[str]) -> tuple[Path, bool]:
         raise InputError(f"source: expected a path of characters, got bytes {shown(text)}")
     if not text:
         raise InputError("source: expected a robot's name or a path, got an empty text")
+    if text.lstrip().startswith("<"):
+        raise InputError("source: expected a robot's name or a path, got the text of a file; write it to a file")
+    text = os.path.expanduser(text)
     if _URL.match(text) and not os.path.exists(text):
         raise LoadError(f"{text}: this is a URL, and mbkit reads local files; download it and give its path")
+    if (other := _OTHERS.get(Path(text).suffix.lower())) is not None:
+        raise LoadError(f"{text}: expected a URDF or MJCF file, {other}")
     if isinstance(source, str):
         looks_like_path = text.lower().endswith((".urdf", ".xml", ".mjcf"))
         robot = None if looks_like_path else find(text)
@@ -280,6 +310,9 @@ def canonical(name: str) -> str | None:
 def unknown(name: str) -> UnknownNameError:
     """Return the error for a name that is neither a robot nor a path."""
     known = sorted({x for r in robots() for x in (r.name, r._spellings[0])} | _SHORT.keys())
+    # Packages of descriptions call a robot's folder so.
+    if (meant := find(re.sub("(_mj|_moveit)?_description$", "", name))) is not None:
+        known = [meant.name]
     return UnknownNameError(
         "robot", name, known, "(a path to a file ends in .urdf or .xml; mbkit robots lists all names)"
     )

@@ -51,6 +51,7 @@ def model_of_mjcf(
     gravity: ArrayLike | None,
     meshes: Literal["auto", "never"],
     loops: bool,
+    actuators: bool,
 ) -> Model:
     """Return the model of a <mujoco> element; for the arguments see `mbkit.load.load`."""
     read = Reader()
@@ -90,7 +91,7 @@ def model_of_mjcf(
     springs = infer_springs(mujoco, path, scene)
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=gravity)
     snap = _Tree(b, scene, springs).add_bodies(scale)
-    transmissions = Transmissions(mujoco, scene, off)
+    transmissions = Transmissions(mujoco, scene, off, servos=actuators)
     equalities = Equalities(mujoco, scene, off, wanted=loops)
     if read.faults:
         raise ModelError(str(path), read.faults)

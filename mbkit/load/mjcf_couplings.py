@@ -3,7 +3,8 @@
 A fixed tendon of length l = Σ coef q becomes a `JointCoupling`, or numbers of its only joint. A spatial tendon straight
 between two sites becomes a `PointSpring`. The length of an actuator is gear times a joint's coordinate or a tendon's
 length; its force at zero control and activation is b0 + b1 l + b2 dl/dt with `biasprm` (b0, b1, b2): a spring of
-stiffness -b1 and rest length -b0/b1, and a damper -b2.
+stiffness -b1 and rest length -b0/b1, and a damper -b2. These act where the file is read with its actuators; without,
+a rotor's inertia and the damping of the transmission act alone.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from mbkit._check import Array
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
 from mbkit.load.xml_reader import LARGEST, Element, Reader, unused
 from mbkit.model import Joint, JointCoupling, Model, PointSpring
+from mbkit.model.description import SERVOS
 from mbkit.model.validation import sample_mass_matrix
 
 _ACTUATORS: Final = (
@@ -115,6 +117,7 @@ class _Acting:
     dampratio: float = 0.0  # of the critical damping at the pose of the file
     ends: tuple[tuple[str, Array], ...] = ()  # bodies and points whose distance is l, if any
     control: str = ""  # description of an actuator's control, which is left out
+    servo: str = ""  # description of its force at zero control
     left_out: list[str] = field(default_factory=list)
 
     @property
@@ -151,10 +154,13 @@ class _Acting:
 
 
 class Transmissions:
-    """Reads the tendons and actuators of a file; its option flags switch `disabled` off."""
+    """Reads the tendons and actuators of a file; its option flags switch `disabled` off.
 
-    def __init__(self, mujoco: Element, scene: Scene, disabled: set[str]) -> None:
-        self._scene, self._read, self._disabled = scene, scene.read, disabled
+    `servos` says whether actuators exert their force at zero control.
+    """
+
+    def __init__(self, mujoco: Element, scene: Scene, disabled: set[str], *, servos: bool) -> None:
+        self._scene, self._read, self._disabled, self._servos = scene, scene.read, disabled, servos
         self._joints: dict[str, MjcfJoint] = {j.name: j for body in scene.bodies for j in body.joints}
         self._names: set[str] = set()
         self._groups: set[float] = set()
@@ -258,9 +264,18 @@ class Transmissions:
         limits = "".join(f" {x:g}" for x in settings.numbers["ctrlrange"])
         at = out.coupling().length if out.factors else element.attributes.get("tendon", "no sum of coordinates")
         out.control = f"{label} ({element.tag}, {gain}{f', range{limits}' if limits else ''}) on {at}"
-        if "actuation" not in self._disabled and group not in self._groups:
-            _add_bias(settings, out)
         out.linear()
+        if "actuation" not in self._disabled and group not in self._groups:
+            servo = _Acting(out.item, out.name, out.factors)
+            _add_bias(settings, servo)
+            servo.linear()
+            if servo.acts or servo.left_out:
+                out.servo = servo.description()
+            if self._servos:
+                names = ("stiffness", "rest_length", "damping", "dampratio")
+                for name in names:
+                    setattr(out, name, getattr(out, name) + getattr(servo, name))
+                out.left_out += servo.left_out
         return out
 
     def _driven(self, element: Element, item: str) -> dict[str, float]:
@@ -312,6 +327,11 @@ class Transmissions:
         return 1 / mobility if mobility > 0 else 0.0
 
     def _notes(self) -> Iterator[str]:
+        if (servos := [x for x in self._actuators if x.servo]) and self._servos:
+            yield f"{SERVOS} act at zero control: {', '.join(x.item for x in servos)}"
+        elif servos:
+            forces = "; ".join(x.servo for x in servos)
+            yield f"{SERVOS} left out; with actuators=True they act at zero control: {forces}"
         for what, at, some in (("tendons", "", self._tendons), ("actuators", ", at zero control", self._actuators)):
             if acting := "; ".join(x.description() for x in some if x.acts):
                 yield f"{what} that act as springs, dampers and rotors{at}: {acting}"

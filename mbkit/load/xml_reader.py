@@ -91,15 +91,18 @@ def read(path: Path) -> Element:
 
 def unknown_root(path: Path, root: Element) -> LoadError:
     """Return the error for a file of neither format."""
-    return LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected <robot> (URDF) or <mujoco> (MJCF)")
+    expected = "<robot> (URDF) or <mujoco> (MJCF)"
+    if root.tag == "mujocoinclude":
+        expected += "; this is a part that such a file includes"
+    return LoadError(f"{path}: the root element is <{root.tag[:60]}>; expected {expected}")
 
 
 def _descriptions(folder: Path) -> str:
-    """List the descriptions in a folder and below, for a message."""
-    files = itertools.islice(folder.rglob("*"), 10_000)
+    """List the descriptions in a folder and in those right below, for a message; a whole disk may be below it."""
+    files = itertools.islice(itertools.chain(folder.glob("*"), folder.glob("*/*")), 10_000)
     names = sorted(str(p.relative_to(folder)) for p in files if p.suffix in _ENDINGS)
     if not names:
-        return ", and no .urdf or .xml file is in it"
+        return ", and no .urdf or .xml file is in it or right below"
     return f"; it holds {', '.join(names[:_MAX_LISTED])}{' and more' * (len(names) > _MAX_LISTED)}"
 
 

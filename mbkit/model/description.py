@@ -44,6 +44,10 @@ def digest(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+#: How the notes of a model on the servos of its file begin; the repr says which choice holds.
+SERVOS: Final = "servos"
+
+
 @dataclass(frozen=True)
 class Needs:
     """One flag per feature; True where the description has it.
@@ -111,8 +115,9 @@ class Needs:
         return asdict(self)
 
     def __str__(self) -> str:
-        there, absent = (", ".join(k for k, x in self.as_dict().items() if x is on) for on in (True, False))
-        return f"has {there or 'nothing'}; without {absent or 'nothing'}"
+        there, absent = ([k for k, x in self.as_dict().items() if x is on] for on in (True, False))
+        there = ["dry friction (in no engine)" if name == "friction" else name for name in there]
+        return f"has {', '.join(there) or 'nothing'}; without {', '.join(absent) or 'nothing'}"
 
 
 @dataclass(frozen=True)

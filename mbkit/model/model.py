@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -18,7 +19,7 @@ from mbkit._escape import html
 from mbkit.errors import ModelError, UnknownNameError, UnsupportedError
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
-from mbkit.model.description import CONSTRAINT_FEATURES, Description, expect_name
+from mbkit.model.description import CONSTRAINT_FEATURES, SERVOS, Description, expect_name
 from mbkit.model.parameters import Parameter
 from mbkit.model.parts import Joint
 from mbkit.model.validation import check_substituted, model_faults
@@ -345,7 +346,12 @@ class Model(Description):
 
     def __repr__(self) -> str:
         between = f"; joint couplings {', '.join(c.name for c in self.couplings)}" if self.couplings else ""
-        return f"<Model {self.name!r}: nq={self.nq}, nv={self.nv}, {self._mass_text()}; {self.needs}{between}>"
+        text = f"nq={self.nq}, nv={self.nv}, {self._mass_text()}{self._servos_text()}; {self.needs}{between}"
+        return f"<Model {self.name!r}: {text}>"
+
+    def _servos_text(self) -> str:
+        notes = [n for n in self.notes if n.startswith(SERVOS)]
+        return f"; {re.split('[;:]', notes[0])[0]}" if notes else ""
 
     def _mass_text(self) -> str:
         return "mass without a value" if any(np.isnan(b.mass) for b in self.bodies) else f"{self.mass:.4g} kg"
@@ -361,7 +367,8 @@ class Model(Description):
         parts = map(str, (*self.couplings, *self.forces, *self.no_slip))
         notes = "".join(f"<li>{html(n)}</li>" for n in (*parts, *self.notes))
         return (
-            f"<p><b>{html(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, {self._mass_text()}; {self.needs}</p>"
+            f"<p><b>{html(self.name)}</b>: nq = {self.nq}, nv = {self.nv}, "
+            f"{self._mass_text()}{self._servos_text()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
 

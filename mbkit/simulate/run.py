@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._warn import warn
@@ -13,11 +14,15 @@ from mbkit.engines.base import no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.errors import DoubtfulRunWarning, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
+from mbkit.model.joint_numbers import dry_friction
 from mbkit.simulate.events import Event
 from mbkit.simulate.integrate import integrate
 from mbkit.simulate.progress import ProgressFunction
 from mbkit.simulate.torque import RunWrenches, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
+
+#: Trajectories of a batch whose starts are looked at for the size of what is left out.
+_MOST_STARTS: Final = 64
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.independent_coordinates import Embedded
@@ -102,7 +107,8 @@ def simulate(
     -------
     Trajectory
         Of a run that diverged, the states up to then, with `stats.ended`, `stats.reached` and `stats.message`, and an
-        `MbkitWarning`. In a batch the others go on.
+        `MbkitWarning`. In a batch the others go on. Where the description has dry friction, an `MbkitWarning` says
+        that it does not act, and its size.
 
     Raises
     ------
@@ -157,6 +163,21 @@ def simulate(
     title = f"{run.model.name}: {run.method}"
     if run.stats.message and run.stats.ended != "event":
         warn(f"{title} {run.stats.message}", MbkitWarning)
+    if doubt:
+        _warn_of_friction(dyn, run)
     for one in run.stats.doubts:
         warn(f"{title}: {one}", DoubtfulRunWarning)
     return run
+
+
+def _warn_of_friction(dyn: Dynamics | Embedded, run: Trajectory) -> None:
+    """Warn that dry friction does not act, with its size beside the other forces at the start."""
+    if not (isinstance(dyn, Dynamics) and run.model.needs.friction):
+        return
+    q, v = (np.atleast_2d(x[..., 0, :])[:_MOST_STARTS] for x in (run.q, run.v))
+    forces = np.abs(dyn.nle(q, v)) + np.abs(dyn.passive(q, v))
+    warn(
+        f"{run.model.name}: dry friction is data, and does not act in this run: {dry_friction(run.model, forces)}, at "
+        'its start; model.without("friction") leaves it out knowingly',
+        MbkitWarning,
+    )

@@ -8,14 +8,16 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.model import Model
-from mbkit.studies.compare.result import FRICTION, LIMITS, STIFF, Finding
+from mbkit.model.description import SERVOS
+from mbkit.model.joint_numbers import dry_friction, owners, per_velocity
+from mbkit.studies.compare.result import ACTUATORS, FRICTION, LIMITS, STIFF, Finding
 
 #: The step of the rollouts, s.
 STEP: Final = 1e-3
 
 
 def findings(model: Model, forces: Array, M: Array, J: Array | None = None) -> tuple[Finding, ...]:
-    """Return dry friction beside the other forces, limits, and stiff joints.
+    """Return the servos of the file, dry friction beside the other forces, limits, and stiff joints.
 
     Parameters
     ----------
@@ -27,25 +29,18 @@ def findings(model: Model, forces: Array, M: Array, J: Array | None = None) -> t
     J : (N, m, nv) array, optional
         Jacobians of the constraints there.
     """
-    return tuple(x for x in (_friction(model, forces), _limits(model), *stiff_joints(model, M, J)) if x)
+    servos = [Finding(ACTUATORS, note, ()) for note in model.notes if note.startswith(SERVOS)]
+    return tuple(x for x in (*servos, _friction(model, forces), _limits(model), *stiff_joints(model, M, J)) if x)
 
 
 def _friction(model: Model, forces: Array) -> Finding | None:
-    friction = _per_velocity(model, "friction")
-    if not friction.any():
+    if (friction := dry_friction(model, forces)) is None:
         return None
-    other = np.median(forces, axis=0)
-    with np.errstate(divide="ignore"):
-        ratio = np.where(friction > 0, friction / np.where(friction > 0, other, 1.0), 0.0)
-    worst = int(np.argmax(ratio))
-    owners = _owners(model)
-    joints = tuple(dict.fromkeys(name for name, f in zip(owners, friction, strict=True) if f))
-    beside = f"{ratio[worst]:.2g} times the other forces there" if np.isfinite(ratio[worst]) else "where no other acts"
     says = (
-        f"no engine applies it: {friction[worst]:.3g} {_unit(model, worst)} at {owners[worst]}, {beside} (gravity, "
-        f"velocities, springs and dampers, at the median state); {_counted(len(joints))} in all"
+        f"no engine applies it: {friction} (gravity, velocities, springs and dampers, at the median state); "
+        f"{_counted(len(friction.joints))} in all"
     )
-    return Finding(FRICTION, says, joints, float(ratio[worst]))
+    return Finding(FRICTION, says, friction.joints, friction.ratio)
 
 
 def _limits(model: Model) -> Finding | None:
@@ -72,13 +67,13 @@ def stiff_joints(model: Model, M: Array, J: Array | None = None) -> list[Finding
     With all others free, a joint's velocity decays by its damper at the rate d (M⁻¹)ⱼⱼ, and swings by its spring at
     √(k (M⁻¹)ⱼⱼ). Constraints take the place of M⁻¹ by the mobility that they leave.
     """
-    damping, stiffness = _per_velocity(model, "damping"), _per_velocity(model, "stiffness")
+    damping, stiffness = per_velocity(model, "damping"), per_velocity(model, "stiffness")
     if not (damping.any() or stiffness.any()):
         return []
     mobility = np.max([np.diag(_mobility(*x)) for x in zip(M, [None] * len(M) if J is None else J, strict=True)], 0)
     out = []
     for what, rates in (("damping", damping * mobility), ("stiffness", np.sqrt(stiffness * mobility))):
-        for j, (joint, rate) in enumerate(zip(_owners(model), rates, strict=True)):
+        for j, (joint, rate) in enumerate(zip(owners(model), rates, strict=True)):
             if rate * STEP > 1.0:
                 of = f"{what} over inertia is {rate:.2g} 1/s" if what == "damping" else f"it swings at {rate:.2g} rad/s"
                 value = (damping if what == "damping" else stiffness)[j]
@@ -100,26 +95,6 @@ def _mobility(M: Array, J: Array | None) -> Array:
         return free @ np.linalg.solve(free.T @ M @ free, free.T)
     except np.linalg.LinAlgError:
         return np.zeros_like(M)
-
-
-def _per_velocity(model: Model, name: str) -> Array:
-    """Return numbers of joints per independent velocity.
-
-    A mimic joint's count by the square of its ratio, as those of springs and dampers do, whose force grows with the
-    ratio too; of dry friction by its size alone.
-    """
-    full = np.concatenate([np.zeros(0), *(getattr(j, name) for j in model.joints)])
-    ratios = np.abs(model.layout.G) if name == "friction" else np.square(model.layout.G)
-    return np.asarray(ratios.T @ full if model.layout.reduced else full)
-
-
-def _owners(model: Model) -> list[str]:
-    return [j.name for j in model.independent_joints for _ in range(j.type.nv)]
-
-
-def _unit(model: Model, velocity: int) -> str:
-    joint = [j for j in model.independent_joints for _ in range(j.type.nv)][velocity]
-    return "N or N m" if joint.type.nv > 1 else "N" if joint.type.lengths else "N m"
 
 
 def _counted(n: int) -> str:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 OWN_LAW: Final = "own law"
 #: Kinds of findings.
 FRICTION: Final = "dry friction"
+ACTUATORS: Final = "actuators"
 LIMITS: Final = "limits"
 STIFF: Final = "stiff joint"
 #: Where an error of exactly zero stands on an axis of digits.

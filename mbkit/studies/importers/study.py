@@ -490,6 +490,8 @@ def _written(stripped: Stripped, floating_base: bool, *, loops: bool = False) ->
             gravity=None,
             meshes="auto",
             loops=loops,
+            # As MuJoCo's own reading has them.
+            actuators=True,
         )
 
 
