@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 import mbkit as mb
+from mbkit.engines.mujoco import engine
 from mbkit.engines.mujoco.constraints import Softness, stiffest
 from mbkit.engines.mujoco.engine import MujocoDynamics
-from mbkit.errors import DoubtfulRunWarning, InputError, ModelError, UnsupportedError
+from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, ModelError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop, Prescribed
@@ -349,3 +350,23 @@ def test_a_loop_survives_mjcf(tmp_path: Path, seed: int, kind: str) -> None:
     # Stacks of joints are joints of their own in MJCF: the ends are where they were in the pose of the file.
     ends = [mb.dynamics(x, "mujoco").constraint_law(x.neutral(), *np.zeros((2, x.nv))) for x in (model, back)]
     assert np.allclose(ends[0].residual, ends[1].residual, rtol=0, atol=1e-13)
+
+
+def test_soft_loops_are_told_once_for_each_model_with_what_they_cost(monkeypatch):
+    monkeypatch.setattr(engine, "_TOLD", set())
+    model = mb.catalog.slider_crank()
+    q, v = mb.dynamics(model).project([0.5, -0.2, -0.1], [1.0, 0.0, 0.0])
+    tau = np.zeros(3)
+    soft = mb.dynamics(model, "mujoco")
+    rigid = mb.dynamics(model).forward_dynamics(q, v, tau)
+    with pytest.warns(MbkitWarning, match="MuJoCo holds loops by soft constraints") as told:
+        a = soft.forward_dynamics(q, v, tau)
+    off = 100 * np.linalg.norm(a - rigid) / np.linalg.norm(rigid)
+    assert f"accelerations are {off:.2g} % off" in str(told[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        soft.forward_dynamics(q, v, tau)
+        mb.dynamics(model, "mujoco").forward_dynamics(np.array([q, q]), v, tau)
+        mb.dynamics(mb.catalog.pendulum(), "mujoco").forward_dynamics([0.1], [0.0], [0.0])
+    with pytest.warns(MbkitWarning, match="soft constraints"):
+        mb.dynamics(model, "mujoco", solref=(0.002, 1.0)).forward_dynamics(q, v, tau)

@@ -28,7 +28,7 @@ from mbkit.engines.mujoco.bodies import MujocoBodies
 from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopRows, Softness, law
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco.rollout import rollout
-from mbkit.errors import DoubtfulRunWarning, InputError, NumericalError, UnsupportedError
+from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
 
 if TYPE_CHECKING:
@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 
 #: Quantities that M is part of.
 _OF_MASS: Final = ("mass_matrix", "mass_matrix_inverse", "inverse_dynamics", "forward_dynamics", "kinetic_energy")
+
+#: Models, and how soft their loops are, of which a process was warned.
+_TOLD: Final[set[tuple[str, Softness]]] = set()
 
 
 class MujocoDynamics(MujocoBodies, MappedDynamics):
@@ -205,8 +208,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         with self._lock, heard_warnings(), self._with_loops():
             b = self._set(q, v)
             self._accelerated(tau + self._elements.force(self, q, v) if self.model.forces else tau)
-            M = full_mass_matrix(self._m, self._d)
-            return law(self._m, self._d, M, self.softness, lambda a: self._force(a - b), self._columns)
+            return self._law(b)
 
     @cached_property
     def _rows(self) -> tuple[LoopRows, list[int]]:
@@ -358,7 +360,29 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         with self._with_loops():
             b = self._set(q, v)
             self._accelerated(tau)
+            if self.model.needs.loops:
+                self._warn_of_softness(b)
             return self._directed(self._force(self._d.qacc - b))
+
+    def _warn_of_softness(self, b: Array) -> None:
+        """Warn, once for each model, how far the soft law is from rigid loops at the state that is in."""
+        key = self.model.form_digest, self.softness
+        if key in _TOLD:
+            return
+        # A singular M has an error of its own.
+        with contextlib.suppress(np.linalg.LinAlgError):
+            error = self._law(b).error
+            _TOLD.add(key)
+            warn(
+                f"{self.model.name}: MuJoCo holds loops by soft constraints: its accelerations are {100 * error:.2g} % "
+                "off those of rigid loops at this state; constraint_law(q, v, tau).digits tells it of any state, and "
+                "stiffer solref and solimp leave less",
+                MbkitWarning,
+            )
+
+    def _law(self, b: Array) -> ConstraintLaw:
+        M = full_mass_matrix(self._m, self._d)
+        return law(self._m, self._d, M, self.softness, lambda a: self._force(a - b), self._columns)
 
     def _accelerated(self, tau: Array) -> None:
         """Let MuJoCo compute its accelerations at the state that is in."""
