@@ -403,3 +403,34 @@ def test_energies_without_bodies_have_none_of_this(engine):
     ):
         with pytest.raises(UnsupportedError, match="written as energies"):
             call()
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "mujoco"])
+def test_poses_of_bodies_are_theirs_where_a_frame_has_the_name(engine, tmp_path):
+    """An MJCF's body frame stays at the body's origin, and the description's body is at its joint."""
+    path = tmp_path / "m.xml"
+    path.write_text(
+        '<mujoco><worldbody><body name="a" pos="0 0 1" euler="10 20 30"><joint name="j" axis="0 1 0" pos=".3 0 .1"/>'
+        '<geom size=".1" pos=".5 0 0"/><body name="b" pos="0 1 0"><joint name="k" pos="0 .2 0"/><geom size=".1"/>'
+        "</body></body></worldbody></mujoco>"
+    )
+    model = mb.load(path)
+    dyn = mb.dynamics(model, engine)
+    Q, V = model.random_state(0, 4)
+    X = dyn.body_poses(Q)
+    com = sum(b.mass * (X[:, k] @ np.append(b.com, 1.0)) for k, b in enumerate(model.bodies)) / model.mass
+    np.testing.assert_allclose(com[:, :3], dyn.center_of_mass(Q), atol=1e-14)
+    assert not np.allclose(dyn.pose(Q, "a"), X[:, 0])
+    tau = np.ones_like(V)
+    left = dyn.newton_euler_residual(Q, V, dyn.forward_dynamics(Q, V, tau), tau)
+    assert np.abs(left).max() < 1e-12 * 9.81 * model.mass
+
+
+def test_a_frame_has_not_the_name_of_another_body():
+    b = mb.ModelBuilder("two")
+    for name, parent in (("a", "world"), ("b", "a")):
+        b.add_joint(f"to {name}", "revolute", parent=parent, child=name, axis=(0, 0, 1))
+        b.add_body(name, mass=1.0, com=(1, 0, 0), inertia=np.eye(3))
+    b.add_frame("a", body="b")
+    with pytest.raises(mb.errors.ModelError, match="frame 'a' on body 'b' has the name of another body"):
+        b.build()

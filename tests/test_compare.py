@@ -317,7 +317,7 @@ def test_one_wrong_entry_of_a_derivative_is_found_at_its_joint(monkeypatch, meth
 )
 def test_the_rounding_of_the_mass_matrix_excuses_no_other_term(monkeypatch, method, term, passed):
     planted(monkeypatch, MujocoDynamics, method, lambda x: x * (1 + 1e-9))
-    monkeypatch.setattr(MujocoDynamics, "mass_matrix_rounding", lambda self, q: 1e10)  # noqa: ARG005
+    monkeypatch.setattr(MujocoDynamics, "mass_matrix_rounding", lambda self, q, quantity: 1e10)  # noqa: ARG005
     rows = {(r.term, r.engine): r for r in terms(mb.load("ur5"), engines=("pinocchio", "mujoco")).rows}
     row = rows[term, "mujoco"]
     assert row.passed == passed
@@ -702,3 +702,55 @@ def test_the_friction_of_a_mimic_joint_goes_by_the_size_of_its_ratio() -> None:
     (friction, *_) = findings(b.build(), np.ones((1, 1)), np.ones((1, 1, 1)))
     # |q̇₀| + 2 |3 q̇₀| is the power that friction takes.
     assert friction.size == pytest.approx(1.0 + 2.0 * 3.0)
+
+
+def far_from_its_joint(far: float) -> mb.Model:
+    """Return an arm whose link of 8 kg has its centre of mass so many metres from its joint: a crane, a blade."""
+    b = mb.ModelBuilder("blade")
+    links = (
+        (4.0, (0, 0, 0.1), 0.02, (0, 0, 1)),
+        (8.0, (far, 0, 0), 0.05, (0, 1, 0)),
+        (1.0, (0, 0.05, 0.1), 0.002, (1, 0, 0)),
+    )
+    for k, (mass, com, inertia, axis) in enumerate(links):
+        b.add_joint(
+            f"j{k}", "revolute", parent=f"l{k - 1}" if k else "world", child=f"l{k}", axis=axis, translation=(0, 0, 0.3)
+        )
+        b.add_body(f"l{k}", mass=mass, com=com, inertia=np.eye(3) * inertia)
+    return b.build()
+
+
+@pytest.mark.parametrize("far", [8.0, 40.0, 80.0])
+def test_what_the_formulas_of_far_masses_must_lose_is_no_disagreement(far):
+    """One rule for all engines, and it reaches their rollouts."""
+    result = mb.compare(far_from_its_joint(far), samples=16)
+    assert result.passed, result.verdict
+    assert all(r.error < 1e-9 for r in result.rollouts)
+    excused = {r.engine for r in result.rows if r.relative > 1e-12}
+    assert far < 40 or excused >= {"mujoco", "lagrangian"}
+
+
+def test_what_an_engine_may_lose_is_small_on_a_robot_and_grows_with_the_distance():
+    robot = mb.load("ur5")
+    q = robot.neutral()
+    for name in ("pinocchio", "lagrangian", "mujoco"):
+        assert 1 <= mb.dynamics(robot, name).mass_matrix_rounding(q) < 1e3
+    # Where the link stands along the first axis, M_11 is small, and the inertia about it grows with the distance.
+    q = [0.0, np.pi / 2, 0.0]
+    near, far = (mb.dynamics(far_from_its_joint(x)).mass_matrix_rounding(q) for x in (4.0, 40.0))
+    assert 50 < far / near < 200
+
+
+def test_mujoco_is_named_where_its_own_run_is_off(monkeypatch):
+    """The others differ from it and not from each other."""
+    rollout = MujocoDynamics.rollout
+
+    def spoilt(self, *args, **kwargs):
+        q, v = rollout(self, *args, **kwargs)
+        return q + 1e-6 * np.arange(len(q))[:, None], v
+
+    monkeypatch.setattr(MujocoDynamics, "rollout", spoilt)
+    result = mb.compare(mb.load("ur5"), samples=4)
+    assert {r.off for r in result.rollouts if r.passed is False} == {"mujoco"}
+    assert "rollout mujoco_rk4 on mujoco differs" in result.verdict
+    assert "pinocchio" not in compare_view.headline(result).split(":")[0]

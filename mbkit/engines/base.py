@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, all_finite, batch_of, real, rows
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
 from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
-from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, FramesAndMomenta, axes_named
+from mbkit.engines.frames_and_momenta import ALIGNED, JOINT, LOCAL, FramesAndMomenta, axes_named, composite_rounding
 from mbkit.engines.linearization import (
     ForwardDynamicsDerivatives,
     InverseDynamicsDerivatives,
@@ -150,6 +150,9 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
     takes_written: ClassVar[bool] = False
     #: Why it does not take loops and prescribed motions; empty where it does.
     lacks_constraints: ClassVar[str] = "it takes the tree alone"
+    #: The point about which it writes composite inertias, by quantity, or for all others by the empty name; of each
+    #: joint its own origin by default. `mbkit.engines.frames_and_momenta` has the choices.
+    inertias_about: ClassVar[dict[str, str]] = {}
     #: Whether it has `mbkit.derivation.Equations` and compiles whole steps of them.
     derived: ClassVar[bool] = False
     #: Of the significand with which it computes.
@@ -363,13 +366,16 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
         out = self._evaluate(quantity, **arguments)
         return [out[..., k, :, :] for k in range(3)]
 
-    def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:  # noqa: ARG002  # for the engines that override it
-        """Return how far the engine's own formula amplifies rounding in M, per sample.
+    def mass_matrix_rounding(self, q: ArrayLike, quantity: str = "mass_matrix") -> float:
+        """Return how far the engine's own formula amplifies rounding in M at one configuration.
 
-        ``Σ |terms| / M_jj`` of the sum that makes the worst diagonal entry, (N,) or a scalar; None where the formula is
-        not known to amplify.
+        ``Σ |terms| / M_jj`` of the sum that makes the worst diagonal entry, at least 1. `quantity` is M or what is
+        computed like it: an engine may take other formulas for M⁻¹ or forward dynamics.
         """
-        return None
+        if not self.model.has_bodies:
+            return 1.0
+        about = self.inertias_about.get(quantity, self.inertias_about.get("", JOINT))
+        return composite_rounding(self, self.model.check_q(q), about)
 
     # Steps
 

@@ -121,7 +121,15 @@ class FramesAndMomenta:
 
     def body_poses(self, q: ArrayLike) -> Array:
         """Return X_WB of all bodies in the order of ``model.bodies``, shape (n, 4, 4) or (N, n, 4, 4)."""
-        return self._of_frames("pose", [b.name for b in self.model.bodies], q=q)
+        out = self._of_frames("pose", [b.name for b in self.model.bodies], q=q)
+        for k, body in enumerate(self.model.bodies):
+            # A frame of a body's name, as an MJCF has them, hides the body: X_WB = X_WF X_FB.
+            frame = self.model.frame(body.name)
+            if frame.translation.any() or not np.array_equal(frame.rotation, np.eye(3)):
+                X_BF = np.eye(4)
+                X_BF[:3, :3], X_BF[:3, 3] = frame.rotation, frame.translation
+                out[..., k, :, :] = out[..., k, :, :] @ np.linalg.inv(X_BF)
+        return out
 
     def jacobian(self, q: ArrayLike, frame: str | Sequence[str], axes: str = ALIGNED) -> Array:
         """Return J with velocity(q, v, frame, axes) = J v, shape (6, nv) or (N, 6, nv).
@@ -244,3 +252,60 @@ class FramesAndMomenta:
         The first block is the mass, the second the rotational inertia, kg m².
         """
         return self._evaluate("locked_inertia", q=q)
+
+
+# What an engine's formula for M must lose: the diagonal is M_jj = sᵀ I_C s, with the composite inertia I_C of all that
+# joint j moves and its axis s (Featherstone 2008, Rigid Body Dynamics Algorithms, eq. 6.11). An engine turns I_C about
+# some point, so that its entries round by eps ‖I_C‖; where a heavy or far body hardly turns with the joint, M_jj is the
+# small difference of them.
+
+#: Points about which an engine writes composite inertias: of each joint its own origin, the centre of mass of the tree
+#: that the joint belongs to, or the world's origin.
+JOINT, TREE = "joint", "tree"
+_EYE: Final = np.eye(3)
+
+
+def composite_rounding(dyn: Any, q: Array, about: str) -> float:
+    """Return Σ |terms| / M_jj of the sum that makes the worst diagonal entry of M at one configuration.
+
+    The terms are bounded by norms: ‖I‖ |ω|² + 2 |h| |ω| |v| + m |v|² with the composite I, first moment h and mass m
+    about the point, and the joint's angular and linear velocity ω, v there.
+    """
+    model = dyn.model
+    diagonal = np.diag(dyn.mass_matrix(q))
+    names = [b.name for b in model.bodies]
+    poses = dyn.body_poses(q)
+    R, p = poses[:, :3, :3], poses[:, :3, 3]
+    mass = np.array([b.mass for b in model.bodies])
+    com = p + np.einsum("nij,nj->ni", R, np.array([b.com for b in model.bodies]))
+    own = np.einsum("nij,njk,nlk->nil", R, np.array([b.inertia for b in model.bodies]), R)
+    worst = 1.0
+    for joint in model.independent_joints:
+        moved = np.array([_moves(model, joint.name, name) for name in names])
+        if about == TREE:
+            tree = np.array([model.way(name)[-2] == model.way(joint.child)[-2] for name in names])
+            total = float(mass[tree].sum())
+            point = mass[tree] @ com[tree] / total if total else np.zeros(3)
+        else:
+            point = np.zeros(3) if about == WORLD else p[names.index(joint.child)]
+        d, m = com[moved] - point, mass[moved]
+        parallel = (d**2).sum(1)[:, None, None] * _EYE - np.einsum("ni,nj->nij", d, d)
+        turning = float(np.linalg.norm((own[moved] + m[:, None, None] * parallel).sum(0), 2))
+        moment = float(np.linalg.norm(m @ d))
+        at = model.layout.v[joint.name]
+        J = dyn.jacobian(q, joint.child)[:, at]
+        # A frame may have the name of a body and another origin: J and this origin are of the same one.
+        origin = dyn.pose(q, joint.child)[:3, 3]
+        angular = np.linalg.norm(J[3:], axis=0)
+        linear = np.linalg.norm(J[:3] + np.cross(J[3:].T, point - origin).T, axis=0)
+        terms = turning * angular**2 + 2 * moment * angular * linear + float(m.sum()) * linear**2
+        size = np.where(diagonal[at] > 0, diagonal[at], np.inf)
+        worst = max(worst, float((terms / size).max(initial=0.0)))
+    return worst
+
+
+def _moves(model: Model, joint: str, body: str) -> bool:
+    """Return whether a joint, or one that follows it, moves a body."""
+    mimics = {j.name for j in model.joints if j.mimic is not None and j.mimic.joint == joint}
+    above = set(model.way(body))
+    return any(j.child in above for j in model.joints if j.name == joint or j.name in mimics)

@@ -325,9 +325,9 @@ class _Balance:
                 speeds.append(np.zeros((len(self._q), 3)))
                 continue
             X, V = self._X[:, self._index[body]], self._dyn.velocity(self._q, self._v, body)
-            arm = _times(X[:, :3, :3], point)
-            ends.append(X[:, :3, 3] + arm)
-            speeds.append(V[:, :3] + np.cross(V[:, 3:], arm))
+            ends.append(X[:, :3, 3] + _times(X[:, :3, :3], point))
+            # Of the frame of the body's name, which may be another one than its own.
+            speeds.append(V[:, :3] + np.cross(V[:, 3:], ends[-1] - self._dyn.pose(self._q, body)[:, :3, 3]))
         gap, rate = ends[1] - ends[0], speeds[1] - speeds[0]
         pull = spring.stiffness * gap
         if spring.needs_direction:
@@ -345,10 +345,14 @@ class _Balance:
         mass = np.array([b.mass for b in bodies])[:, None]
         com, inertia = np.array([b.com for b in bodies]), np.array([b.inertia for b in bodies])
         R = self._X[:, :, :3, :3].swapaxes(2, 3)
+        # Frames of the bodies' names may be other ones than their own; their motion is turned into the bodies' axes.
+        frames = [self._model.frame(name) for name in self._names]
+        turn = np.array([f.rotation for f in frames])
+        arm = com - np.array([f.translation for f in frames])
         local = dyn.acceleration(self._q, self._v, self._a, self._names, LOCAL, CLASSICAL)
-        linear, angular = local[..., :3], local[..., 3:]
-        w = dyn.velocity(self._q, self._v, self._names, LOCAL)[..., 3:]
-        central = linear + np.cross(angular, com) + np.cross(w, np.cross(w, com))
+        linear, angular = _times(turn, local[..., :3]), _times(turn, local[..., 3:])
+        w = _times(turn, dyn.velocity(self._q, self._v, self._names, LOCAL)[..., 3:])
+        central = linear + np.cross(angular, arm) + np.cross(w, np.cross(w, arm))
         force = self._force + mass * _times(R, self._model.gravity) - mass * central
         # Gravity acts at the centre of mass.
         moment = self._moment - np.cross(com, self._force)

@@ -64,6 +64,8 @@ def structure_faults(description: Description) -> Iterator[str]:
         yield from _joint_faults(joint)
     for frame in description.frames:
         yield from unknown(f"frame {frame.name!r}", (frame.body,), known - {"world"})
+        if frame.name in known - {frame.body}:
+            yield f"frame {frame.name!r} on body {frame.body!r} has the name of another body; rename it"
     for spring in description.springs:
         item = f"spring {spring.name!r}"
         yield from unknown(item, (spring.body_a, spring.body_b))

@@ -176,7 +176,7 @@ def headline(result: Comparison) -> str:
         (omissions, result.omissions, "omissions"),
     )
     parts = [f"{len(failed)} of {len(every)} {what}" for failed, every, what in counts if failed]
-    engines = dict.fromkeys([*(r.engine for r in rows), *(r.engine for r in runs)])
+    engines = dict.fromkeys([*(r.engine for r in rows), *(r.off or r.engine for r in runs)])
     known = [r.engine for r in rows if r.defect]
     by_defect = f" ({len(known)} by a known defect of {', '.join(dict.fromkeys(known))})" if known else ""
     subject = f"{', '.join(engines)} differ{'s' * (len(engines) == 1)}: " if engines else ""
@@ -208,9 +208,11 @@ def failures(result: Comparison) -> list[doc.Bullet]:
             out.append(doc.Bullet(f"{r.term}, {r.engine}", r.reason or "differs", "✗", "bad", folded=state))
     for run in result.rollouts:
         if run.passed is False:
-            reason = f"differs from {run.against} by {error_text(run.error)} in q, {run.tolerance:.0e} expected"
+            other = f"{run.method} on {run.engine}" if run.off else run.against
+            reason = f"differs from {other} by {error_text(run.error)} in q, {run.tolerance:.0e} expected"
             reason += f"; {run.note}" if run.note else ""
-            out.append(doc.Bullet(f"rollout {run.method}, {run.engine}", reason, "✗", "bad"))
+            name = f"{run.against}, {run.off}" if run.off else f"{run.method}, {run.engine}"
+            out.append(doc.Bullet(f"rollout {name}", reason, "✗", "bad"))
     changed = [o for o in result.omissions if o.fault]
     what = "changes the accelerations by {}"
     return out + [doc.Bullet(f"leaving out {o.need}", what.format(error_text(o.change)), "✗", "bad") for o in changed]

@@ -24,6 +24,7 @@ from mbkit._fork import fork_safe
 from mbkit._warn import warn
 from mbkit.engines import known_defects, regressors
 from mbkit.engines.base import MappedDynamics, require_no_forces
+from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.mujoco.bodies import MujocoBodies
 from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopRows, Softness, law
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
@@ -65,6 +66,8 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
     engine = "mujoco"
     lacks_constraints = ""
     soft_constraints = True
+    # mj_comPos and mj_crb
+    inertias_about: ClassVar[dict[str, str]] = {"": TREE}
     lacks_derivatives = (
         "MuJoCo differentiates by finite differences alone (mjd_inverseFD, mjd_transitionFD), which lose half of the "
         "digits; mbkit.dynamics(model, 'lagrangian') has exact ones"
@@ -294,28 +297,6 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
             mujoco.mj_tendon(self._m, self._d)
         mujoco.mj_makeM(self._m, self._d)
         return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
-
-    def mass_matrix_rounding(self, q: ArrayLike) -> Array | None:
-        """Return Σ |terms| / M_jj, worst over j.
-
-        MuJoCo writes composite inertias and joint axes about the centre of mass of the whole tree (`mj_comPos`,
-        `mj_crb`); a light link far from there is the small difference of large numbers.
-        """
-        return self._evaluate("mass_matrix_rounding", q=q)
-
-    def _mass_matrix_rounding(self, q: Array) -> Array:
-        diagonal = np.diag(self._mass_matrix(q))
-        cdof, composite = np.abs(self._d.cdof), np.abs(self._d.crb[self._m.dof_bodyid])
-        # crb holds Ixx, Iyy, Izz, Ixy, Ixz, Iyz, m cx, m cy, m cz, m about that point.
-        w, v, h, mass = cdof[:, :3], cdof[:, 3:], composite[:, 6:9], composite[:, 9]
-        x, y, z = w.T
-        turning = composite[:, :3] * w * w
-        mixed = 2 * (composite[:, 3] * x * y + composite[:, 4] * x * z + composite[:, 5] * y * z)
-        coupling = 2 * np.sum(h * (np.roll(w, 1, 1) * np.roll(v, 2, 1) + np.roll(w, 2, 1) * np.roll(v, 1, 1)), axis=1)
-        terms = np.empty(self._m.nv)
-        terms[self._v_index] = turning.sum(axis=1) + mixed + coupling + mass * np.sum(v * v, axis=1)
-        own = self.model.layout.G.T**2 @ terms if self._reduced else terms
-        return np.array(np.max(own / np.where(diagonal > 0, diagonal, np.inf), initial=1.0))
 
     def _gravity(self, q: Array) -> Array:
         self._set(q)

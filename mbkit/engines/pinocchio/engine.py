@@ -19,7 +19,7 @@ from mbkit._check import Array
 from mbkit.engines import known_defects
 from mbkit.engines.base import Dynamics, first_names, unit_quaternions
 from mbkit.engines.elements.passive import JointPassive
-from mbkit.engines.frames_and_momenta import ALIGNED
+from mbkit.engines.frames_and_momenta import ALIGNED, WORLD
 from mbkit.engines.pinocchio.bodies import PinocchioBodies
 from mbkit.engines.pinocchio.constraints import PinConstraints, PinocchioConstrained
 from mbkit.engines.pinocchio.model import PinModel, PointSprings, build
@@ -138,6 +138,8 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         "constraint_rate_gradient": "its derivatives are of trees; mbkit.dynamics(model, 'lagrangian') has this one",
     }
     lacks_constraints = ""
+    # computeMinverse
+    inertias_about: ClassVar[dict[str, str]] = {"mass_matrix_inverse": WORLD}
     _batches = False
 
     def __init__(self, model: Model) -> None:

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -22,18 +23,17 @@ from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO
 from mbkit.methods.registry import DEFAULT_METHOD, EULER_METHOD, METHODS
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
-from mbkit.studies.compare.errors import interleaved
+from mbkit.studies.compare.errors import EPS, ROUNDINGS, interleaved
 from mbkit.studies.compare.findings import STEP, stiff_joints
 from mbkit.studies.compare.result import Omission, RolloutRow
 from mbkit.studies.study_runs import quiet_simulate, start_state, state_within_limits
 
 DURATION: Final = 1.0
 TOLERANCE: Final = 1e-12
-_EPS: Final = float(np.finfo(float).eps)
 #: Multiples of eps times the condition that two engines may differ by.
 _ROUNDINGS: Final = 256.0
 #: Beyond this condition a comparison could not see an error below 1e-9.
-_CHAOS: Final = 1e-9 / (_ROUNDINGS * _EPS)
+_CHAOS: Final = 1e-9 / (_ROUNDINGS * EPS)
 _DISTURBANCE: Final = 1e-8
 #: Steps below which a rollout says nothing.
 _FEWEST: Final = 50
@@ -51,7 +51,7 @@ def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str
     # MuJoCo's own integrators know no forces by functions.
     if MUJOCO not in engines or not ours_on or model.forces:
         return ()
-    rows = []
+    rows: list[RolloutRow] = []
     q0, v0 = start_state(model, seed)
     for method in (DEFAULT_METHOD, EULER_METHOD):
         native = _NATIVE[method]
@@ -59,14 +59,34 @@ def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str
         condition = _condition(engines[MUJOCO], engines[ours_on[0]], native, theirs)
         # The last step before the condition says too little.
         last = int(next(iter(np.flatnonzero(condition > _CHAOS)), len(condition))) - 1
+        own: list[tuple[RolloutRow, Trajectory]] = []
         for name in ours_on:
             # One step first: compiling it is not run time.
             quiet_simulate(engines[name], q0, v0, STEP, method, STEP)
             ours = quiet_simulate(engines[name], q0, v0, STEP * last, method, STEP)
-            rows.append(_row(engines[name], ours, theirs, condition[: last + 1], last + 1 < len(condition), note))
+            amplified = max(_amplified(engines[x], theirs.q[: last + 1]) for x in (MUJOCO, name))
+            grown = condition[: last + 1], last + 1 < len(condition)
+            own.append((_row(engines[name], ours, theirs, *grown, amplified, note), ours))
+        rows += _blamed(model, own)
     if model.needs.damping:
         rows.append(_implicit_damping(model, engines[MUJOCO], q0, v0))
     return tuple(rows)
+
+
+def _amplified(dyn: Dynamics, q: Array) -> float:
+    """Return how far an engine's formula for M amplifies rounding along a run: at its start, middle and end."""
+    return max(dyn.mass_matrix_rounding(q[k]) for k in (0, len(q) // 2, len(q) - 1))
+
+
+def _blamed(model: Model, own: Sequence[tuple[RolloutRow, Trajectory]]) -> Iterator[RolloutRow]:
+    """Yield the rows; where all differ from MuJoCo's run and not from each other, MuJoCo's is the one that is off."""
+    (first, run), *others = own
+    n = min(len(x.t) for _, x in own)
+    apart = max((float(np.abs(model.difference(run.q[:n], x.q[:n])).max()) for _, x in others), default=np.inf)
+    alone = all(row.passed is False for row, _ in own) and apart <= first.tolerance
+    for row, _ in own:
+        says = f"{' and '.join(x.engine for x, _ in own)} agree with each other to {apart:.1e}"
+        yield replace(row, off=MUJOCO, note="; ".join(x for x in (row.note, says) if x)) if alone else row
 
 
 def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajectory) -> Array:
@@ -88,20 +108,31 @@ def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajector
     return np.asarray(np.maximum.accumulate(off))
 
 
-def _row(dyn: Dynamics, ours: Trajectory, theirs: Trajectory, condition: Array, beyond: bool, note: str) -> RolloutRow:
-    """Return two runs compared up to the last step that has a condition; beyond it may have grown too much."""
+def _row(
+    dyn: Dynamics,
+    ours: Trajectory,
+    theirs: Trajectory,
+    condition: Array,
+    beyond: bool,
+    amplified: float,
+    note: str,
+) -> RolloutRow:
+    """Return two runs compared up to the last step that has a condition; beyond it may have grown too much.
+
+    `amplified` is what the formulas of M must lose, which the accelerations, and so the runs, cannot do without.
+    """
     model, q0 = dyn.model, theirs.q[:1]
     last = len(condition) - 1
     n = min(len(ours.t), last + 1)
     grown = float(condition[:n].max(initial=0.0))
-    tolerance = max(TOLERANCE, _ROUNDINGS * _EPS * grown)
+    tolerance = max(TOLERANCE, max(_ROUNDINGS, ROUNDINGS * amplified) * EPS * grown)
     error = float(np.abs(model.difference(theirs.q[:n], ours.q[:n])).max()) if n > 1 else 0.0
     notes = [note] if note else []
     if n <= last:
         notes.append(f"stopped at t = {ours.t[-1]:.3g} s: {ours.stats.message}")
     judged = last >= _FEWEST
     if last < round(DURATION / STEP):
-        grows = f"beyond it rounding errors have grown above {_ROUNDINGS * _EPS * _CHAOS:.0e} of q"
+        grows = f"beyond it rounding errors have grown above {_ROUNDINGS * EPS * _CHAOS:.0e} of q"
         why = grows if beyond else "MuJoCo's own run diverges there"
         notes.append(f"{'judged' if judged else 'not judged: well conditioned'} up to {last * STEP:.3g} s alone; {why}")
         J = dyn.constraint_jacobian(q0) if model.constrained else None

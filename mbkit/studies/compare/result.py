@@ -82,9 +82,11 @@ class RolloutRow:
 
     `dt` is the step, `duration` the compared horizon and `asked` the wanted one, s. `error` is the largest difference
     of q over the horizon, on the manifold. `condition` says how far q moves per relative disturbance of the forces,
-    see `mbkit.studies.compare.beyond_terms`; `tolerance` is 1e-12, or a multiple of eps times the condition if that is
-    more. `seconds` and `seconds_against` are the run times of the two. `judged` is False where too few steps are well
-    conditioned to say anything, and of a row for information, whose tolerance is infinite; `passed` is None there.
+    see `mbkit.studies.compare.beyond_terms`; `tolerance` is 1e-12, or a multiple of eps times the condition if that
+    is more, as where an engine's formula for M loses digits. `off` is MuJoCo where the other engines' runs all differ
+    from its own and not from each other: then its own is the one that is off. `seconds` and `seconds_against` are the
+    run times of the two. `judged` is False where too few steps are well conditioned to say anything, and of a row for
+    information, whose tolerance is infinite; `passed` is None there.
     """
 
     method: str
@@ -102,6 +104,7 @@ class RolloutRow:
     note: str = ""
     judged: bool = True
     asked: float = math.nan
+    off: str = ""
 
     @property
     def cut(self) -> bool:
@@ -242,13 +245,13 @@ class Comparison(ResultTable):
             return f"{'; '.join(parts)}; all else agrees to {self.digits:.1f} digits{missing}"
         failed = [r for r in self.rows if not r.passed and not r.defect]
         parts += [f"{r.engine} differs in {r.term}" + (f" at {r.joint}" if r.joint else "") for r in failed]
-        parts += [
-            f"rollout {x.method} on {x.engine} differs"
+        beyond = [
+            f"rollout {x.against if x.off else x.method} on {x.off or x.engine} differs"
             if isinstance(x, RolloutRow)
             else f"leaving out {x.need} changes the accelerations"
             for x in self._beyond
         ]
-        return "; ".join(parts) + missing
+        return "; ".join([*parts, *dict.fromkeys(beyond)]) + missing
 
     @property
     def nothing(self) -> str:

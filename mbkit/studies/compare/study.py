@@ -23,7 +23,7 @@ from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.beyond_terms import omissions, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
-from mbkit.studies.compare.errors import Errors, Scales, condition_under_constraints, interleaved
+from mbkit.studies.compare.errors import EPS, ROUNDINGS, Errors, Scales, condition_under_constraints, interleaved
 from mbkit.studies.compare.findings import findings
 from mbkit.studies.compare.result import OWN_LAW, Comparison, Row
 from mbkit.studies.compare.terms import (
@@ -41,9 +41,6 @@ from mbkit.studies.results import Refusal, model_info
 from mbkit.studies.study_runs import free_of_mimic, require_motion
 from mbkit.studies.work_precision.study import work_precision
 
-_EPS: Final = float(np.finfo(float).eps)
-# Each of the largest terms went through about this many roundings on the way.
-_ROUNDINGS: Final = 4.0
 #: Where a warning of a known defect goes on with the joints of this model.
 _AS_IT_IS: Final = "; returned as it is"
 
@@ -178,8 +175,8 @@ class Judge:
         of_mass = term.quantity in ("mass_matrix", "mass_matrix_inverse", "forward_dynamics")
         if not of_mass or errors.relative.max() <= self.tolerance:
             return self.tolerance
-        amplified = self.engines[engine].mass_matrix_rounding(self.at.q[errors.worst])
-        return self.tolerance if amplified is None else max(self.tolerance, _ROUNDINGS * _EPS * float(amplified))
+        amplified = self.engines[engine].mass_matrix_rounding(self.at.q[errors.worst], term.quantity)
+        return max(self.tolerance, ROUNDINGS * EPS * amplified)
 
     def _row(self, term: str, engine: str, errors: Errors, defect: str, allowed: float | None = None) -> Row:
         """Return a row against the oracle, not timed."""
@@ -196,7 +193,7 @@ class Judge:
         elif relative > self.tolerance:
             reason = (
                 f"{relative:.1e} at {joint} is above {self.tolerance:.0e}, and within the rounding of {engine}'s own "
-                f"formula ({allowed:.0e}): its terms are {allowed / (_ROUNDINGS * _EPS):.0e} times the result"
+                f"formula ({allowed:.0e}): its terms are {allowed / (ROUNDINGS * EPS):.0e} times the result"
             )
         return Row(
             term=term,
