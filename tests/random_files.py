@@ -277,7 +277,7 @@ def _terms(m: mujoco.MjModel, samples: int, seed: int) -> Reference:
         size = np.abs(M).max()
         scale = max(np.abs(d.qfrc_bias).max(), size * (v @ v), np.linalg.norm(m.opt.gravity) * size)
         lost = np.array(_sums(m, d) / size)
-        forces = T.T @ (d.qfrc_bias + M @ slip), T.T @ d.qfrc_passive
+        forces = T.T @ (d.qfrc_bias + M @ slip), T.T @ (d.qfrc_passive + d.qfrc_actuator)
         for name, x in zip(out, (q, v, T.T @ M @ T, *forces, np.array(scale), lost), strict=True):
             out[name].append(x)
     return Reference(**{name: np.array(x) for name, x in out.items()})

@@ -75,6 +75,7 @@ METHODS = {
     "prescribe": {"joint": "j"},
     "add_joint_force": {"name": "u", "joint": "j", "force": 1.0},
     "add_force": {"name": "w", "frame": "b", "force": (1.0, 0, 0)},
+    "add_gravity_compensation": {"body": "b"},
     "add_bushing": {"name": "g", "body_a": "b", "body_b": "world", "stiffness": 1.0},
     "note": {"text": "words"},
     "build": {},

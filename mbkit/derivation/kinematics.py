@@ -6,6 +6,7 @@ description vanishes while the graph is built.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +14,7 @@ import casadi as ca
 
 from mbkit.derivation import model_values
 from mbkit.derivation.model_values import Constants, Values, is_zero, scalar
-from mbkit.model import Joint, JointCoupling, Model
+from mbkit.model import GravityCompensation, Joint, JointCoupling, Model
 from mbkit.model.joint_types import cross3
 from mbkit.model.parts import PointSpring
 
@@ -227,24 +228,34 @@ def kinetic_energy(kin: Kinematics) -> Any:
     return total
 
 
-def gravity_energy(kin: Kinematics) -> Any:
+def gravity_energy(kin: Kinematics, shares: Mapping[str, Any] | None = None) -> Any:
     """Return V = -Σ m g · p_com, zero with every centre of mass at the world's origin.
 
-    First moments are gathered from the leaves to the root: each joint costs one rotation of a vector.
+    First moments are gathered from the leaves to the root: each joint costs one rotation of a vector. With `shares`,
+    numbers by which masses are multiplied, it is the energy of these bodies alone.
     """
     model = kin.model
     moments: dict[str, list[Any]] = {"world": [0.0] * 3}
     masses: dict[str, Any] = {"world": 0.0}
     for body in model.bodies:
         values = kin.values.bodies[body.name]
-        moments[body.name] = [values.mass * c for c in values.com]
-        masses[body.name] = values.mass
+        mass = values.mass if shares is None else values.mass * shares.get(body.name, 0.0)
+        moments[body.name] = [mass * c for c in values.com]
+        masses[body.name] = mass
     for joint in reversed(model.tree):
         moments[joint.parent] = add(
             moments[joint.parent], kin.to_parent(joint, moments[joint.child], masses[joint.child])
         )
         masses[joint.parent] += masses[joint.child]
     return kin.zero - dot3(kin.values.gravity, moments["world"])
+
+
+def compensation_energy(kin: Kinematics) -> Any:
+    """Return V = Σ fraction m g · p_com of what holds the weight of bodies."""
+    held = [f for f in kin.model.forces if isinstance(f, GravityCompensation)]
+    if not held:
+        return kin.zero
+    return kin.zero - gravity_energy(kin, {f.body: kin.values.forces[f.name].fraction for f in held})
 
 
 def spring_energy(kin: Kinematics) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.model import Frame, Joint, Model, NoSlip
-from mbkit.model.elements.forces import Bushing
+from mbkit.model.elements.forces import Bushing, FrameForce, GravityCompensation, JointForce
 from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.rolling import tangents
 
@@ -104,8 +104,13 @@ _MIMIC: Final = ("ratio", "offset")
 _COUPLING: Final = ("factors", "stiffness", "rest_length", "damping", "armature")
 _SPRING: Final = ("point_a", "point_b", "stiffness", "rest_length", "damping")
 _LOOP: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "length")
-_FORCE: Final = ("numbers",)
 _BUSHING: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "stiffness", "damping", "numbers")
+_FORCES: Final[dict[type, tuple[str, ...]]] = {
+    JointForce: ("numbers",),
+    FrameForce: ("numbers",),
+    Bushing: _BUSHING,
+    GravityCompensation: ("fraction",),
+}
 _NO_SLIP: Final = ("translation_a", "axis_a", "translation_b", "axis_b", "radius", "speed")
 _COUPLER: Final = ("ratio", "offset")
 # A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum of literal masses could be divided
@@ -175,10 +180,7 @@ class Values:
         self.springs = {s.name: self._read("springs", s.name, s, _SPRING) for s in model.springs}
         self.couplings = {c.name: self._read("couplings", c.name, c, _COUPLING) for c in model.couplings}
         self.loops = {x.name: self._read("loops", x.name, x, _LOOP) for x in model.loops}
-        self.forces = {
-            f.name: self._read("forces", f.name, f, _BUSHING if isinstance(f, Bushing) else _FORCE)
-            for f in model.forces
-        }
+        self.forces = {f.name: self._read("forces", f.name, f, _FORCES[type(f)]) for f in model.forces}
         self.no_slip = {x.name: self._contact(x) for x in model.no_slip}
         self.couplers = {x.name: self._read("couplers", x.name, x, _COUPLER) for x in model.couplers}
         self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}

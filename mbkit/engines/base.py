@@ -31,6 +31,7 @@ from mbkit.methods.registry import DEFAULT_METHOD, Method, explicit_method
 from mbkit.methods.tableaus import Tableau
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.description import CONSTRAINT_FEATURES
+from mbkit.model.elements.forces import by_functions
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import NEAR_UNIT
 from mbkit.model.rolling import LIES_FLAT
@@ -98,10 +99,13 @@ def require_tree(
             )
 
 
-def require_no_forces(model: Model, engine: str) -> None:
-    """Raise `UnsupportedError` for a model with forces by functions, in the name of an engine's own integrators."""
-    if model.forces:
-        names = first_names((repr(f.name) for f in model.forces), ", ...")
+def require_no_forces(model: Model, engine: str, *, holds_weights: bool = False) -> None:
+    """Raise `UnsupportedError` for a model with forces by functions, in the name of an engine's own integrators.
+
+    Those of an engine that `holds_weights` know gravity compensation.
+    """
+    if forces := by_functions(model) if holds_weights else model.forces:
+        names = first_names((repr(f.name) for f in forces), ", ...")
         raise UnsupportedError(
             f"{engine}: its own integrators do not know the forces of {model.name} by functions ({names}); use a "
             "method that any engine has, such as rk4, or model.without('forces')"

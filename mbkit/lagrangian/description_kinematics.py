@@ -14,7 +14,7 @@ import sympy as sp
 
 from mbkit._check import Array
 from mbkit._reproducible import pivoted
-from mbkit.derivation.kinematics import Kinematics, gravity_energy, kinetic_energy
+from mbkit.derivation.kinematics import Kinematics, compensation_energy, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
@@ -155,7 +155,14 @@ class SymbolicKinematics(Kinematics):
     @cached_property
     def gravity_energy(self) -> sp.Expr:
         """-Σ m g · p_com."""
-        total = gravity_energy(self)
+        return self._by_heights(gravity_energy(self))
+
+    @cached_property
+    def compensation_energy(self) -> sp.Expr:
+        """Σ fraction m g · p_com."""
+        return self._by_heights(compensation_energy(self))
+
+    def _by_heights(self, total: Any) -> sp.Expr:
         self.drop_dust([total])
         # Height by height rather than with g before them all, so that forces read term by term.
         return self.back(shortest_form(total, whole=False))

@@ -9,7 +9,7 @@ import sympy as sp
 
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.description_kinematics import SymbolicKinematics, exact, motion
-from mbkit.model.elements.forces import RATE, TIME, JointForce
+from mbkit.model.elements.forces import RATE, TIME, GravityCompensation, JointForce
 from mbkit.model.elements.formula import Arithmetic
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.parts import Prescribed
@@ -87,7 +87,7 @@ def _pieces(numbers: Any, t: sp.Symbol) -> sp.Expr:
 
 
 def acting(kin: SymbolicKinematics, t: sp.Symbol) -> tuple[sp.Expr, list[sp.Expr]]:
-    """Return the potential of a model's joint forces, and the rest as one force along each coordinate.
+    """Return the potential of joint forces and of what holds weights, and the rest as one force along each coordinate.
 
     Raises
     ------
@@ -95,8 +95,10 @@ def acting(kin: SymbolicKinematics, t: sp.Symbol) -> tuple[sp.Expr, list[sp.Expr
         Forces on frames and bushings, which this form of the equations does not write out.
     """
     model = kin.model
-    V, forces = sp.Integer(0), [sp.Integer(0)] * model.nv
+    V, forces = kin.compensation_energy, [sp.Integer(0)] * model.nv
     for force in model.forces:
+        if isinstance(force, GravityCompensation):
+            continue
         if not isinstance(force, JointForce):
             raise UnsupportedError(
                 f"{model.name}: {force} is no force at a joint, and is not written out in symbols; "

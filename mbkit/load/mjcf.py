@@ -91,6 +91,7 @@ def model_of_mjcf(
     springs = infer_springs(mujoco, path, scene)
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=gravity)
     snap = _Tree(b, scene, springs).add_bodies(scale)
+    _hold_weights(b, mujoco, scene, off)
     transmissions = Transmissions(mujoco, scene, off, servos=actuators)
     equalities = Equalities(mujoco, scene, off, wanted=loops)
     if read.faults:
@@ -187,6 +188,38 @@ class _Tree:
         self.b.add_joint(
             joint.name, kind, parent=parent, child=child, translation=p, rotation=R, friction=friction, **values
         )
+
+
+def _hold_weights(b: ModelBuilder, mujoco: Element, scene: Scene, off: set[str]) -> None:
+    """Add the gravity compensation of bodies, as MuJoCo 4.0.0 applies it.
+
+    It leaves the passive forces out where springs and dampers are off. The part at a joint with ``actuatorgravcomp`` is
+    an actuator's, and acts with or without an actuator there, but not in a file without actuators or with all off.
+    """
+    held = [body for body in scene.bodies if body.gravcomp and body.mass_properties.mass]
+    if not held or {"spring", "damper"} <= off:
+        return
+    actuated = "actuation" not in off and any(section.children for section in mujoco.all("actuator"))
+    moving: dict[str, list[MjcfJoint]] = {"world": []}
+    for body in scene.bodies:
+        moving[body.name] = [*moving[body.parent], *body.joints]
+    by_actuators: dict[str, None] = {}
+    idle, partly = list[str](), list[str]()
+    for body in held:
+        joints = moving[body.name]
+        lifted = [j.name for j in joints if j.element.attributes.get("actuatorgravcomp") == "true"]
+        by_actuators |= dict.fromkeys(lifted)
+        if lifted and not actuated:
+            (idle if len(lifted) == len(joints) else partly).append(body.name)
+        if body.name not in idle:
+            b.add_gravity_compensation(body.name, body.gravcomp)
+    if by_actuators and actuated:
+        b.note(f"gravity compensation by actuators, which counts as a passive force: joints {name_list(by_actuators)}")
+    if idle:
+        b.note(f"gravity compensation left out, as by MuJoCo without actuators: bodies {name_list(idle)}")
+    if partly:
+        shares = f"bodies {name_list(partly)} at joints {name_list(by_actuators)}"
+        b.note(f"gravity compensation that MuJoCo leaves out without actuators, and that acts here: {shares}")
 
 
 def _range(

@@ -55,6 +55,7 @@ class MjcfBody:
     joints: list[MjcfJoint]
     mass_properties: MassProperties  # in its own axes; nothing while `Scene.inferred` has the body
     sites: list[tuple[str, Pose]]
+    gravcomp: float = 0.0  # share of its weight that is held
 
     @property
     def anchor(self) -> Array:
@@ -177,8 +178,6 @@ def _read_body(element: Element, parent: str, X: Pose, childclass: str | None, s
     read, compiler = scene.read, scene.compiler
     childclass = scene.defaults.known(element.attributes.get("childclass"), element) or childclass
     own = pose(element, compiler, read, item)
-    if read.number(element, "gravcomp", item, 0.0):
-        scene.left_out["gravity compensation"] += 1
     if element.attributes.get("mocap") == "true":
         scene.left_out["motion capture"] += 1
     parts = list(frame_contents(element, HERE, childclass, scene, item))
@@ -198,7 +197,8 @@ def _read_body(element: Element, parent: str, X: Pose, childclass: str | None, s
         scene.inferred[name] = [(e, full.attributes.get("mesh", "")) for e, full, _ in geoms]
     for setting in changed:
         scene.bounded.setdefault(setting, []).append(name)
-    body = MjcfBody(name, parent, X @ own, joints, mass_properties or NOTHING, [])
+    gravcomp = read.number(element, "gravcomp", item, 0.0)
+    body = MjcfBody(name, parent, X @ own, joints, mass_properties or NOTHING, [], gravcomp)
     scene.bodies.append(body)
     _read_children(parts, name, item, body.sites, scene)
 

@@ -65,7 +65,7 @@ def _unsupported(model: Model) -> Iterator[str]:
     yield from (f"loop {x.name!r}" for x in model.loops)
     yield from (f"coupler {x.name!r}" for x in model.couplers)
     yield from (f"joint {p.joint!r} is moved in time" for p in model.prescribed)
-    yield from (f"{force} (a function)" for force in model.forces)
+    yield from map(str, model.forces)
     yield from (f"no slip {x.name!r}" for x in model.no_slip)
 
 

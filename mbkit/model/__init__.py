@@ -3,7 +3,7 @@
 from mbkit.model.base_parameters import BaseParameters
 from mbkit.model.builder import ModelBuilder
 from mbkit.model.description import Needs
-from mbkit.model.elements.forces import Bushing, FrameForce, JointForce
+from mbkit.model.elements.forces import Bushing, FrameForce, GravityCompensation, JointForce
 from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.motion_laws import FormulaMotion, SplineMotion
 from mbkit.model.joint_types import KINDS, JointKind, JointType, kind_of, register_joint_type
@@ -22,6 +22,7 @@ __all__ = [
     "FormulaMotion",
     "Frame",
     "FrameForce",
+    "GravityCompensation",
     "Joint",
     "JointCoupling",
     "JointForce",

@@ -218,7 +218,9 @@ _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
         ("mass", "pitch", "stiffness", "rest_length", "damping", "armature", "length", "radius", "speed"),
         ArgumentReader.quantity,
     ),
-    **dict.fromkeys(("ratio", "offset", "rate", "amplitude", "frequency", "phase"), ArgumentReader.quantity),
+    **dict.fromkeys(
+        ("ratio", "offset", "rate", "amplitude", "frequency", "phase", "fraction"), ArgumentReader.quantity
+    ),
     "inertia": ArgumentReader.inertia,
     "joints": lambda read, name, value: tuple(read.name(name, x) for x in value),
     "factors": lambda read, name, value: read.quantities(name, value, len(value)),

@@ -53,7 +53,7 @@ class Needs:
     """One flag per feature; True where the description has it.
 
     Friction, limits and loops are data; the smooth terms of every engine leave friction and limits out. `forces` are
-    those given by functions; their parts do not count as springs and dampers.
+    those given by functions and what holds weights; their parts do not count as springs and dampers.
     """
 
     gravity: bool
@@ -254,8 +254,8 @@ class Description:
         count for equality.
     time : float
         At which motions prescribed in time are taken, s; neither does it count.
-    forces : tuple of JointForce, FrameForce or Bushing
-        Given by functions of the time and the state.
+    forces : tuple of JointForce, FrameForce, Bushing or GravityCompensation
+        Given by functions of the time and the state, and what holds the weight of bodies.
     """
 
     name: str

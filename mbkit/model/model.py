@@ -272,7 +272,8 @@ class Model(Description):
         *features : str
             Any of damping, springs, armature, friction, gravity, limits, loops, couplers, prescribed, forces, no_slip.
             Springs and damping are those of joints, point-to-point elements and couplings, armature that of joints
-            and couplings; forces are those given by functions, with bushings. Couplers go with the loops.
+            and couplings; forces are those given by functions, with bushings and gravity compensation.
+            Couplers go with the loops.
         """
         model = self
         for feature in features:

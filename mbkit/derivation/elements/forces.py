@@ -18,7 +18,7 @@ import casadi as ca
 
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
-from mbkit.derivation.kinematics import Kinematics, Vector, dot3
+from mbkit.derivation.kinematics import Kinematics, Vector, compensation_energy, dot3
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model.elements.forces import TIME, Bushing, Force, FrameForce, JointForce, coordinate_arguments
 from mbkit.model.elements.formula import Formula
@@ -95,7 +95,7 @@ def rotation_vector(R: list[Vector]) -> Vector:
     return [x * factor for x in u]
 
 
-#: Class of an element -> what it acts on.
+#: Class of an element that acts on rates -> what it acts on.
 _PORTS: Final[dict[type, Callable[[Kinematics, Any], _Port]]] = {
     JointForce: _of_joint,
     FrameForce: _of_frame,
@@ -119,7 +119,8 @@ class ElementForces:
 
     @cached_property
     def _ports(self) -> list[tuple[Force, _Port]]:
-        return [(force, _PORTS[type(force)](self._kin, force)) for force in self._kin.model.forces]
+        forces = self._kin.model.forces
+        return [(force, _PORTS[type(force)](self._kin, force)) for force in forces if type(force) in _PORTS]
 
     def _evaluated(self, force: Force, port: _Port, formula: Formula) -> list[Any]:
         kin = self._kin
@@ -130,8 +131,8 @@ class ElementForces:
 
     @cached_property
     def energy(self) -> Any:
-        """V(q) of linear bushings and of potentials."""
-        total = self._kin.zero
+        """V(q) of linear bushings, of potentials, and of what holds weights."""
+        total = compensation_energy(self._kin)
         for force, port in self._ports:
             if port.linear is not None:
                 x, stiffness, _ = port.linear

@@ -96,6 +96,10 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
     def _hold(self, compiled: MujocoModel) -> None:
         self._maps = compiled
         self._v_index = compiled.v_index
+        self._gravcomp = compiled.model.body_gravcomp.copy()
+        if not self.has_elements:
+            # Among the terms these forces are mbkit's own; MuJoCo's steps get them back.
+            compiled.model.body_gravcomp[:] = 0.0
         self.mj_model = self._m = compiled.model
         self.disabled = compiled.disabled
         self._d = mujoco.MjData(self._m)
@@ -420,7 +424,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
             For reduced mimic joints (MuJoCo would make them soft), and forces on a free joint's translation (MuJoCo
             holds them in world axes), and forces given by functions, which MuJoCo does not know.
         """
-        require_no_forces(self.model, "mujoco")
+        require_no_forces(self.model, "mujoco", holds_weights=True)
         if self._reduced:
             names = ", ".join(j.name for j in self.model.joints if j.mimic)
             raise UnsupportedError(
@@ -438,6 +442,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         if self._lines:
             self.passive(q0, v0)  # raises where a spring has no direction to start in
         model, _ = copy.copy(self.mj_model), self._kept
+        model.body_gravcomp[:] = self._gravcomp
         if self.model.needs.loops and 0 < self.softness.solref[0] < 2 * dt:
             warn(
                 f"{self.model.name}: MuJoCo raises the time constant of its equalities from {self.softness.solref[0]:g}"

@@ -23,7 +23,7 @@ from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings, mapped,
 from mbkit.errors import UnsupportedError
 from mbkit.load.mjcf_couplings import with_couplings
 from mbkit.load.urdf_reader import BASE_JOINT
-from mbkit.model import Coupler, JointCoupling, Loop, Model, PointSpring
+from mbkit.model import Coupler, GravityCompensation, JointCoupling, Loop, Model, PointSpring
 from mbkit.model.joint_types import kind_of
 
 _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
@@ -70,6 +70,8 @@ def _floating(text: str) -> Any:
 
 class _Read(MujocoDynamics):
     """MuJoCo on its own model, with all that acts in it at zero control and activation."""
+
+    has_elements = True
 
     @classmethod
     def of(cls, model: Model, m: Any, numbers: dict[str, int], removals: dict[str, _Removal]) -> _Read:
@@ -208,15 +210,21 @@ class _Description:
         for i in range(1, m.nbody):
             self._body(i)
         self._tree = self._parts.model("mujoco", np.zeros(3) if self._off("GRAVITY") else np.array(m.opt.gravity))
-        #: By key of `Beside`: the descriptions of tendons and actuators.
-        self.parts: dict[str, PointSpring | JointCoupling] = {**dict(self._point_springs()), **dict(self._couplings())}
+        #: By key of `Beside`: the descriptions of tendons, actuators and gravity compensation.
+        self.parts: dict[str, PointSpring | JointCoupling | GravityCompensation] = {
+            **dict(self._point_springs()),
+            **dict(self._couplings()),
+            **dict(self._held()),
+        }
         self.model = self.without("")
 
     def without(self, key: str) -> Model:
-        """Return the description less what it has of one tendon or actuator."""
+        """Return the description less what it has of one tendon, actuator, or held body."""
         kept = [part for name, part in self.parts.items() if name != key]
         springs = tuple(x for x in kept if isinstance(x, PointSpring))
-        return with_couplings(replace(self._tree, springs=springs), [x for x in kept if isinstance(x, JointCoupling)])
+        held = tuple(x for x in kept if isinstance(x, GravityCompensation))
+        tree = replace(self._tree, springs=springs, forces=held)
+        return with_couplings(tree, [x for x in kept if isinstance(x, JointCoupling)])
 
     def loops(self) -> tuple[Loop, ...]:
         """Return the active equalities of two bodies or sites, in the bodies' axes."""
@@ -339,6 +347,15 @@ class _Description:
                     name = m.tendon(t).name or f"tendon{t + 1}"
                     ends = self.names[a], at_a, self.names[b], at_b
                     yield f"tendon {t}", PointSpring(name, *ends, stiffness, rest, damping)
+
+    def _held(self) -> Iterator[tuple[str, GravityCompensation]]:
+        """Yield gravity compensation; none is described where a part is an actuator's, and those are off."""
+        m = self.m
+        idle = m.jnt_actgravcomp.any() and (self._off("ACTUATION") or not m.nu)
+        if idle or (self._off("SPRING") and self._off("DAMPER")):
+            return
+        for b in map(int, np.flatnonzero(m.body_gravcomp)):
+            yield f"body {b}", GravityCompensation(self.names[b], float(m.body_gravcomp[b]))
 
     def _couplings(self) -> Iterator[tuple[str, JointCoupling]]:
         """Yield what tendons and actuators do as springs, dampers and rotors on sums of joint coordinates."""

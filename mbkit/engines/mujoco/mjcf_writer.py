@@ -16,8 +16,9 @@ from mbkit._escape import xml_attribute, xml_comment
 from mbkit.engines.mujoco.constraints import OF_JOINTS
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import JOINT_TYPES, Placed, heard_warnings, mapped, not_held, specified
-from mbkit.errors import UnsupportedError
+from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Joint, Model
+from mbkit.model.elements.forces import by_functions
 
 _TYPES: Final = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
@@ -57,6 +58,9 @@ def read_back(model: Model, text: str) -> MujocoDynamics:
         except ValueError as error:
             reason = " ".join(str(error).split())
             raise UnsupportedError(f"mujoco: refuses what was written of {model.name}: {reason}") from None
+    held = compiled.body_gravcomp
+    if lost := [name for name, body in placed.bodies.items() if held[compiled.body(name).id] != body.gravcomp]:
+        raise MbkitError(f"mujoco: gravity compensation of {lost[0]!r} reads back otherwise; please report this model")
     return MujocoDynamics.holding(model, mapped(compiled, model, placed.joints, placed.bodies, placed.absorbed))
 
 
@@ -74,7 +78,7 @@ def _unsupported(model: Model) -> Iterator[str]:
         if coupling.armature and model.branched(coupling):
             yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
     yield from not_held(model)
-    yield from (f"{force} (a function)" for force in model.forces)
+    yield from (f"{force} (a function)" for force in by_functions(model))
     yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
 
 
@@ -105,7 +109,8 @@ def _body(body: Any, owners: dict[str, Joint], placed: Placed, model: Model, ind
             yield f"{indent}<site{_attributes(name=f.name, pos=f.translation, xyaxes=f.rotation.T[:2])}/>"
     for child in body.bodies:
         simple = None if child.simple else "false"
-        yield f"{indent}<body{_attributes(name=child.name, pos=child.pos, quat=child.quat, simple=simple)}>"
+        placing = _attributes(name=child.name, pos=child.pos, quat=child.quat, gravcomp=child.gravcomp or None)
+        yield f"{indent}<body{placing}{_attributes(simple=simple)}>"
         yield from _body(child, owners, placed, model, indent + "  ")
         yield f"{indent}</body>"
 

@@ -22,7 +22,7 @@ from mbkit.engines.base import STACKS, unknown_joint
 from mbkit.engines.imported import unused
 from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, Softness
 from mbkit.errors import MbkitError, UnsupportedError
-from mbkit.model import Body, Joint, Model
+from mbkit.model import Body, GravityCompensation, Joint, Model
 from mbkit.model.validation import static_bodies
 
 if TYPE_CHECKING:
@@ -171,6 +171,10 @@ def specified(description: Model, softness: Softness | None = None) -> tuple[Any
     compiler.alignfree = False
     disabled = _switch_off(spec, description)
     placed = _add_tree(spec, description)
+    for force in _held(description):
+        # A body without mass, within a stack, has no weight.
+        if force.body in placed.bodies:
+            placed.bodies[force.body].gravcomp = force.fraction
     _add_springs(spec, description, placed)
     _add_couplings(spec, description, placed)
     _add_loops(spec, description, placed, softness or Softness())
@@ -214,9 +218,16 @@ _OFF_WITHOUT: Final = {
 }
 
 
+def _held(description: Model) -> list[GravityCompensation]:
+    return [f for f in description.forces if isinstance(f, GravityCompensation)]
+
+
 def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
     bits = {need: bit for need, bit in _OFF.items() if not (description.needs.loops and bit in _FOR_LOOPS)}
     bits |= dict(pair for need, pair in _OFF_WITHOUT.items() if not getattr(description.needs, need))
+    if _held(description):
+        # Without springs and dampers MuJoCo leaves out gravity compensation too.
+        bits.pop("springs", None)
     spec.option.disableflags = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}", 0)) for bit in bits.values())
     spec.option.gravity = np.array(description.gravity)
     # 4.0.0 can give wrong accelerations with sparse Jacobians.

@@ -12,7 +12,17 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, shown
 from mbkit.errors import MbkitError
-from mbkit.model.elements.forces import DISPLACEMENT, POINT, RATE, TIME, TWIST, Bushing, FrameForce, JointForce
+from mbkit.model.elements.forces import (
+    DISPLACEMENT,
+    POINT,
+    RATE,
+    TIME,
+    TWIST,
+    Bushing,
+    FrameForce,
+    GravityCompensation,
+    JointForce,
+)
 from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.motion_laws import FormulaMotion, SplineMotion
 from mbkit.model.parameters import Expression, Number
@@ -227,6 +237,37 @@ class ElementBuilder:
         )
         frame = self._read.name(f"{item}: frame", frame)
         self._add(FrameForce, "forces", "force", name, {}, {"frame": frame, "axes": axes} | formulas | constants)
+
+    def add_gravity_compensation(self, body: str, fraction: Number = 1.0) -> None:
+        """Hold a part of a body's weight by a force at its centre of mass, as MuJoCo's ``gravcomp`` does.
+
+        The force -fraction m g, N, is one of the passive forces; `gravity` and `nle` keep the whole weight. It has a
+        potential energy.
+
+        Parameters
+        ----------
+        body : str
+            It has one compensation at most.
+        fraction : float
+            Of the weight: 1 holds all of it, and more lifts the body. It may be a `Parameter`.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("arm")
+        >>> b.add_body("link", mass=2.0, com=(0.5, 0, 0), inertia=(0.1, 0.1, 0.1))
+        >>> b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, -1, 0))
+        >>> b.add_gravity_compensation("link", 0.75)
+        >>> dyn = mb.dynamics(b.build())
+        >>> [x.round(9).tolist() for x in (dyn.gravity([0.0]), dyn.passive([0.0], [0.0]))]
+        [[9.81], [7.3575]]
+        """
+        body = self._read.name("gravity compensation: body", body)
+        values = {"fraction": fraction}
+        self._add(
+            lambda _, **numbers: GravityCompensation(body, **numbers),
+            *("forces", "force", GravityCompensation.named(body), values),
+        )
 
     def add_bushing(
         self,

@@ -1,5 +1,7 @@
 """Forces given by functions of the time, the state and named constants: at joints, on frames, and between two bodies.
 
+Beside them stands what holds the weight of bodies.
+
 A force has a `formula` of what acts, a `potential` from which a part of it follows, or both. Their arguments are names:
 the element's own, such as ``"q"`` and ``"v"`` of a joint; ``"t"``; the constants in `symbols`; and of every coordinate
 and velocity of the model that is not the element's own, ``"theta"`` and ``"theta_dot"``.
@@ -17,7 +19,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.errors import nearest
 from mbkit.model.elements.formula import Formula
-from mbkit.model.parts import _Frozen
+from mbkit.model.parts import _Frozen, read_only
 
 #: A `mbkit.model.description.Description`, a floor above.
 _Model = Any
@@ -55,6 +57,11 @@ class Force(_Frozen):
     def constants(self) -> tuple[float, ...]:
         """The numbers in the formulas."""
         return tuple(x for formula in self.formulas for x in formula.constants)
+
+    @property
+    def acts(self) -> bool:
+        """Whether it acts without its formulas."""
+        return False
 
     @property
     def of_time(self) -> bool:
@@ -203,6 +210,11 @@ class Bushing(Force):
     symbols: tuple[str, ...]
     numbers: Array
 
+    @property
+    def acts(self) -> bool:
+        """Whether it is a spring or a damper."""
+        return bool(self.stiffness.any() or self.damping.any())
+
     def positions(self, model: _Model) -> tuple[str, ...]:  # noqa: ARG002  # the same of every model
         """Return x, y, z, rx, ry and rz."""
         return DISPLACEMENT
@@ -231,6 +243,58 @@ class Bushing(Force):
         return f"bushing {self.name!r} between {self.body_a!r} and {self.body_b!r}{of}"
 
 
+@dataclass(frozen=True, eq=False)
+class GravityCompensation(Force):
+    """A force at a body's centre of mass that holds a part of its weight: -fraction m g.
+
+    It has the potential energy fraction m g · p_com. MuJoCo calls it ``gravcomp``.
+
+    Attributes
+    ----------
+    body : str
+    fraction : float
+        Of the weight; 1 holds all of it.
+    """
+
+    body: str
+    fraction: float
+
+    #: It has no formula.
+    formula = potential = None
+    symbols = ()
+    numbers = read_only(np.zeros(0))
+
+    #: Zero may be a parameter's value.
+    acts = True
+
+    @property
+    def name(self) -> str:  # type: ignore[override]  # it follows from the body, which has one at most
+        """The body's, in words."""
+        return self.named(self.body)
+
+    @staticmethod
+    def named(body: str) -> str:
+        """Return the name of a body's."""
+        return f"gravity compensation of {body}"
+
+    def positions(self, model: _Model) -> tuple[str, ...]:  # noqa: ARG002  # it brings none
+        """Return nothing."""
+        return ()
+
+    def velocities(self, model: _Model) -> tuple[str, ...]:  # noqa: ARG002  # as above
+        """Return nothing."""
+        return ()
+
+    def misplaced(self, model: _Model) -> Iterator[str]:
+        """Yield that there is no such body."""
+        names = [b.name for b in model.bodies]
+        if self.body not in names:
+            yield _unknown("body", self.body, names)
+
+    def __str__(self) -> str:
+        return f"gravity compensation of {self.body!r}: {self.fraction:g} of its weight"
+
+
 def _listed(names: tuple[str, ...]) -> str:
     return ", ".join(name for name in names if not name.startswith("#")) or "constants"
 
@@ -244,6 +308,11 @@ def coordinate_arguments(model: _Model) -> Mapping[str, tuple[bool, int]]:
     """Return the names of a model's coordinates and velocities in formulas: whether a velocity, and which."""
     q = {name: (False, i) for i, name in enumerate(model.coordinate_names)}
     return q | {name + RATE: (True, i) for i, name in enumerate(model.velocity_names)}
+
+
+def by_functions(model: _Model) -> tuple[Force, ...]:
+    """Return the forces given by functions: all but what holds weights."""
+    return tuple(f for f in model.forces if not isinstance(f, GravityCompensation))
 
 
 def needs_time(model: _Model) -> bool:
@@ -280,7 +349,7 @@ def force_faults(model: _Model) -> Iterator[str]:
         moving = {TIME, *force.velocities(model), *(n for n, (rate, _) in others.items() if rate)} - {*force.symbols}
         if force.potential is not None and (bad := [n for n in force.potential.arguments if n in moving]):
             yield f"{item}: potential depends on {bad[0]!r}; expected a function of positions, as an energy V(q) is"
-        if not force.formulas and not (isinstance(force, Bushing) and (force.stiffness.any() or force.damping.any())):
+        if not (force.formulas or force.acts):
             yield f"{item}: no force and no potential; it would never act"
 
 

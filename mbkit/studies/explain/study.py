@@ -11,7 +11,8 @@ import numpy as np
 from mbkit._check import count, real
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.model import Model
+from mbkit.model import GravityCompensation, Model
+from mbkit.model.elements.forces import by_functions
 from mbkit.model.model import unchecked
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.engine_differences import engine_causes
@@ -89,7 +90,9 @@ def explain(
     real("tolerance", tolerance, positive=True)
     # Mistakes that are tried on a description may leave one that cannot be.
     with unchecked():
-        out = _Descriptions(model_a, model_b, names or _names(a, b), samples, seed, tolerance).explain()
+        one, other = (x.without("forces") if x.forces else x for x in (model_a, model_b))
+        sides = _Descriptions(one, other, names or _names(a, b), samples, seed, tolerance)
+        out = sides.with_held(sides.explain(), model_a, model_b)
         if not isinstance(a, Dynamics) and not isinstance(b, Dynamics):
             return out
         return engine_causes(a, b, out)
@@ -103,10 +106,10 @@ def _model(x: Model | Dynamics, which: str) -> Model:
         )
     if not model.has_bodies:
         raise UnsupportedError(f"explain: {model.name} was written as energies and has no bodies to compare")
-    if model.forces:
+    if by_functions(model) or (model.forces and isinstance(x, Dynamics)):
         raise UnsupportedError(
-            f"explain: {model.name} has forces by functions, which have no numbers to match; explain "
-            "model.without('forces')"
+            f"explain: {model.name} has forces by functions, which have no numbers to match, or engines that hold "
+            "weights are asked; explain model.without('forces')"
         )
     if not model.nv:
         raise InputError(f"{which}: nothing moves in {model.name} (nv = 0), so there is nothing to explain")
@@ -189,6 +192,28 @@ class _Descriptions:
             massless=massless,
             compared=compared,
         )
+
+    def with_held(self, out: Explanation, a: Model, b: Model) -> Explanation:
+        """Return the explanation with what differs in the weights that the two whole descriptions hold, body by body.
+
+        `explain` merges bodies, and such a force acts on each of them.
+        """
+        ours, theirs = ({f.body: f for f in x.forces if isinstance(f, GravityCompensation)} for x in (a, b))
+        near, causes, found = Tolerances.of(a, self.tolerance), [], {g.term: g for g in out.gaps}
+        for body in dict.fromkeys([*ours, *theirs]):
+            one, other = (side[body].fraction if body in side else 0.0 for side in (ours, theirs))
+            if near.number(one, other):
+                continue
+            model = a if body in ours else b
+            sides = (replace(model, forces=(GravityCompensation(body, x),)) for x in (one, other))
+            effects = self._gaps(*sides)
+            says = f"holds {number_text(other)} of its weight for {number_text(one)}"
+            h = Hypothesis("gravity compensation", f"body {body!r}", says, a=one, b=other)
+            causes.append(self._cause(h, effects.effects))
+            if out.comparable:
+                found |= {g.term: max(g, found.get(g.term, g), key=lambda x: x.relative) for g in effects.terms}
+        acts = any(c.acts for c in causes)
+        return replace(out, agree=out.agree and not acts, causes=(*out.causes, *causes), gaps=tuple(found.values()))
 
     def _is_massless(self, model: Model) -> bool:
         M = model_terms(model, states_of(model, self.samples, self.seed)).get("M")

@@ -145,9 +145,11 @@ def stages(
     """Compare an importer's model with the reference, from the tree to the terms, which its own engine computes."""
     described = reference.model if isinstance(reference, Imported) else reference
     # Importers leave mimic joints free.
-    free = free_of_mimic(described)
+    whole = free_of_mimic(described)
+    # What holds weights acts on single bodies, which are merged here; the terms have it.
+    free = whole.without("forces")
     near = Tolerances.of(free, tolerance)
-    one, other, matching, structural = reconcile_joint_sets(free, imported.model, near)
+    one, other, matching, structural = reconcile_joint_sets(free, imported.model.without("forces"), near)
     there, _ = align_frames(rename_joints(other, one.model, matching), one.model, near)
     theirs = {j.name: j.mimic for j in imported.model.joints}
     mimics = [j.name for j in described.joints if j.mimic and not theirs.get(matching.to_b.get(j.name, ""))]
@@ -163,8 +165,9 @@ def stages(
     if not structural:
         at = states_of(one.model, samples, seed)
         ours = model_terms(one.model, at)
-        if isinstance(reference, Imported):
-            ours = _own_terms_of(one.model, reference, {j.name: j.name for j in one.model.joints}, at)
+        source = reference if isinstance(reference, Imported) else _imported(whole) if whole.forces else None
+        if source is not None:
+            ours = _own_terms_of(one.model, source, {j.name: j.name for j in one.model.joints}, at)
         theirs_ = _own_terms_of(one.model, imported, matching.to_b, at)
         apart = gaps(ours, theirs_, at.v, velocity_joints(one.model))
     by_term = {g.term: g for g in apart.terms}
@@ -250,6 +253,11 @@ def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict
             size = float(np.abs(y.inertia - x.inertia).max() / max(np.abs(x.inertia).max(), np.abs(y.inertia).max()))
             out["inertias"].append((size, x.name, f"{number_text(y.inertia)} for {number_text(x.inertia)} kg m²"))
     return out
+
+
+def _imported(model: Model) -> Imported:
+    """Return a description as if it was an importer's, with all of its terms."""
+    return Imported(model, lambda q, v, _: model_terms(model, States(q, v)), ())
 
 
 def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:

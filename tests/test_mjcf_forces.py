@@ -1,0 +1,138 @@
+"""Forces of MJCF files beside weights and joints' linear springs, against bare MuJoCo: M, bias, passive forces."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.errors import ModelError, UnsupportedError
+from tests.random_files import mujoco_terms
+
+ENGINES = ("lagrangian", "pinocchio", "mujoco", "oracle")
+
+
+def written(text: str, folder: Path, name: str = "m.xml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def check(path: Path, engines: tuple[str, ...] = ENGINES) -> tuple[mb.Model, np.ndarray]:
+    """Compare a file with bare MuJoCo; return the model, and the passive forces there."""
+    model, at = mb.load(path), mujoco_terms(path.read_text(encoding="utf-8"), 4, 0)
+    for engine in engines:
+        dyn = mb.dynamics(model, engine)
+        for name, x, exact in (
+            ("M", dyn.mass_matrix(at.q), at.M),
+            ("nle", dyn.nle(at.q, at.v), at.nle),
+            ("passive", dyn.passive(at.q, at.v), at.passive),
+        ):
+            assert np.abs(x - exact).max() < 1e-12 * max(np.abs(exact).max(), 1.0), (engine, name)
+    return model, at.passive
+
+
+# Gravity compensation
+
+
+def arm(held: str = 'gravcomp="0.7"', joint: str = "", more: str = "", option: str = "") -> str:
+    """Return a free base with a body of two joints and a fixed tool, all of them held."""
+    return f"""<mujoco model="arm"><option gravity="1 2 -9">{option}</option><worldbody>
+      <body name="base" {held} pos="0 0 1"><freejoint name="f"/><geom type="box" size=".1 .2 .3" pos=".2 .1 .3"/>
+        <body name="link" pos="0 0 .6" gravcomp="-0.3"><joint name="j" axis="1 0 0" damping="1" {joint}/>
+          <joint name="k" axis="0 1 1" stiffness="3" {joint}/><geom size=".1" pos=".1 0 .2" euler="1 2 3"/>
+          <body name="tool" pos="0 .3 0" gravcomp="1"><geom type="capsule" size=".1 .2" pos=".1 .1 0"/></body></body>
+      </body></worldbody>{more}</mujoco>"""
+
+
+@pytest.mark.parametrize("option", ["", '<flag gravity="disable"/>', '<flag spring="disable"/>'])
+def test_gravity_compensation_is_that_of_mujoco(option: str, tmp_path: Path) -> None:
+    model, passive = check(written(arm(option=option), tmp_path))
+    assert [f.fraction for f in model.forces] == [0.7, -0.3, 1.0]
+    assert passive[:, :6].any() != ("gravity" in option)
+    assert not any("gravity compensation" in note for note in model.notes)
+
+
+def test_mujoco_holds_no_weight_with_springs_and_dampers_off(tmp_path: Path) -> None:
+    model, passive = check(written(arm(option='<flag spring="disable" damper="disable"/>'), tmp_path), ("lagrangian",))
+    assert not passive.any()
+    assert not model.forces
+
+
+MOTOR = '<actuator><motor joint="k"/></actuator>'
+
+
+@pytest.mark.parametrize("more", ["", MOTOR])
+def test_weight_that_actuators_hold(more: str, tmp_path: Path) -> None:
+    """MuJoCo counts it as actuation, wherever the actuators are; without any it does not act."""
+    text = arm(held="", joint='actuatorgravcomp="true"', more=more).replace('<freejoint name="f"/>', "")
+    model, _ = check(written(text, tmp_path), ("lagrangian",))
+    assert bool(model.forces) == bool(more)
+    assert any("gravity compensation" in note for note in model.notes)
+
+
+def test_weight_that_actuators_hold_in_part_is_told(tmp_path: Path) -> None:
+    notes = mb.load(written(arm(joint='actuatorgravcomp="true"'), tmp_path)).notes
+    assert any("leaves out without actuators" in note and "'tool'" in note for note in notes)
+
+
+def test_mujocos_own_steps_hold_the_weight_as_ours(tmp_path: Path) -> None:
+    model = mb.load(written(arm(), tmp_path))
+    dyn = mb.dynamics(model, "mujoco")
+    q, v = model.random_state(0)
+    ours, theirs = (mb.simulate(dyn, q, v, 0.1, method, 1e-3) for method in ("rk4", "mujoco_rk4"))
+    np.testing.assert_allclose(ours.q[-1], theirs.q[-1], rtol=0, atol=1e-9)
+    assert np.abs(ours.power_balance()).max() < 1e-6 * abs(ours.energy()[0])
+
+
+def test_a_held_weight_is_a_parameter_and_has_an_energy() -> None:
+    b = mb.ModelBuilder("arm")
+    b.add_body("link", mass=2.0, com=(0.5, 0, 0.1), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, -1, 0))
+    b.add_gravity_compensation("link", mb.Parameter("c", 0.75))
+    model = b.build()
+    bare = model.without("forces")
+    for engine in ENGINES:
+        dyn, other = mb.dynamics(model, engine), mb.dynamics(bare, engine)
+        for c in (0.75, -0.2):
+            at = dyn.at(c=c)
+            np.testing.assert_allclose(at.passive([0.3], [1.0]), c * other.gravity([0.3]), rtol=1e-14)
+            np.testing.assert_allclose(at.potential_energy([0.3]), (1 - c) * other.potential_energy([0.3]), rtol=1e-14)
+    symbols = mb.lagrangian.from_model(model)
+    (V, bare_V) = (x.V.subs("c", 0.75).subs("hinge", 0.3) for x in (symbols, mb.lagrangian.from_model(bare)))
+    assert float(V) == pytest.approx(0.25 * float(bare_V), rel=1e-14)
+    assert not mb.dynamics(model.without("gravity")).passive([0.3], [0.0]).any()
+
+
+def test_a_held_weight_is_written_read_and_told(tmp_path: Path) -> None:
+    model = mb.load(written(arm().replace("euler", "zaxis"), tmp_path))
+    back = mb.load(written(mb.convert(model, "mjcf").text, tmp_path))
+    assert {f.body: f.fraction for f in back.forces} == {"base": 0.7, "link": -0.3, "tool": 1.0}
+    assert mb.explain(model, back).agree
+    without = mb.explain(model, model.without("forces"))
+    assert not without.agree
+    assert without.explained
+    assert {c.kind for c in without.acting} == {"gravity compensation"}
+    with pytest.raises(UnsupportedError, match="gravity compensation of 'base'"):
+        mb.convert(model, "urdf")
+
+
+def test_importers_are_asked_whether_they_hold_weights(tmp_path: Path) -> None:
+    pinocchio, read = mb.compare_parsers(written(arm(), tmp_path), ("pinocchio", "mujoco"), samples=1).importers
+    assert read.agrees
+    assert pinocchio.explanation is not None
+    assert {c.kind for c in pinocchio.explanation.acting} >= {"gravity compensation"}
+
+
+def test_faults_of_gravity_compensation_are_named() -> None:
+    b = mb.ModelBuilder("arm")
+    b.add_body("link", mass=2.0, inertia=(0.1, 0.1, 0.1))
+    b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, -1, 0))
+    for body in ("lnik", "link", "link"):
+        b.add_gravity_compensation(body)
+    with pytest.raises(ModelError) as caught:
+        b.build()
+    assert "unknown body 'lnik'; did you mean 'link'?" in str(caught.value)
+    assert "declared 2 times" in str(caught.value)
