@@ -222,7 +222,8 @@ class Reference:
     ----------
     q, v : (N, nq) and (N, nv) arrays
         Quaternions x, y, z, w; a free joint's velocities in the body's axes.
-    M, nle, passive : arrays
+    M, nle, passive, actuated : arrays
+        The last has the forces of actuators at zero control too.
     scale : (N,) array
         |nle|'s largest entry, or what could cancel in it: |M| |v|² and |g| |M| / length.
     rounding : (N,) array
@@ -235,6 +236,7 @@ class Reference:
     M: np.ndarray
     nle: np.ndarray
     passive: np.ndarray
+    actuated: np.ndarray
     scale: np.ndarray
     rounding: np.ndarray
 
@@ -250,10 +252,13 @@ def mujoco_terms(text: str, samples: int, seed: int) -> Reference:
         mujoco.set_mju_user_warning(before)
 
 
+_FORCES = ("passive", "actuated")
+
+
 def _terms(m: mujoco.MjModel, samples: int, seed: int) -> Reference:
     m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
     d, rng = mujoco.MjData(m), np.random.default_rng([seed, 7])
-    out: dict[str, list[np.ndarray]] = {name: [] for name in ("q", "v", "M", "nle", "passive", "scale", "rounding")}
+    out: dict[str, list[np.ndarray]] = {name: [] for name in ("q", "v", "M", "nle", *_FORCES, "scale", "rounding")}
     for _ in range(samples):
         q, v = rng.uniform(-2, 2, m.nq), rng.standard_normal(m.nv)
         T, slip = np.eye(m.nv), np.zeros(m.nv)
@@ -277,7 +282,8 @@ def _terms(m: mujoco.MjModel, samples: int, seed: int) -> Reference:
         size = np.abs(M).max()
         scale = max(np.abs(d.qfrc_bias).max(), size * (v @ v), np.linalg.norm(m.opt.gravity) * size)
         lost = np.array(_sums(m, d) / size)
-        forces = T.T @ (d.qfrc_bias + M @ slip), T.T @ (d.qfrc_passive + d.qfrc_actuator)
+        passive = T.T @ d.qfrc_passive
+        forces = T.T @ (d.qfrc_bias + M @ slip), passive, passive + T.T @ d.qfrc_actuator
         for name, x in zip(out, (q, v, T.T @ M @ T, *forces, np.array(scale), lost), strict=True):
             out[name].append(x)
     return Reference(**{name: np.array(x) for name, x in out.items()})

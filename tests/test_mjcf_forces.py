@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,18 +22,19 @@ def written(text: str, folder: Path, name: str = "m.xml") -> Path:
     return path
 
 
-def check(path: Path, engines: tuple[str, ...] = ENGINES) -> tuple[mb.Model, np.ndarray]:
+def check(path: Path, engines: tuple[str, ...] = ENGINES, **options: Any) -> tuple[mb.Model, np.ndarray]:
     """Compare a file with bare MuJoCo; return the model, and the passive forces there."""
-    model, at = mb.load(path), mujoco_terms(path.read_text(encoding="utf-8"), 4, 0)
+    model, at = mb.load(path, **options), mujoco_terms(path.read_text(encoding="utf-8"), 4, 0)
+    passive = at.actuated if options.get("actuators") else at.passive
     for engine in engines:
         dyn = mb.dynamics(model, engine)
         for name, x, exact in (
             ("M", dyn.mass_matrix(at.q), at.M),
             ("nle", dyn.nle(at.q, at.v), at.nle),
-            ("passive", dyn.passive(at.q, at.v), at.passive),
+            ("passive", dyn.passive(at.q, at.v), passive),
         ):
             assert np.abs(x - exact).max() < 1e-12 * max(np.abs(exact).max(), 1.0), (engine, name)
-    return model, at.passive
+    return model, passive
 
 
 # Gravity compensation
@@ -64,18 +67,25 @@ def test_mujoco_holds_no_weight_with_springs_and_dampers_off(tmp_path: Path) -> 
 MOTOR = '<actuator><motor joint="k"/></actuator>'
 
 
+@pytest.mark.parametrize("actuators", [False, True])
 @pytest.mark.parametrize("more", ["", MOTOR])
-def test_weight_that_actuators_hold(more: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("lifted", ["jk", "k"])
+def test_weight_that_actuators_hold(actuators: bool, more: str, lifted: str, tmp_path: Path) -> None:
     """MuJoCo counts it as actuation, wherever the actuators are; without any it does not act."""
-    text = arm(held="", joint='actuatorgravcomp="true"', more=more).replace('<freejoint name="f"/>', "")
-    model, _ = check(written(text, tmp_path), ("lagrangian",))
-    assert bool(model.forces) == bool(more)
-    assert any("gravity compensation" in note for note in model.notes)
-
-
-def test_weight_that_actuators_hold_in_part_is_told(tmp_path: Path) -> None:
-    notes = mb.load(written(arm(joint='actuatorgravcomp="true"'), tmp_path)).notes
-    assert any("leaves out without actuators" in note and "'tool'" in note for note in notes)
+    text = arm(more=more)
+    for name in lifted:
+        text = text.replace(f'name="{name}"', f'name="{name}" actuatorgravcomp="true"')
+    model, _ = check(written(text, tmp_path), actuators=actuators)
+    assert any(bool(f.without) for f in model.forces) != (actuators and bool(more))
+    assert any("gravity compensation by actuators" in note for note in model.notes)
+    q, v = model.random_state(0)
+    ours, theirs = (mb.simulate(mb.dynamics(model, "mujoco"), q, v, 0.05, x, 1e-3) for x in ("rk4", "mujoco_rk4"))
+    np.testing.assert_allclose(ours.q[-1], theirs.q[-1], rtol=0, atol=1e-9)
+    assert np.abs(ours.power_balance()).max() < 1e-5 * abs(ours.energy()[0])
+    back = mb.load(written(mb.convert(model, "mjcf").text, tmp_path))
+    assert mb.explain(model, back).agree
+    (read,) = mb.compare_parsers(written(text, tmp_path), ("mujoco",), samples=1).importers
+    assert read.agrees
 
 
 def test_mujocos_own_steps_hold_the_weight_as_ours(tmp_path: Path) -> None:
@@ -117,6 +127,12 @@ def test_a_held_weight_is_written_read_and_told(tmp_path: Path) -> None:
     assert {c.kind for c in without.acting} == {"gravity compensation"}
     with pytest.raises(UnsupportedError, match="gravity compensation of 'base'"):
         mb.convert(model, "urdf")
+    elsewhere = [replace(f, without=("j",)) if f.body == "link" else f for f in model.forces]
+    other = replace(model, forces=tuple(elsewhere))
+    (cause,) = mb.explain(model, other).acting
+    assert "at other joints" in cause.says
+    with pytest.raises(UnsupportedError, match="one answer for each joint"):
+        mb.dynamics(other, "mujoco")
 
 
 def test_importers_are_asked_whether_they_hold_weights(tmp_path: Path) -> None:
@@ -131,8 +147,9 @@ def test_faults_of_gravity_compensation_are_named() -> None:
     b.add_body("link", mass=2.0, inertia=(0.1, 0.1, 0.1))
     b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, -1, 0))
     for body in ("lnik", "link", "link"):
-        b.add_gravity_compensation(body)
+        b.add_gravity_compensation(body, without=("hinge", "hnige"))
     with pytest.raises(ModelError) as caught:
         b.build()
     assert "unknown body 'lnik'; did you mean 'link'?" in str(caught.value)
     assert "declared 2 times" in str(caught.value)
+    assert "unknown joint 'hnige'" in str(caught.value)

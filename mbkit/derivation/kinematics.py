@@ -250,12 +250,13 @@ def gravity_energy(kin: Kinematics, shares: Mapping[str, Any] | None = None) -> 
     return kin.zero - dot3(kin.values.gravity, moments["world"])
 
 
-def compensation_energy(kin: Kinematics) -> Any:
-    """Return V = Σ fraction m g · p_com of what holds the weight of bodies."""
-    held = [f for f in kin.model.forces if isinstance(f, GravityCompensation)]
-    if not held:
-        return kin.zero
-    return kin.zero - gravity_energy(kin, {f.body: kin.values.forces[f.name].fraction for f in held})
+def compensation_energies(kin: Kinematics) -> dict[tuple[str, ...], Any]:
+    """Return V = Σ fraction m g · p_com of what holds the weight of bodies, by the joints at which it does not act."""
+    shares: dict[tuple[str, ...], dict[str, Any]] = {}
+    for f in kin.model.forces:
+        if isinstance(f, GravityCompensation):
+            shares.setdefault(f.without, {})[f.body] = kin.values.forces[f.name].fraction
+    return {without: kin.zero - gravity_energy(kin, own) for without, own in shares.items()}
 
 
 def spring_energy(kin: Kinematics) -> Any:

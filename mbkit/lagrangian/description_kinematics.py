@@ -14,7 +14,7 @@ import sympy as sp
 
 from mbkit._check import Array
 from mbkit._reproducible import pivoted
-from mbkit.derivation.kinematics import Kinematics, compensation_energy, gravity_energy, kinetic_energy
+from mbkit.derivation.kinematics import Kinematics, compensation_energies, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
@@ -160,7 +160,7 @@ class SymbolicKinematics(Kinematics):
     @cached_property
     def compensation_energy(self) -> sp.Expr:
         """Σ fraction m g · p_com."""
-        return self._by_heights(compensation_energy(self))
+        return self._by_heights(compensation_energies(self).get((), self.zero))
 
     def _by_heights(self, total: Any) -> sp.Expr:
         self.drop_dust([total])

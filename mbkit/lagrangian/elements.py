@@ -97,7 +97,7 @@ def acting(kin: SymbolicKinematics, t: sp.Symbol) -> tuple[sp.Expr, list[sp.Expr
     model = kin.model
     V, forces = kin.compensation_energy, [sp.Integer(0)] * model.nv
     for force in model.forces:
-        if isinstance(force, GravityCompensation):
+        if isinstance(force, GravityCompensation) and not force.without:
             continue
         if not isinstance(force, JointForce):
             raise UnsupportedError(

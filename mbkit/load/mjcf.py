@@ -91,7 +91,7 @@ def model_of_mjcf(
     springs = infer_springs(mujoco, path, scene)
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=gravity)
     snap = _Tree(b, scene, springs).add_bodies(scale)
-    _hold_weights(b, mujoco, scene, off)
+    _hold_weights(b, mujoco, scene, off, actuators=actuators)
     transmissions = Transmissions(mujoco, scene, off, servos=actuators)
     equalities = Equalities(mujoco, scene, off, wanted=loops)
     if read.faults:
@@ -190,36 +190,28 @@ class _Tree:
         )
 
 
-def _hold_weights(b: ModelBuilder, mujoco: Element, scene: Scene, off: set[str]) -> None:
+def _hold_weights(b: ModelBuilder, mujoco: Element, scene: Scene, off: set[str], *, actuators: bool) -> None:
     """Add the gravity compensation of bodies, as MuJoCo 4.0.0 applies it.
 
     It leaves the passive forces out where springs and dampers are off. The part at a joint with ``actuatorgravcomp`` is
-    an actuator's, and acts with or without an actuator there, but not in a file without actuators or with all off.
+    actuation, with or without an actuator there, and none in a file without actuators or with all of them off.
     """
-    held = [body for body in scene.bodies if body.gravcomp and body.mass_properties.mass]
-    if not held or {"spring", "damper"} <= off:
+    if {"spring", "damper"} <= off:
         return
-    actuated = "actuation" not in off and any(section.children for section in mujoco.all("actuator"))
+    acting = actuators and "actuation" not in off and any(section.children for section in mujoco.all("actuator"))
     moving: dict[str, list[MjcfJoint]] = {"world": []}
+    lifted: dict[str, None] = {}
     for body in scene.bodies:
-        moving[body.name] = [*moving[body.parent], *body.joints]
-    by_actuators: dict[str, None] = {}
-    idle, partly = list[str](), list[str]()
-    for body in held:
-        joints = moving[body.name]
-        lifted = [j.name for j in joints if j.element.attributes.get("actuatorgravcomp") == "true"]
-        by_actuators |= dict.fromkeys(lifted)
-        if lifted and not actuated:
-            (idle if len(lifted) == len(joints) else partly).append(body.name)
-        if body.name not in idle:
-            b.add_gravity_compensation(body.name, body.gravcomp)
-    if by_actuators and actuated:
-        b.note(f"gravity compensation by actuators, which counts as a passive force: joints {name_list(by_actuators)}")
-    if idle:
-        b.note(f"gravity compensation left out, as by MuJoCo without actuators: bodies {name_list(idle)}")
-    if partly:
-        shares = f"bodies {name_list(partly)} at joints {name_list(by_actuators)}"
-        b.note(f"gravity compensation that MuJoCo leaves out without actuators, and that acts here: {shares}")
+        joints = moving[body.name] = [*moving[body.parent], *body.joints]
+        if not (joints and body.gravcomp and body.mass_properties.mass):
+            continue
+        by_actuators = [j.name for j in joints if j.element.attributes.get("actuatorgravcomp") == "true"]
+        lifted |= dict.fromkeys(by_actuators)
+        if acting or len(by_actuators) < len(joints):
+            b.add_gravity_compensation(body.name, body.gravcomp, without=() if acting else by_actuators)
+    if lifted:
+        what = "counts as a passive force" if acting else "was left out; with actuators=True MuJoCo's acts"
+        b.note(f"gravity compensation by actuators {what}: joints {name_list(lifted)}")
 
 
 def _range(

@@ -432,6 +432,10 @@ class Description:
             out.append(self._parents[out[-1]])
         return tuple(out)
 
+    def moving(self, body: str) -> frozenset[str]:
+        """Return the names of the joints from the ground to a body."""
+        return frozenset().union(*(self.chains[j.name] for j in self.joints if j.child == body))
+
     @cached_property
     def _parents(self) -> Mapping[str, str]:
         return MappingProxyType({joint.child: joint.parent for joint in self.joints})

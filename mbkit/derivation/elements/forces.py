@@ -18,7 +18,7 @@ import casadi as ca
 
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
-from mbkit.derivation.kinematics import Kinematics, Vector, compensation_energy, dot3
+from mbkit.derivation.kinematics import Kinematics, Vector, compensation_energies, dot3
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model.elements.forces import TIME, Bushing, Force, FrameForce, JointForce, coordinate_arguments
 from mbkit.model.elements.formula import Formula
@@ -130,9 +130,13 @@ class ElementForces:
         return formula(self._others | constants | time | port.own, casadi_arithmetic(kin.values.number))
 
     @cached_property
+    def _weights(self) -> dict[tuple[str, ...], Any]:
+        return compensation_energies(self._kin)
+
+    @cached_property
     def energy(self) -> Any:
         """V(q) of linear bushings, of potentials, and of what holds weights."""
-        total = compensation_energy(self._kin)
+        total = self._kin.zero + self._weights.get((), 0.0)
         for force, port in self._ports:
             if port.linear is not None:
                 x, stiffness, _ = port.linear
@@ -149,6 +153,12 @@ class ElementForces:
         """The generalized force of what has no energy."""
         kin = self._kin
         total: Any = ca.SX(kin.model.nv, 1)
+        for without, V in self._weights.items():
+            if without:
+                mask: Any = ca.DM.ones(kin.model.nv, 1)
+                for name in without:
+                    mask[kin.model.layout.v[name]] = 0
+                total -= mask * kin.pullback(ca.gradient(V, kin.q))
         for force, port in self._ports:
             acting: Vector = [0.0] * len(port.rates)
             if port.linear is not None:

@@ -349,13 +349,16 @@ class _Description:
                     yield f"tendon {t}", PointSpring(name, *ends, stiffness, rest, damping)
 
     def _held(self) -> Iterator[tuple[str, GravityCompensation]]:
-        """Yield gravity compensation; none is described where a part is an actuator's, and those are off."""
+        """Yield gravity compensation; actuators hold their part where they act."""
         m = self.m
-        idle = m.jnt_actgravcomp.any() and (self._off("ACTUATION") or not m.nu)
-        if idle or (self._off("SPRING") and self._off("DAMPER")):
+        if self._off("SPRING") and self._off("DAMPER"):
             return
+        acting = m.nu and not self._off("ACTUATION")
+        names = [name for name, j in self.numbers.items() if m.jnt_actgravcomp[j] and not acting]
         for b in map(int, np.flatnonzero(m.body_gravcomp)):
-            yield f"body {b}", GravityCompensation(self.names[b], float(m.body_gravcomp[b]))
+            moving = self._tree.moving(self.names[b])
+            without = tuple(x for x in names if x in moving)
+            yield f"body {b}", GravityCompensation(self.names[b], float(m.body_gravcomp[b]), without)
 
     def _couplings(self) -> Iterator[tuple[str, JointCoupling]]:
         """Yield what tendons and actuators do as springs, dampers and rotors on sums of joint coordinates."""

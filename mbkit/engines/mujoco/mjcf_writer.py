@@ -143,6 +143,7 @@ def _joint(joint: Any, owner: Joint) -> str:
     else:
         attributes |= {"pos": joint.pos} if kind == "ball" else {}
         attributes["damping"] = owner.damping[-1] or None
+    attributes["actuatorgravcomp"] = "true" if joint.actgravcomp else None
     return _attributes(**attributes)
 
 

@@ -175,6 +175,9 @@ def specified(description: Model, softness: Softness | None = None) -> tuple[Any
         # A body without mass, within a stack, has no weight.
         if force.body in placed.bodies:
             placed.bodies[force.body].gravcomp = force.fraction
+        for name in (x for joint in force.without for x in placed.joints[joint]):
+            # It would be an actuator's, and there are none.
+            spec.joint(name).actgravcomp = True
     _add_springs(spec, description, placed)
     _add_couplings(spec, description, placed)
     _add_loops(spec, description, placed, softness or Softness())
@@ -191,6 +194,11 @@ def not_held(description: Model) -> Iterator[str]:
             yield f"loop {loop.name!r} is {loop.kind}, and MuJoCo has no such equality, only points and frames"
     for motion in description.prescribed:
         yield f"joint {motion.joint!r} is moved in time, and MuJoCo's equality of a joint holds a constant alone"
+    held = _held(description)
+    for force in held:
+        for joint in force.without:
+            if other := next((f for f in held if joint not in f.without and joint in description.moving(f.body)), None):
+                yield f"{force}, and that of {other.body!r} does; MuJoCo has one answer for each joint"
     for part in description.no_slip:
         yield f"no slip {part.name!r} ({part.kind}) holds velocities, and MuJoCo's equalities hold positions alone"
 

@@ -238,11 +238,11 @@ class ElementBuilder:
         frame = self._read.name(f"{item}: frame", frame)
         self._add(FrameForce, "forces", "force", name, {}, {"frame": frame, "axes": axes} | formulas | constants)
 
-    def add_gravity_compensation(self, body: str, fraction: Number = 1.0) -> None:
+    def add_gravity_compensation(self, body: str, fraction: Number = 1.0, *, without: Sequence[str] = ()) -> None:
         """Hold a part of a body's weight by a force at its centre of mass, as MuJoCo's ``gravcomp`` does.
 
         The force -fraction m g, N, is one of the passive forces; `gravity` and `nle` keep the whole weight. It has a
-        potential energy.
+        potential energy, unless joints are left out.
 
         Parameters
         ----------
@@ -250,6 +250,8 @@ class ElementBuilder:
             It has one compensation at most.
         fraction : float
             Of the weight: 1 holds all of it, and more lifts the body. It may be a `Parameter`.
+        without : sequence of str
+            Joints at which it does not act, as where actuators take its part.
 
         Examples
         --------
@@ -263,10 +265,12 @@ class ElementBuilder:
         [[9.81], [7.3575]]
         """
         body = self._read.name("gravity compensation: body", body)
-        values = {"fraction": fraction}
+        name = GravityCompensation.named(body)
+        joints = tuple(without) if isinstance(without, (list, tuple)) else (without,)
+        ready = {"without": tuple(self._read.name(f"{name}: without", x) for x in joints)}
         self._add(
             lambda _, **numbers: GravityCompensation(body, **numbers),
-            *("forces", "force", GravityCompensation.named(body), values),
+            *("forces", "force", name, {"fraction": fraction}, ready),
         )
 
     def add_bushing(

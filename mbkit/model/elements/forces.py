@@ -64,6 +64,11 @@ class Force(_Frozen):
         return False
 
     @property
+    def drives(self) -> bool:
+        """Whether it may add energy, as a force beside a potential does."""
+        return self.formula is not None
+
+    @property
     def of_time(self) -> bool:
         """Whether it depends on the time itself."""
         return TIME in self.arguments
@@ -247,17 +252,20 @@ class Bushing(Force):
 class GravityCompensation(Force):
     """A force at a body's centre of mass that holds a part of its weight: -fraction m g.
 
-    It has the potential energy fraction m g · p_com. MuJoCo calls it ``gravcomp``.
+    It has the potential energy fraction m g · p_com, unless joints are left out. MuJoCo calls it ``gravcomp``.
 
     Attributes
     ----------
     body : str
     fraction : float
         Of the weight; 1 holds all of it.
+    without : tuple of str
+        Joints at which it does not act, as where actuators take its part.
     """
 
     body: str
     fraction: float
+    without: tuple[str, ...] = ()
 
     #: It has no formula.
     formula = potential = None
@@ -290,9 +298,19 @@ class GravityCompensation(Force):
         names = [b.name for b in model.bodies]
         if self.body not in names:
             yield _unknown("body", self.body, names)
+        joints = [j.name for j in model.joints]
+        yield from (_unknown("joint", name, joints) for name in self.without if name not in joints)
+        if self.without and any(j.mimic for j in model.joints):
+            yield "joints left out beside joints that mimic others; leave none out"
+
+    @property
+    def drives(self) -> bool:
+        """Whether joints are left out."""
+        return bool(self.without)
 
     def __str__(self) -> str:
-        return f"gravity compensation of {self.body!r}: {self.fraction:g} of its weight"
+        at = f", but not at {', '.join(self.without)}" if self.without else ""
+        return f"gravity compensation of {self.body!r}: {self.fraction:g} of its weight{at}"
 
 
 def _listed(names: tuple[str, ...]) -> str:
@@ -321,8 +339,8 @@ def needs_time(model: _Model) -> bool:
 
 
 def drives(model: _Model) -> bool:
-    """Return whether a force may add energy: whether any has a formula beside its potential."""
-    return any(f.formula is not None for f in model.forces)
+    """Return whether a force may add energy."""
+    return any(f.drives for f in model.forces)
 
 
 def lost(model: _Model) -> bool:

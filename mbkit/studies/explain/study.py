@@ -201,14 +201,18 @@ class _Descriptions:
         ours, theirs = ({f.body: f for f in x.forces if isinstance(f, GravityCompensation)} for x in (a, b))
         near, causes, found = Tolerances.of(a, self.tolerance), [], {g.term: g for g in out.gaps}
         for body in dict.fromkeys([*ours, *theirs]):
-            one, other = (side[body].fraction if body in side else 0.0 for side in (ours, theirs))
-            if near.number(one, other):
+            held = [side.get(body) or GravityCompensation(body, 0.0) for side in (ours, theirs)]
+            one, other = held
+            if near.number(one.fraction, other.fraction) and one.without == other.without:
                 continue
             model = a if body in ours else b
-            sides = (replace(model, forces=(GravityCompensation(body, x),)) for x in (one, other))
-            effects = self._gaps(*sides)
-            says = f"holds {number_text(other)} of its weight for {number_text(one)}"
-            h = Hypothesis("gravity compensation", f"body {body!r}", says, a=one, b=other)
+            known = {j.name for j in model.joints}
+            held = [replace(x, without=tuple(j for j in x.without if j in known)) for x in held]
+            effects = self._gaps(*(replace(model, forces=(x,)) for x in held))
+            says = f"holds {number_text(other.fraction)} of its weight for {number_text(one.fraction)}"
+            if near.number(one.fraction, other.fraction):
+                says = "holds its weight at other joints"
+            h = Hypothesis("gravity compensation", f"body {body!r}", says, a=one.fraction, b=other.fraction)
             causes.append(self._cause(h, effects.effects))
             if out.comparable:
                 found |= {g.term: max(g, found.get(g.term, g), key=lambda x: x.relative) for g in effects.terms}
