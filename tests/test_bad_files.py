@@ -483,7 +483,6 @@ MJCFS = {
     "no_bodies": (mjcf(""), ["no bodies"]),
     "no_joints": (mjcf('<body><geom size="1"/></body>'), ["no joints", "floating_base=True"]),
     "attach": (mjcf(f'{BODY}<attach model="m" body="b" prefix="p"/>'), ["<attach> is not read", "names another model"]),
-    "replicate": (mjcf(f'<replicate count="3">{BODY}</replicate>'), ["<replicate> is not read"]),
     "mesh_inertia": (
         mjcf(
             '<body name="b"><joint/><geom type="mesh" mesh="m"/></body>', '<asset><mesh name="m" file="m.stl"/></asset>'

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -153,3 +154,56 @@ def test_faults_of_gravity_compensation_are_named() -> None:
     assert "unknown body 'lnik'; did you mean 'link'?" in str(caught.value)
     assert "declared 2 times" in str(caught.value)
     assert "unknown joint 'hnige'" in str(caught.value)
+
+
+# Copies
+
+
+REPLICATED = """<mujoco model="ring"><compiler eulerseq="XYz"/>
+  <default><default class="light"><geom density="300"/></default></default>
+  <worldbody><body name="hub" pos="0 0 1"><joint name="spin" axis="0 0 1"/>
+    <geom type="box" size=".2 .3 .1"/><site name="o"/>
+    <replicate count="3" offset=".1 .02 .0333333333333" euler="10 20 33.333333333" sep="_" childclass="light">
+      <frame pos="1 .1 0"><body name="arm"><joint name="j" axis="1 2 0" damping=".1"/>
+        <geom size=".1 .2" type="capsule"/><site name="s" pos=".1 .2 .3"/>
+        <replicate count="2" euler="0 90 0"><body name="tip" pos=".3 0 0"><joint name="k" type="slide" axis="1 0 .1"/>
+          <geom size=".05" pos=".1 0 0"/></body></replicate></body></frame></replicate>
+    <body name="last"><joint name="z" axis="1 0 0"/><geom size=".1" pos="0 0 .3"/></body></body></worldbody>
+  <tendon><fixed name="t" stiffness="2" damping=".3"><joint joint="j" coef="1.5"/>
+    <joint joint="spin" coef="-.7"/></fixed>
+    <fixed stiffness="1"><joint joint="k" coef="1"/></fixed></tendon>
+  <actuator><position joint="k" kp="3" kv="1"/><damper tendon="t" kv="1" ctrlrange="0 1"/></actuator>
+  <equality><joint joint1="j" joint2="spin" polycoef=".1 2 0 0 0"/><connect body1="arm" anchor="1 2 3"/></equality>
+</mujoco>"""
+
+
+def test_copies_are_those_of_mujoco(tmp_path: Path) -> None:
+    path = written(REPLICATED, tmp_path)
+    model, _ = check(path, ("lagrangian", "mujoco"), actuators=True, loops=False)
+    compiled = mujoco.MjModel.from_xml_string(REPLICATED)
+    assert [b.name for b in model.bodies if not b.name.startswith("hub_")] == [
+        compiled.body(i).name for i in range(1, compiled.nbody)
+    ]
+    assert list(model.joint_names) == [compiled.joint(i).name for i in range(compiled.njnt)]
+    (note,) = (n for n in model.notes if "<replicate>" in n)
+    assert all(x in note for x in ("3 copies (line 5)", "2 copies (line 8)", "left out, as by MuJoCo (joint, line 15)"))
+    assert len(mb.load(path).loops) == compiled.neq == 3
+    (read,) = mb.compare_parsers(path, ("mujoco",), samples=1).importers
+    assert read.agrees
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (('count="3"', 'count="1.5"'), "whole number"),
+        (('count="3"', 'count="100000000"'), "whole number up to"),
+        (('count="3"', ""), "count"),
+        (('sep="_"', 'pos="1 0 0"'), "unknown attribute 'pos'"),
+        (('<frame pos="1 .1 0">', '<frame pos="1 .1 0"/><joint/><frame>'), "<joint> is not copied"),
+    ],
+)
+def test_faults_of_copies_are_named(change: tuple[str, str], said: str, tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=said):
+        mb.load(written(REPLICATED.replace(*change), tmp_path))
+    none = mb.load(written(REPLICATED.replace('count="3"', 'count="0"').split("<tendon")[0] + "</mujoco>", tmp_path))
+    assert list(none.joint_names) == ["spin", "z"]

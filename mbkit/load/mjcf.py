@@ -23,14 +23,13 @@ from mbkit.load.mjcf_attributes import Compiler, Defaults, about, check_names
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, name_list
 from mbkit.load.mjcf_couplings import Transmissions
 from mbkit.load.mjcf_equalities import Equalities
-from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, add_free_base, read_tree
+from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, add_free_base, read_tree, write_out_copies
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Model, ModelBuilder
 
 _REFUSED: Final = {
     "attach": "it names another model; save the compiled model as one XML",
-    "replicate": "write the copies out; MuJoCo's save as XML does",
     "composite": "write its bodies out; MuJoCo's save as XML does",
     "flexcomp": "deformable bodies are not rigid; remove it",
 }
@@ -58,10 +57,12 @@ def model_of_mjcf(
     for element in mujoco.walk():
         if element.tag in _REFUSED:
             read.fault(f"<{element.tag}> is not read: {_REFUSED[element.tag]}", element)
+    compiler = Compiler.of(mujoco, read)
+    copied = write_out_copies(mujoco, compiler, read)
     misspelt = check_names(mujoco, read)
     if floating_base:
         add_free_base(mujoco, read)
-    scene = Scene(Compiler.of(mujoco, read), Defaults(mujoco, read), read)
+    scene = Scene(compiler, Defaults(mujoco, read), read)
     read_tree(mujoco, scene)
     flags: dict[str, str] = {}
     own_gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
@@ -97,7 +98,7 @@ def model_of_mjcf(
     if read.faults:
         raise ModelError(str(path), read.faults)
     sprung = f"stiffness and damping from MuJoCo's compiler (springdamper): {name_list(springs)}" if springs else ""
-    for note in (*_notes(mujoco, path, scene, flags, scale), inferred, sprung, misspelt, snap.note):
+    for note in (*_notes(mujoco, path, scene, flags, scale), copied, inferred, sprung, misspelt, snap.note):
         if note:
             b.note(note)
     equalities.add_to(b, snap)

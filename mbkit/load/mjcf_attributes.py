@@ -190,11 +190,7 @@ def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
     if name == "axisangle":
         return about(x[:3], compiler.angle * x[3]) if has_length(x[:3]) else None
     if name == "euler":
-        R = np.eye(3)
-        for letter, angle in zip(compiler.eulerseq, compiler.angle * x, strict=True):
-            turn = about(np.eye(3)["xyz".index(letter.lower())], float(angle))
-            R = product(R, turn) if letter.islower() else product(turn, R)
-        return R
+        return from_euler(x, compiler)
     if name == "zaxis":
         return z_to(x) if has_length(x) else None
     if not has_length(x[:3]):
@@ -205,6 +201,15 @@ def _rotation(name: str, x: Array, compiler: Compiler) -> Array | None:
         return None
     second = spatial.normalized(second)
     return np.column_stack([first, second, np.cross(first, second)])
+
+
+def from_euler(angles: Array, compiler: Compiler) -> Array:
+    """Return the rotation by three angles about the axes of ``eulerseq``, in the file's unit."""
+    R = np.eye(3)
+    for letter, angle in zip(compiler.eulerseq, compiler.angle * angles, strict=True):
+        turn = about(np.eye(3)["xyz".index(letter.lower())], float(angle))
+        R = product(R, turn) if letter.islower() else product(turn, R)
+    return R
 
 
 def has_length(x: Array) -> bool:
@@ -237,7 +242,7 @@ _ASIDE: Final = (
     *("texture", "material", "skin", "hfield", "camera", "light"),
 )
 # These are refused or not read.
-_UNREAD: Final = frozenset({"replicate", "attach", "composite", "flexcomp", "plugin"})
+_UNREAD: Final = frozenset({"attach", "composite", "flexcomp", "plugin"})
 
 
 @dataclass(frozen=True)

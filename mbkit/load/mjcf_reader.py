@@ -8,18 +8,31 @@ Inertia by MuJoCo's rules: geoms with a group in ``inertiagrouprange`` and more 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 
+from mbkit import spatial
 from mbkit._check import Array
 from mbkit._reproducible import length, product, turned
-from mbkit.load.mjcf_attributes import HERE, ORIENTATIONS, Compiler, Defaults, Pose, has_length, pose, z_to
+from mbkit.load.mjcf_attributes import (
+    HERE,
+    ORIENTATIONS,
+    Compiler,
+    Defaults,
+    Pose,
+    from_euler,
+    has_length,
+    pose,
+    z_to,
+)
 from mbkit.load.shapes import NOTHING, SIZES, MassProperties, solid, together
 from mbkit.load.urdf_reader import BASE_JOINT
-from mbkit.load.xml_reader import Element, Reader, unused
+from mbkit.load.xml_reader import MOST_ELEMENTS, Element, Reader, unused
+from mbkit.model.validation import listing
 
 KINDS: Final = {"hinge": "revolute", "slide": "prismatic", "ball": "ball", "free": "free"}
 _JOINTS: Final = ("joint", "freejoint")
@@ -108,6 +121,118 @@ class Scene:
         name = unused(name, self.names[kind])
         self.names[kind].add(name)
         return name
+
+
+# Copies
+
+_OF_COPIES: Final = frozenset({"name", "count", "sep", "offset", "euler", "class", "childclass"})
+#: Sections whose elements are copied where they name something that is copied.
+_NAMING: Final = ("tendon", "actuator", "equality")
+#: What an attribute names; a final 1 or 2 is left out.
+_NAMES: Final = {
+    **{kind: kind for kind in ("body", "joint", "site", "geom", "tendon")},
+    **dict.fromkeys(("refsite", "sidesite", "cranksite", "slidersite"), "site"),
+    "jointinparent": "joint",
+}
+
+
+def write_out_copies(mujoco: Element, compiler: Compiler, read: Reader) -> str:
+    """Write the copies of every <replicate> in its place, as MuJoCo 4.0.0 does, and return a note.
+
+    Copy k stands in a <frame> turned by k times the angles, an offset in the axes of the copy before away from it, and
+    has the number k behind its names. Tendons, actuators and equalities that name something in it are copied with it.
+    """
+    copier = _Copier(mujoco, compiler, read)
+    for world in mujoco.all("worldbody"):
+        copier.write_out(world)
+    return f"<replicate> written out: {listing(copier.told, 6)}" if copier.told else ""
+
+
+@dataclass
+class _Copier:
+    """Writes <replicate> elements out, up to a number of elements."""
+
+    mujoco: Element
+    compiler: Compiler
+    read: Reader
+    told: list[str] = field(default_factory=list)
+    left: int = MOST_ELEMENTS
+
+    def write_out(self, owner: Element) -> None:
+        """Write out all copies below an element."""
+        children: list[Element] = []
+        for child in owner.children:
+            # What is inside is written out first: its numbers stand before those of this one.
+            self.write_out(child)
+            if child.tag == "replicate":
+                copies = self._copies(child)
+                self.told.append(f"{len(copies)} copies ({child.place})")
+                self.told += _copy_naming(self.mujoco, child, copies)
+                children += copies.values()
+            else:
+                children.append(child)
+        owner.children = children
+
+    def _copies(self, element: Element) -> dict[str, Element]:
+        """Return a <frame> for each copy by its suffix; none after a fault."""
+        item, own, read = "<replicate>", element.attributes, self.read
+        for name in own.keys() - _OF_COPIES:
+            read.fault(f"{item}: unknown attribute {name!r}; there are: {', '.join(sorted(_OF_COPIES))}", element)
+        for child in element.children:
+            if child.tag in (*_JOINTS, "inertial"):
+                read.fault(f"{item}: <{child.tag}> is not copied; put it into a <body>", child)
+        count, size = read.number(element, "count", item), sum(1 for _ in element.walk())
+        if count != int(count) or count * size > self.left:
+            most = self.left // size
+            read.fault(f"{item}: count {own.get('count', '')[:40]!r}; expected a whole number up to {most}", element)
+            return {}
+        self.left -= int(count) * size
+        offset, angles = (
+            np.array(read.numbers(element, name, item, count=3, default=(0, 0, 0))) for name in ("offset", "euler")
+        )
+        p, out = np.zeros(3), dict[str, Element]()
+        for k in range(int(count)):
+            # MuJoCo multiplies the angles, which is no power of one turn.
+            R = from_euler(k * angles, self.compiler)
+            suffix = f"{own.get('sep', '')}{k:0{len(str(int(count)))}d}"
+            x, y, z, w = spatial.quaternion_from_matrix(R)
+            at = {n: " ".join(repr(float(c)) for c in xs) for n, xs in (("pos", p), ("quat", (w, x, y, z)))}
+            at |= {n: own[n] for n in ("class", "childclass") if n in own}
+            out[suffix] = replace(_suffixed(element, suffix), tag="frame", attributes=at)
+            p = p + product(R, offset)
+        return out
+
+
+def _suffixed(element: Element, suffix: str, names: Mapping[str, Container[str]] = MappingProxyType({})) -> Element:
+    """Return a copy with a suffix behind all names, and behind the names of those to which it refers."""
+    own = {
+        key: x + suffix if key == "name" or x in names.get(_NAMES.get(key.rstrip("12"), ""), ()) else x
+        for key, x in element.attributes.items()
+    }
+    return replace(element, attributes=own, children=[_suffixed(e, suffix, names) for e in element.children])
+
+
+def _copy_naming(mujoco: Element, element: Element, suffixes: Iterable[str]) -> Iterator[str]:
+    """Copy the elements that name something in a <replicate>, and yield those that MuJoCo leaves out."""
+    names: dict[str, set[str]] = {}
+    for inner in element.walk():
+        if inner is not element and inner.tag in _NAMES and "name" in inner.attributes:
+            names.setdefault(inner.tag, set()).add(inner.attributes["name"])
+    for tag in _NAMING:
+        for section in mujoco.all(tag):
+            kept, copied = list[Element](), list[Element]()
+            for e in section.children:
+                ends = [(_NAMES.get(k.rstrip("12"), ""), x) for y in e.walk() for k, x in y.attributes.items()]
+                inside = [x in names.get(kind, ()) for kind, x in ends if kind]
+                if not any(inside):
+                    kept.append(e)
+                elif tag == "equality" and not all(inside):
+                    yield f"an equality with one end in them is left out, as by MuJoCo ({e.tag}, {e.place})"
+                else:
+                    copied += [_suffixed(e, suffix, names) for suffix in suffixes]
+                    if tag == "tendon" and "name" in e.attributes:
+                        names.setdefault(tag, set()).add(e.attributes["name"])
+            section.children = [*kept, *copied]
 
 
 def frame_contents(
