@@ -431,7 +431,7 @@ def test_cvodes_keeps_all_that_was_reached(capfd: pytest.CaptureFixture[str]) ->
     save = np.linspace(0, 2, 201)
     # The bob falls freely, so θ = 0 is reached after √(2 (1 - cos 1) / g).
     down = np.sqrt(2 * (1 - np.cos(1.0)) / 9.81)
-    with pytest.warns(MbkitWarning, match=r"cvodes step below rounding .* after t = 0\.3 s") as heard:
+    with pytest.warns(MbkitWarning, match=r"cvodes stopped with a step below rounding .* after t = 0\.3 s") as heard:
         run = simulate(dyn, [0.0, 1.0], [0.0, 0.0], 2.0, "cvodes", save=save)
     assert len(heard) == 1
     assert run.stats.ended == "step_too_small"

@@ -38,6 +38,9 @@ _TAKES_PART: Final = 0.1
 _STILL: Final = 1e-7
 #: Of γ: its rest at a velocity of rounded digits that stays on a branch.
 _ON_BRANCH: Final = 1e-6
+#: Of J's largest singular value, the smallest one below which a step is one across the pose. v̇ from the equation of
+#: motion loses eps/σ² of itself, `LOOSEST` at a tenth of this; begun there, the step's own stages would be in the pose.
+_WORSE: Final = 10 * float(np.sqrt(np.finfo(float).eps / LOOSEST))
 #: Of the motion's time scale: the difference of times by which J's rate is found.
 _APART: Final = 1e-4
 #: Where a step of rk853 has the pose: in the middle of the widest gap between its stages, 1/3 and 0.6.
@@ -59,11 +62,12 @@ def _known(dyn: Dynamics, t: float) -> float:
 
 
 class _Slopes(NamedTuple):
-    """J, γ, M and the force of gravity, springs and velocities at a state, and how J and γ change from there.
+    """v, J, γ, M and the force of gravity, springs and velocities at a state, and how J and γ change from there.
 
     J̇ and `gamma_rate` are along the motion with constant velocity; `by_velocity` is ∂γ/∂v.
     """
 
+    v: Array
     J: Array
     gamma: Array
     M: Array
@@ -88,7 +92,7 @@ def _slopes(manifold: Manifold, t: float, q: Array, v: Array) -> _Slopes:
         both.append((J1, gamma1[:, 0]))
     (J1, g1), (J0, g0) = both
     by_velocity = (here[2][1 : n + 1, :, 0] - here[2][n + 1 :, :, 0]).T / (2 * around[0, 0])
-    return _Slopes(J, gamma[:, 0], M, force[:, 0], (J1 - J0) / (2 * apart), (g1 - g0) / (2 * apart), by_velocity)
+    return _Slopes(v, J, gamma[:, 0], M, force[:, 0], (J1 - J0) / (2 * apart), (g1 - g0) / (2 * apart), by_velocity)
 
 
 class Passage:
@@ -128,8 +132,11 @@ class Passage:
         turning = self._turned(x.J_rate) @ self._free
         if not np.linalg.svd(turning, compute_uv=False)[-1] > _STILL:
             return "its velocity does not say on which branch it goes on"
-        if not np.abs(self._turned(x.gamma)).max() <= _ON_BRANCH * max(1.0, float(np.abs(x.gamma).max()) / self._size):
-            return "its velocity is on none of the branches"
+        rest = float(np.abs(self._turned(x.gamma)).max())
+        if not rest <= _ON_BRANCH * max(1.0, float(np.abs(x.gamma).max()) / self._size):
+            # γ is quadratic in v, and zero in these rows on a branch.
+            most = float(np.abs(self._turned(x.by_velocity)).sum(axis=1).max()) * float(np.abs(x.v).max())
+            return f"its velocity is off each branch by {rest / most:.1g} of its size"
         return ""
 
     def acceleration(self, tau: Array) -> Array:
@@ -180,11 +187,14 @@ class Approach:
         known.
     ahead : float
         Of one state: when σ will be zero at its present rate, s from the last end; negative where it was before.
+    worse : bool
+        Whether v̇ from the equation of motion has too few digits there for a series.
     """
 
     def __init__(self) -> None:
         self.near, self.ahead = True, np.inf
         self._sizes: Array | float = np.inf
+        self.worse = False
 
     def saw(self, dyn: Dynamics, t: float, q: Array, v: Array) -> None:
         """Take in the end of a step, of one state or a batch."""
@@ -202,6 +212,7 @@ class Approach:
         known = np.shape(self._sizes) == np.shape(least)
         change = np.abs(least - self._sizes) if known else np.full(np.shape(least), np.inf)
         self.near, self._sizes, self.ahead = bool((~(least >= _AHEAD * change)).any()), least, np.inf
+        self.worse = bool((least <= _WORSE * sizes[0, ..., 0]).any())
         if q.ndim == 1:
             rate = (beside[0] - beside[1]) / (2 * apart) if alone else 0.0
             if least <= AT_POSE * sizes[0, 0]:

@@ -127,8 +127,8 @@ class _Solve:
             raise KeyboardInterrupt
         if "RHSFUNC" in code:
             return diverged(f"the acceleration is not finite ({code})")
-        why = f"step below rounding at rtol = {self._rtol:g}: stiff, singular or diverging ({code or message})"
-        return StoppedError("step_too_small", why)
+        why = f"stopped with a step below rounding at rtol = {self._rtol:g}: stiff, singular or diverging"
+        return StoppedError("step_too_small", f"{why} ({code or message})")
 
 
 def _graph(dyn: LagrangianDynamics) -> ca.Function:

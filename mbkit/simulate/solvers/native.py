@@ -79,7 +79,7 @@ def run_drake(problem: IntegrationProblem) -> SolverResult:
                 y = np.concatenate(run.over(t))
             except RuntimeError as error:
                 text = str(error).strip().splitlines()[0]
-                why = f"step below the smallest: stiff, singular or diverging ({text})"
+                why = f"stopped with a step below the smallest: stiff, singular or diverging ({text})"
                 raise StoppedError("step_too_small", why) from None
             finally:
                 record.steps, record.rejected = run.steps, run.rejected

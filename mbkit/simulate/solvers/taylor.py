@@ -108,7 +108,11 @@ class _Across:
 
     def crosses(self, h: float) -> bool:
         """Return whether a series of length h from where the last state was would meet a pose."""
-        return self._attempts.approach.crosses(h)
+        approach = self._attempts.approach
+        # A series of a tight tolerance has short steps beside a pose, as it meets the digits that v̇ loses there.
+        out = approach.crosses(h) or approach.worse
+        approach.near = approach.near or out
+        return out
 
     def step(self, k: int, stop: float) -> tuple[float, Array]:
         """Return the time and the state after a step; `StoppedError` where there is none."""
@@ -197,13 +201,13 @@ class TaylorSteps:
                 elif outcome != self._success:
                     raise self._without_series()
                 elif h < least:
-                    raise StoppedError("step_too_small", "step below rounding: singular or diverging")
+                    raise StoppedError("step_too_small", "stopped with a step below rounding: singular or diverging")
                 if not is_bounded(rounded(state)):
                     raise StoppedError("diverged", DIVERGED)
                 if self._system.kinked and self._jumped(float(h), force(k)):
                     raise StoppedError(
                         "step_too_small",
-                        f"a force jumps, which a series cannot follow and method={ADAPTIVE_METHOD!r} can,",
+                        f"stopped where a force jumps, which a series cannot follow (method={ADAPTIVE_METHOD!r} can),",
                     )
                 if self._settled is not None:
                     state[:] = self._settled(float(integrator.time), rounded(state))
@@ -227,7 +231,7 @@ class TaylorSteps:
         if np.isfinite(series[:, :2]).all() and np.isnan(series[:, 2:4]).any():
             return StoppedError(
                 "step_too_small",
-                f"a root or power of zero, which has no Taylor series and method={ADAPTIVE_METHOD!r} goes past,",
+                f"stopped at a root or power of zero, which has no series (method={ADAPTIVE_METHOD!r} goes past it),",
             )
         return StoppedError("diverged", DIVERGED)
 
@@ -240,7 +244,9 @@ class TaylorSteps:
         order = series.shape[1] - 1
         orders = np.arange(max(1, order - 5), order + 1)
         sizes = np.maximum(series[:, orders].max(axis=0), np.finfo(float).tiny)
-        radius = (max(1.0, series[:, 0].max()) / sizes) ** (1 / orders)
+        with np.errstate(over="ignore"):
+            # Terms that all vanish bound no radius.
+            radius = (max(1.0, series[:, 0].max()) / sizes) ** (1 / orders)
         return float(radius.min() * np.exp(-2 - 0.7 / (order - 1)))
 
     def _jumped(self, h: float, force: Array) -> bool:

@@ -45,7 +45,9 @@ def below_rounding(tolerances: Tolerances) -> StoppedError:
     """Return the end of a run where no step is long enough to change the time."""
     rtol, atol = tolerances
     own = "" if atol == rtol else f", atol = {atol:g}"
-    return StoppedError("step_too_small", f"step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging")
+    return StoppedError(
+        "step_too_small", f"stopped with a step below rounding at rtol = {rtol:g}{own}: stiff, singular or diverging"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +128,8 @@ class TrajectoryRecord:
         elif lost:
             self.stop(diverged())
         elif passed:
-            why = "a singular pose, which a method of several steps leaves on any branch and"
-            self.stop(StoppedError("step_too_small", f"{why} method={ADAPTIVE_METHOD!r} on its own,"))
+            why = "stopped past a singular pose, which a method of several steps leaves on any branch"
+            self.stop(StoppedError("step_too_small", f"{why} (method={ADAPTIVE_METHOD!r} on its own),"))
         return hit is None and not lost and not passed
 
     def _passed(self, poses: SingularPoses, accepted: AcceptedSteps, steps: int) -> bool:
@@ -212,7 +214,7 @@ class TrajectoryRecord:
         covered = self.reached - since
         self._look = attempts, self.reached
         if covered < _COVERED * self._problem.duration:
-            why = f"{attempts - before} steps covered {covered:.2g} s alone: stiff, singular or diverging"
+            why = f"stopped, as {attempts - before} steps covered {covered:.2g} s alone: stiff, singular or diverging"
             self.stop(StoppedError("step_too_small", why))
             return True
         return False
