@@ -207,3 +207,25 @@ def test_faults_of_copies_are_named(change: tuple[str, str], said: str, tmp_path
         mb.load(written(REPLICATED.replace(*change), tmp_path))
     none = mb.load(written(REPLICATED.replace('count="3"', 'count="0"').split("<tendon")[0] + "</mujoco>", tmp_path))
     assert list(none.joint_names) == ["spin", "z"]
+
+
+# Springs whose rest MuJoCo measures, and of several coordinates
+
+RESTING = """<mujoco model="tied"><worldbody><site name="o" pos=".1 .2 .3"/>
+  <body name="base" pos="0 .3 1" euler="10 20 30"><freejoint name="f"/><geom type="box" size=".1 .2 .3" pos=".2 .1 .3"/>
+    <site name="b" pos=".3 .1 0"/>
+    <body name="link" pos="0 0 .6" euler="0 10 0"><joint name="j" axis="1 0 .2" pos="0 .1 0" ref="15" springref="40"/>
+      <geom size=".1" pos=".1 0 .2"/><body name="end" pos=".1 .2 .3" euler="3 2 1">
+      <joint name="k" type="slide" axis="1 1 0" ref=".1" springref="-.2"/><joint name="l" type="ball"/>
+      <geom size=".1 .2" type="capsule" pos="0 0 .3"/><site name="e" pos=".2 .3 .4"/></body></body></body></worldbody>
+  <tendon><spatial name="free" stiffness="3" damping=".1"><site site="o"/><site site="e"/></spatial>
+    <spatial name="inner" stiffness="2" springlength="-1 -1"><site site="b"/><site site="e"/></spatial>
+  </tendon></mujoco>"""
+
+
+def test_a_tendon_rests_at_the_length_that_mujoco_measures(tmp_path: Path) -> None:
+    model, _ = check(written(RESTING, tmp_path))
+    assert [s.name for s in model.springs] == ["free", "inner"]
+    compiled = mujoco.MjModel.from_xml_string(RESTING)
+    lengths = [s.rest_length for s in model.springs]
+    np.testing.assert_allclose(lengths, compiled.tendon_lengthspring[:, 0], rtol=1e-14)

@@ -15,7 +15,10 @@ from typing import Final
 
 import numpy as np
 
+from mbkit import spatial
 from mbkit._check import Array
+from mbkit._reproducible import length
+from mbkit.load.mjcf_attributes import HERE, Pose
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
 from mbkit.load.xml_reader import LARGEST, Element, Reader, unused
 from mbkit.model import Joint, JointCoupling, Model, PointSpring
@@ -116,6 +119,7 @@ class _Acting:
     armature: float = 0.0
     dampratio: float = 0.0  # of the critical damping at the pose of the file
     ends: tuple[tuple[str, Array], ...] = ()  # bodies and points whose distance is l, if any
+    measured: bool = False  # whether the rest length is that distance where the springs of joints rest
     control: str = ""  # description of an actuator's control, which is left out
     servo: str = ""  # description of its force at zero control
     left_out: list[str] = field(default_factory=list)
@@ -228,8 +232,9 @@ class Transmissions:
         out.armature = read.number(full, "armature", item, 0.0)
         first, *second = read.numbers(full, "springlength", item, count=2, least=1, default=(-1.0,))
         out.rest_length = first
-        if first == -1.0 and all(x == -1.0 for x in second) and not out.ends:
-            # The distance of two points in the pose of the file is not computed.
+        if first == -1.0 and all(x == -1.0 for x in second):
+            # The distance of two points is measured once there is a tree.
+            out.measured = bool(out.ends)
             out.rest_length = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
         elif out.stiffness and second and second[0] != first:
             out.left_out.append(f"stiffness {out.stiffness:g} with a range of rest lengths, {first:g} to {second[0]:g}")
@@ -296,6 +301,11 @@ class Transmissions:
     def applied(self, model: Model) -> Model:
         """Return the model with these springs, dampers and rotors, and with notes on them and on parts left out."""
         acting = [x for x in (*self._tendons, *self._actuators) if x.acts]
+        if measured := [x for x in acting if x.measured]:
+            places = self._resting(model)
+            for x in measured:
+                a, b = (places[body] @ Pose(np.eye(3), point) for body, point in x.ends)
+                x.rest_length = length(b.p - a.p)
         springs = tuple(x.point_spring() for x in acting if x.ends)
         out = with_couplings(replace(model, springs=springs), [x.coupling() for x in acting if not x.ends])
         ratios = []
@@ -309,6 +319,23 @@ class Transmissions:
         if branched := ", ".join(repr(c.name) for c in out.couplings if c.armature and out.branched(c)):
             notes.append(f"the armature of {branched} acts between branches; MuJoCo 4.0 leaves it out of M there")
         return replace(out, notes=tuple(notes))
+
+    def _resting(self, model: Model) -> dict[str, Pose]:
+        """Return the poses of the bodies where the springs of all joints rest; MuJoCo's ``qpos_spring``."""
+        q = model.neutral()
+        for body in self._scene.bodies:
+            for joint in body.joints:
+                at = model.layout.q[joint.name]
+                if joint.scalar:
+                    q[at] = self._spring_reference(joint.name)
+                elif joint.kind == "free":
+                    q[at] = *body.pose.p, *spatial.quaternion_from_matrix(body.pose.R)
+        places = {"world": HERE}
+        for link in model.tree:
+            R, p = link.type.placement(np, link, list(q[model.layout.full_q[link.name]]))
+            moved = Pose(np.array(R, dtype=float), np.array(p, dtype=float))
+            places[link.child] = places[link.parent] @ Pose(link.rotation, link.translation) @ moved
+        return places
 
     def _reflected(self, model: Model, coupling: JointCoupling) -> float:
         """Return the inertia that a coupling's length moves in the pose of the file; 0 where M is singular for it."""
