@@ -58,7 +58,9 @@ def _as_float(name: str, value: ArrayLike) -> Array:
         why = f" ({error})" if isinstance(error, (ValueError, TypeError)) else ""
         raise InputError(f"{name}: expected an array of numbers, got {type(value).__name__}{why}") from None
     if raw.dtype.kind not in "fiu":
-        raise InputError(f"{name}: expected real numbers, got dtype {raw.dtype}")
+        called = getattr(value, "__name__", "")
+        got = f"a function; call it: {called}()" if called else f"dtype {raw.dtype}"
+        raise InputError(f"{name}: expected real numbers, got {got}")
     return np.asarray(raw, dtype=np.float64)
 
 

@@ -574,3 +574,10 @@ def test_the_entry_point_listens_before_anything_heavy_is_imported():
     code = "import sys; from mbkit import __main__; print(*sorted(sys.modules))"
     run = subprocess.run([sys.executable, "-S", "-c", code], capture_output=True, text=True, check=True)
     assert not {"typing", "click", "numpy", "mbkit.cli", "mbkit.errors"} & set(run.stdout.split())
+
+
+@pytest.mark.usefixtures("here")
+def test_an_option_that_own_parsers_do_not_take_is_named():
+    result = call("check", "ur3", "--own-parsers", "--no-rollouts", "--mimic", "free")
+    assert result.exit_code == 2
+    assert "not --no-rollouts, --mimic" in " ".join(result.stderr.split())

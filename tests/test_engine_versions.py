@@ -19,10 +19,13 @@ import numpy as np
 import pytest
 
 import mbkit as mb
+from mbkit.engines.registry import find_engine
 from mbkit.engines.versions import environment, process
+from mbkit.engines.versions.dynamics import VersionDynamics
 from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion, versions_of
 from mbkit.engines.versions.remote import serve
-from mbkit.errors import EngineProcessError, InputError, UnknownNameError, UnsupportedError
+from mbkit.errors import EngineProcessError, InputError, MbkitError, UnknownNameError, UnsupportedError
+from mbkit.studies._targets import engine_names
 from tests.random_trees import IN_MUJOCO, SOUND, random_tree
 
 ENGINES = tuple(PACKAGES)
@@ -442,3 +445,16 @@ def test_forces_by_functions_are_added_and_no_own_run_leaves_them_out():
         assert value == pytest.approx(truth, rel=1e-12)
     with pytest.raises(UnsupportedError, match="forces of pushed"):
         dyn.rollout([0.4], [0.3], 1e-3, 2)
+
+
+def test_studies_take_the_engines_that_dynamics_takes():
+    """The names alone: an environment is made at the first evaluation."""
+    assert engine_names(["pinocchio", mb.engine("mujoco==3.3.7")]) == ("pinocchio", "mujoco==3.3.7")
+    assert engine_names(("drake==1.40.0",)) == ("drake==1.40.0",)
+    for bad, words in (
+        ("mujoco==x", "expected an engine and its version"),
+        ("mujocco==3.3.7", "did you mean 'mujoco'"),
+    ):
+        with pytest.raises(MbkitError, match=words):
+            engine_names([bad])
+    assert find_engine("mujoco==3.3.7").load() is VersionDynamics

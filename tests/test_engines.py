@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 import mbkit as mb
+from mbkit._attributes import ELSEWHERE
 from mbkit.engines import ENGINES, QUANTITIES, Dynamics
-from mbkit.errors import InputError, MbkitError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, MbkitError, MbkitWarning, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.model import kind_of
 from mbkit.model.joint_types import KINDS
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
@@ -591,3 +592,51 @@ def test_a_spring_that_needs_a_direction_is_refused_where_it_has_none(way, axes,
     if way == "mujoco":
         with pytest.raises(NumericalError, match="'s'"):
             dyn.rollout("rk4", zero, one, 1e-3, None, 2)
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "mujoco", "oracle"])
+def test_a_dynamics_is_read_only_and_knows_what_others_call_its_methods(engine):
+    dyn = mb.dynamics(mb.catalog.pendulum(), engine)
+    for name in ("gravity", "mass_matrix", "model", "supports"):
+        with pytest.raises((InputError, AttributeError), match=r"read-only|no setter"):
+            setattr(dyn, name, 0.0)
+    assert dyn.gravity([0.3]) == pytest.approx(dyn.inverse_dynamics([0.3], [0.0], [0.0]))
+    for name, meant in {
+        "M": "mass_matrix",
+        "crba": "mass_matrix",
+        "qfrc_bias": "nle",
+        "aba": "forward_dynamics",
+    }.items():
+        with pytest.raises(AttributeError, match=f"no attribute '{name}'; did you mean {meant}"):
+            getattr(dyn, name)
+    with pytest.raises(AttributeError, match="did you mean jacobian"):
+        dyn.jacobain  # noqa: B018
+    assert not hasattr(dyn, "_no_such_thing")
+
+
+def test_every_name_of_elsewhere_leads_to_a_method():
+    for meant in ELSEWHERE.values():
+        assert callable(getattr(Dynamics, meant))
+
+
+def test_a_function_in_the_place_of_a_configuration_is_named():
+    model = mb.load("panda")
+    with pytest.raises(InputError, match=r"got a function; call it: neutral\(\)"):
+        mb.dynamics(model).mass_matrix(model.neutral)
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
+def test_one_value_for_each_sample_is_told_to_be_the_own_derivations(engine):
+    model = mb.catalog.pendulum(mass=mb.Parameter("m", 2.0))
+    with pytest.raises(InputError, match=r"'m': expected a number, got shape \(2,\); the lagrangian engine takes one"):
+        mb.dynamics(model, engine).at(m=np.array([1.0, 2.0]))
+
+
+def test_a_seed_that_looks_like_a_number_of_states_is_told():
+    model = mb.catalog.pendulum()
+    with pytest.warns(MbkitWarning, match=r"100 is a seed, of one state; random_state\(seed, 100\) draws 100"):
+        model.random_state(100)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.random_state(7)
+        model.random_state(100, 3)

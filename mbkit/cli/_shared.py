@@ -145,13 +145,16 @@ def in_options(message: str) -> str:
 
 def check_engines(names: tuple[str, ...], least: int) -> None:
     """Raise for names that are no engine's, before anything is read, loaded or computed."""
-    from mbkit.engines.registry import REFERENCE, compared
+    from mbkit.engines.registry import REFERENCE, compared, find_engine
 
     comparable = compared()
     for name in names:
         if name == REFERENCE:
             raise InputError("--engines: the oracle is what every engine is measured by; leave it out")
-        if name not in comparable:
+        if "==" in name:
+            # Another version, by the form of its name.
+            find_engine(name)
+        elif name not in comparable:
             raise UnknownNameError("engine", name, comparable)
     if len(set(names)) < least:
         count = {1: "one", 2: "two"}[least]

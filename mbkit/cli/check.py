@@ -45,12 +45,17 @@ def check(
     TARGET is a robot (mbkit robots lists them), a catalog system, a path to a URDF or
     MJCF file, or package.module:function for a function that returns a Model. Printed are the verdict, what the
     file has that no engine uses, faults, and each engine's worst row; --full and the page have the rest. With
-    --own-parsers it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves; --floating-base then
-    lets its base go in all of them.
+    --own-parsers it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves; with --floating-base
+    its base moves freely in all of them.
     """
-    if own_parsers and (everything or target is None or no_rollouts or options.keys() - {"floating_base"}):
+    others = {"--all": everything, "--no-rollouts": no_rollouts} | dict.fromkeys(
+        options.keys() - {"floating_base"}, True
+    )
+    if own_parsers and (target is None or any(others.values())):
+        given = [f"--{name.strip('-').replace('_', '-')}" for name, on in others.items() if on]
         raise click.UsageError(
             "--own-parsers takes one TARGET as it is written, and --floating-base, --seed, --json and --out"
+            + (f"; not {', '.join(given)}" if given else "")
         )
     if everything and (target is not None or "nonphysical" in options):
         raise click.UsageError("--all takes every robot as it is: without a TARGET and without --nonphysical")

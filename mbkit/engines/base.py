@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mbkit._attributes import ReadOnly, single_values
 from mbkit._check import Array, all_finite, batch_of, real, rows
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
 from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
@@ -125,7 +126,7 @@ def scalar(value: Array | float) -> Any:
     return value if np.ndim(value) else float(value)
 
 
-class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Regressors):
+class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuantities, Regressors):
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
     Every method takes one state or a batch with one leading axis, checks shapes, finite numbers and unit quaternions,
@@ -184,7 +185,8 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
             model.require_values(self.engine)
         if model.constrained and self.lacks_constraints:
             require_tree(model, self.engine, self.lacks_constraints)
-        self.model = model
+        # Also where a copy begins again.
+        vars(self)["model"] = model
 
     @property
     def supports(self) -> frozenset[str]:
@@ -235,7 +237,7 @@ class Dynamics(FramesAndMomenta, IndependentMotion, LinearizationQuantities, Reg
         >>> float(dyn.mass_matrix([0.0])[0, 0]), float(dyn.at(m=3.0).mass_matrix([0.0])[0, 0])
         (2.0, 3.0)
         """
-        return self._at_time(values) or type(self)(self.model.with_nominal(values))
+        return self._at_time(values) or type(self)(self.model.with_nominal(single_values(values)))
 
     def _at_time(self, values: Mapping[str, Any]) -> Self | None:
         """Return the same dynamics, with all that was built, at another time; None for other values."""

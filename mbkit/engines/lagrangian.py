@@ -296,7 +296,7 @@ class LagrangianDynamics(Dynamics):
         # Both share derived and compiled functions, now and later.
         out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
         out.__dict__.pop("parameter_values", None)
-        out.model, out._batched, out._wrenched = model, batched, {}
+        vars(out).update(model=model, _batched=batched, _wrenched={})
         return out
 
     def __reduce__(self) -> tuple[Any, ...]:

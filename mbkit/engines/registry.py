@@ -223,7 +223,10 @@ def load_entry_points() -> None:
 
 
 def find_engine(name: str) -> EngineInfo:
-    """Return an engine's `EngineInfo`; `UnknownNameError` for an unknown name."""
+    """Return an engine's `EngineInfo`, of another version too; `UnknownNameError` for an unknown name."""
+    if isinstance(name, str) and "==" in name:
+        own = "mbkit.engines.versions.dynamics", "VersionDynamics"
+        return EngineInfo(named_version(name).name, None, *own, shown=())
     if name not in ENGINES:
         load_entry_points()
     if name not in ENGINES:

@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, count, generator, real, rows
 from mbkit._escape import html
-from mbkit.errors import ModelError, UnknownNameError, UnsupportedError
+from mbkit._warn import warn
+from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, UnsupportedError
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
 from mbkit.model.description import CONSTRAINT_FEATURES, SERVOS, Description, expect_name
@@ -24,6 +25,8 @@ from mbkit.model.parameters import Parameter
 from mbkit.model.parts import Joint
 from mbkit.model.validation import check_substituted, model_faults
 
+#: Seeds that look like a number of states.
+_ROUND: Final = (100, 1_000, 10_000, 100_000, 1_000_000)
 _PER_VELOCITY: Final = {"damping": "damping", "springs": "stiffness", "armature": "armature", "friction": "friction"}
 #: Elements between joints or points, and the numbers that make them act.
 _ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness", "damping", "armature")}
@@ -123,6 +126,11 @@ class Model(Description):
         """
         if size is not None:
             count("size", size)
+        elif isinstance(rng, (int, np.integer)) and rng in _ROUND:
+            warn(
+                f"random_state({rng}): {rng} is a seed, of one state; random_state(seed, {rng}) draws {rng}",
+                MbkitWarning,
+            )
         rng = generator("rng", rng)
         return _states_of(self).random(rng, size) if self.constrained else manifold.random_state(self, rng, size)
 

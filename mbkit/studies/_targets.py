@@ -15,7 +15,8 @@ from typing import Any, Final
 
 from mbkit import catalog
 from mbkit._check import real
-from mbkit.engines.registry import ENGINES, REFERENCE, compared
+from mbkit.engines.registry import ENGINES, REFERENCE, compared, find_engine
+from mbkit.engines.versions.engine_version import EngineVersion
 from mbkit.engines.versions.engine_version import engine as named_version
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import load
@@ -190,12 +191,16 @@ def numbers_of(what: str, values: object, **sign: bool) -> tuple[float, ...]:
 
 
 def engine_names(engines: object, least: int = 1) -> tuple[str, ...]:
-    """Return the names of engines that can be compared and measured, each once."""
+    """Return the names of engines that can be compared and measured, each once; other versions too, as `dynamics`."""
+    if isinstance(engines, Iterable) and not isinstance(engines, str):
+        engines = [x.name if isinstance(x, EngineVersion) else x for x in engines]
     names, known = names_of("engines", engines), compared()
     for name in names:
         if name == REFERENCE:
             raise InputError("engines: the oracle is the reference by which the others are measured; leave it out")
-        if name not in known:
+        if "==" in name:
+            find_engine(name)
+        elif name not in known:
             raise UnknownNameError("engine", name, known)
     if len(names) < least:
         raise InputError(f"engines: expected at least {least} of {list(known)}, got {list(names)}")

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mbkit._attributes import single_values
 from mbkit._check import Array, batch_of, count, real
 from mbkit._fork import fork_safe
 from mbkit._warn import warn
@@ -91,7 +92,9 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         return _rebuilt, (type(self), self.model, self.softness)
 
     def at(self, /, **values: Any) -> MujocoDynamics:
-        return self._at_time(values) or _rebuilt(type(self), self.model.with_nominal(values), self.softness)
+        return self._at_time(values) or _rebuilt(
+            type(self), self.model.with_nominal(single_values(values)), self.softness
+        )
 
     def _hold(self, compiled: MujocoModel) -> None:
         self._maps = compiled
