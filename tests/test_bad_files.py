@@ -556,17 +556,13 @@ MJCFS = {
         mjcf('<body name="b"><freejoint/><joint/><geom size="1"/></body>'),
         ["body 'b': a free joint and others"],
     ),
-    "armature_on_ball": (
-        mjcf(BODY.replace('name="j"', 'name="j" type="ball" armature="1"')),
-        ["joint 'j': armature 1 on a ball joint", "line 1"],
+    "armature_on_free": (
+        mjcf(BODY.replace('name="j"', 'name="j" type="free" armature="1"')),
+        ["joint 'j': armature 1 on a free joint", "line 1"],
     ),
-    "spring_on_ball": (
-        mjcf(BODY.replace('name="j"', 'name="j" type="ball" stiffness="1"')),
-        ["joint 'j': stiffness 1 on a ball joint", "line 1"],
-    ),
-    "curved_spring": (
-        mjcf(BODY.replace('name="j"', 'name="j" stiffness="1 2"')),
-        ["joint 'j': stiffness that depends"],
+    "curved_spring_on_ball": (
+        mjcf(BODY.replace('name="j"', 'name="j" type="ball" stiffness="1 2"')),
+        ["joint 'j': stiffness that grows", "line 1"],
     ),
     "nan": (
         mjcf(BODY.replace('pos="0 0 0"', 'pos="0 nan 0"')),

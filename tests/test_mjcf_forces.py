@@ -229,3 +229,63 @@ def test_a_tendon_rests_at_the_length_that_mujoco_measures(tmp_path: Path) -> No
     compiled = mujoco.MjModel.from_xml_string(RESTING)
     lengths = [s.rest_length for s in model.springs]
     np.testing.assert_allclose(lengths, compiled.tendon_lengthspring[:, 0], rtol=1e-14)
+
+
+NONLINEAR = """<mujoco model="bent"><option>{option}</option><worldbody>
+  <body name="base" pos="0 .3 1" euler="10 20 30"><joint type="free" name="f" stiffness="{free}" damping="2"/>
+    <geom type="box" size=".1 .2 .3" pos=".2 .1 .3"/>
+    <body name="link" pos="0 0 .6" euler="0 10 0"><joint name="j" axis="1 0 .2" pos="0 .1 0" ref="15" springref="40"
+      stiffness="1 2 3" damping=".1 .2 .3"/><joint name="w" type="slide" stiffness="0 0 2" damping="0 1"/>
+      <geom size=".1" pos=".1 0 .2"/><body name="end" pos=".1 .2 .3" euler="3 2 1">
+      <joint name="l" type="ball" pos=".1 0 0" stiffness="{ball}" damping=".1" armature="{armature}"/>
+      <geom size=".1 .2" type="capsule" pos="0 0 .3"/></body></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("free", "ball", "option"),
+    [
+        ("2", "3", ""),
+        ("2 0 3", "0 0 1", ""),
+        ("2", "1", '<flag spring="disable"/>'),
+        ("2", "1", '<flag damper="disable"/>'),
+    ],
+)
+def test_springs_of_all_joints_and_polynomials(free: str, ball: str, option: str, tmp_path: Path) -> None:
+    path = written(NONLINEAR.format(free=free, ball=ball, option=option, armature="0"), tmp_path)
+    model, passive = check(path, ENGINES if option == "" else ("lagrangian",))
+    assert np.abs(passive).max() > 0.1
+    (read,) = mb.compare_parsers(path, ("mujoco",), samples=1).importers
+    assert read.agrees
+    assert bool([f for f in model.forces if "spring" in f.name]) == ("spring" not in option)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("{ball}", "1 1"), "joint 'l': stiffness that grows"),
+        (('damping="2"', 'damping="2 1"'), "damping that grows with the speed of a free joint"),
+        (('damping=".1"', 'damping=".1 1"'), "damping that grows with the speed of a ball joint"),
+        (('damping="2"', 'damping="2" armature="1"'), "joint 'f': armature 1"),
+    ],
+)
+def test_springs_and_dampers_that_are_not_read_are_refused(change: tuple[str, str], said: str, tmp_path: Path) -> None:
+    text = NONLINEAR.replace(*change).format(free="1", ball="1", option="", armature="0")
+    with pytest.raises(ModelError, match=said):
+        mb.load(written(text, tmp_path))
+
+
+def test_armature_of_a_ball_joint(tmp_path: Path) -> None:
+    text = NONLINEAR.format(free="0", ball="0", option="", armature="0.7")
+    for polynomial in ('stiffness="1 2 3" damping=".1 .2 .3"', 'stiffness="0 0 2" damping="0 1"'):
+        text = text.replace(polynomial, "")
+    path = written(text, tmp_path)
+    model, _ = check(path)
+    q, v = model.random_state(0)
+    a = np.random.default_rng(0).standard_normal(model.nv)
+    exact = mb.dynamics(model, "oracle").inverse_dynamics(q, v, a)
+    for elimination in ("links", "mass matrix", "least constraint"):
+        dyn = mb.dynamics(model, "lagrangian", elimination=elimination)
+        np.testing.assert_allclose(dyn.forward_dynamics(q, v, exact), a, rtol=0, atol=1e-12 * np.abs(a).max())
+    back = mb.load(written(mb.convert(model, "mjcf").text, tmp_path))
+    assert mb.explain(model, back).agree
+    assert back.joint("l").armature.tolist() == [0.7] * 3

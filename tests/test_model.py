@@ -458,7 +458,7 @@ FAULTS = {
     "crossed limits": (joint_k(lower=1.0, upper=-1.0), "joint 'k': lower limit .* above upper"),
     "NaN limit": (joint_k(lower=np.nan), "joint 'k': lower: expected 1 numbers"),
     "negative damping": (joint_k(damping=-1.0), "joint 'k': damping .* is negative"),
-    "armature on a ball": (joint_k("ball", armature=1.0), "joint 'k': armature on a ball joint"),
+    "armature on a ball": (joint_k("ball", armature=(1.0, 1.0, 2.0)), "joint 'k': armature on a ball joint"),
     "armature on a planar": (joint_k("planar", armature=1.0), "joint 'k': armature on a planar joint"),
     "armature on a free": (joint_k("free", armature=1.0), "joint 'k': armature on a free joint"),
     "spring on a ball": (joint_k("ball", stiffness=1.0), "joint 'k': joint spring on a ball joint"),

@@ -91,7 +91,7 @@ def model_of_mjcf(
     scale = wanted / total if wanted > 0 and total > 0 else 1.0
     springs = infer_springs(mujoco, path, scene)
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=gravity)
-    snap = _Tree(b, scene, springs).add_bodies(scale)
+    snap = _Tree(b, scene, springs, off).add_bodies(scale)
     _hold_weights(b, mujoco, scene, off, actuators=actuators)
     transmissions = Transmissions(mujoco, scene, off, servos=actuators)
     equalities = Equalities(mujoco, scene, off, wanted=loops)
@@ -113,8 +113,11 @@ def model_of_mjcf(
 class _Tree:
     """Adds the bodies of a scene to a builder."""
 
-    def __init__(self, b: ModelBuilder, scene: Scene, springs: Mapping[str, tuple[float, float]]) -> None:
+    def __init__(
+        self, b: ModelBuilder, scene: Scene, springs: Mapping[str, tuple[float, float]], off: set[str]
+    ) -> None:
         self.b, self.scene, self.read, self.springs, self.snap = b, scene, scene.read, springs, Snapper()
+        self.off = off
 
     def add_bodies(self, scale: float) -> Snapper:
         """Add the bodies, with `scale` times their masses, and return the record of rounded entries."""
@@ -153,10 +156,10 @@ class _Tree:
         item, element, read, scene = f"joint {joint.name!r}", joint.element, self.read, self.scene
         angle = scene.compiler.angle if joint.kind in ("hinge", "ball") else 1.0
         values: dict[str, Any] = {"armature": read.number(element, "armature", item, 0.0)}
+        higher: dict[str, tuple[float, ...]] = {}
         for name in ("stiffness", "damping"):
-            values[name], *higher = read.numbers(element, name, item, count=3, least=1, default=(0.0,))
-            if any(higher):
-                read.fault(f"{item}: {name} that depends on the position or speed; only constants are read", element)
+            values[name], *rest_of = read.numbers(element, name, item, count=3, least=1, default=(0.0,))
+            higher[name] = (*rest_of, 0.0, 0.0)[:2]
         if joint.name in self.springs:
             values["stiffness"], values["damping"] = self.springs[joint.name]
         rest = angle * read.number(element, "springref", item, 0.0) if joint.scalar else 0.0
@@ -173,21 +176,66 @@ class _Tree:
         else:
             if joint.kind == "ball" and _range(element, "range", "limited", item, scene, ordered=False):
                 scene.left_out["limit of a ball joint"] += 1
-            # They may come from a default class for hinges.
-            for name, why in (("stiffness", "a joint of one coordinate"), ("armature", "a joint of one velocity")):
-                value = values.pop(name)
-                if value:
-                    read.fault(
-                        f"{item}: {name} {value:g} on a {joint.kind} joint; expected {why}; set it to 0", element
-                    )
+            # It may come from a default class for hinges.
+            if joint.kind == "free" and (armature := values.pop("armature")):
+                read.fault(f"{item}: armature {armature:g} on a free joint, which has no rotor; set it to 0", element)
         yields = read.number(element, "springyield", item, 0.0)
-        if values.get("stiffness"):
+        if values["stiffness"] or any(higher["stiffness"]):
             values["rest"] = rest
             scene.left_out["yield of a spring"] += bool(yields)
-        friction = read.number(element, "frictionloss", item, 0.0)
         kind, R = KINDS[joint.kind], self.snap(R)
+        if not joint.scalar:
+            values.pop("rest", None)
+            self._add_spring(joint, (values.pop("stiffness"), *higher["stiffness"]), parent, child, R, p)
+        elif any(higher["stiffness"]) and "spring" not in self.off:
+            k1, k2 = higher["stiffness"]
+            self.b.add_joint_force(
+                f"spring of {joint.name}",
+                joint.name,
+                potential=lambda q: k1 / 3 * (q - rest) ** 3 + k2 / 4 * (q - rest) ** 4,
+            )
+        c1, c2 = higher["damping"]
+        if not joint.scalar and (c1 or c2):
+            why = f"damping that grows with the speed of a {joint.kind} joint; expected one number"
+            read.fault(f"{item}: {why}", element)
+        elif (c1 or c2) and "damper" not in self.off:
+            self.b.add_joint_force(
+                f"damper of {joint.name}", joint.name, lambda _t, _q, v: -(c1 * abs(v) + c2 * v**2) * v
+            )
+        friction = read.number(element, "frictionloss", item, 0.0)
         self.b.add_joint(
             joint.name, kind, parent=parent, child=child, translation=p, rotation=R, friction=friction, **values
+        )
+
+    def _add_spring(
+        self, joint: MjcfJoint, stiffness: tuple[float, ...], parent: str, child: str, R: Array, p: Array
+    ) -> None:
+        """Add the spring of a ball or free joint, against the rotation vector and the way from the pose of the file."""
+        k0, k1, k2 = stiffness
+        if not any(stiffness) or "spring" in self.off:
+            return
+        name = f"spring of {joint.name}"
+        if k1:
+            # The cube of a rotation vector's length has no second derivative where it rests.
+            why = f"stiffness that grows with the {joint.kind} joint's displacement; expected 0 for the second number"
+            self.read.fault(f"joint {joint.name!r}: {why}", joint.element)
+        free = joint.kind == "free"
+        if free:
+            pose = next(body.pose for body in self.scene.bodies if body.name == child)
+            R, p = self.snap(pose.R), pose.p
+
+        def potential(x: Any) -> Any:
+            squares = [sum(x[i] ** 2 for i in part) for part in ((0, 1, 2), (3, 4, 5))[not free :]]
+            return sum(k2 / 4 * square**2 for square in squares)
+
+        self.b.add_bushing(
+            name,
+            body_a=parent,
+            translation_a=p,
+            rotation_a=R,
+            body_b=child,
+            stiffness=[*[k0 * free] * 3, k0, k0, k0],
+            potential=potential if k2 else None,
         )
 
 

@@ -349,7 +349,7 @@ class ModelBuilder(ElementBuilder):
         lower, upper, velocity_limit, effort_limit, friction : float, (nq,) or (nv,) array_like, optional
             Data, not dynamics.
         armature : float
-            Added to M's diagonal, kg m² (kg for a prismatic joint); joints of one velocity only.
+            Added to M's diagonal, kg m² (kg for a prismatic joint); joints of one velocity, and ball joints.
         damping, stiffness, rest : float or (nv,) array_like
             N m s/rad (N s/m), and a spring's torque -stiffness (q - rest), not for ball and free joints.
         mimic : Mimic or (joint, ratio, offset), optional

@@ -122,10 +122,12 @@ def _joint_faults(joint: Joint) -> Iterator[str]:
     yield from _negative(item, joint, "armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
     if type_.quaternion is not None and np.isfinite([x[type_.quaternion :] for x in (joint.lower, joint.upper)]).any():
         yield f"{item}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite"
-    if np.any(joint.armature) and type_.nv != 1:
+    # The same about three axes is a sphere's, which has no gyroscopic term.
+    sphere = type_.quaternion == 0 and not np.ptp(joint.armature) > 0
+    if np.any(joint.armature) and type_.nv != 1 and not sphere:
         yield (
-            f"{item}: armature on a {joint.kind} joint; expected a joint of one velocity "
-            "(engines leave out the gyroscopic term otherwise): add a rotor as a body"
+            f"{item}: armature on a {joint.kind} joint; expected a joint of one velocity, or one number for the three "
+            "of a ball joint (engines leave out the gyroscopic term otherwise): add a rotor as a body"
         )
     if np.any(joint.stiffness) and not type_.coordinate_velocities:
         yield f"{item}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring"

@@ -209,6 +209,10 @@ def _turning(joint: Joint, at: Any, body: Any) -> Any:
             raise UnsupportedError(
                 f"drake: joint {joint.name!r} is damped differently along its body axes; Drake damps it evenly"
             )
+    if joint.armature.any():
+        raise UnsupportedError(
+            f"drake: joint {joint.name!r} is {joint.kind} and has armature, which Drake has no rotor for"
+        )
     if joint.kind == "ball":
         return tree.BallRpyJoint(joint.name, at, body, float(angular[0]))
     return tree.QuaternionFloatingJoint(joint.name, at, body, float(angular[0]), float(linear[0]))

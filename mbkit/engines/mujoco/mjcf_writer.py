@@ -142,7 +142,7 @@ def _joint(joint: Any, owner: Joint) -> str:
             attributes |= {"actuatorfrclimited": "true", "actuatorfrcrange": (-effort, effort)}
     else:
         attributes |= {"pos": joint.pos} if kind == "ball" else {}
-        attributes["damping"] = owner.damping[-1] or None
+        attributes |= {"damping": owner.damping[-1] or None, "armature": owner.armature[-1] or None}
     attributes["actuatorgravcomp"] = "true" if joint.actgravcomp else None
     return _attributes(**attributes)
 

@@ -415,9 +415,9 @@ def _set_constants(model: Any, description: Model, placed: Placed) -> None:
     for name, moments in placed.degenerate.items():
         model.body_inertia[model.body(name).id] = moments
     for joint in description.joints:
-        if joint.kind in ("ball", "free") and joint.damping.any():
+        if joint.kind in ("ball", "free"):
             adr = _addresses(model, placed.joints[joint.name])[1]
-            model.dof_damping[adr] = joint.damping
+            model.dof_damping[adr], model.dof_armature[adr] = joint.damping, joint.armature
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 

@@ -25,6 +25,8 @@ from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_reader import urdf_links
 from mbkit.model import Coupler, Loop, Model
+from mbkit.model.elements.forces import by_functions
+from mbkit.model.validation import listing
 from mbkit.studies import results
 from mbkit.studies.explain.hypotheses import angle_of, number_text
 from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_sets, rename_joints
@@ -455,8 +457,14 @@ def _compared(
 ) -> Parsed:
     """Return an importer's reading, compared with the reference."""
     described = reference.model if isinstance(reference, Imported) else reference
+    unmatched = by_functions(described)
     explanation = explain(
-        described, imported.model, samples=samples, seed=seed, tolerance=tolerance, names=(label, engine)
+        replace(described, forces=tuple(f for f in described.forces if f not in unmatched)),
+        *(imported.model,),
+        samples=samples,
+        seed=seed,
+        tolerance=tolerance,
+        names=(label, engine),
     )
     compared = stages(reference, loops, imported, samples, seed, tolerance)
     causes, idle, held = own_terms(engine, imported, samples, seed, tolerance)
@@ -464,6 +472,8 @@ def _compared(
         theirs, _, also = own_terms(label, reference, samples, seed, tolerance)
         causes, held = [*theirs, *causes], held and also
     notes = (*explanation.notes, *imported.notes, *idle)
+    if unmatched:
+        notes = (*notes, f"compared by what they do to passive forces alone: {listing([*map(str, unmatched)], 6)}")
     explanation = with_own_terms(explanation, compared, causes, held)
     return Parsed(engine, _version(engine), "", compared, explanation, notes)
 
