@@ -178,7 +178,6 @@ URDFS = {
     "negative_damping": (with_joint(LIMIT + '<dynamics damping="-1"/>'), ["joint 'j': damping", "negative"]),
     "zero_axis": (with_joint('<axis xyz="0 0 0"/>' + LIMIT), ["joint 'j': axis is zero"]),
     "short_axis": (with_joint('<axis xyz="0 1"/>' + LIMIT), ["joint 'j': axis xyz: expected 3 numbers, got '0 1'"]),
-    "planar_across": (with_joint("", "planar"), ["joint 'j': planar with the normal 1 0 0", '<axis xyz="0 0 1"/>']),
     "damped_floating": (with_joint('<dynamics damping="1"/>', "floating"), ["joint 'j': damping or friction"]),
     "two_limits": (with_joint(LIMIT + LIMIT.replace('"1"', '"2"')), ["joint 'j': 2 <limit> elements"]),
     "mimic_unknown": (

@@ -545,6 +545,65 @@ def test_planar_and_floating_joints_of_a_urdf(tmp_path):
     assert_near(sample_mass_matrix(model), pinocchio_mass_matrix(raw, model, sample(model)))
 
 
+@pytest.mark.parametrize("axis", ["", '<axis xyz="0 1 0"/>', '<axis xyz="0 0 -2"/>', '<axis xyz="1 2 -3"/>'])
+def test_a_planar_joint_moves_across_its_normal_and_turns_about_it(axis, tmp_path):
+    """URDF's default is x. The link moves as the specification says, whatever the coordinates along the plane."""
+    inertial = (
+        '<inertial><origin xyz=".1 .2 .3"/><mass value="2"/>'
+        '<inertia ixx="1" ixy=".1" ixz="0" iyy="1.2" iyz="0" izz="1.3"/></inertial>'
+    )
+    place = '<origin xyz=".3 -.2 .1" rpy=".5 .6 .7"/>'
+    text = (
+        f'<robot name="r"><link name="base"/><link name="puck">{inertial}</link><link name="arm">{inertial}</link>'
+        + urdf_joint("slide", "base", "puck", place + axis, "planar")
+        + urdf_joint("hinge", "puck", "arm", '<origin xyz="1 0 0"/><axis xyz="0 1 0"/>', "continuous")
+        + "</robot>"
+    )
+    model = load(write(tmp_path, text))
+    n = np.array([float(x) for x in axis.split('"')[1].split()] if axis else (1.0, 0.0, 0.0))
+    n /= np.linalg.norm(n)
+    assert any("its normal" in note and "'puck_plane'" in note for note in model.notes)
+    dyn = mb.dynamics(model)
+    X0 = dyn.pose(model.neutral(), "puck")
+    np.testing.assert_allclose(X0[:3, :3], spatial.matrix_from_rpy(0.5, 0.6, 0.7), atol=1e-15)
+    q = np.array([0.4, -0.7, 0.9, 0.2])
+    moved = np.linalg.inv(X0) @ dyn.pose(q, "puck")
+    assert abs(n @ moved[:3, 3]) < 1e-15
+    assert np.linalg.norm(moved[:3, 3]) == pytest.approx(np.hypot(0.4, 0.7), abs=1e-15)
+    turn = spatial.matrix_from_quaternion(spatial.exp_quaternion(0.9 * n))
+    np.testing.assert_allclose(moved[:3, :3], turn, atol=1e-15)
+    # The matter moves with the links.
+    com = [(dyn.pose(q, link) @ np.array([0.1, 0.2, 0.3, 1.0]))[:3] for link in ("puck", "arm")]
+    np.testing.assert_allclose(dyn.center_of_mass(q), np.mean(com, axis=0), atol=1e-15)
+    mb.testing.assert_engines_agree(model, ["pinocchio", "lagrangian"])
+
+
+def test_welded_bodies_without_inertia_count_as_parts_of_their_carriers(tmp_path):
+    """As MuJoCo has them, and as a URDF's fixed links are."""
+    inner = '<body name="point" pos=".1 .2 .3" euler="10 20 30"><inertial pos=".1 0 0" mass="2" diaginertia="0 0 0"/>{}</body>'
+    text = (
+        '<mujoco><worldbody><body name="a"><joint name="j" axis="0 1 0" pos="0 0 .1"/><geom size=".1" pos=".3 0 0"/>'
+        + inner.format('<body name="b" pos="0 .5 0"><joint name="k" axis="1 0 0"/><geom size=".1"/></body>')
+        + '<body name="shell" pos="0 0 1"><geom size=".1"/></body></body></worldbody></mujoco>'
+    )
+    path = write(tmp_path, text, "r.xml")
+    model = load(path)
+    assert any("'point in a'" in note for note in model.notes)
+    assert model.body("point").mass == 0
+    assert model.body("shell").mass > 0
+    m = mujoco.MjModel.from_xml_path(str(path))
+    d = mujoco.MjData(m)
+    dyn = mb.dynamics(model)
+    for q, v in zip(*model.random_state(0, 3), strict=True):
+        d.qpos[:], d.qvel[:] = q, v
+        mujoco.mj_forward(m, d)
+        M = np.zeros((2, 2))
+        mujoco.mj_fullM(m, d, M)
+        np.testing.assert_allclose(dyn.mass_matrix(q), M, rtol=1e-14)
+        np.testing.assert_allclose(dyn.nle(q, v), d.qfrc_bias, rtol=1e-13, atol=1e-13)
+    assert model.mass == pytest.approx(m.body_subtreemass[0], rel=1e-15)
+
+
 # Rounded zeros.
 
 

@@ -23,10 +23,12 @@ from mbkit.load.mjcf_attributes import Compiler, Defaults, about, check_names
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, name_list
 from mbkit.load.mjcf_couplings import Transmissions
 from mbkit.load.mjcf_equalities import Equalities
-from mbkit.load.mjcf_reader import KINDS, MjcfJoint, Scene, add_free_base, read_tree, write_out_copies
+from mbkit.load.mjcf_reader import KINDS, MjcfBody, MjcfJoint, Scene, add_free_base, read_tree, write_out_copies
+from mbkit.load.shapes import NOTHING, together
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Body, Model, ModelBuilder
+from mbkit.model.validation import body_fault
 
 _REFUSED: Final = {
     "attach": "it names another model; save the compiled model as one XML",
@@ -91,6 +93,7 @@ def model_of_mjcf(
     scale = wanted / total if wanted > 0 and total > 0 else 1.0
     springs = infer_springs(mujoco, path, scene)
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=gravity)
+    joined = _join_welded(scene)
     snap = _Tree(b, scene, springs, off).add_bodies(scale)
     _hold_weights(b, mujoco, scene, off, actuators=actuators)
     transmissions = Transmissions(mujoco, scene, off, servos=actuators)
@@ -98,7 +101,7 @@ def model_of_mjcf(
     if read.faults:
         raise ModelError(str(path), read.faults)
     sprung = f"stiffness and damping from MuJoCo's compiler (springdamper): {name_list(springs)}" if springs else ""
-    for note in (*_notes(mujoco, path, scene, flags, scale), copied, inferred, sprung, misspelt, snap.note):
+    for note in (*_notes(mujoco, path, scene, flags, scale), joined, copied, inferred, sprung, misspelt, snap.note):
         if note:
             b.note(note)
     equalities.add_to(b, snap)
@@ -108,6 +111,36 @@ def model_of_mjcf(
         raise ModelError(str(path), error.faults) from None
     features = {"spring": "springs", "damper": "damping"}
     return transmissions.applied(model.without(*(feature for flag, feature in features.items() if flag in off)))
+
+
+def _join_welded(scene: Scene) -> str:
+    """Give the masses of welded bodies that no body can have alone to the bodies that carry them; return a note.
+
+    Such as mass without inertia: a URDF's links that are fixed to each other are one body too. The frames stay.
+    """
+    known, joined = {body.name: body for body in scene.bodies}, []
+    for body in reversed(scene.bodies):
+        at, carrier = body.mass_properties, known.get(body.parent)
+        if body.joints or carrier is None or not at.mass or body.gravcomp != carrier.gravcomp:
+            continue
+        if not _moves(body, known):
+            # Any matter may stand still.
+            continue
+        if body_fault(Body(body.name, at.mass, at.com, at.inertia), point_masses=False) is not None:
+            parts = [carrier.mass_properties, at.moved(body.pose.R, body.pose.p)]
+            carrier.mass_properties = together([x for x in parts if x.mass])
+            body.mass_properties = NOTHING
+            joined.append(f"{body.name} in {carrier.name}")
+    if not joined:
+        return ""
+    return (
+        f"welded bodies with masses that no body has alone count as parts of those that carry them: {name_list(joined)}"
+    )
+
+
+def _moves(body: MjcfBody, known: Mapping[str, MjcfBody]) -> bool:
+    """Return whether a joint carries a body."""
+    return bool(body.joints) or (body.parent in known and _moves(known[body.parent], known))
 
 
 class _Tree:

@@ -115,6 +115,7 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
     macros = [e for e in robot.walk() if e.tag.startswith("xacro:")]
     if macros:
         read.fault(f"{len(macros)} xacro elements, such as <{macros[0].tag}>; run xacro on the file first", macros[0])
+    robot = _with_planes_turned(robot, read)
     odd: dict[str, str] = {}
     links = [_link(e, read, odd) for e in robot.all("link")]
     joints = [_joint(e, read) for e in robot.all("joint")]
@@ -306,13 +307,6 @@ def _axis(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[str,
         return {}, ""
     if not any(vector):
         read.fault(f"{item}: axis is zero; expected a direction, such as 0 0 1", axis)
-    elif kind == "planar" and (vector[:2] != (0, 0) or vector[2] <= 0):
-        normal = " ".join(f"{x:g}" for x in vector)
-        read.fault(
-            f"{item}: planar with the normal {normal} (URDF's default is 1 0 0); only 0 0 1 is read: "
-            'turn the joint by <origin rpy="..."/> and write <axis xyz="0 0 1"/>',
-            axis or joint,
-        )
     return ({}, "") if kind == "planar" else ({"axis": vector}, _copy(axis, "xyz") if axis else "")
 
 
@@ -363,6 +357,71 @@ def _dynamics(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[
 def unbounded(limit: ArrayLike) -> Array:
     """Return limits, infinite where the largest double of a parser stands for none."""
     return np.where(np.abs(limit) < 1e300, limit, np.copysign(np.inf, limit))
+
+
+def _with_planes_turned(robot: Element, read: Reader) -> Element:
+    """Return the robot with the normal of each planar joint along z: its frame is turned, and a fixed joint turns back.
+
+    The turn is the shortest one from z to the normal; from -z it is about x.
+    """
+    links = {e.attributes.get("name", "") for e in robot.all("link")}
+    joints = {e.attributes.get("name", "") for e in robot.all("joint")}
+    children: list[Element] = []
+    for e in robot.children:
+        name, child = e.attributes.get("name", ""), e.first("child")
+        if e.tag != "joint" or e.attributes.get("type") != "planar" or child is None:
+            children.append(e)
+            continue
+        item, axis, before = f"joint {name!r}", read.only(e, "axis", f"joint {name!r}"), len(read.faults)
+        normal = np.array((1.0, 0.0, 0.0) if axis is None else read.numbers(axis, "xyz", item, count=3))
+        _, rpy, _ = _origin(e, item, read)
+        if len(read.faults) > before or not normal.any() or not (normal[:2].any() or normal[2] < 0):
+            children.append(e)
+            continue
+        R = _from_z(normal / np.linalg.norm(normal))
+        plane, back = unused(f"{child.attributes.get('link', '')}_plane", links), unused(f"{name}_back", joints)
+        links.add(plane)
+        joints.add(back)
+        origin = e.first("origin")
+        placed = origin.attributes if origin is not None else {}
+        turned = placed | {"rpy": _rpy(spatial.matrix_from_rpy(*rpy) @ R)}
+        new = {"origin": turned, "child": {"link": plane}, "axis": {"xyz": "0 0 1"}}
+        kept = [c for c in e.children if c.tag not in new]
+        children += [
+            replace(e, children=[*kept, *(Element(tag, x, e.line) for tag, x in new.items())]),
+            Element("link", {"name": plane}, e.line),
+            Element(
+                "joint",
+                {"name": back, "type": "fixed"},
+                e.line,
+                [
+                    Element("origin", {"rpy": _rpy(R.T)}, e.line),
+                    Element("parent", {"link": plane}, e.line),
+                    Element("child", dict(child.attributes), e.line),
+                ],
+            ),
+        ]
+        shown = " ".join(f"{x:g}" for x in normal)
+        link = child.attributes.get("link", "")
+        read.notes.append(
+            f"{item}: its normal {shown} is z of the body {plane!r}, whose x and y it moves along; {link!r} is a frame "
+            "of that body"
+        )
+    return replace(robot, children=children)
+
+
+def _from_z(normal: Array) -> Array:
+    """Return the shortest turn from z to a unit vector; from -z about x."""
+    x, y, z = normal
+    if z < 0 and not (x or y):
+        return np.diag([1.0, -1.0, -1.0])
+    K = spatial.skew(np.array([-y, x, 0.0]))
+    # Rodrigues' formula, with 1 / (1 + cos) for (1 - cos) / sin²: Murray, Li, Sastry 1994, eq. 2.14.
+    return np.asarray(np.eye(3) + K + K @ K / (1 + z))
+
+
+def _rpy(R: Array) -> str:
+    return " ".join(repr(float(x)) for x in spatial.rpy_from_matrix(R))
 
 
 # Unknown names
