@@ -293,10 +293,6 @@ def test_equalities_without_a_loop_are_named(tmp_path: Path) -> None:
         ('<weld name="x" site1="s" site2="r" active="false"/>', "inactive"),
         ('<weld name="x" body1="b" body2="f"/>', "no joint moves"),
         ('<weld name="x" body1="m" body2="c"/>', "motion capture"),
-        (
-            '<joint name="x" joint1="j1" joint2="j2" polycoef="0 1 0.5 0 0"/>',
-            "0 1 0.5 0 0 is not linear",
-        ),
         ('<joint name="x" joint1="j1"/>', "it holds a single joint"),
         ('<tendon name="x" tendon1="t"/>', "'x' (tendon, tendon1 't')"),
     ):

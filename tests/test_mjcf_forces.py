@@ -289,3 +289,62 @@ def test_armature_of_a_ball_joint(tmp_path: Path) -> None:
     back = mb.load(written(mb.convert(model, "mjcf").text, tmp_path))
     assert mb.explain(model, back).agree
     assert back.joint("l").armature.tolist() == [0.7] * 3
+
+
+# Curves
+
+KNEE = """<mujoco model="knee"><worldbody><body name="thigh"><joint name="hip" axis="0 1 0"/>
+  <geom size=".1 .2" type="capsule" pos="0 0 -.2"/><body name="shin" pos="0 0 -.4">
+  <joint name="slip" type="slide" axis="1 0 .1" ref=".1"/><joint name="knee" axis="0 1 0" ref="20"/>
+  <geom size=".1 .2" type="capsule" pos=".1 0 -.2"/></body></body></worldbody>
+  <equality><joint name="roll" joint1="slip" joint2="knee" polycoef=".02 .3 -.4 .5 -.6"/></equality></mujoco>"""
+
+
+def test_an_equality_of_higher_degree_is_a_curve(tmp_path: Path) -> None:
+    path = written(KNEE, tmp_path)
+    model = mb.load(path)
+    compiled = mujoco.MjModel.from_xml_string(KNEE)
+    data, q, v = mujoco.MjData(compiled), np.array([0.3, 0.25, 0.7]), np.array([1.0, 2.0, -3.0])
+    data.qpos[:], data.qvel[:] = q, v
+    mujoco.mj_forward(compiled, data)
+    for engine in ("lagrangian", "pinocchio", "oracle"):
+        dyn = mb.dynamics(model, engine)
+        np.testing.assert_allclose(dyn.constraint_residual(q), data.efc_pos, rtol=0, atol=1e-14)
+        J = data.efc_J.reshape(1, 3)
+        np.testing.assert_allclose(dyn.constraint_jacobian(q), J, rtol=0, atol=1e-14)
+        # MuJoCo knows no J̇ v: the Jacobian's central difference along v.
+        h = 1e-5
+        rate = (dyn.constraint_jacobian(q + h * v) - dyn.constraint_jacobian(q - h * v)) / (2 * h)
+        np.testing.assert_allclose(dyn.constraint_bias(q, v), rate @ v, rtol=1e-8)
+    at, rates = mb.dynamics(model).project(q, v)
+    tau = np.array([1.0, -2.0, 3.0])
+    exact = mb.dynamics(model, "oracle").forward_dynamics(at, rates, tau)
+    for engine in ("lagrangian", "pinocchio"):
+        a = mb.dynamics(model, engine).forward_dynamics(at, rates, tau)
+        np.testing.assert_allclose(a, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+    run = mb.simulate(mb.dynamics(model, "lagrangian"), at, rates, 1.0, dt=1e-3)
+    assert np.abs(run.power_balance()).max() < 1e-8 * abs(run.energy()[0])
+    with pytest.raises(UnsupportedError, match="'roll' is a curve"):
+        mb.dynamics(model, "mujoco")
+    (read,) = mb.compare_parsers(path, ("mujoco",), samples=1).importers
+    assert all(stage.same for stage in read.stages if stage.name == "couplers")
+    (row,) = mb.lagrangian.from_model(model).constraints
+    values = dict(zip(("hip", "slip", "knee"), q, strict=True))
+    assert float(row.subs({x: values[x.name] for x in row.free_symbols})) == pytest.approx(data.efc_pos[0], abs=1e-14)
+    straight = replace(model.couplers[0], curve=np.zeros(3))
+    (cause,) = mb.explain(model, replace(model, couplers=(straight,))).acting
+    assert "curve" in cause.says
+
+
+def test_numbers_of_a_curve_are_parameters_and_checked() -> None:
+    b = mb.ModelBuilder("cam")
+    for name in ("a", "b"):
+        b.add_body(name, mass=1.0, inertia=(0.1, 0.1, 0.1))
+        b.add_joint(f"j{name}", "revolute", parent="world", child=name, axis=(0, 1, 0))
+    b.add_coupler("cam", "ja", "jb", curve=(mb.Parameter("c", 0.5), 0.0, 0.0))
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    for c in (0.5, 2.0):
+        np.testing.assert_allclose(dyn.at(c=c).constraint_residual([0.0, 0.3]), -0.3 - c * 0.09, rtol=1e-14)
+    b.add_coupler("bad", "ja", "jb", curve=(1.0, 2.0))
+    with pytest.raises(ModelError, match="curve: expected shape"):
+        b.build()

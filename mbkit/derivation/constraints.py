@@ -30,7 +30,7 @@ from mbkit._check import Array
 from mbkit._reproducible import pivoted
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
-from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, dot3
+from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, dot3, follower
 from mbkit.derivation.least_constraint import hard_poses
 from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.errors import InputError
@@ -227,8 +227,8 @@ def _every_row(kin: Kinematics, time: Any) -> Iterator[_Row]:
             yield _Row(loop.name, f"loop {loop.name!r} {name}", row)
     for coupler in model.couplers:
         (at,), (leading,) = (kin.coordinates(model.joint(name)) for name in (coupler.joint, coupler.leader))
-        ratio = kin.values.couplers[coupler.name]
-        yield _Row(coupler.name, f"coupler {coupler.name!r}", at - (ratio.ratio * leading + ratio.offset))
+        curve = follower(kin.values.couplers[coupler.name], leading)
+        yield _Row(coupler.name, f"coupler {coupler.name!r}", at - curve)
     for motion in model.prescribed:
         (at,) = kin.coordinates(model.joint(motion.joint))
         numbers = casadi_arithmetic(kin.values.number)

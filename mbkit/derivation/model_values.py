@@ -112,7 +112,7 @@ _FORCES: Final[dict[type, tuple[str, ...]]] = {
     GravityCompensation: ("fraction",),
 }
 _NO_SLIP: Final = ("translation_a", "axis_a", "translation_b", "axis_b", "radius", "speed")
-_COUPLER: Final = ("ratio", "offset")
+_COUPLER: Final = ("ratio", "offset", "curve")
 # A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum of literal masses could be divided
 # by, and its quotient be rounded to double.
 _DIRECTIONS: Final = frozenset({"rotation", "axes", "rotation_a", "rotation_b", "axis_a", "axis_b", "tangents"})

@@ -276,11 +276,12 @@ def motion(kin: SymbolicKinematics, prescribed: Prescribed, t: sp.Symbol) -> sp.
 
 
 def coupled(kin: SymbolicKinematics, coupler: Coupler) -> sp.Expr:
-    """Return q - ratio leader - offset."""
+    """Return q less what its leader gives it."""
     x = kin.written.values.couplers[coupler.name]
     (at,), (leading,) = (kin.symbols_of[name] for name in (coupler.joint, coupler.leader))
     offset = _read(x.offset) if kin.model.joint(coupler.joint).type.angular and x.offset else x.offset
-    return at - x.ratio * leading - offset
+    higher = sum((c * leading ** (k + 2) for k, c in enumerate(x.curve)), sp.Integer(0))
+    return at - x.ratio * leading - offset - higher
 
 
 def angle(x: float) -> sp.Expr:

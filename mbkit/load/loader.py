@@ -103,8 +103,8 @@ def load(
         Whether an MJCF's meshes are read where a body has no other inertia, which MuJoCo's compiler then infers; with
         "never" such bodies are refused.
     loops : bool, path or sequence of Loop or dict
-        Whether an MJCF's active <connect> and <weld> elements become loops, and those of two joints with a linear
-        polynomial couplers, which hold exactly; without, they are left out and noted, as others always are. Or loops
+        Whether an MJCF's active <connect> and <weld> elements become loops, and those of two joints couplers,
+        which hold exactly; without, they are left out and noted, as others always are. Or loops
         beside those of the file: dicts with the arguments of `ModelBuilder.add_loop`, `Loop` objects, or a TOML file
         with a table ``[[loop]]`` of these arguments for each. A URDF has no loops of its own. Their bodies may be
         frames too, such as links that were merged.

@@ -1,9 +1,8 @@
 """Equality constraints of an MJCF as loops (XML reference of MuJoCo 4.0, section "equality").
 
-A <connect> becomes a loop of two points, a <weld> one of two frames, and a <joint> whose polynomial is linear a coupler
-of two joints, all exact where MuJoCo's are soft. What an
-element with bodies does not say is measured in the reference configuration, the pose of the file: the second anchor of
-a <connect>, and the relative pose of a <weld>.
+A <connect> becomes a loop of two points, a <weld> one of two frames, and a <joint> of two joints a coupler, all exact
+where MuJoCo's are soft. What an element with bodies does not say is measured in the reference configuration, the pose
+of the file: the second anchor of a <connect>, and the relative pose of a <weld>.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from mbkit import spatial
 from mbkit._reproducible import product
@@ -46,8 +46,8 @@ class Equalities:
         self._left_out: list[str] = []
         self._soft: list[str] = []
         self._loops: dict[str, tuple[str, _End, _End]] = {}
-        #: Joint, leader, ratio and offset.
-        self._couplers: dict[str, tuple[str, str, float, float]] = {}
+        #: Joint, leader, ratio, offset and curve.
+        self._couplers: dict[str, tuple[str, str, float, float, list[float]]] = {}
         elements = [(e, element_label(e, k)) for k, e in self._numbered(mujoco)]
         if not elements:
             return
@@ -100,15 +100,14 @@ class Equalities:
                 self._read.fault(f"{item}: {key} {name!r} is no hinge or slide of the file", element)
                 return "a joint is missing"
         shape = self._read.numbers(element, "polycoef", item, count=5, default=(0.0, 1.0, 0.0, 0.0, 0.0))
-        constant, ratio, *higher = shape
-        if any(higher):
-            return f"its polynomial {' '.join(f'{x:g}' for x in shape)} is not linear"
         follower, leader = scalars[first], scalars[second]
         if follower is leader:
             return "it holds a joint against itself"
         name = unused(element.attributes.get("name") or f"joint{len(self._couplers) + 1}", self._couplers)
         # MuJoCo's polynomial is of the coordinates less those of the pose of the file.
-        self._couplers[name] = first, second, ratio, follower.ref + constant - ratio * leader.ref
+        curve = Polynomial(shape)(Polynomial([-leader.ref, 1.0])) if leader.ref else Polynomial(shape)
+        constant, ratio, *higher = (float(x) for x in (*curve.coef, *[0.0] * 5)[:5])
+        self._couplers[name] = first, second, ratio, follower.ref + constant, higher
         return ""
 
     @staticmethod
@@ -166,8 +165,8 @@ class Equalities:
                 sides[f"translation_{side}"] = end.pose.p - self._anchors[end.body]
                 sides[f"rotation_{side}"] = snap(end.pose.R) if kind == "frame" else None
             b.add_loop(name, kind, **sides)  # type: ignore[arg-type]  # of the kinds
-        for name, (joint, leader, ratio, offset) in self._couplers.items():
-            b.add_coupler(name, joint, leader, ratio=ratio, offset=offset)
+        for name, (joint, leader, ratio, offset, curve) in self._couplers.items():
+            b.add_coupler(name, joint, leader, ratio=ratio, offset=offset, curve=curve)
         if self._couplers:
             held = listing([repr(x) for x in self._couplers], 6)
             b.note(f"couplers of joints, held exactly where MuJoCo's are soft: {held}")

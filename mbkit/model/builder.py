@@ -222,6 +222,7 @@ _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
         ("ratio", "offset", "rate", "amplitude", "frequency", "phase", "fraction"), ArgumentReader.quantity
     ),
     "inertia": ArgumentReader.inertia,
+    "curve": lambda read, name, value: read.quantities(name, value, 3),
     "joints": lambda read, name, value: tuple(read.name(name, x) for x in value),
     "factors": lambda read, name, value: read.quantities(name, value, len(value)),
 }
@@ -494,12 +495,21 @@ class ModelBuilder(ElementBuilder):
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
         self._add(Loop, "loops", "loop", name, a | b | {"length": length}, {"kind": kind})
 
-    def add_coupler(self, name: str, joint: str, leader: str, *, ratio: Number = 1.0, offset: Number = 0.0) -> None:
+    def add_coupler(
+        self,
+        name: str,
+        joint: str,
+        leader: str,
+        *,
+        ratio: Number = 1.0,
+        offset: Number = 0.0,
+        curve: _Vector = (0.0, 0.0, 0.0),
+    ) -> None:
         """Hold the coordinates of two joints in a fixed ratio, q = ratio * leader + offset, by a constraint.
 
-        A pair of gears, a belt, or a screw. Each joint keeps its coordinate; the multiplier is the torque on `joint`,
-        between its parent and child, and -ratio times it acts in `leader`. A mimic joint has no coordinate, and is the
-        cheaper one where nothing else closes on it.
+        A pair of gears, a belt, a screw, or with a curve a cam or a knee. Each joint keeps its coordinate; the
+        multiplier is the torque on `joint`, between its parent and child, and in `leader` acts -dq/dleader times it. A
+        mimic joint has no coordinate, and is the cheaper one where nothing else closes on it.
 
         Parameters
         ----------
@@ -508,8 +518,10 @@ class ModelBuilder(ElementBuilder):
             Two joints of one velocity each.
         ratio, offset : float
             As rad or m of `joint` for rad or m of `leader`.
+        curve : (3,) array_like
+            Coefficients of the leader's second, third and fourth power, which are added.
         """
-        values = {"joint": joint, "leader": leader, "ratio": ratio, "offset": offset}
+        values = {"joint": joint, "leader": leader, "ratio": ratio, "offset": offset, "curve": curve}
         self._add(Coupler, "couplers", "coupler", name, values)
 
     def add_blade(

@@ -207,10 +207,10 @@ class Layout:
             row[self.full_v[joint]] += factor
         return row
 
-    def coupler_row(self, coupler: Coupler) -> Array:
-        """Return the Jacobian of a coupler's constraint on the full velocities, shape (full nv,)."""
-        row = np.zeros(self.sizes[3])
-        row[self.full_v[coupler.joint]], row[self.full_v[coupler.leader]] = 1.0, -coupler.ratio
+    def coupler_row(self, coupler: Coupler, leading: float = 0.0) -> Array:
+        """Return the Jacobian of a coupler's constraint on the full velocities at a coordinate of its leader."""
+        row, slope = np.zeros(self.sizes[3]), float(coupler.polynomial.deriv()(leading))
+        row[self.full_v[coupler.joint]], row[self.full_v[coupler.leader]] = 1.0, -slope
         return row
 
     def expand_q(self, q: Array) -> Array:

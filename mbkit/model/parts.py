@@ -5,10 +5,11 @@ All lengths are metres, masses kilograms, angles radians. Arrays are read-only.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from mbkit._check import Array, shown
 from mbkit.errors import ModelError
@@ -309,9 +310,10 @@ class Loop(_Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Coupler(_Frozen):
-    """A fixed ratio of two coordinates, as a constraint: q = ratio * leader + offset.
+    """A fixed ratio of two coordinates, or a curve, as a constraint.
 
-    Both joints keep their coordinates. A joint that mimics has none of its own.
+    q = offset + ratio * leader + curve[0] leader² + curve[1] leader³ + curve[2] leader⁴. Both joints keep their
+    coordinates. A joint that mimics has none of its own.
 
     Attributes
     ----------
@@ -319,6 +321,8 @@ class Coupler(_Frozen):
         The joints have one velocity each.
     ratio, offset : float
         As rad or m of `joint` for rad or m of `leader`.
+    curve : (3,) array
+        Coefficients of the leader's second, third and fourth power.
     """
 
     name: str
@@ -326,6 +330,15 @@ class Coupler(_Frozen):
     leader: str
     ratio: float = 1.0
     offset: float = 0.0
+    curve: Array = field(default_factory=lambda: np.zeros(3))
+
+    @property
+    def polynomial(self) -> Polynomial:
+        """The joint's coordinate as a function of the leader's."""
+        return Polynomial([self.offset, self.ratio, *self.curve])
+
+    def _shape(self, name: str) -> tuple[int, ...] | None:
+        return (3,) if name == "curve" else super()._shape(name)
 
 
 @dataclass(frozen=True, eq=False)

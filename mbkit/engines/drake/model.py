@@ -75,6 +75,8 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True, st
         with _refusal(f"drake: refuses loop {loop.name!r}"):
             CONSTRAINTS[loop.kind](plant, loop, bodies[loop.body_a], bodies[loop.body_b])
     for coupler in description.couplers if step else ():
+        if coupler.curve.any():
+            raise UnsupportedError(f"drake: coupler {coupler.name!r} is a curve; Drake has fixed ratios alone")
         (follower,), (leader,) = added[coupler.joint], added[coupler.leader]
         with _refusal(f"drake: refuses coupler {coupler.name!r}"):
             plant.AddCouplerConstraint(follower, leader, coupler.ratio, coupler.offset)

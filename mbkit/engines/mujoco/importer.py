@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from mbkit import spatial
 from mbkit._check import Array
@@ -247,17 +248,18 @@ class _Description:
         return tuple(out)
 
     def couplers(self) -> tuple[Coupler, ...]:
-        """Return the active equalities of two joints whose polynomial is linear."""
+        """Return the active equalities of two joints."""
         m, out = self.m, []
         names = {j: name for name, j in self.numbers.items()}
         for i in self._equalities():
-            if m.eq_type[i] != mujoco.mjtEq.mjEQ_JOINT or m.eq_obj2id[i] < 0 or np.any(m.eq_data[i][2:5]):
+            if m.eq_type[i] != mujoco.mjtEq.mjEQ_JOINT or m.eq_obj2id[i] < 0:
                 continue
             joint, leader = int(m.eq_obj1id[i]), int(m.eq_obj2id[i])
-            constant, ratio = (float(x) for x in m.eq_data[i][:2])
             # The polynomial is of the coordinates less those of the pose of the file.
             start, other = (float(m.qpos0[m.jnt_qposadr[j]]) for j in (joint, leader))
-            out.append(Coupler(m.eq(i).name, names[joint], names[leader], ratio, start + constant - ratio * other))
+            curve = Polynomial(m.eq_data[i][:5])(Polynomial([-other, 1.0]))
+            constant, ratio, *higher = (*curve.coef, *np.zeros(5))[:5]
+            out.append(Coupler(m.eq(i).name, names[joint], names[leader], ratio, start + constant, np.array(higher)))
         return tuple(out)
 
     def _equalities(self) -> list[int]:

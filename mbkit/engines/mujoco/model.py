@@ -192,6 +192,10 @@ def not_held(description: Model) -> Iterator[str]:
             yield f"loop {loop.name!r} is a rod (distance), and {why}"
         elif loop.kind not in EQUALITIES:
             yield f"loop {loop.name!r} is {loop.kind}, and MuJoCo has no such equality, only points and frames"
+    for coupler in description.couplers:
+        if coupler.curve.any():
+            why = "MuJoCo's equality of such joints leaves J̇ v out, which no stiffness makes up for"
+            yield f"coupler {coupler.name!r} is a curve, and {why}"
     for motion in description.prescribed:
         yield f"joint {motion.joint!r} is moved in time, and MuJoCo's equality of a joint holds a constant alone"
     held = _held(description)

@@ -320,8 +320,9 @@ class PinConstraints:
         for x in self._model.couplers:
             i, k = layout.full_q[x.joint].start, layout.full_q[x.leader].start
             at = layout.G_q[[i, k]] @ q + layout.offsets[[i, k]]
-            to = layout.coupler_row(x) @ layout.G
-            out.append(_row(at[0] - (x.ratio * at[1] + x.offset), to, to @ v, 0.0))
+            to, curve = layout.coupler_row(x, at[1]) @ layout.G, x.polynomial
+            rate = layout.G[layout.full_v[x.leader].start] @ v
+            out.append(_row(at[0] - curve(at[1]), to, to @ v, -curve.deriv(2)(at[1]) * rate**2))
         return out
 
     def rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:

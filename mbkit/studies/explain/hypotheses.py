@@ -547,7 +547,9 @@ def _other_numbers(a: Any, b: Any, near: Tolerances) -> str:
         return ", and ".join(loop_differences(a, b, near))
     if isinstance(a, Coupler) and not _alike(a, b, near):
         one, other = (
-            f"{x.joint} = {number_text(x.ratio)} {x.leader}" + (f" + {number_text(x.offset)}" if x.offset else "")
+            f"{x.joint} = {number_text(x.ratio)} {x.leader}"
+            + (f" + {number_text(x.offset)}" if x.offset else "")
+            + (f", with curve {number_text(x.curve)}" if x.curve.any() else "")
             for x in (a, b)
         )
         return f"has {other} for {one}"

@@ -131,11 +131,14 @@ def coupler_differences(
             out.append((1.0, _says(a), "missing"))
         elif (far := _apart(a, b)) > tolerance * max(1.0, abs(a.ratio) + abs(a.offset)):
             says = f"ratio {b.ratio:.6g} and offset {b.offset:.6g} for {a.ratio:.6g} and {a.offset:.6g}"
+            if (a.curve != b.curve).any():
+                says += f", curve {' '.join(f'{x:.6g}' for x in b.curve)} for {' '.join(f'{x:.6g}' for x in a.curve)}"
             out.append((far, _says(a), says))
     mimics = {j.name: j.mimic for j in file.joints if j.mimic}
     for b in left:
         (root, r1, o1), (other, r2, o2) = (_from_root(name, mimics) for name in (b.joint, b.leader))
         far = abs(r1 - b.ratio * r2) + abs(o1 - b.ratio * o2 - b.offset)
+        far += float(np.abs(b.curve).sum())
         if root == other and far <= tolerance * max(1.0, abs(r1) + abs(o1)):
             continue
         off = _taken(b, inactive) is not None
@@ -159,12 +162,12 @@ def _taken(a: Coupler, some: list[Coupler]) -> Coupler | None:
 
 
 def _apart(a: Coupler, b: Coupler) -> float:
-    return abs(a.ratio - b.ratio) + abs(a.offset - b.offset)
+    return abs(a.ratio - b.ratio) + abs(a.offset - b.offset) + float(np.abs(a.curve - b.curve).sum())
 
 
 def _ordered(x: Coupler) -> Coupler:
-    """Return a coupler with its joints in the order of their names, which its equation has either way."""
-    if x.joint <= x.leader or not x.ratio:
+    """Return a coupler with its joints in the order of their names, which its equation has either way without curve."""
+    if x.joint <= x.leader or not x.ratio or x.curve.any():
         return x
     return replace(x, joint=x.leader, leader=x.joint, ratio=1 / x.ratio, offset=-x.offset / x.ratio)
 
