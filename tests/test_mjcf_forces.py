@@ -348,3 +348,43 @@ def test_numbers_of_a_curve_are_parameters_and_checked() -> None:
     b.add_coupler("bad", "ja", "jb", curve=(1.0, 2.0))
     with pytest.raises(ModelError, match="curve: expected shape"):
         b.build()
+
+
+@pytest.mark.parametrize(
+    ("equality", "why"),
+    [
+        ('<tendon name="e" tendon1="t" tendon2="u" polycoef=".1 .2 .3 .4 .5"/>', ""),
+        ('<tendon name="e" tendon1="w" polycoef=".1 7 0 0 0"/>', ""),
+        ('<tendon name="e" tendon1="u" tendon2="w" polycoef=".1 .4 0 0 0"/>', ""),
+        ('<tendon name="e" tendon1="w" tendon2="t" polycoef=".1 1 0 0 0"/>', "it holds a single joint"),
+        ('<tendon name="e" tendon1="v" tendon2="t"/>', "it holds 3 joints at once"),
+        ('<tendon name="e" tendon1="t" tendon2="w" polycoef=".1 1 2 0 0"/>', "polynomial of a sum"),
+        ('<tendon name="e" tendon1="line" tendon2="w"/>', "'line' is no sum of coordinates"),
+    ],
+)
+def test_an_equality_of_tendons_is_a_coupler(equality: str, why: str, tmp_path: Path) -> None:
+    lengths = {"t": {"hip": 2.0}, "u": {"knee": -3.0}, "w": {"hip": 2.0, "knee": 0.5}, "v": {"knee": 1.0, "slip": 1.0}}
+    fixed = "".join(
+        f'<fixed name="{name}">{"".join(f"""<joint joint="{j}" coef="{x}"/>""" for j, x in row.items())}</fixed>'
+        for name, row in lengths.items()
+    )
+    line = '<spatial name="line"><site site="s"/><site site="r"/></spatial>'
+    text = KNEE.split("<equality>")[0].replace("</body></body>", '<site name="s"/></body><site name="r"/></body>')
+    text += f"<tendon>{fixed}{line}</tendon><equality>{equality}</equality></mujoco>"
+    path = written(text, tmp_path)
+    model = mb.load(path)
+    if why:
+        assert not model.couplers
+        assert any(why in note for note in model.notes)
+        return
+    compiled = mujoco.MjModel.from_xml_string(text)
+    data, q = mujoco.MjData(compiled), np.array([0.3, 0.25, 0.7])
+    data.qpos[:] = q
+    mujoco.mj_forward(compiled, data)
+    dyn = mb.dynamics(model, "lagrangian")
+    # MuJoCo's is of lengths: its Jacobian has the factor of the coupled joint.
+    scale = data.efc_J[list(model.joint_names).index(model.couplers[0].joint)]
+    np.testing.assert_allclose(scale * dyn.constraint_residual(q), data.efc_pos, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(scale * dyn.constraint_jacobian(q)[0], data.efc_J, rtol=0, atol=1e-14)
+    (read,) = mb.compare_parsers(path, ("mujoco",), samples=1).importers
+    assert all(stage.same for stage in read.stages if stage.name == "couplers")

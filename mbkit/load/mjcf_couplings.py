@@ -184,7 +184,8 @@ class Transmissions:
 
         tendons = inside("tendon")
         self._tendons = [self._tendon(e, label, k) for k, (e, label) in enumerate(tendons, 1)]
-        self._factors = {
+        #: dl/dq by joint of each tendon; nothing where its length is no sum of coordinates.
+        self.factors = {
             e.attributes.get("name", ""): t.factors for (e, _), t in zip(tendons, self._tendons, strict=True)
         }
         self._actuators = [self._actuator(e, label, k) for k, (e, label) in enumerate(inside("actuator"), 1)]
@@ -292,9 +293,9 @@ class Transmissions:
             if joint is None:
                 self._read.fault(f"{item}: joint {name!r} is not in the file", element)
             return {name: 1.0} if joint is not None and joint.scalar else {}
-        if tendon is not None and tendon not in self._factors:
+        if tendon is not None and tendon not in self.factors:
             self._read.fault(f"{item}: tendon {tendon!r} is not in the file", element)
-        return self._factors.get(tendon, {}) if tendon is not None else {}
+        return self.factors.get(tendon, {}) if tendon is not None else {}
 
     # Their effect on the model
 

@@ -1,13 +1,13 @@
 """Equality constraints of an MJCF as loops (XML reference of MuJoCo 4.0, section "equality").
 
-A <connect> becomes a loop of two points, a <weld> one of two frames, and a <joint> of two joints a coupler, all exact
-where MuJoCo's are soft. What an element with bodies does not say is measured in the reference configuration, the pose
-of the file: the second anchor of a <connect>, and the relative pose of a <weld>.
+A <connect> becomes a loop of two points, a <weld> one of two frames, and a <joint> or <tendon> that holds two joints a
+coupler, all exact where MuJoCo's are soft. What an element with bodies does not say is measured in the reference
+configuration, the pose of the file: the second anchor of a <connect>, and the relative pose of a <weld>.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -28,6 +28,32 @@ _KINDS: Final = {"connect": "point", "weld": "frame"}
 #: How soft MuJoCo holds an element: nothing of it is left in an exact loop.
 _SOFT: Final = ("solref", "solimp", "torquescale")
 _JOINT: Final = "joint"
+_COUPLED: Final = (_JOINT, "tendon")
+#: Joint, leader, ratio, offset and curve of a coupler.
+_Curve = tuple[str, str, float, float, list[float]]
+
+
+def coupled(sides: Sequence[Mapping[str, float]], shape: Sequence[float], refs: Mapping[str, float]) -> _Curve | str:
+    """Return an equality l₁ = P(l₂) as a coupler, or why it is none.
+
+    A side is a sum of coordinates, less those of the pose of the file, with factors by joint. `shape` has P's five
+    coefficients; a single side is equal to the first.
+    """
+    a, b = (*sides, {})[:2]
+    if len(a) == len(b) == 1 and a.keys() != b.keys():
+        ((joint, c), (leader, d)) = (*a.items(), *b.items())
+        curve = Polynomial(shape)(Polynomial([-d * refs[leader], d])) if d != 1 or refs[leader] else Polynomial(shape)
+    elif b and any(shape[2:]):
+        return "it is a polynomial of a sum of coordinates"
+    else:
+        row = {name: a.get(name, 0.0) - shape[1] * b.get(name, 0.0) for name in (*a, *b)}
+        row = {name: x for name, x in row.items() if x}
+        if len(row) != 2:
+            return f"it holds {len(row)} joints at once" if len(row) > 1 else "it holds a single joint"
+        ((joint, c), (leader, d)) = row.items()
+        curve = Polynomial([shape[0] + d * refs[leader], -d])
+    constant, ratio, *higher = (float(x) / c for x in (*curve.coef, *[0.0] * 5)[:5])
+    return joint, leader, ratio, refs[joint] + constant, higher
 
 
 @dataclass(frozen=True)
@@ -39,15 +65,26 @@ class _End:
 
 
 class Equalities:
-    """The <equality> sections of a file; with `wanted` false, or switched off by a flag, none becomes a loop."""
+    """The <equality> sections of a file; with `wanted` false, or switched off by a flag, none becomes a loop.
 
-    def __init__(self, mujoco: Element, scene: Scene, disabled: set[str], *, wanted: bool) -> None:
+    `tendons` has dl/dq of each joint for the lengths that are sums of coordinates, and nothing for the others.
+    """
+
+    def __init__(
+        self,
+        mujoco: Element,
+        scene: Scene,
+        disabled: set[str],
+        *,
+        wanted: bool,
+        tendons: Mapping[str, Mapping[str, float]],
+    ) -> None:
         self._scene, self._read = scene, scene.read
         self._left_out: list[str] = []
         self._soft: list[str] = []
         self._loops: dict[str, tuple[str, _End, _End]] = {}
-        #: Joint, leader, ratio, offset and curve.
-        self._couplers: dict[str, tuple[str, str, float, float, list[float]]] = {}
+        self._tendons = tendons
+        self._couplers: dict[str, _Curve] = {}
         elements = [(e, element_label(e, k)) for k, e in self._numbered(mujoco)]
         if not elements:
             return
@@ -62,14 +99,14 @@ class Equalities:
         moved = {e.attributes.get("name") for e in mujoco.walk() if e.attributes.get("mocap") == "true"}
         for element, label in elements:
             full = replace(scene.defaults.filled(replace(element, tag="equality"), None), tag=element.tag)
-            why = "" if element.tag in (*_KINDS, _JOINT) else "no loop"
+            why = "" if element.tag in (*_KINDS, *_COUPLED) else "no loop"
             if off := disabled & {"equality", "constraint"}:
                 why = f"option flag {sorted(off)[0]} is off"
             elif full.attributes.get("active") == "false":
                 why = "it is inactive"
             elif not wanted and not why:
                 why = "loops=False"
-            if not why and element.tag == _JOINT:
+            if not why and element.tag in _COUPLED:
                 why = self._couple(full, f"equality {label}")
                 if not why:
                     continue
@@ -90,24 +127,28 @@ class Equalities:
                 self._left_out.append(f"{label} ({bound_parts(element)}){'' if why == 'no loop' else f': {why}'}")
 
     def _couple(self, element: Element, item: str) -> str:
-        """Take an equality of two joints, or return why it is left out."""
-        scalars = {j.name: j for body in self._scene.bodies for j in body.joints if j.scalar}
-        first, second = (element.attributes.get(key, "") for key in ("joint1", "joint2"))
-        if not second:
-            return "it holds a single joint"
-        for key, name in (("joint1", first), ("joint2", second)):
-            if name not in scalars:
-                self._read.fault(f"{item}: {key} {name!r} is no hinge or slide of the file", element)
-                return "a joint is missing"
+        """Take an equality of two joints or of tendons, or return why it is left out."""
+        kind = element.tag
+        joints = {j.name: {j.name: 1.0} for body in self._scene.bodies for j in body.joints if j.scalar}
+        known, expected = (joints, "hinge or slide") if kind == _JOINT else (self._tendons, "tendon")
+        sides: list[Mapping[str, float]] = []
+        for key in (f"{kind}1", f"{kind}2"):
+            name = element.attributes.get(key, "")
+            if not name and sides:
+                break
+            if name not in known:
+                self._read.fault(f"{item}: {key} {name!r} is no {expected} of the file", element)
+                return f"a {kind} is missing"
+            if not known[name]:
+                return f"tendon {name!r} is no sum of coordinates"
+            sides.append(known[name])
         shape = self._read.numbers(element, "polycoef", item, count=5, default=(0.0, 1.0, 0.0, 0.0, 0.0))
-        follower, leader = scalars[first], scalars[second]
-        if follower is leader:
-            return "it holds a joint against itself"
-        name = unused(element.attributes.get("name") or f"joint{len(self._couplers) + 1}", self._couplers)
-        # MuJoCo's polynomial is of the coordinates less those of the pose of the file.
-        curve = Polynomial(shape)(Polynomial([-leader.ref, 1.0])) if leader.ref else Polynomial(shape)
-        constant, ratio, *higher = (float(x) for x in (*curve.coef, *[0.0] * 5)[:5])
-        self._couplers[name] = first, second, ratio, follower.ref + constant, higher
+        refs = {j.name: j.ref for body in self._scene.bodies for j in body.joints}
+        held = coupled(sides, shape, refs)
+        if isinstance(held, str):
+            return held
+        name = unused(element.attributes.get("name") or f"{kind}{len(self._couplers) + 1}", self._couplers)
+        self._couplers[name] = held
         return ""
 
     @staticmethod

@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import mujoco
 import numpy as np
-from numpy.polynomial import Polynomial
 
 from mbkit import spatial
 from mbkit._check import Array
@@ -23,6 +22,7 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings, mapped, matrix_of
 from mbkit.errors import UnsupportedError
 from mbkit.load.mjcf_couplings import with_couplings
+from mbkit.load.mjcf_equalities import coupled
 from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.model import Coupler, GravityCompensation, JointCoupling, Loop, Model, PointSpring
 from mbkit.model.joint_types import kind_of
@@ -248,18 +248,20 @@ class _Description:
         return tuple(out)
 
     def couplers(self) -> tuple[Coupler, ...]:
-        """Return the active equalities of two joints."""
+        """Return the active equalities that hold two joints, of joints and of tendons."""
         m, out = self.m, []
         names = {j: name for name, j in self.numbers.items()}
+        refs = {name: float(m.qpos0[m.jnt_qposadr[j]]) for name, j in self.numbers.items()}
+        kinds = {int(mujoco.mjtEq.mjEQ_JOINT): lambda j: {j: 1.0}, int(mujoco.mjtEq.mjEQ_TENDON): self._row}
         for i in self._equalities():
-            if m.eq_type[i] != mujoco.mjtEq.mjEQ_JOINT or m.eq_obj2id[i] < 0:
+            of = kinds.get(int(m.eq_type[i]))
+            if of is None:
                 continue
-            joint, leader = int(m.eq_obj1id[i]), int(m.eq_obj2id[i])
-            # The polynomial is of the coordinates less those of the pose of the file.
-            start, other = (float(m.qpos0[m.jnt_qposadr[j]]) for j in (joint, leader))
-            curve = Polynomial(m.eq_data[i][:5])(Polynomial([-other, 1.0]))
-            constant, ratio, *higher = (*curve.coef, *np.zeros(5))[:5]
-            out.append(Coupler(m.eq(i).name, names[joint], names[leader], ratio, start + constant, np.array(higher)))
+            rows = [of(k) for k in (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])) if k >= 0]
+            sides = [{names[j]: x for j, x in row.items() if x} for row in rows]
+            held = coupled(sides, m.eq_data[i][:5].tolist(), refs) if all(sides) else ""
+            if not isinstance(held, str):
+                out.append(Coupler(m.eq(i).name, *held[:4], np.array(held[4])))
         return tuple(out)
 
     def _equalities(self) -> list[int]:
@@ -335,6 +337,15 @@ class _Description:
         wraps = slice(int(self.m.tendon_adr[t]), int(self.m.tendon_adr[t]) + int(self.m.tendon_num[t]))
         return set(self.m.wrap_type[wraps].tolist()), wraps
 
+    def _row(self, t: int) -> dict[int, float]:
+        """Return the factors of a tendon's length by joint; nothing where it is no sum of coordinates."""
+        types, wraps = self._path(t)
+        row: dict[int, float] = {}
+        if types <= {int(mujoco.mjtWrap.mjWRAP_JOINT)}:
+            for j, factor in zip(self.m.wrap_objid[wraps].tolist(), self.m.wrap_prm[wraps].tolist(), strict=True):
+                row[j] = row.get(j, 0.0) + factor
+        return row
+
     def _point_springs(self) -> Iterator[tuple[str, PointSpring]]:
         """Yield the tendons that are springs between two sites, with their keys."""
         m = self.m
@@ -376,11 +387,8 @@ class _Description:
 
         tendons: dict[int, dict[int, float]] = {}
         for t in range(m.ntendon):
-            types, wraps = self._path(t)
-            if types <= {int(mujoco.mjtWrap.mjWRAP_JOINT)}:
-                row = tendons[t] = {}
-                for j, factor in zip(m.wrap_objid[wraps].tolist(), m.wrap_prm[wraps].tolist(), strict=True):
-                    row[j] = row.get(j, 0.0) + factor
+            if self._path(t)[0] <= {int(mujoco.mjtWrap.mjWRAP_JOINT)}:
+                row = tendons[t] = self._row(t)
                 name = m.tendon(t).name or f"tendon{t + 1}"
                 yield from coupling(f"tendon {t}", name, row, *self._spring(t), float(m.tendon_armature[t]))
         of_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
