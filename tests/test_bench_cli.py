@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+import mbkit as mb
 from mbkit.cli import cli
 from mbkit.errors import OutputError
 from mbkit.studies._checkpoint import InterruptedSweepError
@@ -168,3 +169,14 @@ def test_bad_input_is_one_message_and_exit_2(here, arguments, told):
     assert "Traceback" not in result.output
     assert result.stdout == ""
     assert [p.name for p in here.iterdir()] == ["regular"]
+
+
+def test_a_bench_says_that_its_runs_are_short_and_full_ones_are_not():
+    model = mb.catalog.pendulum()
+    short, whole = (
+        mb.work_precision(model, ["lagrangian"], ["rk4"], steps=[0.1], duration=0.1, repeats=1, work=work)
+        for work in (6_000, None)
+    )
+    assert short.shortened == ("runs of up to 6,000 evaluations alone",)
+    assert whole.shortened == ()
+    assert call("bench", "pendulum", "--full", "--quick").exit_code == 2

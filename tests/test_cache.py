@@ -307,3 +307,12 @@ def test_a_second_dynamics_of_the_same_description_derives_nothing(monkeypatch):
     for engine in ("lagrangian", "oracle"):
         with pytest.raises(AssertionError, match="derived again"):
             mb.dynamics(other, engine).nle(q, v)
+
+
+def test_a_folder_with_room_is_not_looked_through_at_each_entry(folder, monkeypatch):
+    looked = []
+    monkeypatch.setattr(disk_cache, "_left", {})
+    monkeypatch.setattr(disk_cache.os, "scandir", lambda at, scan=os.scandir: looked.append(at) or scan(at))
+    for k in range(20):
+        disk_cache.write(f"{k:064x}", {"k": k}, b"x")
+    assert looked == [folder]

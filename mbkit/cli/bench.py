@@ -12,6 +12,9 @@ from mbkit import _interrupt
 from mbkit.cli import _shared as shared
 from mbkit.cli._shared import Report
 
+#: Limits of evaluations in a run, of all methods and of a few.
+_WORK, _QUICK_WORK = 6_000, 24_000
+
 
 @shared.command("mbkit bench double_pendulum --quick", "mbkit bench ur5 --methods rk4,rk853 --duration 2 --out results")
 @click.argument("target")
@@ -19,10 +22,11 @@ from mbkit.cli._shared import Report
 @shared.methods_option("all there are")
 @click.option("--duration", default=1.0, show_default=True, type=float, help="Horizon of the motion, s.")
 @shared.seed_option("Of the start.")
-@click.option("--repeats", type=click.IntRange(min=1), help="Timings of each setting.  [default: 5; quick: 3]")
+@click.option("--repeats", type=click.IntRange(min=1), help="Timings of each setting.  [default: 3; full: 5]")
 @click.option("--seconds", type=float, help="Of the processor, at the most, s.  [default: work is bounded, not time]")
 @click.option("--jobs", type=click.IntRange(min=1), help="Measure in so many processes: sooner done, times less sure.")
-@click.option("--quick", is_flag=True, help="Seven methods, fewer repetitions and shorter runs.")
+@click.option("--quick", is_flag=True, help="Seven methods alone.")
+@click.option("--full", is_flag=True, help="Finer settings, in runs of up to 200,000 evaluations: a minute or more.")
 @shared.load_options
 @shared.report_options
 def bench(
@@ -32,13 +36,15 @@ def bench(
     repeats: int | None,
     jobs: int | None,
     quick: bool,
+    full: bool,
     options: dict[str, Any],
     report: Report,
     **settings: Any,
 ) -> None:
     """Measure error against run time on TARGET: every engine, every method.
 
-    TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written.
+    TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written. Runs have up to 6,000 evaluations,
+    one called from Python counting eight, so that a small system takes some seconds; with --full 200,000.
     Ctrl-C ends the study early and writes the finished part.
     """
     from mbkit.methods.registry import METHODS, QUICK_METHODS
@@ -49,6 +55,8 @@ def bench(
     from mbkit.studies._targets import model_of
     from mbkit.studies.worker import WorkerPool
 
+    if full and quick:
+        raise click.UsageError("--full and --quick are opposites; give one")
     shared.check_engines(engines, least=1)
     report.prepare()
     model = model_of(target, options)
@@ -57,8 +65,8 @@ def bench(
     if quick and not methods:
         # A method that none of the engines has would be refused.
         methods = tuple(m for m in QUICK_METHODS if not METHODS[m].engines or set(engines) & set(METHODS[m].engines))
-    settings["repeats"] = repeats or (3 if quick else 5)
-    settings["work"] = 24_000 if quick else None
+    settings["repeats"] = repeats or (5 if full else 3)
+    settings["work"] = None if full else _QUICK_WORK if quick else _WORK
     workers: AbstractContextManager[Executor | None] = nullcontext() if jobs is None else WorkerPool(jobs)
     try:
         with _interrupt.keeping, Bar(f"bench {model.name}") as bar, workers as executor:

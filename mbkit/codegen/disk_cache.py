@@ -26,6 +26,8 @@ T = TypeVar("T")
 _MAGIC: Final = b"mbkit machine code 1\n"
 #: The oldest entries go when the folder holds more than this, bytes.
 _MAX_BYTES: Final = 512 * 2**20
+#: By folder what this process may write before it looks through it again, bytes.
+_left: Final[dict[Path, int]] = {}
 #: Names of entries, and of those being written.
 _ENTRY: Final = re.compile(r"[0-9a-f]{64}|\.new-.+")
 #: Entries compiled within a block of `force_recompile`; None outside of one.
@@ -125,7 +127,7 @@ def write(key: str, about: dict[str, Any], code: bytes) -> None:
             with suppress(OSError):
                 os.unlink(temporary)
             return
-        _delete_oldest(at)
+        _make_room(at, len(content))
     except OSError:
         return
 
@@ -150,16 +152,25 @@ def cached(
     return code
 
 
-def _delete_oldest(at: Path) -> None:
+def _make_room(at: Path, written: int) -> None:
+    """Delete the oldest entries of a folder that is full; it is looked through only when it may be."""
+    left = _left.get(at, 0) - written
+    if left > 0:
+        _left[at] = left
+        return
     entries = []
-    for path in at.iterdir():
-        with suppress(OSError):
-            if _ENTRY.fullmatch(path.name):
-                entries.append((path.stat().st_mtime, path.stat().st_size, path))
+    with os.scandir(at) as found:
+        for entry in found:
+            with suppress(OSError):
+                if _ENTRY.fullmatch(entry.name):
+                    status = entry.stat()
+                    entries.append((status.st_mtime, status.st_size, entry.path))
     size = sum(entry[1] for entry in entries)
     for _, bytes_, path in sorted(entries):
         if size <= _MAX_BYTES:
-            return
+            break
         with suppress(OSError):
-            path.unlink()
+            os.unlink(path)
             size -= bytes_
+    # Others write too.
+    _left[at] = (_MAX_BYTES - size) // 4

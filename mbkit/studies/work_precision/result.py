@@ -103,6 +103,8 @@ class WorkPrecision(ResultTable):
         if failed := self.failed:
             names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in failed))
             out.append(f"{_counted(len(names), 'curve')} left out: {', '.join(names)}")
+        if (work := self.settings.get("work", math.inf)) < self.settings.get("whole_work", 0):
+            out.append(f"runs of up to {work:,.0f} evaluations alone")
         ended = [f"{c.engine} {c.method}" for c in self.curves if c.ended]
         if ended:
             out.append(f"{_counted(len(ended), 'curve')} ended by time: {', '.join(ended)}")

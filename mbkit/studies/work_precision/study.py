@@ -146,7 +146,8 @@ def work_precision(
     require_motion(model, "integrate").require_values("a study of run time")
     usual = min(_USUAL + _PER_VELOCITY * model.nv, _MAX_USUAL)
     limit = _LATEST * usual if seconds is None else real("seconds", seconds, positive=True)
-    most = _WORK * min(1.0, _VELOCITIES / model.nv) if work is None else count("work", work, least=1)
+    whole = _WORK * min(1.0, _VELOCITIES / model.nv)
+    most = whole if work is None else count("work", work, least=1)
     budget = TimeBudget(limit, min(usual, limit), most)
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
     _check_executor(executor, torque)
@@ -203,6 +204,7 @@ def work_precision(
                 "repeats": repeats,
                 "allowed": budget.seconds,
                 "work": budget.work,
+                "whole_work": whole,
                 "steps": steps,
                 "tolerances": tolerances,
                 "torque": "function" if callable(force) else None if force is None else force.tolist(),
