@@ -97,14 +97,19 @@ class WorkPrecision(ResultTable):
         )
 
     @property
+    def bounded(self) -> str:
+        """The limit of work of each run, where it is less than a study's own; else empty."""
+        work, whole = self.settings.get("work", math.inf), self.settings.get("whole_work", 0)
+        return f"runs of up to {work:,.0f} evaluations alone" if work < whole else ""
+
+    @property
     def shortened(self) -> tuple[str, ...]:
         """What is missing, such as curves that failed, curves that time ended, a horizon that was cut."""
         out = [] if self.complete else ["interrupted"]
         if failed := self.failed:
             names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in failed))
             out.append(f"{_counted(len(names), 'curve')} left out: {', '.join(names)}")
-        if (work := self.settings.get("work", math.inf)) < self.settings.get("whole_work", 0):
-            out.append(f"runs of up to {work:,.0f} evaluations alone")
+        out += [self.bounded] if self.bounded else []
         ended = [f"{c.engine} {c.method}" for c in self.curves if c.ended]
         if ended:
             out.append(f"{_counted(len(ended), 'curve')} ended by time: {', '.join(ended)}")
