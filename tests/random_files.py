@@ -247,7 +247,7 @@ def mujoco_terms(text: str, samples: int, seed: int) -> Reference:
     # MuJoCo would print them and write a file into the working folder.
     mujoco.set_mju_user_warning(lambda _: None)
     try:
-        return _terms(mujoco.MjModel.from_xml_string(text), samples, seed)
+        return terms_of(mujoco.MjModel.from_xml_string(text), samples, seed)
     finally:
         mujoco.set_mju_user_warning(before)
 
@@ -255,7 +255,8 @@ def mujoco_terms(text: str, samples: int, seed: int) -> Reference:
 _FORCES = ("passive", "actuated")
 
 
-def _terms(m: mujoco.MjModel, samples: int, seed: int) -> Reference:
+def terms_of(m: mujoco.MjModel, samples: int, seed: int) -> Reference:
+    """Return the terms of a compiled model."""
     m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
     d, rng = mujoco.MjData(m), np.random.default_rng([seed, 7])
     out: dict[str, list[np.ndarray]] = {name: [] for name in ("q", "v", "M", "nle", *_FORCES, "scale", "rounding")}

@@ -481,7 +481,7 @@ BODY = '<body name="b"><joint name="j"/><inertial pos="0 0 0" mass="1" diaginert
 MJCFS = {
     "no_bodies": (mjcf(""), ["no bodies"]),
     "no_joints": (mjcf('<body><geom size="1"/></body>'), ["no joints", "floating_base=True"]),
-    "attach": (mjcf(f'{BODY}<attach model="m" body="b" prefix="p"/>'), ["<attach> is not read", "names another model"]),
+    "attach": (mjcf(f'{BODY}<attach model="m" body="b" prefix="p"/>'), ["model 'm' is no <model> of <asset>"]),
     "mesh_inertia": (
         mjcf(
             '<body name="b"><joint/><geom type="mesh" mesh="m"/></body>', '<asset><mesh name="m" file="m.stl"/></asset>'

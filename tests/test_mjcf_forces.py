@@ -12,7 +12,8 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import ModelError, UnsupportedError
-from tests.random_files import mujoco_terms
+from mbkit.show import shapes_of
+from tests.random_files import mujoco_terms, terms_of
 
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "oracle")
 
@@ -388,3 +389,101 @@ def test_an_equality_of_tendons_is_a_coupler(equality: str, why: str, tmp_path: 
     np.testing.assert_allclose(scale * dyn.constraint_jacobian(q)[0], data.efc_J, rtol=0, atol=1e-14)
     (read,) = mb.compare_parsers(path, ("mujoco",), samples=1).importers
     assert all(stage.same for stage in read.stages if stage.name == "couplers")
+
+
+# Attached models
+
+HAND = """<mujoco model="hand"><compiler angle="radian"/><option gravity="0 0 0"/>
+  <default><joint damping=".3"/><default class="light"><geom density="300"/><joint range="-1 1" springref=".2"/>
+  <position kp="3"/></default></default>
+  <worldbody><frame pos="0 0 1" euler=".1 .2 .3" name="mount"><body name="palm" pos=".1 .2 .3333333333333"
+    euler=".3 0 .1" childclass="light"><joint name="j" axis="1 0 0" stiffness="2"/><geom size=".1" pos="0 .1 0"/>
+    <site name="s" pos=".1 .1 .1"/><body name="tip" pos="0 0 .1"><joint name="k" ref=".1" axis="0 1 0"/>
+    <joint name="p" type="slide" ref=".1" springref=".3" stiffness="1"/><geom type="box" size=".2 .1 .1"/></body></body>
+  </frame><body name="other"><joint name="o"/><geom size=".1" axisangle="0 1 0 .3"/></body></worldbody>
+  <actuator><position class="light" joint="k"/><motor joint="o" gear="2" armature=".1"/></actuator>
+  <tendon><fixed name="t" stiffness="2"><joint joint="k" coef="2"/></fixed>
+    <fixed name="mixed" stiffness="2"><joint joint="k" coef="2"/><joint joint="o" coef="2"/></fixed></tendon>
+  <equality><connect body1="tip" anchor="0 0 .1"/><joint joint1="j" joint2="o"/></equality></mujoco>"""
+ARM = """<mujoco model="arm"><asset><model name="hand" file="sub/hand.xml"/></asset>
+  <default><default class="heavy"><geom density="3000"/></default></default><worldbody>
+  <body name="base" pos="0 0 1"><joint name="f" axis="0 1 0" range="-90 90" limited="true"/>
+    <geom size=".1" pos="0 .2 .1" class="heavy"/>{attach}</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "attach",
+    [
+        '<attach model="hand" body="palm" prefix="l_"/>',
+        '<attach model="hand" prefix="l_"/>',
+        '<attach model="hand" frame="mount" prefix="l_"/><body pos="1 0 0"><joint/><geom size=".1"/></body>',
+        '<attach model="hand" body="tip" prefix="l_"/>'
+        '<frame pos="1 .2 .3" euler="10 20 30"><attach model="hand" body="palm" prefix="r_"/></frame>',
+    ],
+)
+def test_what_is_attached_is_that_of_mujoco(attach: str, tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    written(HAND, tmp_path, "sub/hand.xml")
+    path = written(ARM.format(attach=attach), tmp_path)
+    compiled = mujoco.MjModel.from_xml_path(str(path))
+    model, at = mb.load(path, actuators=True), terms_of(compiled, 4, 0)
+    dyn = mb.dynamics(model, "lagrangian")
+    for x, exact in (
+        (dyn.mass_matrix(at.q), at.M),
+        (dyn.nle(at.q, at.v), at.nle),
+        (dyn.passive(at.q, at.v), at.actuated),
+    ):
+        assert np.abs(x - exact).max() < 1e-12 * max(np.abs(exact).max(), 1.0)
+    names = [compiled.joint(i).name for i in range(compiled.njnt)]
+    assert [x for x in model.joint_names if x in names] == [x for x in names if x]
+    for i in np.flatnonzero(compiled.jnt_limited):
+        joint = model.joint(names[i])
+        np.testing.assert_allclose([joint.lower[0], joint.upper[0]], compiled.jnt_range[i], rtol=1e-14)
+    assert len(model.loops) + len(model.couplers) == compiled.neq
+    assert any("<attach> written out: 'hand' as 'l_'" in note for note in model.notes)
+    drawn = {shape.body for shape in shapes_of(model)}
+    assert {x for x in drawn if x.startswith("l_")} == {b.name for b in model.bodies if b.mass and b.name[:2] == "l_"}
+
+
+def test_meshes_of_what_is_attached_are_found(tmp_path: Path) -> None:
+    corners = [(x, y, z) for x in (-0.1, 0.1) for y in (-0.2, 0.2) for z in (-0.3, 0.3)]
+    faces = ["1 2 4", "1 4 3", "5 7 8", "5 8 6", "1 5 6", "1 6 2", "3 4 8", "3 8 7", "1 3 7", "1 7 5", "2 6 8", "2 8 4"]
+    (tmp_path / "sub" / "shapes").mkdir(parents=True)
+    lines = [*("v {} {} {}".format(*c) for c in corners), *(f"f {f}" for f in faces)]
+    written("\n".join(lines), tmp_path, "sub/shapes/box.obj")
+    text = HAND.replace('"radian"', '"radian" meshdir="shapes"').replace(
+        "<default>", '<default><mesh scale="1 2 1"/>', 1
+    )
+    text = text.replace("<worldbody>", '<asset><mesh file="box.obj"/></asset><worldbody>')
+    written(text.replace('<geom size=".1" pos', '<geom type="mesh" mesh="box" pos'), tmp_path, "sub/hand.xml")
+    path = written(ARM.format(attach='<attach model="hand" body="palm" prefix="l_"/>'), tmp_path)
+    at = terms_of(mujoco.MjModel.from_xml_path(str(path)), 2, 0)
+    M = mb.dynamics(mb.load(path)).mass_matrix(at.q)
+    assert np.abs(M - at.M).max() < 1e-12 * np.abs(at.M).max()
+
+
+@pytest.mark.parametrize(
+    ("where", "change", "said"),
+    [
+        ("arm", ('prefix="l_"', ""), "prefix"),
+        ("arm", ('model="hand" body', 'model="hnd" body'), "model 'hnd' is no <model>"),
+        ("arm", ("sub/hand.xml", "sub/none.xml"), "no such file"),
+        ("arm", ("sub/hand.xml", "/etc/hand.xml"), "absolute path"),
+        ("arm", ('body="palm"', 'body="plam"'), "body 'plam' is not in sub/hand.xml"),
+        ("arm", ('<default><default class="heavy">', '<default><joint damping="1"/><default class="heavy">'), "main"),
+        ("hand", ('angle="radian"', 'angle="radian" eulerseq="XYZ"'), "compiler eulerseq is XYZ, and xyz here"),
+        (
+            "hand",
+            ("<option", '<asset><model name="x" file="y"/></asset><worldbody><attach/></worldbody><option'),
+            "own",
+        ),
+    ],
+)
+def test_faults_of_what_is_attached_are_named(where: str, change: tuple[str, str], said: str, tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    texts = {"arm": ARM.format(attach='<attach model="hand" body="palm" prefix="l_"/>'), "hand": HAND}
+    assert change[0] in texts[where]
+    texts[where] = texts[where].replace(*change)
+    written(texts["hand"], tmp_path, "sub/hand.xml")
+    with pytest.raises(ModelError, match=said):
+        mb.load(written(texts["arm"], tmp_path))

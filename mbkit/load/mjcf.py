@@ -23,7 +23,16 @@ from mbkit.load.mjcf_attributes import Compiler, Defaults, about, check_names
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, name_list
 from mbkit.load.mjcf_couplings import Transmissions
 from mbkit.load.mjcf_equalities import Equalities
-from mbkit.load.mjcf_reader import KINDS, MjcfBody, MjcfJoint, Scene, add_free_base, read_tree, write_out_copies
+from mbkit.load.mjcf_reader import (
+    KINDS,
+    MjcfBody,
+    MjcfJoint,
+    Scene,
+    add_free_base,
+    read_tree,
+    write_out_attached,
+    write_out_copies,
+)
 from mbkit.load.shapes import NOTHING, together
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
@@ -31,7 +40,6 @@ from mbkit.model import Body, Model, ModelBuilder
 from mbkit.model.validation import body_fault
 
 _REFUSED: Final = {
-    "attach": "it names another model; save the compiled model as one XML",
     "composite": "write its bodies out; MuJoCo's save as XML does",
     "flexcomp": "deformable bodies are not rigid; remove it",
 }
@@ -60,6 +68,7 @@ def model_of_mjcf(
         if element.tag in _REFUSED:
             read.fault(f"<{element.tag}> is not read: {_REFUSED[element.tag]}", element)
     compiler = Compiler.of(mujoco, read)
+    attached = write_out_attached(mujoco, path, compiler, read)
     copied = write_out_copies(mujoco, compiler, read)
     misspelt = check_names(mujoco, read)
     if floating_base:
@@ -101,7 +110,16 @@ def model_of_mjcf(
     if read.faults:
         raise ModelError(str(path), read.faults)
     sprung = f"stiffness and damping from MuJoCo's compiler (springdamper): {name_list(springs)}" if springs else ""
-    for note in (*_notes(mujoco, path, scene, flags, scale), joined, copied, inferred, sprung, misspelt, snap.note):
+    for note in (
+        *_notes(mujoco, path, scene, flags, scale),
+        joined,
+        attached,
+        copied,
+        inferred,
+        sprung,
+        misspelt,
+        snap.note,
+    ):
         if note:
             b.note(note)
     equalities.add_to(b, snap)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from types import MappingProxyType
 from typing import Final
 
@@ -18,6 +19,8 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._reproducible import length, product, turned
+from mbkit.errors import LoadError
+from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import (
     HERE,
     ORIENTATIONS,
@@ -26,6 +29,7 @@ from mbkit.load.mjcf_attributes import (
     Pose,
     from_euler,
     has_length,
+    mesh_name,
     pose,
     z_to,
 )
@@ -212,18 +216,239 @@ def _suffixed(element: Element, suffix: str, names: Mapping[str, Container[str]]
     return replace(element, attributes=own, children=[_suffixed(e, suffix, names) for e in element.children])
 
 
+# Attached models
+
+#: Settings of <compiler> that what is attached must share; angles are converted.
+_SHARED: Final = ("eulerseq", "autolimits", "inertiafromgeom", "groups", "balanceinertia", "boundmass", "boundinertia")
+
+
+def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Reader) -> str:
+    """Write the parts of other files that <attach> names in its place, as MuJoCo 4.0.0 does, and return a note.
+
+    All names get the prefix. Defaults become a class of their own; meshes, and the tendons, actuators and equalities
+    that name nothing but what is attached, are added. Options of the other file do not count.
+    """
+    attacher = _Attacher(mujoco, path, compiler, read)
+    for world in mujoco.all("worldbody"):
+        attacher.write_out(world)
+    return f"<attach> written out: {listing(attacher.told, 6)}" if attacher.told else ""
+
+
+@dataclass
+class _Other:
+    """A file from which something is attached."""
+
+    root: Element
+    path: Path
+    compiler: Compiler
+    defaults: Defaults
+    factor: float  # of its angles
+    file: str
+
+
+@dataclass
+class _Attacher:
+    """Writes <attach> elements out, up to a number of elements."""
+
+    mujoco: Element
+    path: Path
+    compiler: Compiler
+    read: Reader
+    told: list[str] = field(default_factory=list)
+    others: dict[str, _Other | None] = field(default_factory=dict)
+    added: set[tuple[str, str]] = field(default_factory=set)
+    left: int = MOST_ELEMENTS
+
+    def write_out(self, owner: Element) -> None:
+        """Write out all that is attached below an element."""
+        children: list[Element] = []
+        for child in owner.children:
+            if child.tag == "attach":
+                children += self._attached(child)
+            else:
+                self.write_out(child)
+                children.append(child)
+        owner.children = children
+
+    def _attached(self, element: Element) -> list[Element]:
+        own, read = element.attributes, self.read
+        model, prefix = (read.name(element, name, "<attach>") for name in ("model", "prefix"))
+        if model not in self.others:
+            self.others[model] = self._other(model, element)
+        if (other := self.others[model]) is None:
+            return []
+        wanted = [(tag, own[tag]) for tag in ("body", "frame") if own.get(tag)]
+        worlds = other.root.all("worldbody")
+        found = [x for world in worlds for x in self._found(world, wanted, None, other)] if wanted else []
+        if wanted and not found:
+            read.fault(f"<attach>: {wanted[0][0]} {wanted[0][1]!r} is not in {other.file}", element)
+            return []
+        parts = found[:1] or [(x, None) for world in worlds for x in world.children]
+        self.left -= sum(1 for part, _ in parts for _ in part.walk())
+        if self.left < 0:
+            read.fault(f"<attach>: more than {MOST_ELEMENTS} elements; attach less", element)
+            return []
+        self.told.append(f"{model!r} as {prefix!r} ({element.place})")
+        if (model, prefix) not in self.added:
+            self.added.add((model, prefix))
+            self._add_shared(prefix, other, element)
+        self._add_naming([part for part, _ in parts], prefix, other)
+        out = []
+        for part, childclass in parts:
+            inside = _Prefixed(prefix, other).of(part, childclass)
+            frame = {"childclass": prefix + (childclass or "main")}
+            out.append(Element("frame", frame, element.line, [inside], file=element.file))
+        return out
+
+    def _other(self, model: str, element: Element) -> _Other | None:
+        """Read the file of a <model>, or keep a fault."""
+        assets = (e for asset in self.mujoco.all("asset") for e in asset.all("model"))
+        asset = next((e for e in assets if e.attributes.get("name") == model), None)
+        if asset is None:
+            self.read.fault(f"<attach>: model {model!r} is no <model> of <asset>", element)
+            return None
+        file = asset.attributes.get("file", "").replace("\\", "/")
+        if PurePosixPath(file).is_absolute() or PureWindowsPath(file).drive:
+            self.read.fault(
+                f"model {model!r}: an absolute path is not followed; write it as seen from this file", asset
+            )
+            return None
+        path = self.path.parent / file
+        try:
+            root = xml_reader.with_includes(xml_reader.read(path), path)
+        except LoadError as error:
+            self.read.fault(f"model {model!r}: {error}", asset)
+            return None
+        if root.tag != "mujoco" or any(e.tag in ("attach", "replicate") for e in root.walk()):
+            self.read.fault(f"model {model!r}: expected an MJCF without <attach> and <replicate> of its own", asset)
+            return None
+        compiler = Compiler.of(root, self.read)
+        for name in _SHARED:
+            ours, theirs = getattr(self.compiler, name), getattr(compiler, name)
+            if ours != theirs:
+                self.read.fault(
+                    f"model {model!r}: compiler {name} is {theirs}, and {ours} here; expected the same", asset
+                )
+        main = [e for top in self.mujoco.all("default") for e in top.children if e.tag != "default" and e.attributes]
+        if main:
+            why = "would reach what is attached; put it into a class of its own"
+            self.read.fault(f"model {model!r}: the main default class {why}", main[0])
+        factor = compiler.angle / self.compiler.angle
+        return _Other(root, path, compiler, Defaults(root, self.read), factor, file)
+
+    def _found(
+        self, owner: Element, wanted: list[tuple[str, str]], childclass: str | None, other: _Other
+    ) -> Iterator[tuple[Element, str | None]]:
+        """Yield the element of this tag and name below another, with the class that reaches it."""
+        for child in owner.children:
+            if (child.tag, child.attributes.get("name")) in wanted:
+                yield child, childclass
+            yield from self._found(child, wanted, _class_inside(child, childclass), other)
+
+    def _add_shared(self, prefix: str, other: _Other, element: Element) -> None:
+        """Add the defaults and meshes of a file, with a prefix."""
+        prefixed = _Prefixed(prefix, other, of_classes=True)
+        tops = self.mujoco.all("default") or [Element("default", {}, element.line)]
+        if tops[0] not in self.mujoco.children:
+            self.mujoco.children.append(tops[0])
+        inside = [prefixed.of(e, None) for top in other.root.all("default") for e in top.children]
+        tops[0].children.append(Element("default", {"class": f"{prefix}main"}, element.line, inside, file=other.file))
+        meshes = []
+        for mesh in (e for asset in other.root.all("asset") for e in asset.all("mesh")):
+            own = mesh.attributes | {"name": prefix + mesh_name(mesh)}
+            own["class"] = prefix + own.get("class", "main")
+            if "file" in own:
+                own["file"] = str((other.path.parent / other.compiler.mesh_path(own["file"])).absolute())
+            meshes.append(replace(mesh, attributes=own, file=other.file))
+        self.mujoco.children.append(Element("asset", {}, element.line, meshes, file=other.file))
+
+    def _add_naming(self, parts: list[Element], prefix: str, other: _Other) -> None:
+        """Add the tendons, actuators and equalities that name nothing but what is attached."""
+        names = _names(parts)
+        for tag in _NAMING:
+            for section in other.root.all(tag):
+                kept = []
+                for e in section.children:
+                    inside = _inside(e, names)
+                    if inside and all(inside):
+                        own = {"class": "main"} | e.attributes
+                        kept.append(_Prefixed(prefix, other).of(replace(e, attributes=own), None))
+                        if tag == "tendon" and "name" in e.attributes:
+                            names.setdefault(tag, set()).add(e.attributes["name"])
+                self.mujoco.children.append(Element(tag, {}, section.line, kept, file=other.file))
+
+
+@dataclass
+class _Prefixed:
+    """Copies elements of another file, with a prefix before all names, and angles in this file's unit."""
+
+    prefix: str
+    other: _Other
+    of_classes: bool = False  # whether these are defaults
+
+    def of(self, element: Element, childclass: str | None) -> Element:
+        """Return a copy of an element that a class reaches."""
+        own = dict(element.attributes)
+        if self.other.factor != 1:
+            self._turn(element, own, childclass)
+        for key, x in own.items():
+            named = key in ("name", "class", "childclass", "mesh") or key.rstrip("12") in _NAMES
+            if named and x not in ("", "world"):
+                own[key] = self.prefix + x
+        inner = _class_inside(element, childclass)
+        children = [self.of(e, inner) for e in element.children]
+        return replace(element, attributes=own, children=children, file=self.other.file)
+
+    def _turn(self, element: Element, own: dict[str, str], childclass: str | None) -> None:
+        for key in ("euler", "axisangle"):
+            if key in own:
+                first, last = ([], own[key].split()) if key == "euler" else (own[key].split()[:3], own[key].split()[3:])
+                own[key] = " ".join([*first, *map(self._angle, last)])
+        # In a default class its type may not be known: every joint says its own angles.
+        if element.tag == "joint" and not self.of_classes and not {"joint", "joint1"} & own.keys():
+            full = self.other.defaults.filled(element, childclass).attributes
+            if full.get("type", "hinge") in ("hinge", "ball"):
+                for key in ("range", "ref", "springref"):
+                    if key in full:
+                        own[key] = " ".join(map(self._angle, full[key].split()))
+
+    def _angle(self, text: str) -> str:
+        try:
+            return repr(float(text) * self.other.factor)
+        except ValueError:
+            # Not a number: whoever reads it says so.
+            return text
+
+
+def _class_inside(element: Element, childclass: str | None) -> str | None:
+    """Return the class that reaches what is inside an element."""
+    own = element.attributes
+    return own.get("childclass", own.get("class", childclass) if element.tag == "frame" else childclass)
+
+
+def _names(elements: Iterable[Element]) -> dict[str, set[str]]:
+    """Return all names below elements, by tag."""
+    names: dict[str, set[str]] = {}
+    for inner in (x for element in elements for x in element.walk()):
+        if inner.tag in _NAMES and "name" in inner.attributes:
+            names.setdefault(inner.tag, set()).add(inner.attributes["name"])
+    return names
+
+
+def _inside(element: Element, names: Mapping[str, Container[str]]) -> list[bool]:
+    """Return of each part that an element names whether it is among some names."""
+    ends = [(_NAMES.get(k.rstrip("12"), ""), x) for y in element.walk() for k, x in y.attributes.items()]
+    return [x in names.get(kind, ()) for kind, x in ends if kind]
+
+
 def _copy_naming(mujoco: Element, element: Element, suffixes: Iterable[str]) -> Iterator[str]:
     """Copy the elements that name something in a <replicate>, and yield those that MuJoCo leaves out."""
-    names: dict[str, set[str]] = {}
-    for inner in element.walk():
-        if inner is not element and inner.tag in _NAMES and "name" in inner.attributes:
-            names.setdefault(inner.tag, set()).add(inner.attributes["name"])
+    names = _names(element.children)
     for tag in _NAMING:
         for section in mujoco.all(tag):
             kept, copied = list[Element](), list[Element]()
             for e in section.children:
-                ends = [(_NAMES.get(k.rstrip("12"), ""), x) for y in e.walk() for k, x in y.attributes.items()]
-                inside = [x in names.get(kind, ()) for kind, x in ends if kind]
+                inside = _inside(e, names)
                 if not any(inside):
                     kept.append(e)
                 elif tag == "equality" and not all(inside):

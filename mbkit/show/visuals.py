@@ -17,6 +17,7 @@ from mbkit._check import Array
 from mbkit.errors import LoadError, UnknownNameError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import Compiler, mesh_assets, mesh_name, read_mesh
+from mbkit.load.mjcf_reader import write_out_attached
 from mbkit.load.shapes import SIZES
 from mbkit.load.xml_reader import Element, Reader, element_text
 from mbkit.model import Model
@@ -192,6 +193,7 @@ def _rgba(material: Element) -> Color | None:
 def _mjcf(model: Model, source: Path, mujoco: Element, kind: str) -> Visuals:
     out, assets = Visuals(), dict[str, bytes]()
     settings = Compiler.of(mujoco, Reader())
+    write_out_attached(mujoco, source, settings, Reader())
     lost: dict[str, str] = {}
     for name, mesh in mesh_assets(mujoco).items():
         file = mesh.attributes.get("file", "")
