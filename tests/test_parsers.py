@@ -476,3 +476,21 @@ def test_what_is_not_installed_refuses_nothing(tmp_path: Path) -> None:
     verdict = replace(result, importers=(result.importers[0], gone)).verdict
     assert "mujoco is not installed" in verdict
     assert "refuse" not in verdict
+
+
+def test_mimic_joints_that_an_importer_holds_are_not_called_free():
+    """Agreement leaves mimic joints out, and says so; no mark of a fault stands below a tick."""
+    result = mb.compare_parsers("panda")
+    assert result.agree
+    assert result.verdict.endswith("with the file as written, mimic joints apart")
+    ways = {"pinocchio": "left free", "mujoco": "held by soft equality constraints", "drake": "held by constraints"}
+    for read in result.importers:
+        mimic = next(s for s in read.stages if s.name == "mimic")
+        assert mimic.says == f"1 {ways[read.engine]}: panda_finger_joint2"
+        (cause,) = (c for c in read.explanation.causes if c.kind == "mimic")
+        assert ("leaves it free" in cause.says) == (read.engine == "pinocchio")
+    with CliRunner().isolated_filesystem():
+        shown = CliRunner().invoke(cli, ["check", "panda", "--own-parsers"])
+    assert shown.exit_code == 0
+    assert "✗" not in shown.output
+    assert mb.compare_parsers("ur5").verdict.endswith("with the file as written")

@@ -77,6 +77,7 @@ class Imported:
     loops: tuple[Loop, ...] | str = ()
     #: Fixed ratios of two coordinates that it holds, outside of all terms.
     couplers: tuple[Coupler, ...] = ()
+    holds_mimics: str = ""
 
 
 def joint_of(

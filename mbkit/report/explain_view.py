@@ -45,15 +45,16 @@ def explanation_view(result: Explanation) -> Document:
     )
 
 
-def _causes(causes: Iterable[Cause]) -> list[Block]:
-    """Return the causes, those that move something first."""
+def _causes(causes: Iterable[Cause], apart: tuple[str, ...] = ()) -> list[Block]:
+    """Return the causes, those that move something first; kinds that stand `apart` decide nothing."""
     bullets: list[Bullet] = []
     known = list(causes)
     for acts, mark, style in ((True, "✗", "bad"), (False, "!", "allowed")):
         for kind, says, what in grouped(c for c in known if c.acts == acts):
             # What a kind means is said once.
             again = any(b.head == kind for b in bullets)
-            bullets.append(Bullet(kind, f"{says} ({what})", mark, style, "" if again else meaning(kind)))  # type: ignore[arg-type]
+            look = ("!", "allowed") if kind in apart else (mark, style)
+            bullets.append(Bullet(kind, f"{says} ({what})", *look, "" if again else meaning(kind)))  # type: ignore[arg-type]
     return [Items(bullets)]
 
 
@@ -160,7 +161,7 @@ def _differences(read: list[Parsed]) -> Iterator[Section]:
             title += f": not all is explained{where}"
         elif not why.acting:
             title += " moves the same; what differs is data"
-        yield Section(f"Why they differ: {title}", [about, *_causes(why.causes)])
+        yield Section(f"Why they differ: {title}", [about, *_causes(why.causes, ("mimic",))])
 
 
 def _stage(stage: Stage) -> Span:

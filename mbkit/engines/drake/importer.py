@@ -62,11 +62,12 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     notes = [f"the base {welded!r} floats by itself; welded to the world here"] if welded else []
     messages = [" ".join(record.getMessage().split("warning: ")[-1].split()) for record in records]
     notes += [text for text in dict.fromkeys(messages) if not any(x in text for x in _IDLE)]
-    if plant.num_constraints():
+    held = "by constraints" if plant.num_constraints() else ""
+    if held:
         notes.append(f"{plant.num_constraints()} constraints, outside M and nle")
     # A plant counts its constraints.
     loops = "pydrake does not give the bodies and points of constraints" if plant.num_constraints() else ()
-    return Imported(model, dyn.terms, tuple(notes), loops=loops)
+    return Imported(model, dyn.terms, tuple(notes), loops=loops, holds_mimics=held)
 
 
 @contextmanager

@@ -55,7 +55,9 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     dyn = _Read.of(checked("mujoco", described.model), m, described.numbers, {x.key: y for x, y in extras})
     notes = (*_constraints(m), *(" ".join(w.split()) for w in heard))
     beside = tuple(x._replace(without=described.without(x.key)) if x.key in described.parts else x for x, _ in extras)
-    return Imported(described.model, dyn.terms, notes, beside, described.loops(), described.couplers())
+    couplers = described.couplers()
+    held = "by soft equality constraints" if couplers else ""
+    return Imported(described.model, dyn.terms, notes, beside, described.loops(), couplers, held)
 
 
 def _floating(text: str) -> Any:

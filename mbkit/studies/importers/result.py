@@ -98,7 +98,9 @@ class ParserComparison(ResultTable):
         refuse = [p.engine for p in self.importers if p.refused and p.engine not in missing]
         against = "" if self.reference == "file" else f" from the {self.against}"
         alone = [p.engine for p in self.importers if not p.stages and not p.refused]
+        apart = any(s.name == "mimic" and s.same is False for p in self.importers if p.agrees for s in p.stages)
         parts = [f"{_listed(same)} agree{_s(same)} with the {self.against.split(',')[0]}"] if same else []
+        parts = [f"{x}, mimic joints apart" if apart else x for x in parts]
         parts += [f"{_listed(differ)} differ{_s(differ)}{against}"] if differ else []
         parts += [f"{_listed(refuse)} refuse{_s(refuse)}"] if refuse else []
         parts += [f"{_listed(missing)} {'is' if len(missing) == 1 else 'are'} not installed"] if missing else []

@@ -125,12 +125,12 @@ class Reading:
 
 def _read(
     module: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes]
-) -> tuple[Model, tuple[str, ...], tuple[Beside, ...], tuple[Loop, ...] | str, tuple[Coupler, ...]]:
+) -> tuple[Model, tuple[str, ...], tuple[Beside, ...], tuple[Loop, ...] | str, tuple[Coupler, ...], str]:
     global _held
     # The file before can be as large.
     _held = None
     _held = reader(module)(text, format_, floating_base, files)
-    return _held.model, _held.notes, _held.beside, _held.loops, _held.couplers
+    return _held.model, _held.notes, _held.beside, _held.loops, _held.couplers, _held.holds_mimics
 
 
 def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
@@ -158,7 +158,7 @@ def stages(
     out = [_missing("joints", [h.subject for h in structural], "without a counterpart")]
     for name, some in _differences(one, there, near).items():
         if name == "total mass":
-            out.append(_missing("mimic", mimics, "left free"))
+            out.append(_missing("mimic", mimics, f"held {held}" if (held := imported.holds_mimics) else "left free"))
         out.append(_worst(name, some))
     back = {m.b: m.a for m in matching.pairs}
     out.append(_loop_stage(loops, imported, back, near))
@@ -474,8 +474,23 @@ def _compared(
     notes = (*explanation.notes, *imported.notes, *idle)
     if unmatched:
         notes = (*notes, f"compared by what they do to passive forces alone: {listing([*map(str, unmatched)], 6)}")
-    explanation = with_own_terms(explanation, compared, causes, held)
+    explanation = _with_mimics_held(with_own_terms(explanation, compared, causes, held), imported)
     return Parsed(engine, _version(engine), "", compared, explanation, notes)
+
+
+def _with_mimics_held(explanation: Explanation, imported: Imported) -> Explanation:
+    """Return an explanation that knows that the importer holds mimic joints by constraints, outside of all terms."""
+    if not imported.holds_mimics:
+        return explanation
+    causes = (
+        replace(
+            c, says=c.says.replace("leaves it free, which", f"holds it {imported.holds_mimics}, outside its terms; it")
+        )
+        if c.kind == "mimic"
+        else c
+        for c in explanation.causes
+    )
+    return replace(explanation, causes=tuple(causes))
 
 
 def written(source: str | os.PathLike[str]) -> Model:
