@@ -218,11 +218,12 @@ def test_what_acts_and_what_is_left_out_is_named(tmp_path):
     def note(start: str) -> str:
         return next(text for head, text in notes.items() if head.startswith(start))
 
-    for name, words in {"sum": "range -1 2", "slack": "stiffness 8", "3 (fixed, line 1)": "9"}.items():
+    for name, words in {"sum": "range -1 2", "3 (fixed, line 1)": "9"}.items():
         assert name in note("left out of tendons")
         assert words in note("left out of tendons")
     assert "'sum' on a - 2 b: stiffness 7" in note("tendons that act")
     assert "'string' between" in note("tendons that act")
+    assert "'slack': stiffness 8 0 0, rest length 0 to 1" in note("springs of tendons")
     assert "'servo' on b: stiffness 5" in note("actuators that act")
     for name, words in {
         "servo": "force range -4 4",

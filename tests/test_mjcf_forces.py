@@ -292,6 +292,28 @@ def test_armature_of_a_ball_joint(tmp_path: Path) -> None:
     assert back.joint("l").armature.tolist() == [0.7] * 3
 
 
+BANDS = """<tendon><spatial stiffness="3" damping=".1" springlength="0 1.2"><site site="o"/><site site="e"/></spatial>
+  <spatial name="bent" stiffness="2 .5 .3" springlength=".4"><site site="b"/><site site="e"/></spatial>
+  <fixed stiffness="2 .5 .3" springlength="-.2 .1"><joint joint="j" coef="-1.5"/></fixed>
+  <fixed stiffness="2 0 .3"><joint joint="k" coef="2"/></fixed>"""
+LEFT_OUT = """<fixed name="sum" stiffness="2 1"><joint joint="j" coef="1"/><joint joint="k" coef="1"/></fixed>
+  <spatial name="no" stiffness="1 1"><site site="o"/><site site="b"/></spatial>"""
+
+
+@pytest.mark.parametrize("off", [False, True])
+def test_springs_of_tendons_that_rest_between_two_lengths(off: bool, tmp_path: Path) -> None:
+    text = RESTING.split("<tendon>")[0] + BANDS
+    if off:
+        text = text.replace("<worldbody>", '<option><flag spring="disable"/></option><worldbody>')
+    notes = mb.load(written(f"{text}{LEFT_OUT}</tendon></mujoco>", tmp_path)).notes
+    assert any(note.startswith("left out of tendons: 'sum': ") and "'no': " in note for note in notes)
+    path = written(f"{text}</tendon></mujoco>", tmp_path)
+    model, _ = check(path)
+    assert len(model.forces) == (0 if off else 4)
+    (read,) = mb.compare_parsers(path, ("mujoco",), samples=1).importers
+    assert read.agrees
+
+
 # Curves
 
 KNEE = """<mujoco model="knee"><worldbody><body name="thigh"><joint name="hip" axis="0 1 0"/>

@@ -106,6 +106,7 @@ def model_of_mjcf(
     snap = _Tree(b, scene, springs, off).add_bodies(scale)
     _hold_weights(b, mujoco, scene, off, actuators=actuators)
     transmissions = Transmissions(mujoco, scene, off, servos=actuators)
+    transmissions.add_bands(b)
     equalities = Equalities(mujoco, scene, off, wanted=loops, tendons=transmissions.factors)
     if read.faults:
         raise ModelError(str(path), read.faults)

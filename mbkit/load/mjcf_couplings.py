@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from mbkit._reproducible import length
 from mbkit.load.mjcf_attributes import HERE, Pose
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
 from mbkit.load.xml_reader import LARGEST, Element, Reader, unused
-from mbkit.model import Joint, JointCoupling, Model, PointSpring
+from mbkit.model import Joint, JointCoupling, Model, ModelBuilder, PointSpring
 from mbkit.model.description import SERVOS
 from mbkit.model.validation import sample_mass_matrix
 
@@ -106,6 +106,26 @@ class _Actuator:
         return _Actuator(tag, self.parent, gain, (b0, b1, b2), gaintype, biastype, forcelimited, numbers)
 
 
+@dataclass(frozen=True)
+class _Band:
+    """A spring -x (k0 + k1 x + k2 x²), with x from the nearer one of two lengths, between which it rests."""
+
+    stiffness: tuple[float, float, float]
+    lower: float
+    upper: float
+
+    def energy(self, length: Any) -> Any:
+        """Return the energy at a length."""
+        beyond, short = length - self.upper, self.lower - length
+        x = (beyond + abs(beyond)) / 2 - (short + abs(short)) / 2
+        k0, k1, k2 = self.stiffness
+        return k0 / 2 * x**2 + k1 / 3 * x**3 + k2 / 4 * x**4
+
+    def __str__(self) -> str:
+        numbers = " ".join(f"{x:g}" for x in self.stiffness)
+        return f"stiffness {numbers}, rest length {self.lower:g} to {self.upper:g}"
+
+
 @dataclass
 class _Acting:
     """The forces of a tendon or an actuator."""
@@ -119,6 +139,7 @@ class _Acting:
     armature: float = 0.0
     dampratio: float = 0.0  # of the critical damping at the pose of the file
     ends: tuple[tuple[str, Array], ...] = ()  # bodies and points whose distance is l, if any
+    band: _Band | None = None  # a spring that is no line
     measured: bool = False  # whether the rest length is that distance where the springs of joints rest
     control: str = ""  # description of an actuator's control, which is left out
     servo: str = ""  # description of its force at zero control
@@ -225,22 +246,31 @@ class Transmissions:
             sites = (self._sites.get(e.attributes.get("site", "")) for e in element.children)
             ends = tuple(x for x in sites if x is not None)
             out.ends = ends if len({body for body, _ in ends}) == 2 else ()
+        curved: dict[str, tuple[float, float, float]] = {}
         for name in ("stiffness", "damping"):
             first, *higher = read.numbers(full, name, item, count=3, least=1, default=(0.0,))
             setattr(out, name, 0.0 if any(higher) else first)
             if any(higher):
-                out.left_out.append(f"{name} that depends on the length or its rate")
+                curved[name] = first, higher[0], (*higher, 0.0)[1]
         out.armature = read.number(full, "armature", item, 0.0)
         first, *second = read.numbers(full, "springlength", item, count=2, least=1, default=(-1.0,))
-        out.rest_length = first
-        if first == -1.0 and all(x == -1.0 for x in second):
+        last = second[0] if second else first
+        if first == last == -1.0:
             # The distance of two points is measured once there is a tree.
             out.measured = bool(out.ends)
-            out.rest_length = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
-        elif out.stiffness and second and second[0] != first:
-            out.left_out.append(f"stiffness {out.stiffness:g} with a range of rest lengths, {first:g} to {second[0]:g}")
+            first = last = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
+        out.rest_length = first
+        k0, k1, k2 = curved.get("stiffness", (out.stiffness, 0.0, 0.0))
+        if (k1 or k2 or (k0 and first != last)) and not out.measured and (out.ends or len(out.factors) == 1):
+            out.band = _Band((k0, k1, k2), first, last)
+            curved.pop("stiffness", None)
             out.stiffness = 0.0
-        out.stiffness *= "spring" not in self._disabled
+        out.left_out += [f"{name} that depends on the length or its rate" for name in curved]
+        if out.stiffness and first != last:
+            out.left_out.append(f"stiffness {out.stiffness:g} with a range of rest lengths, {first:g} to {last:g}")
+            out.stiffness = 0.0
+        if "spring" in self._disabled:
+            out.stiffness, out.band = 0.0, None
         out.damping *= "damper" not in self._disabled
         out.linear()
         own = full.attributes
@@ -298,6 +328,27 @@ class Transmissions:
         return self.factors.get(tendon, {}) if tendon is not None else {}
 
     # Their effect on the model
+
+    def add_bands(self, b: ModelBuilder) -> None:
+        """Add the springs that are no lines: potentials of a joint's coordinate, or of the way between two points."""
+        for x in self._tendons:
+            if x.band is None:
+                continue
+            name, band = f"spring of {x.name}", x.band
+            if x.ends:
+                (a, at_a), (end, at_b) = x.ends
+
+                def between(way: Any, band: _Band = band) -> Any:
+                    return band.energy((way[0] ** 2 + way[1] ** 2 + way[2] ** 2) ** 0.5)
+
+                b.add_bushing(name, body_a=a, translation_a=at_a, body_b=end, translation_b=at_b, potential=between)
+            else:
+                ((joint, factor),) = x.factors.items()
+
+                def along(q: Any, band: _Band = band, factor: float = factor) -> Any:
+                    return band.energy(factor * q)
+
+                b.add_joint_force(name, joint, potential=along)
 
     def applied(self, model: Model) -> Model:
         """Return the model with these springs, dampers and rotors, and with notes on them and on parts left out."""
@@ -361,11 +412,13 @@ class Transmissions:
             forces = "; ".join(x.servo for x in servos)
             yield f"{SERVOS} left out; with actuators=True they act at zero control: {forces}"
         for what, at, some in (("tendons", "", self._tendons), ("actuators", ", at zero control", self._actuators)):
+            if bands := "; ".join(f"{x.item}: {x.band}" for x in some if x.band):
+                yield f"springs of {what} that rest between two lengths, or are polynomials: {bands}"
             if acting := "; ".join(x.description() for x in some if x.acts):
                 yield f"{what} that act as springs, dampers and rotors{at}: {acting}"
             if lost := "; ".join(f"{x.item}: {', '.join(x.left_out)}" for x in some if x.left_out):
                 yield f"left out of {what}: {lost}"
-            if idle := ", ".join(x.item for x in some if not (x.acts or x.left_out or x.control)):
+            if idle := ", ".join(x.item for x in some if not (x.acts or x.band or x.left_out or x.control)):
                 yield f"{what} that exert no force of their own: {idle}"
         if self._actuators:
             controls = "; ".join(x.control for x in self._actuators)
