@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 import mbkit as mb
 from mbkit.errors import ModelError, UnsupportedError
 from mbkit.show import shapes_of
-from tests.random_files import mujoco_terms, terms_of
+from tests.random_files import mujoco_terms, random_mjcf, terms_of
 
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "oracle")
 
@@ -64,6 +65,17 @@ def test_mujoco_holds_no_weight_with_springs_and_dampers_off(tmp_path: Path) -> 
     model, passive = check(written(arm(option='<flag spring="disable" damper="disable"/>'), tmp_path), ("lagrangian",))
     assert not passive.any()
     assert not model.forces
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_gravity_compensation_of_random_files_is_that_of_mujoco(seed: int, tmp_path: Path) -> None:
+    numbers = iter(np.random.default_rng(seed).uniform(-1, 2, 100))
+    text = re.sub("<body ", lambda _: f'<body gravcomp="{float(next(numbers))!r}" ', random_mjcf(seed))
+    model, at = mb.load(written(text, tmp_path)), mujoco_terms(text, 3, seed)
+    passive = mb.dynamics(model, "lagrangian").passive(at.q, at.v)
+    assert model.forces
+    # Weights cancel in the sums that MuJoCo and mbkit form in another order.
+    assert np.abs(passive - at.passive).max() < 1e-13 * max(np.abs(at.passive).max(), np.abs(at.nle).max(), 1.0)
 
 
 MOTOR = '<actuator><motor joint="k"/></actuator>'
