@@ -521,3 +521,39 @@ def test_faults_of_what_is_attached_are_named(where: str, change: tuple[str, str
     written(texts["hand"], tmp_path, "sub/hand.xml")
     with pytest.raises(ModelError, match=said):
         mb.load(written(texts["arm"], tmp_path))
+
+
+# Aligned free bodies
+
+
+@pytest.mark.parametrize(
+    "matter",
+    [
+        '<inertial pos=".1 .2 .3" mass="2" diaginertia="1 2 1.5" euler="10 20 30"/>',
+        '<inertial pos=".1 .2 .3" mass="2" fullinertia="1 2 1.5 .1 .2 .3"/>',
+        '<geom type="box" size=".1 .2 .3" pos=".3 .1 0" euler="10 20 30"/><geom size=".1"/>',
+    ],
+)
+@pytest.mark.parametrize("below", ["", '<body name="c" pos="1 0 0"><joint name="k"/><geom size=".1"/></body>'])
+@pytest.mark.parametrize("by", ["compiler", "joint"])
+def test_a_free_body_may_be_aligned(by: str, below: str, matter: str, tmp_path: Path) -> None:
+    align, setting = ('align="true"', "") if by == "joint" else ("", '<compiler alignfree="true"/>')
+    text = (
+        f'<mujoco>{setting}<worldbody><site name="o"/><body name="b" pos="1 2 3" euler="5 6 7">'
+        f'<freejoint name="f" {align}/>{matter}<site name="s" pos=".1 0 .2" euler="1 2 3"/>{below}</body></worldbody>'
+        '<tendon><spatial stiffness="3"><site site="o"/><site site="s"/></spatial></tendon></mujoco>'
+    )
+    model, _ = check(written(text, tmp_path))
+    (body,) = (b for b in model.bodies if b.name == "b")
+    assert any("align" in note for note in model.notes) == (not below)
+    assert bool(np.abs(body.com).max() > 1e-12) == bool(below)
+    compiled = mujoco.MjModel.from_xml_string(text)
+    site = model.frame("s").translation
+    np.testing.assert_allclose(site, compiled.site_pos[compiled.site("s").id], rtol=0, atol=1e-14)
+
+
+def test_equalities_of_aligned_bodies_name_sites(tmp_path: Path) -> None:
+    text = """<mujoco><worldbody><body name="b"><freejoint align="true"/><geom size=".1" pos=".1 0 0"/></body>
+      </worldbody><equality><connect body1="b" anchor="0 0 0"/></equality></mujoco>"""
+    with pytest.raises(ModelError, match="moved by align; name sites"):
+        mb.load(written(text, tmp_path))

@@ -360,5 +360,7 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
     moved = [b for b in scene.bodies if np.any(b.pose.p) or not np.array_equal(b.pose.R, np.eye(3))]
     if free := [b.name for b in moved if b.joints and b.joints[0].kind == "free"]:
         yield f"q of a free body is its pose in the world; its pose in the file was left out: {name_list(free)}"
+    if scene.aligned:
+        yield f"the frame of free bodies is their inertial frame (align): {name_list(scene.aligned)}"
     if stacked := [b.name for b in scene.bodies if len(b.joints) > 1]:
         yield f"massless bodies stand between the joints of bodies with several: {name_list(stacked)}"

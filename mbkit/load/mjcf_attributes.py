@@ -54,6 +54,7 @@ class Compiler:
     settotalmass: float
     meshdir: str
     strippath: bool
+    alignfree: bool
 
     @classmethod
     def of(cls, mujoco: Element, read: Reader) -> Compiler:
@@ -70,8 +71,6 @@ class Compiler:
 
         if attributes.get("coordinate", "local") != "local":
             read.fault("compiler coordinate: only 'local' is read; convert the file with MuJoCo 2.3.3", merged)
-        if attributes.get("alignfree", "false") != "false":
-            read.fault("compiler alignfree moves the frames of free bodies; set it to false", merged)
         seq = attributes.get("eulerseq", "xyz")
         if len(seq) != 3 or set(seq.lower()) - set("xyz"):
             read.fault(f"compiler eulerseq: expected three of xyzXYZ, got {seq[:20]!r}", merged)
@@ -90,6 +89,7 @@ class Compiler:
             settotalmass=read.number(merged, "settotalmass", item, -1.0),
             meshdir=meshdir.replace("\\", "/"),
             strippath=attributes.get("strippath") == "true",
+            alignfree=flag("alignfree"),
         )
 
     def mesh_path(self, file: str) -> PurePosixPath:

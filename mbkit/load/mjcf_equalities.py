@@ -176,6 +176,8 @@ class Equalities:
             a, b = found
             return None if a is None or b is None else (a, b)
         body1, body2 = names.get("body1", ""), names.get("body2", "world")
+        if moved := {body1, body2} & {*self._scene.aligned}:
+            self._read.fault(f"{item}: the frame of {min(moved)!r} is moved by align; name sites", element)
         for key, body in (("body1", body1), ("body2", body2)):
             if body not in self._poses:
                 self._read.fault(f"{item}: {key} {body!r} is no body of the file", element)

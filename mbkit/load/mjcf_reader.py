@@ -96,6 +96,8 @@ class Scene:
     inferred: dict[str, list[tuple[Element, str]]] = field(default_factory=dict)
     #: Settings of the compiler that changed a mass or inertia, and the bodies.
     bounded: dict[str, list[str]] = field(default_factory=dict)
+    #: Free bodies whose frame became their inertial frame.
+    aligned: list[str] = field(default_factory=list)
     #: Sites of the world.
     sites: list[tuple[str, Pose]] = field(default_factory=list)
     #: Parts of the motion that a `Model` does not hold.
@@ -219,7 +221,16 @@ def _suffixed(element: Element, suffix: str, names: Mapping[str, Container[str]]
 # Attached models
 
 #: Settings of <compiler> that what is attached must share; angles are converted.
-_SHARED: Final = ("eulerseq", "autolimits", "inertiafromgeom", "groups", "balanceinertia", "boundmass", "boundinertia")
+_SHARED: Final = (
+    "eulerseq",
+    "autolimits",
+    "inertiafromgeom",
+    "groups",
+    "balanceinertia",
+    "boundmass",
+    "boundinertia",
+    "alignfree",
+)
 
 
 def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Reader) -> str:
@@ -547,10 +558,46 @@ def _read_body(element: Element, parent: str, X: Pose, childclass: str | None, s
         scene.inferred[name] = [(e, full.attributes.get("mesh", "")) for e, full, _ in geoms]
     for setting in changed:
         scene.bounded.setdefault(setting, []).append(name)
+    if any(j.kind == "free" and _aligned(j, scene) for j in joints) and not any(e.tag == "body" for e, _, _ in parts):
+        at = _inertial_frame(mass_properties, inertials, compiler, read, item)
+        own, back = own @ at, Pose(at.R.T, -product(at.R.T, at.p))
+        parts = [(e, back @ Y, c) for e, Y, c in parts]
+        mass_properties = (mass_properties or NOTHING).moved(back.R, back.p)
+        scene.aligned.append(name)
     gravcomp = read.number(element, "gravcomp", item, 0.0)
     body = MjcfBody(name, parent, X @ own, joints, mass_properties or NOTHING, [], gravcomp)
     scene.bodies.append(body)
     _read_children(parts, name, item, body.sites, scene)
+
+
+def _aligned(joint: MjcfJoint, scene: Scene) -> bool:
+    """Return whether the frame of a free body is to be its inertial frame; MuJoCo moves none with bodies below it."""
+    choices = ("auto", "true", "false")
+    said = scene.read.choice(joint.element, "align", choices) if joint.element.tag == "freejoint" else "auto"
+    return said == "true" or (said == "auto" and scene.compiler.alignfree)
+
+
+def _inertial_frame(
+    matter: MassProperties | None, inertials: list[tuple[Element, Pose]], compiler: Compiler, read: Reader, item: str
+) -> Pose:
+    """Return the frame of principal axes at the centre of mass, with the axes in MuJoCo's order."""
+    if matter is None:
+        read.fault(f"{item}: align, with an inertia from a mesh or a shell; add <inertial>, or set align to false")
+        return HERE
+    infer = compiler.inertiafromgeom
+    turned_by = np.eye(3)
+    if inertials and not infer:
+        element, X = inertials[0]
+        turned_by = (X @ pose(element, compiler, read, item)).R
+        if "fullinertia" not in element.attributes:
+            return Pose(turned_by, matter.com)
+    # Imported late: only the order and signs of the axes need it.
+    import mujoco
+
+    values, axes, quat = np.zeros(3), np.zeros(9), np.zeros(4)
+    mujoco.mju_eig3(values, axes, quat, turned(turned_by.T, matter.inertia).ravel())
+    w, x, y, z = quat
+    return Pose(product(turned_by, spatial.matrix_from_quaternion(np.array([x, y, z, w]))), matter.com)
 
 
 def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: Scene) -> MjcfJoint:
@@ -562,8 +609,6 @@ def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: 
     type_ = "free" if free else full.attributes.get("type", "hinge")
     if type_ not in KINDS:
         read.fault(f"{item}: type {type_[:40]!r}; expected one of {', '.join(KINDS)}", element)
-    if free and element.attributes.get("align") == "true":
-        read.fault(f"{item}: align moves the body's frame; set it to false", element)
     joint = MjcfJoint(name, full, type_ if type_ in KINDS else "hinge", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
     if joint.kind != "free":
         joint.anchor = X.p + product(X.R, np.array(read.numbers(full, "pos", item, count=3, default=(0, 0, 0))))
