@@ -706,3 +706,18 @@ def test_a_start_time_shifts_all_times_of_a_constrained_run(form, method):
         assert run.q == pytest.approx(runs[0].q, abs=1e-9)
         assert [hit.t - t for hit in run.events] == pytest.approx([hit.t for hit in runs[0].events], abs=1e-9)
         assert run.stats.steps == runs[0].stats.steps or method in ("rk853", "dop853")
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "oracle"])
+def test_the_first_accelerations_of_an_open_loop_warn(engine):
+    model = mb.catalog.slider_crank()
+    open_q = np.array([0.5, 0.3, 0.2])
+    with pytest.warns(MbkitWarning, match=r"slider_crank: constraint .* is open by .*project\(q, v\) returns"):
+        mb.dynamics(model, engine).forward_dynamics(open_q, np.zeros(3), np.zeros(3))
+    closed, v = model.random_state(0, 3)
+    dyn = mb.dynamics(model, engine)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dyn.forward_dynamics(closed, v, np.zeros(3))
+    with pytest.warns(MbkitWarning, match="is open by"):
+        mb.dynamics(model, engine).forward_dynamics(np.array([closed[0], open_q]), v[:2], np.zeros(3))

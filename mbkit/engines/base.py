@@ -185,6 +185,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
             model.require_values(self.engine)
         if model.constrained and self.lacks_constraints:
             require_tree(model, self.engine, self.lacks_constraints)
+        #: Whether the first accelerations look whether their state satisfies the constraints.
+        self.looks = model.constrained and not self.soft_constraints
         # Also where a copy begins again.
         vars(self)["model"] = model
 
@@ -302,8 +304,12 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     ) -> Array:
         """Return v̇ = M⁻¹ (τ + τ_passive - nle + Σ Jᵀ w), shape (nv,) or (N, nv).
 
-        `wrenches` on frames and their `axes` are those of `generalized_force`.
+        `wrenches` on frames and their `axes` are those of `generalized_force`. Under constraints the first call warns
+        where the state does not satisfy them; `constraint_residual` tells it of any.
         """
+        if self.looks:
+            self.looks = False
+            self._warn_of_open_states(q)
         if not wrenches:
             return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
         frames, w = self._stacked_wrenches(wrenches)

@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of
-from mbkit.errors import InputError, UnsupportedError
+from mbkit._warn import warn
+from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
 
+#: Of each row's scale: what rounding and a few typed digits leave of a consistent state.
+CONSISTENT: Final = 1e-8
 QUANTITIES: Final = (
     "constraint_residual",
     "constraint_jacobian",
@@ -77,6 +80,18 @@ class Constrained:
     def velocity_constraint_names(self) -> tuple[str, ...]:
         """Names of the rows that hold velocities alone, the last ones of `constraint_names`."""
         return self._states_held.names_of(self, moving=True) if self.model.no_slip else ()
+
+    def _warn_of_open_states(self, q: ArrayLike) -> None:
+        """Warn where configurations do not satisfy the constraints, whose accelerations are those of no motion."""
+        residual = np.abs(self.constraint_residual(q))
+        worst = np.unravel_index(int(np.argmax(residual)), residual.shape) if residual.size else ()
+        if worst and residual[worst] > CONSISTENT * max(1.0, float(np.abs(q).max())):
+            name = self.constraint_names[worst[-1]]
+            warn(
+                f"{self.model.name}: constraint {name} is open by {residual[worst]:.2g}: these accelerations "
+                "are those of no motion; project(q, v) returns the nearest consistent state",
+                MbkitWarning,
+            )
 
     def constraint_residual(self, q: ArrayLike) -> Array:
         """Return f(q, t), zero where all loops are closed and all that rolls touches its plane.

@@ -22,14 +22,13 @@ from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
+from mbkit.engines.constrained import CONSISTENT
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.manifold import random_state
 
 _EPS: Final = float(np.finfo(float).eps)
-#: Of each row's scale: what rounding and a few typed digits leave of a consistent state.
-_CONSISTENT: Final = 1e-8
 #: Rounds of the projection's iterations.
 _ROUNDS: Final = 8
 # How far Newton's iteration may move a state before it is looked whether its factors are of rounding.
@@ -182,7 +181,7 @@ class Manifold:
         f, J, ways = self.call("all_rows", q)
         scale = np.maximum(np.abs(J[: len(f)]).sum(axis=1), 1.0) * max(1.0, float(np.abs(q).max()))
         names = self.equations.all_constraints.names
-        rows = [names[k] for k in np.flatnonzero(~(np.abs(f[:, 0]) <= _CONSISTENT * scale))]
+        rows = [names[k] for k in np.flatnonzero(~(np.abs(f[:, 0]) <= CONSISTENT * scale))]
         model = self.dyn.model
         turned = [f"loop {x.name!r} half a turn off" for x in model.loops]
         turned += [f"no slip {x.name!r}, whose disc lies flat" for x in discs_of(model)]
@@ -218,7 +217,7 @@ class Manifold:
         for k, one_q, one_v in ((k, states[0][k], states[1][k]) for k in suspects):
             terms = self.member(k)._terms(one_q, one_v)
             for name, what, residual, x in (("q0", "f", terms.f, one_q), ("v0", "J v + c", terms.rate, one_v)):
-                scale = _CONSISTENT * terms.scale[: len(residual)] * max(1.0, float(np.abs(x).max()))
+                scale = CONSISTENT * terms.scale[: len(residual)] * max(1.0, float(np.abs(x).max()))
                 if not (np.abs(residual) <= scale).all():
                     where = "" if q.ndim == 1 else f" of state {k}"
                     raise InputError(
@@ -227,7 +226,7 @@ class Manifold:
                     )
         if self.dyn.samples is None:
             f, _, ways = self.call("all_rows", states[0])
-            suspects = np.flatnonzero((np.abs(f) > _CONSISTENT).any(axis=(1, 2)) | (ways < 0).any(axis=(1, 2))).tolist()
+            suspects = np.flatnonzero((np.abs(f) > CONSISTENT).any(axis=(1, 2)) | (ways < 0).any(axis=(1, 2))).tolist()
             for k in suspects:
                 if still := self.still_open(states[0][k]):
                     where = "" if q.ndim == 1 else f" of state {k}"
@@ -241,7 +240,7 @@ class Manifold:
         for residual, x in ((f, q), (rate, v)):
             size = np.maximum(1.0, np.abs(x).max(axis=1))[:, None]
             rows = residual[..., 0]
-            bad |= ~(np.abs(rows) <= _CONSISTENT * scale[:, : rows.shape[1]] * size).all(axis=1)
+            bad |= ~(np.abs(rows) <= CONSISTENT * scale[:, : rows.shape[1]] * size).all(axis=1)
         return [int(k) for k in np.flatnonzero(bad)]
 
     def doubtful(self, q: Array) -> Array:
@@ -349,7 +348,7 @@ class Manifold:
         """Refuse held coordinates that break the constraints at a state, or leave the others undetermined there."""
         model, terms = self.dyn.model, self._terms(q, v)
         for what, left, x in (("f", terms.f, q), ("J v + ∂f/∂t", terms.rate, v)):
-            most = _CONSISTENT * terms.scale[: len(left)] * max(1.0, float(np.abs(x).max(initial=0.0)))
+            most = CONSISTENT * terms.scale[: len(left)] * max(1.0, float(np.abs(x).max(initial=0.0)))
             if len(bad := np.flatnonzero(~(np.abs(left) <= most))):
                 raise InputError(
                     f"hold: {names} held, the constraints of {model.name} cannot be met: {what} = "
@@ -504,7 +503,7 @@ def accelerated(dyn: Dynamics, q: Array, v: Array, a: Array, hold: Sequence[str]
     out = manifold.acceleration(q, v, a, held)
     J, _, gamma, *_ = manifold.call("embedded", q, v)
     left = J @ out + gamma[:, 0]
-    most = _CONSISTENT * np.maximum(np.abs(J).sum(axis=1), 1.0) * max(1.0, float(np.abs(out).max(initial=0.0)))
+    most = CONSISTENT * np.maximum(np.abs(J).sum(axis=1), 1.0) * max(1.0, float(np.abs(out).max(initial=0.0)))
     if len(bad := np.flatnonzero(~(np.abs(left) <= most))):
         raise InputError(
             f"hold: {', '.join(hold) or 'nothing'} held, J a + γ = 0 of {dyn.model.name} cannot be met: "
