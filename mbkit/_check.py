@@ -145,3 +145,22 @@ def shown(value: Any) -> str:
     except Exception:
         text = f"an object of type {type(value).__name__}"
     return text.encode("utf-8", "backslashreplace").decode()
+
+
+# Axes of six-vectors, and kinds of accelerations.
+
+LOCAL: Final = "local"
+WORLD: Final = "world"
+ALIGNED: Final = "local_world_aligned"
+AXES: Final = (LOCAL, WORLD, ALIGNED)
+SPATIAL: Final = "spatial"
+CLASSICAL: Final = "classical"
+
+
+def axes_named(axes: str) -> str:
+    """Return these axes, checked."""
+    # The name that jacobian() had for them before there were three.
+    axes = LOCAL if axes == "body" else axes
+    if axes not in AXES:
+        raise InputError(f"axes: expected one of {', '.join(map(repr, AXES))}, got {axes!r}")
+    return axes

@@ -21,6 +21,7 @@ import mbkit as mb
 from mbkit.cli import cli
 from mbkit.codegen.c_source import c_code, export_c
 from mbkit.derivation import FUNCTIONS
+from mbkit.derivation.body_motion import OF_FRAME
 from mbkit.errors import InputError, MbkitError, OutputError, UnknownNameError, UnsupportedError
 from tests.random_trees import off, random_tree, states
 
@@ -408,3 +409,85 @@ def test_the_header_holds_what_the_functions_hold() -> None:
     header = export_c(b.build(), ["mass_matrix"]).header
     (holds,) = re.findall(r"Holds +(.*)", header)
     assert holds == "gravity, damping"
+
+
+#: Of frames, their inputs; and of the whole.
+OF_BODIES = {
+    "pose": "q",
+    "jacobian": "q",
+    "velocity": "qv",
+    "acceleration": "qva",
+    "jacobian_dot_v": "qv",
+    "center_of_mass": "q",
+    "center_of_mass_velocity": "qv",
+    "center_of_mass_acceleration": "qva",
+    "center_of_mass_jacobian": "q",
+    "centroidal_momentum": "qv",
+    "centroidal_momentum_matrix": "q",
+    "centroidal_momentum_bias": "qv",
+    "locked_inertia": "q",
+}
+
+
+@pytest.mark.parametrize(
+    ("robot", "frame", "floating"), [("panda", "panda_hand", False), ("anymal_b", "LF_FOOT", True)]
+)
+@pytest.mark.parametrize("axes", ["local_world_aligned", "local", "world"])
+def test_functions_of_frames_and_of_the_whole_are_every_engines(robot, frame, floating, axes):
+    model = mb.load(robot, floating_base=floating)
+    own, other = mb.dynamics(model, "lagrangian"), mb.dynamics(model, "pinocchio")
+    q, v = model.random_state(2)
+    states = {"q": q, "v": v, "a": np.linspace(-1, 1, model.nv)}
+    for name, inputs in OF_BODIES.items():
+        at = [states[x] for x in inputs]
+        if name in OF_FRAME:
+            more = {} if name == "pose" else {"axes": axes}
+            f, theirs = own.function(name, frame=frame, **more), getattr(other, name)(*at, frame, **more)
+        else:
+            f, theirs = own.function(name), getattr(other, name)(*at)
+        assert f.name_in() == list(inputs)
+        found = f(*at).full().reshape(np.shape(theirs))
+        np.testing.assert_allclose(found, theirs, rtol=0, atol=1e-12 * max(1.0, np.abs(theirs).max()), err_msg=name)
+    w = np.array([1.0, -2.0, 3.0, 0.4, 0.5, -0.6])
+    force = own.function("generalized_force", frame, axes=axes)(q, w).full().ravel()
+    np.testing.assert_allclose(force, other.generalized_force(q, {frame: w}, axes), atol=1e-12)
+
+
+def test_the_derivative_of_an_end_effectors_place_is_its_jacobian():
+    """By CasADi, of the pose's function: a second way to J."""
+    model = mb.load("ur5")
+    dyn = mb.dynamics(model, "lagrangian")
+    x, q = ca.SX.sym("q", model.nq), model.random_state(0)[0]
+    place = dyn.function("pose", frame="tool0")(x)[:3, 3]
+    by_q = ca.Function("by_q", [x], [ca.jacobian(place, x)])
+    np.testing.assert_allclose(by_q(q).full(), dyn.jacobian(q, "tool0")[:3], atol=1e-14)
+
+
+def test_frames_and_axes_that_are_not_there_are_told():
+    model = mb.catalog.pendulum()
+    dyn = mb.dynamics(model, "lagrangian")
+    for bad, error, words in (
+        (lambda: dyn.function("jacobian"), InputError, "frame: jacobian is of a frame; expected its name"),
+        (lambda: dyn.function("pose", frame="tp"), UnknownNameError, "did you mean 'tip'"),
+        (lambda: dyn.function("pose", frame="tip", axes="here"), InputError, "axes: expected one of"),
+        (lambda: mb.lagrangian.export_c(model, ["pose"]), InputError, "frames: pose is of a frame"),
+        (lambda: mb.lagrangian.export_c(model, ["pose"], frames=["tp"]), UnknownNameError, "did you mean 'tip'"),
+        (lambda: dyn.function("center_of_mas"), UnknownNameError, "did you mean 'center_of_mass'"),
+    ):
+        with pytest.raises(error, match=words):
+            bad()
+
+
+@needs_cc
+def test_frames_in_c_are_the_engines(tmp_path):
+    model = mb.load("panda")
+    source = mb.lagrangian.export_c(model, ["pose", "jacobian", "center_of_mass"], frames=["panda_hand", "panda_link3"])
+    own = Compiled(model, source, tmp_path)
+    own.functions = {f.name.removeprefix("panda_"): f for f in source.functions}
+    dyn, (q, _) = mb.dynamics(model, "pinocchio"), model.random_state(4)
+    for frame in ("panda_hand", "panda_link3"):
+        (pose,), (J,) = own(f"pose_{frame}", q), own(f"jacobian_{frame}", q)
+        np.testing.assert_allclose(pose, dyn.pose(q, frame), atol=1e-14)
+        np.testing.assert_allclose(J, dyn.jacobian(q, frame), atol=1e-14)
+    np.testing.assert_allclose(np.ravel(own("center_of_mass", q)[0]), dyn.center_of_mass(q), atol=1e-14)
+    assert "jacobian of panda_hand in local_world_aligned axes" in source.header

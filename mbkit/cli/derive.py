@@ -155,6 +155,9 @@ def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: boo
     metavar="NAME",
     help="What to compute; may be repeated.  [default: inverse_dynamics, forward_dynamics]",
 )
+@click.option(
+    "--frame", "frames", multiple=True, metavar="NAME", help="Of pose, jacobian and the like; may be repeated."
+)
 @shared.load_options
 @click.option("--name", help="Prefix of every name in C, and stem of the files.  [default: the target's name]")
 @shared.force_option
@@ -186,7 +189,13 @@ def export(target: str, options: dict[str, Any], as_json: bool, out: Path, force
 
 
 def _write_c(
-    model: Model, target: str, out: Path, force: bool, quantities: tuple[str, ...] = (), name: str | None = None
+    model: Model,
+    target: str,
+    out: Path,
+    force: bool,
+    quantities: tuple[str, ...] = (),
+    name: str | None = None,
+    frames: tuple[str, ...] = (),
 ) -> tuple[CSource, tuple[Path, Path]]:
     """Return the code of a model and the paths of its header and source."""
     from mbkit.codegen.c_source import DEFAULT, c_identifier, export_c
@@ -195,7 +204,7 @@ def _write_c(
     # Several robots' files hold the same name.
     robot = canonical(target)
     stem = c_identifier(robot) if name is None and robot is not None else name
-    source = export_c(model, quantities or DEFAULT, name=stem)
+    source = export_c(model, quantities or DEFAULT, name=stem, frames=frames)
     return source, source.write(out, force=force)
 
 

@@ -15,10 +15,12 @@ from typing import Final
 import casadi as ca
 
 from mbkit import _interrupt
+from mbkit._check import ALIGNED, CLASSICAL, axes_named
 from mbkit._escape import c_comment
 from mbkit._version import __version__
 from mbkit.codegen.program import program
 from mbkit.derivation import FUNCTIONS, equations_of
+from mbkit.derivation.body_motion import OF_FRAME, OF_WHOLE
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.description import CONSTRAINT_FEATURES
@@ -36,6 +38,20 @@ _OUTPUTS: Final = {
     "kinetic_energy": ("T", "kinetic energy, J"),
     "potential_energy": ("V", "potential energy of gravity and springs, J"),
     "energy_rate": ("dE_dt", "d(T + V)/dt at accelerations a, W"),
+    "pose": ("X", "pose X_WF of the frame, homogeneous"),
+    "jacobian": ("J", "Jacobian of the frame's velocity, linear then angular"),
+    "velocity": ("V", "velocity of the frame, linear then angular"),
+    "acceleration": ("A", "classical acceleration of the frame, linear then angular, without gravity"),
+    "jacobian_dot_v": ("Jdot_v", "rate of the frame's velocity at dv/dt = 0"),
+    "generalized_force": ("tau", "J^T w of a wrench on the frame, force then moment"),
+    "center_of_mass": ("p_G", "centre of mass of all bodies in the world, m"),
+    "center_of_mass_velocity": ("v_G", "its velocity, m/s"),
+    "center_of_mass_acceleration": ("a_G", "its acceleration, m/s^2"),
+    "center_of_mass_jacobian": ("J_G", "Jacobian of its velocity"),
+    "centroidal_momentum": ("h_G", "linear, then angular momentum about the centre of mass, in world axes"),
+    "centroidal_momentum_matrix": ("A_G", "matrix that takes v to the centroidal momentum"),
+    "centroidal_momentum_bias": ("Adot_G_v", "rate of the centroidal momentum at dv/dt = 0"),
+    "locked_inertia": ("I_G", "inertia of the whole about its centre of mass, in world axes"),
 }
 #: Output of a quantity that has several -> its meaning.
 _DERIVATIVES: Final = {
@@ -49,6 +65,7 @@ _INPUTS: Final = {
     "v": "velocities",
     "a": "accelerations dv/dt",
     "tau": "forces",
+    "wrenches": "force, N, then moment, N m, about the frame's origin",
     "parameters": "parameters",
 }
 
@@ -70,6 +87,8 @@ class CFunction:
     operations: int
     #: Bytes of local variables where the compiler does not optimise, copies of the inputs among them.
     stack: int
+    #: The frame and its axes, for the comment.
+    of: str = ""
 
     @property
     def signature(self) -> str:
@@ -96,7 +115,8 @@ def _declaration(f: CFunction, macro: str, nv: int) -> str:
         size = f"{shape[0]} * {shape[1]}" if matrix else shape[0]
         rows.append((f"{name}[{size}]", f"out{', by columns' * matrix}: {text}"))
     width = max(len(shape) for shape, _ in rows)
-    about = [f"{f.quantity}: {f.operations} operations, {f.stack} bytes of local variables."]
+    of = f" of {c_comment(f.of)}" if f.of else ""
+    about = [f"{f.quantity}{of}: {f.operations} operations, {f.stack} bytes of local variables."]
     about += [f"    {shape.ljust(width)}  {text}" for shape, text in rows]
     one_line = f"void {f.name}({', '.join(arguments)})"
     if len(one_line) >= 110:
@@ -282,7 +302,14 @@ class CSource:
         return header, source
 
 
-def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | None = None) -> CSource:
+def export_c(
+    model: Model,
+    quantities: Iterable[str] = DEFAULT,
+    *,
+    name: str | None = None,
+    frames: Iterable[str] = (),
+    axes: str = ALIGNED,
+) -> CSource:
     """Return C99 code that computes quantities of a model, each in one function without heap or state.
 
     Named parameters of the model are a last input. The header states units, layouts, conventions and the order of the
@@ -293,10 +320,15 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     ----------
     model : Model
     quantities : iterable of str
-        Keys of `mbkit.derivation.FUNCTIONS`.
+        Keys of `mbkit.derivation.FUNCTIONS`; of frames pose, jacobian, velocity, acceleration, jacobian_dot_v and
+        generalized_force; of the whole center_of_mass, centroidal_momentum and what belongs to them.
     name : str, optional
         Prefix of every name in C, and stem of the files; the model's name in lower case, with underscores, if not
         given.
+    frames : iterable of str
+        Each quantity of frames has a function for each, such as ``panda_jacobian_panda_hand``.
+    axes : {"local_world_aligned", "local", "world"}
+        Of velocities, Jacobians and wrenches, as in `Dynamics.velocity`.
 
     Returns
     -------
@@ -305,9 +337,9 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     Raises
     ------
     UnknownNameError
-        An unknown quantity.
+        An unknown quantity or frame.
     InputError
-        No quantity, or a `name` that is no identifier in C.
+        No quantity, a quantity of frames without `frames`, or a `name` that is no identifier in C.
     UnsupportedError
         The model has constraints, or no joint that moves.
 
@@ -318,7 +350,10 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     >>> source.functions[0].name
     'pendulum_forward_dynamics'
     """
-    wanted = _checked(quantities)
+    wanted, named, axes = _checked(quantities), list(frames), axes_named(axes)
+    for quantity in wanted:
+        if quantity in OF_FRAME and not named:
+            raise InputError(f"frames: {quantity} is of a frame; expected the names of some, got none")
     for feature in CONSTRAINT_FEATURES:
         if getattr(model, feature, ()):
             paper = "mbkit.lagrangian.from_model(model).model with them, or " if feature != "no_slip" else ""
@@ -332,8 +367,15 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     if not _IDENTIFIER.fullmatch(prefix):
         raise InputError(f"name: expected letters, digits and _, a letter first, got {name!r}")
     equations = equations_of(model)
-    code = {f"{prefix}_{quantity}": equations.function(quantity) for quantity in wanted}
-    functions = tuple(_described(*item, quantity) for item, quantity in zip(code.items(), wanted, strict=True))
+    code, of = {}, []
+    for quantity in wanted:
+        for frame in named if quantity in OF_FRAME else [""]:
+            own = "_".join(x for x in (prefix, quantity, c_identifier(frame) if frame else "") if x)
+            while own in code:
+                own += "_"
+            code[own] = equations.function(quantity, frame or None, axes, CLASSICAL)
+            of.append((quantity, f"{frame} in {axes} axes" if frame and quantity != "pose" else frame))
+    functions = tuple(_described(*item, *x) for item, x in zip(code.items(), of, strict=True))
     versions = {"mbkit": __version__, "casadi": str(ca.CasadiMeta.version())}
     written_by = f"{_MARK} {versions['mbkit']} with casadi {versions['casadi']}"
     return CSource(
@@ -346,23 +388,24 @@ def export_c(model: Model, quantities: Iterable[str] = DEFAULT, *, name: str | N
     )
 
 
-def _described(name: str, function: ca.Function, quantity: str) -> CFunction:
+def _described(name: str, function: ca.Function, quantity: str, of: str) -> CFunction:
     operations = program(function)
     inputs = tuple(zip(function.name_in(), operations.inputs, strict=True))
     names = (_OUTPUTS[quantity][0],) if quantity in _OUTPUTS else function.name_out()
     outputs = tuple(zip(names, operations.shapes, strict=True))
     stack = 8 * (function.sz_w() + sum(operations.inputs))
-    return CFunction(name, quantity, inputs, outputs, operations.arithmetic, stack)
+    return CFunction(name, quantity, inputs, outputs, operations.arithmetic, stack, of)
 
 
 def _checked(quantities: Iterable[str]) -> list[str]:
     if isinstance(quantities, str) or not isinstance(quantities, Iterable):
         raise InputError(f"quantities: expected a list of names such as ['nle'], got {quantities!r}")
+    known = (*FUNCTIONS, *OF_FRAME, *OF_WHOLE)
     # Each once, in the caller's order.
     wanted = list(dict.fromkeys(map(str, quantities)))
     for quantity in wanted:
-        if quantity not in FUNCTIONS:
-            raise UnknownNameError("quantity", quantity, FUNCTIONS)
+        if quantity not in known:
+            raise UnknownNameError("quantity", quantity, known)
     if not wanted:
         raise InputError(f"quantities: expected at least one of {', '.join(FUNCTIONS)}, got none")
     return wanted

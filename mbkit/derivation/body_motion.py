@@ -326,6 +326,13 @@ def _rate(name: str, *, moved: bool) -> Callable[[BodyMotion], Any]:
     return lambda motion: motion.rate(getattr(motion, name), motion.a if moved else ca.SX(motion.model.nv, 1))
 
 
+#: Quantities of one frame, those of the whole, and the force of a wrench on a frame, that have a function in CasADi and
+#: in C.
+OF_FRAME: Final = ("pose", "jacobian", "velocity", "acceleration", "jacobian_dot_v", "generalized_force")
+OF_WHOLE: Final = (
+    *("center_of_mass", "center_of_mass_velocity", "center_of_mass_acceleration", "center_of_mass_jacobian"),
+    *("centroidal_momentum", "centroidal_momentum_matrix", "centroidal_momentum_bias", "locked_inertia"),
+)
 #: Name of each quantity -> how it is derived. Those of frames take their names and axes, and return one value a frame.
 BODY_QUANTITIES: Final[dict[str, BodyQuantity]] = {
     "pose": BodyQuantity(("q",), lambda m, frames: ca.vertcat(*(m.pose(name) for name in frames)), 3, 4),

@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit.derivation import kinematics as energies
-from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyMotion
+from mbkit.derivation.body_motion import BODY_QUANTITIES, OF_FRAME, OF_WHOLE, BodyMotion
 from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS, ConstrainedMotion
 from mbkit.derivation.elements.forces import ElementForces
 from mbkit.derivation.fingerprint import SOURCES as _SOURCES  # noqa: F401  # read with the code that it fingerprints
@@ -28,7 +28,7 @@ from mbkit.derivation.kinematics import Kinematics
 from mbkit.derivation.least_constraint import LeastConstraint, squares
 from mbkit.derivation.mass_matrix_solve import elimination_order, solve
 from mbkit.derivation.model_values import Constants, scalar
-from mbkit.errors import UnknownNameError
+from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
 
 Elimination = Literal["links", "mass matrix", "least constraint"]
@@ -304,11 +304,26 @@ class Equations:
         arguments = {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau}
         return self.named(f"{name}_by_parameters", names, [arguments[n] for n in names], out)
 
-    def function(self, name: str) -> ca.Function:
-        """Return a quantity as a function of its arguments, with repeated operations as they came."""
+    def function(self, name: str, frame: str | None = None, axes: str = "", kind: str = "") -> ca.Function:
+        """Return a quantity as a function of its arguments, with repeated operations as they came.
+
+        `frame`, `axes` and `kind` are those of quantities of a frame.
+        """
+        if name in OF_FRAME and frame is not None:
+            self.model.frame(frame)
+            more = {"pose": (), "acceleration": (axes, kind)}.get(name, (axes,))
+            f = self.body_quantity(name, (frame,), *more)
+            given = f.sx_in()
+            (out,) = f.call(given)
+            # Six numbers stand below each other.
+            return ca.Function(name, given, [out.T if out.shape == (1, 6) else out], f.name_in(), [name])
+        if name in OF_WHOLE:
+            return self.body_quantity(name)
         known = FUNCTIONS | (CONSTRAINT_FUNCTIONS if self.model.constrained else {})
+        if name in OF_FRAME:
+            raise InputError(f"frame: {name} is of a frame; expected its name, got None")
         if name not in known:
-            raise UnknownNameError("quantity", name, known)
+            raise UnknownNameError("quantity", name, [*known, *OF_FRAME, *OF_WHOLE])
         symbols = {"q": self.q, "v": self.v, "a": self.a, "tau": self.force}
         names = known[name]
         return self.named(name, names, [symbols[n] for n in names], getattr(self, name))

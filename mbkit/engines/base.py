@@ -18,7 +18,14 @@ from mbkit._attributes import ReadOnly, single_values
 from mbkit._check import Array, all_finite, batch_of, real, rows
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
 from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
-from mbkit.engines.frames_and_momenta import ALIGNED, JOINT, LOCAL, FramesAndMomenta, axes_named, composite_rounding
+from mbkit.engines.frames_and_momenta import (
+    ALIGNED,
+    JOINT,
+    LOCAL,
+    FramesAndMomenta,
+    axes_named,
+    composite_rounding,
+)
 from mbkit.engines.linearization import (
     ForwardDynamicsDerivatives,
     InverseDynamicsDerivatives,
@@ -325,16 +332,6 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         Gravity's part is zero where every centre of mass is at the world's origin.
         """
         return scalar(self._evaluate("potential_energy", q=q))
-
-    def function(self, name: str) -> Any:
-        """Return a quantity as a `casadi.Function`; the lagrangian engine only.
-
-        Inputs are named as in `mbkit.derivation.FUNCTIONS` (q, v, a, tau), all of them column vectors; of a model with
-        parameters the last one is "parameters", in the order of ``model.parameters``. The output has the quantity's
-        name and is dense: (nv, nv), (nv, 1) or (1, 1); derivatives are by_q, by_v and by_a or by_tau. It may be called
-        with MX or SX and differentiated. `mbkit.lagrangian.export_c` writes it as C.
-        """
-        return self._method("function")(name)
 
     def visual_model(self, shapes: Kind = "visual") -> Any:
         """Return the engine's own model of what there is to draw, for its viewers; nothing of it acts on the motion.

@@ -14,17 +14,18 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mbkit._check import ALIGNED as ALIGNED
+from mbkit._check import AXES as AXES
+from mbkit._check import CLASSICAL as CLASSICAL
+from mbkit._check import LOCAL as LOCAL
+from mbkit._check import SPATIAL as SPATIAL
+from mbkit._check import WORLD as WORLD
 from mbkit._check import Array
+from mbkit._check import axes_named as axes_named
 from mbkit.errors import InputError
 from mbkit.model import Frame, Model
 from mbkit.spatial import skew
 
-LOCAL: Final = "local"
-WORLD: Final = "world"
-ALIGNED: Final = "local_world_aligned"
-AXES: Final = (LOCAL, WORLD, ALIGNED)
-SPATIAL: Final = "spatial"
-CLASSICAL: Final = "classical"
 _OF_TWO_AXES: Final = ("pose", "jacobian")
 #: Quantities of this part of the protocol.
 QUANTITIES: Final = (
@@ -32,15 +33,6 @@ QUANTITIES: Final = (
     *("center_of_mass", "center_of_mass_velocity", "center_of_mass_acceleration", "center_of_mass_jacobian"),
     *("centroidal_momentum", "centroidal_momentum_matrix", "centroidal_momentum_bias", "locked_inertia"),
 )
-
-
-def axes_named(axes: str) -> str:
-    """Return these axes, checked."""
-    # The name that jacobian() had for them before there were three.
-    axes = LOCAL if axes == "body" else axes
-    if axes not in AXES:
-        raise InputError(f"axes: expected one of {', '.join(map(repr, AXES))}, got {axes!r}")
-    return axes
 
 
 def seen_from(R: Array, p: Array, linear: Array, angular: Array, axes: str) -> Array:
@@ -89,6 +81,7 @@ class FramesAndMomenta:
 
     model: Model
     _evaluate: Callable[..., Array]
+    _method: Callable[[str], Callable[..., Any]]
     _frames_held: dict[Any, tuple[Frame, ...]]
 
     def _frames(self, frame: str | Sequence[str]) -> tuple[tuple[Frame, ...], bool]:
@@ -208,6 +201,19 @@ class FramesAndMomenta:
         ``"local_world_aligned"`` axes, the spatial one in the others.
         """
         return self._of_frames("jacobian_dot_v", frame, axes_named(axes), q=q, v=v)
+
+    def function(self, name: str, frame: str | None = None, axes: str = ALIGNED, kind: str = CLASSICAL) -> Any:
+        """Return a quantity as a `casadi.Function`; the lagrangian engine only.
+
+        Inputs are named as in `mbkit.derivation.FUNCTIONS` (q, v, a, tau), all of them column vectors; of a model with
+        parameters the last one is "parameters", in the order of ``model.parameters``. The output has the quantity's
+        name and is dense: (nv, nv), (nv, 1) or (1, 1); derivatives are by_q, by_v and by_a or by_tau. It may be called
+        with MX or SX and differentiated. `mbkit.lagrangian.export_c` writes it as C. A `frame` is that of pose (4, 4),
+        jacobian (6, nv), velocity, acceleration and jacobian_dot_v (6, 1), and of generalized_force, whose input
+        "wrenches" is (6, 1); `axes` and `kind` are as in these methods. Those of the whole, such as center_of_mass and
+        centroidal_momentum_matrix, take none.
+        """
+        return self._method("function")(name, frame, axes_named(axes), kind)
 
     # The whole
 

@@ -507,8 +507,8 @@ class LagrangianDynamics(Dynamics):
         q1, v1, slopes = momentum_step_slopes(self.model, equations, q, v)
         return q1, v1, slopes if parameters else slopes[..., : 3 * self.model.nv]
 
-    def _function(self, name: str) -> Any:
-        f = self.equations.function(name)
+    def _function(self, name: str, frame: str | None, axes: str, kind: str) -> Any:
+        f = self.equations.function(name, frame, axes, kind)
         given = f.sx_in()
         # Users inline and differentiate it: small is worth a search.
         return ca.Function(name, given, f.call(given), f.name_in(), f.name_out(), {"cse": True})
