@@ -15,7 +15,7 @@ import pytest
 import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import dynamics
-from mbkit.errors import InputError, MbkitWarning, TorqueError, UnsupportedError
+from mbkit.errors import InputError, LoadError, MbkitWarning, OutputError, TorqueError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import METHODS, Trajectory, at_section, simulate
 from mbkit.simulate.plotting.stick_figure import skeleton
@@ -448,5 +448,133 @@ def test_dir_holds_what_a_reader_looks_for() -> None:
     assert {name for name in dir(swing()) if not name.startswith("_")} == {
         *("t", "q", "v", "model", "method", "engine", "stats", "events"),
         *("energy", "kinetic_energy", "potential_energy", "tau", "wrenches", "work", "power_balance"),
-        *("momentum", "canonical_momentum", "plot", "picture", "animate", "to_csv", "check"),
+        *("momentum", "canonical_momentum", "plot", "picture", "animate", "to_csv", "check", "driven"),
+        *("to_dataframe", "save", "load"),
     }
+
+
+def driven(batch: bool) -> Trajectory:
+    model = catalog.cart_pole()
+    start = np.zeros((3, 2)) if batch else np.zeros(2)
+    return simulate(dynamics(model), start, start, 0.05, torque=lambda t, q, v: [np.cos(t), 0.1 - q[0]], dt=0.01)
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_a_table_of_a_controlled_run_has_the_torques(batch):
+    run = driven(batch)
+    head, *rows = run.to_csv().splitlines()
+    assert head.split(",")[-2:] == [f"tau.{n}" for n in run.model.velocity_names]
+    assert np.array([row.split(",") for row in rows], float)[:, -2:].tolist() == run.tau.reshape(-1, 2).tolist()
+    free = simulate(dynamics(run.model), [0.0, 0.0], [0.0, 0.0], 0.05)
+    assert "tau" not in free.to_csv()
+
+
+def test_a_controlled_run_is_drawn_with_its_torques_and_forces():
+    labels = [axis.get_ylabel() or axis.get_title() for axis in driven(False).plot().axes]
+    assert any("torques (N m)" in x for x in labels)
+    assert any("forces (N)" in x for x in labels)
+    free = simulate(dynamics(catalog.cart_pole()), [0.0, 0.0], [0.0, 0.0], 0.05)
+    assert not any("torques" in (axis.get_ylabel() or axis.get_title()) for axis in free.plot().axes)
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_a_saved_run_comes_back_with_all_its_digits(batch, tmp_path):
+    run, path = driven(batch), tmp_path / "run.npz"
+    run.save(path)
+    again = Trajectory.load(path, run.model)
+    for name in ("t", "q", "v", "tau"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(run, name))
+    assert (again.method, again.engine, again.stats) == (run.method, run.engine, run.stats)
+    np.testing.assert_array_equal(again.energy(), run.energy())
+    np.testing.assert_allclose(again.work(), run.work(), atol=1e-15)
+    with pytest.raises(InputError, match="digests differ"):
+        Trajectory.load(path, catalog.cart_pole(gravity=1.6))
+    for content in (b"", b"PK", b"no run"):
+        (tmp_path / "other.npz").write_bytes(content)
+        with pytest.raises(LoadError, match=r"expected a run that Trajectory.save wrote"):
+            Trajectory.load(tmp_path / "other.npz", run.model)
+    with pytest.raises(OutputError, match="cannot write"):
+        run.save(tmp_path / "no" / "run.npz")
+
+
+def test_a_data_frame_is_pandas_or_told():
+    run = driven(True)
+    try:
+        import pandas  # noqa: F401
+    except ImportError:
+        with pytest.raises(UnsupportedError, match="pip install pandas"):
+            run.to_dataframe()
+        return
+    table = run.to_dataframe()
+    assert list(table.columns) == run.to_csv().splitlines()[0].split(",")
+    assert (table["trajectory"] == np.repeat([0, 1, 2], len(run.t))).all()
+
+
+def slider() -> Model:
+    b = ModelBuilder("slider", gravity=(0, 0, 0))
+    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+    b.add_body("cart", mass=2.0, inertia=np.eye(3))
+    return b.build()
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
+@pytest.mark.parametrize("method", ["rk4", "rk853", "mujoco_rk4"])
+def test_a_sampled_controller_is_its_discrete_map(engine, method):
+    """x⁺ = x + v h + u h²/2, v⁺ = v + u h with u of the last sample: exact for every method of order 2 and more."""
+    if method == "mujoco_rk4" and engine != "mujoco":
+        pytest.skip("MuJoCo's own")
+    calls: list[float] = []
+
+    def control(t, q, v):
+        calls.append(t)
+        return -2 * (8 * q + 3 * v)
+
+    h, dt = 0.05, None if method == "rk853" else 0.01
+    run = simulate(dynamics(slider(), engine), [1.0], [0.0], 1.0, method, dt, torque=control, hold=h)
+    assert calls == pytest.approx(np.arange(20) * h)
+    x, v, at = 1.0, 0.0, [(1.0, 0.0)]
+    for _ in range(20):
+        u = -(8 * x + 3 * v)
+        x, v = x + v * h + u * h * h / 2, v + u * h
+        at.append((x, v))
+    which = np.searchsorted(run.t, np.arange(21) * h - 1e-9)
+    np.testing.assert_allclose(np.c_[run.q[which], run.v[which]], at, atol=1e-13)
+    # Held: the torque of the table changes at the samples alone.
+    assert len(np.unique(run.tau.round(12))) <= 20
+    assert np.abs(run.power_balance()).max() < 1e-12
+
+
+def test_a_sampled_controller_of_a_batch_saves_what_is_asked_for():
+    model = catalog.double_pendulum()
+    dyn = dynamics(model, "lagrangian")
+    q, v = model.random_state(0, 3)
+    control = lambda t, q, v: -3.0 * v  # noqa: E731
+    many = simulate(dyn, q, v, 0.2, dt=0.01, torque=control, hold=0.04, save=5)
+    assert many.t == pytest.approx([0, 0.05, 0.1, 0.15, 0.2])
+    for i in range(3):
+        one = simulate(dyn, q[i], v[i], 0.2, dt=0.01, torque=control, hold=0.04, save=[0.0, 0.1, 0.2])
+        np.testing.assert_allclose(one.q, many.q[i, ::2], atol=1e-14)
+        np.testing.assert_allclose(one.tau, many.tau[i, ::2], atol=1e-13)
+    exact = simulate(dyn, q[0], v[0], 0.2, "rk853", torque=control, hold=0.04, rtol=1e-12, save=[0.0, 0.07, 0.2])
+    fine = simulate(dyn, q[0], v[0], 0.2, dt=1e-3, torque=control, hold=0.04, save=[0.0, 0.07, 0.2])
+    np.testing.assert_allclose(exact.q, fine.q, atol=1e-9)
+
+
+def test_a_sampled_controller_that_fails_keeps_what_it_reached():
+    def control(t, q, v):
+        if t > 0.35:
+            raise ValueError("no")
+        return [0.0]
+
+    with pytest.raises(TorqueError, match="the callable raised ValueError") as told:
+        simulate(dynamics(slider()), [0.0], [1.0], 1.0, dt=0.05, torque=control, hold=0.1)
+    kept = told.value.trajectory
+    assert kept.stats.ended == "function_failed"
+    assert kept.t[-1] == pytest.approx(0.4)
+    for options, words in (
+        ({"hold": 0.1}, "expected a torque function"),
+        ({"hold": 0.07, "torque": control}, "a multiple of the step"),
+        ({"hold": -1.0, "torque": control}, "hold: expected"),
+    ):
+        with pytest.raises(InputError, match=words):
+            simulate(dynamics(slider()), [0.0], [1.0], 1.0, dt=0.05, **options)

@@ -12,12 +12,13 @@ from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
-from mbkit.errors import DoubtfulRunWarning, MbkitWarning, UnsupportedError
+from mbkit.errors import DoubtfulRunWarning, FunctionError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.model.joint_numbers import dry_friction
 from mbkit.simulate.events import Event
 from mbkit.simulate.integrate import integrate
 from mbkit.simulate.progress import ProgressFunction
+from mbkit.simulate.sampled_control import integrate_held
 from mbkit.simulate.torque import RunWrenches, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
 
@@ -45,6 +46,7 @@ def simulate(
     t0: float | None = None,
     wrenches: RunWrenches | None = None,
     wrench_axes: str = ALIGNED,
+    hold: float | None = None,
 ) -> Trajectory:
     """Integrate v̇ = forward_dynamics(q, v, τ), q̇ = D(q) v from one state or a batch.
 
@@ -73,7 +75,7 @@ def simulate(
     torque : array_like or callable, optional
         Generalized force τ: (nv,) all the time; (steps, nv) or (N, steps, nv), held over each step (for an adaptive
         method, each interval of `save`, which then runs from `t0` to the end); or a function of (t, q, v) that
-        returns (nv,), called for one state at a time, at each stage.
+        returns (nv,), called for one state at a time, at each stage; a controller that samples takes `hold`.
     save : int or (K,) array_like, optional
         Which states to keep: every n-th and the last, or those at these times (for a fixed step, multiples of it after
         `t0`); by default all. An adaptive method takes times alone; a batch needs them, and so does ``"cvodes"``.
@@ -102,6 +104,10 @@ def simulate(
     wrench_axes : {"local", "local_world_aligned", "world"}
         Axes of the wrenches, with the default of `Dynamics.jacobian` and `Dynamics.generalized_force`: the world's
         axes. ``"local"`` are the frame's own. ``"world"`` has moments about the world's origin.
+    hold : float, optional
+        Period of a controller that samples, s: `torque` is called at the start and every `hold` seconds, with the state
+        there, and its answer is held until the next call. A fixed step must divide it. On every method, MuJoCo's own
+        too. Without `save`, an adaptive method keeps the states at the samples. Without events.
 
     Returns
     -------
@@ -143,13 +149,18 @@ def simulate(
     """
     loads = (wrenches, wrench_axes)
     arguments = (q0, v0, duration, method, dt, rtol, atol, torque, save, progress, events)
-    if isinstance(dyn, Dynamics):
+    error: FunctionError | None
+    if isinstance(dyn, Dynamics) and hold is not None:
+        data, error = integrate_held(dyn, *arguments, doubt, t0, *loads, hold=hold)
+    elif isinstance(dyn, Dynamics):
         data, error = integrate(dyn, *arguments, doubt, t0, *loads)
     elif hasattr(dyn, "chart"):
         if wrenches:
             raise UnsupportedError(
                 "wrenches: a system written as energies has no frames; give the generalized force, torque="
             )
+        if hold is not None:
+            raise UnsupportedError("hold: not on independent coordinates; take the dynamics of the whole system")
         # Only where SymPy and CasADi are loaded already.
         from mbkit.simulate.independent_coordinates import integrate_on_charts
 

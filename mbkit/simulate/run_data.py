@@ -103,6 +103,11 @@ class RunData:
         return along(self._by(engine), (), lambda own, q: own.potential_energy(q), self.q)
 
     @property
+    def driven(self) -> bool:
+        """Whether a torque, or a wrench on a frame, acted."""
+        return self._applied is not None
+
+    @property
     def tau(self) -> Array:
         """The generalized force that acted at each state, of the shape of v; read-only.
 

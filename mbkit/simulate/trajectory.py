@@ -3,26 +3,31 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import io
+import json
 import os
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import _check
+from mbkit._check import Array
 from mbkit._escape import csv_text, html, one_line
 from mbkit.engines import Dynamics
-from mbkit.errors import InputError, MbkitWarning, OutputError
+from mbkit.errors import InputError, LoadError, MbkitWarning, OutputError, UnsupportedError
 from mbkit.methods.registry import AUTOMATIC_METHOD, METHODS, Method
 from mbkit.model import Model
 from mbkit.simulate.diagnostics.checks import CHECKED_TIMES, diagnostics
 from mbkit.simulate.integrate import integrate
+from mbkit.simulate.result import Stats
 from mbkit.simulate.run_data import RunData, RunSettings, dynamics_of_trajectory
+from mbkit.simulate.torque import SampledTorque
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -211,20 +216,17 @@ class Trajectory(RunData):
         return member, self.model if self._dyn is None else dynamics_of_trajectory(self._dyn, member).model
 
     def to_csv(self, path: str | os.PathLike[str] | None = None) -> str:
-        """Return t, q and v with all their digits, one line per state; with `path`, write it there too.
+        """Return t, q, v and τ with all their digits, one line per state; with `path`, write it there too.
 
-        A batch has a first column with the index of its trajectory. OutputError where the file cannot be written.
+        τ is there where a torque acted. A batch has a first column with the index of its trajectory. OutputError where
+        the file cannot be written.
         """
-        batch = self.q.ndim == 3
-        header = [*(["trajectory"] if batch else []), "t"]
-        header += [f"q.{n}" for n in self.model.coordinate_names] + [f"v.{n}" for n in self.model.velocity_names]
+        header, rows = self._table()
         stream = io.StringIO()
         writer = csv.writer(stream)
         writer.writerow(map(csv_text, header))
-        for i, (q, v) in enumerate(zip(self.q, self.v, strict=True) if batch else [(self.q, self.v)]):
-            lead = [i] if batch else []
-            rows = np.column_stack([self.t, q, v]).tolist()
-            writer.writerows([*lead, *row] for row in rows)
+        # The number of a trajectory is a whole one.
+        writer.writerows([int(row[0]), *row[1:]] if self.q.ndim == 3 else row for row in rows.tolist())
         text = stream.getvalue()
         try:
             if path is not None:
@@ -232,6 +234,91 @@ class Trajectory(RunData):
         except OSError as error:
             raise OutputError(f"cannot write {path}: {error.strerror or error}; choose a folder that exists") from error
         return text
+
+    def _table(self) -> tuple[list[str], Array]:
+        """Return the names of the columns of a table of all states, and the table."""
+        batch, named = self.q.ndim == 3, self.model.velocity_names
+        header = [*(["trajectory"] if batch else []), "t", *(f"q.{n}" for n in self.model.coordinate_names)]
+        header += [f"v.{n}" for n in named] + ([f"tau.{n}" for n in named] if self.driven else [])
+        states = [self.q, self.v, *([self.tau] if self.driven else [])]
+        count = len(self.q) if batch else 1
+        columns = [np.tile(self.t, count)[:, None], *(x.reshape(-1, x.shape[-1]) for x in states)]
+        if batch:
+            columns.insert(0, np.repeat(np.arange(float(count)), len(self.t))[:, None])
+        return header, np.hstack(columns)
+
+    def to_dataframe(self) -> Any:
+        """Return the table of `to_csv` as a `pandas.DataFrame`.
+
+        Raises
+        ------
+        UnsupportedError
+            pandas is not installed.
+        """
+        try:
+            frames: Any = importlib.import_module("pandas")
+        except ImportError:
+            raise UnsupportedError("to_dataframe needs pandas, which is not installed; pip install pandas") from None
+        header, rows = self._table()
+        out = frames.DataFrame(rows, columns=header)
+        return out.astype({"trajectory": int}) if self.q.ndim == 3 else out
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write states, forces and what is known of the run to a file of NumPy's (.npz), which `load` reads.
+
+        The model is not in it: its digest is. OutputError where the file cannot be written.
+
+        Examples
+        --------
+        >>> import mbkit as mb, tempfile, pathlib
+        >>> model = mb.catalog.pendulum()
+        >>> run = mb.simulate(mb.dynamics(model), [1.0], [0.0], 0.1)
+        >>> path = pathlib.Path(tempfile.mkdtemp()) / "run.npz"
+        >>> run.save(path)
+        >>> again = mb.Trajectory.load(path, model)
+        >>> bool((again.q == run.q).all()), again.method
+        (True, 'rk4')
+        """
+        about = {"format": 1, "digest": self.model.digest, "model": self.model.name, "method": self.method}
+        about |= {"engine": self.engine, "stats": asdict(self.stats)}
+        arrays: dict[str, Any] = {"t": self.t, "q": self.q, "v": self.v, "about": np.array(json.dumps(about))}
+        arrays |= {"tau": self.tau} if self.driven else {}
+        try:
+            with open(path, "wb") as file:
+                np.savez_compressed(file, **arrays)
+        except OSError as error:
+            raise OutputError(f"cannot write {path}: {error.strerror or error}; choose a folder that exists") from error
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], model: Model) -> Trajectory:
+        """Return a run that `save` wrote, of the same model; nothing in the file is executed.
+
+        Events, wrenches on frames and what a run was started with are not in it: `check` knows its doubts alone.
+
+        Raises
+        ------
+        LoadError
+            The file is missing, or is none of `save`.
+        InputError
+            It is a run of another model, by the digest.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {name: data[name] for name in data.files}
+            about = json.loads(str(arrays.pop("about")))
+            stats = about["stats"]
+            reached = stats["reached"]
+            stats |= {"reached": tuple(reached) if isinstance(reached, list) else reached}
+            known = Stats(**stats | {"doubts": tuple(stats["doubts"])})
+            parts = arrays["t"], arrays["q"], arrays["v"], model, about["method"], about["engine"], known
+            digest = about["digest"]
+        except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
+            raise LoadError(f"{path}: expected a run that Trajectory.save wrote ({error})") from None
+        if digest != model.digest:
+            other = f"a run of {about['model']!r} with other numbers than this {model.name!r}"
+            raise InputError(f"model: {path} is {other} (digests differ)")
+        acted = SampledTorque(arrays["tau"]) if "tau" in arrays else None
+        return cls(*parts, _applied=acted)
 
     def _facts(self) -> list[tuple[str, str]]:
         count = f"{len(self.q)} trajectories of " if self.q.ndim == 3 else ""

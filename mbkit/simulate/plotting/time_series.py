@@ -51,7 +51,8 @@ def _panels(model: Model) -> list[tuple[tuple[str, str, str], list[int], list[in
 def plot(run: RunData, fig: Figure | SubFigure | None = None) -> Figure:
     """Draw a run; see `Trajectory.plot`."""
     panels = _panels(run.model)
-    rows = len(panels) + 1
+    forces = _forces(run)
+    rows = len(panels) + 1 + (len(forces) > 0)
     with drawing(more=_SIZES), np.errstate(over="ignore", invalid="ignore"):
         fig = fig or _figure(rows)
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False)
@@ -61,6 +62,10 @@ def plot(run: RunData, fig: Figure | SubFigure | None = None) -> Figure:
             # One legend at the right is for both.
             _lines(left, run.t, run.q[..., q], own, f"{title} ({unit})", legend=own != rates)
             _lines(right, run.t, run.v[..., v], rates, f"their velocities ({rate})")
+        for axis, (label, own, values) in zip(axes[-2] if forces else (), forces, strict=False):
+            _lines(axis, run.t, values, own, label)
+        if len(forces) == 1:
+            axes[-2][1].set_axis_off()
         left, right = axes[-1]
         _energies(left, right, run)
         if run.stats.ended == "diverged":
@@ -74,6 +79,19 @@ def plot(run: RunData, fig: Figure | SubFigure | None = None) -> Figure:
             title += f", {len(run.q)} trajectories" + (f", the first {_DRAWN}" if len(run.q) > _DRAWN else "")
         fig.suptitle(title, fontsize=11)
     return _whole(fig)
+
+
+def _forces(run: RunData) -> list[tuple[str, list[str], Array]]:
+    """Return label, names and values of the torques and forces that acted; a coordinate on paper has no unit."""
+    if not run.driven or not np.nan_to_num(run.tau).any():
+        return []
+    names, tau = run.model.velocity_names, run.tau
+    if not run.model.has_bodies:
+        return [("generalized forces (SI)", list(names), tau)]
+    linear = {names[k] for (_, _, rate), _, of_v in _panels(run.model) if rate == "m/s" for k in of_v}
+    turning, straight = ([n for n in names if (n in linear) == moves] for moves in (False, True))
+    parts = ("torques (N m)", turning), ("forces (N)", straight)
+    return [(label, own, tau[..., [names.index(n) for n in own]]) for label, own in parts if own]
 
 
 def plot_csv(text: str, title: str) -> Figure:
@@ -90,7 +108,11 @@ def plot_csv(text: str, title: str) -> Figure:
     names = head[batch + 1 :]
     try:
         data = np.array([row for row in rows if row], dtype=float)
-        if head[batch : batch + 1] != ["t"] or {name[:2] for name in names} != {"q.", "v."} or not len(data):
+        if (
+            head[batch : batch + 1] != ["t"]
+            or {name[:2] for name in names if not name.startswith("tau.")} != {"q.", "v."}
+            or not len(data)
+        ):
             raise ValueError("its columns are " + ", ".join(head[:4]) + ", ...")
         data = data.reshape(len(np.unique(data[:, 0])) if batch else 1, -1, len(head))[:, :, int(batch) :]
     except ValueError as error:
@@ -101,7 +123,7 @@ def plot_csv(text: str, title: str) -> Figure:
         fig = _figure(2)
         axes = fig.subplots(2, 1, sharex=True)
         for axis, kind, label in zip(axes, "qv", ("q (m or rad)", "v (m/s or rad/s)"), strict=True):
-            which = [k for k, name in enumerate(names, 1) if name[0] == kind]
+            which = [k for k, name in enumerate(names, 1) if name.startswith(f"{kind}.")]
             _lines(axis, data[0, :, 0], data[:, :, which], [names[k - 1][2:] for k in which], label)
         axes[-1].set_xlabel("t (s)")
         fig.suptitle(title, fontsize=11)

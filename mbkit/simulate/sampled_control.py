@@ -1,0 +1,150 @@
+"""Runs with a controller that samples: its torque is computed at equal times and held between them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, batch_of, real
+from mbkit.engines import Dynamics
+from mbkit.errors import InputError, TorqueError
+from mbkit.methods.registry import method_of
+from mbkit.simulate.integrate import integrate, times_of
+from mbkit.simulate.result import Stats
+from mbkit.simulate.run_data import RunData
+from mbkit.simulate.time_grid import Grid, save_times
+from mbkit.simulate.torque import PiecewiseConstantTorque, TorqueCallback
+
+#: Of a step: a hold that is no multiple of it is off by more.
+_MULTIPLE = 1e-6
+
+
+def integrate_held(
+    dyn: Dynamics,
+    q0: ArrayLike,
+    v0: ArrayLike,
+    duration: float,
+    method: str,
+    dt: float | None,
+    rtol: float | None,
+    atol: float | None,
+    torque: Any,
+    save: Any,
+    progress: Any,
+    events: Any,
+    doubt: bool,
+    t0: float | None,
+    wrenches: Any,
+    wrench_axes: str,
+    *,
+    hold: float,
+) -> tuple[RunData, TorqueError | None]:
+    """Return a run's data, and the error of a torque function that ended it; see `mbkit.simulate`.
+
+    Each interval between two samples is a run of its own, from the state where the last one ended.
+    """
+    if not callable(torque):
+        raise InputError("hold: expected a torque function, which is sampled; an array is held as it is")
+    if events is not None:
+        raise InputError("hold: events end a run within an interval; leave out events, or hold")
+    if wrenches and any(map(callable, wrenches.values())):
+        raise InputError("hold: wrenches by functions are not sampled; give arrays, or leave out hold")
+    hold, chosen, model = real("hold", hold, positive=True), method_of(method), dyn.model
+    start, duration, step = times_of(dyn, chosen, t0, duration, dt)
+    fixed = chosen.kind != "adaptive"
+    if fixed and abs(hold / step - round(hold / step)) > _MULTIPLE:
+        raise InputError(f"hold: expected a multiple of the step, {step:g} s, got {hold:g} s")
+    q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
+    batch = batch_of(q0=q, v0=v)
+    if batch is not None:
+        q, v = np.broadcast_to(q, (batch, model.nq)), np.broadcast_to(v, (batch, model.nv))
+    control = TorqueCallback(torque, model.nv)
+    count = max(1, int(np.ceil(duration / hold - _MULTIPLE)))
+    samples: Array = start + hold * np.arange(count, dtype=float)
+    ends = np.append(samples[1:], start + duration)
+    wanted = None if fixed or save is None else save_times(save, start, start + duration)
+    parts: list[RunData] = []
+    rows: list[Array] = []
+    failed: TorqueError | None = None
+    for begin, end in zip(samples.tolist(), ends.tolist(), strict=True):
+        try:
+            row = _sampled(control, begin, q, v)
+        except TorqueError as error:
+            failed = error
+            break
+        rows.append(row)
+        steps = max(1, round((end - begin) / step)) if fixed else 1
+        held = row if batch is None else np.broadcast_to(row[:, None], (batch, steps, model.nv))
+        kept = None if fixed else _kept(wanted, begin, end)
+        arguments = (q, v, end - begin, method, dt, rtol, atol, held, kept, None, None, doubt, begin)
+        data, _ = integrate(dyn, *arguments, wrenches, wrench_axes)
+        parts.append(data)
+        if progress:
+            _tell(progress, (end - start) / duration)
+        if not data.stats.finished:
+            break
+        q, v = data.q[..., -1, :], data.v[..., -1, :]
+    if not parts:
+        assert failed is not None
+        raise failed
+    return _joined(parts, rows, samples, failed, fixed, wanted, save, Grid.of(start, duration, step)), failed
+
+
+def _tell(progress: Any, done: float) -> None:
+    if callable(progress):
+        progress(min(1.0, done))
+
+
+def _kept(wanted: Array | None, begin: float, end: float) -> Array:
+    within = np.zeros(0) if wanted is None else wanted[(wanted > begin) & (wanted < end)]
+    return np.concatenate([[begin], within, [end]])
+
+
+def _sampled(control: TorqueCallback, t: float, q: Array, v: Array) -> Array:
+    if q.ndim == 1:
+        return control.one(t, q, v)
+    return np.array([control.one(t, *state, member=i) for i, state in enumerate(zip(q, v, strict=True))])
+
+
+def _joined(
+    parts: list[RunData],
+    rows: list[Array],
+    samples: Array,
+    failed: TorqueError | None,
+    fixed: bool,
+    wanted: Array | None,
+    save: Any,
+    grid: Grid,
+) -> RunData:
+    """Return the intervals as one run."""
+    first, last = parts[0], parts[-1]
+    # Each begins where the one before it ended.
+    cut = [slice(None), *[slice(1, None)] * (len(parts) - 1)]
+    t = np.concatenate([x.t[c] for x, c in zip(parts, cut, strict=True)])
+    q, v = (np.concatenate([getattr(x, n)[..., c, :] for x, c in zip(parts, cut, strict=True)], -2) for n in "qv")
+    which: Any = slice(None)
+    if fixed and save is not None:
+        which = grid.kept(save, q.shape[-1] + v.shape[-1])
+        which = which[which < len(t)]
+    elif wanted is not None:
+        which = np.isin(t, wanted)
+    stats = [x.stats for x in parts]
+    message = last.stats.message if failed is None else f"stopped by the torque function after t = {t[-1]:.6g} s"
+    whole = Stats(
+        steps=sum(x.steps for x in stats),
+        evaluations=sum(x.evaluations for x in stats),
+        seconds=sum(x.seconds for x in stats),
+        ended=last.stats.ended if failed is None else "function_failed",
+        reached=last.stats.reached,
+        message=message,
+        rejected=sum(x.rejected for x in stats),
+        jacobians=sum(x.jacobians for x in stats),
+        doubts=tuple(dict.fromkeys(one for x in stats for one in x.doubts)),
+    )
+    acted = PiecewiseConstantTorque(np.stack(rows, axis=-2), samples[: len(rows)])
+    return replace(
+        first, t=t[which], q=q[..., which, :], v=v[..., which, :], stats=whole, _applied=acted, _settings=None
+    )
