@@ -167,7 +167,7 @@ def test_cheap_checks_evaluate_a_few_percent_of_what_the_run_did(duration, state
     dyn, counts = mb.dynamics(mb.catalog.double_pendulum()), []
     for name in ("mass_matrix", "potential_energy"):
         term = getattr(dyn, name)
-        monkeypatch.setattr(dyn, name, lambda *a, term=term: counts.append(1) or term(*a))
+        monkeypatch.setitem(vars(dyn), name, lambda *a, term=term: counts.append(1) or term(*a))
     mb.simulate(dyn, [1.0, 0.5], [0.0, 0.0], duration, dt=1e-3, doubt=False)
     assert not counts
     mb.simulate(dyn, [1.0, 0.5], [0.0, 0.0], duration, dt=1e-3)

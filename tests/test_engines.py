@@ -413,6 +413,7 @@ def test_no_entry_that_is_not_finite_passes_unseen(way):
                     assert str(error).startswith(f"{x}: "), (model.name, name, x, i, bad)
 
 
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning")
 @pytest.mark.parametrize("way", WAYS)
 def test_overflow_is_an_error_in_every_quantity(way):
     """A slide of 1e200 m with 1e200 kg: products of these numbers are beyond a double."""
