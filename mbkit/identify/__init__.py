@@ -2,16 +2,19 @@
 
 from mbkit._callable import make_callable
 from mbkit.identify.fourier_series import Excitation, excitation
+from mbkit.identify.motion_noise import FilteredMotion, filtered_motion
 from mbkit.identify.result import Identification, IdentifiedParameter, Residual, Undetermined
 from mbkit.identify.study import identify
 
 __all__ = [
     "Excitation",
+    "FilteredMotion",
     "Identification",
     "IdentifiedParameter",
     "Residual",
     "Undetermined",
     "excitation",
+    "filtered_motion",
     "identify",
 ]
 

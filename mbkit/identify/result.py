@@ -17,6 +17,8 @@ from mbkit.model.validation import check_substituted, suspects
 from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
 
 _SIZE: Final = len(STANDARD)
+#: Velocities whose residuals are printed.
+_SHOWN: Final = 8
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,8 @@ class IdentifiedParameter:
 
     `combination` is the sum of standard parameters that it is. `before` is its value in the model, `value` the estimate
     and `deviation` its standard deviation (Cramér and Rao's bound for the noise found), infinite where the data cannot
-    tell it; SI units.
+    tell it; SI units. `bias` is what noise of the motion is estimated to add to the value, beside that; zero where the
+    samples tell of none.
     """
 
     name: str
@@ -33,6 +36,7 @@ class IdentifiedParameter:
     before: float
     value: float
     deviation: float
+    bias: float = 0.0
 
     _derived: ClassVar = ("determined", "relative")
 
@@ -120,6 +124,8 @@ class Identification(ResultTable):
         Whether these were identified.
     source : Model or None
         The model before; None in a result that was read from JSON.
+    cutoff : float or None
+        Hz, of the filter that the positions went through, where it was given.
     """
 
     model_name: str
@@ -135,6 +141,7 @@ class Identification(ResultTable):
     friction: bool
     armature: bool
     source: Model | None = None
+    cutoff: float | None = None
 
     _csv_columns: ClassVar = (*columns_of(IdentifiedParameter), Column("determined", attrgetter("determined")))
 
@@ -196,6 +203,24 @@ class Identification(ResultTable):
         lost = f", {len(self.undetermined)} directions undetermined" if self.undetermined else ""
         size = f"{len(self.parameters)} parameters of {self.samples} samples"
         return f"<Identification of {self.model_name!r}: {size}{lost}>"
+
+    def __str__(self) -> str:
+        told = [p for p in self.parameters if p.determined]
+        worst = max(told, key=lambda p: p.relative, default=None)
+        biased = max(told, key=lambda p: abs(p.bias) / p.deviation if p.deviation else 0.0, default=None)
+        lines = [f"{self.model_name}: {len(self.parameters)} parameters of {self.samples} samples"]
+        lines += [f"  condition {self.condition:.3g}" + (f", cut-off {self.cutoff:g} Hz" if self.cutoff else "")]
+        if worst:
+            lines += [f"  least sure: {worst.name}, {100 * worst.relative:.2g} % of its value"]
+        if biased and biased.bias:
+            ratio = abs(biased.bias) / biased.deviation if biased.deviation else 0.0
+            lines += [f"  bias by noise of the motion: up to {ratio:.2g} standard deviations ({biased.name})"]
+        if self.undetermined:
+            lines += [f"  {len(self.undetermined)} directions that the data cannot tell"]
+        lines += ["  residual / torque, root mean squares"]
+        lines += [f"    {r.velocity}: {r.noise:.3g} / {r.torque:.3g}" for r in self.residuals[:_SHOWN]]
+        more = len(self.residuals) - _SHOWN
+        return "\n".join(lines + ([f"    and {more} more; .residuals has all"] if more > 0 else []))
 
     def _blocks(self) -> Iterator[Block]:
         how = f", physically consistent, {self.prior} prior" if self.physical else ""

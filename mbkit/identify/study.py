@@ -8,16 +8,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real, shown
+from mbkit._warn import warn
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError
+from mbkit.errors import InputError, MbkitWarning
 from mbkit.identify.consistency import ENTROPIC, NEGLIGIBLE, PRIORS, consistent, nearest
 from mbkit.identify.least_squares import Fit, fit, stacked
 from mbkit.identify.measurements import Equations, Measurements, Unknowns, equations
+from mbkit.identify.motion_noise import bias, motion_noise
 from mbkit.identify.result import Identification, IdentifiedParameter, Residual, Undetermined
 from mbkit.model import Model
 from mbkit.model.base_parameters import POWERS, length_of, standard_names
 from mbkit.model.builder import expect_model
 from mbkit.simulate.progress import Progress, ProgressFunction
+
+#: Standard deviations of bias from which on the user is warned.
+_BIASED = 3.0
 
 
 def identify(
@@ -34,6 +39,7 @@ def identify(
     prior: str | None = None,
     prior_weight: float = 1.0,
     progress: bool | ProgressFunction | None = None,
+    cutoff: float | None = None,
 ) -> Identification:
     """Identify the base parameters of a model from measured motions and torques, by weighted least squares.
 
@@ -46,7 +52,8 @@ def identify(
     q : (N, nq) array_like
         rad, m.
     v, a : (N, nv) array_like
-        Velocities and accelerations, as free of noise as can be: only that of the torques is weighed.
+        Velocities and accelerations, as free of noise as can be: only that of the torques is weighed. `filtered_motion`
+        makes them of positions. Where samples follow each other in time, what their noise does is estimated.
     tau : (N, nv) array_like
         Measured generalized forces, N m, N.
     weights : (nv,) or (N, nv) array_like, optional
@@ -68,6 +75,8 @@ def identify(
         standard deviation of their own size.
     progress : bool or callable, optional
         True for a bar, or a function of the fraction done.
+    cutoff : float, optional
+        Hz, of the filter that the positions went through; it is kept in the result.
 
     Returns
     -------
@@ -82,6 +91,11 @@ def identify(
         A model written as energies, one with loops or prescribed motions, or a package that is not installed.
     NumericalError
         The solver found no consistent parameters.
+
+    Warns
+    -----
+    MbkitWarning
+        Noise of the motion biases an estimate by more than three of its standard deviations.
 
     Notes
     -----
@@ -117,6 +131,7 @@ def identify(
         given = equations(LagrangianDynamics(model), unknowns, data, reported)
     length = length_of(model)
     fitted = fit(given, unknowns.nominal, _units(model, unknowns, length), weighted=weights is not None)
+    off = _bias(model, unknowns, data, fitted, length, weights is not None)
     values = fitted.values
     if physical:
         noise = np.maximum(fitted.noise, NEGLIGIBLE * (max(x.size for x in given) or 1.0))
@@ -127,7 +142,7 @@ def identify(
         standard = nearest(unknowns.base, values, length)
     return Identification(
         model.name,
-        _parameters(unknowns, values, fitted),
+        _parameters(unknowns, values, fitted, off),
         tuple(_undetermined(unknowns, row) for row in fitted.null),
         _residuals(model, given, fitted),
         fitted.condition,
@@ -139,6 +154,7 @@ def identify(
         unknowns.friction,
         unknowns.armature,
         model,
+        None if cutoff is None else real("cutoff", cutoff, positive=True),
     )
 
 
@@ -157,8 +173,30 @@ def _units(model: Model, unknowns: Unknowns, length: float) -> Array:
     return np.array([length ** powers.get(name, 0) for name in unknowns.names])
 
 
-def _parameters(unknowns: Unknowns, values: Array, fitted: Fit) -> tuple[IdentifiedParameter, ...]:
-    numbers = (x.tolist() for x in (unknowns.nominal, values, fitted.deviations))
+def _bias(model: Model, unknowns: Unknowns, data: Measurements, fitted: Fit, length: float, weighted: bool) -> Array:
+    """Return the bias of the estimates by noise of the motion, and warn where it is large."""
+    dyn, units = LagrangianDynamics(model), _units(model, unknowns, length)
+
+    def solve(other: Measurements) -> tuple[Array, Array]:
+        again = fit(equations(dyn, unknowns, other, Progress(None, "")), unknowns.nominal, units, weighted=weighted)
+        return again.values, again.noise
+
+    out = bias(data, fitted.values, fitted.noise, solve)
+    known = np.isfinite(fitted.deviations) & (fitted.deviations > 0)
+    ratio = np.where(known, np.abs(out) / np.where(known, fitted.deviations, 1.0), 0.0)
+    if (many := int(np.sum(ratio > _BIASED))) > 0:
+        worst, (v, a) = int(np.argmax(ratio)), motion_noise(data)
+        warn(
+            f"{model.name}: noise of the motion (up to {v.max():.2g} in v, {a.max():.2g} in a) biases {many} of "
+            f"{len(ratio)} estimates by more than {_BIASED:g} standard deviations, {unknowns.names[worst]} by "
+            f"{ratio[worst]:.3g}; filter the positions first: mbkit.identify.filtered_motion",
+            MbkitWarning,
+        )
+    return out
+
+
+def _parameters(unknowns: Unknowns, values: Array, fitted: Fit, off: Array) -> tuple[IdentifiedParameter, ...]:
+    numbers = (x.tolist() for x in (unknowns.nominal, values, fitted.deviations, off))
     return tuple(IdentifiedParameter(*x) for x in zip(unknowns.names, unknowns.combinations, *numbers, strict=True))
 
 
