@@ -18,7 +18,7 @@ import pytest
 import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import dynamics
-from mbkit.errors import InputError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import simulate
 from mbkit.studies.work_precision import reference as module
@@ -187,7 +187,7 @@ def test_time_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Deadline, "look", look)
     found = reference(catalog.pendulum(), [2.0], [0.0], 3.0, np.linspace(0, 3, 301))
     assert 1.15 < found.horizon < 1.5
-    assert "ends: the time was up at t = 1." in found.how
+    assert "ends: the seconds allowed for it were used up at t = 1." in found.how
 
 
 def test_a_way_that_is_too_slow_leaves_time_for_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -347,3 +347,15 @@ def test_a_model_without_joints_rests() -> None:
     found = reference(model, [], [], 1.0, [0, 1.0])
     assert isinstance(found, Reference)
     assert found.q.shape == (2, 0)
+
+
+def test_a_reference_without_a_witness_says_why(monkeypatch):
+    """That an engine gives no accelerations is no reason to say that it does not hold the model."""
+
+    def refuse(*_: object) -> None:
+        raise NumericalError("M is singular here")
+
+    monkeypatch.setattr(sys.modules[reference.__module__], "_accelerations", refuse)
+    known = reference(mb.catalog.pendulum(), [1.0], [0.0], 0.1, [0.0, 0.1])
+    assert "no other engine gives its accelerations" in known.how
+    assert "M is singular here" in known.how

@@ -499,7 +499,7 @@ def add_free_base(mujoco: Element, read: Reader) -> None:
     joints = [len(list(parts(b, _JOINTS))) for b in tops]
     if tops and (len(tops) > 1 or joints[0]):
         names = (repr(b.attributes.get("name", "")) if b.attributes.get("name") else f"({b.place})" for b in tops)
-        there = ", ".join(f"{name} ({n} joints)" for name, n in zip(names, joints, strict=True))
+        there = ", ".join(f"{name} ({n} joint{'s' * (n != 1)})" for name, n in zip(names, joints, strict=True))
         read.fault(f"floating_base=True needs one body of the world, without joints; there are: {there}")
     elif any(e.tag in _JOINTS and e.attributes.get("name") == BASE_JOINT for e in mujoco.walk()):
         read.fault(f"joint {BASE_JOINT!r}: floating_base=True adds a joint of that name; rename yours")

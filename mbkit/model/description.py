@@ -133,7 +133,7 @@ class Layout:
     def __repr__(self) -> str:
         nq, nv, full_nq, full_nv = self.sizes
         full = f" of {full_nq} and {full_nv} with mimic joints" if self.reduced else ""
-        return f"<Layout of {len(self.joints)} joints: nq={nq}, nv={nv}{full}>"
+        return f"<Layout of {len(self.joints)} joint{'s' * (len(self.joints) != 1)}: nq={nq}, nv={nv}{full}>"
 
     @cached_property
     def full_q(self) -> dict[str, slice]:

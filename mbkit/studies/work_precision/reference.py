@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, real
+from mbkit._escape import one_line
 from mbkit.codegen.extended_precision import Extended, arithmetic
 from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.program import program
@@ -241,7 +242,7 @@ def _states(motion: Motion, kind: Any, steps: TaylorSteps, deadline: Deadline, m
     except StoppedError as error:
         return states, count, f"{error} after t = {steps.t:.6g} s"
     except LateError:
-        return states, count, f"the time was up at t = {steps.t:.6g} s"
+        return states, count, f"the seconds allowed for it were used up at t = {steps.t:.6g} s"
     return states, count, ""
 
 
@@ -274,7 +275,7 @@ def two_engines(motion: Motion, deadline: Deadline) -> Known:
                 if not legs[-1].stats.finished:
                     why = f"{method} on {dyn.engine} ended early, within {times[k]:.6g} to {times[end]:.6g} s"
         except LateError:
-            why = f"the time was up after t = {times[k]:.6g} s"
+            why = f"the seconds allowed for it were used up after t = {times[k]:.6g} s"
             break
         n = min(len(leg.t) for leg in legs)
         states = [
@@ -552,6 +553,10 @@ def _cut(motion: Motion, known: Known) -> Reference:
     )
 
 
+#: Characters of a reason why an engine is no witness.
+_REASON: Final = 120
+
+
 def _witness(motion: Motion, best: Reference) -> str:
     """Return a text that compares accelerations along a motion with those of another engine."""
     which = np.unique(np.linspace(0, len(best.t) - 1, min(_WITNESSED, len(best.t))).astype(int))
@@ -560,16 +565,19 @@ def _witness(motion: Motion, best: Reference) -> str:
     tau = np.array([force(min(int(k), last)) for k in which])
     constants = [motion.values(best.t[which])] if len(motion.equations.constant_values) else []
     a = Machine(motion.equations.function("forward_dynamics"))(q, v, tau, *constants)[0][..., 0]
+    failed = []
     for engine in INDEPENDENT:
         try:
             dyn = dynamics(motion.model, engine)
             _require_rigid(dyn)
             other = _accelerations(dyn, best.t[which], q, v, tau)
-        except MbkitError:
+        except MbkitError as error:
+            failed.append(one_line(str(error), _REASON))
             continue
         apart = np.abs(a - other).max() / (np.abs(a).max() or 1.0)
         return f"; accelerations along it differ by {apart:.1e} from those of {engine}"
-    return "; no other engine holds the model, so its formulas were checked by no other derivation"
+    reasons = "; ".join(failed)
+    return f"; no other engine gives its accelerations, so that no other derivation checked its formulas ({reasons})"
 
 
 def _accelerations(dyn: Dynamics, t: Array, q: Array, v: Array, tau: Array) -> Array:
