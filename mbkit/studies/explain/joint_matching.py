@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines.imported import joint_of, unused
 from mbkit.model import Body, Joint, Model
-from mbkit.model.joint_types import FIXED
+from mbkit.model.joint_types import FIXED, PRISMATIC
 from mbkit.studies.explain.hypotheses import Hypothesis
 from mbkit.studies.explain.merged_model import FrameChange, MergedModel, Tolerances, merge, reattached
 from mbkit.studies.explain.terms import restricted, trimmed_couplings
@@ -289,6 +289,8 @@ def reconcile_joint_sets(
     whichever leaves fewer differences. The matching names these joints as without counterpart.
     """
     causes: list[Hypothesis] = []
+    # The order in q and v is told beside.
+    b = _with_slides_in_order(a, b)
     alone: tuple[list[str], list[str]] = ([], [])
     sides = [a, b]
     while True:
@@ -314,6 +316,57 @@ def reconcile_joint_sets(
         causes.append(_structural_cause(still, name, model, below, side, fixed=fixed))
         alone[side].append(name)
         sides[side] = options[still]
+
+
+def _with_slides_in_order(a: Model, b: Model) -> Model:
+    """Return `b` with slides that follow each other in the order of `a`: translations commute."""
+    order = {j.name: k for k, j in enumerate(a.tree)}
+    joints = {j.name: j for j in b.joints}
+    for run in _runs_of_slides(b):
+        wanted = sorted(run, key=lambda name: order.get(name, -1))
+        if wanted == run or not set(run) <= set(order):
+            continue
+        own = [b.joint(name) for name in run]
+        for name, place in zip(wanted, own, strict=True):
+            # Where a joint is on its parent belongs to the place.
+            where: dict[str, Any] = {"parent": place.parent, "child": place.child, "translation": place.translation}
+            joints[name] = replace(b.joint(name), rotation=place.rotation, **where)
+    return replace(b, joints=tuple(joints[j.name] for j in b.joints))
+
+
+def _runs_of_slides(model: Model) -> list[list[str]]:
+    """Return the slides that follow each other, without matter, turns or anything else between them."""
+    on: dict[str, list[Joint]] = {}
+    for joint in model.joints:
+        on.setdefault(joint.parent, []).append(joint)
+    used = {f.body for f in model.frames}
+    ends: tuple[Any, ...] = (*model.springs, *model.loops, *model.no_slip)
+    for x in ends:
+        used |= {x.body_a, x.body_b}
+    runs: list[list[str]] = []
+    for joint in model.tree:
+        before = runs[-1] if runs else []
+        last = model.joint(before[-1]) if before else None
+        body = model.body(joint.parent) if joint.parent != "world" else None
+        plain = joint.kind == PRISMATIC.name and joint.mimic is None
+        follows = (
+            last is not None
+            and body is not None
+            and last.child == joint.parent
+            and len(on[joint.parent]) == 1
+            and not body.mass
+            and not body.inertia.any()
+            and joint.parent not in used
+            and np.array_equal(joint.rotation, np.eye(3))
+        )
+        if plain and follows:
+            before.append(joint.name)
+        elif plain:
+            runs.append([joint.name])
+        elif before:
+            # Ends the run.
+            runs.append([])
+    return [run for run in runs if len(run) > 1]
 
 
 def _held(model: Model, name: str) -> Model:
