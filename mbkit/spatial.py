@@ -6,11 +6,16 @@ angles take one at a time. Series replace closed forms near zero where those los
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import Array, finite_array
+from mbkit.errors import InputError
 
 __all__ = [
     "conjugate",
@@ -36,6 +41,39 @@ __all__ = [
 _SMALL = 1e-2
 
 
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def _takes(*shapes: tuple[int, ...]) -> Callable[[_F], _F]:
+    """Let a function take lists too, and name an argument whose last axes are others: a scalar is no vector."""
+
+    def decorated(function: _F) -> _F:
+        names = tuple(inspect.signature(function).parameters)
+
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if kwargs or len(args) != len(names):
+                args = tuple(inspect.signature(function).bind(*args, **kwargs).args)
+            if any(type(x) is not np.ndarray or x.shape[-len(n) :] != n for x, n in zip(args, shapes, strict=True)):
+                args = tuple(map(_shaped, names, args, shapes))
+            return function(*args)
+
+        return call  # type: ignore[return-value]
+
+    return decorated
+
+
+def _shaped(name: str, x: Any, shape: tuple[int, ...]) -> Any:
+    try:
+        got = np.shape(x)
+    except ValueError as error:
+        raise InputError(f"{name}: expected an array of numbers, got rows of different lengths ({error})") from None
+    if got[-len(shape) :] != shape:
+        raise InputError(f"{name}: expected shape {shape} or (..., {str(shape)[1:-1].rstrip(',')}), got {got}")
+    return x if isinstance(x, np.ndarray) else finite_array(name, x, got)
+
+
+@_takes((3,))
 def skew(w: Array) -> Array:
     """Return the matrix of ``w ×``, shape (..., 3, 3)."""
     out = np.zeros((*w.shape[:-1], 3, 3))
@@ -51,6 +89,7 @@ def _cross(a: Array, b: Array) -> Array:
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
 
 
+@_takes((4,), (4,))
 def multiply(a: Array, b: Array) -> Array:
     """Return the quaternion product a b, (..., 4)."""
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
@@ -59,6 +98,7 @@ def multiply(a: Array, b: Array) -> Array:
     return np.concatenate([vector, scalar], axis=-1)
 
 
+@_takes((4,))
 def conjugate(a: Array) -> Array:
     """Return the conjugate (..., 4), the inverse of a unit quaternion."""
     return np.asarray(a * np.array([-1.0, -1.0, -1.0, 1.0]))
@@ -69,6 +109,7 @@ def normalized(a: Array) -> Array:
     return np.asarray(a / np.linalg.norm(a, axis=-1, keepdims=True))
 
 
+@_takes((4,), (3,))
 def rotate(quaternion: Array, x: Array) -> Array:
     """Return the vectors x (..., 3), rotated by unit quaternions (..., 4)."""
     u, w = quaternion[..., :3], quaternion[..., 3:]
@@ -76,6 +117,7 @@ def rotate(quaternion: Array, x: Array) -> Array:
     return np.asarray(x + w * t + _cross(u, t))
 
 
+@_takes((4,))
 def matrix_from_quaternion(quaternion: Array) -> Array:
     """Return R, shape (..., 3, 3), of unit quaternions q (..., 4), with R x = q x conj(q)."""
     x, y, z, w = (quaternion[..., i] for i in range(4))
@@ -86,6 +128,7 @@ def matrix_from_quaternion(quaternion: Array) -> Array:
     return out
 
 
+@_takes((3, 3))
 def quaternion_from_matrix(R: Array) -> Array:
     """Return the unit quaternion (4,) of one rotation matrix (3, 3), with w >= 0.
 
@@ -116,6 +159,7 @@ def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
+@_takes((3, 3))
 def rpy_from_matrix(R: Array) -> tuple[float, float, float]:
     """Return roll, pitch, yaw in radians with R = Rz(yaw) Ry(pitch) Rx(roll), pitch within ±π/2.
 
@@ -127,6 +171,7 @@ def rpy_from_matrix(R: Array) -> tuple[float, float, float]:
     return float(np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])), pitch, yaw
 
 
+@_takes((3,))
 def exp_quaternion(w: Array) -> Array:
     """Return the unit quaternions (..., 4) of rotation vectors w (..., 3), in radians."""
     theta = np.linalg.norm(w, axis=-1, keepdims=True)
@@ -138,6 +183,7 @@ def exp_quaternion(w: Array) -> Array:
     return np.concatenate([scale * w, np.cos(half)], axis=-1)
 
 
+@_takes((4,))
 def log_quaternion(quaternion: Array) -> Array:
     """Return the rotation vectors (..., 3), of length π at most, of unit quaternions (..., 4)."""
     q = np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
@@ -148,6 +194,7 @@ def log_quaternion(quaternion: Array) -> Array:
     return np.asarray(scale * q[..., :3])
 
 
+@_takes((3,))
 def left_jacobian(w: Array) -> Array:
     """Return V, shape (..., 3, 3), with V(w) u the translation of ``exp_se3([u, w])``.
 
@@ -165,6 +212,7 @@ def left_jacobian(w: Array) -> Array:
     return np.asarray(np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W))
 
 
+@_takes((3,))
 def left_jacobian_inverse(w: Array) -> Array:
     """Return the inverse of `left_jacobian`, shape (..., 3, 3)."""
     theta2 = np.sum(w * w, axis=-1)
@@ -179,12 +227,14 @@ def left_jacobian_inverse(w: Array) -> Array:
     return np.asarray(np.eye(3) - W / 2 + c[..., None, None] * (W @ W))
 
 
+@_takes((6,))
 def exp_se3(xi: Array) -> tuple[Array, Array]:
     """Return translation (..., 3) and quaternion (..., 4) of exp of twists (..., 6), linear then angular."""
     u, w = xi[..., :3], xi[..., 3:]
     return np.einsum("...ij,...j->...i", left_jacobian(w), u), exp_quaternion(w)
 
 
+@_takes((3,), (4,))
 def log_se3(p: Array, quaternion: Array) -> Array:
     """Return the twists (..., 6), linear then angular, whose `exp_se3` are these rigid motions.
 
@@ -207,6 +257,7 @@ def log_se3(p: Array, quaternion: Array) -> Array:
     return np.concatenate([np.einsum("...ij,...j->...i", left_jacobian_inverse(w), p), w], axis=-1)
 
 
+@_takes((4, 4), (4, 4))
 def pose_error(X: Array, X_goal: Array) -> Array:
     """Return what is missing from a pose to a goal, (..., 6), as controllers in task space use it.
 

@@ -6,6 +6,7 @@ import importlib
 import inspect
 import math
 import pickle
+from collections.abc import Callable
 from dataclasses import FrozenInstanceError, fields, replace
 from decimal import Decimal
 from fractions import Fraction
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 
 import mbkit as mb
 from mbkit.engines import ENGINES
-from mbkit.errors import InputError, ModelError, NonPhysicalWarning, UnknownNameError
+from mbkit.errors import InputError, MbkitError, ModelError, NonPhysicalWarning, UnknownNameError
 from mbkit.model import KINDS, Mimic
 from mbkit.model.manifold import unit_quaternions
 from mbkit.model.model import unchecked
@@ -708,3 +709,62 @@ def test_a_velocity_by_the_pose_error_goes_straight_to_the_goal() -> None:
     assert np.abs(dyn.pose(q, "tool0") - goal).max() < 1e-12
     batch = mb.spatial.pose_error(dyn.pose(np.stack([q, q]), "tool0"), goal)
     assert batch.shape == (2, 6)
+
+
+def calls_with_a_scalar() -> dict[str, Callable[[], Any]]:
+    """Return a call for each vector argument of a public function, with a number in its place."""
+    model, X, unit = mb.load("ur5"), np.eye(4), np.array([0.0, 0.0, 0.0, 1.0])
+    dyn, z = mb.dynamics(model, "lagrangian"), np.zeros(6)
+    many = np.zeros((50, 6))
+    out: dict[str, Callable[[], Any]] = {
+        "simulate q0": lambda: mb.simulate(dyn, 0.5, z, 0.01),
+        "simulate v0": lambda: mb.simulate(dyn, z, 0.5, 0.01),
+        "simulate torque": lambda: mb.simulate(dyn, z, z, 0.01, torque=1.0),
+        "simulate torque function": lambda: mb.simulate(dyn, z, z, 0.01, torque=lambda *_: 1.0),
+        "simulate wrench": lambda: mb.simulate(dyn, z, z, 0.01, wrenches={"tool0": 5.0}),
+        "simulate wrench function": lambda: mb.simulate(dyn, z, z, 0.01, wrenches={"tool0": lambda *_: 1.0}),
+        "inverse_dynamics wrench": lambda: dyn.inverse_dynamics(z, z, z, wrenches={"tool0": 5.0}),
+        "generalized_force": lambda: dyn.generalized_force(z, {"tool0": 5.0}),
+        "forward_dynamics tau": lambda: dyn.forward_dynamics(z, z, 1.0),
+        "step tau": lambda: dyn.step(z, z, 1.0, 1e-3),
+        "step wrench": lambda: dyn.step(z, z, z, 1e-3, wrenches={"tool0": 1.0}),
+        "integrate": lambda: model.integrate(z, 1.0),
+        "difference": lambda: model.difference(z, 1.0),
+        "jacobian": lambda: dyn.jacobian(1.0, "tool0"),
+        "operational_space": lambda: mb.operational_space(dyn, 1.0, "tool0"),
+        "equilibrium": lambda: mb.equilibrium(dyn, 1.0),
+        "linearize": lambda: dyn.linearize(1.0, z, z),
+        "identify weights": lambda: mb.identify(model, many, many, many, many, weights=1.0),
+        "filtered_motion": lambda: mb.identify.filtered_motion(model, 1.0, 1e-3, 10.0),
+        "solref": lambda: mb.dynamics(mb.catalog.slider_crank(), "mujoco", solref=0.02),
+        "save": lambda: mb.simulate(dyn, z, z, 0.01, save=0.01),
+        "show": lambda: mb.show(model, 1.0),
+        "picture view": lambda: mb.simulate(dyn, z, z, 0.01).picture(view=1.0),
+        "multiply": lambda: mb.spatial.multiply(unit, 1.0),
+        "rotate": lambda: mb.spatial.rotate(unit, 1.0),
+        "log_se3": lambda: mb.spatial.log_se3(np.zeros(3), 1.0),
+        "pose_error": lambda: mb.spatial.pose_error(X, 1.0),
+    }
+    for name in ("skew", "exp_quaternion", "log_quaternion", "exp_se3", "left_jacobian", "left_jacobian_inverse"):
+        out[name] = lambda name=name: getattr(mb.spatial, name)(1.0)  # type: ignore[misc]
+    for name in ("conjugate", "matrix_from_quaternion", "quaternion_from_matrix", "rpy_from_matrix"):
+        out[name] = lambda name=name: getattr(mb.spatial, name)(1.0)  # type: ignore[misc]
+    return out
+
+
+def test_a_scalar_is_a_vector_for_no_public_function():
+    for name, call in calls_with_a_scalar().items():
+        with pytest.raises(MbkitError, match="expected"):
+            pytest.fail(f"{name}: {call()!r}")
+
+
+def test_functions_of_space_take_lists_and_name_wrong_shapes():
+    assert mb.spatial.skew([1, 2, 3]).tolist() == [[0, -3, 2], [3, 0, -1], [-2, 1, 0]]
+    assert mb.spatial.rotate(quaternion=[0, 0, 1, 0], x=[1, 0, 0]).tolist() == [-1, 0, 0]
+    for bad, words in (
+        (lambda: mb.spatial.skew([[1, 2]]), r"w: expected shape \(3,\) or \(..., 3\), got \(1, 2\)"),
+        (lambda: mb.spatial.rotate([0, 0, 0, 1], [1, "a", 2]), "x: expected real numbers"),
+        (lambda: mb.spatial.skew([[1, 2, 3], [1]]), "w: expected an array of numbers, got rows"),
+    ):
+        with pytest.raises(InputError, match=words):
+            bad()
