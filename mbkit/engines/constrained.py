@@ -98,15 +98,42 @@ class Constrained:
 
         (k,) or (N, k), in m and rad: the first k of the m rows of `constraint_names`. Rows that hold velocities alone
         have no such function; their residual is that of `constraint_rate`.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
+        >>> q, v = dyn.project([0.5, 0.0, 1.0], [1.0, 0.0, 0.0])
+        >>> bool(abs(dyn.constraint_residual(q)).max() < 1e-14)
+        True
         """
         return self._bound("constraint_residual", q=q)
 
     def constraint_jacobian(self, q: ArrayLike) -> Array:
-        """Return J of all rows, with the rates J v + c; (m, nv) or (N, m, nv)."""
+        """Return J of all rows, with the rates J v + c; (m, nv) or (N, m, nv).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
+        >>> q, v = dyn.project([0.5, 0.0, 1.0], [1.0, 0.0, 0.0])
+        >>> J = dyn.constraint_jacobian(q)
+        >>> J.shape, bool(abs(J @ v).max() < 1e-14)
+        ((2, 3), True)
+        """
         return self._bound("constraint_jacobian", q=q)
 
     def constraint_rate(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return the rates J v + c of all rows, zero in a consistent state: ḟ, then A v - b; (m,) or (N, m)."""
+        """Return the rates J v + c of all rows, zero in a consistent state: ḟ, then A v - b; (m,) or (N, m).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
+        >>> q, v = dyn.project([0.5, 0.0, 1.0], [1.0, 0.0, 0.0])
+        >>> bool(abs(dyn.constraint_rate(q, v)).max() < 1e-14)
+        True
+        """
         return self._bound("constraint_rate", q=q, v=v)
 
     def constraint_rate_gradient(self, q: ArrayLike, v: ArrayLike) -> Array:
@@ -159,7 +186,17 @@ class Constrained:
         return np.asarray(np.linalg.svd(rows / np.where(sizes > 0, sizes, 1.0))[2][2 * model.nv - left :].T)
 
     def constraint_bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return γ of all rows, with the rates' derivative J v̇ + γ = 0; (m,) or (N, m)."""
+        """Return γ of all rows, with the rates' derivative J v̇ + γ = 0; (m,) or (N, m).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
+        >>> q, v = dyn.project([0.5, 0.0, 1.0], [1.0, 0.0, 0.0])
+        >>> a = dyn.forward_dynamics(q, v, [0.0] * 3)
+        >>> bool(abs(dyn.constraint_jacobian(q) @ a + dyn.constraint_bias(q, v)).max() < 1e-12)
+        True
+        """
         return self._bound("constraint_bias", q=q, v=v)
 
     def constraint_forces(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
@@ -167,11 +204,28 @@ class Constrained:
 
         Where rows are redundant, λ is not unique: it is the one with the least norm, in N and N m. Jᵀ λ, which
         `generalized_constraint_force` returns, is unique all the same.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
+        >>> q, v = dyn.project([0.5, 0.0, 1.0], [1.0, 0.0, 0.0])
+        >>> dyn.constraint_forces(q, v, [0.0] * 3).shape, len(dyn.constraint_names)
+        ((2,), 2)
         """
         return self._bound("constraint_forces", q=q, v=v, tau=tau)
 
     def generalized_constraint_force(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
-        """Return Jᵀ λ, the generalized force that keeps the constraints under τ; (nv,) or (N, nv)."""
+        """Return Jᵀ λ, the generalized force that keeps the constraints under τ; (nv,) or (N, nv).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
+        >>> q, v = dyn.project([0.5, 0.0, 1.0], [1.0, 0.0, 0.0])
+        >>> dyn.generalized_constraint_force(q, v, [0.0] * 3).shape
+        (3,)
+        """
         return self._bound("generalized_constraint_force", q=q, v=v, tau=tau)
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:

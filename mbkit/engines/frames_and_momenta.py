@@ -109,11 +109,26 @@ class FramesAndMomenta:
         """Return X_WF of a frame or body, shape (4, 4) or (N, 4, 4).
 
         X_WF has the rotation R_WF and the origin p_WF, m: it takes a point from the frame's axes to the world's.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.pose([0.0], "tip")[:3, 3]
+        array([ 0.,  0., -2.])
         """
         return self._of_frames("pose", frame, q=q)
 
     def body_poses(self, q: ArrayLike) -> Array:
-        """Return X_WB of all bodies in the order of ``model.bodies``, shape (n, 4, 4) or (N, n, 4, 4)."""
+        """Return X_WB of all bodies in the order of ``model.bodies``, shape (n, 4, 4) or (N, n, 4, 4).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.body_poses([0.0]).shape
+        (1, 4, 4)
+        """
         out = self._of_frames("pose", [b.name for b in self.model.bodies], q=q)
         for k, body in enumerate(self.model.bodies):
             # A frame of a body's name, as an MJCF has them, hides the body: X_WB = X_WF X_FB.
@@ -133,6 +148,13 @@ class FramesAndMomenta:
         frame : str or sequence of str
         axes : {"local", "world", "local_world_aligned"}
             As in `velocity`; ``"body"`` is another name for ``"local"``.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.jacobian([0.0], "tip").T + 0.0
+        array([[ 2.,  0.,  0.,  0., -1.,  0.]])
         """
         return self._of_frames("jacobian", frame, axes_named(axes), q=q)
 
@@ -189,6 +211,13 @@ class FramesAndMomenta:
         -------
         (6,) or (N, 6) array
             With a list of frames (k, 6) or (N, k, 6).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.acceleration([0.0], [3.0], [0.0], "tip")[:3] + 0.0  # to the pivot, l θ̇²
+        array([ 0.,  0., 18.])
         """
         if kind not in (SPATIAL, CLASSICAL):
             raise InputError(f"kind: expected {SPATIAL!r} or {CLASSICAL!r}, got {kind!r}")
@@ -199,6 +228,13 @@ class FramesAndMomenta:
 
         So J a + J̇ v is the rate of the velocity's six numbers: the classical acceleration in
         ``"local_world_aligned"`` axes, the spatial one in the others.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.jacobian_dot_v([0.0], [3.0], "tip")[:3] + 0.0
+        array([ 0.,  0., 18.])
         """
         return self._of_frames("jacobian_dot_v", frame, axes_named(axes), q=q, v=v)
 
@@ -212,6 +248,13 @@ class FramesAndMomenta:
         jacobian (6, nv), velocity, acceleration and jacobian_dot_v (6, 1), and of generalized_force, whose input
         "wrenches" is (6, 1); `axes` and `kind` are as in these methods. Those of the whole, such as center_of_mass and
         centroidal_momentum_matrix, take none.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.function("jacobian", frame="tip")
+        Function(jacobian:(q)->(jacobian[6]) SXFunction)
         """
         return self._method("function")(name, frame, axes_named(axes), kind)
 
@@ -221,19 +264,50 @@ class FramesAndMomenta:
         """Return p_G, the centre of mass of all bodies in the world, m, shape (3,) or (N, 3).
 
         Bodies that are welded to the world count, as they do in ``model.mass`` and in the potential energy.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.center_of_mass([0.0])
+        array([ 0.,  0., -2.])
         """
         return self._evaluate("center_of_mass", q=q)
 
     def center_of_mass_velocity(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return ṗ_G in world axes, m/s, shape (3,) or (N, 3)."""
+        """Return ṗ_G in world axes, m/s, shape (3,) or (N, 3).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.center_of_mass_velocity([0.0], [3.0]) + 0.0
+        array([6., 0., 0.])
+        """
         return self._evaluate("center_of_mass_velocity", q=q, v=v)
 
     def center_of_mass_acceleration(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Array:
-        """Return p̈_G in world axes, m/s², shape (3,) or (N, 3)."""
+        """Return p̈_G in world axes, m/s², shape (3,) or (N, 3).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.center_of_mass_acceleration([0.0], [3.0], [0.0]) + 0.0
+        array([ 0.,  0., 18.])
+        """
         return self._evaluate("center_of_mass_acceleration", q=q, v=v, a=a)
 
     def center_of_mass_jacobian(self, q: ArrayLike) -> Array:
-        """Return J_G with ṗ_G = J_G v, shape (3, nv) or (N, 3, nv)."""
+        """Return J_G with ṗ_G = J_G v, shape (3, nv) or (N, 3, nv).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.center_of_mass_jacobian([0.0]).T + 0.0
+        array([[2., 0., 0.]])
+        """
         return self._evaluate("center_of_mass_jacobian", q=q)
 
     def centroidal_momentum(self, q: ArrayLike, v: ArrayLike) -> Array:
@@ -241,21 +315,51 @@ class FramesAndMomenta:
 
         Shape (6,) or (N, 6). p_G is that of `center_of_mass`. Orin, Goswami and Lee 2013, Centroidal dynamics of a
         humanoid robot, Autonomous Robots 35.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.centroidal_momentum([0.0], [3.0])[:3] + 0.0
+        array([18.,  0.,  0.])
         """
         return self._evaluate("centroidal_momentum", q=q, v=v)
 
     def centroidal_momentum_matrix(self, q: ArrayLike) -> Array:
-        """Return A_G with the centroidal momentum A_G v, shape (6, nv) or (N, 6, nv)."""
+        """Return A_G with the centroidal momentum A_G v, shape (6, nv) or (N, 6, nv).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.centroidal_momentum_matrix([0.0])[:3].T + 0.0
+        array([[6., 0., 0.]])
+        """
         return self._evaluate("centroidal_momentum_matrix", q=q)
 
     def centroidal_momentum_bias(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return Ȧ_G v: the rate of the centroidal momentum is A_G a + Ȧ_G v; shape (6,) or (N, 6)."""
+        """Return Ȧ_G v: the rate of the centroidal momentum is A_G a + Ȧ_G v; shape (6,) or (N, 6).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.centroidal_momentum_bias([0.0], [3.0])[:3] + 0.0
+        array([ 0.,  0., 54.])
+        """
         return self._evaluate("centroidal_momentum_bias", q=q, v=v)
 
     def locked_inertia(self, q: ArrayLike) -> Array:
         """Return the inertia of the whole with its joints locked, about p_G in world axes, shape (6, 6) or (N, 6, 6).
 
         The first block is the mass, the second the rotational inertia, kg m².
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum(length=2.0, mass=3.0), "lagrangian")
+        >>> dyn.locked_inertia([0.0]).shape
+        (6, 6)
         """
         return self._evaluate("locked_inertia", q=q)
 
