@@ -13,6 +13,7 @@ import pytest
 
 import mbkit as mb
 from mbkit import catalog
+from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError
 from mbkit.methods.tableaus import ImplicitTableau, Tableau, gauss_legendre
 from mbkit.model import Model, ModelBuilder
@@ -213,6 +214,49 @@ def test_the_last_step_may_be_shorter() -> None:
     truth = simulate(dyn, q, v, 0.107, "dop853", rtol=3e-14, save=[0.107])
     assert run.t[-1] == 0.107
     assert run.q[-1] == pytest.approx(truth.q[-1], abs=1e-11)
+
+
+# Machine code
+
+
+def both(model: Model, method: str, q: np.ndarray, v: np.ndarray, **more: object) -> list[mb.Trajectory]:
+    return [
+        simulate(mb.dynamics(model, "lagrangian", compile=compiled), q, v, 0.1, method, dt=0.01, **more)  # type: ignore[arg-type]
+        for compiled in (True, False)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_steps_are_those_of_python(seed: int) -> None:
+    """Springs, damping, armature, rotations; states and torques of their own in a batch."""
+    model = random_tree(seed, n=3, kinds=("free", "ball", "revolute", "prismatic")[seed % 2 :])
+    q, v = model.random_state(np.random.default_rng(seed), 3)
+    rows = np.random.default_rng(seed).standard_normal((3, 10, model.nv))
+    for method in GAUSS:
+        compiled, interpreted = both(model, method, q, v, torque=rows)
+        for x, y in ((compiled.q, interpreted.q), (compiled.v, interpreted.v)):
+            # Ten steps of rounding, which inverse and forward dynamics have their own of.
+            assert np.abs(x - y).max() <= 1e4 * EPS * max(1.0, np.abs(y).max())
+
+
+def test_compiled_steps_take_wrenches_and_a_start() -> None:
+    model = random_tree(4, n=3, kinds=("revolute", "prismatic"))
+    q, v = model.random_state(np.random.default_rng(4))
+    push = {model.frames[-1].name: np.array([1.0, -2.0, 3.0, 0.1, 0.2, -0.3])}
+    compiled, interpreted = both(model, "gauss4", q, v, wrenches=push, t0=3.0)
+    free, _ = both(model, "gauss4", q, v)
+    assert np.abs(compiled.q - interpreted.q).max() <= 1e3 * EPS * max(1.0, np.abs(interpreted.q).max())
+    assert np.abs(compiled.q - free.q).max() > 1e-6
+
+
+def test_a_large_loop_is_not_compiled_for_a_few_steps() -> None:
+    """Compiling the delta robot's step takes ten seconds, as many as some twenty thousand steps in Python."""
+    robot = catalog.delta_robot()
+    dyn = mb.dynamics(robot, "lagrangian", compile=True)
+    assert isinstance(dyn, LagrangianDynamics)
+    run = simulate(dyn, *robot.random_state(0), 0.01, "gauss4", dt=0.005)
+    assert run.stats.ended == "finished"
+    assert not any("collocation" in name for names in dyn._machines for name in names)
 
 
 # What goes wrong

@@ -261,7 +261,9 @@ METHODS: Final[dict[str, Method]] = {
             "implicit_midpoint", 2, stability=TableauStability(_MIDPOINT), mass_matrix=True, compiled=True, **_MOMENTA
         ),
         *(
-            _fixed(tableau.name, tableau.order, formula_source=tableau, stability=TableauStability(tableau))
+            _fixed(
+                tableau.name, tableau.order, formula_source=tableau, stability=TableauStability(tableau), compiled=True
+            )
             for tableau in (gauss_legendre(2), gauss_legendre(3))
         ),
         _adaptive(
@@ -387,5 +389,5 @@ def registered_methods() -> tuple[Method, ...]:
 def _runge_kutta(tableau: Tableau) -> Method:
     about = f"Runge-Kutta method of order {tableau.order} in {tableau.stages} stages"
     stages, stability = tableau.stages if tableau.explicit else 0, TableauStability(tableau)
-    more: dict[str, Any] = {"solver": "fixed_step:run_fixed", "formula_source": tableau, "compiled": tableau.explicit}
+    more: dict[str, Any] = {"solver": "fixed_step:run_fixed", "formula_source": tableau, "compiled": True}
     return Method(tableau.name, "fixed", tableau.order, stages, about, stability=stability, **more)

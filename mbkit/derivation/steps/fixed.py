@@ -216,7 +216,7 @@ def _stepped(
     """
     formula, space = method_of(method).formula, SymbolicSpace(equations.model)
     if not isinstance(formula, (Tableau, SemiImplicitEuler)) or not formula.explicit:
-        explicit = ", ".join(m.name for m in METHODS.values() if m.kind == "fixed" and m.compiled and m.formula)
+        explicit = ", ".join(m.name for m in METHODS.values() if m.explicit)
         raise InputError(f"method: expected one with an explicit step, got {method!r}; there are: {explicit}")
     last: list[Any] = [s["q"]]
 

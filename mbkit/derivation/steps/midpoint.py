@@ -110,6 +110,12 @@ class Midpoint:
     Every function takes the equations' extra arguments behind its own.
     """
 
+    carried = ("q", "pi")
+    #: The names of the velocities of the last steps.
+    past = ("w", "w_1", "w_2")
+    #: The time that the parameters hold, in steps behind the start of one.
+    clock = 0.5
+
     def __init__(self, equations: Equations) -> None:
         self._equations, self._space = equations, _MomentumSpace(equations.model)
         nq, nv = equations.model.nq, equations.model.nv
@@ -121,6 +127,8 @@ class Midpoint:
         step = ("q", "pi", "w", "tau", "dt")
         #: One step of Newton's iteration, and 0 where it was the last one needed.
         self.newton = self._part("newton", step, ("w1", "miss"), self._newton)
+        #: The parts of one such step: this one.
+        self.iteration = (self.newton,)
         #: The same equation, to be solved elsewhere.
         self.system = self._part("system", step, ("residual", "jacobian"), self._system)
         #: The state after the step from its velocity w and those of the two before, the first guess of the next
@@ -197,7 +205,7 @@ class Midpoint:
         return q1, pi1, self._guess(), s["misses"] + s["miss"] + is_lost(q1, pi1)
 
     def _guess(self) -> Any:
-        return sum(weight * self._s[n] for weight, n in zip(GUESS, ("w", "w_1", "w_2"), strict=True))
+        return sum(weight * self._s[n] for weight, n in zip(GUESS, self.past, strict=True))
 
     def _momentum(self) -> tuple[Any]:
         eq, s = self._equations, self._s

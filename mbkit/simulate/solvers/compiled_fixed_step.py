@@ -11,17 +11,20 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from itertools import pairwise
 from math import isqrt
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.codegen.compiled import Call, KernelSequence, aligned, cores
+from mbkit.derivation.steps.collocation import Collocation
 from mbkit.derivation.steps.fixed import Part
-from mbkit.derivation.steps.midpoint import GUESS, MOST, Midpoint
+from mbkit.derivation.steps.midpoint import MOST
+from mbkit.engines.base import at_time
 from mbkit.engines.compiled_calls import Plan
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.methods.registry import method_of
+from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
@@ -36,6 +39,9 @@ BLOCK: Final = 16
 # Half of what a core has in its second cache.
 _CACHE: Final = 2**19
 _LANES: Final = 8
+#: Multiplications of an implicit step's system beyond which compiling it takes longer than tens of thousands of steps
+#: in Python.
+_WORTH_COMPILING: Final = 10_000
 _MOST_STATES: Final = 1032
 # What a step writes -> what the next one reads.
 _STATE: Final = {"q1": "q", "w1": "w", "squares1": "squares"}
@@ -51,7 +57,7 @@ class BlockLoop:
 
     block: int
     good: Indices | None = None
-    carried = ("q", "w")
+    carried: tuple[str, str] = ("q", "w")
 
     def __init__(self, sizes: Mapping[str, tuple[int, int]], count: int) -> None:
         width = padded(count)
@@ -265,6 +271,8 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core."""
     dyn, method, grid, record = problem.dyn, problem.method, problem.grid, GridRecord(problem)
     assert isinstance(dyn, LagrangianDynamics)
+    if isinstance(formula := method_of(method).formula, ImplicitTableau):
+        return _run_collocation(problem, formula)
     space = Space(dyn.model)
     w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn.parameter_values
     clock = None if dyn.model.time_parameter is None else list(dyn.model.parameters).index(dyn.model.time_parameter)
@@ -319,6 +327,29 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     return record.result(why, method_of(method).stages * (int(record.steps.sum()) + len(lost)))
 
 
+def _run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> SolverResult:
+    """Take implicit steps; what the compiled ones do not solve, or is near a singular pose, goes on in Python."""
+    dyn = problem.dyn
+    assert isinstance(dyn, LagrangianDynamics)
+    parts, space, q0, v0 = Collocation(dyn.equations, tableau), Space(dyn.model), problem.q, problem.v
+    if parts.size > _WORTH_COMPILING:
+        return run_fixed(problem)
+    w0, first = space.to_integrator_velocity(q0, v0), problem.torque.columns(np.arange(len(q0)), 0, 1)[0].T
+    more = at_time(dyn, problem.start)._trailing(q0)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        tau = np.broadcast_to(first, (len(q0), first.shape[-1]))
+        guess = dyn.code(parts.start.name, make=parts.start.make)(q0, v0, w0, tau, *more)[0][..., 0]
+        record, iterations, lost = run_implicit(problem, parts, w0, guess)
+        if not space.flat:
+            # The start is there already, as it was given.
+            q, w = (x[:, record.kept > 0] for x in (record.q, record.v))
+            flat = space.to_body_velocity(*(x.reshape(-1, x.shape[-1]) for x in (q, w)))
+            record.v[:, record.kept > 0] = flat.reshape(w.shape)
+    if lost:
+        return run_fixed(problem, record, np.array(sorted(lost)))
+    return record.result(lambda _: "", tableau.stages * iterations)
+
+
 def _split(n: int, widest: int, workers: int) -> list[slice]:
     """Return parts of about equal size, none above `widest`, as many as keep every worker busy."""
     if not n:
@@ -330,7 +361,7 @@ def _split(n: int, widest: int, workers: int) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(ends)]
 
 
-# The implicit midpoint rule: many steps for states side by side.
+# Implicit methods: many steps for states side by side.
 
 #: States that go side by side, at most: enough for the processor's vectors, and nine
 #: cache lines in a row of them, because an even number would meet in the same sets.
@@ -339,46 +370,68 @@ WIDEST: Final = 72
 _PATIENCE: Final = 32
 # Steps of a block, whose states fill half of a core's second cache.
 _SHORTEST, _LONGEST = 16, 256
-# Until there are velocities to guess the next one from, more iterations are needed.
-_FIRST: Final = len(GUESS)
 
 
-class MidpointChunk(BlockLoop):
+class ImplicitParts(Protocol):
+    """The parts of a step of an implicit method: `Midpoint` or `Collocation` of `mbkit.derivation.steps`.
+
+    `carried` are the names of q and of what goes with it, `past` those of the unknowns of the last steps, the step's
+    own first; `clock` is the time that the parameters hold, in steps behind the start of one. `iteration` ends with a
+    new unknown and 0 where it was the last one needed; `end` writes the state, the next guess and the missed steps.
+    """
+
+    carried: tuple[str, str]
+    clock: float
+    unknowns: int
+    end: Part
+
+    @property
+    def past(self) -> tuple[str, ...]: ...  # as above
+    @property
+    def iteration(self) -> tuple[Part, ...]: ...  # as above
+
+
+class ImplicitChunk(BlockLoop):
     """At most `WIDEST` trajectories that take blocks of steps with equally many Newton iterations each.
 
     Where a step is not solved, the block is repeated with more. `torques`: each step has its own torque.
     """
 
-    carried = ("q", "pi")
-
-    def __init__(self, dyn: LagrangianDynamics, midpoint: Midpoint, count: int, steps: int, *, torques: bool) -> None:
-        nq, nv, unknowns = dyn.model.nq, dyn.model.nv, midpoint.unknowns
-        self._newton, self._end = midpoint.newton, midpoint.end
-        self._codes = {part.name: dyn.code(part.name, make=part.make) for part in (self._newton, self._end)}
-        most = min(_CACHE // (8 * padded(count) * (nq + nv + 2 * unknowns + 1)), _LONGEST, isqrt(steps))
-        n, back = max(most, _SHORTEST), len(GUESS) - 1
-        self._longest, self.block = n, _FIRST
+    def __init__(self, dyn: LagrangianDynamics, parts: ImplicitParts, count: int, steps: int, *, torques: bool) -> None:
+        self._parts, self.carried = parts, parts.carried
+        every = (*parts.iteration, parts.end)
+        self._codes = {part.name: dyn.code(part.name, make=part.make) for part in every}
+        rows = dict[str, int]()
+        for part in every:
+            code = self._codes[part.name]
+            rows |= dict(zip(part.reads, code.inputs, strict=True))
+            rows |= dict(zip(part.writes, (r * c for r, c in code.shapes), strict=True))
+        x, q, other = parts.past[0], *parts.carried
+        most = min(_CACHE // (8 * padded(count) * (rows[q] + rows[other] + 2 * rows[x] + 1)), _LONGEST, isqrt(steps))
+        n, back = max(most, _SHORTEST), len(parts.past) - 1
+        # Until there are unknowns to guess the next one from, more iterations are needed.
+        self._longest, self.block = n, back + 1
         # The time is one of the parameters, and another in each step.
-        names, clock = list(dyn.model.parameters), dyn.model.time_parameter
-        self._clock = None if clock is None else names.index(clock)
-        # The velocity of each step behind those of the last ones before the block.
-        sizes = {"q": (n + 1, nq), "pi": (n + 1, nv), "misses": (n + 1, 1)}
-        sizes |= {"w": (n + back, unknowns), **dict.fromkeys(("guess", "trial"), (2, unknowns))}
-        sizes |= {"miss": (1, 1), "dt": (1, 1)}
-        sizes["tau"] = n if torques else 1, dyn.equations.force.numel()
-        sizes["parameters"] = 1 if clock is None else n, len(names)
-        super().__init__(sizes, count)
+        clock = dyn.model.time_parameter
+        self._clock = None if clock is None else list(dyn.model.parameters).index(clock)
+        # The unknown of each step behind those of the last ones before the block.
+        places = {q: n + 1, other: n + 1, "misses": n + 1, x: n + back, "guess": 2, "trial": 2}
+        places |= {"tau": n if torques else 1, "parameters": 1 if clock is None else n}
+        rows |= {"trial": rows[x], "tau": dyn.equations.force.numel()}
+        ends = {*parts.past[1:], *parts.end.writes, f"{x}1"} - {"guess"}
+        self._own = tuple(name for name in rows if name not in places and name not in ends)
+        super().__init__({name: (places.get(name, 1), rows[name]) for name in rows if name not in ends}, count)
         self._count, self._back = count, back
         self._sequences: dict[tuple[int, int], KernelSequence] = {}
         self._iterations, self._smooth = 2, 0
         self.iterations = 0
         self._alive = np.full(count, True)
 
-    def begin(self, q: Array, pi: Array, w: Array, parameters: Array) -> None:
-        """Put (n, nq) configurations, (n, nv) momenta and velocities in, and the parameters' values, (p,) or (n, p)."""
-        self._begin(parameters, q=q, pi=pi, guess=w)
+    def begin(self, q: Array, other: Array, guess: Array, parameters: Array) -> None:
+        """Put in (n, nq) configurations, what goes with them, unknowns, and values of parameters, (p,) or (n, p)."""
+        self._begin(parameters, **{self.carried[0]: q, self.carried[1]: other}, guess=guess)
         for place in range(self._back):
-            self._fill("w", place, w.T)
+            self._fill(self._parts.past[0], place, guess.T)
 
     def _sequence(self, iterations: int) -> KernelSequence:
         key = iterations, self.block
@@ -388,35 +441,35 @@ class MidpointChunk(BlockLoop):
         return self._sequences[key]
 
     def _step(self, j: int, iterations: int) -> list[Call]:
-        at = self._array
-        held = {name: at(name, j) for name in ("q", "pi", "tau", "misses", "parameters")}
-        held |= {name: at(name, 0) for name in ("dt", "miss")}
-        new = {"q1": at("q", j + 1), "pi1": at("pi", j + 1), "misses1": at("misses", j + 1), "guess": at("guess", 1)}
+        at, x, end = self._array, self._parts.past[0], self._parts.end
+        arrays = {name: at(name, 0) for name in self._own}
+        varied = (*self.carried, "misses", "tau", *(["parameters"] if "parameters" in self._room else []))
+        arrays |= {name: at(name, j) for name in varied}
         # The block's first guess stays unchanged, so that the block can be repeated.
-        tries = [at("guess", min(j, 1)), *(at("trial", i) for i in range(iterations - 1)), at("w", j + self._back)]
+        tries = [at("guess", min(j, 1)), *(at("trial", i) for i in range(iterations - 1)), at(x, j + self._back)]
         calls = []
-        for w, w1 in pairwise(tries):
-            arrays = {**held, "w": w}
-            calls.append(self._call(self._newton, arrays, [w1, held["miss"]]))
-        past = {name: at("w", j + self._back - i) for i, name in enumerate(("w", "w_1", "w_2"))}
-        outs = [new[name] for name in self._end.writes]
-        return [*calls, self._call(self._end, {**held, **past}, outs)]
+        for before, after in pairwise(tries):
+            arrays |= {x: before, f"{x}1": after}
+            calls += [self._call(part, arrays) for part in self._parts.iteration]
+        arrays |= {name: at(x, j + self._back - i) for i, name in enumerate(self._parts.past)}
+        arrays |= {f"{name}1": at(name, j + 1) for name in (*self.carried, "misses")} | {"guess": at("guess", 1)}
+        return [*calls, self._call(end, arrays)]
 
-    def _call(self, part: Part, arrays: dict[str, Array], outs: list[Array]) -> Call:
-        return Call(self._codes[part.name], [arrays[n] for n in part.reads], outs)
+    def _call(self, part: Part, arrays: dict[str, Array]) -> Call:
+        return Call(self._codes[part.name], [arrays[n] for n in part.reads], [arrays[n] for n in part.writes])
 
     def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
         """Take some steps, and count in `good` how many of them are solved."""
         self._hold(steps, dt, torques)
         if self._clock is not None:
-            middles = start + (np.arange(steps) + 0.5) * dt
-            self._room["parameters"][:steps, self._clock] = middles[:, None]
+            times = start + (np.arange(steps) + self._parts.clock) * dt
+            self._room["parameters"][:steps, self._clock] = times[:, None]
         self._room["misses"][0] = 0.0
         if self._smooth >= _PATIENCE and self._iterations > 1:
             self._iterations, self._smooth = self._iterations - 1, 0
-        iterations = self._iterations
+        iterations, calls = self._iterations, len(self._parts.iteration)
         while True:
-            self._sequence(iterations).run(0, steps * (iterations + 1))
+            self._sequence(iterations).run(0, steps * (iterations * calls + 1))
             self.iterations += iterations * steps * int(self._alive.sum())
             missed = self._room["misses"][steps, 0, : self._count] > 0
             if not (missed & self._alive).any():
@@ -436,10 +489,39 @@ class MidpointChunk(BlockLoop):
                 self._iterations = 2
 
     def again(self) -> None:
-        n = self._taken
+        n, past = self._taken, self._room[self._parts.past[0]]
         if self.block != self._longest:
             self.block, self._iterations = self._longest, 2
-        for name in ("q", "pi"):
+        for name in self.carried:
             self._room[name][0] = self._room[name][n]
         self._room["guess"][0] = self._room["guess"][1]
-        self._room["w"][: self._back] = self._room["w"][n : n + self._back].copy()
+        past[: self._back] = past[n : n + self._back].copy()
+
+
+def run_implicit(
+    problem: IntegrationProblem, parts: ImplicitParts, other: Array, guess: Array
+) -> tuple[GridRecord, int, dict[int, list[Array]]]:
+    """Run every trajectory, some side by side, and such chunks at once on several cores.
+
+    `other` is what goes with q, (n, nv), and `guess` the first unknown. Returns also Newton's iterations, and the last
+    state of each trajectory that was lost, by its index. The record holds `other` in the place of v.
+    """
+    dyn, record, grid = problem.dyn, GridRecord(problem), problem.grid
+    assert isinstance(dyn, LagrangianDynamics)
+    values, n = dyn.parameter_values, len(other)
+    count = -(-n // WIDEST)
+    ends = [n * i // max(count, 1) for i in range(count + 1)]
+    # Threads append to it, and write their own members.
+    iterations, lost = list[int](), dict[int, list[Array]]()
+
+    def run(part: slice) -> Iterator[int]:
+        members = np.arange(n)[part]
+        chunk = ImplicitChunk(dyn, parts, len(members), grid.steps, torques=problem.torque.held)
+        chunk.begin(problem.q[part], other[part], guess[part], values[part] if values.ndim == 2 else values)
+        for end, last in run_blocks(problem, record, chunk, members):
+            lost.update(last)
+            yield end
+        iterations.append(chunk.iterations)
+
+    run_parts([slice(a, b) for a, b in pairwise(ends)], lambda: run, dyn.threads or cores(), grid.steps, problem.bar)
+    return record, sum(iterations), lost

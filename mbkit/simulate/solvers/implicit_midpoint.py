@@ -7,9 +7,7 @@ converges linearly, at the rate of the step times the torque's derivative.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -46,19 +44,29 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
     dyn = problem.dyn
     assert isinstance(dyn, LagrangianDynamics)
     midpoint, q0 = midpoint_of(dyn), problem.q
-    why: Callable[[int], str]
     error: FunctionError | None = None
     w0 = np.zeros((len(q0), midpoint.unknowns))
     w0[:, : dyn.model.nv] = Space(dyn.model).to_integrator_velocity(q0, problem.v)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         (pi0,) = called(dyn, midpoint.momentum, None, problem.start, q0, problem.v)
         if _machine_code(dyn, midpoint, problem):
-            record, iterations, why = _in_chunks(dyn, midpoint, problem, pi0, w0)
+            # It loads LLVM, which interpreting never needs.
+            from mbkit.simulate.solvers.compiled_fixed_step import run_implicit
+
+            record, iterations, lost = run_implicit(problem, midpoint, pi0, w0)
+
+            def why(i: int) -> str:
+                return _reason(*lost[i])
+
         else:
             stepper = MidpointStepper(dyn, problem, w0)
             run = SteppedRun(problem, stepper, pi0[0] if problem.batch is None else pi0)
             error = run.to_end()
-            record, iterations, why = run.record, stepper.iterations, lambda _: run.why
+            record, iterations = run.record, stepper.iterations
+
+            def why(i: int) -> str:  # noqa: ARG001  # of a batch the first one's
+                return run.why
+
         _to_velocities(dyn, midpoint, problem, record)
     # Each iteration is an evaluation, and so is the end of each step.
     evaluations = iterations + int(record.steps.sum())
@@ -126,36 +134,6 @@ def _written_out(dyn: LagrangianDynamics) -> bool:
 def _reason(q: Array, pi: Array) -> str:
     # An overflow in the middle of a step leaves no number for the iteration either.
     return DIVERGED if max(np.abs(x).max() for x in (q, pi)) > BOUND**0.5 else _UNSOLVED
-
-
-def _in_chunks(
-    dyn: LagrangianDynamics, midpoint: Midpoint, problem: IntegrationProblem, pi0: Array, w0: Array
-) -> tuple[GridRecord, int, Callable[[int], str]]:
-    """Run every trajectory, some side by side, and such chunks at once on several cores.
-
-    Returns also Newton's iterations, and why trajectories were lost.
-    """
-    # These load LLVM, which interpreting never needs.
-    from mbkit.codegen.compiled import cores
-    from mbkit.simulate.solvers.compiled_fixed_step import WIDEST, MidpointChunk, run_blocks, run_parts
-
-    record, grid, values, n = GridRecord(problem), problem.grid, dyn.parameter_values, len(pi0)
-    count = -(-n // WIDEST)
-    ends = [n * i // max(count, 1) for i in range(count + 1)]
-    # Threads append to it, and write their own members.
-    iterations, reasons = list[int](), dict[int, str]()
-
-    def run(part: slice) -> Iterator[int]:
-        members = np.arange(n)[part]
-        chunk = MidpointChunk(dyn, midpoint, len(members), grid.steps, torques=problem.torque.held)
-        chunk.begin(problem.q[part], pi0[part], w0[part], values[part] if values.ndim == 2 else values)
-        for end, lost in run_blocks(problem, record, chunk, members):
-            reasons.update({i: _reason(*last) for i, last in lost.items()})
-            yield end
-        iterations.append(chunk.iterations)
-
-    run_parts([slice(a, b) for a, b in pairwise(ends)], lambda: run, dyn.threads or cores(), grid.steps, problem.bar)
-    return record, sum(iterations), reasons.__getitem__
 
 
 class MidpointStepper(Stepper):
