@@ -22,8 +22,8 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate import at_section, simulate
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
-from mbkit.simulate.solvers.adaptive import RosenbrockAttempts
 from mbkit.simulate.solvers.adaptive_compiled import CompiledAttempts
+from mbkit.simulate.solvers.step_attempts import RosenbrockAttempts
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
@@ -80,7 +80,7 @@ def both(dyns: dict[str, Dynamics], rtol: float = 1e-10) -> dict[str, Any]:
         start, torque = (model.neutral(), np.zeros(model.nv)), Torque(None, model, None, None)
         problem = IntegrationProblem(dyn, "rodas5", *start, 0.0, 1.0, tolerances, torque, None, (), Progress(None, ""))
         own = problem, Space(model), tolerances
-        made[name] = CompiledAttempts(*own, "rodas5") if name == "lanes" else RosenbrockAttempts(*own)
+        made[name] = CompiledAttempts(*own, RosenbrockAttempts) if name == "lanes" else RosenbrockAttempts(*own)
     return made
 
 

@@ -186,6 +186,32 @@ def test_two_runs_of_a_compiled_batch_are_those_alone() -> None:
         assert np.abs(together.q[k] - alone.q).max() < 1e-12
 
 
+@pytest.mark.parametrize("method", ["rk853", "rodas5"])
+def test_only_steps_near_the_pose_leave_machine_code(method, monkeypatch) -> None:
+    from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
+
+    pytest.importorskip("llvmlite")
+    advance, tried = RungeKuttaAttempts.advance, []
+
+    def counted(self):
+        tried.append(self)
+        return advance(self)
+
+    monkeypatch.setattr(RungeKuttaAttempts, "advance", counted)
+    dyn = mb.dynamics(row(2).model, "lagrangian", compile=True)
+    starts = [(-0.5, -4.0), (-0.4, -4.0), (math.pi - 0.3, 0.0)]
+    q, v = (np.array(x) for x in zip(*(parallel(dyn, *start) for start in starts), strict=True))
+    t = np.linspace(0.0, 3.0, 61)
+    run, _ = simulated(dyn, q, v, 3.0, method, rtol=1e-10, save=t)
+    for k, start in enumerate(starts):
+        # States between the steps, of both kinds.
+        for at in (7, 23, 40, 60):
+            exact = parallel(dyn, motion(2, [t[at]], *start)[0], 0.0)[0]
+            assert run.q[k, at] == pytest.approx(exact, abs=1e-7)
+    assert 0 < len(tried) < run.stats.steps / 3
+    assert run.stats.evaluations > run.stats.steps
+
+
 def test_a_motion_that_comes_to_rest_in_the_pose_is_stopped_there() -> None:
     """All links of this parallelogram hang in one line: where damping ends its swing, every branch is as good."""
     b = mb.ModelBuilder("hanging")

@@ -131,6 +131,8 @@ class AttemptParts:
         good = (error < 1) * (s["step"] > 0)
         h, most, last = next_step(SYMBOLS, factors, good, s["step"], s["h"], s["most"], s["last"])
         q, w, t = (choose(good, new, s[old]) for new, old in ((q1, "q"), (w1, "w"), (s["t_new"], "t")))
-        state = q, w, t, h, most, last, s["end"], error, (t < s["end"]) * (s["least"] < h)
+        # Near a singular pose this loop ends; a NaN is tried again, shorter.
+        goes = (t < s["end"]) * (s["least"] < h) * (error != inf)
+        state = q, w, t, h, most, last, s["end"], error, goes
         extra = self.equations.extra_arguments if self.equations.model.constrained else {}
         self.add("end", {**s, **rates, **extra}, {f"{name}1": value for name, value in zip(STATE, state, strict=True)})

@@ -1,4 +1,8 @@
-"""The embedded step as machine code: many attempts in a row without going back to Python."""
+"""The embedded step as machine code: many attempts in a row without going back to Python.
+
+Near a singular pose the stages have to be projected: there a trajectory steps in Python, from a few steps before, until
+the pose is behind it.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +18,19 @@ from mbkit.derivation.steps.adaptive import STATE, embedded_parts
 from mbkit.derivation.steps.rosenbrock import rosenbrock_parts
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.methods.one_step import FIRST_ROOT, MAX_GROWTH, first_length
-from mbkit.methods.registry import ADAPTIVE_METHOD, Tolerances, method_of
+from mbkit.methods.registry import Tolerances
 from mbkit.methods.tableaus import EmbeddedTableau, RosenbrockTableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
 from mbkit.simulate.solvers.trajectory_record import ROUNDS, AcceptedSteps, StoppedError, below_rounding, diverged
 from mbkit.simulate.solvers.vector_field import DivergenceError, Field
 
 #: Larger than any scale or length: no error is seen, and a step is as long as its gap.
 _HUGE: Final = 1e300
+#: Accepted steps that are taken again in Python before the first one that ends near a singular pose: whoever looks how
+#: fast the pose comes has to see it coming.
+_BEFORE: Final = 8
 
 
 def _code(dyn: LagrangianDynamics, own: EmbeddedTableau | RosenbrockTableau) -> CompiledStepLoop:
@@ -33,10 +41,6 @@ def _code(dyn: LagrangianDynamics, own: EmbeddedTableau | RosenbrockTableau) -> 
         name = (dyn.form, own.name, own.digest)
         codes[own.name] = compiled_step_loop(name, lambda: parts(dyn.equations, own), STATE)
     return codes[own.name]
-
-
-class NearSingularPoseError(Exception):
-    """A step that ended near a singular pose, where stages have to be projected; never leaves mbkit."""
 
 
 class _Arena:
@@ -67,13 +71,17 @@ class CompiledAttempts:
     """Some hundred attempts at once, of a few trajectories; `StepAttempts` says what its methods do."""
 
     def __init__(
-        self, problem: IntegrationProblem, space: Space, tolerances: Tolerances, method: str = ADAPTIVE_METHOD
+        self,
+        problem: IntegrationProblem,
+        space: Space,
+        tolerances: Tolerances,
+        in_python: type[RungeKuttaAttempts] = RungeKuttaAttempts,
     ) -> None:
         assert isinstance(problem.dyn, LagrangianDynamics)
         self._dyn, self._torque, self._batch = problem.dyn, problem.torque, problem.batch
         self._space, self._parameters, self._wanted = space, problem.dyn.parameter_values, problem.tolerances
-        own = method_of(method).formula
-        assert isinstance(own, (EmbeddedTableau, RosenbrockTableau))
+        self._problem, self._in_python = problem, in_python
+        own = in_python.formula()
         self._stiff = isinstance(own, RosenbrockTableau)
         # Evaluations of an attempt, the name of ẇ after one of no length, the power of the length in the error.
         self._stages = own.stages + self._stiff
@@ -81,14 +89,27 @@ class CompiledAttempts:
         self._code = _code(problem.dyn, own)
         self._outer = _Arena(self._code, tolerances, problem.duration * float(np.finfo(float).eps))
         self._inner: _Arena | None = None
-        self._tolerances = tolerances
+        self._tolerances, self._of_place = tolerances, [tolerances] * width()
         self.width, self.rounds = width(), ROUNDS
         self._log = aligned(ROUNDS * self._outer.state.size).reshape(ROUNDS, *self._outer.state.shape)
         rows = self._code.rows
         zero = rows[f"{STATE[0]}1"][0]
         self._at = {name: slice(rows[f"{name}1"][0] - zero, sum(rows[f"{name}1"]) - zero) for name in STATE}
         self._row = {name: part.start for name, part in self._at.items()}
-        self.evaluations = self.jacobians = 0
+        self._evaluations = self._jacobians = self._k = 0
+        self._stop = 0.0
+        # Of a place near a singular pose its steps in Python, and since when; all of these so far.
+        self._near: dict[int, RungeKuttaAttempts] = {}
+        self._from: dict[int, float] = {}
+        self._taken: list[RungeKuttaAttempts] = []
+
+    @property
+    def evaluations(self) -> int:
+        return self._evaluations + sum(x.evaluations for x in self._taken)
+
+    @property
+    def jacobians(self) -> int:
+        return self._jacobians + sum(x.jacobians for x in self._taken)
 
     def _state(self, count: int, q: Array, w: Array, **values: Array | float) -> Array:
         """Return the rows of states side by side: (n, nq), (n, nv), and numbers by name."""
@@ -108,6 +129,7 @@ class CompiledAttempts:
         self._active = np.zeros(self.width, dtype=bool)
         self._dropped = np.zeros(self.width, dtype=bool)
         self._begun = h > 0
+        self._near.clear()
 
     def _set_parameters(self, arena: _Arena, which: Sequence[int]) -> None:
         if self._parameters.size:
@@ -120,13 +142,16 @@ class CompiledAttempts:
         return force
 
     def hold(self, k: int, stop: float) -> None:
-        arena, self._k = self._outer, k
+        arena, self._k, self._stop = self._outer, k, stop
         arena["tau"][:] = np.column_stack([self._force(k, i) for i in self._which])
         if not self._begun:
             arena.state[self._row["h"]] = self._first(stop)
             self._begun = True
         self._active = ~self._dropped & (arena.state[self._row["t"]] < stop)
         self._active[self._places :] = False
+        for place, attempts in self._near.items():
+            self._active[place] = False
+            attempts.hold(k, stop)
         # A lane that has no way to go stays where it is.
         arena.state[self._row["end"]] = np.where(self._active, stop, arena.state[self._row["t"]])
 
@@ -144,19 +169,20 @@ class CompiledAttempts:
 
         h = first_length(self._space, q, w, probe(q, w), self._tolerances, probe, self._grows)
         arena.state[:] = start
-        self.evaluations += 2 * self._places
+        self._evaluations += 2 * self._places
         # Where there is no rate, the step finds that out.
         return np.where(h > 0, h, 1e-6 * (stop - arena.state[self._row["t"]]))
 
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
+        for place in [place for place, attempts in self._near.items() if attempts.passed]:
+            if not self._singular(place):
+                self._return(place)
+        out = [(place, steps) for place, attempts in self._near.items() for _, steps in attempts.advance()]
         if not self._active.any():
-            return []
+            return out
         arena, log = self._outer, self._log
         before = arena.state.copy()
         count = arena.run(arena.state, log, self.rounds, on=True)
-        if self._dyn.model.constrained and np.isposinf(log[:count, self._row["error"]][:, self._active]).any():
-            raise NearSingularPoseError
-        out = []
         for place in np.flatnonzero(self._active).tolist():
             going = log[:count, self._row["go"], place] != 0
             attempts = count if going[-1] else int(np.argmin(going)) + 1
@@ -164,19 +190,56 @@ class CompiledAttempts:
             states = np.concatenate([before[None, :, place], log[:attempts, :, place]])
             times, good = states[:, self._row["t"]], np.full(len(states), True)
             np.greater(times[1:], times[:-1], out=good[1:])
+            singular = np.isposinf(states[1:, self._row["error"]])
+            if singular.any():
+                good[int(np.argmax(singular)) + 1 :] = False
+                good[np.flatnonzero(good)[1:][-_BEFORE:]] = False
+                self._leave(place, states[np.flatnonzero(good)[-1]])
             accepted = states[good]
             t, q, w = (accepted[:, at] for at in (self._row["t"], self._at["q"], self._at["w"]))
             out.append((place, AcceptedSteps(t, q, w, attempts)))
-            self.evaluations += self._stages * attempts
-            self.jacobians += self._stiff * attempts
+            self._evaluations += self._stages * attempts
+            self._jacobians += self._stiff * attempts
         return out
+
+    def _leave(self, place: int, state: Array) -> None:
+        """Go on in Python from a state."""
+        attempts = self._in_python(self._problem, self._space, self._of_place[place])
+        t, h, most, last = (float(state[self._row[name]]) for name in ("t", "h", "most", "last"))
+        attempts.start([self._which[place]], state[None, self._at["q"]], state[None, self._at["w"]], t, h)
+        attempts.go_on(most, last)
+        attempts.hold(self._k, self._stop)
+        self._near[place], self._from[place], self._active[place] = attempts, t, False
+        self._taken.append(attempts)
+        # The lane has no way to go.
+        lane = self._outer.state[:, place]
+        lane[self._row["end"]] = lane[self._row["t"]]
+
+    def _singular(self, place: int) -> bool:
+        """Return whether a step that ended where Python is would end near a singular pose."""
+        _, q, w, *_ = self._near[place].now
+        # An attempt of no length ends where it starts.
+        arena = self._beside(place)
+        arena.run(self._state(self.width, q[None], w[None]), self._log, 1, on=False)
+        return bool(np.isposinf(self._log[0, self._row["error"], 0]))
+
+    def _return(self, place: int) -> None:
+        """Go on in machine code from where Python is."""
+        t, q, w, h, most, last = self._near.pop(place).now
+        values = {"t": t, "h": h, "most": most, "last": last, "end": self._stop}
+        self._outer.state[:, place] = self._state(1, q[None], w[None], **values)[:, 0]
+        self._active[place] = not self._dropped[place] and t < self._stop
 
     def drop(self, place: int) -> None:
         self._dropped[place], self._active[place] = True, False
+        if place in self._near:
+            self._near[place].drop(0)
         state = self._outer.state
         state[self._row["end"], place] = state[self._row["t"], place]
 
     def stuck(self, place: int) -> StoppedError | None:
+        if place in self._near:
+            return self._near[place].stuck(0)
         state = self._outer.state[:, place]
         t, end, error, go = (float(state[self._row[name]]) for name in ("t", "end", "error", "go"))
         if go or t >= end:
@@ -194,6 +257,9 @@ class CompiledAttempts:
     def tighten(self, place: int, tolerances: Tolerances) -> None:
         for name, value in zip(("rtol", "atol"), tolerances, strict=True):
             self._outer[name][:, place] = value
+        self._of_place[place] = tolerances
+        if place in self._near:
+            self._near[place].tighten(0, tolerances)
 
     def _beside(self, place: int) -> _Arena:
         """Return room for other attempts of a lane's trajectory, in all lanes."""
@@ -204,17 +270,21 @@ class CompiledAttempts:
         return self._inner
 
     def rates(self, place: int, q: Array, w: Array) -> Array:
+        if place in self._near:
+            return self._near[place].rates(0, q, w)
         arena, out = self._beside(place), []
         for start in range(0, len(q), self.width):
             # Those beyond the last repeat it. An attempt of no length has the rates in its first stage.
             pick = np.minimum(np.arange(start, start + self.width), len(q) - 1)
             arena.run(self._state(self.width, q[pick], w[pick]), self._log, 1, on=False)
             out.append(arena[self._rate].T.copy())
-        self.evaluations += len(q)
+        self._evaluations += len(q)
         return np.concatenate(out)[: len(q)]
 
     def within(self, place: int, start: AcceptedSteps, times: Array) -> tuple[Array, Array]:
         """Return states within steps, several side by side."""
+        if place in self._near and start.t[0] >= self._from[place]:
+            return self._near[place].within(0, start, times)
         arena, count = self._beside(place), len(times)
         rounds = -(-count // self.width)
         pick = np.minimum(np.arange(rounds * self.width), count - 1)
@@ -223,7 +293,7 @@ class CompiledAttempts:
         queue = np.ascontiguousarray(states.reshape(-1, rounds, self.width).transpose(1, 0, 2))
         done = np.empty_like(queue)
         arena.run(queue, done, rounds, on=False)
-        self.evaluations += self._stages * count
+        self._evaluations += self._stages * count
         after = done.transpose(0, 2, 1).reshape(len(pick), -1)[:count]
         # One that failed stayed at its start, and is no state at that time.
         after[~(after[:, self._row["error"]] < 1)] = np.nan

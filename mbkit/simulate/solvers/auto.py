@@ -24,7 +24,8 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.diagnostics.stiffness import Stiffness, linearized, stiffness_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.adaptive import StepAttempts, compiled_or_not, make_attempts, march, run_groups
+from mbkit.simulate.solvers.adaptive import make_attempts, march, run_groups
+from mbkit.simulate.solvers.step_attempts import StepAttempts
 from mbkit.simulate.solvers.trajectory_record import ROUNDS, AcceptedSteps, TrajectoryRecord, assemble_result
 
 EXPLICIT, IMPLICIT = ADAPTIVE_METHOD, STIFF_METHOD
@@ -90,15 +91,14 @@ _IN_PYTHON: Final = Costs(first=5, later=2, worth=100, guess=300, pilot=8)
 class AutoContext:
     """What all trajectories of a run share: the problem, the costs of checks, and all attempts."""
 
-    def __init__(self, problem: IntegrationProblem, *, compiled: bool) -> None:
+    def __init__(self, problem: IntegrationProblem) -> None:
         self.problem, self.space, self.stops = problem, Space(problem.dyn.model), problem.stops
-        self._compiled = compiled
         self.attempts: list[StepAttempts] = []
         self.costs = _IN_PYTHON
 
     def make(self, method: str, tolerances: Tolerances) -> StepAttempts:
         """Return the step attempts of a method, whose evaluations are counted with all others."""
-        attempts = make_attempts(self.problem, method, self.space, tolerances, compiled=self._compiled)
+        attempts = make_attempts(self.problem, method, self.space, tolerances)
         self.attempts.append(attempts)
         self.costs = _COMPILED if attempts.rounds > 1 else _IN_PYTHON
         return attempts
@@ -407,11 +407,7 @@ class SwitchingController:
 
 def run_auto(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or a batch of them, of which each is decided on by itself."""
-    return compiled_or_not(problem, EXPLICIT, lambda compiled: _run(problem, compiled=compiled))
-
-
-def _run(problem: IntegrationProblem, *, compiled: bool) -> SolverResult:
-    context = AutoContext(problem, compiled=compiled)
+    context = AutoContext(problem)
     controllers = [SwitchingController(context, i) for i in range(len(problem.q))]
     explicit = context.make(EXPLICIT, loosest(EXPLICIT, problem.tolerances))
 

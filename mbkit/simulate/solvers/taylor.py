@@ -21,7 +21,7 @@ from mbkit.model.integration_space import Space
 from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.adaptive import RungeKuttaAttempts
+from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
 from mbkit.simulate.solvers.trajectory_record import (
     AcceptedSteps,
     StoppedError,
