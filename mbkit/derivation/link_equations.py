@@ -21,7 +21,14 @@ from mbkit._check import Array
 from mbkit.derivation.constraints import ConstrainedMotion
 from mbkit.derivation.equations import NOTHING, Acting, ConstrainedEquations, Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
-from mbkit.derivation.least_constraint import hard_poses, has_squares, loses_digits, mass_matrices
+from mbkit.derivation.least_constraint import (
+    LeastConstraint,
+    hard_poses,
+    has_squares,
+    loses_digits,
+    mass_matrices,
+    squares,
+)
 from mbkit.derivation.link_derivatives import Entries, LinkDerivatives, has_constant_columns
 from mbkit.derivation.link_mechanics import LinkMechanics, mass_matrix
 from mbkit.derivation.links import Links
@@ -39,6 +46,8 @@ _STATES: Final = 3
 #: themselves makes up to 1.3 on robots, and up to 38 on a chain of 128 links.
 _MAX_ERROR: Final = 1.4
 _MAX_FORCE_ERROR: Final = 40.0
+#: A bit: what a short form may lose against the plain frames.
+_MOST_LOST: Final = 2.0
 
 
 def elimination_of(model: Model) -> Elimination:
@@ -136,9 +145,28 @@ class LinkEquations(Equations):
             return self.least_constraint.accelerations(self.tau + self.passive)
         exact = self._reduced(self.plain, ())
         for form in (self._shortest(), self._reduced(self.mechanics, ())):
-            if ca.n_nodes(form) < ca.n_nodes(exact) and self._error(form, exact) < _MAX_ERROR:
+            if ca.n_nodes(form) < ca.n_nodes(exact) and self._keeps_digits(form, exact):
                 return form
         return exact
+
+    def _keeps_digits(self, form: Any, exact: Any) -> bool:
+        """Return whether a short form of the accelerations is as good as that of the plain frames, but for one bit.
+
+        Where they differ by more than rounding, both may be off: with axes that lie anyhow the plain frames round as
+        much. The orthogonal elimination, which forms no M, tells how far each is.
+        """
+        if self._error(form, exact) < _MAX_ERROR:
+            return True
+        if self._witness is None:
+            return False
+        return self._error(form, self._witness) < _MOST_LOST * self._error(exact, self._witness)
+
+    @cached_property
+    def _witness(self) -> Any:
+        if not has_squares(self.model):
+            return None
+        other = LeastConstraint(squares(self.kin), self.elimination_order)
+        return other.accelerations(self.tau + self.passive)
 
     def _shortest(self) -> Any:
         best = self._reduced(self.mechanics, ())
@@ -275,7 +303,7 @@ class LinkEquations(Equations):
         """The short frames, if an elimination of all accelerations keeps its digits there, else the plain ones."""
         exact, form = (self._reduced(mechanics, ()) for mechanics in (self.plain, self.mechanics))
         shorter = ca.n_nodes(form) < ca.n_nodes(exact)
-        return self.mechanics if shorter and self._error(form, exact) < _MAX_ERROR else self.plain
+        return self.mechanics if shorter and self._keeps_digits(form, exact) else self.plain
 
     def _derivatives_at(self, own: LinkDerivatives, a: Any) -> tuple[Any, Any]:
         """Return ∂ID/∂q and ∂ID/∂v at these accelerations."""
