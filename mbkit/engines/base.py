@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._attributes import ReadOnly, single_values
-from mbkit._check import Array, all_finite, batch_of, real, rows
+from mbkit._check import Array, all_finite, batch_of, rows
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
 from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
 from mbkit.engines.frames_and_momenta import (
@@ -33,14 +33,11 @@ from mbkit.engines.linearization import (
 )
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.regressors import Regressors
+from mbkit.engines.steps import Steps
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
-from mbkit.methods.registry import DEFAULT_METHOD, Method, explicit_method
-from mbkit.methods.tableaus import Tableau
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.forces import by_functions
-from mbkit.model.integration_space import Space
 from mbkit.model.manifold import NEAR_UNIT
 from mbkit.model.rolling import LIES_FLAT
 
@@ -120,20 +117,12 @@ def require_no_forces(model: Model, engine: str, *, holds_weights: bool = False)
         )
 
 
-class _NotFiniteError(Exception):
-    """A stage has a state or acceleration that is not finite; its argument is which samples are, as far as known."""
-
-
-def _finite_rows(q: Array, v: Array) -> Array:
-    return np.asarray(np.isfinite(q).all(axis=-1) & np.isfinite(v).all(axis=-1))
-
-
 def scalar(value: Array | float) -> Any:
     """Return one state's number as a float, a batch's as an array."""
     return value if np.ndim(value) else float(value)
 
 
-class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuantities, Regressors):
+class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuantities, Regressors, Steps):
     """A model evaluated by one engine; `mbkit.dynamics` returns one.
 
     Every method takes one state or a batch with one leading axis, checks shapes, finite numbers and unit quaternions,
@@ -258,13 +247,31 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         return out
 
     def of_samples(self, which: ArrayLike) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
-        """Return the dynamics of these samples of a batch, by index: itself, unless parameters differ between them."""
+        """Return the dynamics of these samples of a batch, by index: itself, unless parameters differ between them.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> model = mb.catalog.pendulum(mass=mb.Parameter("m", 2.0))
+        >>> dyn = mb.dynamics(model, "lagrangian").at(m=[1.0, 2.0, 3.0])
+        >>> dyn.of_samples([0, 2]).samples
+        2
+        """
         return self
 
     # Terms of the equation of motion
 
     def mass_matrix(self, q: ArrayLike) -> Array:
-        """Return M(q), shape (nv, nv) or (N, nv, nv)."""
+        """Return M(q), shape (nv, nv) or (N, nv, nv).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> print(dyn.mass_matrix([0.1, 0.2]).round(4))
+        [[4.9601 1.9801]
+         [1.9801 1.    ]]
+        """
         return self._evaluate("mass_matrix", q=q)
 
     def coriolis_matrix(self, q: ArrayLike, v: ArrayLike) -> Array:
@@ -272,6 +279,15 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 
         Coriolis matrices are not unique; mbkit's own is Christoffel's. Compare C v between engines, not the entries.
         A value that an engine is known to get wrong comes with a `KnownDefectWarning`.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> q, v = [0.1, 0.2], [1.0, -2.0]
+        >>> C = dyn.coriolis_matrix(q, v)
+        >>> bool(abs(C @ v - dyn.coriolis_force(q, v)).max() < 1e-14)
+        True
         """
         return self._evaluate("coriolis_matrix", q=q, v=v)
 
@@ -279,19 +295,50 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         """Return C(q, v) v, shape (nv,) or (N, nv).
 
         It is formed with the engine's own Coriolis matrix where it has one, so that a wrong matrix shows.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> print(dyn.coriolis_force([0.1, 0.2], [1.0, -2.0]).round(4))
+        [0.     0.1987]
         """
         return self._evaluate("coriolis_force", q=q, v=v)
 
     def gravity(self, q: ArrayLike) -> Array:
-        """Return g(q), on the left of the equation, without springs; (nv,) or (N, nv)."""
+        """Return g(q), on the left of the equation, without springs; (nv,) or (N, nv).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> print(dyn.gravity([0.1, 0.2]).round(4))
+        [4.8578 2.8991]
+        """
         return self._evaluate("gravity", q=q)
 
     def nle(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return C(q, v) v + g(q), shape (nv,) or (N, nv)."""
+        """Return C(q, v) v + g(q), shape (nv,) or (N, nv).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> print(dyn.nle([0.1, 0.2], [1.0, -2.0]).round(4))
+        [4.8578 3.0977]
+        """
         return self._evaluate("nle", q=q, v=v)
 
     def passive(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return the generalized force of springs and dampers, shape (nv,) or (N, nv)."""
+        """Return the generalized force of springs and dampers, shape (nv,) or (N, nv).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.elastic_pendulum())
+        >>> print(dyn.passive([0.1, 0.2], [0.0, 0.0])[1].round(4))
+        -20.0
+        """
         return self._evaluate("passive", q=q, v=v)
 
     def inverse_dynamics(
@@ -300,6 +347,15 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         """Return τ = M a + nle - τ_passive - Σ Jᵀ w, shape (nv,) or (N, nv).
 
         `wrenches` on frames and their `axes` are those of `generalized_force`.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> q, v, a = [0.1, 0.2], [1.0, -2.0], [0.5, 0.0]
+        >>> tau = dyn.inverse_dynamics(q, v, a)
+        >>> bool(abs(tau - (dyn.mass_matrix(q) @ a + dyn.nle(q, v))).max() < 1e-14)
+        True
         """
         if not wrenches:
             return self._evaluate("inverse_dynamics", q=q, v=v, a=a)
@@ -313,6 +369,13 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 
         `wrenches` on frames and their `axes` are those of `generalized_force`. Under constraints the first call warns
         where the state does not satisfy them; `constraint_residual` tells it of any.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> print(dyn.forward_dynamics([0.1, 0.2], [1.0, -2.0], [0.0, 0.0]).round(4))
+        [ 1.2275 -5.5282]
         """
         if self.looks:
             self.looks = False
@@ -323,13 +386,28 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         return self._evaluate("forward_dynamics_with_wrenches", frames, axes_named(axes), q=q, v=v, tau=tau, wrenches=w)
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> Any:
-        """Return ½ vᵀ M v in J, a float or shape (N,)."""
+        """Return ½ vᵀ M v in J, a float or shape (N,).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> round(dyn.kinetic_energy([0.1, 0.2], [1.0, -2.0]), 4)
+        0.5199
+        """
         return scalar(self._evaluate("kinetic_energy", q=q, v=v))
 
     def potential_energy(self, q: ArrayLike) -> Any:
         """Return the energy of gravity and springs in J, a float or shape (N,).
 
         Gravity's part is zero where every centre of mass is at the world's origin.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> round(dyn.potential_energy([0.1, 0.2]), 4)
+        -28.8938
         """
         return scalar(self._evaluate("potential_energy", q=q))
 
@@ -359,6 +437,14 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         """Return the partial derivatives of inverse dynamics: fields q, v and a, each (nv, nv) or (N, nv, nv).
 
         That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``, with v and a held.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> by = dyn.inverse_dynamics_derivatives([0.1, 0.2], [1.0, -2.0], [0.5, 0.0])
+        >>> bool(abs(by.a - dyn.mass_matrix([0.1, 0.2])).max() < 1e-14)
+        True
         """
         return InverseDynamicsDerivatives(*self._derivatives("inverse_dynamics_derivatives", q=q, v=v, a=a))
 
@@ -366,6 +452,14 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         """Return the partial derivatives of forward dynamics: fields q, v and tau, each (nv, nv) or (N, nv, nv).
 
         That by q is along the manifold: column k is d/dt of ``model.integrate(q, t e_k)``, with v and tau held.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> by = dyn.forward_dynamics_derivatives([0.1, 0.2], [1.0, -2.0], [0.0, 0.0])
+        >>> by.q.shape, by.v.shape, by.tau.shape
+        ((2, 2), (2, 2), (2, 2))
         """
         return ForwardDynamicsDerivatives(*self._derivatives("forward_dynamics_derivatives", q=q, v=v, tau=tau))
 
@@ -380,144 +474,20 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 
         ``Σ |terms| / M_jj`` of the sum that makes the worst diagonal entry, at least 1. `quantity` is M or what is
         computed like it: an engine may take other formulas for M⁻¹ or forward dynamics.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
+        >>> round(dyn.mass_matrix_rounding([0.1, 0.2]), 1)
+        1.0
         """
         if not self.model.has_bodies:
             return 1.0
         about = self.inertias_about.get(quantity, self.inertias_about.get("", JOINT))
         return composite_rounding(self, self.model.check_q(q), about)
 
-    # Steps
-
-    def step(
-        self,
-        q: ArrayLike,
-        v: ArrayLike,
-        tau: ArrayLike,
-        dt: float,
-        method: str = DEFAULT_METHOD,
-        wrenches: Wrenches | None = None,
-        axes: str = ALIGNED,
-    ) -> tuple[Array, Array]:
-        """Return (q, v) after one step of length dt, with the force τ held: for control loops and environments.
-
-        There is no record and no check of the run; `mbkit.simulate` has them, and every other method.
-
-        Parameters
-        ----------
-        q : (nq,) or (N, nq) array_like
-            Units m and rad, quaternions of unit length, as are those of the result.
-        v, tau : (nv,) or (N, nv) array_like
-            Velocity and generalized force. One state beside a batch is repeated.
-        dt : float
-            s, above 0.
-        method : str
-            An explicit one with a fixed step: ``"rk4"``, ``"semi_implicit_euler"``, or an explicit tableau of
-            `mbkit.simulate.register_method`.
-        wrenches : dict of str to (6,) or (N, 6) array_like, optional
-            That act on frames, as in `generalized_force`. The wrench is held over the step, and Σ Jᵀ w follows the
-            configuration from stage to stage.
-        axes : {"local", "local_world_aligned", "world"}
-            Axes of the wrenches, as in `generalized_force`.
-
-        Returns
-        -------
-        q, v : (nq,) and (nv,), or (N, nq) and (N, nv) arrays
-            New ones. They are those of ``mbkit.simulate(dyn, q, v, dt, method, dt, torque=tau)``: the same bits; with
-            constraints, and on the lagrangian engine with a free joint or quasi-velocities, the same up to rounding.
-
-        Raises
-        ------
-        InputError
-            A wrong shape, state, force or step.
-        NumericalError
-            The state after the step, or an acceleration on the way, is not finite.
-        UnknownNameError
-            No method of this name.
-        UnsupportedError
-            A method without an explicit step.
-
-        Notes
-        -----
-        The state that a step leads to is projected onto loops and prescribed motions, and these are taken at the time
-        that the dynamics hold: ``dyn.at(t=...)``. On the lagrangian engine the step is the same machine code as in
-        `mbkit.simulate`: microseconds for a state, and batches are shared among threads. The first step of a model
-        compiles it. Other engines and ``compile=False`` evaluate the forward dynamics stage by stage, by the same
-        formulas.
-
-        Examples
-        --------
-        >>> import mbkit as mb
-        >>> dyn = mb.dynamics(mb.catalog.pendulum())
-        >>> q, v = [1.0], [0.0]
-        >>> for _ in range(1000):
-        ...     q, v = dyn.step(q, v, [0.0], dt=1e-3)
-        >>> run = mb.simulate(dyn, [1.0], [0.0], duration=1.0, dt=1e-3)
-        >>> bool(q == run.q[-1])
-        True
-        """
-        if wrenches:
-            frames, w = self._stacked_wrenches(wrenches)
-            return self._under(frames, axes_named(axes)).step(
-                q, v, _beside(self.model.check_v(tau, "tau"), w), dt, method
-            )
-        chosen, h = explicit_method(method), real("dt", dt, positive=True)
-        self._method("forward_dynamics")
-        states, _ = self._states({"q": q, "v": v, "tau": tau})
-        # An overflow is reported as an error.
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            try:
-                q1, v1 = self._step(chosen, **states, dt=h)
-                good = _finite_rows(q1, v1)
-            except _NotFiniteError as error:
-                good = error.args[0]
-        if not good.all():
-            # A mass matrix that is singular at the start has a message of its own.
-            self.forward_dynamics(states["q"], states["v"], states["tau"])
-            sample = f" in sample {int(np.argmin(good))}" if good.ndim else ""
-            raise NumericalError(
-                f"{self.engine}: step of {self.model.name} by {chosen.name}: the state is not finite{sample} after "
-                f"dt = {h:g} s; take shorter steps, or look at the accelerations of forward_dynamics(q, v, tau)"
-            )
-        return q1, v1
-
-    def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
-        """Return the state after a step, stage by stage."""
-        space, formula = Space(self.model), method.formula
-        assert isinstance(formula, (Tableau, SemiImplicitEuler))
-        w = space.to_integrator_velocity(q, v)
-
-        clock = self.model.time_parameter
-        start = 0.0 if clock is None else float(self.model.parameters[clock] or 0.0)
-
-        def take(near: bool) -> tuple[Array, Array, Array] | None:
-            last = [q]
-
-            def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
-                last[0], v = q, space.to_body_velocity(q, w)
-                if near:
-                    q, v = self._onto_constraints(t, q, v)
-                    w = space.to_integrator_velocity(q, v)
-                if not (good := _finite_rows(q, v)).all():
-                    raise _NotFiniteError(good)
-                try:
-                    a = at_time(self, t).forward_dynamics(q, v, tau)
-                except NumericalError:
-                    # Its message would blame the model for a state that has grown beyond all bounds.
-                    raise _NotFiniteError(np.array(False)) from None
-                return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
-
-            try:
-                q1, w1, _ = formula.step(space, rates, ArrayStages(method.stages, v.shape), start, dt, q, w)
-            except _NotFiniteError:
-                if near or not self.projects:
-                    raise
-                return None
-            return q1, w1, last[0]
-
-        taken: Any = self._explicit_step(formula, start, dt, q, take) if self.projects else take(False)
-        q1, w1, *_ = taken
-        v1 = space.to_body_velocity(q1, w1)
-        return self._pulled(start + dt, q1, v1) if self.projects else (q1, v1)
+    # Wrenches behind the force
 
     def _under(self, frames: tuple[Frame, ...], axes: str) -> Dynamics:
         """Return the same dynamics with wrenches on frames behind τ in that argument: nv + 6 k numbers.
@@ -648,13 +618,6 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if discs:
             return f"; possible cause: a disc that lies flat on its plane: {', '.join(discs[:_MAX_NAMES])}"
         return "; perhaps links without mass, or numbers so large that they overflow"
-
-
-def _beside(tau: Array, wrenches: Array) -> Array:
-    """Return τ with wrenches behind it, (nv + 6 k,) or (N, nv + 6 k)."""
-    size = batch_of(tau=tau, wrenches=wrenches)
-    parts = (x if size is None or x.ndim == 2 else np.broadcast_to(x, (size, len(x))) for x in (tau, wrenches))
-    return np.concatenate(tuple(parts), axis=-1)
 
 
 class WrenchedDynamics(Dynamics):

@@ -140,6 +140,14 @@ class Constrained:
         """Return the derivative of the rates J v + c by q, (m, nv) or (N, m, nv), on the own derivation and the oracle.
 
         Column k is that of q ⊕ t e_k, with the components of v held.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
+        >>> q, v = dyn.model.random_state(0)
+        >>> dyn.constraint_rate_gradient(q, v).shape
+        (2, 3)
         """
         return self._bound("constraint_rate_gradient", q=q, v=v)
 

@@ -21,7 +21,7 @@ from mbkit.engines.base import Dynamics, scalar
 from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.engines.loads import Wrenches
-from mbkit.engines.step_derivatives import momentum_step_slopes
+from mbkit.engines.steps import momentum_step_slopes
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Joint, Model

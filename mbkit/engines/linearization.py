@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, arrays_shown, real, shown
-from mbkit.engines.step_derivatives import Slopes, differentiable_method, step_derivatives
+from mbkit.engines.steps import Slopes, differentiable_method, step_derivatives
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, Method
 from mbkit.model import Model
@@ -388,6 +388,14 @@ class LinearizationQuantities:
 
         Only entries that are not zero for every state are computed. Deriving and compiling takes some three seconds for
         an arm of six joints and six seconds for one of eight; beyond 200,000 operations they are interpreted.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
+        >>> by = dyn.inverse_dynamics_second_derivatives([0.1, 0.2], [1.0, -2.0], [0.0, 0.0])
+        >>> bool(by.vv[1, 0, 0] > 0)  # the centrifugal force on the second joint
+        True
         """
         name = "inverse_dynamics_second_derivatives"
         out = self._differentiated(name, self._own_method(name), {"q": q, "v": v, "a": a})

@@ -109,7 +109,16 @@ class Loads:
         return np.einsum("kij,ki->j", self._jacobian(q, frames, axes), wrenches.reshape(-1, 6))
 
     def mass_matrix_inverse(self, q: ArrayLike) -> Array:
-        """Return M⁻¹(q), shape (nv, nv) or (N, nv, nv)."""
+        """Return M⁻¹(q), shape (nv, nv) or (N, nv, nv).
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
+        >>> unit = dyn.mass_matrix_inverse([0.1, 0.2]) @ dyn.mass_matrix([0.1, 0.2])
+        >>> bool(abs(unit - [[1.0, 0.0], [0.0, 1.0]]).max() < 1e-12)
+        True
+        """
         return self._evaluate("mass_matrix_inverse", q=q)
 
     def joint_wrenches(
@@ -227,6 +236,18 @@ class Loads:
         ------
         UnsupportedError
             The engine cannot tell the load of a joint; mostly of a fixed one, where it merges bodies.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
+        >>> q, v = [0.1, 0.2], [1.0, -2.0]
+        >>> tau = [0.5, 0.0]
+        >>> a = dyn.forward_dynamics(q, v, tau)
+        >>> bool(abs(dyn.newton_euler_residual(q, v, a, tau)).max() < 1e-12)
+        True
+        >>> bool(abs(dyn.newton_euler_residual(q, v, a + 0.1, tau)).max() > 0.01)
+        True
         """
         model = self.model
         states = {"q": model.check_q(q), "v": model.check_v(v), "a": model.check_v(a, "a")}

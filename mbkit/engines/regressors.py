@@ -107,6 +107,15 @@ class Regressors:
         Returns
         -------
         (nv, p) or (N, nv, p) array
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
+        >>> q, v = [0.1, 0.2], [1.0, -2.0]
+        >>> pi = dyn.model.base_parameters().standard
+        >>> bool(abs(dyn.momentum_regressor(q, v) @ pi - dyn.mass_matrix(q) @ v).max() < 1e-12)
+        True
         """
         columns = self._columns_of(parameters, False, armature)
         return self._evaluate("momentum_regressor", columns, q=q, v=v)
@@ -122,6 +131,15 @@ class Regressors:
         Returns
         -------
         (2, p) or (N, 2, p) array
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
+        >>> q, v = [0.1, 0.2], [1.0, -2.0]
+        >>> T, V = dyn.energy_regressor(q, v) @ dyn.model.base_parameters().standard
+        >>> bool(abs(T - dyn.kinetic_energy(q, v)) < 1e-12), bool(abs(V - dyn.potential_energy(q)) < 1e-12)
+        (True, True)
         """
         columns = self._columns_of(parameters, False, armature)
         return self._evaluate("energy_regressor", columns, q=q, v=v)

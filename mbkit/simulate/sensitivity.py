@@ -4,7 +4,7 @@ A run by a method with a fixed step is a composition of steps, so its derivative
 
     X_{k+1} = A_k X_k + (0, B_k, P_k)        X_0 = (1, 0, 0)
 
-with A_k, B_k and P_k those of `mbkit.engines.step_derivatives` at the states of the run. They are derivatives of the
+with A_k, B_k and P_k those of `mbkit.engines.steps` at the states of the run. They are derivatives of the
 numbers that the run computes, not of the exact motion, from which they differ by the method's order.
 """
 
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, count, real
 from mbkit.engines import Dynamics
 from mbkit.engines.base import no_dynamics
-from mbkit.engines.step_derivatives import differentiable_method
+from mbkit.engines.steps import differentiable_method
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.simulate.run import simulate

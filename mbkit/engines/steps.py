@@ -1,4 +1,4 @@
-"""The exact derivative of one step of a method, by the chain rule through its own formula.
+"""One step of a method, and its exact derivative by the chain rule through the method's own formula.
 
 The formulas of `mbkit.methods` run on any arithmetic; here on values with their derivatives (forward-mode automatic
 differentiation; Griewank and Walther 2008, Evaluating Derivatives, ch. 3), side by side for a batch. Stages that are
@@ -8,14 +8,17 @@ solved for are differentiated by the implicit function theorem.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from mbkit._check import Array
+from mbkit._check import Array, batch_of, real
+from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
+from mbkit.engines.loads import Wrenches
 from mbkit.errors import NumericalError, UnsupportedError
-from mbkit.methods.one_step import SemiImplicitEuler
-from mbkit.methods.registry import METHODS, Method, method_of
+from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
+from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method, explicit_method, method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model import Model
 from mbkit.model.integration_space import Space
@@ -27,6 +30,173 @@ _EPS: Final = float(np.finfo(float).eps)
 #: corrections that stop shrinking are rounding.
 _MOST: Final = 25
 _ROUNDING: Final = 1e-11
+
+
+class _NotFiniteError(Exception):
+    """A stage has a state or acceleration that is not finite; its argument is which samples are, as far as known."""
+
+
+def _finite_rows(q: Array, v: Array) -> Array:
+    return np.asarray(np.isfinite(q).all(axis=-1) & np.isfinite(v).all(axis=-1))
+
+
+class Steps:
+    """The method of `Dynamics` that takes a step."""
+
+    # Of `Dynamics`.
+    engine: ClassVar[str]
+    model: Model
+    projects: Any
+    at: Callable[..., Any]
+    forward_dynamics: Callable[..., Array]
+    _stacked_wrenches: Callable[..., Any]
+    _under: Callable[..., Any]
+    _method: Callable[..., Any]
+    _states: Callable[..., Any]
+    _onto_constraints: Callable[..., Any]
+    _explicit_step: Callable[..., Any]
+    _pulled: Callable[..., Any]
+
+    def step(
+        self,
+        q: ArrayLike,
+        v: ArrayLike,
+        tau: ArrayLike,
+        dt: float,
+        method: str = DEFAULT_METHOD,
+        wrenches: Wrenches | None = None,
+        axes: str = ALIGNED,
+    ) -> tuple[Array, Array]:
+        """Return (q, v) after one step of length dt, with the force τ held: for control loops and environments.
+
+        There is no record and no check of the run; `mbkit.simulate` has them, and every other method.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+            Units m and rad, quaternions of unit length, as are those of the result.
+        v, tau : (nv,) or (N, nv) array_like
+            Velocity and generalized force. One state beside a batch is repeated.
+        dt : float
+            s, above 0.
+        method : str
+            An explicit one with a fixed step: ``"rk4"``, ``"semi_implicit_euler"``, or an explicit tableau of
+            `mbkit.simulate.register_method`.
+        wrenches : dict of str to (6,) or (N, 6) array_like, optional
+            That act on frames, as in `generalized_force`. The wrench is held over the step, and Σ Jᵀ w follows the
+            configuration from stage to stage.
+        axes : {"local", "local_world_aligned", "world"}
+            Axes of the wrenches, as in `generalized_force`.
+
+        Returns
+        -------
+        q, v : (nq,) and (nv,), or (N, nq) and (N, nv) arrays
+            New ones. They are those of ``mbkit.simulate(dyn, q, v, dt, method, dt, torque=tau)``: the same bits; with
+            constraints, and on the lagrangian engine with a free joint or quasi-velocities, the same up to rounding.
+
+        Raises
+        ------
+        InputError
+            A wrong shape, state, force or step.
+        NumericalError
+            The state after the step, or an acceleration on the way, is not finite.
+        UnknownNameError
+            No method of this name.
+        UnsupportedError
+            A method without an explicit step.
+
+        Notes
+        -----
+        The state that a step leads to is projected onto loops and prescribed motions, and these are taken at the time
+        that the dynamics hold: ``dyn.at(t=...)``. On the lagrangian engine the step is the same machine code as in
+        `mbkit.simulate`: microseconds for a state, and batches are shared among threads. The first step of a model
+        compiles it. Other engines and ``compile=False`` evaluate the forward dynamics stage by stage, by the same
+        formulas.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> dyn = mb.dynamics(mb.catalog.pendulum())
+        >>> q, v = [1.0], [0.0]
+        >>> for _ in range(1000):
+        ...     q, v = dyn.step(q, v, [0.0], dt=1e-3)
+        >>> run = mb.simulate(dyn, [1.0], [0.0], duration=1.0, dt=1e-3)
+        >>> bool(q == run.q[-1])
+        True
+        """
+        if wrenches:
+            frames, w = self._stacked_wrenches(wrenches)
+            held: Steps = self._under(frames, axes_named(axes))
+            return held.step(q, v, _beside(self.model.check_v(tau, "tau"), w), dt, method)
+        chosen, h = explicit_method(method), real("dt", dt, positive=True)
+        self._method("forward_dynamics")
+        states, _ = self._states({"q": q, "v": v, "tau": tau})
+        # An overflow is reported as an error.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            try:
+                q1, v1 = self._step(chosen, **states, dt=h)
+                good = _finite_rows(q1, v1)
+            except _NotFiniteError as error:
+                good = error.args[0]
+        if not good.all():
+            # A mass matrix that is singular at the start has a message of its own.
+            self.forward_dynamics(states["q"], states["v"], states["tau"])
+            sample = f" in sample {int(np.argmin(good))}" if good.ndim else ""
+            raise NumericalError(
+                f"{self.engine}: step of {self.model.name} by {chosen.name}: the state is not finite{sample} after "
+                f"dt = {h:g} s; take shorter steps, or look at the accelerations of forward_dynamics(q, v, tau)"
+            )
+        return q1, v1
+
+    def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
+        """Return the state after a step, stage by stage."""
+        space, formula = Space(self.model), method.formula
+        assert isinstance(formula, (Tableau, SemiImplicitEuler))
+        w = space.to_integrator_velocity(q, v)
+
+        clock = self.model.time_parameter
+        start = 0.0 if clock is None else float(self.model.parameters[clock] or 0.0)
+
+        def take(near: bool) -> tuple[Array, Array, Array] | None:
+            last = [q]
+
+            def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
+                last[0], v = q, space.to_body_velocity(q, w)
+                if near:
+                    q, v = self._onto_constraints(t, q, v)
+                    w = space.to_integrator_velocity(q, v)
+                if not (good := _finite_rows(q, v)).all():
+                    raise _NotFiniteError(good)
+                try:
+                    own = self if clock is None else self.at(**{clock: t})
+                    a = own.forward_dynamics(q, v, tau)
+                except NumericalError:
+                    # Its message would blame the model for a state that has grown beyond all bounds.
+                    raise _NotFiniteError(np.array(False)) from None
+                return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
+
+            try:
+                q1, w1, _ = formula.step(space, rates, ArrayStages(method.stages, v.shape), start, dt, q, w)
+            except _NotFiniteError:
+                if near or not self.projects:
+                    raise
+                return None
+            return q1, w1, last[0]
+
+        taken: Any = self._explicit_step(formula, start, dt, q, take) if self.projects else take(False)
+        q1, w1, *_ = taken
+        v1 = space.to_body_velocity(q1, w1)
+        return self._pulled(start + dt, q1, v1) if self.projects else (q1, v1)
+
+
+def _beside(tau: Array, wrenches: Array) -> Array:
+    """Return τ with wrenches behind it, (nv + 6 k,) or (N, nv + 6 k)."""
+    size = batch_of(tau=tau, wrenches=wrenches)
+    parts = (x if size is None or x.ndim == 2 else np.broadcast_to(x, (size, len(x))) for x in (tau, wrenches))
+    return np.concatenate(tuple(parts), axis=-1)
+
+
+# Derivatives of a step
 
 
 class Slopes(NamedTuple):
