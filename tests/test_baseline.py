@@ -648,6 +648,27 @@ def test_a_frame_that_moved_is_no_word_of_rest(tmp_path: Path) -> None:
     assert not any("same" in text for text in texts)
 
 
+def test_poses_and_velocities_of_named_frames_are_numbers_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, path = mb.load("ur5"), tmp_path / "ur5.toml"
+    made = mb.baseline.record(model, path, engines=["pinocchio"])
+    assert "tool0" in made.frames
+    k, dyn = made.frames.index("tool0"), mb.dynamics(model, "lagrangian")
+    poses, speeds = made.terms["frames"][:, k, :12].reshape(-1, 3, 4), made.terms["frames"][:, k, 12:]
+    assert np.abs(poses - dyn.pose(made.states.q, "tool0")[:, :3]).max() < 1e-14
+    J = dyn.jacobian(made.states.q, "tool0")
+    assert np.abs(speeds - np.einsum("nij,nj->ni", J, made.states.v)).max() < 1e-13
+    assert np.array_equal(mb.baseline.read(path).terms["frames"], made.terms["frames"])
+    # An engine that places the tool elsewhere, with everything else as it was.
+    pose = PinocchioDynamics._pose
+    monkeypatch.setattr(
+        PinocchioDynamics, "_pose", lambda self, q, frames: pose(self, q, frames) + 1e-6 * np.eye(4, k=3)
+    )
+    result = mb.baseline.check(model, path)
+    assert [r.term for r in result.moved] == ["frames"]
+    assert result.moved[0].joint in made.frames
+    assert result.moved[0].error > 1e-8
+
+
 def test_a_coupler_is_recorded(tmp_path: Path) -> None:
     def pair(ratio: float) -> mb.Model:
         b = mb.ModelBuilder("pair")

@@ -32,7 +32,7 @@ from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.file import Baseline, path_of, read
 from mbkit.studies.baseline.history import Commit, History
 from mbkit.studies.baseline.result import BaselineResult, BisectResult, ChangedNumber, Examined, Onset
-from mbkit.studies.baseline.study import Comparator, check, description_changes, differences, evaluate, package_of
+from mbkit.studies.baseline.study import Comparator, check, description_changes, differences, evaluated, package_of
 from mbkit.studies.results import Refusal
 from mbkit.studies.versions.study import digits_of, direction_of, middles
 from mbkit.studies.worker import describe
@@ -399,7 +399,7 @@ class _EngineStudy:
         version.interpreter()
         recorded = self._recorded
         try:
-            values, refusals = evaluate(dynamics(self._model, version), recorded.states, recorded.rollout)
+            values, refusals = evaluated(dynamics(self._model, version), recorded)
         except UnsupportedError as error:
             if not self._refused_whole:
                 raise

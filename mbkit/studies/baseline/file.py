@@ -29,6 +29,9 @@ from mbkit.studies.results import Refusal, write_whole
 
 #: The name of a rollout's end among the terms: q, then v, (nq + nv,).
 ROLLOUT: Final = "rollout"
+#: The name of named frames among the terms: of each X_WF's three rows and J v, (n, k, 18).
+FRAMES: Final = "frames"
+_OF_FRAME: Final = {"pose": slice(0, 12), "velocity": slice(12, 18)}
 VECTORS: Final = ("q", "v", "a", "tau")
 #: Of the file. Another number is another layout, which this one does not read.
 FORMAT: Final = 1
@@ -63,7 +66,8 @@ class Baseline:
     `digest` is the model's fingerprint, `Model.digest`. `target` and `options` are what `mbkit baseline check` loads,
     and how; empty for a model without a source. `versions` are those of what computes, by package. `description` has
     the model's parameters, as `mbkit.studies.baseline.description` says. `terms` has for each term the values at the
-    states by the oracle, rounded to double, and as ``"rollout"`` the end of a rollout. `errors` has for each engine
+    states by the oracle, rounded to double, as ``"rollout"`` the end of a rollout, and as ``"frames"`` the poses and
+    velocities of `frames`, those that the file names. `errors` has for each engine
     and term the worst error against these, as `mbkit.studies.compare.errors` defines it; zero for one of less than
     8 eps, which any engine may have. `own` has the engine's own values where it differed by more than rounding.
     `left_out` is what an engine could not do when this was recorded.
@@ -83,6 +87,7 @@ class Baseline:
     rollout: Rollout
     terms: dict[str, Array]
     errors: dict[str, dict[str, float]]
+    frames: tuple[str, ...] = ()
     own: dict[str, dict[str, Array]] = field(default_factory=dict)
     left_out: tuple[Refusal, ...] = ()
 
@@ -141,6 +146,14 @@ def _values(b: Baseline, term: str, x: Array, *, half: bool) -> Any:
     if term == ROLLOUT:
         n = len(b.coordinates)
         return {"q": _columns(b.coordinates, x[:n]), "v": _columns(b.velocities, x[n:])}
+    if term == FRAMES:
+        return {
+            name: {
+                what: {str(k + 1): row.tolist() for k, row in enumerate(x[:, i, part])}
+                for what, part in _OF_FRAME.items()
+            }
+            for i, name in enumerate(b.frames)
+        }
     if not x.any():
         return 0.0
     if x.ndim == 1:
@@ -173,6 +186,10 @@ def _from_table(t: Mapping[str, Any]) -> Baseline:
     def values(term: str, x: Any, half: bool) -> Array:
         if term == ROLLOUT:
             return array(term, [*x["q"].values(), *x["v"].values()], (len(coordinates) + nv,))
+        if term == FRAMES:
+            rows = [[list(frame[what].values()) for frame in x.values()] for what in _OF_FRAME]
+            poses = np.concatenate([np.array(row, dtype=np.float64) for row in rows], axis=-1).swapaxes(0, 1)
+            return array(term, poses, (n, len(x), 18))
         shape = (n,) if term.endswith("energy") else (n, nv, nv) if term == "M" else (n, nv)
         if isinstance(x, float):
             _expect(x == 0, f"{term}: expected rows of numbers or 0.0, got {x!r}")
@@ -199,6 +216,7 @@ def _from_table(t: Mapping[str, Any]) -> Baseline:
         rollout=Rollout(t["rollout"]["dt"], t["rollout"]["steps"]),
         terms={term: values(term, x, True) for term, x in t["terms"].items()},
         errors={e: {term: errors.get(e, {}).get(term, 0.0) for term in terms} for e, terms in computed.items()},
+        frames=tuple(t["terms"].get(FRAMES, {})),
         own={e: {term: values(term, x, False) for term, x in terms.items()} for e, terms in t.get("own", {}).items()},
         left_out=tuple(
             Refusal(engine, "" if term == "everything" else term, reason)

@@ -41,7 +41,7 @@ from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import checked_target, engine_names, with_values
 from mbkit.studies.baseline import description, file
 from mbkit.studies.baseline.description import Change, changes, described, links_of, moving_mass, without_consequences
-from mbkit.studies.baseline.file import ROLLOUT, Baseline, Rollout, path_of, read
+from mbkit.studies.baseline.file import FRAMES, ROLLOUT, Baseline, Rollout, path_of, read
 from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, Status, VersionChange
 from mbkit.studies.compare.errors import Errors, Scales
 from mbkit.studies.compare.terms import TERMS, States, states
@@ -79,8 +79,9 @@ def record(
 ) -> Baseline:
     """Record what engines say of a model, for `check` to hold them against later.
 
-    The file has the model's parameters, every term at a few seeded states and the end of a short rollout, by the
-    oracle; how far each engine was from these; and versions. The same model, versions and processor give the same
+    The file has the model's parameters, every term at a few seeded states, there the pose and the velocity of frames
+    that the file names, and the end of a short rollout, by the oracle; how far each engine was from these; and
+    versions. The same model, versions and processor give the same
     bytes.
 
     Parameters
@@ -134,7 +135,10 @@ def record(
         raise UnsupportedError(f"no engine holds {model.name}, so there is nothing to record: {why}")
     at = _states(plain, samples, seed)
     tell(0.1, "34 digits")
-    terms, absent = evaluate(OracleDynamics(plain), at, _ROLLOUT)
+    described_model = described(model)
+    # One that stands where another does says no more.
+    frames = tuple(name for name, part in described_model.get("frames", {}).items() if "same_as" not in part)
+    terms, absent = evaluate(OracleDynamics(plain), at, _ROLLOUT, frames)
     recorded = Baseline(
         model=model.name,
         digest=model.digest,
@@ -143,19 +147,20 @@ def record(
         seed=seed,
         processor=results.processor(),
         versions=_versions_of(built),
-        description=described(model) | links_of(model, target, options or {}, where),
+        description=described_model | links_of(model, target, options or {}, where),
         coordinates=tuple(model.coordinate_names),
         velocities=tuple(model.velocity_names),
         states=at,
         rollout=_ROLLOUT,
         terms=terms,
         errors={name: {} for name in built},
+        frames=frames,
     )
     comparator = Comparator(recorded)
     left_out = [*refused, *absent]
     for k, (name, dyn) in enumerate(built.items()):
         tell(0.6 + 0.4 * k / len(built), name)
-        values, without = evaluate(dyn, at, _ROLLOUT)
+        values, without = evaluate(dyn, at, _ROLLOUT, frames)
         left_out += [r for r in without if r.term in terms]
         for term in [t for t in values if t in terms]:
             error = comparator.error(term, values[term], terms[term])
@@ -253,7 +258,7 @@ def check(
     worst = 0.0
     for k, (name, dyn) in enumerate(built.items()):
         tell(0.1 + 0.9 * k / len(built), name)
-        some, error = differences(recorded, name, *evaluate(dyn, recorded.states, recorded.rollout), moved)
+        some, error = differences(recorded, name, *evaluated(dyn, recorded), moved)
         rows += some
         worst = max(worst, error)
     tell(1.0, "done")
@@ -380,20 +385,36 @@ def _build_engines(model: Model, names: Iterable[str]) -> tuple[dict[str, Dynami
     return engines, refused, missing
 
 
-def evaluate(dyn: Dynamics, at: States, rollout: Rollout) -> tuple[dict[str, Array], list[Refusal]]:
+def evaluate(
+    dyn: Dynamics, at: States, rollout: Rollout, frames: Sequence[str] = ()
+) -> tuple[dict[str, Array], list[Refusal]]:
     """Return every term that an engine gives, and why it does not give the others."""
     values: dict[str, Array] = {}
     refusals = []
-    calls = {term.name: partial(term.call, dyn, at) for term in TERMS}
+    calls: dict[str, Any] = {term.name: partial(term.call, dyn, at) for term in TERMS}
+    calls[ROLLOUT] = partial(_rollout_end, dyn, at, rollout)
+    if frames:
+        calls[FRAMES] = partial(_frames_at, dyn, at, list(frames))
     with warnings.catch_warnings():
         # A defect that was there before is recorded, and no news.
         warnings.simplefilter("ignore", KnownDefectWarning)
-        for name, call in {**calls, ROLLOUT: partial(_rollout_end, dyn, at, rollout)}.items():
+        for name, call in calls.items():
             try:
                 values[name] = call()
             except MbkitError as error:
                 refusals.append(Refusal.of(dyn.engine, error, name))
     return values, refusals
+
+
+def evaluated(dyn: Dynamics, recorded: Baseline) -> tuple[dict[str, Array], list[Refusal]]:
+    """Return what `evaluate` does at a baseline's states."""
+    return evaluate(dyn, recorded.states, recorded.rollout, recorded.frames)
+
+
+def _frames_at(dyn: Dynamics, at: States, frames: Sequence[str]) -> Array:
+    """Return of each frame the three rows of X_WF, and J v in the world's axes, (n, k, 18)."""
+    X = dyn.pose(at.q, frames)[..., :3, :]
+    return np.concatenate([X.reshape(*X.shape[:-2], 12), dyn.velocity(at.q, at.v, frames)], axis=-1)
 
 
 def _rollout_end(dyn: Dynamics, at: States, rollout: Rollout) -> Array:
@@ -428,9 +449,19 @@ class Comparator:
         self._velocities, self._split = b.velocities, len(b.coordinates)
         self._ends = [f"q of {n}" for n in b.coordinates] + [f"v of {n}" for n in b.velocities]
         self._states = [f"{kind} state {k + 1}" for k, kind in enumerate(b.states.kinds)]
+        self._frames = b.frames
 
     def errors(self, term: str, value: Array, reference: Array) -> Errors:
-        """Measure a term's values; of a rollout's end q and v each relative to their size, rad, m and s or more."""
+        """Measure a term's values; of a rollout's end q and v each relative to their size, rad, m and s or more.
+
+        Of frames, rotations are as large as 1, and what else there is as the largest of its kind.
+        """
+        if term == FRAMES:
+            size = np.ones(18)
+            for kind in ([3, 7, 11], [12, 13, 14], [15, 16, 17]):
+                size[kind] = np.abs(reference[..., kind]).max(initial=0.0) or 1.0
+            e = np.abs(value - reference)
+            return Errors(e.max(axis=(1, 2)), (e / size).max(axis=(1, 2)), (e / size).max(axis=(0, 2)))
         if term != ROLLOUT:
             return self._measures[term](value - reference, reference, self._scales)
         e, ends = np.abs(value - reference), np.split(reference, [self._split])
@@ -454,11 +485,13 @@ class Comparator:
         index: tuple[int, ...] = (errors.worst,)
         if per.size:
             j = int(np.argmax(per))
-            joint, index = (self._ends if term == ROLLOUT else self._velocities)[j], (j,)
+            names = {ROLLOUT: self._ends, FRAMES: self._frames}.get(term, self._velocities)
+            joint, index = names[j], (j,)
             if off.ndim > 1:
                 n, *more = (int(x) for x in np.unravel_index(np.argmax(off[:, j]), off[:, j].shape))
                 state, index = self._states[n], (n, j, *more)
-                joint += "".join(f", {self._velocities[i]}" for i in more if i != j)
+                if term != FRAMES:
+                    joint += "".join(f", {self._velocities[i]}" for i in more if i != j)
         numbers = float(reference[index]), float(value[index])
         return ChangedNumber(term, engine, joint, state, *numbers, error, allowed, cause, reason)
 
@@ -535,10 +568,9 @@ def _effect(recorded: Baseline, model: Model, changed: tuple[Change, ...]) -> st
         return ""
     for name in recorded.engines:
         for dyn in _build_engines(model, [name])[0].values():
-            evaluated = evaluate(dyn, recorded.states, recorded.rollout)
-            rows = [r for r in differences(recorded, name, *evaluated)[0] if np.isfinite(r.error)]
+            rows = [r for r in differences(recorded, name, *evaluated(dyn, recorded))[0] if np.isfinite(r.error)]
             frames = _moved_frames(recorded, model)
-            if not rows:
+            if all(r.term == FRAMES for r in rows) and (frames or not rows):
                 return (
                     f"{frames}, with their Jacobians; no other term moves ({name})"
                     if frames
