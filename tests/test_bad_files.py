@@ -532,13 +532,6 @@ MJCFS = {
     "flag": (mjcf(BODY, '<option><flag gravity="off"/></option>'), ["gravity", "'off'"]),
     "limited": (mjcf(BODY.replace('name="j"', 'name="j" limited="yes"')), ["limited", "'yes'"]),
     "springdamper": (mjcf(BODY.replace('name="j"', 'name="j" springdamper="1 0"')), ["joint 'j'", "springdamper"]),
-    "inherited": (
-        mjcf(
-            '<body name="b"><joint name="j" type="free"/><geom size="1"/></body>',
-            '<default><joint armature="1"/></default>',
-        ),
-        ["joint 'j': armature 1 on a free joint", "line 1"],
-    ),
     "world_attribute": (
         mjcf(BODY).replace("<worldbody", '<worldbody childclass="main"'),
         ["worldbody", "'childclass'"],
@@ -554,10 +547,6 @@ MJCFS = {
     "free_and_hinge": (
         mjcf('<body name="b"><freejoint/><joint/><geom size="1"/></body>'),
         ["body 'b': a free joint and others"],
-    ),
-    "armature_on_free": (
-        mjcf(BODY.replace('name="j"', 'name="j" type="free" armature="1"')),
-        ["joint 'j': armature 1 on a free joint", "line 1"],
     ),
     "curved_spring_on_ball": (
         mjcf(BODY.replace('name="j"', 'name="j" type="ball" stiffness="1 2"')),

@@ -278,13 +278,27 @@ def test_springs_of_all_joints_and_polynomials(free: str, ball: str, option: str
         (("{ball}", "1 1"), "joint 'l': stiffness that grows"),
         (('damping="2"', 'damping="2 1"'), "damping that grows with the speed of a free joint"),
         (('damping=".1"', 'damping=".1 1"'), "damping that grows with the speed of a ball joint"),
-        (('damping="2"', 'damping="2" armature="1"'), "joint 'f': armature 1"),
+        (('damping="2"', 'damping="2" armature="-1"'), "joint 'f': armature -1"),
     ],
 )
 def test_springs_and_dampers_that_are_not_read_are_refused(change: tuple[str, str], said: str, tmp_path: Path) -> None:
     text = NONLINEAR.replace(*change).format(free="1", ball="1", option="", armature="0")
     with pytest.raises(ModelError, match=said):
         mb.load(written(text, tmp_path))
+
+
+def test_armature_of_a_free_joint_is_matter_without_weight(tmp_path: Path) -> None:
+    text = arm().replace('<freejoint name="f"/>', '<joint name="f" type="free" armature="0.3"/>')
+    model, at = mb.load(written(text, tmp_path)), mujoco_terms(text, 4, 0)
+    assert "the armature of free joint 'f' is a body without weight, of 0.3 kg" in " ".join(model.notes)
+    for engine in (*ENGINES, "drake", "oracle"):
+        dyn = mb.dynamics(model, engine)
+        for name, x, exact in (
+            ("M", dyn.mass_matrix(at.q), at.M),
+            # The weight that is held stands on both sides.
+            ("forces", dyn.nle(at.q, at.v) - dyn.passive(at.q, at.v), at.nle - at.passive),
+        ):
+            assert np.abs(x - exact).max() < 1e-12 * max(np.abs(exact).max(), 1.0), (engine, name)
 
 
 def test_armature_of_a_ball_joint(tmp_path: Path) -> None:

@@ -228,9 +228,8 @@ class _Tree:
         else:
             if joint.kind == "ball" and _range(element, "range", "limited", item, scene, ordered=False):
                 scene.left_out["limit of a ball joint"] += 1
-            # It may come from a default class for hinges.
             if joint.kind == "free" and (armature := values.pop("armature")):
-                read.fault(f"{item}: armature {armature:g} on a free joint, which has no rotor; set it to 0", element)
+                self._add_weightless(joint, child, armature)
         yields = read.number(element, "springyield", item, 0.0)
         if values["stiffness"] or any(higher["stiffness"]):
             values["rest"] = rest
@@ -257,6 +256,20 @@ class _Tree:
         friction = read.number(element, "frictionloss", item, 0.0)
         self.b.add_joint(
             joint.name, kind, parent=parent, child=child, translation=p, rotation=R, friction=friction, **values
+        )
+
+    def _add_weightless(self, joint: MjcfJoint, child: str, armature: float) -> None:
+        """Add the armature of a free joint: matter about its origin that has inertia and no weight."""
+        if armature < 0:
+            self.read.fault(f"joint {joint.name!r}: armature {armature:g}; expected at least 0", joint.element)
+            return
+        name = self.scene.unused("body", f"armature of {joint.name}")
+        self.b.add_body(name, mass=armature, inertia=armature * np.eye(3))
+        self.b.add_joint(name, "fixed", parent=child, child=name)
+        self.b.add_gravity_compensation(name, 1.0)
+        self.b.note(
+            f"the armature of free joint {joint.name!r} is a body without weight, of {armature:g} kg and {armature:g} "
+            "kg m²; unlike in MuJoCo it counts in the mass and in the centre of mass"
         )
 
     def _add_spring(
