@@ -276,8 +276,6 @@ def test_springs_of_all_joints_and_polynomials(free: str, ball: str, option: str
     ("change", "said"),
     [
         (("{ball}", "1 1"), "joint 'l': stiffness that grows"),
-        (('damping="2"', 'damping="2 1"'), "damping that grows with the speed of a free joint"),
-        (('damping=".1"', 'damping=".1 1"'), "damping that grows with the speed of a ball joint"),
         (('damping="2"', 'damping="2" armature="-1"'), "joint 'f': armature -1"),
     ],
 )
@@ -285,6 +283,14 @@ def test_springs_and_dampers_that_are_not_read_are_refused(change: tuple[str, st
     text = NONLINEAR.replace(*change).format(free="1", ball="1", option="", armature="0")
     with pytest.raises(ModelError, match=said):
         mb.load(written(text, tmp_path))
+
+
+def test_dampers_that_grow_with_the_speed_of_any_joint(tmp_path: Path) -> None:
+    text = NONLINEAR.format(free="0", ball="0", option="", armature="0")
+    text = text.replace('damping="2"', 'damping="2 1 .5"').replace('damping=".1"', 'damping=".1 2 .3"')
+    model, passive = check(written(text, tmp_path), (*ENGINES, "drake"))
+    assert np.abs(passive[:, :6]).max() > 1.0
+    assert [f.name for f in model.forces if "damper" in f.name] == [f"damper of {j}" for j in "fjwl"]
 
 
 def test_armature_of_a_free_joint_is_matter_without_weight(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from mbkit.load.mjcf_reader import (
 from mbkit.load.shapes import NOTHING, together
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
-from mbkit.model import Body, Model, ModelBuilder
+from mbkit.model import Body, Model, ModelBuilder, quaternions
 from mbkit.model.validation import body_fault
 
 _REFUSED: Final = {
@@ -245,14 +245,8 @@ class _Tree:
                 joint.name,
                 potential=lambda q: k1 / 3 * (q - rest) ** 3 + k2 / 4 * (q - rest) ** 4,
             )
-        c1, c2 = higher["damping"]
-        if not joint.scalar and (c1 or c2):
-            why = f"damping that grows with the speed of a {joint.kind} joint; expected one number"
-            read.fault(f"{item}: {why}", element)
-        elif (c1 or c2) and "damper" not in self.off:
-            self.b.add_joint_force(
-                f"damper of {joint.name}", joint.name, lambda _t, _q, v: -(c1 * abs(v) + c2 * v**2) * v
-            )
+        if any(higher["damping"]) and "damper" not in self.off:
+            self.b.add_joint_force(f"damper of {joint.name}", joint.name, _damper(joint, *higher["damping"]))
         friction = read.number(element, "frictionloss", item, 0.0)
         self.b.add_joint(
             joint.name, kind, parent=parent, child=child, translation=p, rotation=R, friction=friction, **values
@@ -302,6 +296,24 @@ class _Tree:
             stiffness=[*[k0 * free] * 3, k0, k0, k0],
             potential=potential if k2 else None,
         )
+
+
+def _damper(joint: MjcfJoint, c1: float, c2: float) -> Any:
+    """Return the force of a damper that grows with the speed, without its linear part; one for each velocity."""
+
+    def resisted(v: Any) -> Any:
+        return -(c1 * abs(v) + c2 * v**2) * v
+
+    if joint.scalar:
+        return lambda _t, _q, v: resisted(v)
+    import casadi as ca
+
+    free = joint.kind == "free"
+    q, v = (ca.vertsplit(ca.SX.sym(name, n)) for name, n in (("q", 4 + 3 * free), ("v", 3 + 3 * free)))
+    # MuJoCo's velocities of a free body's origin are in the axes of the world.
+    linear = [resisted(x) for x in quaternions.rotate(q[3:], v[:3])] if free else []
+    back = quaternions.rotate_back(q[3:], linear) if free else []
+    return ca.vertcat(*back, *(resisted(x) for x in v[-3:]))
 
 
 def _hold_weights(b: ModelBuilder, mujoco: Element, scene: Scene, off: set[str], *, actuators: bool) -> None:
