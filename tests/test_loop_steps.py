@@ -221,5 +221,6 @@ def test_rodas5_in_machine_code_gives_way_near_a_singular_pose() -> None:
             q, v = dyn.project([1.0, -1.0, 1.0], [2.0, -2.0, 2.0])
             with pytest.warns(mb.errors.DoubtfulRunWarning, match="singular pose"):
                 runs.append(mb.simulate(dyn, q, v, 1.0, method, rtol=1e-9, atol=1e-9))
-        assert runs[0].stats.steps == pytest.approx(runs[1].stats.steps, abs=3)
+        # Near the pose machine code hands over a few steps before those that Python alone would choose otherwise.
+        assert runs[0].stats.steps == pytest.approx(runs[1].stats.steps, rel=0.2)
         assert np.abs(runs[0].q[-1] - runs[1].q[-1]).max() < 1e-6

@@ -87,9 +87,9 @@ class Baseline:
     rollout: Rollout
     terms: dict[str, Array]
     errors: dict[str, dict[str, float]]
-    frames: tuple[str, ...] = ()
     own: dict[str, dict[str, Array]] = field(default_factory=dict)
     left_out: tuple[Refusal, ...] = ()
+    frames: tuple[str, ...] = ()
 
     @property
     def engines(self) -> tuple[str, ...]:
@@ -299,7 +299,7 @@ def read(path: str | os.PathLike[str]) -> Baseline:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     _ = mb.baseline.record(mb.catalog.pendulum(), folder + "/a.toml", engines=["lagrangian"])
     ...     mb.baseline.read(folder + "/a.toml")
-    <Baseline of 'pendulum': lagrangian; 10 terms at 3 states>
+    <Baseline of 'pendulum': lagrangian; 11 terms at 3 states>
     """
     where = path_of(path)
     try:
