@@ -85,6 +85,7 @@ TEXTS = {
     "sdf": (b'<sdf version="1.6"/>', "root element is <sdf>; expected <robot>"),
     "html": (b"<html><body/></html>", "root element is <html>"),
     "nested": (b"<robot>" + b"<link>" * 100_000, "nested more than 250 deep"),
+    "nested_a_little": (b"<robot>" + b"<link>" * 251, "nested more than 250 deep"),
 }
 
 

@@ -503,3 +503,12 @@ def test_a_first_step_below_rounding_is_told(engine: str, speed: float) -> None:
         run = mb.simulate(mb.dynamics(mb.catalog.pendulum(), engine), [1.0], [speed], 0.01, "rk853")
     assert run.t[-1] == run.stats.reached
     assert (run.t[-1] == 0.01) if run.stats.ended == "finished" else run.stats.message
+
+
+def test_evaluations_are_those_of_all_attempts() -> None:
+    model, q, v = catalog.double_pendulum(), [2.0, 1.0], [3.0, -2.0]
+    for kind, dyn in both(model).items():
+        run = simulate(dyn, q, v, 2.0, "rk853", rtol=1e-10)
+        attempts, stages = run.stats.steps + run.stats.rejected, dormand_prince_853().stages
+        # The first stage of the next step is where the last one ended, which Python keeps, and machine code computes.
+        assert (stages - 1) * attempts <= run.stats.evaluations <= stages * attempts + 4, kind

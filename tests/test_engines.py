@@ -641,3 +641,18 @@ def test_a_seed_that_looks_like_a_number_of_states_is_told():
         warnings.simplefilter("error")
         model.random_state(7)
         model.random_state(100, 3)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
+@pytest.mark.parametrize("length", [0.9, 1.1])
+def test_a_quaternion_of_another_length_is_refused_by_every_engine(engine: str, length: float) -> None:
+    for model in (mb.catalog.free_body(), random_tree(1, n=2, kinds=("ball",))):
+        dyn, (start, _) = mb.dynamics(model, engine), model.quaternions[-1]
+        q, v = model.random_state(0)
+        calls = (lambda: dyn.mass_matrix(q), lambda: dyn.nle(q, v), lambda: dyn.forward_dynamics(q, v, v))  # noqa: B023  # called at once
+        for call in calls:
+            call()
+        q[start : start + 4] *= length
+        for call in calls:
+            with pytest.raises(InputError, match="expected 1"):
+                call()

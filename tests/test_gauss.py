@@ -239,6 +239,19 @@ def test_compiled_steps_are_those_of_python(seed: int) -> None:
             assert np.abs(x - y).max() <= 1e4 * EPS * max(1.0, np.abs(y).max())
 
 
+@pytest.mark.parametrize("seed", [0, 5])
+def test_steps_that_are_long_lead_to_the_same_solution(seed: int) -> None:
+    """At seed 5 Newton's iteration from a far guess would end at another solution of the stages' equations."""
+    model = catalog.double_pendulum()
+    q, v = model.random_state(seed)
+    for method, dt in ((method, dt) for method in GAUSS for dt in (0.05, 0.1)):
+        compiled, interpreted = (
+            simulate(mb.dynamics(model, "lagrangian", compile=x), q, 3 * v, 3.0, method, dt=dt) for x in (True, False)
+        )
+        # Sixty steps of a chaotic motion: no step is off by what an iteration too few would leave, 1e-10 and more.
+        assert np.abs(compiled.q - interpreted.q).max() < 2e-11
+
+
 def test_compiled_steps_take_wrenches_and_a_start() -> None:
     model = random_tree(4, n=3, kinds=("revolute", "prismatic"))
     q, v = model.random_state(np.random.default_rng(4))

@@ -244,6 +244,13 @@ def test_a_tendon_rests_at_the_length_that_mujoco_measures(tmp_path: Path) -> No
     np.testing.assert_allclose(lengths, compiled.tendon_lengthspring[:, 0], rtol=1e-14)
 
 
+def test_a_tendon_on_one_joint_acts_by_the_square_of_its_factor(tmp_path: Path) -> None:
+    tendon = '<tendon><fixed name="t" stiffness="3" damping=".4"><joint joint="j" coef="-2"/></fixed></tendon>'
+    model, passive = check(written(arm(held="", more=tendon).replace(' gravcomp="-0.3"', ""), tmp_path))
+    assert model.joint("j").damping == 1.0 + 4 * 0.4
+    assert passive[:, 6].any()
+
+
 NONLINEAR = """<mujoco model="bent"><option>{option}</option><worldbody>
   <body name="base" pos="0 .3 1" euler="10 20 30"><joint type="free" name="f" stiffness="{free}" damping="2"/>
     <geom type="box" size=".1 .2 .3" pos=".2 .1 .3"/>

@@ -94,6 +94,17 @@ def test_damping_grows_from_zero():
     assert np.allclose(plain.inertia, damped.inertia, rtol=1e-8)
 
 
+def test_the_damped_inertia_is_that_of_the_least_singular_value_allowed():
+    model = mb.catalog.double_pendulum()
+    dyn, tip = mb.dynamics(model, "lagrangian"), model.frames[-1].name
+    with pytest.warns(SingularPoseWarning):
+        largest = [
+            np.linalg.eigvalsh(mb.operational_space(dyn, [0.3, 1e-4], tip, rows=[0, 2], damping=damping).inertia)[-1]
+            for damping in (0.1, 0.2)
+        ]
+    assert largest[0] / largest[1] == pytest.approx(4.0, rel=1e-3)
+
+
 def test_bad_arguments_are_named():
     dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
     for more, message in (

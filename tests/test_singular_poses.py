@@ -212,6 +212,14 @@ def test_only_steps_near_the_pose_leave_machine_code(method, monkeypatch) -> Non
     assert run.stats.evaluations > run.stats.steps
 
 
+def test_near_a_rest_in_the_pose_machine_code_and_python_do_not_take_turns() -> None:
+    """This pendulum turns where all links lie flat, so that each step of machine code would end near the pose again."""
+    dyn = mb.dynamics(row(2).model, "lagrangian", compile=True)
+    q, v = parallel(dyn, 0.5 * math.pi, 0.1)
+    run, _ = simulated(dyn, q, v, 5.0, "rk853", rtol=1e-10)
+    assert run.stats.steps < 1000
+
+
 def test_a_motion_that_comes_to_rest_in_the_pose_is_stopped_there() -> None:
     """All links of this parallelogram hang in one line: where damping ends its swing, every branch is as good."""
     b = mb.ModelBuilder("hanging")

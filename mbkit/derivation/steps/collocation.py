@@ -29,17 +29,24 @@ from mbkit.derivation.steps.fixed import Part, at_time, function_of
 from mbkit.derivation.steps.midpoint import LEAST, SMALL, is_lost
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, thorough_projection
 from mbkit.derivation.steps.rosenbrock import Factors
-from mbkit.derivation.steps.symbols import SymbolicSpace
+from mbkit.derivation.steps.symbols import SymbolicSpace, choose
 from mbkit.methods.tableaus import ImplicitTableau
 
 #: Steps through whose stages the first guess of the next ones is continued.
 _PAST: Final = 2
+#: Numbers of an unknown behind its stages.
+_JUDGED: Final = 2
+#: The ratio of corrections up to which the iteration goes straight to the solution beside its guess (Kantorovich's
+#: condition; Deuflhard 2011, Newton Methods for Nonlinear Problems, ch. 2.1).
+_STRAIGHT: Final = 0.5
 
 
 class Collocation:
     """The parts of a step from (q, w), with the names that `mbkit.simulate.solvers.compiled_fixed_step` chains.
 
-    An unknown x has all stages, one behind the other: k, then r of the rotations, then λ.
+    An unknown x has all stages, one behind the other: k, then r of the rotations, then λ. Behind them stand the size of
+    the last correction and the worst ratio of one to the one before: where Newton's iteration wanders from its guess it
+    may end at another solution than the motion's, and is not believed.
     """
 
     carried = ("q", "w")
@@ -57,7 +64,7 @@ class Collocation:
         self._timed = eq.model.time_parameter is not None
         self._each = eq.model.nv + len(self._space.turning) + self._rows
         #: Entries of a step's unknown.
-        self.unknowns = s * self._each
+        self.unknowns = s * self._each + _JUDGED
         # A tableau of a user's own has no name but its numbers.
         self._prefix = f"{tableau.name}_{tableau.digest}"
         extra, timed = tuple(eq.extra_arguments), ("parameters",) if self._timed else ()
@@ -104,7 +111,10 @@ class Collocation:
 
     def _split(self, x: Any) -> list[tuple[Any, ...]]:
         """Return k, r and λ of each stage."""
-        return [tuple(ca.vertsplit(part, [0, *self._bounds])) for part in ca.vertsplit(x, self._each)]
+        return [tuple(ca.vertsplit(part, [0, *self._bounds])) for part in self._parts(x)]
+
+    def _parts(self, x: Any) -> list[Any]:
+        return list(ca.vertsplit(x[: self._stages * self._each], self._each))
 
     @property
     def _bounds(self) -> tuple[int, int, int]:
@@ -122,7 +132,7 @@ class Collocation:
 
     def _spread(self) -> ca.Function:
         s, results = self._symbols, dict[str, Any]()
-        for i, own in enumerate(ca.vertsplit(s["x"], self._each)):
+        for i, own in enumerate(self._parts(s["x"])):
             u, dw = self._moved(self._tableau.A[i], s["x"])
             after = float(self._tableau.c[i]) * s["dt"]
             more = [at_time(self._equations, after)["parameters"]] if self._timed else []
@@ -191,9 +201,13 @@ class Collocation:
             residuals.append(residual)
         factors = Factors.of(ca.sparsify(ca.vertcat(*rows)), self._order)
         change = factors.applied(factors.values, ca.vertsplit(ca.vertcat(*residuals)))
-        x1 = s["x"] - change
-        results = {"x1": x1, "miss": 1 - self._is_last(change, x1)}
-        return function_of(self.iteration[-1].name, given, results)
+        x1, (last, worst) = s["x"][:-_JUDGED] - change, ca.vertsplit(s["x"][-_JUDGED:])
+        size = ca.sqrt(self._square(change))
+        # Once nothing but rounding is left, corrections say no more.
+        counts = (last > 0) * (1 - self._is_rest(last**2, x1))
+        worst = ca.fmax(worst, choose(counts, size / choose(last > 0, last, 1.0), 0.0))
+        solved = self._is_rest(size**2, x1) * (worst <= _STRAIGHT)
+        return function_of(self.iteration[-1].name, given, {"x1": ca.vertcat(x1, size, worst), "miss": 1 - solved})
 
     @property
     def _order(self) -> list[int]:
@@ -203,14 +217,16 @@ class Collocation:
             each += [c, *([nv + turning.index(c)] if c in turning else [])]
         return [i * self._each + c for c in each for i in range(self._stages)]
 
-    def _is_last(self, change: Any, x: Any) -> Any:
-        """Return 1 where a correction was the last one needed: what Newton's iteration leaves is its square."""
+    def _square(self, x: Any) -> Any:
+        """Return the sum of squares of velocities in an unknown: of h ẇ, and of u̇ on rotations."""
+        h = self._symbols["dt"]
+        return sum((ca.sumsqr(h * k) + ca.sumsqr(r) for k, r, _ in self._split(x)), ca.SX(0))
+
+    def _is_rest(self, square: Any, x: Any) -> Any:
+        """Return 1 where a correction of this square was the last one needed: what is left after it is its square."""
         s, h = self._symbols, self._symbols["dt"]
-        far, size = (
-            sum((ca.sumsqr(h * k) + ca.sumsqr(r) for k, r, _ in self._split(y)), ca.SX(0)) for y in (change, x)
-        )
         # A NaN is not below anything.
-        return far < SMALL**2 * (ca.sumsqr(s["w"]) + size) + (LEAST / h) ** 2 * (1 + ca.sumsqr(s["q"]))
+        return square < SMALL**2 * (ca.sumsqr(s["w"]) + self._square(x)) + (LEAST / h) ** 2 * (1 + ca.sumsqr(s["q"]))
 
     # The ends of a step
 
@@ -236,8 +252,8 @@ class Collocation:
         for i, j, k in product(range(self._stages), range(len(nodes)), range(len(nodes))):
             if j != k:
                 weights[i, j] *= (self._tableau.c[i] - nodes[k]) / (nodes[j] - nodes[k])
-        values = [x for name in self.past for x in ca.vertsplit(self._symbols[name], self._each)]
-        return ca.vertcat(*(_sum(row, values) for row in weights))
+        values = [x for name in self.past for x in self._parts(self._symbols[name])]
+        return ca.vertcat(*(_sum(row, values) for row in weights), ca.SX(_JUDGED, 1))
 
     def _start(self) -> ca.Function:
         eq, space, s = self._equations, self._space, self._symbols
@@ -246,7 +262,7 @@ class Collocation:
         parts = [space.acceleration(s["q"], s["v"], a), space.turns_of(s["w"]), ca.SX(0, 1)]
         if self._rows:
             parts[2] = eq.function("independent_multipliers")(s["q"], s["v"], s["tau"], *extra)
-        guess = ca.repmat(ca.vertcat(*parts), self._stages, 1)
+        guess = ca.vertcat(ca.repmat(ca.vertcat(*parts), self._stages, 1), ca.SX(_JUDGED, 1))
         return function_of(self.start.name, self._named("q", "v", "w", "tau"), {"guess": guess})
 
 
