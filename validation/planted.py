@@ -130,7 +130,7 @@ def main(words: list[str]) -> int:
             for k, d in enumerate(chosen)
         ]
         DATA.write_text(
-            json.dumps({**stamp("planted"), "defects": parts}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+            json.dumps({**stamp(), "defects": parts}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
         )
     return int(bool(lost))
 
