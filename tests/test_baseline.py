@@ -648,6 +648,17 @@ def test_a_frame_that_moved_is_no_word_of_rest(tmp_path: Path) -> None:
     assert not any("same" in text for text in texts)
 
 
+def test_two_baselines_are_compared_in_the_frames_that_both_have(tmp_path: Path) -> None:
+    model, paths = mb.load("ur5"), [tmp_path / "a.toml", tmp_path / "b.toml"]
+    more = replace(model.frames[-1], name="extra", translation=model.frames[-1].translation + 0.1)
+    for path, frames in zip(paths, (model.frames, (more, *model.frames)), strict=True):
+        mb.baseline.record(replace(model, frames=frames), path, engines=["lagrangian"])
+    for pair, word in ((paths, "new"), (paths[::-1], "gone")):
+        result = mb.baseline.diff(*pair)
+        assert [c.text for c in result.changes] == [f"frame extra is {word}"]
+        assert not result.moved
+
+
 def test_poses_and_velocities_of_named_frames_are_numbers_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model, path = mb.load("ur5"), tmp_path / "ur5.toml"
     made = mb.baseline.record(model, path, engines=["pinocchio"])

@@ -312,6 +312,9 @@ def test_armature_of_a_free_joint_is_matter_without_weight(tmp_path: Path) -> No
             ("forces", dyn.nle(at.q, at.v) - dyn.passive(at.q, at.v), at.nle - at.passive),
         ):
             assert np.abs(x - exact).max() < 1e-12 * max(np.abs(exact).max(), 1.0), (engine, name)
+    # MuJoCo's own model has no such body to compare.
+    (read,) = mb.compare_parsers(written(text, tmp_path), ("mujoco",), samples=1).importers
+    assert read.refused.startswith("joint 'f' is free and has armature")
 
 
 def test_armature_of_a_ball_joint(tmp_path: Path) -> None:

@@ -259,7 +259,7 @@ class _Tree:
             return
         name = self.scene.unused("body", f"armature of {joint.name}")
         self.b.add_body(name, mass=armature, inertia=armature * np.eye(3))
-        self.b.add_joint(name, "fixed", parent=child, child=name)
+        self.b.add_joint(self.scene.unused("joint", name), "fixed", parent=child, child=name)
         self.b.add_gravity_compensation(name, 1.0)
         self.b.note(
             f"the armature of free joint {joint.name!r} is a body without weight, of {armature:g} kg and {armature:g} "

@@ -6,11 +6,11 @@ under constraints λ_i. With u_i = h Σ a_ij u̇_j and w_i = w0 + h Σ a_ij k_j 
     F(u_i, w_i, k_i) - Jᵀ λ_i = 0      r_i = dexp⁻¹(u_i) w_i      J v̇_i + γ = 0
 
 with F inverse dynamics less the applied force at q0 ⊕ u_i: nothing is solved but Newton's system. Its derivatives are
-exact, stage by stage, and it is that of a tree whose joints have as many unknowns as there are stages: eliminated from
-the leaves to the root, without pivoting, and the multipliers last, it is not filled in. Under constraints the end is
-projected as in `mbkit.derivation.steps.onto_constraints`.
+exact, stage by stage. It is eliminated from the leaves to the root, without pivoting, all stages of a joint together:
+so the tree fills in nothing. The multipliers come last. Under constraints the end is projected as in
+`mbkit.derivation.steps.onto_constraints`.
 
-Where a step is not solved, or is near a singular pose, it counts as missed, and Python takes the run from there.
+Where a step is not solved, or is near a singular pose, it counts as missed: Python then runs the whole trajectory.
 """
 
 from __future__ import annotations

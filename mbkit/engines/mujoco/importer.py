@@ -305,6 +305,11 @@ class _Description:
         m, nv = self.m, kind_of(kind).nv
         v = slice(int(m.jnt_dofadr[j]), int(m.jnt_dofadr[j]) + nv) if j >= 0 else slice(0, 0)
         numbers: dict[str, Any] = {"armature": np.array(m.dof_armature[v]), "friction": np.array(m.dof_frictionloss[v])}
+        if kind == "free" and numbers["armature"].any():
+            raise UnsupportedError(
+                f"joint {name!r} is free and has armature, which mbkit.load reads as a body without weight; MuJoCo's "
+                "model has no such body to compare. Set the armature to 0; mbkit check compares the engines with it"
+            )
         if not self._off("DAMPER"):
             numbers["damping"] = np.array(m.dof_damping[v])
         if nv == 1:

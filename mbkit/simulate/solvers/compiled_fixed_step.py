@@ -17,6 +17,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.codegen.compiled import Call, KernelSequence, aligned, cores
+from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.steps.collocation import Collocation
 from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import MOST
@@ -328,11 +329,12 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
 
 
 def _run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> SolverResult:
-    """Take implicit steps; what the compiled ones do not solve, or is near a singular pose, goes on in Python."""
+    """Take implicit steps; trajectories with one that is not solved, or is near a singular pose, run in Python."""
     dyn = problem.dyn
     assert isinstance(dyn, LagrangianDynamics)
     parts, space, q0, v0 = Collocation(dyn.equations, tableau), Space(dyn.model), problem.q, problem.v
-    if parts.size > _WORTH_COMPILING:
+    every = (parts.start, *parts.iteration, parts.end)
+    if parts.size > _WORTH_COMPILING or any(isinstance(dyn.code(x.name, make=x.make), Machine) for x in every):
         return run_fixed(problem)
     w0, first = space.to_integrator_velocity(q0, v0), problem.torque.columns(np.arange(len(q0)), 0, 1)[0].T
     more = at_time(dyn, problem.start)._trailing(q0)
@@ -347,7 +349,7 @@ def _run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> S
             record.v[:, record.kept > 0] = flat.reshape(w.shape)
     if lost:
         return run_fixed(problem, record, np.array(sorted(lost)))
-    return record.result(lambda _: "", tableau.stages * iterations)
+    return record.result(lambda _: "", tableau.stages * iterations, iterations)
 
 
 def _split(n: int, widest: int, workers: int) -> list[slice]:
@@ -386,9 +388,9 @@ class ImplicitParts(Protocol):
     end: Part
 
     @property
-    def past(self) -> tuple[str, ...]: ...  # as above
+    def past(self) -> tuple[str, ...]: ...
     @property
-    def iteration(self) -> tuple[Part, ...]: ...  # as above
+    def iteration(self) -> tuple[Part, ...]: ...
 
 
 class ImplicitChunk(BlockLoop):

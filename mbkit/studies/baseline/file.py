@@ -13,7 +13,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -95,6 +95,17 @@ class Baseline:
     def engines(self) -> tuple[str, ...]:
         """The engines that were recorded."""
         return tuple(self.errors)
+
+    def with_frames(self, names: tuple[str, ...]) -> Baseline:
+        """Return it with the numbers of these frames alone, in this order."""
+        which = [self.frames.index(name) for name in names]
+
+        def chosen(terms: dict[str, Array]) -> dict[str, Array]:
+            kept = {term: x[:, which] if term == FRAMES else x for term, x in terms.items()}
+            return kept if which else {term: x for term, x in kept.items() if term != FRAMES}
+
+        own = {engine: chosen(terms) for engine, terms in self.own.items()}
+        return replace(self, frames=names, terms=chosen(self.terms), own=own)
 
     @property
     def disagreements(self) -> tuple[str, ...]:

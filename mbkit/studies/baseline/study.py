@@ -300,7 +300,8 @@ def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> Base
         states_text = f"seed {a.seed} and {b.seed}, {len(a.states.q)} and {len(b.states.q)} of them"
         notes = (f"the states are others ({states_text}), so no number can be compared",)
     moved = _version_changes(a.versions, b.versions)
-    rows = () if notes else _moved_numbers(a, b, moved)
+    both = tuple(name for name in a.frames if name in b.frames)
+    rows = () if notes else _moved_numbers(a.with_frames(both), b.with_frames(both), moved)
     changed = without_consequences(changes(a.description, b.description), a.description)
     status: Status = "description" if changed else "numbers" if rows or notes else "versions" if moved else "same"
     return BaselineResult(
