@@ -64,6 +64,9 @@ def test_heun_runs_as_machine_code_where_rk4_does(monkeypatch: pytest.MonkeyPatc
     for name in ("heun", "rk4", "trapezoid"):
         simulate(dyn, *START, 0.1, name, dt=0.01, doubt=False)
     assert compiled == ["heun", "rk4", "trapezoid"]
+    # No step of it is given up: two of its stages, of one step and of the next, are at one time.
+    monkeypatch.setattr(compiled_fixed_step, "run_fixed", None)
+    assert simulate(dyn, *START, 1.0, "trapezoid", dt=0.01, doubt=False).stats.finished
     # One by one, in a batch, and in NumPy under a torque function.
     q, v = (np.tile(x, (9, 1)) for x in START)
     one, batch = simulate(dyn, *START, 0.1, "heun", dt=0.01), simulate(dyn, q, v, 0.1, "heun", dt=0.01)

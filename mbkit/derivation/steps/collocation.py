@@ -16,11 +16,10 @@ Where a step is not solved, or is near a singular pose, it counts as missed: Pyt
 from __future__ import annotations
 
 from functools import cached_property
-from itertools import product
+from math import prod
 from typing import Any, Final
 
 import casadi as ca
-import numpy as np
 
 from mbkit._check import Array
 from mbkit.derivation.equations import Equations
@@ -34,6 +33,8 @@ from mbkit.methods.tableaus import ImplicitTableau
 
 #: Steps through whose stages the first guess of the next ones is continued.
 _PAST: Final = 2
+#: Times of stages, in steps, that differ by less are one.
+_SAME_TIME: Final = 1e-9
 #: Numbers of an unknown behind its stages.
 _JUDGED: Final = 2
 #: The ratio of corrections up to which the iteration goes straight to the solution beside its guess (Kantorovich's
@@ -247,13 +248,20 @@ class Collocation:
 
     def _continued(self) -> Any:
         """Return the polynomials through the stages of the last steps, at those of the next."""
-        nodes = np.concatenate([self._tableau.c - 1 - i for i in range(_PAST)])
-        weights = np.ones((self._stages, len(nodes)))
-        for i, j, k in product(range(self._stages), range(len(nodes)), range(len(nodes))):
-            if j != k:
-                weights[i, j] *= (self._tableau.c[i] - nodes[k]) / (nodes[j] - nodes[k])
-        values = [x for name in self.past for x in self._parts(self._symbols[name])]
-        return ca.vertcat(*(_sum(row, values) for row in weights), ca.SX(_JUDGED, 1))
+        times, c = list[float](), self._tableau.c.tolist()
+        values = []
+        for back, name in enumerate(self.past):
+            for end, x in zip(c, self._parts(self._symbols[name]), strict=True):
+                time = end - 1 - back
+                # A stage at the end of a step and one at the start of the next are at one time.
+                if not any(abs(time - other) < _SAME_TIME for other in times):
+                    times.append(time)
+                    values.append(x)
+        guesses = []
+        for at in c:
+            weights = [prod((at - b) / (a - b) for b in times if b != a) for a in times]
+            guesses.append(_sum(weights, values))
+        return ca.vertcat(*guesses, ca.SX(_JUDGED, 1))
 
     def _start(self) -> ca.Function:
         eq, space, s = self._equations, self._space, self._symbols

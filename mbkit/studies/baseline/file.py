@@ -96,17 +96,6 @@ class Baseline:
         """The engines that were recorded."""
         return tuple(self.errors)
 
-    def with_frames(self, names: tuple[str, ...]) -> Baseline:
-        """Return it with the numbers of these frames alone, in this order."""
-        which = [self.frames.index(name) for name in names]
-
-        def chosen(terms: dict[str, Array]) -> dict[str, Array]:
-            kept = {term: x[:, which] if term == FRAMES else x for term, x in terms.items()}
-            return kept if which else {term: x for term, x in kept.items() if term != FRAMES}
-
-        own = {engine: chosen(terms) for engine, terms in self.own.items()}
-        return replace(self, frames=names, terms=chosen(self.terms), own=own)
-
     @property
     def disagreements(self) -> tuple[str, ...]:
         """Where an engine differed from the oracle by more than rounding when this was recorded."""
@@ -119,6 +108,18 @@ class Baseline:
     def __repr__(self) -> str:
         content = f"{len(self.terms)} terms at {len(self.states.kinds)} states"
         return f"<Baseline of {self.model!r}: {', '.join(self.engines)}; {content}>"
+
+
+def with_frames(b: Baseline, names: tuple[str, ...]) -> Baseline:
+    """Return a baseline with the numbers of these frames alone, in this order."""
+    which = [b.frames.index(name) for name in names]
+
+    def chosen(terms: dict[str, Array]) -> dict[str, Array]:
+        kept = {term: x[:, which] if term == FRAMES else x for term, x in terms.items()}
+        return kept if which else {term: x for term, x in kept.items() if term != FRAMES}
+
+    own = {engine: chosen(terms) for engine, terms in b.own.items()}
+    return replace(b, frames=names, terms=chosen(b.terms), own=own)
 
 
 # The content of a file as nested tables.

@@ -41,7 +41,7 @@ from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import checked_target, engine_names, with_values
 from mbkit.studies.baseline import description, file
 from mbkit.studies.baseline.description import Change, changes, described, links_of, moving_mass, without_consequences
-from mbkit.studies.baseline.file import FRAMES, ROLLOUT, Baseline, Rollout, path_of, read
+from mbkit.studies.baseline.file import FRAMES, ROLLOUT, Baseline, Rollout, path_of, read, with_frames
 from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, Status, VersionChange
 from mbkit.studies.compare.errors import Errors, Scales
 from mbkit.studies.compare.terms import TERMS, States, states
@@ -301,7 +301,7 @@ def diff(path_a: str | os.PathLike[str], path_b: str | os.PathLike[str]) -> Base
         notes = (f"the states are others ({states_text}), so no number can be compared",)
     moved = _version_changes(a.versions, b.versions)
     both = tuple(name for name in a.frames if name in b.frames)
-    rows = () if notes else _moved_numbers(a.with_frames(both), b.with_frames(both), moved)
+    rows = () if notes else _moved_numbers(with_frames(a, both), with_frames(b, both), moved)
     changed = without_consequences(changes(a.description, b.description), a.description)
     status: Status = "description" if changed else "numbers" if rows or notes else "versions" if moved else "same"
     return BaselineResult(
