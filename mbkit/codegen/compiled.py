@@ -185,7 +185,7 @@ def compiled(name: Sequence[str], make: Callable[[], ca.Function]) -> Compiled:
 
 
 def _compile(make: Callable[[], ca.Function]) -> tuple[dict[str, Any], bytes]:
-    derived = program(make())
+    derived = jit.host().lowered(program(make()))
     code, work = jit.program_object(derived)
     return {"inputs": derived.inputs, "shapes": derived.shapes, "operations": derived.arithmetic, "work": work}, code
 

@@ -24,13 +24,18 @@ _SIGNATURE: Final = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, cty
 
 
 class Host(NamedTuple):
-    """What machine code depends on; `width` is the number of doubles in a register."""
+    """What machine code depends on; `width` is the number of doubles in a register, `fma` says whether it fuses."""
 
     triple: str
     cpu: str
     features: str
     width: int
+    fma: bool
     llvm: str
+
+    def lowered(self, program: Program) -> Program:
+        """Return the program with the operations that this processor has."""
+        return program.fused if self.fma else program
 
 
 class Loaded:
@@ -81,14 +86,16 @@ def host_of(level: str) -> Host:
     version = f"llvmlite {llvmlite.__version__}, LLVM {'.'.join(map(str, llvm.llvm_version_info))}"
     if not level:
         width = 8 if flags.get("avx512f") else 4 if flags.get("avx") else 2
-        return Host(triple, llvm.get_host_cpu_name(), flags.flatten(), width, version)
+        fma = bool(flags.get("fma")) or not triple.startswith("x86_64")
+        return Host(triple, llvm.get_host_cpu_name(), flags.flatten(), width, fma, version)
     have = [name for name, (needs, _) in LEVELS.items() if triple.startswith("x86_64") and all(map(flags.get, needs))]
     if level not in have:
         raise InputError(
             f"MBKIT_CPU: expected a level that this processor has, {', '.join(have) or 'of which there is none'}, got "
             f"{level!r}; unset it to compile for this processor"
         )
-    return Host(triple, level, "", LEVELS[level][1], version)
+    needs, width = LEVELS[level]
+    return Host(triple, level, "", width, "fma" in needs or level == "x86-64-v4", version)
 
 
 def _target() -> Any:

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable
 from typing import Final
 
+import mpmath
+
 from mbkit.codegen.program import Program
+
+
+def _hex(x: float) -> str:
+    return f"0x{struct.pack('>d', x).hex().upper()}"
 
 
 def number(x: float) -> str:
     """Return a double in every lane, as LLVM writes it without loss."""
-    return f"splat (double 0x{struct.pack('>d', x).hex().upper()})"
+    return f"splat (double {_hex(x)})"
 
 
 def declarations(width: int) -> str:
@@ -42,9 +49,9 @@ class Text:
         """Append an instruction without a result."""
         self.lines.append(f"  {code}")
 
-    def op(self, name: str, a: str, b: str, flags: str = "") -> str:
+    def op(self, name: str, a: str, b: str) -> str:
         """Append a binary instruction."""
-        return self.put(f"{name} {flags}{self.vector} {a}, {b}")
+        return self.put(f"{name} {self.vector} {a}, {b}")
 
     def neg(self, a: str) -> str:
         """Append -a."""
@@ -75,15 +82,16 @@ class Text:
 # Sine and cosine of a whole vector.
 #
 # Reduction by Cody and Waite with π/2 in three parts: the first difference is exact in a fused multiply-add, the second
-# by Knuth's exact sum, so that the reduced angle has twice the working precision. On [-π/4, π/4] the minimax
-# polynomials of Ng's ``__kernel_sin`` and ``__kernel_cos`` (Sun's fdlibm, 1993) take that tail into account. Measured
-# against 70 digits: at most 0.76 ulp below `LIMIT`, next to multiples of π/2 too; beyond it a lane takes the C
-# library's value. Its neighbours keep theirs: no state's bits depend on what stands beside it.
+# by Knuth's exact sum, so that the reduced angle has twice the working precision. Beyond `LIMIT` a lane is reduced by
+# Payne and Hanek's method (1983), with as many bits of 2/π as its exponent asks for. On [-π/4, π/4] the minimax
+# polynomials of Ng's ``__kernel_sin`` and ``__kernel_cos`` (Sun's fdlibm, 1993) take the tail into account. Measured
+# against 70 digits: at most 0.76 ulp, next to multiples of π/2 too. No library is called, so that every processor gives
+# the same bits; and no lane's depend on what stands beside it.
 #
 # The function's name is not the C library's ``sincos``, which LLVM may call for a sine
 # and a cosine of one angle, and which it would take ours for.
 
-#: Angles above this in absolute value are left to the C library, rad.
+#: Angles above this in absolute value are reduced with more bits of 2/π, rad.
 LIMIT: Final = 1e8
 
 #: π/2 = the sum of these to 161 bits.
@@ -106,7 +114,7 @@ _COS: Final = (
 )
 
 
-def sincos(width: int) -> str:
+def sincos(width: int, attributes: str = "noinline") -> str:
     """Return LLVM code of ``@mbkit_sincos``: a vector of angles -> {sines, cosines}."""
     t = Text(width)
     V, Q, B = t.vector, f"<{width} x i64>", f"<{width} x i1>"
@@ -122,72 +130,183 @@ def sincos(width: int) -> str:
     moved = t.op("fsub", first, r0)
     lost = t.op("fsub", t.op("fsub", r0, t.op("fsub", first, moved)), t.op("fadd", middle, moved))
     rest = t.fma(back, half_pi[2], t.op("fsub", lost, below))
-    r = t.op("fadd", first, rest)
-    tail = t.op("fadd", t.op("fsub", first, r), rest)
-    z = t.op("fmul", r, r)
+    near = t.op("fadd", first, rest)
+    near_tail = t.op("fadd", t.op("fsub", first, near), rest)
+    near_quadrant = t.put(f"fptosi {V} {turns} to {Q}")
+    reduction = "\n".join(t.lines)
 
+    s = Text(width, prefix="s")
+    kinds = (f"<{width} x double>", f"<{width} x double>", Q)
+    sums = list(zip(kinds, (near, near_tail, near_quadrant), strict=True))
+    for lane in range(width):
+        x = s.put(f"extractelement {V} %x, i64 {lane}")
+        far = s.put(f"extractelement {B} %far, i64 {lane}")
+        found = s.put(f"call {_FAR} @mbkit_far(double {x})")
+        for i, (kind, held) in enumerate(sums):
+            entry = kind.split(" x ")[1][:-1]
+            own = s.put(f"extractelement {kind} {held}, i64 {lane}")
+            new = s.put(f"select i1 {far}, {entry} {s.put(f'extractvalue {_FAR} {found}, {i}')}, {entry} {own}")
+            sums[i] = kind, s.put(f"insertelement {kind} {held}, {entry} {new}, i64 {lane}")
+    distant = "\n".join(s.lines)
+
+    p = Text(width, prefix="p")
+    r, tail, quadrant = (
+        p.put(f"phi {kind} [{here}, %entry], [{there}, %distant]")
+        for (kind, there), here in zip(sums, (near, near_tail, near_quadrant), strict=True)
+    )
+    z = p.op("fmul", r, r)
     high = number(_SIN[5])
     for c in _SIN[4:0:-1]:
-        high = t.fma(high, z, number(c))
-    cube = t.op("fmul", z, r)
-    low = t.op("fsub", t.op("fmul", number(0.5), tail), t.op("fmul", cube, high))
-    low = t.fma(z, low, t.neg(tail))
-    sine = t.op("fsub", r, t.fma(t.neg(cube), number(_SIN[0]), low))
+        high = p.fma(high, z, number(c))
+    cube = p.op("fmul", z, r)
+    low = p.op("fsub", p.op("fmul", number(0.5), tail), p.op("fmul", cube, high))
+    low = p.fma(z, low, p.neg(tail))
+    sine = p.op("fsub", r, p.fma(p.neg(cube), number(_SIN[0]), low))
 
     high = number(_COS[5])
     for c in _COS[4::-1]:
-        high = t.fma(high, z, number(c))
-    half = t.op("fmul", number(0.5), z)
-    head = t.op("fsub", number(1.0), half)
-    lost = t.op("fsub", t.op("fsub", number(1.0), head), half)
-    low = t.fma(z, t.op("fmul", high, z), t.neg(t.op("fmul", r, tail)))
-    cosine = t.op("fadd", head, t.op("fadd", lost, low))
+        high = p.fma(high, z, number(c))
+    half = p.op("fmul", number(0.5), z)
+    head = p.op("fsub", number(1.0), half)
+    lost = p.op("fsub", p.op("fsub", number(1.0), head), half)
+    low = p.fma(z, p.op("fmul", high, z), p.neg(p.op("fmul", r, tail)))
+    cosine = p.op("fadd", head, p.op("fadd", lost, low))
 
     # The quadrant decides which is which, and the signs.
-    quadrant = t.put(f"fptosi {V} {turns} to {Q}")
-    odd = t.put(f"trunc {Q} {quadrant} to {B}")
-    after = t.put(f"add {Q} {quadrant}, splat (i64 1)")
-    results = []
-    for q, yes, no in ((quadrant, cosine, sine), (after, sine, cosine)):
-        sign = t.put(f"shl {Q} {t.put(f'and {Q} {q}, splat (i64 2)')}, splat (i64 62)")
-        chosen = t.put(f"select {B} {odd}, {V} {yes}, {V} {no}")
-        bits = t.put(f"xor {Q} {t.put(f'bitcast {V} {chosen} to {Q}')}, {sign}")
-        results.append(t.put(f"bitcast {Q} {bits} to {V}"))
-    pair = f"{{ {V}, {V} }}"
-    out = t.put(f"insertvalue {pair} poison, {V} {results[0]}, 0")
-    out = t.put(f"insertvalue {pair} {out}, {V} {results[1]}, 1")
-    fast = "\n".join(t.lines)
-
-    s = Text(width, prefix="s")
-    sines = cosines = f"{V} poison"
-    for lane in range(width):
-        x = s.put(f"extractelement {V} %x, i64 {lane}")
-        sines = f"{V} " + s.put(f"insertelement {sines}, double {s.put(f'call double @sin(double {x})')}, i64 {lane}")
-        cosines = f"{V} " + s.put(
-            f"insertelement {cosines}, double {s.put(f'call double @cos(double {x})')}, i64 {lane}"
-        )
-    both = [s.put(f"select {B} %far, {far}, {V} {near}") for far, near in zip((sines, cosines), results, strict=True)]
-    slow_out = s.put(f"insertvalue {pair} poison, {V} {both[0]}, 0")
-    slow_out = s.put(f"insertvalue {pair} {slow_out}, {V} {both[1]}, 1")
-    slow = "\n".join(s.lines)
+    odd = p.put(f"trunc {Q} {quadrant} to {B}")
+    after = p.put(f"add {Q} {quadrant}, splat (i64 1)")
+    out, pair = "poison", f"{{ {V}, {V} }}"
+    for i, (q, yes, no) in enumerate(((quadrant, cosine, sine), (after, sine, cosine))):
+        sign = p.put(f"shl {Q} {p.put(f'and {Q} {q}, splat (i64 2)')}, splat (i64 62)")
+        chosen = p.put(f"select {B} {odd}, {V} {yes}, {V} {no}")
+        bits = p.put(f"xor {Q} {p.put(f'bitcast {V} {chosen} to {Q}')}, {sign}")
+        out = p.put(f"insertvalue {pair} {out}, {V} {p.put(f'bitcast {Q} {bits} to {V}')}, {i}")
+    polynomials = "\n".join(p.lines)
     return f"""
-declare double @sin(double) nounwind willreturn memory(none)
-declare double @cos(double) nounwind willreturn memory(none)
 declare i1 @llvm.vector.reduce.or.v{width}i1({B})
-
-define internal {pair} @mbkit_sincos({V} %x) noinline nounwind willreturn memory(none) {{
+{_far()}
+define internal {pair} @mbkit_sincos({V} %x) {attributes} nounwind willreturn memory(none) {{
+entry:
   %size = call {V} @llvm.fabs.v{width}f64({V} %x)
   %far = fcmp ugt {V} %size, {number(LIMIT)}
   %any = call i1 @llvm.vector.reduce.or.v{width}i1({B} %far)
-{fast}
-  br i1 %any, label %slow, label %done
+{reduction}
+  br i1 %any, label %distant, label %done
+distant:
+{distant}
+  br label %done
 done:
+{polynomials}
   ret {pair} {out}
-slow:
-{slow}
-  ret {pair} {slow_out}
 }}
 """
+
+
+_FAR: Final = "{ double, double, i64 }"
+#: Words of 64 bits of 2/π that the largest double asks for, behind one of zeros.
+_WORDS: Final = 20
+_ZERO_BITS: Final = 64
+
+
+def _two_over_pi() -> list[int]:
+    bits = 64 * _WORDS
+    with mpmath.workprec(bits + 64):
+        digits = int(mpmath.floor(mpmath.ldexp(2 / mpmath.pi, bits)))
+    return [0, *(digits >> (bits - 64 * (i + 1)) & (2**64 - 1) for i in range(_WORDS))]
+
+
+def _far() -> str:
+    """Return LLVM code of the reduction of one large angle: rest, its tail, and number of quarter turns.
+
+    |x| = m 2^e, and 2/π from the bit of weight 4 2^-e on, 192 of them, times m is the angle in full turns: bits before
+    are whole turns. 128 of its bits are enough: no double is nearer than 2^-62 quarter turns to a whole number of them
+    (Muller et al., Handbook of Floating-Point Arithmetic, 2nd ed. 2018, section 10.2).
+    """
+    words = _two_over_pi()
+    table = (
+        f"@mbkit_two_over_pi = internal constant [{len(words)} x i64] [{', '.join(f'i64 {_signed(w)}' for w in words)}]"
+    )
+    t = Text(1)
+
+    def op(code: str) -> str:
+        return t.put(code)
+
+    def wide(x: str) -> str:
+        return op(f"zext i64 {x} to i128")
+
+    def low(x: str) -> str:
+        return op(f"trunc i128 {x} to i64")
+
+    def high(x: str) -> str:
+        return low(op(f"lshr i128 {x}, 64"))
+
+    bits = op("bitcast double %x to i64")
+    e = op(f"and i64 {op(f'lshr i64 {bits}, 52')}, 2047")
+    m = op(f"or i64 {op(f'and i64 {bits}, {2**52 - 1}')}, {2**52}")
+    # e - 1075 is the exponent of m; from the bit behind that of weight 4 on, and behind the zeros.
+    start = op(f"add i64 {e}, {_ZERO_BITS - 2 - 1075}")
+    # Neighbours in a vector may be small.
+    start = op(f"call i64 @llvm.smax.i64(i64 {start}, i64 0)")
+    word, shift = op(f"lshr i64 {start}, 6"), op(f"and i64 {start}, 63")
+    held = []
+    for i in range(4):
+        at = op(f"getelementptr i64, ptr @mbkit_two_over_pi, i64 {op(f'add i64 {word}, {i}')}")
+        held.append(op(f"load i64, ptr {at}, align 8"))
+    f = [op(f"call i64 @llvm.fshl.i64(i64 {a}, i64 {b}, i64 {shift})") for a, b in itertools.pairwise(held)]
+    last, middle, top = (op(f"mul i128 {wide(m)}, {wide(x)}") for x in reversed(f))
+    above = op(f"add i128 {middle}, {wide(high(last))}")
+    first = op(f"add i64 {low(top)}, {high(above)}")
+    whole = op(f"or i128 {op(f'shl i128 {wide(first)}, 64')}, {wide(low(above))}")
+    # Now 126 bits behind two of quarter turns; the nearest whole number of these.
+    rest = op(f"shl i128 {whole}, 2")
+    rest = op(f"or i128 {rest}, {wide(op(f'lshr i64 {low(last)}, 62'))}")
+    up = op(f"icmp slt i128 {rest}, 0")
+    quarters = op(f"add i64 {op(f'lshr i64 {first}, 62')}, {op(f'zext i1 {up} to i64')}")
+    size = op(f"select i1 {up}, i128 {op(f'sub i128 0, {rest}')}, i128 {rest}")
+    # Three parts that are doubles, to a sum of two.
+    parts = []
+    for drop, n in ((85, 43), (42, 43), (0, 42)):
+        part = op(f"and i64 {low(op(f'lshr i128 {size}, {drop}'))}, {2**n - 1}")
+        parts.append(op(f"fmul double {op(f'uitofp i64 {part} to double')}, {_hex(2.0 ** (drop - 128))}"))
+
+    def summed(a: str, b: str) -> tuple[str, str]:
+        total = op(f"fadd double {a}, {b}")
+        return total, op(f"fsub double {b}, {op(f'fsub double {total}, {a}')}")
+
+    head, back = summed(parts[0], parts[1])
+    head, back = summed(head, op(f"fadd double {back}, {parts[2]}"))
+    fma = "call double @llvm.fma.f64"
+    product = op(f"fmul double {head}, {_hex(_HALF_PI[0])}")
+    error = op(f"{fma}(double {head}, double {_hex(_HALF_PI[0])}, double {op(f'fneg double {product}')})")
+    error = op(f"{fma}(double {head}, double {_hex(_HALF_PI[1])}, double {error})")
+    error = op(f"{fma}(double {back}, double {_hex(_HALF_PI[0])}, double {error})")
+    r, tail = summed(product, error)
+    negative = op(f"icmp slt i64 {bits}, 0")
+    signs = op(f"select i1 {op(f'xor i1 {negative}, {up}')}, double -1.0, double 1.0")
+    # NaN of infinity and NaN.
+    void = op("fsub double %x, %x")
+    r = op(f"fadd double {op(f'fmul double {r}, {signs}')}, {void}")
+    tail = op(f"fmul double {tail}, {signs}")
+    turned = op(f"select i1 {negative}, i64 {op(f'sub i64 0, {quarters}')}, i64 {quarters}")
+    out = op(f"insertvalue {_FAR} poison, double {r}, 0")
+    out = op(f"insertvalue {_FAR} {out}, double {tail}, 1")
+    out = op(f"insertvalue {_FAR} {out}, i64 {turned}, 2")
+    body = "\n".join(t.lines)
+    return f"""
+{table}
+declare i64 @llvm.fshl.i64(i64, i64, i64)
+declare i64 @llvm.smax.i64(i64, i64)
+declare double @llvm.fma.f64(double, double, double)
+
+define internal {_FAR} @mbkit_far(double %x) noinline nounwind willreturn memory(none) {{
+{body}
+  ret {_FAR} {out}
+}}
+"""
+
+
+def _signed(word: int) -> int:
+    return word - 2**64 if word >= 2**63 else word
 
 
 # Functions of whole vectors that call the C library lane by lane.
@@ -242,8 +361,8 @@ _ONE: Final = number(1.0)
 _Operation = Callable[..., str]
 
 
-def _contracted(instruction: str) -> _Operation:
-    return lambda t, a, b: t.op(instruction, a, b, "contract ")
+def _plain(instruction: str) -> _Operation:
+    return lambda t, a, b: t.op(instruction, a, b)
 
 
 def _comparison(how: str) -> _Operation:
@@ -266,14 +385,17 @@ def _sign(t: Text, a: str) -> str:
 
 #: Operation -> function that appends it to a text, and returns the name of its result.
 OPERATIONS: Final[dict[str, _Operation]] = {
-    **{name: _contracted(f"f{name}") for name in ("add", "sub", "mul", "div")},
+    **{name: _plain(f"f{name}") for name in ("add", "sub", "mul", "div")},
     **{name: _comparison(how) for name, how in (("lt", "olt"), ("le", "ole"), ("eq", "oeq"), ("ne", "une"))},
     "and": _logical("and"),
     "or": _logical("or"),
     "fmin": _least("olt"),
     "fmax": _least("ogt"),
-    "sq": lambda t, a: t.op("fmul", a, a, "contract "),
-    "twice": lambda t, a: t.op("fadd", a, a, "contract "),
+    "sq": lambda t, a: t.op("fmul", a, a),
+    "twice": lambda t, a: t.op("fadd", a, a),
+    "fma": Text.fma,
+    "fms": lambda t, a, b, c: t.fma(a, b, t.neg(c)),
+    "fnma": lambda t, a, b, c: t.fma(t.neg(a), b, c),
     "inv": lambda t, a: t.op("fdiv", _ONE, a),
     "neg": Text.neg,
     "sqrt": lambda t, a: t.call("sqrt", a),

@@ -57,6 +57,45 @@ class Program:
     outputs: tuple[NDArray[np.intp], ...]
 
     @cached_property
+    def fused(self) -> Program:
+        """The same with fused multiply-adds, a b ± c with one rounding, and without the products that they take in.
+
+        A product is taken in where nothing else reads it. Which ones is decided here and not by a compiler, so that
+        every processor that has the instruction rounds alike.
+        """
+        uses = np.zeros(len(self.operations), dtype=np.intp)
+        for o in self.operations:
+            if o.name != "input":
+                for j in o.arguments:
+                    uses[j] += 1
+        for out in self.outputs:
+            np.add.at(uses, out.ravel(), 1)
+
+        def factors(j: int) -> tuple[int, ...] | None:
+            o = self.operations[j]
+            if uses[j] != 1 or o.name not in ("mul", "sq"):
+                return None
+            return o.arguments if o.name == "mul" else o.arguments * 2
+
+        taken, made = set[int](), list[Operation]()
+        for o in self.operations:
+            if o.name in ("add", "sub"):
+                a, b = o.arguments
+                if (pair := factors(a)) is not None:
+                    taken.add(a)
+                    o = Operation("fma" if o.name == "add" else "fms", (*pair, b), 0.0)
+                elif (pair := factors(b)) is not None:
+                    taken.add(b)
+                    o = Operation("fma" if o.name == "add" else "fnma", (*pair, a), 0.0)
+            made.append(o)
+        place = np.cumsum([k not in taken for k in range(len(made))]) - 1
+        kept = (o for k, o in enumerate(made) if k not in taken)
+        operations = tuple(
+            o if o.name == "input" else o._replace(arguments=tuple(place[list(o.arguments)].tolist())) for o in kept
+        )
+        return Program(self.inputs, self.shapes, operations, tuple(place[out] for out in self.outputs))
+
+    @cached_property
     def arithmetic(self) -> int:
         """Number of operations that compute something."""
         return sum(o.name not in ("input", "const") for o in self.operations)

@@ -5,8 +5,7 @@ The function written has the signature ::
     void body(double **in, int64 *in_strides, double **out, int64 *out_strides, double *work)
 
 Entry j of argument i is the vector at ``in[i] + j * in_strides[i]``; entries of an
-output count along the rows. Products and sums may be contracted to one rounding,
-which the derivation's expressions leave open; nothing else is reordered.
+output count along the rows. Nothing is reordered, and only what the program says is fused.
 
 The first vector of the work space gathers 0 times the numbers read and returned: it
 stays zero in a lane until one of them is not finite, whether a graph reads it or not.
@@ -151,6 +150,13 @@ class Piece:
         for i, out in enumerate(program.outputs):
             for j, k in enumerate(out.ravel().tolist()):
                 if not _is_zero(program, k):
+                    self._outputs.setdefault(k, []).append((i, j))
+
+    def store_zeros(self) -> None:
+        """Store zeros like everything else, and not by a function of their own."""
+        for i, out in enumerate(self._program.outputs):
+            for j, k in enumerate(out.ravel().tolist()):
+                if _is_zero(self._program, k):
                     self._outputs.setdefault(k, []).append((i, j))
 
     def write(self, slots: dict[int, int], *, first: bool) -> None:

@@ -72,7 +72,7 @@ _HELD: Final[WeakValueDictionary[str, CompiledStepLoop]] = WeakValueDictionary()
 
 def _compile(parts: Sequence[Part], state: Sequence[str]) -> tuple[dict[str, Any], bytes]:
     made = {part.name: part.make for part in parts}
-    programs = {name: program(make()) for name, make in made.items()}
+    programs = {name: jit.host().lowered(program(make())) for name, make in made.items()}
     rows, size = _rows(parts, programs, state)
     written = {part.name: _function(part, programs[part.name], rows, size) for part in parts}
     size += max(work for _, work in written.values())
@@ -132,11 +132,7 @@ class _Placed(Piece):
         super().__init__(made, piece, width())
         self._reads, self._start = reads, work
         self._writes = [0, *accumulate(out.size for out in made.outputs)]
-        for i, out in enumerate(made.outputs):
-            for j, k in enumerate(out.ravel().tolist()):
-                # Zeros are stored like everything else.
-                if (i, j) not in self._outputs.setdefault(k, []):
-                    self._outputs[k].append((i, j))
+        self.store_zeros()
 
     def _place(self, arrays: str, strides: str, i: int, j: int) -> str:  # noqa: ARG002  # rows are all alike
         row = (self._reads if arrays == "in" else self._writes)[i] + j
