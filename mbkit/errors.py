@@ -14,6 +14,7 @@ from mbkit import _escape
 
 __all__ = [
     "BaselineError",
+    "DeviceError",
     "DoubtfulRunWarning",
     "EngineProcessError",
     "EventError",
@@ -54,6 +55,10 @@ class MbkitError(Exception):
 
 class InputError(MbkitError, ValueError):
     """An argument has the wrong shape, type or value."""
+
+
+class DeviceError(MbkitError, RuntimeError):
+    """A GPU's driver refused a call, or the GPU has no room."""
 
 
 class FunctionError(InputError):

@@ -9,9 +9,10 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import casadi as ca
+import numpy as np
 
 from mbkit._fork import fork_safe
 from mbkit.codegen import disk_cache as disk
@@ -28,6 +29,8 @@ DERIVING: Final = fork_safe(threading.RLock())
 #: matrix of a hundred joints has twice as many, and is interpreted in 0.5 ms.
 _MAX_OPERATIONS: Final = 200_000
 T = TypeVar("T")
+#: A GPU's kind in DLPack (kDLCUDA).
+GPU: Final = 2
 
 
 class LastUsed(Generic[T]):
@@ -67,11 +70,18 @@ def compile_by_default() -> bool:
     return os.environ.get("MBKIT_COMPILE", "1") != "0"
 
 
-def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile: bool) -> Compiled | Machine:  # noqa: A002  # the word that users look for
+def executable(
+    name: Sequence[str],
+    make: Callable[[], ca.Function],
+    *,
+    compile: bool,  # noqa: A002  # the word that users look for
+    device: str | None = None,
+    quaternions: Sequence[int] = (),
+) -> Compiled | Machine:
     """Return a function ready to run; `name` is all that it depends on but mbkit's code, `make` derives it.
 
     Without a compiler a `NoCompilerWarning` says so once, and CasADi's interpreter runs it, as it does very large
-    functions.
+    functions. Batches run on a `device`; `quaternions` begin at these places of the first argument.
     """
     if not compile or not has_compiler():
         return Machine(_DERIVED.get(name, make))
@@ -85,9 +95,35 @@ def executable(name: Sequence[str], make: Callable[[], ca.Function], *, compile:
         return function
 
     try:
-        return compiled(name, checked)
+        code = compiled(name, checked)
     except _TooLargeError as error:
         return Machine(error.args[0])
+    if device is None:
+        return code
+    from mbkit.codegen.cuda.driver import device_of
+    from mbkit.codegen.cuda.runs import on_device
+
+    return on_device(name, make, code, device_of(device), quaternions)
+
+
+def is_on_device(x: Any) -> bool:
+    """Return whether an argument says that it is an array on a GPU."""
+    if isinstance(x, (np.ndarray, float, int, list, tuple)):
+        return False
+    if hasattr(x, "__cuda_array_interface__"):
+        return True
+    return hasattr(x, "__dlpack_device__") and int(x.__dlpack_device__()[0]) == GPU
+
+
+def on_host(x: Any) -> Any:
+    """Return an array on a GPU as one of NumPy's, and anything else as it is."""
+    if not is_on_device(x):
+        return x
+    # CuPy's is `get`, PyTorch's `cpu`, Warp's `numpy`; JAX copies by itself.
+    for name in ("get", "cpu", "numpy"):
+        if callable(own := getattr(x, name, None)):
+            return np.asarray(own())
+    return np.asarray(x)
 
 
 class _TooLargeError(Exception):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count, finite_array, real
-from mbkit.codegen.backend import DERIVING, compile_by_default, executable
+from mbkit.codegen.backend import DERIVING, compile_by_default, executable, has_compiler, is_on_device, on_host
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity
@@ -22,11 +22,12 @@ from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.steps import momentum_step_slopes
-from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Joint, Model
 
 if TYPE_CHECKING:
+    from mbkit.codegen.cuda.runs import CudaSteps
     from mbkit.derivation.steps.fixed import Part
     from mbkit.engines.compiled_calls import CompiledStep, Plan, QuantityCall
 
@@ -49,6 +50,8 @@ def _trimmed(quantity: BodyQuantity) -> Callable[[Array], Array]:
     return lambda x: x.reshape(*x.shape[:-2], x.shape[-2] // rows, rows, x.shape[-1])
 
 
+#: Quantities of three derivatives.
+_DERIVATIVES: Final = ("inverse_dynamics_derivatives", "forward_dynamics_derivatives")
 #: Three derivatives side by side, which `_TRIM` puts one behind the other.
 _STACKED: Final = "stacked"
 #: What one compiled function gives, and how its result loses the axes that the quantity does not have.
@@ -163,12 +166,14 @@ class LagrangianDynamics(Dynamics):
         compile: bool | None = None,  # noqa: A002  # the word that users look for
         threads: int | None = None,
         elimination: Elimination | None = None,
+        device: str | None = None,
     ) -> None:
         super().__init__(model)
         self._chosen = None if elimination is None else _elimination(model, elimination)
         if compile is not None and not isinstance(compile, bool):
             raise InputError(f"compile: expected True, False or None, got {compile!r}")
-        self.compile = compile_by_default() if compile is None else compile
+        self.device = None if device is None else _checked_device(device, compile)
+        self.compile = (compile_by_default() or device is not None) if compile is None else compile
         self.threads = None if threads is None else count("threads", threads, least=1)
         #: Values of parameters that differ from sample to sample, (N,) each; the others are in the model.
         self._batched: dict[str, Array] = {}
@@ -217,7 +222,10 @@ class LagrangianDynamics(Dynamics):
                 return self.equations.function(name)
 
             with DERIVING:
-                code = executable((self.form, *map(str, key)), derive, compile=self.compile)
+                # Of the last argument of a quantity with frames or joints nothing is known.
+                starts = [start for start, _ in self.model.quaternions] if name in _TRIM else []
+                named = self.form, *map(str, key)
+                code = executable(named, derive, compile=self.compile, device=self.device, quaternions=starts)
             if name in _TRIM and not isinstance(code, Machine):
                 # Loads LLVM, which interpreting never needs.
                 from mbkit.engines.compiled_calls import quantity_call
@@ -300,7 +308,7 @@ class LagrangianDynamics(Dynamics):
         return out
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (self.model, self._batched, self.compile, self.threads, self._chosen)
+        return _restore, (self.model, self._batched, self.compile, self.threads, self._chosen, self.device)
 
     def _states(self, arguments: dict[str, ArrayLike]) -> tuple[dict[str, Array], int | None]:
         n = self.samples
@@ -313,7 +321,9 @@ class LagrangianDynamics(Dynamics):
             }
         return super()._states(arguments)
 
-    def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
+    def _evaluate(self, quantity: str, *more: Any, **arguments: Any) -> Any:
+        if self.device is not None and any(map(is_on_device, arguments.values())):
+            return self._on_device(quantity, more, arguments)
         short = self._short.get((quantity, *more))
         if short is None and more:
             # Frames and joints are the same objects in the next call, and quicker to look up than their names.
@@ -329,6 +339,26 @@ class LagrangianDynamics(Dynamics):
             if many is not None:
                 return many
         return super()._evaluate(quantity, *more, **arguments)
+
+    def _on_device(self, quantity: str, more: tuple[Any, ...], given: dict[str, Any]) -> Any:
+        from mbkit.codegen.cuda.arrays import batch_on_device
+
+        names = tuple(map(_names, more))
+        key = (quantity, *names) if quantity in _TRIM else (_STACKED, quantity)
+        if key[0] == _STACKED and quantity not in _DERIVATIVES:
+            raise UnsupportedError(f"{quantity} takes arrays of the host, not of a GPU; copy them with numpy first")
+        trailing = self._trailing(np.empty(0))
+        arguments = {**given, **({"parameters": trailing[0]} if trailing else {})}
+        out = batch_on_device(self.code(*key), _TRIM[key[0]], arguments)
+        if out is None:
+            # The host's checks say what is wrong.
+            near = {k: on_host(x) for k, x in given.items()}
+            super()._evaluate(quantity, *more, **near)
+            raise NumericalError(f"{quantity}: the GPU gave numbers that are not finite, and the CPU did not")
+        return out
+
+    def _warn_of_open_states(self, q: ArrayLike) -> None:
+        super()._warn_of_open_states(on_host(q))
 
     mass_matrix, coriolis_matrix = _quick(Dynamics.mass_matrix), _quick(Dynamics.coriolis_matrix)
     coriolis_force, gravity = _quick(Dynamics.coriolis_force), _quick(Dynamics.gravity)
@@ -416,7 +446,7 @@ class LagrangianDynamics(Dynamics):
             return self._wrenched[key]
         kept: dict[Any, LagrangianDynamics] = self.equations.kept.setdefault("under", {})
         if key not in kept:
-            own = LagrangianDynamics(self.model, compile=self.compile, threads=self.threads)
+            own = LagrangianDynamics(self.model, compile=self.compile, threads=self.threads, device=self.device)
             own.elimination, own.form, own._acting = self.elimination, f"{self.form} under {key}", (frames, axes)
             own.equations = equations_of(self.model, elimination=self.elimination, acting=key)
             kept[key] = own
@@ -443,6 +473,23 @@ class LagrangianDynamics(Dynamics):
         if key not in plans:
             plans[key] = Plan(self.equations, method, self._part, thorough=thorough)
         return plans[key]
+
+    def device_steps(self, method: str, *, thorough: bool = False) -> CudaSteps:
+        """Return the same steps on the GPU of these dynamics."""
+        from mbkit.codegen.cuda.driver import device_of
+        from mbkit.codegen.cuda.runs import steps_on_device
+        from mbkit.derivation.steps.fixed import STATE, march_in_stages
+
+        assert self.device is not None
+        held: dict[Any, CudaSteps] = self.equations.kept.setdefault("device", {})
+        name = METHODS[method].code_name, str(thorough)
+        if (key := (self.device, *name)) not in held:
+
+            def parts() -> tuple[Part, ...]:
+                return march_in_stages(self.equations, method, thorough=thorough)
+
+            held[key] = steps_on_device((self.form, *name), parts, STATE, device_of(self.device))
+        return held[key]
 
     def _part(self, part: Part) -> Any:
         return self.code(part.name, make=part.make)
@@ -524,8 +571,19 @@ def _restore(
     compile: bool,  # noqa: A002  # as above
     threads: int | None,
     elimination: Elimination | None,
+    device: str | None = None,
 ) -> LagrangianDynamics:
-    return LagrangianDynamics(model, compile=compile, threads=threads, elimination=elimination).at(**batched)
+    options: dict[str, Any] = {"compile": compile, "threads": threads, "elimination": elimination, "device": device}
+    return LagrangianDynamics(model, **options).at(**batched)
+
+
+def _checked_device(device: str, compile: bool | None) -> str:  # noqa: A002  # as above
+    """Return the full name of a GPU that is there."""
+    from mbkit.codegen.cuda.driver import device_of
+
+    if compile is False or not has_compiler():
+        raise InputError(f"device: expected None where nothing is compiled, got {device!r}")
+    return device_of(device).name
 
 
 def _elimination(model: Model, name: str) -> Elimination:

@@ -33,6 +33,8 @@ from mbkit.model.integration_space import Space
 
 _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
+#: What a march hands on from step to step.
+STATE: Final = ("q", "w", "squares")
 #: Parts that evaluate forward dynamics, without and with constraints.
 DYNAMICS: Final = ("forward_dynamics", "held_dynamics")
 

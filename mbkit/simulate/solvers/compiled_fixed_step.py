@@ -30,7 +30,7 @@ from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import GridRecord, divergence_reason, run_fixed
+from mbkit.simulate.solvers.fixed_step import GridRecord, divergence_reason, run_fixed, to_body_velocity
 from mbkit.simulate.solvers.vector_field import BOUND, are_bounded
 from mbkit.simulate.time_grid import Indices
 
@@ -255,12 +255,7 @@ class Chunk(BlockLoop):
             self.good = np.logical_and.accumulate(are_bounded(q, w), axis=1).sum(axis=1)
 
     def to_body_velocity(self, q: Array, w: Array) -> Array:
-        if self._space.flat:
-            return w
-        flat = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, w))
-        # What a lost state has become is nobody's concern here.
-        with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(self._space.to_body_velocity(*flat).reshape(w.shape))
+        return to_body_velocity(self._space, q, w)
 
     def again(self) -> None:
         for name in _STATE.values():
@@ -288,9 +283,15 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
         chunk.begin(problem.q[members], w0[members], values[members] if values.ndim == 2 else values)
         return run_blocks(problem, record, chunk, members, ends.tolist())
 
-    def suspects_of(plan: Plan, members: Indices) -> Indices:
+    def suspects_of(members: Indices, *, thorough: bool) -> Indices:
         """Take members of the batch to the end; return those that were not bounded, or lost to their constraints."""
         n, squares = len(members), np.zeros(len(members))
+        if dyn.device is not None and problem.batch is not None and clock is None:
+            from mbkit.simulate.solvers.device_steps import step_on_device
+
+            squares = step_on_device(problem, record, w0, members, thorough=thorough)
+            return members[~(squares < BOUND**2)]
+        plan = dyn.step_plan(method, thorough=thorough)
         parts = _split(n, _widest(plan), workers)
 
         def new_worker() -> Callable[[slice], Iterator[int]]:
@@ -308,17 +309,19 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
         # A NaN is not below anything.
         return members[~(squares < BOUND**2)]
 
-    plan, lost = dyn.step_plan(method), dict[int, list[Array]]()
-    suspects = suspects_of(plan, np.arange(len(problem.q)))
+    lost = dict[int, list[Array]]()
+    suspects = suspects_of(np.arange(len(problem.q)), thorough=False)
     if len(suspects) and dyn.model.constrained:
-        suspects = suspects_of(dyn.step_plan(method, thorough=True), suspects)
+        suspects = suspects_of(suspects, thorough=True)
         if len(suspects):
             # Near a singular pose stages are projected too, and the pose is named. The others of a batch are done.
             return run_fixed(problem, record, suspects)
-    for first in range(0, len(suspects), _widest(plan)):
-        members = suspects[first : first + _widest(plan)]
-        for _, last in blocks(new_chunk(plan, len(members), all_kept=True, watched=True), members, members[:0]):
-            lost |= last
+    if len(suspects):
+        plan = dyn.step_plan(method)
+        for first in range(0, len(suspects), _widest(plan)):
+            members = suspects[first : first + _widest(plan)]
+            for _, last in blocks(new_chunk(plan, len(members), all_kept=True, watched=True), members, members[:0]):
+                lost |= last
 
     def why(i: int) -> str:
         k, (q, w) = int(record.steps[i]), lost[i]

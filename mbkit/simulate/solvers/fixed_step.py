@@ -29,6 +29,16 @@ from mbkit.simulate.torque import Force
 Step = Callable[[float, float, Array, Array, Force], tuple[Array, Array]]
 
 
+def to_body_velocity(space: Space, q: Array, w: Array) -> Array:
+    """Return mbkit's velocity of the integrators' own, of states (..., nq) and (..., nv)."""
+    if space.flat:
+        return w
+    flat = (np.ascontiguousarray(x).reshape(-1, x.shape[-1]) for x in (q, w))
+    # What a lost state has become is nobody's concern here.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(space.to_body_velocity(*flat).reshape(w.shape))
+
+
 class GridRecord:
     """Kept states of each trajectory of a run with a fixed step, (n, K, ...), and its good steps, (n,)."""
 

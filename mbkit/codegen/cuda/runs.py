@@ -1,0 +1,229 @@
+"""Batches and steps on a GPU.
+
+`OnDevice` runs batches on the GPU, and single states on the CPU. `CudaSteps` takes states through many steps in one
+launch; what a step's parts read and write has a place for each thread in one array, the arena, row after row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+from weakref import WeakValueDictionary
+
+import casadi as ca
+import numpy as np
+
+from mbkit._check import Array
+from mbkit._version import __version__
+from mbkit.codegen import disk_cache as disk
+from mbkit.codegen import jit
+from mbkit.codegen.compiled import Compiled
+from mbkit.codegen.cuda.driver import CUDA, Device, OutOfMemoryError
+from mbkit.codegen.cuda.kernels import BATCH, STEPS, kernel_code, steps_code
+from mbkit.codegen.program import program
+from mbkit.derivation.fingerprint import SOURCES
+from mbkit.derivation.steps.fixed import Part
+
+
+class Place(NamedTuple):
+    """Where an array of (N, n) is on the GPU: its address, and the strides between rows and samples, in doubles."""
+
+    address: int
+    across: int
+    along: int
+
+
+class OnDevice(Compiled):
+    """A function of vectors whose batches run on a GPU, and whose single states run on the CPU."""
+
+    def __init__(self, host: Compiled, device: Device, kernel: Callable[[], _Kernel]) -> None:
+        vars(self).update({k: x for k, x in vars(host).items() if k != "_single"})
+        self.device, self._make = device, kernel
+
+    @cached_property
+    def _kernel(self) -> _Kernel:
+        return self._make()
+
+    def run(self, inputs: Sequence[Array], outputs: Sequence[Array], threads: int | None = None) -> bool:  # noqa: ARG002
+        """Fill (N, n) outputs, as `Compiled.run` does; where the GPU has no room, part after part."""
+        start, size, good = 0, len(inputs[0]), True
+        while start < len(inputs[0]):
+            try:
+                good &= self._near(
+                    [x[start : start + size] for x in inputs], [x[start : start + size] for x in outputs]
+                )
+            except OutOfMemoryError:
+                if size == 1:
+                    raise
+                size = -(-size // 2)
+                continue
+            start += size
+        return good
+
+    def _near(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> bool:
+        with self._room() as taken:
+            places = [self._sent(x, taken) for x in inputs]
+            makes = [_as_sent(x, copy=False) for x in outputs]
+            made = [Place(taken(x.size), across, along) for x, across, along in makes]
+            good = self._kernel.launch(places, made, len(inputs[0]), taken)
+            for x, (near, _, _), place in zip(outputs, makes, made, strict=True):
+                self.device.download(place.address, near)
+                if not np.may_share_memory(near, x):
+                    x[:] = near.T if near.shape != x.shape else near
+        return good
+
+    def on_device(self, inputs: Sequence[Place | Array], outputs: Sequence[Place], n: int) -> bool:
+        """Fill outputs on the GPU from inputs on it, or on the host; return what `run` does."""
+        with self._room() as taken:
+            places = [x if isinstance(x, Place) else self._sent(x, taken) for x in inputs]
+            return self._kernel.launch(places, outputs, n, taken)
+
+    @contextmanager
+    def _room(self) -> Iterator[Callable[[int], int]]:
+        """Give a function that takes room for so many doubles, which is freed at the end."""
+        with self.device.current(), ExitStack() as stack:
+
+            def taken(size: int) -> int:
+                address = self.device.take(8 * size)
+                stack.callback(self.device.give, address)
+                return address
+
+            yield taken
+
+    def _sent(self, x: Array, taken: Callable[[int], int]) -> Place:
+        near, across, along = _as_sent(x)
+        place = Place(taken(near.size), across, along)
+        self.device.upload(near, place.address)
+        return place
+
+
+def _as_sent(x: Array, *, copy: bool = True) -> tuple[Array, int, int]:
+    """Return an array as it goes to the GPU in one piece, with its strides there."""
+    if copy and len(x) > 1 and x.strides[0] == 0:
+        return np.ascontiguousarray(x[0]), 1, 0
+    if x.shape[1] > 1 and x.strides[0] == 8:
+        whole = x.T if x.T.flags.c_contiguous else np.ascontiguousarray(x.T) if copy else np.empty(x.T.shape)
+        return whole, len(x), 1
+    return (x if x.flags.c_contiguous else np.ascontiguousarray(x) if copy else np.empty(x.shape)), 1, x.shape[1]
+
+
+class _Kernel:
+    """A program's kernel on one GPU."""
+
+    def __init__(self, device: Device, about: dict[str, Any], code: bytes) -> None:
+        self.device, self._work = device, int(about["work"])
+        self._module, self._function = device.load(code, BATCH)
+
+    def launch(self, inputs: Sequence[Place], outputs: Sequence[Place], n: int, taken: Callable[[int], int]) -> bool:
+        """Run it, and wait; return whether all numbers are finite and quaternions are of unit length."""
+        flags, found = taken(1), np.zeros(2, dtype=np.int32)
+        self.device.upload(found, flags)
+        work = taken(self._work * n) if self._work > 1 else flags
+        self.device.launch(self._function, n, *(x for place in (*inputs, *outputs) for x in place), n, flags, work)
+        self.device.download(flags, found)
+        return not found.any()
+
+
+_HELD: Final[WeakValueDictionary[str, _Kernel]] = WeakValueDictionary()
+
+
+def on_device(
+    name: Sequence[str], make: Callable[[], ca.Function], host: Compiled, device: Device, quaternions: Sequence[int]
+) -> OnDevice:
+    """Return a compiled function whose batches run on a GPU; the names are those of `compiled`."""
+
+    def kernel() -> tuple[dict[str, Any], bytes]:
+        text, work = kernel_code(program(make()).fused, quaternions)
+        return {"work": work}, device.machine_code(text)
+
+    def held() -> _Kernel:
+        with jit.COMPILING:
+            key = _key("batch", [*name, *map(str, quaternions)], device)
+            return disk.cached(key, _HELD, lambda *found: _Kernel(device, *found), kernel)
+
+    return OnDevice(host, device, held)
+
+
+def _key(kind: str, name: Sequence[str], device: Device) -> str:
+    versions = __version__, ca.CasadiMeta.version(), SOURCES, jit.host().llvm
+    return disk.key_of(CUDA, kind, *name, *device.code_name, str(device.ordinal), *versions)
+
+
+class CudaSteps:
+    """Steps of a method on one GPU; `rows` has the first row and number of rows of each name, of `size` in all."""
+
+    def __init__(self, device: Device, about: dict[str, Any], code: bytes) -> None:
+        self.device, self.size = device, int(about["size"])
+        self.rows = {name: (int(a), int(n)) for name, (a, n) in about["rows"].items()}
+        self._module, self._function = device.load(code, STEPS)
+
+    def arena(self, count: int) -> Arena:
+        """Return the room of so many states; `OutOfMemoryError` where there is none."""
+        return Arena(self, count)
+
+
+class Arena:
+    """The room of states on the GPU, (rows, count), and steps of all of them; a context that frees it."""
+
+    def __init__(self, steps: CudaSteps, count: int) -> None:
+        self._steps, self._device, self._count = steps, steps.device, count
+        with self._device.current():
+            self._address = self._device.take(8 * steps.size * count)
+
+    def __enter__(self) -> Arena:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with self._device.current():
+            self._device.give(self._address)
+
+    def _place(self, name: str) -> int:
+        return self._address + 8 * self._steps.rows[name][0] * self._count
+
+    def put(self, name: str, x: Array) -> None:
+        """Copy values in, (rows, count) or what broadcasts to it; what no part reads is left out."""
+        if name in self._steps.rows:
+            with self._device.current():
+                shape = self._steps.rows[name][1], self._count
+                near = np.ascontiguousarray(np.broadcast_to(x, shape))
+                self._device.upload(near, self._place(name))
+
+    def get(self, name: str) -> Array:
+        """Return values, (rows, count)."""
+        out = np.empty((self._steps.rows[name][1], self._count))
+        with self._device.current():
+            self._device.download(self._place(name), out)
+        return out
+
+    def take_steps(self, count: int, force: Array) -> None:
+        """Take steps, and wait; the force is (steps or 1, rows, count or 1)."""
+        with self._device.current():
+            address = self._device.take(force.nbytes)
+            try:
+                near = np.ascontiguousarray(force)
+                self._device.upload(near, address)
+                many, rows, wide = near.shape
+                strides = rows * wide if many > 1 else 0, wide, int(wide > 1)
+                arguments = self._address, self._count, count, address, *strides
+                self._device.launch(self._steps._function, self._count, *arguments)
+                self._device.download(address, np.empty(0))
+            finally:
+                self._device.give(address)
+
+
+_STEPS: Final[WeakValueDictionary[str, CudaSteps]] = WeakValueDictionary()
+
+
+def steps_on_device(
+    name: Sequence[str], make: Callable[[], Sequence[Part]], state: Sequence[str], device: Device
+) -> CudaSteps:
+    """Return steps of parts on a GPU, as `compiled_step_loop` does on the CPU."""
+
+    def code() -> tuple[dict[str, Any], bytes]:
+        text, about = steps_code(make(), state)
+        return about, device.machine_code(text)
+
+    with jit.COMPILING:
+        return disk.cached(_key("steps", name, device), _STEPS, lambda *made: CudaSteps(device, *made), code)

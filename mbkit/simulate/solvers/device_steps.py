@@ -1,0 +1,92 @@
+"""Fixed steps of a batch on a GPU: many in one launch, states stay there until they are kept."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.codegen.cuda.driver import OutOfMemoryError
+from mbkit.codegen.cuda.runs import Arena
+from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.model.integration_space import Space
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.solvers.fixed_step import GridRecord, to_body_velocity
+from mbkit.simulate.time_grid import Indices
+
+#: Steps of the first launch; later ones take longer until one lasts so many seconds, so that Ctrl-C is heard.
+_FIRST: Final = 8
+_LONG: Final = 0.1
+#: Bytes of held torques that go to the GPU at once.
+_TORQUES: Final = 2**28
+
+
+def step_on_device(
+    problem: IntegrationProblem, record: GridRecord, w0: Array, members: Indices, *, thorough: bool
+) -> Array:
+    """Take members of the batch to the end; return the sum of the squares of all states of each.
+
+    As many go side by side as the GPU has room for. `w0` are the integrators' own velocities of the whole batch.
+    """
+    dyn = problem.dyn
+    assert isinstance(dyn, LagrangianDynamics)
+    steps = dyn.device_steps(problem.method, thorough=thorough)
+    squares, start, size = np.zeros(len(members)), 0, len(members)
+    while start < len(members):
+        part = members[start : start + size]
+        try:
+            with steps.arena(len(part)) as arena:
+                _run(problem, record, arena, w0, part, start / len(members), len(part) / len(members))
+                squares[start : start + size] = arena.get("squares")[0]
+        except OutOfMemoryError:
+            if size == 1:
+                raise
+            size = -(-size // 2)
+            continue
+        start += size
+    return squares
+
+
+def _run(
+    problem: IntegrationProblem,
+    record: GridRecord,
+    arena: Arena,
+    w0: Array,
+    members: Indices,
+    done: float,
+    share: float,
+) -> None:
+    dyn, grid, torque = problem.dyn, problem.grid, problem.torque
+    assert isinstance(dyn, LagrangianDynamics)
+    space = Space(dyn.model)
+    # Of a batch that is whole or in parts; a list of indices would copy the rows of an array of torques.
+    which = slice(int(members[0]), int(members[-1]) + 1)
+    rows: slice | Indices = which if which.stop - which.start == len(members) else members
+    values = dyn.parameter_values
+    arena.put("q", problem.q[members].T)
+    arena.put("w", w0[members].T)
+    arena.put("squares", np.zeros((1, 1)))
+    arena.put("parameters", values[members].T if values.ndim == 2 else values[:, None])
+    # The last step may have a length of its own.
+    stops = {*record.kept.tolist(), grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps} - {0}
+    k, most = 0, _FIRST
+    for stop in sorted(stops):
+        while k < stop:
+            arena.put("dt", np.full((1, 1), grid.step(k)))
+            count = min(most, stop - k)
+            force = torque.columns(rows, k, k + (count if torque.held else 1))
+            if torque.held:
+                count = max(1, min(count, _TORQUES // max(force[0].nbytes, 1)))
+            began = time.perf_counter()
+            arena.take_steps(count, force[:count])
+            if time.perf_counter() - began < _LONG:
+                most *= 2
+            k += count
+            problem.bar.update(done + share * k / grid.steps)
+        if (kept := record.rows(stop, stop)).start < kept.stop:
+            q, w = (np.ascontiguousarray(arena.get(name).T) for name in ("q", "w"))
+            record.q[rows, kept.start] = q
+            record.v[rows, kept.start] = to_body_velocity(space, q, w)
+    record.steps[members] = grid.steps
