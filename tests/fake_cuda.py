@@ -1,7 +1,7 @@
 """A driver for tests: the calls are those of the real one, memory is the host's, and kernels run on the CPU.
 
-What it is given in the place of PTX is LLVM's text, of which it makes code for this processor: thread by thread the same
-operations as on a GPU. It knows nothing of a GPU's order of threads, caches and time.
+In the place of PTX it is given LLVM's text, of which it makes code for this processor: thread by thread the operations
+of a GPU. It knows nothing of a GPU's order of threads, caches and time.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class FakeDriver:
     def cuDeviceGetDefaultMemPool(self, device: int) -> tuple[int, int]:
         return OK, device
 
-    def cuMemPoolSetAttribute(self, pool: int, kind: int, value: int) -> tuple[int]:
+    def cuMemPoolSetAttribute(self, _pool: int, kind: int, value: int) -> tuple[int]:
         assert (kind, value) == (4, 2**63)
         return (OK,)
 
@@ -124,7 +124,7 @@ class FakeDriver:
         ctypes.memmove(target, source, size)
         return (OK,)
 
-    def cuStreamSynchronize(self, stream: int) -> tuple[int]:
+    def cuStreamSynchronize(self, _stream: int) -> tuple[int]:
         return (OK,)
 
     def cuLinkCreate(self, count: int, options: list[Any], values: list[Any]) -> tuple[int, int]:
@@ -156,9 +156,6 @@ class FakeDriver:
 
     def cuModuleGetFunction(self, module: Any, name: bytes) -> tuple[int, Any]:
         return OK, (*module, name.decode())
-
-    def cuModuleUnload(self, module: Any) -> tuple[int]:
-        return (OK,)
 
     def cuLaunchKernel(self, function: Any, *sizes: Any) -> tuple[int]:
         (engine, counts, name), (x, y, z, block, by, bz, shared, stream, places, extra) = function, sizes
@@ -195,18 +192,18 @@ def _for_this_processor(text: str) -> bytes:
 
 
 @pytest.fixture
-def gpu(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
+def fake(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
     """A GPU that is none, with a gibibyte."""
-    fake, real = FakeDriver(), driver.ptx
+    stands_in, real = FakeDriver(), driver.ptx
 
     def text_after_ptx(text: str, target: str) -> bytes:
         # PTX must come of it all the same.
         assert b".entry" in real(text, target)
         return text.encode() + b"\0"
 
-    monkeypatch.setattr(driver, "driver", lambda: fake)
+    monkeypatch.setattr(driver, "driver", lambda: stands_in)
     monkeypatch.setattr(driver, "ptx", text_after_ptx)
     monkeypatch.setattr(driver, "_DEVICES", {})
     # Code of a real GPU, kept by the same names, is no code for this one.
     monkeypatch.setenv("MBKIT_CACHE_DIR", "")
-    return fake
+    return stands_in

@@ -13,6 +13,7 @@ import sys
 import threading
 import warnings
 import weakref
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -27,7 +28,7 @@ import mbkit as mb
 from mbkit.codegen import backend, disk_cache, jit, simd_kernel
 from mbkit.codegen.compiled import Call, Compiled, KernelSequence, compiled
 from mbkit.codegen.interpreter import Machine
-from mbkit.codegen.program import program
+from mbkit.codegen.program import Program, program
 from mbkit.codegen.python_call import python_call
 from mbkit.errors import InputError
 from tests.random_trees import random_tree, states
@@ -74,9 +75,11 @@ def code() -> Compiled:
         lambda _: np.arange(1, 2000) * (np.pi / 2),
         lambda rng: rng.integers(-60_000_000, 60_000_000, 3000) * (np.pi / 2),
         lambda rng: rng.uniform(-1, 1, 500) * 10.0 ** rng.uniform(8, 300, 500),
-        lambda _: np.array([0.0, -0.0, 1e8, np.nextafter(1e8, 2e8), -1e8]),
+        lambda rng: rng.integers(1, 2**50, 500) * (np.pi / 2) * 2.0 ** rng.integers(0, 900, 500),
+        # The double nearest to a multiple of π/2 (Muller et al. 2018, section 10.2), the largest one, both ends.
+        lambda _: np.array([6381956970095103 * 2.0**797, np.finfo(float).max, 1e8, np.nextafter(1e8, 2e8), -1e8, -0.0]),
     ],
-    ids=["turn", "many turns", "tiny", "multiples", "far multiples", "beyond", "edges"],
+    ids=["turn", "many turns", "tiny", "multiples", "far multiples", "beyond", "multiples beyond", "edges"],
 )
 def test_sine_and_cosine_are_right_to_three_quarters_of_an_ulp(angles):
     x = angles(np.random.default_rng(0))
@@ -596,6 +599,79 @@ print(jit.host().cpu, jit.host().width, np.abs(a - b).max() / np.abs(b).max())
     assert (level, width) == ("x86-64", "2")
     # Code without FMA differs from this processor's own in the last bits alone.
     assert float(apart) < 1e3 * EPS
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="levels are those of x86-64")
+def test_processors_that_fuse_have_the_same_bits() -> None:
+    """Whatever the width of their registers: which products are fused is decided before any compiler sees them."""
+    code = """
+import hashlib, numpy as np, mbkit as mb
+from mbkit.codegen import jit
+from tests.random_trees import random_tree
+model = random_tree(4, n=4, kinds=("free", "ball", "revolute", "helical"))
+dyn = mb.dynamics(model, "lagrangian", compile=True)
+q, v = model.random_state(0, 9)
+q[3:, -1] *= 1e12
+numbers = dyn.forward_dynamics(q, v, v), *dyn.step(q, 0.1 * v, v, 1e-3)
+print(jit.host().width, jit.host().fma, hashlib.sha256(b"".join(x.tobytes() for x in numbers)).hexdigest())
+"""
+    found = []
+    for level in ("", "x86-64-v4", "x86-64-v3"):
+        env = {**os.environ, "MBKIT_CPU": level}
+        done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
+        if "expected a level that this processor has" not in done.stderr:
+            found.append(done.stdout.split())
+    if any(fma == "False" for _, fma, _ in found):
+        pytest.skip("this processor has no fused multiply-add")
+    assert len({bits for *_, bits in found}) == 1, found
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32 - 1))
+def test_a_fused_program_has_fewer_operations_and_the_same_numbers(seed: int) -> None:
+    """Sums of products of whole numbers are exact, with one rounding or two."""
+    rng = np.random.default_rng(seed)
+    x = ca.SX.sym("x", 6)
+    known = [*ca.vertsplit(x), ca.SX(3.0)]
+    for _ in range(30):
+        a, b = (known[i] for i in rng.integers(7, size=2))
+        c = known[rng.integers(len(known))]
+        known.append([a * b + c, c - a * b, a * a - c, a + b, a * b][rng.integers(5)])
+    made = program(ca.Function("f", [x], [ca.densify(ca.vertcat(*known[-12:]))], {"cse": False}).expand())
+    fused = made.fused
+    whole = rng.integers(-4, 5, 6).astype(float)
+    exact, found = run_program(made, whole), run_program(fused, whole)
+    assert found == exact
+    products = sum(o.name in ("fma", "fms", "fnma") for o in fused.operations)
+    assert len(fused.operations) == len(made.operations) - products
+    # No product that is left is read by one sum alone.
+    read = Counter(j for o in fused.operations if o.name != "input" for j in o.arguments)
+    read.update(k for out in fused.outputs for k in out.ravel().tolist())
+    for o in fused.operations:
+        if o.name in ("add", "sub"):
+            assert all(fused.operations[j].name not in ("mul", "sq") or read[j] > 1 for j in o.arguments)
+
+
+def run_program(made: Program, x: np.ndarray) -> list[float]:
+    """Return what a program gives, in Python's own numbers."""
+    do = {
+        "add": lambda a, b: a + b,
+        "sub": lambda a, b: a - b,
+        "mul": lambda a, b: a * b,
+        "fma": lambda a, b, c: a * b + c,
+        "fms": lambda a, b, c: a * b - c,
+        "fnma": lambda a, b, c: c - a * b,
+        "sq": lambda a: a * a,
+        "twice": lambda a: 2 * a,
+        "neg": lambda a: -a,
+    }
+    values: list[float] = []
+    for o in made.operations:
+        if o.name == "input":
+            values.append(float(x[o.arguments[1]]))
+        else:
+            values.append(o.value if o.name == "const" else do[o.name](*(values[j] for j in o.arguments)))
+    return [values[k] for out in made.outputs for k in out.ravel().tolist()]
 
 
 def test_levels_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ import mbkit as mb
 from mbkit import catalog
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import Equations
+from mbkit.derivation.steps import fixed
 from mbkit.derivation.steps.fixed import march, march_in_stages, step
 from mbkit.engines import compiled_calls, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
@@ -68,9 +69,11 @@ def planar() -> LagrangianDynamics:
 
 @pytest.fixture
 def in_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled_calls, "_ONE_PIECE", 0)
+    monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
     monkeypatch.setattr(
-        LagrangianDynamics, "step_plan", lambda dyn, method: compiled_calls.Plan(dyn.equations, method, dyn._part)
+        LagrangianDynamics,
+        "step_plan",
+        lambda dyn, method, **how: compiled_calls.Plan(dyn.equations, method, dyn._part, **how),
     )
 
 

@@ -12,7 +12,8 @@ import pytest
 import sympy as sp
 
 import mbkit as mb
-from mbkit.engines import Dynamics, compiled_calls
+from mbkit.derivation.steps import fixed
+from mbkit.engines import Dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian import systems
@@ -83,7 +84,7 @@ def test_with_a_free_joint_it_is_simulate_to_rounding(method: str) -> None:
 
 @pytest.mark.parametrize("kinds", [SAME_VELOCITY[:3], ("free", "ball", "revolute")])
 def test_a_step_in_parts_too(kinds: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiled_calls, "_ONE_PIECE", 0)
+    monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
     dyn = own(random_tree(3, n=3, kinds=kinds))
     assert_simulated(dyn, "rk4", rounding="free" in kinds)
     assert len(dyn.step_plan("rk4").parts) > 1

@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from mbkit.codegen.cuda.arrays import DeviceArray
 from mbkit.codegen.cuda.driver import device_of
 from mbkit.codegen.cuda.kernels import kernel_code, ptx, steps_code
 from mbkit.codegen.program import program
-from mbkit.derivation.steps.fixed import STATE, march_in_stages
+from mbkit.derivation.steps.fixed import STATE, Part, parts_of
 from mbkit.errors import InputError
 from validation.stamp import stamp
 
@@ -137,16 +138,16 @@ def rates(model: mb.Model) -> Iterator[dict[str, Any]]:
             row: dict[str, Any] = {"quantity": quantity, "states": n}
             for layout in ("coordinate-major", "C"):
                 arrays = [on_device(x, major=layout != "C") for x in given]
-                row[layout] = n / seconds(lambda a=arrays: getattr(gpu, quantity)(*a))  # type: ignore[misc]
+                row[layout] = n / seconds(partial(getattr(gpu, quantity), *arrays))
             if n <= 1_000_000:
                 major = [np.asfortranarray(x) for x in given]
-                row["with transfer"] = n / seconds(lambda a=major: getattr(gpu, quantity)(*a), times=3)  # type: ignore[misc]
-                row["CPU"] = n / seconds(lambda a=major: getattr(cpu, quantity)(*a), times=3)  # type: ignore[misc]
+                row["with transfer"] = n / seconds(partial(getattr(gpu, quantity), *major), times=3)
+                row["CPU"] = n / seconds(partial(getattr(cpu, quantity), *major), times=3)
             yield row
 
 
 def steps(model: mb.Model, n: int = 2**18, count: int = 1000) -> dict[str, Any]:
-    """Return RK4 steps a second of whole runs whose ends are kept, and how many of their numbers differ from the CPU's."""
+    """Return RK4 steps a second of runs whose ends are kept, and how many numbers differ from the CPU's."""
     gpu, cpu = (mb.dynamics(model, "lagrangian", compile=True, device=x) for x in ("cuda", None))
     given = states(model, n)
     v, dt = 0.1 * given["v"], 1e-4
@@ -264,6 +265,11 @@ def varied(n: int = 1_000_000) -> dict[str, Any]:
     return {"states": n, "a second": n / seconds(lambda: gpu.forward_dynamics(*arrays)), "differ": differ}
 
 
+def operations(dyn: Any, part: Part) -> int:
+    """Return how many operations a part of a step has."""
+    return int(dyn.code(part.name, make=part.make).operations)
+
+
 def assembled(ptxas: str) -> dict[str, Any]:
     """Return registers and spilled bytes of forward dynamics and RK4 steps, as ptxas tells them for two targets."""
     out: dict[str, Any] = {}
@@ -271,7 +277,7 @@ def assembled(ptxas: str) -> dict[str, Any]:
         model = loaded(name)
         dyn = mb.dynamics(model, "lagrangian", compile=True)
         forward = program(dyn.equations.function("forward_dynamics")).fused
-        parts = march_in_stages(dyn.equations, "rk4")
+        parts = parts_of(dyn.equations, "rk4", partial(operations, dyn))
         texts = {"forward_dynamics": kernel_code(forward, [s for s, _ in model.quaternions])[0]}
         texts["rk4"] = steps_code(parts, STATE)[0]
         for kernel, text in texts.items():

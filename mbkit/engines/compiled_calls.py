@@ -15,17 +15,13 @@ from mbkit._check import Array
 from mbkit.codegen.compiled import Compiled
 from mbkit.codegen.python_call import FLOAT, POSITIVE, Step, python_call
 from mbkit.derivation.equations import Equations
-from mbkit.derivation.steps.fixed import DYNAMICS, Part, march, march_in_stages, velocity_changes
-from mbkit.methods.registry import method_of
+from mbkit.derivation.steps.fixed import Part, parts_of, velocity_changes
 from mbkit.model import Model
 from mbkit.model.manifold import NEAR_UNIT
 
 Call = Callable[..., Any]
 
 _FLOAT: Final = np.dtype(np.float64)
-# Above this many operations the forward dynamics is compiled once and called for each stage: LLVM's time grows faster
-# than the step, which then runs no faster than its parts.
-_ONE_PIECE: Final = 20_000
 
 
 class QuantityCall(NamedTuple):
@@ -80,16 +76,20 @@ def _is_batch(given: Sequence[Any], sizes: Sequence[int], starts: Sequence[int])
 class Plan:
     """An explicit method's step for one model in machine code: its parts in order, and the rows of what they use.
 
-    `code` compiles a part. `thorough`: of a step that the quick projection onto constraints loses.
+    `code` compiles a part. `thorough`: of a step that the quick projection onto constraints loses;
+    `fed`: under a state feedback.
     """
 
     def __init__(
-        self, equations: Equations, method: str, code: Callable[[Part], Compiled], *, thorough: bool = False
+        self,
+        equations: Equations,
+        method: str,
+        code: Callable[[Part], Compiled],
+        *,
+        thorough: bool = False,
+        fed: bool = False,
     ) -> None:
-        self.parts = march_in_stages(equations, method, thorough=thorough)
-        forward = next(part for part in self.parts if part.name in DYNAMICS)
-        if method_of(method).stages * code(forward).operations <= _ONE_PIECE:
-            self.parts = march(equations, method, thorough=thorough)
+        self.parts = parts_of(equations, method, lambda x: code(x).operations, thorough=thorough, fed=fed)
         self.codes = tuple(code(part) for part in self.parts)
         self.sizes: dict[str, int] = {}
         for part, own in zip(self.parts, self.codes, strict=True):

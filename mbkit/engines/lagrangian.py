@@ -461,32 +461,36 @@ class LagrangianDynamics(Dynamics):
             return False
         return not isinstance(self.code("forward_dynamics"), Machine)
 
-    def step_plan(self, method: str, *, thorough: bool = False) -> Plan:
+    def step_plan(self, method: str, *, thorough: bool = False, fed: bool = False) -> Plan:
         """Return the compiled parts of an explicit method's step; `compiles_steps` says whether there are some.
 
-        `thorough`: with the projection for steps that the usual one loses to their constraints.
+        `thorough`: with the projection for steps that the usual one loses to their constraints; `fed`: under a state
+        feedback.
         """
         from mbkit.engines.compiled_calls import Plan
 
-        plans: dict[tuple[str, bool], Plan] = self.equations.kept.setdefault("rollout", {})
-        key = METHODS[method].code_name, thorough
+        plans: dict[Any, Plan] = self.equations.kept.setdefault("rollout", {})
+        key = METHODS[method].code_name, thorough, fed
         if key not in plans:
-            plans[key] = Plan(self.equations, method, self._part, thorough=thorough)
+            plans[key] = Plan(self.equations, method, self._part, thorough=thorough, fed=fed)
         return plans[key]
 
-    def device_steps(self, method: str, *, thorough: bool = False) -> CudaSteps:
+    def device_steps(self, method: str, *, thorough: bool = False, fed: bool = False) -> CudaSteps:
         """Return the same steps on the GPU of these dynamics."""
         from mbkit.codegen.cuda.driver import device_of
         from mbkit.codegen.cuda.runs import steps_on_device
-        from mbkit.derivation.steps.fixed import STATE, march_in_stages
+        from mbkit.derivation.steps.fixed import STATE, parts_of
 
         assert self.device is not None
         held: dict[Any, CudaSteps] = self.equations.kept.setdefault("device", {})
-        name = METHODS[method].code_name, str(thorough)
+        name = METHODS[method].code_name, str(thorough), str(fed)
         if (key := (self.device, *name)) not in held:
 
             def parts() -> tuple[Part, ...]:
-                return march_in_stages(self.equations, method, thorough=thorough)
+                def operations(part: Part) -> int:
+                    return int(self._part(part).operations)
+
+                return parts_of(self.equations, method, operations, thorough=thorough, fed=fed)
 
             held[key] = steps_on_device((self.form, *name), parts, STATE, device_of(self.device))
         return held[key]

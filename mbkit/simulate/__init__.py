@@ -8,6 +8,7 @@ from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
 from mbkit.simulate.result import Stats
 from mbkit.simulate.run import simulate
 from mbkit.simulate.sensitivity import Sensitivities, sensitivities
+from mbkit.simulate.torque import StateFeedback
 from mbkit.simulate.trajectory import RunCheck, Trajectory
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "Method",
     "RunCheck",
     "Sensitivities",
+    "StateFeedback",
     "Stats",
     "Stiffness",
     "Tableau",

@@ -146,7 +146,9 @@ def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | 
 def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Callable[[IntegrationProblem], SolverResult]:
     """Return the function that runs a method, imported when it is first needed."""
     module, function = method.solver.split(":")
-    if method.kind == "fixed" and method.compiled and method.formula and not torque.callable and _compiles(dyn):
+    compiles = method.kind == "fixed" and method.compiled and method.formula
+    as_data = not torque.callable or (torque.feedback is not None and method.explicit)
+    if compiles and as_data and _compiles(dyn):
         module, function = "compiled_fixed_step", "run_rollout"
     run: Callable[..., SolverResult] = getattr(import_module(f"mbkit.simulate.solvers.{module}"), function)
     return run

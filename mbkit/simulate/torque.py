@@ -59,6 +59,70 @@ class PiecewiseConstantTorque:
         return np.searchsorted(self.starts, t, side="right") - 1
 
 
+class StateFeedback:
+    """A state feedback u = u0 + K (x0 - x), x = (q, v): a torque as data, which compiled steps evaluate themselves.
+
+    With a fixed step on the own derivation a batch then runs at the speed of a constant torque, on every core or on a
+    GPU; everywhere else it is a torque function like any other. It acts at every stage of a method, not held.
+
+    Parameters
+    ----------
+    gain : (nv, nq + nv) array_like
+        K, N m or N for each unit of q and v. A ball or free joint has its quaternion in q as it is.
+    q : (nq,) array_like, optional
+    v : (nv,) array_like, optional
+        x0; zeros by default.
+    torque : (nv,) array_like, optional
+        u0; zeros by default.
+
+    Raises
+    ------
+    InputError
+        A shape that does not fit the others, or a number that is not finite.
+
+    Examples
+    --------
+    >>> import numpy as np, mbkit as mb
+    >>> arm = mb.catalog.double_pendulum()
+    >>> hold = mb.simulate.StateFeedback(np.hstack([300 * np.eye(2), 30 * np.eye(2)]), q=[1.0, 0.5])
+    >>> print(hold(0.0, np.array([1.0, 0.4]), np.zeros(2)))
+    [ 0. 30.]
+    """
+
+    def __init__(
+        self,
+        gain: ArrayLike,
+        q: ArrayLike | None = None,
+        v: ArrayLike | None = None,
+        torque: ArrayLike | None = None,
+    ) -> None:
+        shape = _shape("gain", gain)
+        if len(shape) != 2 or shape[1] < 2 * shape[0]:
+            raise InputError(f"gain: expected shape (nv, nq + nv), got {shape}")
+        nv, nq = shape[0], shape[1] - shape[0]
+        self.gain = finite_array("gain", gain, shape)
+        self.q, self.v, self.torque = (
+            np.zeros(n) if x is None else finite_array(name, x, (n,))
+            for name, x, n in (("q", q, nq), ("v", v, nv), ("torque", torque, nv))
+        )
+        for x in (self.gain, self.q, self.v, self.torque):
+            x.setflags(write=False)
+        self._constant = self.torque + self.gain @ np.concatenate([self.q, self.v])
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:  # noqa: ARG002  # the same at any time
+        """Return the torque at one state, (nv,)."""
+        return np.asarray(self._constant - self.gain @ np.concatenate([q, v]))
+
+    def __repr__(self) -> str:
+        nv, nx = self.gain.shape
+        return f"<StateFeedback of {nx} numbers to {nv} torques>"
+
+    @property
+    def numbers(self) -> Array:
+        """Constant and gain of each torque, row after row, as compiled steps take them."""
+        return np.column_stack([self._constant, self.gain]).ravel()
+
+
 @dataclass(frozen=True, eq=False)
 class SampledTorque:
     """Values at the saved states of a force with functions in it, (K, n) or (N, K, n)."""
@@ -149,6 +213,13 @@ class Torque:
         parts: list[tuple[slice, Array]] = []
         functions: list[tuple[slice, TorqueCallback]] = []
         self._size = model.nv
+        #: Of a torque that is nothing else.
+        self.feedback = torque if isinstance(torque, StateFeedback) and not wrenches else None
+        if isinstance(torque, StateFeedback) and torque.gain.shape != (model.nv, model.nq + model.nv):
+            raise InputError(
+                f"torque: expected a gain of shape {(model.nv, model.nq + model.nv)}, (nv, nq + nv) of {model.name}, "
+                f"got {torque.gain.shape}"
+            )
         if callable(torque):
             functions.append((slice(0, model.nv), TorqueCallback(torque, model.nv)))
         elif torque is not None:

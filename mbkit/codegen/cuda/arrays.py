@@ -87,6 +87,9 @@ def viewed(name: str, x: Any, device: Device) -> _View:
     InputError
         It holds no doubles, or is on another GPU.
     """
+    if isinstance(x, DeviceArray):
+        _require(name, x._device is device, x._device.name)
+        return _View(x._address, x.shape, x._strides, x)
     if not hasattr(x, "__dlpack__"):
         facts = x.__cuda_array_interface__
         shape, kind = tuple(map(int, facts["shape"])), facts["typestr"]
@@ -170,11 +173,12 @@ class DeviceArray:
 
     def numpy(self) -> Array:
         """Return a copy on the host."""
-        order = sorted(range(len(self.shape)), key=lambda i: (-self._strides[i], i))
-        near = np.empty([self.shape[i] for i in order])
+        if not prod(self.shape):
+            return np.empty(self.shape)
+        span = np.empty(1 + sum((n - 1) * s for n, s in zip(self.shape, self._strides, strict=True)))
         with self._device.current():
-            self._device.download(self._address, near)
-        return near.transpose(np.argsort(order))
+            self._device.download(self._address, span)
+        return np.lib.stride_tricks.as_strided(span, self.shape, [8 * s for s in self._strides])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         """Return a copy on the host; see `numpy.asarray`."""

@@ -16,6 +16,7 @@ from mbkit.errors import DeviceError, UnknownNameError, UnsupportedError
 
 #: What `device=` may be, but for the number of a GPU behind it, as in "cuda:1".
 CUDA: Final = "cuda"
+_CAPABILITY: Final = "CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY"
 _OUT_OF_MEMORY: Final = 2  # CUDA_ERROR_OUT_OF_MEMORY
 
 
@@ -29,9 +30,7 @@ def driver() -> Any:
     try:
         from cuda.bindings import driver as module
     except ImportError as error:
-        raise UnsupportedError(
-            f"device: cuda-bindings is not installed ({error}); pip install 'mbkit[cuda]'"
-        ) from error
+        raise UnsupportedError("device: cuda-bindings is not installed; pip install 'mbkit[cuda]'") from error
     return module
 
 
@@ -55,20 +54,14 @@ class Device:
         _ask("cuInit", 0)
         count = int(_ask("cuDeviceGetCount"))
         if ordinal >= count:
-            raise UnsupportedError(
-                f"device: this machine has {count} NVIDIA GPUs, numbered from 0; got number {ordinal}"
-            )
+            raise UnsupportedError(f"device: expected one of {count} NVIDIA GPUs, numbered from 0; got {ordinal}")
         self.ordinal, self._handle = ordinal, _ask("cuDeviceGet", ordinal)
         self._context = _ask("cuDevicePrimaryCtxRetain", self._handle)
         #: What NVIDIA calls it.
         self.title = _ask("cuDeviceGetName", 100, self._handle).decode().strip("\0 ")
         kinds = driver().CUdevice_attribute
         major, minor = (
-            int(
-                _ask(
-                    "cuDeviceGetAttribute", getattr(kinds, f"CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_{x}"), self._handle
-                )
-            )
+            int(_ask("cuDeviceGetAttribute", getattr(kinds, f"{_CAPABILITY}_{x}"), self._handle))
             for x in ("MAJOR", "MINOR")
         )
         known = [x for x in TARGETS if x <= 10 * major + minor]

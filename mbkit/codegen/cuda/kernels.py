@@ -18,7 +18,7 @@ from mbkit.codegen import jit
 from mbkit.codegen.llvm_ir import CALLS, Text, declarations, library, number
 from mbkit.codegen.program import Program, program
 from mbkit.codegen.simd_kernel import Piece, pieces_of, slots_of
-from mbkit.derivation.steps.fixed import Part
+from mbkit.derivation.steps.fixed import LAW, Part
 from mbkit.errors import UnsupportedError
 from mbkit.model.manifold import NEAR_UNIT
 
@@ -173,7 +173,7 @@ class _Entry(Piece):
 class _Values(Piece):
     """A program among others of one function: its arguments are values there, and so are its results."""
 
-    def __init__(self, made: Program, text: Text, given: Sequence[Sequence[str]]) -> None:
+    def __init__(self, made: Program, text: Text, given: Sequence[Sequence[str] | str]) -> None:
         super().__init__(made, [k for k, o in enumerate(made.operations) if o.name not in ("input", "const")], 1)
         self.store_zeros()
         self._text, self._given, self._made = text, given, dict[tuple[int, int], str]()
@@ -185,7 +185,9 @@ class _Values(Piece):
 
     def _load(self, pointer: Any) -> str:
         i, j = pointer
-        return self._given[i][j]
+        given = self._given[i]
+        # What all threads share is read where it is used: there is no room for it in registers.
+        return _read(self._text, given, str(j)) if isinstance(given, str) else given[j]
 
     def _store(self, value: str, pointer: Any) -> None:
         self._made[pointer] = value
@@ -203,7 +205,8 @@ def steps_code(parts: Sequence[Part], state: Sequence[str], force: str = "tau") 
 
     `state` has the names at the start of a step, which the last part writes with a 1 behind: between steps they stay
     in registers. A part that stands several times, the forward dynamics, is a function. Before each step the force is
-    read from an array of its own, with strides between steps, entries and samples.
+    read from an array of its own, with strides between steps, entries and samples; the numbers of a state feedback are
+    the same for every thread.
     """
     made = {part.name: program(part.make()).fused for part in {part.name: part for part in parts}.values()}
     _require_known(*made.values())
@@ -212,12 +215,13 @@ def steps_code(parts: Sequence[Part], state: Sequence[str], force: str = "tau") 
         sizes |= dict(zip(part.reads, made[part.name].inputs, strict=True))
         sizes |= dict(zip(part.writes, (r * c for r, c in made[part.name].shapes), strict=True))
     written = {name for part in parts for name in part.writes}
-    held = [*state, *(name for name in sizes if name not in written and name not in (*state, force))]
+    held = [*state, *(name for name in sizes if name not in written and name not in (*state, force, LAW))]
     starts = accumulate((sizes[name] for name in held), initial=0)
     rows = {name: (start, sizes[name]) for name, start in zip(held, starts, strict=False)}
 
     first, t, last = (Text(1, prefix) for prefix in "bvl")
-    values = {name: [_read(first, "arena", _row(first, a + j)) for j in range(n)] for name, (a, n) in rows.items()}
+    values: dict[str, Any] = {LAW: LAW}
+    values |= {name: [_read(first, "arena", _row(first, a + j)) for j in range(n)] for name, (a, n) in rows.items()}
     before = {name: values[name] for name in state}
     values |= {name: [f"%{name}_{j}" for j in range(rows[name][1])] for name in state}
     now = t.put(f"add i64 {t.put('mul i64 %k, %force_step')}, {t.put('mul i64 %s, %force_along')}")
@@ -243,7 +247,8 @@ def steps_code(parts: Sequence[Part], state: Sequence[str], force: str = "tau") 
     loop = ["  br label %one", "one:", "  %k = phi i64 [ 0, %begin ], [ %next, %one ]"]
     more = ["  %next = add i64 %k, 1", "  %more = icmp ult i64 %next, %steps", "  br i1 %more, label %one, label %over"]
     body = "\n".join([*first.lines, *loop, *phis, *t.lines, *more, "over:", *last.lines])
-    parameters = "ptr %arena, i64 %n, i64 %steps, ptr %force, i64 %force_step, i64 %force_across, i64 %force_along"
+    parameters = f"ptr %arena, ptr noalias %{LAW}, i64 %n, i64 %steps, ptr %force"
+    parameters += ", i64 %force_step, i64 %force_across, i64 %force_along"
     texts = [_HEAD, declarations(1), library(1, *made.values()), *functions, _entry(STEPS, parameters, body)]
     return "\n".join(texts), {"rows": rows, "size": sum(n for _, n in rows.values())}
 

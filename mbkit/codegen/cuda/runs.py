@@ -169,6 +169,7 @@ class Arena:
 
     def __init__(self, steps: CudaSteps, count: int) -> None:
         self._steps, self._device, self._count = steps, steps.device, count
+        self._shared: int | None = None
         with self._device.current():
             self._address = self._device.take(8 * steps.size * count)
 
@@ -177,7 +178,9 @@ class Arena:
 
     def __exit__(self, *error: object) -> None:
         with self._device.current():
-            self._device.give(self._address)
+            for address in (self._address, self._shared):
+                if address is not None:
+                    self._device.give(address)
 
     def _place(self, name: str) -> int:
         return self._address + 8 * self._steps.rows[name][0] * self._count
@@ -189,6 +192,12 @@ class Arena:
                 shape = self._steps.rows[name][1], self._count
                 near = np.ascontiguousarray(np.broadcast_to(x, shape))
                 self._device.upload(near, self._place(name))
+
+    def share(self, numbers: Array) -> None:
+        """Copy in the numbers of a state feedback."""
+        with self._device.current():
+            self._shared = self._device.take(numbers.nbytes)
+            self._device.upload(numbers, self._shared)
 
     def get(self, name: str) -> Array:
         """Return values, (rows, count)."""
@@ -206,7 +215,7 @@ class Arena:
                 self._device.upload(near, address)
                 many, rows, wide = near.shape
                 strides = rows * wide if many > 1 else 0, wide, int(wide > 1)
-                arguments = self._address, self._count, count, address, *strides
+                arguments = self._address, self._shared or self._address, self._count, count, address, *strides
                 self._device.launch(self._steps._function, self._count, *arguments)
                 self._device.download(address, np.empty(0))
             finally:

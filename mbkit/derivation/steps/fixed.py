@@ -33,6 +33,11 @@ from mbkit.model.integration_space import Space
 
 _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
+#: Operations of all stages above which the forward dynamics is compiled once and called for each of them: LLVM's time
+#: grows faster than the step, which then runs no faster than its parts.
+_ONE_PIECE: Final = 20_000
+#: The numbers of a state feedback.
+LAW: Final = "law"
 #: What a march hands on from step to step.
 STATE: Final = ("q", "w", "squares")
 #: Parts that evaluate forward dynamics, without and with constraints.
@@ -118,18 +123,21 @@ def step(equations: Equations, method: str) -> ca.Function:
     return function_of(f"{method}_step", names, {"q1": q1, "v1": space.to_body_velocity(q1, w1)})
 
 
-def march(equations: Equations, method: str, *, thorough: bool = False) -> tuple[Part, ...]:
+def march(equations: Equations, method: str, *, thorough: bool = False, fed: bool = False) -> tuple[Part, ...]:
     """Return one part: the whole step in the integrators' own velocity, for many steps in a row.
 
     It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum of the squares of all states so
     far: a number that once was not finite, or beyond all bounds, shows in it for ever; so does a step that is lost to
-    its constraints. `thorough` projections lose fewer steps.
+    its constraints. `thorough` projections lose fewer steps. `fed`: it reads the numbers of a state feedback too, whose
+    torque is added to tau.
     """
-    name, reads = f"{_prefix(method, thorough)}_march", (*_MARCH, *equations.extra_arguments)
+    name = f"{_prefix(method, thorough, fed)}_march"
+    reads = (*_MARCH, *equations.extra_arguments, *([LAW] if fed else []))
 
     def make() -> ca.Function:
         s, space = _symbols(equations), SymbolicSpace(equations.model)
-        ends = _stepped(equations, method, s, s["w"], _acceleration(equations, space, s), thorough=thorough)
+        law = s[LAW] if fed else None
+        ends = _stepped(equations, method, s, s["w"], _acceleration(equations, space, s, law), thorough=thorough)
         return function_of(name, {n: s[n] for n in reads}, _with_squares(s, *ends))
 
     return (Part(name, reads, _MARCHED, make),)
@@ -145,11 +153,20 @@ def velocity_changes(equations: Equations) -> tuple[tuple[Part, ...], tuple[Part
     return (before,), (Part.of("body_velocity", {"q1": s["q"], "w1": s["w"]}, {"v1": v1}),)
 
 
-def _prefix(method: str, thorough: bool) -> str:
-    return method_of(method).code_name + ("_thorough" if thorough else "")
+def _prefix(method: str, thorough: bool, fed: bool) -> str:
+    return method_of(method).code_name + ("_thorough" if thorough else "") + ("_fed" if fed else "")
 
 
-def march_in_stages(equations: Equations, method: str, *, thorough: bool = False) -> tuple[Part, ...]:
+def _fed(law: Any, q: Any, v: Any) -> Any:
+    """Return the torque of a state feedback with these numbers, constants and gains in rows."""
+    nv = v.numel()
+    rows = ca.reshape(law, law.numel() // nv, nv).T
+    return rows[:, 0] - rows[:, 1:] @ ca.vertcat(q, v)
+
+
+def march_in_stages(
+    equations: Equations, method: str, *, thorough: bool = False, fed: bool = False
+) -> tuple[Part, ...]:
     """Return the same step cut at each evaluation of the forward dynamics.
 
     The forward dynamics, most of the step, is then compiled once instead of once a stage. Between the parts go the
@@ -158,25 +175,31 @@ def march_in_stages(equations: Equations, method: str, *, thorough: bool = False
     s, space = _symbols(equations), SymbolicSpace(equations.model)
     known = {n: s[n] for n in ("q", "w", "dt")}
     parts: list[Part] = []
-    prefix = _prefix(method, thorough)
+    prefix = _prefix(method, thorough, fed)
 
     timed = equations.model.time_parameter is not None
     held = equations.model.constrained
     known |= equations.extra_arguments if held else {}
+    own = {n: s[n] for n in ("tau", LAW)} if fed else {}
     dependences: list[Any] = []
 
     def acceleration(t: Any, q: Any, w: Any) -> Any:
         i = sum(part.name in DYNAMICS for part in parts)
         v = space.to_body_velocity(q, w)
-        at, more = ("q", "w"), (*equations.extra_arguments,)
+        at, force, more = ("q", "w"), "tau", (*equations.extra_arguments,)
+        stage = dict[str, Any]()
         if i or not space.flat:
             at = (f"q_{i}", f"v_{i}")
-            stage = dict(zip(at, (q, v), strict=True))
+            stage |= dict(zip(at, (q, v), strict=True))
             if timed:
                 more = (f"parameters_{i}",)
                 stage[more[0]] = at_time(equations, t)["parameters"]
-            parts.append(Part.of(f"{prefix}_stage_{i}", known, stage))
-        reads = (*at, "tau", *more)
+        if fed:
+            force = f"tau_{i}"
+            stage[force] = s["tau"] + _fed(s[LAW], q, v)
+        if stage:
+            parts.append(Part.of(f"{prefix}_stage_{i}", known | own, stage))
+        reads = (*at, force, *more)
         if held:
             writes = f"a_{i}", f"depends_{i}"
             parts.append(Part("held_dynamics", reads, writes, lambda: _held_dynamics(equations)))
@@ -190,6 +213,20 @@ def march_in_stages(equations: Equations, method: str, *, thorough: bool = False
     ends = _stepped(equations, method, s, s["w"], acceleration, thorough=thorough, dependences=dependences)
     known["squares"] = s["squares"]
     return (*parts, Part.of(f"{prefix}_end", known, _with_squares(s, *ends)))
+
+
+def parts_of(
+    equations: Equations, method: str, operations: Callable[[Part], int], *, thorough: bool = False, fed: bool = False
+) -> tuple[Part, ...]:
+    """Return the step in one part, or cut at its forward dynamics where these have too many operations for that.
+
+    The choice is the same on every processor and device, so that the bits are.
+    """
+    staged = march_in_stages(equations, method, thorough=thorough, fed=fed)
+    forward = next(part for part in staged if part.name in DYNAMICS)
+    if method_of(method).stages * operations(forward) > _ONE_PIECE:
+        return staged
+    return march(equations, method, thorough=thorough, fed=fed)
 
 
 def _held_dynamics(equations: Equations) -> ca.Function:
@@ -246,16 +283,19 @@ def _stepped(
 
 def _symbols(equations: Equations) -> dict[str, Any]:
     nq, nv = equations.model.nq, equations.model.nv
-    sizes = {"q": nq, "v": nv, "w": nv, "tau": equations.force.numel(), "dt": 1, "squares": 1}
+    sizes = {"q": nq, "v": nv, "w": nv, "tau": equations.force.numel(), "dt": 1, "squares": 1, LAW: nv * (1 + nq + nv)}
     return {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
 
 
-def _acceleration(equations: Equations, space: Space, s: dict[str, Any]) -> Callable[[Any, Any, Any], Any]:
+def _acceleration(
+    equations: Equations, space: Space, s: dict[str, Any], law: Any = None
+) -> Callable[[Any, Any, Any], Any]:
     forward = equations.function("forward_dynamics")
 
     def acceleration(t: Any, q: Any, w: Any) -> Any:
         v = space.to_body_velocity(q, w)
-        return space.acceleration(q, v, forward(q, v, s["tau"], *at_time(equations, t).values()))
+        tau = s["tau"] if law is None else s["tau"] + _fed(law, q, v)
+        return space.acceleration(q, v, forward(q, v, tau, *at_time(equations, t).values()))
 
     return acceleration
 

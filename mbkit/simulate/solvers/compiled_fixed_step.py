@@ -19,7 +19,7 @@ from mbkit._check import Array
 from mbkit.codegen.compiled import Call, KernelSequence, aligned, cores
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.steps.collocation import Collocation
-from mbkit.derivation.steps.fixed import Part
+from mbkit.derivation.steps.fixed import LAW, Part
 from mbkit.derivation.steps.midpoint import MOST
 from mbkit.engines.base import at_time
 from mbkit.engines.compiled_calls import Plan
@@ -240,9 +240,9 @@ class Chunk(BlockLoop):
             for part, code in zip(plan.parts, plan.codes, strict=True)
         ]
 
-    def begin(self, q: Array, w: Array, parameters: Array) -> None:
-        """Put in states, (n, nq) and (n, nv) of `Space`, and the values of parameters, (p,) or (n, p)."""
-        self._begin(parameters, q=q, w=w, squares=np.zeros((len(q), 1)))
+    def begin(self, q: Array, w: Array, parameters: Array, **more: Array) -> None:
+        """Put in states, (n, nq) and (n, nv) of `Space`, the values of parameters, (p,) or (n, p), and what is more."""
+        self._begin(parameters, q=q, w=w, squares=np.zeros((len(q), 1)), **more)
 
     def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
         self._hold(steps, dt, torques)
@@ -272,6 +272,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     space = Space(dyn.model)
     w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn.parameter_values
     clock = None if dyn.model.time_parameter is None else list(dyn.model.parameters).index(dyn.model.time_parameter)
+    law = problem.torque.feedback
     workers = workers or dyn.threads or cores()
     # Every block costs some calls: worth it for a state now and then, not for most.
     dense = 2 * len(record.kept) > grid.steps
@@ -280,7 +281,8 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
         return Chunk(plan, space, most, torques=problem.torque.held, all_kept=all_kept, watched=watched, clock=clock)
 
     def blocks(chunk: Chunk, members: Indices, ends: Indices) -> Iterator[tuple[int, dict[int, list[Array]]]]:
-        chunk.begin(problem.q[members], w0[members], values[members] if values.ndim == 2 else values)
+        more = {} if law is None else {LAW: law.numbers[None]}
+        chunk.begin(problem.q[members], w0[members], values[members] if values.ndim == 2 else values, **more)
         return run_blocks(problem, record, chunk, members, ends.tolist())
 
     def suspects_of(members: Indices, *, thorough: bool) -> Indices:
@@ -291,7 +293,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
 
             squares = step_on_device(problem, record, w0, members, thorough=thorough)
             return members[~(squares < BOUND**2)]
-        plan = dyn.step_plan(method, thorough=thorough)
+        plan = dyn.step_plan(method, thorough=thorough, fed=law is not None)
         parts = _split(n, _widest(plan), workers)
 
         def new_worker() -> Callable[[slice], Iterator[int]]:
@@ -317,7 +319,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
             # Near a singular pose stages are projected too, and the pose is named. The others of a batch are done.
             return run_fixed(problem, record, suspects)
     if len(suspects):
-        plan = dyn.step_plan(method)
+        plan = dyn.step_plan(method, fed=law is not None)
         for first in range(0, len(suspects), _widest(plan)):
             members = suspects[first : first + _widest(plan)]
             for _, last in blocks(new_chunk(plan, len(members), all_kept=True, watched=True), members, members[:0]):
@@ -326,6 +328,8 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     def why(i: int) -> str:
         k, (q, w) = int(record.steps[i]), lost[i]
         force = np.asarray(problem.torque.columns(np.array([i]), k, k + 1)[0][:, 0])
+        if law is not None:
+            force = law(grid.time(k), q, to_body_velocity(space, q, w))
         return divergence_reason(dyn.of_samples([i]), method, grid.time(k), grid.step(k), q[None], w[None], force[None])
 
     return record.result(why, method_of(method).stages * (int(record.steps.sum()) + len(lost)))

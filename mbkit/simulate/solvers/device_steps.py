@@ -32,7 +32,7 @@ def step_on_device(
     """
     dyn = problem.dyn
     assert isinstance(dyn, LagrangianDynamics)
-    steps = dyn.device_steps(problem.method, thorough=thorough)
+    steps = dyn.device_steps(problem.method, thorough=thorough, fed=problem.torque.feedback is not None)
     squares, start, size = np.zeros(len(members)), 0, len(members)
     while start < len(members):
         part = members[start : start + size]
@@ -68,6 +68,8 @@ def _run(
     arena.put("q", problem.q[members].T)
     arena.put("w", w0[members].T)
     arena.put("squares", np.zeros((1, 1)))
+    if torque.feedback is not None:
+        arena.share(torque.feedback.numbers)
     arena.put("parameters", values[members].T if values.ndim == 2 else values[:, None])
     # The last step may have a length of its own.
     stops = {*record.kept.tolist(), grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps} - {0}

@@ -1,0 +1,415 @@
+"""The GPU's programs, on a driver that runs them on the CPU: the calls, the arrays, and every bit.
+
+What a real GPU adds, `python -m validation.gpu` looks at.
+"""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import shutil
+import sys
+from types import ModuleType
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.codegen import simd_kernel
+from mbkit.codegen.cuda import arrays, driver
+from mbkit.codegen.cuda.arrays import DeviceArray
+from mbkit.codegen.cuda.kernels import kernel_code, steps_code
+from mbkit.codegen.program import program
+from mbkit.derivation import equations_of
+from mbkit.derivation.steps.fixed import STATE, march_in_stages
+from mbkit.errors import DeviceError, InputError, UnknownNameError, UnsupportedError
+from mbkit.simulate.solvers import compiled_fixed_step
+from tests.fake_cuda import FakeDriver, fake  # noqa: F401  # a fixture
+from tests.random_trees import random_tree
+from validation import gpu as study
+
+pytestmark = pytest.mark.usefixtures("fake")
+
+
+def both(model: mb.Model, **values: Any) -> tuple[Any, Any]:
+    """Return the same dynamics on the CPU and on the GPU."""
+    return tuple(mb.dynamics(model, "lagrangian", compile=True, device=x).at(**values) for x in (None, "cuda"))
+
+
+def on_gpu(x: np.ndarray, *, major: bool = False) -> DeviceArray:
+    return study.on_device(x, major=major)
+
+
+def varied_arm() -> mb.Model:
+    """Return two links whose masses and dampers are parameters."""
+    return mb.catalog.double_pendulum(mass1=mb.Parameter("m1", 1.0), mass2=mb.Parameter("m2", 2.0))
+
+
+MODELS = {
+    "a tree of every joint": lambda: random_tree(3),
+    "a floating tree": lambda: random_tree(5, 4, ("free", "revolute", "ball")),
+    "panda": lambda: mb.load("panda"),
+    "a loop": mb.catalog.four_bar,
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_quantity_has_the_bits_of_the_cpu(name: str) -> None:
+    model = MODELS[name]()
+    cpu, gpu = both(model)
+    given = study.states(model, 21)
+    if model.constrained:
+        given["q"], given["v"] = cpu.project(given["q"], given["v"])
+    for quantity, arguments in study.QUANTITIES.items():
+        if "derivatives" in quantity and name != "a loop":
+            continue
+        own = [given[x] for x in arguments]
+        want = study._parts(getattr(cpu, quantity)(*own))
+        for layout in (np.ascontiguousarray, np.asfortranarray, lambda x: on_gpu(x), lambda x: on_gpu(x, major=True)):
+            found = study._parts(getattr(gpu, quantity)(*map(layout, own)))
+            assert len(found) == len(want)
+            assert all(np.array_equal(a, b) for a, b in zip(found, want, strict=True)), (quantity, layout)
+
+
+def test_frames_and_derivatives_have_the_bits_of_the_cpu() -> None:
+    model = mb.load("ur5")
+    cpu, gpu = both(model)
+    q, v, a = study.states(model, 9).values()
+    for call in (
+        lambda d, *x: d.jacobian(x[0], "tool0"),
+        lambda d, *x: d.frame_pose(x[0], "tool0") if hasattr(d, "frame_pose") else d.gravity(x[0]),
+        lambda d, *x: d.forward_dynamics_derivatives(*x).tau,
+    ):
+        want = np.asarray(call(cpu, q, v, a))
+        assert np.array_equal(call(gpu, q, v, a), want)
+        assert np.array_equal(np.asarray(call(gpu, *(on_gpu(x, major=True) for x in (q, v, a)))), want)
+
+
+def test_one_state_runs_on_the_cpu(fake: FakeDriver) -> None:  # noqa: F811
+    model = mb.load("ur5")
+    cpu, dyn = both(model)
+    q, v, a = (x[0] for x in study.states(model, 1).values())
+    fake.calls.clear()
+    assert np.array_equal(dyn.forward_dynamics(q, v, a), cpu.forward_dynamics(q, v, a))
+    assert "cuLaunchKernel" not in fake.calls
+
+
+def test_an_array_of_one_state_on_the_gpu_gives_one_of_its_shape() -> None:
+    model = mb.load("ur5")
+    cpu, gpu = both(model)
+    q, v, a = (x[0] for x in study.states(model, 1).values())
+    out = gpu.forward_dynamics(on_gpu(q[None])[0], v, a)
+    assert out.shape == (6,)
+    assert np.array_equal(out.numpy(), cpu.forward_dynamics(q[None], v[None], a[None])[0])
+
+
+def test_a_program_in_pieces_has_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = mb.load("panda")
+    cpu, gpu = both(model)
+    q, v, a = study.states(model, 9).values()
+    want = cpu.forward_dynamics(q, v, a)
+    monkeypatch.setattr(simd_kernel, "_WHOLE", 300)
+    monkeypatch.setattr(simd_kernel, "_PIECE", 200)
+    assert np.array_equal(gpu.forward_dynamics(q, v, a), want)
+
+
+def without_reruns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the GPU loses would be run again on the CPU, and be right."""
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("the CPU runs it again")
+
+    monkeypatch.setattr(compiled_fixed_step, "Chunk", refuse)
+
+
+TORQUES = {
+    "none": lambda _model, _n, _steps: None,
+    "constant": lambda model, _n, _steps: np.linspace(-1, 1, model.nv),
+    "each step's": lambda model, _n, steps: np.random.default_rng(1).normal(size=(steps, model.nv)),
+    "each step's of each run": lambda model, n, steps: np.random.default_rng(2).normal(size=(n, steps, model.nv)),
+    "feedback": lambda model, _n, _steps: mb.simulate.StateFeedback(
+        np.random.default_rng(3).normal(size=(model.nv, model.nq + model.nv)), torque=np.ones(model.nv)
+    ),
+}
+
+
+@pytest.mark.parametrize("torque", TORQUES)
+@pytest.mark.parametrize("name", ["a floating tree", "panda"])
+@pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler"])
+def test_runs_have_the_bits_of_the_cpu(name: str, method: str, torque: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, n, steps = MODELS[name](), 7, 21
+    cpu, gpu = both(model)
+    q, v, _ = study.states(model, n).values()
+    tau = TORQUES[torque](model, n, steps)
+    # The last step is shorter.
+    run = {"duration": 0.0205, "dt": 1e-3, "save": 8, "torque": tau, "doubt": False, "method": method}
+    want = mb.simulate(cpu, q, 0.1 * v, **run)
+    assert np.isfinite(want.q).all()
+    without_reruns(monkeypatch)
+    found = mb.simulate(gpu, q, 0.1 * v, **run)
+    assert np.array_equal(found.q, want.q)
+    assert np.array_equal(found.v, want.v)
+    assert np.array_equal(found.t, want.t)
+
+
+def test_runs_of_a_loop_have_the_bits_of_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = mb.catalog.four_bar()
+    cpu, gpu = both(model)
+    q, v = cpu.project(*model.random_state(0))
+    start = np.tile(q, (3, 1)), np.outer([0.5, 1.0, 2.0], v)
+    run = {"duration": 0.02, "dt": 1e-3, "save": 5, "method": "rk4", "doubt": False}
+    want = mb.simulate(cpu, *start, **run)
+    without_reruns(monkeypatch)
+    found = mb.simulate(gpu, *start, **run)
+    assert np.array_equal(found.q, want.q)
+
+
+def test_each_sample_may_have_parameters_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    n = 11
+    values = {"m1": np.linspace(0.5, 2, n), "m2": np.linspace(3, 1, n)}
+    cpu, gpu = both(varied_arm(), **values)
+    q, v, a = study.states(varied_arm(), n).values()
+    want = cpu.forward_dynamics(q, v, a)
+    assert np.array_equal(gpu.forward_dynamics(q, v, a), want)
+    assert np.array_equal(gpu.forward_dynamics(on_gpu(q), on_gpu(v), on_gpu(a)).numpy(), want)
+    # One value for all is one number on the GPU.
+    assert np.array_equal(*(d.at(m1=1.5, m2=2.0).forward_dynamics(q, v, a) for d in (cpu, gpu)))
+    runs = [{"duration": 0.01, "dt": 1e-3, "save": 10, "method": "rk4", "doubt": False}] * 2
+    want = mb.simulate(cpu, q, v, **runs[0])
+    without_reruns(monkeypatch)
+    assert np.array_equal(mb.simulate(gpu, q, v, **runs[1]).q, want.q)
+
+
+def test_a_run_that_diverges_ends_as_on_the_cpu() -> None:
+    model = random_tree(5, 4, ("free", "revolute", "ball"))
+    q, v, _ = study.states(model, 4).values()
+    v[2] *= 1e4
+    ends = [mb.simulate(d, q, v, 1.0, "rk4", dt=0.05, save=20, doubt=False) for d in both(model)]
+    assert ends[0].stats.message == ends[1].stats.message != ""
+    assert np.array_equal(ends[0].q, ends[1].q, equal_nan=True)
+    assert ends[0].stats.reached == ends[1].stats.reached
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("where", [np.asarray, on_gpu])
+def test_numbers_that_are_not_finite_are_named(bad: float, where: Any) -> None:
+    model = mb.load("ur5")
+    _, gpu = both(model)
+    q, v, a = study.states(model, 5).values()
+    v[3, 1] = bad
+    with pytest.raises(InputError, match=r"v: (nan|inf) at index \(3, 1\)"):
+        gpu.forward_dynamics(where(q), where(v), where(a))
+
+
+def test_a_quaternion_that_is_not_of_unit_length_is_named() -> None:
+    model = random_tree(5, 4, ("free", "revolute", "ball"))
+    cpu, gpu = both(model)
+    q, v, a = study.states(model, 5).values()
+    start, _ = model.quaternions[-1]
+    q[4, start : start + 4] *= 1.01
+    for d, given in ((cpu, (q, v, a)), (gpu, (q, v, a)), (gpu, map(on_gpu, (q, v, a)))):
+        with pytest.raises(InputError, match="quaternion"):
+            d.forward_dynamics(*given)
+
+
+def test_arrays_of_a_wrong_shape_or_type_are_refused() -> None:
+    model = mb.load("ur5")
+    _, gpu = both(model)
+    q, v, a = study.states(model, 5).values()
+    with pytest.raises(InputError, match=r"v: expected shape \(6,\) or \(5, 6\), got \(4, 6\)"):
+        gpu.forward_dynamics(on_gpu(q), on_gpu(v[:4]), a)
+
+    class Single(Foreign):
+        @property
+        def __cuda_array_interface__(self) -> dict[str, Any]:
+            return super().__cuda_array_interface__ | {"typestr": "<f4"}
+
+    with pytest.raises(InputError, match="q: expected float64 on the GPU of the dynamics, got <f4"):
+        gpu.forward_dynamics(Single(on_gpu(q)), v, a)
+    with pytest.raises(UnsupportedError, match="a_quantity_of_the_host takes arrays of the host"):
+        gpu._evaluate("a_quantity_of_the_host", q=on_gpu(q))
+
+
+class Foreign:
+    """An array of a library that knows Numba's protocol alone."""
+
+    def __init__(self, x: DeviceArray) -> None:
+        self.x = x
+
+    @property
+    def __cuda_array_interface__(self) -> dict[str, Any]:
+        return self.x.__cuda_array_interface__
+
+    def get(self) -> np.ndarray:
+        return self.x.numpy()
+
+
+def test_arrays_come_and_go_by_numba_s_protocol(fake: FakeDriver) -> None:  # noqa: F811
+    model = mb.load("ur5")
+    cpu, dyn = both(model)
+    q, v, a = study.states(model, 5).values()
+    for major in (False, True):
+        arrays = [Foreign(on_gpu(x, major=major)) for x in (q, v, a)]
+        fake.calls.clear()
+        out = dyn.forward_dynamics(*arrays)
+        # The flags alone cross over.
+        assert [fake.calls.count(f"cuMemcpy{x}Async") for x in ("HtoD", "DtoH")] == [1, 1]
+        assert isinstance(out, DeviceArray)
+        assert np.array_equal(np.asarray(out), cpu.forward_dynamics(q, v, a))
+
+
+def test_results_are_arrays_of_the_library_that_gave_the_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
+    library = ModuleType("fakelib")
+
+    class Tensor:
+        __module__ = "fakelib.inside"
+
+        def __init__(self, x: Any) -> None:
+            self.x = x
+
+        def __dlpack_device__(self) -> tuple[int, int]:
+            return self.x.__dlpack_device__()
+
+        def __dlpack__(self, stream: int) -> Any:
+            assert stream == 1
+            return self.x.__dlpack__(stream=stream)
+
+    library.from_dlpack = Tensor  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "fakelib", library)
+    model = mb.load("ur5")
+    cpu, gpu = both(model)
+    q, v, a = study.states(model, 5).values()
+    out = gpu.mass_matrix(Tensor(on_gpu(q, major=True)))
+    assert isinstance(out, Tensor)
+    assert np.array_equal(out.x.numpy(), cpu.mass_matrix(q))
+    # Other arguments may stay on the host.
+    assert np.array_equal(gpu.forward_dynamics(Tensor(on_gpu(q)), v, a).x.numpy(), cpu.forward_dynamics(q, v, a))
+
+
+def test_dlpack_hands_over_what_is_there_and_takes_it_back(fake: FakeDriver) -> None:  # noqa: F811
+    x = np.arange(24.0).reshape(2, 3, 4)
+    array = DeviceArray.empty(driver.device_of("cuda"), (2, 12), major=False)
+    with array._device.current():
+        array._device.upload(x, array._address)
+    shaped = array.seen(lambda y: y.reshape(2, 3, 4)).seen(lambda y: y.swapaxes(1, 2))
+    assert np.array_equal(shaped.numpy(), x.swapaxes(1, 2))
+    assert np.array_equal(shaped[1].numpy(), x.swapaxes(1, 2)[1])
+    assert (len(shaped), shaped.ndim, shaped.shape) == (2, 3, (2, 4, 3))
+
+    class OnHost:
+        """NumPy reads the memory of the host alone, where the fake driver's is."""
+
+        def __dlpack_device__(self) -> tuple[int, int]:
+            return 1, 0
+
+        def __dlpack__(self, **_: Any) -> Any:
+            capsule = handed.pop().__dlpack__()
+            address = arrays._API.PyCapsule_GetPointer(capsule, arrays._NAME)
+            arrays._Managed.from_address(address).tensor.device_type = 1
+            return capsule
+
+    handed = [shaped]
+    taken = np.from_dlpack(OnHost())
+    assert np.array_equal(taken, x.swapaxes(1, 2))
+    del array, shaped
+    assert fake.left
+    del taken, OnHost
+    gc.collect()
+    assert not fake.left
+
+
+def test_a_batch_too_large_for_the_gpu_goes_in_parts(fake: FakeDriver) -> None:  # noqa: F811
+    fake.room = 20_000
+    model = mb.load("ur5")
+    cpu, gpu = both(model)
+    q, v, a = study.states(model, 300).values()
+    assert np.array_equal(gpu.forward_dynamics(q, v, a), cpu.forward_dynamics(q, v, a))
+    assert fake.calls.count("cuLaunchKernel") > 1
+    assert not fake.left
+    runs = [mb.simulate(d, q, v, 5e-3, "rk4", dt=1e-3, save=5, doubt=False) for d in (cpu, gpu)]
+    assert np.array_equal(runs[0].q, runs[1].q)
+    assert not fake.left
+    fake.room = 64
+    with pytest.raises(DeviceError, match="device: out of memory"):
+        gpu.forward_dynamics(q[:2], v[:2], a[:2])
+    assert not fake.left
+
+
+def test_machine_code_is_kept_on_disk(fake: FakeDriver, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:  # noqa: F811
+    monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path / "kept"))
+    model = random_tree(17, 3, ("revolute",))
+    q, v, a = study.states(model, 3).values()
+    for made in (1, 0):
+        fake.calls.clear()
+        _, dyn = both(model)
+        dyn.forward_dynamics(q, v, a)
+        mb.simulate(dyn, q, v, 2e-3, "rk4", dt=1e-3, save=2, doubt=False)
+        assert fake.calls.count("cuLinkComplete") == 2 * made
+        del dyn
+        equations_of(model).kept.pop("device", None)
+
+
+def test_pickled_dynamics_come_back_on_the_gpu() -> None:
+    model = mb.load("ur5")
+    _, gpu = both(model)
+    again = pickle.loads(pickle.dumps(gpu))
+    assert again.device == gpu.device == "cuda:0"
+    q, v, a = study.states(model, 3).values()
+    assert np.array_equal(again.forward_dynamics(q, v, a), gpu.forward_dynamics(q, v, a))
+
+
+@pytest.mark.parametrize("name", ["gpu", "cuda:", "cuda:x", "", 3])
+def test_other_devices_are_unknown(name: Any) -> None:
+    with pytest.raises(UnknownNameError, match="device"):
+        mb.dynamics(mb.load("ur5"), "lagrangian", device=name)
+
+
+def test_a_gpu_that_is_not_there_is_named() -> None:
+    with pytest.raises(UnsupportedError, match="device: expected one of 1 NVIDIA GPUs, numbered from 0; got 1"):
+        mb.dynamics(mb.load("ur5"), "lagrangian", device="cuda:1")
+    with pytest.raises(InputError, match="device: expected None where nothing is compiled"):
+        mb.dynamics(mb.load("ur5"), "lagrangian", device="cuda", compile=False)
+
+
+@pytest.mark.parametrize(
+    ("failing", "message"),
+    [
+        (lambda *_: (100,), "device: cuInit failed with 100"),
+        (lambda *_: (_ for _ in ()).throw(RuntimeError("no libcuda")), "this machine has no NVIDIA driver"),
+    ],
+)
+def test_what_the_driver_lacks_is_said(failing: Any, message: str, fake: FakeDriver) -> None:  # noqa: F811
+    fake.cuInit = failing  # type: ignore[method-assign]
+    with pytest.raises((DeviceError, UnsupportedError), match=message):
+        mb.dynamics(mb.load("ur5"), "lagrangian", device="cuda")
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    driver.driver.cache_clear()
+    monkeypatch.setitem(sys.modules, "cuda.bindings", None)
+    with pytest.raises(UnsupportedError, match=r"cuda-bindings is not installed; pip install 'mbkit\[cuda\]'"):
+        driver.driver()
+    driver.driver.cache_clear()
+
+
+def test_functions_without_a_counterpart_are_named() -> None:
+    x = ca.SX.sym("x")
+    with pytest.raises(UnsupportedError, match="device: exp, tan of this model"):
+        kernel_code(program(ca.Function("f", [x], [ca.exp(x) + ca.tan(x)])))
+
+
+@pytest.mark.skipif(study.ptxas_path() is None, reason="ptxas of nvidia-cuda-nvcc is not installed")
+@pytest.mark.parametrize("target", ["sm_80", "sm_90"])
+def test_ptx_is_assembled_for_real_gpus(target: str) -> None:
+    model = mb.load("ur5")
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    ptxas = study.ptxas_path() or shutil.which("ptxas") or ""
+    forward = kernel_code(program(dyn.equations.function("forward_dynamics")).fused)[0]
+    found = study.assemble(forward, target, ptxas)
+    assert found["registers"] <= 255
+    assert found["spilled"] == 0
+    steps = steps_code(march_in_stages(dyn.equations, "rk4", fed=True), STATE)[0]
+    assert study.assemble(steps, target, ptxas)["registers"] <= 255
