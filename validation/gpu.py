@@ -152,15 +152,20 @@ def steps(model: mb.Model, n: int = 2**18, count: int = 1000) -> dict[str, Any]:
     given = states(model, n)
     v, dt = 0.1 * given["v"], 1e-4
     count //= 4 if model.nv > 10 else 1
+    gain = np.random.default_rng(1).normal(size=(model.nv, model.nq + model.nv))
+    out: dict[str, Any] = {"states": n, "steps": count, "differ": 0}
+    for name, torque in (("constant torque", given["a"][0]), ("state feedback", mb.simulate.StateFeedback(gain))):
 
-    def run(dyn: Any, m: int, k: int) -> Any:
-        return mb.simulate(dyn, given["q"][:m], v[:m], k * dt, "rk4", dt=dt, torque=given["a"][0], save=k, doubt=False)
+        def run(dyn: Any, m: int, k: int, tau: Any = torque) -> Any:
+            start = given["q"][:m], v[:m]
+            return mb.simulate(dyn, *start, k * dt, "rk4", dt=dt, torque=tau, save=k, doubt=False)
 
-    ours, theirs = (run(d, 2000, 50) for d in (gpu, cpu))
-    run(gpu, n, 8)
-    began = time.perf_counter()
-    run(gpu, n, count)
-    whole = time.perf_counter() - began
+        ours, theirs = (run(d, min(n, 2000), 50) for d in (gpu, cpu))
+        out["differ"] += int(np.count_nonzero(ours.q != theirs.q) + np.count_nonzero(ours.v != theirs.v))
+        run(gpu, n, 8)
+        began = time.perf_counter()
+        run(gpu, n, count)
+        out[f"a second, {name}"] = n * count / (time.perf_counter() - began)
     made = gpu.device_steps("rk4")
     with made.arena(n) as arena:
         arena.put("q", given["q"].T)
@@ -168,14 +173,8 @@ def steps(model: mb.Model, n: int = 2**18, count: int = 1000) -> dict[str, Any]:
         arena.put("squares", np.zeros((1, 1)))
         arena.put("dt", np.full((1, 1), dt))
         force = np.zeros((1, model.nv, 1))
-        time_of_steps = seconds(lambda: arena.take_steps(100, force), times=3)
-    return {
-        "states": n,
-        "steps": count,
-        "steps a second": 100 * n / time_of_steps,
-        "with simulate": n * count / whole,
-        "differ": int(np.count_nonzero(ours.q != theirs.q) + np.count_nonzero(ours.v != theirs.v)),
-    }
+        out["a second, in one launch"] = 100 * n / seconds(lambda: arena.take_steps(100, force), times=3)
+    return out
 
 
 _FIRST = """
@@ -318,48 +317,73 @@ def ptxas_path() -> str | None:
     return shutil.which("ptxas")
 
 
+def measured(keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """Return all that needs a GPU; what is done is kept after each part, and a part that fails stops no other."""
+    began = time.perf_counter()
+    models = {name: loaded(name) for name in ROBOTS}
+    out: dict[str, Any] = {"device": device_of("cuda").title, "CPU cores": cores()}
+    robots: dict[str, Callable[[str], Any]] = {
+        "first calls, s": first_calls,
+        "same": lambda name: same(models[name]),
+        "against the oracle": lambda name: against_oracle(models[name]),
+        "rk4": lambda name: steps(models[name]),
+        "rates": lambda name: [*rates(models[name])],
+    }
+    alone: dict[str, Callable[[], Any]] = {
+        "edges": lambda: edges(models["ur5"]),
+        "exchange": lambda: exchange(models["ur5"]),
+        "varied": varied,
+    }
+    parts = [(key, "", call) for key, call in alone.items()]
+    parts += [(key, name, partial(call, name)) for key, call in robots.items() for name in ROBOTS]
+    for key, name, call in parts:
+        try:
+            found = call()
+        except Exception as error:  # the next part may have nothing to do with it
+            found = None
+            out.setdefault("failed", {})[f"{key} {name}"] = f"{type(error).__name__}: {error}"
+        if name:
+            out.setdefault(key, {})[name] = found
+        else:
+            out[key] = found
+        print(f"{time.perf_counter() - began:6.1f} s  {key} {name}: {found}", flush=True)
+        keep(out)
+    return out | {"seconds": time.perf_counter() - began}
+
+
+def wrong(data: dict[str, Any]) -> list[str]:
+    """Return what is not as it must be."""
+    out = [f"{part}: {why}" for part, why in data.get("failed", {}).items()]
+    out += [f"{edge}: not as on the CPU" for edge, good in (data.get("edges") or {}).items() if not good]
+    rows = [(name, row) for name, each in data.get("same", {}).items() for row in (each or {}).values()]
+    rows += [*data.get("rk4", {}).items(), ("varied", data.get("varied"))]
+    return out + [
+        f"{name}: {row['differ']} numbers differ from the CPU's" for name, row in rows if row and row["differ"]
+    ]
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print and write; return 1 where a number is wrong."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--assemble", action="store_true", help="only registers and spilled bytes, by ptxas")
     chosen = parser.parse_args(arguments)
     data = json.loads(DATA.read_text()) if DATA.exists() else {}
+
+    def keep(found: dict[str, Any]) -> None:
+        DATA.write_text(json.dumps({**data, **found, "made": stamp()}, indent=1) + "\n")
+
     if chosen.assemble:
-        data["assembled"] = assembled(ptxas_path() or "ptxas")
+        path = ptxas_path()
+        if path is None:
+            raise SystemExit("ptxas is not installed: pip install nvidia-cuda-nvcc")
+        found = {"assembled": assembled(path)}
     else:
-        data |= measured()
-    DATA.write_text(json.dumps({**data, "made": stamp()}, indent=1) + "\n")
-    print(json.dumps(data, indent=1))
-    differ = sum(row["differ"] for each in data.get("same", {}).values() for row in each.values())
-    differ += data.get("varied", {}).get("differ", 0) + sum(row["differ"] for row in data.get("rk4", {}).values())
-    return int(differ > 0 or not all(data.get("edges", {}).values()))
-
-
-def measured() -> dict[str, Any]:
-    """Return all that needs a GPU."""
-    began = time.perf_counter()
-    device = device_of("cuda")
-    out: dict[str, Any] = {"device": device.title, "CPU cores": cores()}
-    models = {name: loaded(name) for name in ROBOTS}
-
-    def say(what: str) -> None:
-        print(f"{time.perf_counter() - began:6.1f} s  {what}", flush=True)
-
-    for key, what in (
-        ("first calls, s", lambda name, _: first_calls(name)),
-        ("same", lambda _, model: same(model)),
-        ("against the oracle", lambda _, model: against_oracle(model)),
-        ("rates", lambda _, model: [*rates(model)]),
-        ("rk4", lambda _, model: steps(model)),
-    ):
-        out[key] = {}
-        for name, model in models.items():
-            out[key][name] = what(name, model)
-            say(f"{key}: {name}: {out[key][name]}")
-    out["edges"], out["exchange"], out["varied"] = edges(models["ur5"]), exchange(models["ur5"]), varied()
-    say(f"{out['edges']} {out['exchange']} {out['varied']}")
-    out["seconds"] = time.perf_counter() - began
-    return out
+        data.pop("failed", None)
+        found = measured(keep)
+    keep(found)
+    bad = wrong({**data, **found})
+    print("\n".join(bad) or "every number is as on the CPU")
+    return int(bool(bad))
 
 
 if __name__ == "__main__":
