@@ -55,6 +55,7 @@ PARTS = {
     "bench_rollouts": Part(5, ("rollouts.json",), "batches of rollouts, beside mujoco.rollout"),
     "bench_trajectory": Part(5, ("trajectory.json",), "one trajectory to an error of 1e-9"),
     "bench_derivation": Part(1, ("derivation.json",), "equations to read, beside sympy.physics.mechanics"),
+    "gpu": Part(4, ("gpu.json",), "the own derivation on an NVIDIA GPU, which it needs"),
     "checks_cost": Part(3, ("checks_cost.json",), "the checks after a run"),
     "work_precision": Part(14, ("work_precision.json",), "error against run time of ten scenes"),
 }

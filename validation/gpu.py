@@ -321,7 +321,7 @@ def measured(keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """Return all that needs a GPU; what is done is kept after each part, and a part that fails stops no other."""
     began = time.perf_counter()
     models = {name: loaded(name) for name in ROBOTS}
-    out: dict[str, Any] = {"device": device_of("cuda").title, "CPU cores": cores()}
+    out: dict[str, Any] = {"made": stamp(), "device": device_of("cuda").title, "CPU cores": cores()}
     robots: dict[str, Callable[[str], Any]] = {
         "first calls, s": first_calls,
         "same": lambda name: same(models[name]),
@@ -370,15 +370,15 @@ def main(arguments: list[str] | None = None) -> int:
     data = json.loads(DATA.read_text()) if DATA.exists() else {}
 
     def keep(found: dict[str, Any]) -> None:
-        DATA.write_text(json.dumps({**data, **found, "made": stamp()}, indent=1) + "\n")
+        DATA.write_text(json.dumps({**data, **found}, indent=1) + "\n")
 
     if chosen.assemble:
         path = ptxas_path()
         if path is None:
             raise SystemExit("ptxas is not installed: pip install nvidia-cuda-nvcc")
-        found = {"assembled": assembled(path)}
+        found = {"assembled": {"made": stamp(), **assembled(path)}}
     else:
-        data.pop("failed", None)
+        data = {"assembled": data.get("assembled", {})}
         found = measured(keep)
     keep(found)
     bad = wrong({**data, **found})

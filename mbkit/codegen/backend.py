@@ -76,12 +76,12 @@ def executable(
     *,
     compile: bool,  # noqa: A002  # the word that users look for
     device: str | None = None,
-    quaternions: Sequence[int] = (),
+    quaternions: Sequence[int] | None = None,
 ) -> Compiled | Machine:
     """Return a function ready to run; `name` is all that it depends on but mbkit's code, `make` derives it.
 
     Without a compiler a `NoCompilerWarning` says so once, and CasADi's interpreter runs it, as it does very large
-    functions. Batches run on a `device`; `quaternions` begin at these places of the first argument.
+    functions. Batches of a quantity run on a `device`; its `quaternions` begin at these places of the first argument.
     """
     if not compile or not has_compiler():
         return Machine(_DERIVED.get(name, make))
@@ -94,16 +94,15 @@ def executable(
             raise _TooLargeError(function)
         return function
 
+    if device is not None:
+        from mbkit.codegen.cuda.driver import device_of
+        from mbkit.codegen.cuda.runs import on_device
+
+        return on_device(name, make, device_of(device), quaternions)
     try:
-        code = compiled(name, checked)
+        return compiled(name, checked)
     except _TooLargeError as error:
         return Machine(error.args[0])
-    if device is None:
-        return code
-    from mbkit.codegen.cuda.driver import device_of
-    from mbkit.codegen.cuda.runs import on_device
-
-    return on_device(name, make, code, device_of(device), quaternions)
 
 
 def is_on_device(x: Any) -> bool:

@@ -60,6 +60,9 @@ def _cache_line_offset(arrays: Sequence[Array], first: int, last: int) -> int:
 class Compiled:
     """Machine code of a function whose arguments are vectors."""
 
+    #: The GPU on which batches run, if any.
+    device: Any = None
+
     def __init__(self, about: dict[str, Any], code: bytes) -> None:
         #: Entries of each argument, and rows and columns of each result.
         self.inputs = tuple(about["inputs"])

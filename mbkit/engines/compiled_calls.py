@@ -48,7 +48,11 @@ def quantity_call(model: Model, code: Compiled, trim: Callable[[Array], Array], 
     # More axes than before are a view with the entries in another order.
     ordered = len(shape) <= raw.ndim
     results = {"result": shape if ordered else raw.shape}
-    single = python_call([(code, [*inputs], [*results])], inputs, results, starts)
+
+    def of_a_state() -> Call:
+        return python_call([(code, [*inputs], [*results])], inputs, results, starts)
+
+    single = of_a_state() if code.device is None else _at_first_state(of_a_state)
 
     def batch(*given: Any) -> Any:
         if not _is_batch(given, sizes, starts):
@@ -57,6 +61,20 @@ def quantity_call(model: Model, code: Compiled, trim: Callable[[Array], Array], 
         return trim(results[0]) if finite else None
 
     return QuantityCall(single, batch, (lambda x: x) if ordered else trim)
+
+
+def _at_first_state(make: Callable[[], Call]) -> Call:
+    """Return a call of one state that is made when one comes: dynamics on a GPU may never see one."""
+    made: list[Call] = []
+
+    def call(*given: Any) -> Any:
+        if type(given[0]) is not np.ndarray or given[0].ndim != 1:
+            return None
+        if not made:
+            made.append(make())
+        return made[0](*given)
+
+    return call
 
 
 def _is_batch(given: Sequence[Any], sizes: Sequence[int], starts: Sequence[int]) -> bool:

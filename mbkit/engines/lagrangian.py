@@ -134,6 +134,9 @@ class LagrangianDynamics(Dynamics):
         for a few evaluations. By default compiled, unless the environment says ``MBKIT_COMPILE=0``.
     threads : int, optional
         Threads that share a large batch; by default as many as the process has cores.
+    device : {"cuda", "cuda:1", ...}, optional
+        An NVIDIA GPU on which batches of quantities and their fixed steps run, to the same bits; single states and all
+        else stay on the CPU. `UnsupportedError` says what is missing for it.
     elimination : {"links", "mass matrix", "least constraint"}, optional
         What accelerations come from; by default the first, or the last where the first would lose digits.
 
@@ -222,8 +225,7 @@ class LagrangianDynamics(Dynamics):
                 return self.equations.function(name)
 
             with DERIVING:
-                # Of the last argument of a quantity with frames or joints nothing is known.
-                starts = [start for start, _ in self.model.quaternions] if name in _TRIM else []
+                starts = [start for start, _ in self.model.quaternions] if name in _TRIM else None
                 named = self.form, *map(str, key)
                 code = executable(named, derive, compile=self.compile, device=self.device, quaternions=starts)
             if name in _TRIM and not isinstance(code, Machine):

@@ -252,7 +252,8 @@ def dynamics(model: Model, engine: str | EngineVersion = PINOCCHIO, **options: A
         measuring the others; or an engine of `register_engine`; or another version of an engine, from
         `mbkit.engine` or by its name, such as ``"mujoco==3.12.0"``.
     **options
-        The lagrangian engine's ``compile=`` (True or False) and ``threads=``; MuJoCo's ``solref=`` and ``solimp=`` of
+        The lagrangian engine's ``compile=`` (True or False), ``threads=`` and ``device=`` ("cuda" for batches on an
+        NVIDIA GPU); MuJoCo's ``solref=`` and ``solimp=`` of
         the soft constraints that hold loops; other engines have none.
 
     Returns

@@ -75,7 +75,8 @@ def simulate(
     torque : array_like or callable, optional
         Generalized force τ: (nv,) all the time; (steps, nv) or (N, steps, nv), held over each step (for an adaptive
         method, each interval of `save`, which then runs from `t0` to the end); or a function of (t, q, v) that
-        returns (nv,), called for one state at a time, at each stage; a controller that samples takes `hold`.
+        returns (nv,), called for one state at a time, at each stage; a controller that samples takes `hold`. A
+        `StateFeedback` is such a function too, which fixed steps on the own derivation evaluate in machine code.
     save : int or (K,) array_like, optional
         Which states to keep: every n-th and the last, or those at these times (for a fixed step, multiples of it after
         `t0`); by default all. An adaptive method takes times alone; a batch needs them, and so does ``"cvodes"``.

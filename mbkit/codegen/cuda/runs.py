@@ -19,7 +19,7 @@ from mbkit._check import Array
 from mbkit._version import __version__
 from mbkit.codegen import disk_cache as disk
 from mbkit.codegen import jit
-from mbkit.codegen.compiled import Compiled
+from mbkit.codegen.compiled import Compiled, compiled
 from mbkit.codegen.cuda.driver import CUDA, Device, OutOfMemoryError
 from mbkit.codegen.cuda.kernels import BATCH, STEPS, kernel_code, steps_code
 from mbkit.codegen.program import program
@@ -36,15 +36,30 @@ class Place(NamedTuple):
 
 
 class OnDevice(Compiled):
-    """A function of vectors whose batches run on a GPU, and whose single states run on the CPU."""
+    """A function of vectors whose batches run on a GPU, and whose single states run on the CPU.
 
-    def __init__(self, host: Compiled, device: Device, kernel: Callable[[], _Kernel]) -> None:
-        vars(self).update({k: x for k, x in vars(host).items() if k != "_single"})
-        self.device, self._make = device, kernel
+    Either's code is made at its first use; `first` says whose knows of arguments and results.
+    """
+
+    device: Device
+
+    def __init__(self, device: Device, kernel: Callable[[], _Kernel], host: Callable[[], Compiled], first: str) -> None:
+        self.device, self._make_kernel, self._make_host, self._first = device, kernel, host, first
 
     @cached_property
     def _kernel(self) -> _Kernel:
-        return self._make()
+        return self._make_kernel()
+
+    @cached_property
+    def _host(self) -> Compiled:
+        return self._make_host()
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("inputs", "shapes", "operations"):
+            return getattr(self._kernel if self._first == CUDA else self._host, name)
+        if name in ("loaded", "share", "work_size", "_local"):
+            return getattr(self._host, name)
+        raise AttributeError(name)
 
     def run(self, inputs: Sequence[Array], outputs: Sequence[Array], threads: int | None = None) -> bool:  # noqa: ARG002
         """Fill (N, n) outputs, as `Compiled.run` does; where the GPU has no room, part after part."""
@@ -114,6 +129,8 @@ class _Kernel:
 
     def __init__(self, device: Device, about: dict[str, Any], code: bytes) -> None:
         self.device, self._work = device, int(about["work"])
+        self.inputs, self.operations = tuple(about["inputs"]), int(about["operations"])
+        self.shapes = tuple((r, c) for r, c in about["shapes"])
         self._module, self._function = device.load(code, BATCH)
 
     def launch(self, inputs: Sequence[Place], outputs: Sequence[Place], n: int, taken: Callable[[int], int]) -> bool:
@@ -130,20 +147,26 @@ _HELD: Final[WeakValueDictionary[str, _Kernel]] = WeakValueDictionary()
 
 
 def on_device(
-    name: Sequence[str], make: Callable[[], ca.Function], host: Compiled, device: Device, quaternions: Sequence[int]
+    name: Sequence[str], make: Callable[[], ca.Function], device: Device, quaternions: Sequence[int] | None
 ) -> OnDevice:
-    """Return a compiled function whose batches run on a GPU; the names are those of `compiled`."""
+    """Return a compiled function whose batches run on a GPU; the names are those of `compiled`.
+
+    `quaternions` begin at these places of the first argument; None of a function that is no quantity, which batches
+    may never see.
+    """
 
     def kernel() -> tuple[dict[str, Any], bytes]:
-        text, work = kernel_code(program(make()).fused, quaternions)
-        return {"work": work}, device.machine_code(text)
+        made = program(make()).fused
+        text, work = kernel_code(made, quaternions or ())
+        about = {"inputs": made.inputs, "shapes": made.shapes, "operations": made.arithmetic, "work": work}
+        return about, device.machine_code(text)
 
     def held() -> _Kernel:
         with jit.COMPILING:
-            key = _key("batch", [*name, *map(str, quaternions)], device)
+            key = _key("batch", [*name, *map(str, quaternions or ())], device)
             return disk.cached(key, _HELD, lambda *found: _Kernel(device, *found), kernel)
 
-    return OnDevice(host, device, held)
+    return OnDevice(device, held, lambda: compiled(name, make), "" if quaternions is None else CUDA)
 
 
 def _key(kind: str, name: Sequence[str], device: Device) -> str:

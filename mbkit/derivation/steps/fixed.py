@@ -224,7 +224,8 @@ def parts_of(
     """
     staged = march_in_stages(equations, method, thorough=thorough, fed=fed)
     forward = next(part for part in staged if part.name in DYNAMICS)
-    if method_of(method).stages * operations(forward) > _ONE_PIECE:
+    law = equations.model.nv * (equations.model.nq + equations.model.nv) if fed else 0
+    if method_of(method).stages * (operations(forward) + law) > _ONE_PIECE:
         return staged
     return march(equations, method, thorough=thorough, fed=fed)
 
