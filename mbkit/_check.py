@@ -164,3 +164,29 @@ def axes_named(axes: str) -> str:
     if axes not in AXES:
         raise InputError(f"axes: expected one of {', '.join(map(repr, AXES))}, got {axes!r}")
     return axes
+
+
+# Arrays on a GPU
+
+#: A GPU's kind in DLPack (kDLCUDA).
+GPU: Final = 2
+
+
+def is_on_device(x: Any) -> bool:
+    """Return whether an argument says that it is an array on a GPU."""
+    if isinstance(x, (np.ndarray, float, int, list, tuple)):
+        return False
+    if hasattr(x, "__cuda_array_interface__"):
+        return True
+    return hasattr(x, "__dlpack_device__") and int(x.__dlpack_device__()[0]) == GPU
+
+
+def on_host(x: Any) -> Any:
+    """Return an array on a GPU as one of NumPy's, and anything else as it is."""
+    if not is_on_device(x):
+        return x
+    # CuPy's is `get`, PyTorch's `cpu`, Warp's `numpy`; JAX copies by itself.
+    for name in ("get", "cpu", "numpy"):
+        if callable(own := getattr(x, name, None)):
+            return np.asarray(own())
+    return np.asarray(x)

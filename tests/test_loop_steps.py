@@ -21,9 +21,9 @@ def plans(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     asked: list[bool] = []
     plan = LagrangianDynamics.step_plan
 
-    def step_plan(self: LagrangianDynamics, method: str, *, thorough: bool = False) -> object:
+    def step_plan(self: LagrangianDynamics, method: str, *, thorough: bool = False, **how: bool) -> object:
         asked.append(thorough)
-        return plan(self, method, thorough=thorough)
+        return plan(self, method, thorough=thorough, **how)
 
     monkeypatch.setattr(LagrangianDynamics, "step_plan", step_plan)
     return asked

@@ -9,10 +9,9 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 import casadi as ca
-import numpy as np
 
 from mbkit._fork import fork_safe
 from mbkit.codegen import disk_cache as disk
@@ -29,8 +28,6 @@ DERIVING: Final = fork_safe(threading.RLock())
 #: matrix of a hundred joints has twice as many, and is interpreted in 0.5 ms.
 _MAX_OPERATIONS: Final = 200_000
 T = TypeVar("T")
-#: A GPU's kind in DLPack (kDLCUDA).
-GPU: Final = 2
 
 
 class LastUsed(Generic[T]):
@@ -103,26 +100,6 @@ def executable(
         return compiled(name, checked)
     except _TooLargeError as error:
         return Machine(error.args[0])
-
-
-def is_on_device(x: Any) -> bool:
-    """Return whether an argument says that it is an array on a GPU."""
-    if isinstance(x, (np.ndarray, float, int, list, tuple)):
-        return False
-    if hasattr(x, "__cuda_array_interface__"):
-        return True
-    return hasattr(x, "__dlpack_device__") and int(x.__dlpack_device__()[0]) == GPU
-
-
-def on_host(x: Any) -> Any:
-    """Return an array on a GPU as one of NumPy's, and anything else as it is."""
-    if not is_on_device(x):
-        return x
-    # CuPy's is `get`, PyTorch's `cpu`, Warp's `numpy`; JAX copies by itself.
-    for name in ("get", "cpu", "numpy"):
-        if callable(own := getattr(x, name, None)):
-            return np.asarray(own())
-    return np.asarray(x)
 
 
 class _TooLargeError(Exception):

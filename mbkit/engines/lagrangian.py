@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, count, finite_array, real
-from mbkit.codegen.backend import DERIVING, compile_by_default, executable, has_compiler, is_on_device, on_host
+from mbkit._check import Array, count, finite_array, is_on_device, on_host, real
+from mbkit.codegen.backend import DERIVING, compile_by_default, executable, has_compiler
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity

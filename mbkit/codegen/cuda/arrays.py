@@ -15,8 +15,7 @@ from weakref import finalize
 
 import numpy as np
 
-from mbkit._check import Array
-from mbkit.codegen.backend import GPU, is_on_device
+from mbkit._check import GPU, Array, is_on_device
 from mbkit.codegen.cuda.driver import Device
 from mbkit.codegen.cuda.runs import OnDevice, Place
 from mbkit.errors import InputError

@@ -289,7 +289,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
         """Take members of the batch to the end; return those that were not bounded, or lost to their constraints."""
         n, squares = len(members), np.zeros(len(members))
         if dyn.device is not None and problem.batch is not None and clock is None:
-            from mbkit.simulate.solvers.device_steps import step_on_device
+            from mbkit.simulate.solvers.compiled_device_steps import step_on_device
 
             squares = step_on_device(problem, record, w0, members, thorough=thorough)
             return members[~(squares < BOUND**2)]
