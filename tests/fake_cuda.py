@@ -40,6 +40,7 @@ class FakeDriver:
         self.cuuint64_t = int
         self._linked: dict[int, Any] = {}
         self._current: list[Any] = []
+        self.unloaded: list[Any] = []
 
     def __getattribute__(self, name: str) -> Any:
         if name.startswith("cu") and name != "cuuint64_t":
@@ -85,10 +86,6 @@ class FakeDriver:
         assert (kind, value) == (4, 2**63)
         return (OK,)
 
-    def cuMemGetInfo(self) -> tuple[int, int, int]:
-        assert self._current
-        return OK, self.room - self._taken, self.room
-
     @property
     def _taken(self) -> int:
         return sum(x.nbytes for x in self.left.values())
@@ -112,8 +109,8 @@ class FakeDriver:
     def _require(self, address: int, size: int) -> None:
         assert any(a <= address and address + size <= a + x.nbytes for a, x in self.left.items())
 
-    def cuMemcpyHtoDAsync(self, target: int, source: int, size: int, stream: int) -> tuple[int]:
-        assert stream == 0
+    def cuMemcpyHtoD(self, target: int, source: int, size: int) -> tuple[int]:
+        assert self._current
         self._require(target, size)
         ctypes.memmove(target, source, size)
         return (OK,)
@@ -156,6 +153,11 @@ class FakeDriver:
 
     def cuModuleGetFunction(self, module: Any, name: bytes) -> tuple[int, Any]:
         return OK, (*module, name.decode())
+
+    def cuModuleUnload(self, module: Any) -> tuple[int]:
+        assert self._current
+        self.unloaded.append(module)
+        return (OK,)
 
     def cuLaunchKernel(self, function: Any, *sizes: Any) -> tuple[int]:
         (engine, counts, name), (x, y, z, block, by, bz, shared, stream, places, extra) = function, sizes

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from typing import Any, Final
+from weakref import finalize
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,11 +101,12 @@ class Device:
             finally:
                 _ask("cuLinkDestroy", state)
 
-    def load(self, code: bytes, name: str) -> tuple[Any, Any]:
-        """Return the module of machine code, and a function in it."""
+    def load(self, code: bytes, name: str, owner: Any) -> Any:
+        """Return a function of machine code, which is dropped with its owner."""
         with self.current():
             module = _ask("cuModuleLoadData", code)
-            return module, _ask("cuModuleGetFunction", module, name.encode())
+            finalize(owner, self.unload, module)
+            return _ask("cuModuleGetFunction", module, name.encode())
 
     def take(self, size: int) -> int:
         """Return the address of new memory, bytes."""
@@ -120,9 +122,10 @@ class Device:
         with suppress(Exception), self.current():
             self.give(address)
 
-    def free(self) -> int:
-        """Return how many bytes are free."""
-        return int(_ask("cuMemGetInfo")[0])
+    def unload(self, module: Any) -> None:
+        """Drop machine code at any time, in any thread."""
+        with suppress(Exception), self.current():
+            _ask("cuModuleUnload", module)
 
     def wait(self, stream: int) -> None:
         """Wait for all work on a stream of another library."""
@@ -132,7 +135,8 @@ class Device:
     def upload(self, x: NDArray[Any], address: int) -> None:
         """Copy a contiguous array of the host to the GPU."""
         if x.size:
-            _ask("cuMemcpyHtoDAsync", address, x.ctypes.data, x.nbytes, 0)
+            # Not asynchronous: the array may be gone before a copy that is.
+            _ask("cuMemcpyHtoD", address, x.ctypes.data, x.nbytes)
 
     def download(self, address: int, x: NDArray[Any]) -> None:
         """Copy from the GPU into a contiguous array of the host, and wait for it."""
@@ -151,6 +155,20 @@ class Device:
     def name(self) -> str:
         """As in ``device="cuda:0"``."""
         return f"{CUDA}:{self.ordinal}"
+
+
+def in_parts(count: int, work: Callable[[slice], None]) -> None:
+    """Do some work on all of a batch, or on part after part where the GPU has no room for all."""
+    start, size = 0, count
+    while start < count:
+        try:
+            work(slice(start, min(start + size, count)))
+        except OutOfMemoryError:
+            if size == 1:
+                raise
+            size = -(-size // 2)
+        else:
+            start += size
 
 
 _DEVICES: Final[dict[int, Device]] = {}

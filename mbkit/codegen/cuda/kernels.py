@@ -59,7 +59,7 @@ def kernel_code(made: Program, quaternions: Sequence[int] = ()) -> tuple[str, in
     written = [_Entry(made, piece) for piece in pieces]
     for k, piece in enumerate(written):
         piece.write(slots, first=k == 0)
-    given = ", ".join(f"{kind} {'noalias ' if kind == 'ptr' else ''}%{name}" for kind, name in _Entry.parameters(made))
+    given = _Entry.parameters(made)
     functions, lines = [], check.lines if quaternions else []
     if len(written) == 1:
         lines = [*lines, *written[0].lines]
@@ -118,13 +118,14 @@ class _Entry(Piece):
         return self._text.lines
 
     @staticmethod
-    def parameters(made: Program) -> list[tuple[str, str]]:
-        """Return kinds and names of the kernel's parameters."""
+    def parameters(made: Program) -> str:
+        """Return the kernel's parameters."""
         arrays = [f"{way}{i}" for way, many in (("in", made.inputs), ("out", made.shapes)) for i in range(len(many))]
         each = [
             (kind, f"{a}{end}") for a in arrays for kind, end in (("ptr", ""), ("i64", "_across"), ("i64", "_along"))
         ]
-        return [*each, ("i64", "n"), ("ptr", "flags"), ("ptr", "work")]
+        every = [*each, ("i64", "n"), ("ptr", "flags"), ("ptr", "work")]
+        return ", ".join(f"{kind} {'noalias ' if kind == 'ptr' else ''}%{name}" for kind, name in every)
 
     def _place(self, arrays: str, strides: str, i: int, j: int) -> str:  # noqa: ARG002  # strides go by the array's name
         t, name = self._text, f"%{arrays}{i}"
@@ -164,10 +165,7 @@ class _Entry(Piece):
         self._mark(t.compare("uge", worst, number(NEAR_UNIT)), _NOT_UNIT)
 
     def function(self, name: str, linkage: str = "internal") -> str:
-        given = ", ".join(
-            f"{kind} {'noalias ' if kind == 'ptr' else ''}%{x}" for kind, x in self.parameters(self._made)
-        )
-        return self._function(f"{linkage} void @{name}({given}, i64 %s)")
+        return self._function(f"{linkage} void @{name}({self.parameters(self._made)}, i64 %s)")
 
 
 class _Values(Piece):

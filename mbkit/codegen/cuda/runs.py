@@ -20,7 +20,7 @@ from mbkit._version import __version__
 from mbkit.codegen import disk_cache as disk
 from mbkit.codegen import jit
 from mbkit.codegen.compiled import Compiled, compiled
-from mbkit.codegen.cuda.driver import CUDA, Device, OutOfMemoryError
+from mbkit.codegen.cuda.driver import CUDA, Device, in_parts
 from mbkit.codegen.cuda.kernels import BATCH, STEPS, kernel_code, steps_code
 from mbkit.codegen.program import program
 from mbkit.derivation.fingerprint import SOURCES
@@ -63,19 +63,13 @@ class OnDevice(Compiled):
 
     def run(self, inputs: Sequence[Array], outputs: Sequence[Array], threads: int | None = None) -> bool:  # noqa: ARG002
         """Fill (N, n) outputs, as `Compiled.run` does; where the GPU has no room, part after part."""
-        start, size, good = 0, len(inputs[0]), True
-        while start < len(inputs[0]):
-            try:
-                good &= self._near(
-                    [x[start : start + size] for x in inputs], [x[start : start + size] for x in outputs]
-                )
-            except OutOfMemoryError:
-                if size == 1:
-                    raise
-                size = -(-size // 2)
-                continue
-            start += size
-        return good
+        good: list[bool] = []
+
+        def one(part: slice) -> None:
+            good.append(self._near([x[part] for x in inputs], [x[part] for x in outputs]))
+
+        in_parts(len(inputs[0]), one)
+        return all(good)
 
     def _near(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> bool:
         with self._room() as taken:
@@ -131,7 +125,7 @@ class _Kernel:
         self.device, self._work = device, int(about["work"])
         self.inputs, self.operations = tuple(about["inputs"]), int(about["operations"])
         self.shapes = tuple((r, c) for r, c in about["shapes"])
-        self._module, self._function = device.load(code, BATCH)
+        self._function = device.load(code, BATCH, self)
 
     def launch(self, inputs: Sequence[Place], outputs: Sequence[Place], n: int, taken: Callable[[int], int]) -> bool:
         """Run it, and wait; return whether all numbers are finite and quaternions are of unit length."""
@@ -180,7 +174,7 @@ class CudaSteps:
     def __init__(self, device: Device, about: dict[str, Any], code: bytes) -> None:
         self.device, self.size = device, int(about["size"])
         self.rows = {name: (int(a), int(n)) for name, (a, n) in about["rows"].items()}
-        self._module, self._function = device.load(code, STEPS)
+        self._function = device.load(code, STEPS, self)
 
     def arena(self, count: int) -> Arena:
         """Return the room of so many states; `OutOfMemoryError` where there is none."""

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.codegen.cuda.driver import OutOfMemoryError
+from mbkit.codegen.cuda.driver import in_parts
 from mbkit.codegen.cuda.runs import Arena
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model.integration_space import Space
@@ -33,19 +33,14 @@ def step_on_device(
     dyn = problem.dyn
     assert isinstance(dyn, LagrangianDynamics)
     steps = dyn.device_steps(problem.method, thorough=thorough, fed=problem.torque.feedback is not None)
-    squares, start, size = np.zeros(len(members)), 0, len(members)
-    while start < len(members):
-        part = members[start : start + size]
-        try:
-            with steps.arena(len(part)) as arena:
-                _run(problem, record, arena, w0, part, start / len(members), len(part) / len(members))
-                squares[start : start + size] = arena.get("squares")[0]
-        except OutOfMemoryError:
-            if size == 1:
-                raise
-            size = -(-size // 2)
-            continue
-        start += size
+    squares = np.zeros(len(members))
+
+    def run(part: slice) -> None:
+        with steps.arena(part.stop - part.start) as arena:
+            _run(problem, record, arena, w0, members[part], part.start / len(members), part.stop / len(members))
+            squares[part] = arena.get("squares")[0]
+
+    in_parts(len(members), run)
     return squares
 
 
@@ -56,7 +51,7 @@ def _run(
     w0: Array,
     members: Indices,
     done: float,
-    share: float,
+    end: float,
 ) -> None:
     dyn, grid, torque = problem.dyn, problem.grid, problem.torque
     assert isinstance(dyn, LagrangianDynamics)
@@ -86,7 +81,7 @@ def _run(
             if time.perf_counter() - began < _LONG:
                 most *= 2
             k += count
-            problem.bar.update(done + share * k / grid.steps)
+            problem.bar.update(done + (end - done) * k / grid.steps)
         if (kept := record.rows(stop, stop)).start < kept.stop:
             q, w = (np.ascontiguousarray(arena.get(name).T) for name in ("q", "w"))
             record.q[rows, kept.start] = q
