@@ -18,7 +18,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.codegen import jit, simd_kernel
-from mbkit.codegen.cuda import arrays, driver
+from mbkit.codegen.cuda import arrays, driver, runs
 from mbkit.codegen.cuda.arrays import DeviceArray
 from mbkit.codegen.cuda.kernels import kernel_code, steps_code
 from mbkit.codegen.program import program
@@ -27,7 +27,7 @@ from mbkit.derivation.steps.fixed import STATE, march_in_stages
 from mbkit.errors import DeviceError, InputError, UnknownNameError, UnsupportedError
 from mbkit.simulate.solvers import compiled_fixed_step
 from tests.fake_cuda import FakeDriver, fake  # noqa: F401  # a fixture
-from tests.random_trees import random_tree
+from tests.random_trees import off, random_tree
 from validation import gpu as study
 
 pytestmark = [
@@ -157,6 +157,23 @@ def test_runs_have_the_bits_of_the_cpu(name: str, method: str, torque: str, monk
     assert np.array_equal(found.t, want.t)
 
 
+def test_a_step_in_stages_is_the_same_to_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The forward dynamics is then a function, which is called for each stage."""
+    monkeypatch.setattr(runs, "WHOLE", 0)
+    model = MODELS["a floating tree"]()
+    cpu, gpu = both(model)
+    q, v, _ = study.states(model, 5).values()
+    run = {"duration": 0.02, "dt": 1e-3, "save": 20, "doubt": False, "method": "rk4"}
+    for torque in TORQUES.values():
+        tau = torque(model, 5, 20)
+        want = mb.simulate(cpu, q, 0.1 * v, torque=tau, **run)
+        with monkeypatch.context() as alone:
+            without_reruns(alone)
+            found = mb.simulate(gpu, q, 0.1 * v, torque=tau, **run)
+        assert off(found.q, want.q) < 1e-13
+        assert off(found.v, want.v) < 1e-12
+
+
 def test_runs_of_a_loop_have_the_bits_of_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     model = mb.catalog.four_bar()
     cpu, gpu = both(model)
@@ -179,10 +196,10 @@ def test_each_sample_may_have_parameters_of_its_own(monkeypatch: pytest.MonkeyPa
     assert np.array_equal(gpu.forward_dynamics(on_gpu(q), on_gpu(v), on_gpu(a)).numpy(), want)
     # One value for all is one number on the GPU.
     assert np.array_equal(*(d.at(m1=1.5, m2=2.0).forward_dynamics(q, v, a) for d in (cpu, gpu)))
-    runs = [{"duration": 0.01, "dt": 1e-3, "save": 10, "method": "rk4", "doubt": False}] * 2
-    want = mb.simulate(cpu, q, v, **runs[0])
+    run = {"duration": 0.01, "dt": 1e-3, "save": 10, "method": "rk4", "doubt": False}
+    want = mb.simulate(cpu, q, v, **run)
     without_reruns(monkeypatch)
-    assert np.array_equal(mb.simulate(gpu, q, v, **runs[1]).q, want.q)
+    assert np.array_equal(mb.simulate(gpu, q, v, **run).q, want.q)
 
 
 def test_a_run_that_diverges_ends_as_on_the_cpu() -> None:
@@ -331,8 +348,8 @@ def test_a_batch_too_large_for_the_gpu_goes_in_parts(fake: FakeDriver) -> None: 
     assert np.array_equal(gpu.forward_dynamics(q, v, a), cpu.forward_dynamics(q, v, a))
     assert fake.calls.count("cuLaunchKernel") > 1
     assert not fake.left
-    runs = [mb.simulate(d, q, v, 5e-3, "rk4", dt=1e-3, save=5, doubt=False) for d in (cpu, gpu)]
-    assert np.array_equal(runs[0].q, runs[1].q)
+    ends = [mb.simulate(d, q, v, 5e-3, "rk4", dt=1e-3, save=5, doubt=False) for d in (cpu, gpu)]
+    assert np.array_equal(ends[0].q, ends[1].q)
     assert not fake.left
     fake.room = 64
     with pytest.raises(DeviceError, match="device: out of memory"):

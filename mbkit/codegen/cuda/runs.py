@@ -239,6 +239,9 @@ class Arena:
                 self._device.give(address)
 
 
+#: Operations of a step that is one function: Talos' 19,000, or 27,000 under a feedback, kept the driver's compiler busy
+#: for more than two minutes.
+WHOLE: Final = 10_000
 _STEPS: Final[WeakValueDictionary[str, CudaSteps]] = WeakValueDictionary()
 
 

@@ -216,16 +216,19 @@ def march_in_stages(
 
 
 def parts_of(
-    equations: Equations, method: str, operations: Callable[[Part], int], *, thorough: bool = False, fed: bool = False
+    equations: Equations,
+    method: str,
+    operations: Callable[[Part], int],
+    *,
+    thorough: bool = False,
+    fed: bool = False,
+    most: int = _ONE_PIECE,
 ) -> tuple[Part, ...]:
-    """Return the step in one part, or cut at its forward dynamics where these have too many operations for that.
-
-    The choice is the same on every processor and device, so that the bits are.
-    """
+    """Return the step in one part, or cut at its forward dynamics where these have more than `most` operations."""
     staged = march_in_stages(equations, method, thorough=thorough, fed=fed)
     forward = next(part for part in staged if part.name in DYNAMICS)
     law = equations.model.nv * (equations.model.nq + equations.model.nv) if fed else 0
-    if method_of(method).stages * (operations(forward) + law) > _ONE_PIECE:
+    if method_of(method).stages * (operations(forward) + law) > min(most, _ONE_PIECE):
         return staged
     return march(equations, method, thorough=thorough, fed=fed)
 
