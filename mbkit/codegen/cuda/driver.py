@@ -37,8 +37,9 @@ def driver() -> Any:
 
 def _ask(name: str, *arguments: Any) -> Any:
     """Return what a function of the driver gives, without the code of its success."""
+    function = getattr(driver(), name)
     try:
-        code, *out = getattr(driver(), name)(*arguments)
+        code, *out = function(*arguments)
     except (RuntimeError, OSError) as error:
         raise UnsupportedError(f"device: this machine has no NVIDIA driver ({error})") from error
     if int(code) == _OUT_OF_MEMORY:
