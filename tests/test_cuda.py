@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.codegen import jit, simd_kernel
+from mbkit.codegen import backend, jit, simd_kernel
 from mbkit.codegen.cuda import arrays, driver, runs
 from mbkit.codegen.cuda.arrays import DeviceArray
 from mbkit.codegen.cuda.kernels import kernel_code, steps_code
@@ -430,6 +430,18 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         mb.dynamics(mb.load("ur5"), "lagrangian", device="cuda")
     driver.driver.cache_clear()
+
+
+def test_a_function_too_large_to_compile_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(backend, "_MAX_OPERATIONS", 20)
+    model = random_tree(19, 3, ("revolute",))
+    _, gpu = both(model)
+    q, v, a = study.states(model, 3).values()
+    for states in ((q, v, a), (q[0], v[0], a[0])):
+        with pytest.raises(
+            UnsupportedError, match=r"at most 20 operations, forward_dynamics of this model has [\d,]+; use"
+        ):
+            gpu.forward_dynamics(*states)
 
 
 def test_functions_without_a_counterpart_are_named() -> None:

@@ -77,7 +77,9 @@ def test_other_engines_and_methods_take_it_as_a_function(engine: str) -> None:
 def test_the_law_is_what_it_says() -> None:
     rng = np.random.default_rng(1)
     K, q0, v0, u0, q, v = (rng.normal(size=s) for s in ((2, 4), 2, 2, 2, 2, 2))
-    feedback = StateFeedback(K, q0, v0, u0)
+    given = K.copy()
+    feedback = StateFeedback(given, q0, v0, u0)
+    given[:] = 0.0
     assert feedback(0.0, q, v) == pytest.approx(u0 + K @ np.concatenate([q0 - q, v0 - v]), rel=1e-14)
     assert feedback.numbers.reshape(2, 5)[:, 1:].tolist() == K.tolist()
     assert repr(feedback) == "<StateFeedback of 4 numbers to 2 torques>"

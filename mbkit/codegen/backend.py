@@ -16,7 +16,7 @@ import casadi as ca
 from mbkit._fork import fork_safe
 from mbkit.codegen import disk_cache as disk
 from mbkit.codegen.interpreter import Machine
-from mbkit.errors import NoCompilerWarning
+from mbkit.errors import NoCompilerWarning, UnsupportedError
 
 if TYPE_CHECKING:
     from mbkit.codegen.compiled import Compiled
@@ -95,7 +95,16 @@ def executable(
         from mbkit.codegen.cuda.driver import device_of
         from mbkit.codegen.cuda.runs import on_device
 
-        return on_device(name, make, device_of(device), quaternions)
+        def small() -> ca.Function:
+            try:
+                return checked()
+            except _TooLargeError as error:
+                raise UnsupportedError(
+                    f"device: expected at most {_MAX_OPERATIONS:,} operations, {name[1]} of this model has "
+                    f"{error.args[0].n_instructions():,}; use the CPU"
+                ) from None
+
+        return on_device(name, small, device_of(device), quaternions)
     try:
         return compiled(name, checked)
     except _TooLargeError as error:

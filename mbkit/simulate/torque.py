@@ -62,8 +62,8 @@ class PiecewiseConstantTorque:
 class StateFeedback:
     """A state feedback u = u0 + K (x0 - x), x = (q, v): a torque as data, which compiled steps evaluate themselves.
 
-    With a fixed step on the own derivation a batch then runs at the speed of a constant torque, on every core or on a
-    GPU; everywhere else it is a torque function like any other. It acts at every stage of a method, not held.
+    With an explicit fixed step on the own derivation it is machine code with the step, on every core or on a GPU;
+    everywhere else it is a torque function like any other. It acts at every stage of a method, not held.
 
     Parameters
     ----------

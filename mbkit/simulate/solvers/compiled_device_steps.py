@@ -68,10 +68,12 @@ def _run(
     arena.put("parameters", values[members].T if values.ndim == 2 else values[:, None])
     # The last step may have a length of its own.
     stops = {*record.kept.tolist(), grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps} - {0}
-    k, most = 0, _FIRST
+    k, most, dt = 0, _FIRST, np.nan
     for stop in sorted(stops):
         while k < stop:
-            arena.put("dt", np.full((1, 1), grid.step(k)))
+            if grid.step(k) != dt:
+                dt = grid.step(k)
+                arena.put("dt", np.full((1, 1), dt))
             count = min(most, stop - k)
             force = torque.columns(rows, k, k + (count if torque.held else 1))
             if torque.held:
