@@ -1,4 +1,15 @@
-"""Motion in time: one trajectory or a batch, by any engine's forward dynamics."""
+"""Motion in time: one trajectory or a batch, by any engine's forward dynamics.
+
+Start with `run`: `simulate` integrates, checks, and returns a `Trajectory`. `integrate` reads the arguments, makes an
+`IntegrationProblem` of them (`problem`), and hands it to the solver that the method's entry in `methods` names.
+`solvers` has one module for each way to integrate: fixed steps in Python or compiled, adaptive ones, `auto`, and those
+of SciPy, heyoka, SUNDIALS, MuJoCo and Drake. Each returns a `SolverResult` (`result`).
+`run_data` has the states and what follows from them; `trajectory` adds the checks that integrate once more.
+`diagnostics` asks after a run whether its numbers can be believed; its doubts stand in the run's `Stats`.
+
+In: an engine's `Dynamics`, start states, torques (`torque`), events. Out: times and states, with what they cost.
+Callers: users, every study, `mbkit simulate`.
+"""
 
 from mbkit._callable import make_callable
 from mbkit.methods.registry import METHODS, Method, register_method
