@@ -58,6 +58,10 @@ CASES: dict[str, tuple[Callable[[], Model], closed_forms.System]] = {
 }
 
 
+def test_every_system_is_found_by_tab_completion():
+    assert {*dir(catalog)} == {*catalog.systems(), "get", "systems"}
+
+
 def engine(model: Model, name: str) -> Dynamics:
     try:
         return dynamics(model, name)

@@ -13,53 +13,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from mbkit.catalog import mechanisms, planar_loops, rigid_bodies, rolling, spatial_loops
 from mbkit.catalog._system import SYSTEMS
-from mbkit.catalog.mechanisms import (
-    acrobot,
-    cart_pole,
-    chain,
-    double_pendulum,
-    elastic_pendulum,
-    furuta_pendulum,
-    pendulum,
-    slider_crank,
-    spherical_pendulum,
-)
-from mbkit.catalog.planar_loops import (
-    andrews_squeezer,
-    chebyshev,
-    five_bar,
-    four_bar,
-    four_bars,
-    hoecken,
-    inverted_slider_crank,
-    pantograph,
-    parallel_gripper,
-    peaucellier,
-    planar_3rrr,
-    scissor,
-    watt,
-)
-from mbkit.catalog.rigid_bodies import (
-    clamped_beam,
-    flexible_spacecraft,
-    free_body,
-    gyroscope,
-    heavy_top,
-    spacecraft_with_wheels,
-)
-from mbkit.catalog.rolling import bicycle, chaplygin_sleigh, rolling_disc
-from mbkit.catalog.spatial_loops import bricard, delta_robot, double_cardan_shaft, flyball_governor, stewart_platform
+from mbkit.catalog.mechanisms import *  # noqa: F403  # each family names its systems once
+from mbkit.catalog.planar_loops import *  # noqa: F403
+from mbkit.catalog.rigid_bodies import *  # noqa: F403
+from mbkit.catalog.rolling import *  # noqa: F403
+from mbkit.catalog.spatial_loops import *  # noqa: F403
 from mbkit.errors import UnknownNameError
 from mbkit.model import Model
 
-__all__ = ["acrobot", "andrews_squeezer", "bicycle", "bricard", "cart_pole", "chain", "chaplygin_sleigh"]
-__all__ += ["chebyshev", "clamped_beam"]
-__all__ += ["delta_robot", "double_cardan_shaft", "double_pendulum", "elastic_pendulum", "five_bar"]
-__all__ += ["flexible_spacecraft", "flyball_governor", "four_bar", "four_bars", "free_body", "furuta_pendulum"]
-__all__ += ["get", "gyroscope", "heavy_top", "hoecken", "inverted_slider_crank", "pantograph"]
-__all__ += ["parallel_gripper", "peaucellier", "pendulum", "planar_3rrr", "rolling_disc", "scissor", "slider_crank"]
-__all__ += ["spacecraft_with_wheels", "spherical_pendulum", "stewart_platform", "systems", "watt"]
+__all__ = ["get", "systems"]
+__all__ += mechanisms.__all__
+__all__ += planar_loops.__all__
+__all__ += rigid_bodies.__all__
+__all__ += rolling.__all__
+__all__ += spatial_loops.__all__
 
 
 def systems() -> dict[str, Callable[..., Model]]:

@@ -7,6 +7,18 @@ from typing import Final
 from mbkit.catalog._system import Vector, down, moments, nonnegative, system
 from mbkit.model import Model, ModelBuilder, Number, known, nominal
 
+__all__ = [
+    "acrobot",
+    "cart_pole",
+    "chain",
+    "double_pendulum",
+    "elastic_pendulum",
+    "furuta_pendulum",
+    "pendulum",
+    "slider_crank",
+    "spherical_pendulum",
+]
+
 #: Axis of planar hinges: a positive turn about -y swings what hangs down towards +x.
 _SWING: Final = (0.0, -1.0, 0.0)
 _X: Final = (1.0, 0.0, 0.0)

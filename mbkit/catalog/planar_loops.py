@@ -14,6 +14,22 @@ from mbkit.catalog._system import down, positive, system
 from mbkit.errors import InputError
 from mbkit.model import Model, ModelBuilder, Number, known, nominal
 
+__all__ = [
+    "andrews_squeezer",
+    "chebyshev",
+    "five_bar",
+    "four_bar",
+    "four_bars",
+    "hoecken",
+    "inverted_slider_crank",
+    "pantograph",
+    "parallel_gripper",
+    "peaucellier",
+    "planar_3rrr",
+    "scissor",
+    "watt",
+]
+
 
 @system
 def four_bar(

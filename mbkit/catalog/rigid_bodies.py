@@ -12,6 +12,8 @@ from mbkit.catalog._system import Vector, down, lengths, moments, nonnegative, p
 from mbkit.errors import InputError
 from mbkit.model import Model, ModelBuilder, Number
 
+__all__ = ["clamped_beam", "flexible_spacecraft", "free_body", "gyroscope", "heavy_top", "spacecraft_with_wheels"]
+
 
 @system(sides=lengths)
 def free_body(*, mass: Number = 10.0, sides: Vector = (0.1, 0.4, 0.9), gravity: Number = 0.0) -> Model:

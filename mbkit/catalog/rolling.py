@@ -12,6 +12,8 @@ from mbkit.catalog._links import X, Y, Z
 from mbkit.catalog._system import Vector, acute, down, finite, nonnegative, point, system
 from mbkit.model import Model, ModelBuilder, Number
 
+__all__ = ["bicycle", "chaplygin_sleigh", "rolling_disc"]
+
 #: Joints that carry a body anywhere in any attitude but those of a gimbal lock, which is a lean by a right angle.
 _CARRIERS: Final = (
     ("x", "prismatic", X),

@@ -14,6 +14,8 @@ from mbkit.catalog._links import THIRDS, TURN, Point, X, Y, Z, add_pin, add_rod,
 from mbkit.catalog._system import acute, down, nonnegative, number, system
 from mbkit.model import Model, ModelBuilder, Number
 
+__all__ = ["bricard", "delta_robot", "double_cardan_shaft", "flyball_governor", "stewart_platform"]
+
 #: Cosine and sine of the angle at which a governor's arms start below the level: 30°.
 _COS, _SIN = 0.75**0.5, 0.5
 #: Half the angle between two feet of a Stewart platform, or two joints, that stand together.
