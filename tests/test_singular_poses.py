@@ -19,8 +19,8 @@ from validation import elliptic
 #: Methods that project, with a setting and the error that it leaves after a second.
 METHODS = [
     ("rk4", {"dt": 1e-3}, 1e-9),
-    ("semi_implicit_euler", {"dt": 1e-4}, 2e-3),
-    ("gauss4", {"dt": 1e-3}, 1e-9),
+    ("semi_implicit_euler", {"dt": 1e-3}, 2e-2),
+    ("gauss4", {"dt": 4e-3}, 1e-7),
     ("rk853", {"rtol": 1e-11}, 1e-10),
     ("rodas5", {"rtol": 1e-9}, 1e-7),
     ("dop853", {"rtol": 1e-10}, 1e-8),
@@ -87,7 +87,7 @@ def _level(n: int, theta: float, rate: float) -> float:
     return low
 
 
-@pytest.mark.parametrize("n", [1, 3, 6])
+@pytest.mark.parametrize("n", [1, 3])
 @pytest.mark.parametrize("method", ["rk853", "rodas5", "taylor"])
 def test_tighter_tolerances_are_no_worse(n, method) -> None:
     skip_without(method, "lagrangian")
@@ -95,7 +95,7 @@ def test_tighter_tolerances_are_no_worse(n, method) -> None:
     q, v = parallel(dyn, 0.0, -1.0)
     t = np.arange(1.0, 6.0)
     exact, errors, drifts = motion(n, t, 0.0, -1.0), [], []
-    for rtol in (1e-6, 1e-8, 1e-10, 1e-12):
+    for rtol in (1e-6, 1e-9, 1e-12):
         run, _ = simulated(dyn, q, v, 5.0, method, rtol=rtol, save=[0.0, *t])
         assert run.stats.finished
         errors.append(np.abs(run.q[1:, 0] - exact).max())
