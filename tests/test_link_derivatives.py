@@ -99,7 +99,7 @@ def values(equations: Equations, name: str, *arguments: np.ndarray) -> list[np.n
 def test_they_are_those_of_the_energies(case):
     _, model = case
     links, energies = LinkEquations(model, elimination="links"), Equations(model)
-    for q, v, a, tau in zip(*states(model, 3), strict=True):
+    for q, v, a, tau in zip(*states(model, 2), strict=True):
         for name, third in (("inverse_dynamics_derivatives", a), ("forward_dynamics_derivatives", tau)):
             M = values(energies, "mass_matrix", q)[0]
             k = K * (1.0 if name.startswith("inverse") else np.linalg.cond(M))
@@ -241,7 +241,7 @@ def test_the_links_give_inverse_factors_of_the_mass_matrix(name):
     assert off(L @ (inverse * L.T) @ M, np.eye(n)) < 10 * np.linalg.cond(M) * EPS
 
 
-@pytest.mark.parametrize("seed", [1, 10])
+@pytest.mark.parametrize("seed", [1])
 def test_they_have_the_digits_of_the_accelerations(seed):
     """Factors of a formed mass matrix would lose up to a hundred times as many."""
     model = random_tree(seed, 12, nearest=2, mimic=True, springs=False, damping=False)

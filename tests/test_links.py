@@ -43,7 +43,7 @@ def sample(model: mb.model.Model, n: int = 3, seed: int = 0) -> dict[str, np.nda
     return dict(zip("qvat", states(model, n, seed), strict=True))
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(8))
 def test_every_term_is_that_of_the_energies(seed):
     model = model_of(seed)
     at, links, energies = sample(model), LinkEquations(model, elimination="links"), Equations(model)
@@ -65,7 +65,7 @@ def test_robots_are_as_exact_as_before(name):
         assert off(evaluated(links, term, at).reshape(exact.shape), exact) < bar, term
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(5))
 def test_any_velocities_may_be_carried_to_the_root(seed):
     model, rng = model_of(seed), np.random.default_rng(seed)
     eq, at = LinkEquations(model, elimination="links"), sample(model, 2)

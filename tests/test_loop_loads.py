@@ -66,7 +66,7 @@ def test_engines_agree_and_every_body_is_in_balance(name: str) -> None:
         assert np.abs(left).max() < CLOSE * np.abs(exact[0]).max()
 
 
-@pytest.mark.parametrize("kind", ["point", "frame", "revolute", "universal", "cylindrical", "prismatic", "distance"])
+@pytest.mark.parametrize("kind", ["point", "universal", "prismatic", "distance"])
 def test_random_trees_are_in_balance_with_every_kind_of_loop(kind: str) -> None:
     model, q = closed_tree(1, kind)
     rng = np.random.default_rng(3)

@@ -174,8 +174,9 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("method", ["rodas5", "auto"])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    ("name", "method"), [*((name, "rodas5") for name in MODELS), ("stiff four-bar", "auto"), ("rolling_disc", "auto")]
+)
 def test_stiff_methods_take_the_same_steps_in_machine_code(name: str, method: str) -> None:
     model = MODELS[name]()
     q, v = mb.dynamics(model, "lagrangian").project(*model.random_state(np.random.default_rng(3)))

@@ -81,9 +81,9 @@ def test_gravity_compensation_of_random_files_is_that_of_mujoco(seed: int, tmp_p
 MOTOR = '<actuator><motor joint="k"/></actuator>'
 
 
-@pytest.mark.parametrize("actuators", [False, True])
-@pytest.mark.parametrize("more", ["", MOTOR])
-@pytest.mark.parametrize("lifted", ["jk", "k"])
+@pytest.mark.parametrize(
+    ("lifted", "more", "actuators"), [("jk", MOTOR, True), ("k", MOTOR, True), ("jk", MOTOR, False), ("k", "", True)]
+)
 def test_weight_that_actuators_hold(actuators: bool, more: str, lifted: str, tmp_path: Path) -> None:
     """MuJoCo counts it as actuation, wherever the actuators are; without any it does not act."""
     text = arm(more=more)

@@ -231,7 +231,9 @@ def test_every_method_runs_it(make, method):
     assert np.abs(run.q.T - truth[: len(q)]).max() < bound
 
 
-@pytest.mark.parametrize("method", [*METHODS, "auto", "rodas5", "semi_implicit_euler", "gauss4"])
+@pytest.mark.parametrize(
+    "method", ["rk4", "implicit_midpoint", "rk853", "radau", "bdf", "cvodes", "taylor", "auto", "rodas5"]
+)
 def test_a_run_goes_on_from_its_middle(method):
     """Started again at 0.1 s from its own state, a run under a force of the time moves as it did."""
     dyn, q, v, _ = solved(driven)
