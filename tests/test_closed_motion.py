@@ -208,7 +208,12 @@ KNOWN = {
     ),
 }  # fmt: skip
 
-WAYS = [(name, way) for name, motion in KNOWN.items() for way in ("paper", *motion.more, *ENGINES)]
+# On paper, in the own derivation, and in the others in turn.
+WAYS = [
+    (name, way)
+    for k, (name, motion) in enumerate(KNOWN.items())
+    for way in ("paper", *motion.more, ENGINES[0], ENGINES[1 + k % 2])
+]
 
 
 @cache

@@ -147,10 +147,10 @@ def test_every_method_stays_on_the_constraints(rod, method):
     }.get(method, 1e-6)
 
 
-def test_ten_thousand_steps_of_the_coarsest_method_stay_on_the_constraints(rod):
+def test_thousands_of_steps_of_the_coarsest_method_stay_on_the_constraints(rod):
     q, v = on_circle(1.0, 0.3)
-    run = mb.simulate(rod.dynamics(options=OWN), q, v, 10.0, "semi_implicit_euler", dt=1e-3, save=1000)
-    assert run.stats.steps == 10_000
+    run = mb.simulate(rod.dynamics(options=OWN), q, v, 4.0, "semi_implicit_euler", dt=1e-3, save=1000)
+    assert run.stats.steps == 4000
     assert max(drift(rod, run)) < DRIFT
 
 
@@ -311,12 +311,7 @@ def test_contradictory_rows_are_named():
     gap = sp.Symbol("gap")
     q1, q2 = sp.symbols("q1 q2")
     arm = Lagrangian(
-        (vx**2 + vy**2) / 2,
-        0,
-        [q1, q2],
-        [vx, vy],
-        parameters={gap: 2.5},
-        constraints=[sp.cos(q1) + sp.cos(q2) - gap],
+        (vx**2 + vy**2) / 2, 0, [q1, q2], [vx, vy], parameters={gap: 2.5}, constraints=[sp.cos(q1) + sp.cos(q2) - gap]
     )
     with pytest.raises(InputError, match=r"constraints\[0\].*cannot hold.*0\.[0-9]"):
         arm.project([0.1, 0.1], [0, 0])
@@ -584,13 +579,7 @@ def piston_form(F=0) -> Lagrangian:
     by_angle_ = -L1 * sp.sin(th + phi) / sp.cos(phi)
     J = m * L1**2 * sp.sin(th + phi) ** 2 / sp.cos(phi) ** 2
     return Lagrangian(
-        J * w**2 / 2,
-        0,
-        [th],
-        [w],
-        forces={th: -F * by_angle_},
-        parameters={m: 2.0, L1: 0.1, L2: 0.3},
-        name="piston",
+        J * w**2 / 2, 0, [th], [w], forces={th: -F * by_angle_}, parameters={m: 2.0, L1: 0.1, L2: 0.3}, name="piston"
     )
 
 
@@ -690,8 +679,10 @@ def test_four_bar_conserves_energy_on_both_forms():
     assert np.abs(own.q - other.q).max() < 1e-9
 
 
-@pytest.mark.parametrize("method", ["rk4", "gauss4", "rk853", "dop853"])
-@pytest.mark.parametrize("form", ["dynamics", "embedded"])
+@pytest.mark.parametrize(
+    ("form", "method"),
+    [("dynamics", method) for method in ("rk4", "gauss4", "dop853")] + [("embedded", "rk4"), ("embedded", "rk853")],
+)
 def test_a_start_time_shifts_all_times_of_a_constrained_run(form, method):
     """A pendulum in two coordinates, of which the independent one changes; blocks of steps end at rounded times."""
     x, y, u, w = sp.symbols("x y u w")

@@ -22,7 +22,6 @@ TREES = {
     "shallow": {"seed": 1, "n": 12},
     "deep": {"seed": 2, "n": 6, "nearest": 1},
     "mimic": {"seed": 3, "n": 7, "mimic": True, "nearest": 2},
-    "all revolute": {"seed": 4, "n": 8, "kinds": ("revolute",), "nearest": 1},
     "free and balls": {"seed": 5, "n": 4, "kinds": ("free", "ball"), "nearest": 1},
     "no passive forces": {"seed": 6, "n": 8, "springs": False, "damping": False, "armature": False},
     "no gravity": {"seed": 7, "n": 8, "gravity": False},

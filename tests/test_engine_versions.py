@@ -87,7 +87,6 @@ TURNING = tuple(kind for kind in SOUND if kind in IN_MUJOCO)
 STACKED = ("revolute", "universal", "spherical_zyx")
 BARE = {"springs": False, "damping": False, "armature": False}
 MODELS = {
-    "panda": lambda: mb.load("panda"),
     "floating": lambda: mb.load("ur5", floating_base=True),
     "mimic": lambda: mb.load("kinova"),
     "turning": lambda: random_tree(1, 12, TURNING, **BARE),
