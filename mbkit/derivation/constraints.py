@@ -30,7 +30,7 @@ from mbkit._check import Array
 from mbkit._reproducible import pivoted
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
-from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, dot3, follower
+from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, follower
 from mbkit.derivation.least_constraint import hard_poses
 from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.errors import InputError
@@ -211,7 +211,7 @@ def _contact_rows(kin: Kinematics, part: NoSlip) -> tuple[list[Any], list[Any]]:
     at = add(centre, place.offset)
     ends = (kin.velocity_at(body, both, at) for body in (part.body_a, part.body_b))
     velocity, gap = ([x - y for x, y in zip(*two, strict=True)] for two in (ends, (centre, ground)))
-    return [dot3(gap, n) - place.reach for n in place.up], [dot3(velocity, t) - values.speed for t in place.along]
+    return place.rows(gap, velocity, values.speed)
 
 
 def _rows(kin: Kinematics, time: Any) -> list[_Row]:

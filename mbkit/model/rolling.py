@@ -55,6 +55,14 @@ class Contact:
     up: list[Vector]
     along: list[Vector]
 
+    def rows(self, gap: Vector, velocity: Vector, speed: Any) -> tuple[list[Any], list[Any]]:
+        """Return the rows that hold positions and those that hold velocities.
+
+        They come from the way of the centre, from a point of the plane, and from the velocity of the material point at
+        the contact, both as body b sees them.
+        """
+        return [_dot(gap, n) - self.reach for n in self.up], [_dot(velocity, t) - speed for t in self.along]
+
 
 def _dot(a: Vector, b: Vector) -> Any:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -23,9 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass
 from functools import cached_property
-from math import cos, inf, isfinite, sin, sqrt
+from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -33,13 +32,19 @@ import pinocchio as pin
 
 from mbkit._check import Array
 from mbkit.engines.base import first_names
+from mbkit.engines.closed_loops.frame_rows import (
+    MovingFrame,
+    Rows,
+    contact_rows,
+    coupler_rows,
+    loop_rows,
+    motion_rows,
+)
 from mbkit.engines.pinocchio.model import PinModel
 from mbkit.errors import NumericalError, UnsupportedError
-from mbkit.model import Model, Prescribed
+from mbkit.model import Model
 from mbkit.model.loops import LOOP_KINDS
-from mbkit.model.parts import Loop, NoSlip
-from mbkit.model.rolling import LIES_FLAT, NO_SLIP_ROWS, contact, tangents
-from mbkit.spatial import skew
+from mbkit.model.rolling import NO_SLIP_ROWS
 
 if TYPE_CHECKING:
     from mbkit.derivation.constraints import RowChoice
@@ -61,177 +66,16 @@ _ALIGNED: Final = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _LOCAL: Final = pin.ReferenceFrame.LOCAL
 
 
-@dataclass(frozen=True)
-class Rows:
-    """f, J, rate and γ of rows; f is zero where a row holds velocities alone."""
-
-    f: Array
-    J: Array
-    rate: Array
-    gamma: Array
-
-    def __getitem__(self, which: Any) -> Rows:
-        return Rows(self.f[which], self.J[which], self.rate[which], self.gamma[which])
-
-    @staticmethod
-    def stacked(parts: list[Rows]) -> Rows:
-        """Return rows one below the other."""
-        columns = ([getattr(x, name) for x in parts] for name in ("f", "J", "rate", "gamma"))
-        return Rows(*(np.concatenate(x) for x in columns))
-
-
-class _Frame:
-    """A frame on a joint: its place and rotation in the world, Jacobians, velocities and accelerations of v̇ = 0."""
-
-    def __init__(self, m: Any, d: Any, G: Array | None, joint: int, X_JF: Any) -> None:
-        X = d.oMi[joint] * X_JF
-        self.R, self.p = X.rotation, X.translation
-        # Of the world's joint in a model without others, Pinocchio would read beyond an array.
-        J = np.zeros((6, m.nv))
-        if joint:
-            J = pin.getFrameJacobian(m, d, joint, X_JF, _ALIGNED).reshape(6, m.nv)
-        J = J if G is None else J @ G
-        speed, rate = (
-            own(m, d, joint, X_JF, _ALIGNED) for own in (pin.getFrameVelocity, pin.getFrameClassicalAcceleration)
-        )
-        self.J, self.J_turn = J[:3], J[3:]
-        self.v, self.w = speed.linear, speed.angular
-        self.a, self.alpha = rate.linear, rate.angular
-
-
-class _Relative:
-    """Both ends of a loop as the body sees them that carries both, in its axes.
-
-    r is the gap from end b to end a, with its derivatives. A and B are the ends' rotations, with Jacobians of turning,
-    angular velocities and their rates.
-    """
-
-    def __init__(self, loop: Loop, a: _Frame, b: _Frame, c: _Frame) -> None:
-        self.length = loop.length
-        to = c.R.T
-        gap, speed = a.p - b.p, a.v - b.v
-        self.r = to @ gap
-        self.J = to @ (a.J - b.J + skew(gap) @ c.J_turn)
-        self.dr = to @ (speed - _cross(c.w, gap))
-        # Of gap = R r, twice differentiated.
-        rest = _cross(c.alpha, gap) + 2.0 * _cross(c.w, speed) - _cross(c.w, _cross(c.w, gap))
-        self.ddr = to @ (a.a - b.a - rest)
-        self.A, self.B = to @ a.R, to @ b.R
-        (self.J_a, self.w_a, self.dw_a), (self.J_b, self.w_b, self.dw_b) = (
-            (to @ (e.J_turn - c.J_turn), to @ (e.w - c.w), to @ (e.alpha - c.alpha - _cross(c.w, e.w))) for e in (a, b)
-        )
-
-    def gap(self) -> Rows:
-        """Return the gap."""
-        return Rows(self.r, self.J, self.dr, self.ddr)
-
-    def turn(self) -> Rows:
-        """Return the axis of the turn from frame b to frame a, times the sine of its angle.
-
-        Of Q = A Bᵀ it is half of what is skew, and its rate ½ (tr Q - Q) ω_a - ½ (tr Q - Qᵀ) ω_b.
-        """
-        Q = self.A @ self.B.T
-        dQ = skew(self.w_a) @ Q - Q @ skew(self.w_b)
-        value = 0.5 * np.array([Q[2, 1] - Q[1, 2], Q[0, 2] - Q[2, 0], Q[1, 0] - Q[0, 1]])
-        on_a, on_b, da, db = (0.5 * (np.trace(x) * np.eye(3) - x) for x in (Q, Q.T, dQ, dQ.T))
-        gamma = on_a @ self.dw_a - on_b @ self.dw_b + da @ self.w_a - db @ self.w_b
-        return Rows(value, on_a @ self.J_a - on_b @ self.J_b, on_a @ self.w_a - on_b @ self.w_b, gamma)
-
-    def between(self, i: int, j: int) -> Rows:
-        """Return the cosine of the angle between axis i of frame a and axis j of frame b."""
-        a, b = self.A[:, i], self.B[:, j]
-        n, w, J = _cross(a, b), self.w_a - self.w_b, self.J_a - self.J_b
-        dn = _cross(_cross(self.w_a, a), b) + _cross(a, _cross(self.w_b, b))
-        return _row(a @ b, n @ J, n @ w, n @ (self.dw_a - self.dw_b) + dn @ w)
-
-    def across(self) -> Rows:
-        """Return the rows that keep frame b's z-axis along frame a's."""
-        return Rows.stacked([self.between(0, 2), self.between(1, 2)])
-
-    def sideways(self) -> Rows:
-        """Return the gap across frame a's z-axis."""
-        out = []
-        for i in range(2):
-            a = self.A[:, i]
-            n, da = _cross(a, self.r), _cross(self.w_a, a)
-            gamma = n @ self.dw_a + _cross(self.w_a, da) @ self.r + 2.0 * da @ self.dr + a @ self.ddr
-            out.append(_row(a @ self.r, n @ self.J_a + a @ self.J, n @ self.w_a + a @ self.dr, gamma))
-        return Rows.stacked(out)
-
-    def stretch(self) -> Rows:
-        """Return (r² - l²) / 2 l of a rod."""
-        r, size = self.r, self.length
-        value = (r @ r - size * size) / (2.0 * size)
-        return _row(value, r @ self.J / size, r @ self.dr / size, (self.dr @ self.dr + r @ self.ddr) / size)
-
-
-class _Contact:
-    """A contact without slip in world axes: W, the velocity of body a's point at the contact as body b sees it.
-
-    A row is a direction d with the rate d·W, the Jacobian dᵀ J and γ = ḋ·W + d·Ẇ. The contact point of a disc moves in
-    the disc, by ṙ - ω x r, across the normal: so n·W is the rate of the height.
-    """
-
-    def __init__(self, part: NoSlip, a: _Frame, b: _Frame) -> None:
-        kind, R = part.kind, part.radius
-        axis, normal = a.R @ part.axis_a, b.R @ part.axis_b
-        along = [b.R @ x for x in tangents(part.axis_b)]
-        place = contact(kind, axis, normal, along, R, sqrt)
-        r, to_a, to_b = np.array(place.offset), _cross(a.w, axis), _cross(b.w, normal)
-        if kind in LIES_FLAT:
-            r_rate, turns = _disc_rates(axis, normal, to_a, to_b, r, R)
-        else:
-            # A blade's direction is on one of both bodies.
-            r_rate = -R * to_b
-            turns = [_cross(b.w, x) for x in along] if R else [to_a + to_b]
-        arm = a.p + r - b.p
-        arm_rate = a.v + r_rate - b.v
-        self.J = a.J - skew(r) @ a.J_turn - b.J + skew(arm) @ b.J_turn
-        self.W = a.v + _cross(a.w, r) - b.v - _cross(b.w, arm)
-        self.dW = a.a + _cross(a.alpha, r) + _cross(a.w, r_rate) - b.a - _cross(b.alpha, arm) - _cross(b.w, arm_rate)
-        gap = a.p - b.p
-        self.held = [self._row(np.array(n), to_b, normal @ gap - place.reach, 0.0) for n in place.up]
-        self.moving = [
-            self._row(d, dd, 0.0, part.speed) for d, dd in zip(map(np.array, place.along), turns, strict=True)
-        ]
-
-    def _row(self, d: Array, rate: Array, f: Any, speed: float) -> Rows:
-        return _row(f, d @ self.J, d @ self.W - speed, rate @ self.W + d @ self.dW)
-
-
-def _disc_rates(a: Array, n: Array, da: Array, dn: Array, r: Array, R: float) -> tuple[Array, list[Array]]:
-    """Return the rates of the way r to a disc's lowest point and of its directions, from those of axis and normal."""
-    u, cosine, slope = -r / R, a @ n, da @ n + a @ dn
-    lowest = n - cosine * a
-    s = sqrt(lowest @ lowest)
-    dm = dn - slope * a - cosine * da
-    ds = u @ dm
-    forward = _cross(a, n) / s
-    d_forward = (_cross(da, n) + _cross(a, dn) - ds * forward) / s
-    return -R * (dm - ds * u) / s, [d_forward, _cross(dn, forward) + _cross(n, d_forward)]
-
-
-def _row(f: Any, J: Array, rate: Any, gamma: Any) -> Rows:
-    return Rows(np.array([f]), J[None], np.array([rate]), np.array([gamma]))
-
-
-def _cross(a: Array, b: Array) -> Array:
-    # numpy.cross takes ten times as long.
-    x, y, z = a
-    u, v, w = b
-    return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
-
-
-#: Kind of a loop -> its rows, in the order of `mbkit.derivation.constraints.LOOP_ROWS`.
-_ROWS: Final[dict[str, tuple[Callable[[_Relative], Rows], ...]]] = {
-    "point": (_Relative.gap,),
-    "frame": (_Relative.gap, _Relative.turn),
-    "revolute": (_Relative.gap, _Relative.across),
-    "universal": (_Relative.gap, lambda ends: ends.between(2, 2)),
-    "cylindrical": (_Relative.sideways, _Relative.across),
-    "prismatic": (_Relative.sideways, _Relative.turn),
-    "distance": (_Relative.stretch,),
-}
+def _frame(m: Any, d: Any, G: Array | None, joint: int, X_JF: Any) -> MovingFrame:
+    """Return how a frame on a joint moves."""
+    X = d.oMi[joint] * X_JF
+    # Of the world's joint in a model without others, Pinocchio would read beyond an array.
+    J = np.zeros((6, m.nv))
+    if joint:
+        J = pin.getFrameJacobian(m, d, joint, X_JF, _ALIGNED).reshape(6, m.nv)
+    J = J if G is None else J @ G
+    moves = (pin.getFrameVelocity, pin.getFrameClassicalAcceleration)
+    return MovingFrame(X.rotation, X.translation, J, *(own(m, d, joint, X_JF, _ALIGNED).vector for own in moves))
 
 
 class PinConstraints:
@@ -288,11 +132,10 @@ class PinConstraints:
     def every(self, q: Array, v: Array) -> Rows:
         """Return all rows of loops, those that say nothing among them."""
         self._move(q, v)
-        m, d = self._m, self._d
-        parts = []
-        for loop, ends in zip(self._model.loops, self._ends, strict=True):
-            seen = _Relative(loop, *(_Frame(m, d, self._G, *end) for end in ends))
-            parts += [rows(seen) for rows in _ROWS[loop.kind]]
+        parts = [
+            loop_rows(loop, *(_frame(self._m, self._d, self._G, *end) for end in ends))
+            for loop, ends in zip(self._model.loops, self._ends, strict=True)
+        ]
         return Rows.stacked(parts) if parts else Rows(*(np.zeros((0, *x)) for x in ((), (self._model.nv,), (), ())))
 
     def _move(self, q: Array, v: Array) -> None:
@@ -304,26 +147,17 @@ class PinConstraints:
         m, d, held, moving = self._m, self._d, [], []
         with np.errstate(divide="ignore", invalid="ignore"):
             for part, ends in zip(self._model.no_slip, self._touching, strict=True):
-                seen = _Contact(part, *(_Frame(m, d, self._G, *end) for end in ends))
-                held += seen.held
-                moving += seen.moving
+                own = contact_rows(part, *(_frame(m, d, self._G, *end) for end in ends))
+                held.append(own[0])
+                moving.append(own[1])
         return held, moving
 
     def all_rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
         """Return the rows of loops, couplers, motions and contacts; `given` are q and v of the description."""
         loops = self.every(q, v)
         held, moving = self._contacts()
-        return Rows.stacked([loops, *self._couplers(*given), *self._motions(*given), *held, *moving])
-
-    def _couplers(self, q: Array, v: Array) -> list[Rows]:
-        layout, out = self._model.layout, []
-        for x in self._model.couplers:
-            i, k = layout.full_q[x.joint].start, layout.full_q[x.leader].start
-            at = layout.G_q[[i, k]] @ q + layout.offsets[[i, k]]
-            to, curve = layout.coupler_row(x, at[1]) @ layout.G, x.polynomial
-            rate = layout.G[layout.full_v[x.leader].start] @ v
-            out.append(_row(at[0] - curve(at[1]), to, to @ v, -curve.deriv(2)(at[1]) * rate**2))
-        return out
+        others = coupler_rows(self._model, *given), motion_rows(self._model, self._laws, self._time, *given)
+        return Rows.stacked([loops, *others[0], *others[1], *held, *moving])
 
     def rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
         """Return the rows that say something."""
@@ -335,22 +169,6 @@ class PinConstraints:
         from mbkit.derivation.elements.motions import law_rates
 
         return [law_rates(x) for x in self._model.prescribed]
-
-    def _motions(self, q: Array, v: Array) -> list[Rows]:
-        layout, t, out = self._model.layout, self._time, []
-        for number, x in enumerate(self._model.prescribed):
-            i, k = layout.full_q[x.joint].start, layout.full_v[x.joint].start
-            if isinstance(x, Prescribed):
-                turn = x.frequency * t + x.phase
-                path = x.offset + x.rate * t + x.amplitude * sin(turn)
-                speed = x.rate + x.amplitude * x.frequency * cos(turn)
-                gamma = x.amplitude * x.frequency**2 * sin(turn)
-            else:
-                path, speed, rate = self._laws[number](t)
-                gamma = -rate
-            to = layout.G[k]
-            out.append(_row(layout.G_q[i] @ q + layout.offsets[i] - path, to, to @ v - speed, gamma))
-        return out
 
     # Motion
 
