@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +24,7 @@ PIN: dict[str, Any] = {
     "body_b": "rocker",
     "translation_b": [bare.ROCKER, 0, 0],
 }
-TABLE = f"""[[loop]]
-name = "pin"
-kind = "point"
-body_a = "coupler"
-translation_a = [{bare.COUPLER}, 0, 0]
-body_b = "rocker"
-translation_b = [{bare.ROCKER}, 0, 0]
-"""
+TABLE = "[[loop]]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in PIN.items())
 
 
 def urdf(tip: bool = False) -> str:
@@ -131,11 +125,7 @@ def test_loops_of_an_mjcf_stay_beside_those_that_are_added(tmp_path: Path) -> No
         ([PIN | {"rotation_b": np.ones((3, 3))}], ModelError, "rotation_b is not a rotation matrix"),
         ([PIN | {"body_c": "x"}], InputError, r"loops\[0\]: unknown argument 'body_c'"),
         ([{"name": "pin"}], InputError, r"loops\[0\]: kind, body_a, body_b missing"),
-        (
-            [{"name": "pin", "kind": "pointt"}],
-            InputError,
-            r"unknown kind 'pointt'.*'frame'.*body_a, body_b missing",
-        ),
+        ([{"name": "pin", "kind": "pointt"}], InputError, r"unknown kind 'pointt'.*'frame'.*body_a, body_b missing"),
         ([3], InputError, r"loops\[0\]: expected a Loop or a dict"),
         (3, InputError, "loops: expected True, False"),
         ("no.toml", LoadError, r"no\.toml: No such file"),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -51,43 +52,50 @@ METHOD_NAMES = (
 WORDS = ("fixed", "free", "ball", "auto")
 
 
-def literals(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the strings of a module with their lines, without docstrings and f-strings."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+@cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+@cache
+def literals(path: Path) -> list[tuple[int, str]]:
+    """Return the strings of a module with their lines, without docstrings and f-strings."""
     skipped = {
         id(part)
-        for node in ast.walk(tree)
+        for node in nodes(path)
         if isinstance(node, (ast.Expr, ast.JoinedStr))
         for part in ([node.value] if isinstance(node, ast.Expr) else node.values)
     }
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in skipped:
-            yield node.lineno, node.value
+    return [
+        (node.lineno, node.value)
+        for node in nodes(path)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in skipped
+    ]
 
 
-def uses(names: Iterable[str], allowed: Iterable[str], found: Callable[[Path], Iterable[tuple[int, str]]]) -> list[str]:
+def uses(names: Iterable[str], allowed: Iterable[str]) -> list[str]:
     """Return where a name stands as a string outside of files and folders (which end in a slash)."""
     names, allowed = frozenset(names), tuple(allowed)
     return [
         f"mbkit/{name}:{line}: {text!r}"
         for name, path in FILES.items()
         if not any(name == x or (x.endswith("/") and name.startswith(x)) for x in allowed)
-        for line, text in found(path)
+        for line, text in literals(path)
         if text in names
     ]
 
 
 def test_names_of_engines_stand_in_the_registry():
-    assert uses((n for n, info in ENGINES.items() if info.built_in), ENGINE_NAMES, literals) == []
+    assert uses((n for n, info in ENGINES.items() if info.built_in), ENGINE_NAMES) == []
 
 
 def test_names_of_joint_types_stand_with_the_joint_types():
     names = (n for n, joint_type in KINDS.items() if joint_type.built_in and n not in WORDS)
-    assert uses(names, JOINT_NAMES, literals) == []
+    assert uses(names, JOINT_NAMES) == []
 
 
 def test_names_of_methods_stand_with_the_methods():
-    assert uses((n for n in METHODS if n not in WORDS), METHOD_NAMES, literals) == []
+    assert uses((n for n in METHODS if n not in WORDS), METHOD_NAMES) == []
 
 
 def test_no_joint_is_asked_for_the_name_of_its_type():
@@ -96,7 +104,7 @@ def test_no_joint_is_asked_for_the_name_of_its_type():
     for name, path in FILES.items():
         if name.startswith(("engines/", "load/")):
             continue
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(path):
             sides = [node.left, *node.comparators] if isinstance(node, ast.Compare) else []
             constants = {x.value for x in sides if isinstance(x, ast.Constant)}
             kinds = any(isinstance(x, ast.Attribute) and x.attr == "kind" for x in sides)
@@ -119,7 +127,7 @@ def test_folders_hold_few_modules():
 def test_validation_scripts_import_names_that_exist():
     missing = []
     for path in sorted((ROOT.parent / "validation").glob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(path):
             if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "mbkit":
                 for name in (alias.name for alias in node.names):
                     module = node.module if find_spec(node.module) else ""

@@ -678,18 +678,3 @@ def test_poses_and_velocities_of_named_frames_are_numbers_too(tmp_path: Path, mo
     assert [r.term for r in result.moved] == ["frames"]
     assert result.moved[0].joint in made.frames
     assert result.moved[0].error > 1e-8
-
-
-def test_a_coupler_is_recorded(tmp_path: Path) -> None:
-    def pair(ratio: float) -> mb.Model:
-        b = mb.ModelBuilder("pair")
-        for k in (0, 1):
-            b.add_body(f"rod{k}", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
-            b.add_joint(f"j{k}", "revolute", parent="world", child=f"rod{k}", axis=(0, 1, 0))
-        b.add_coupler("gear", "j0", "j1", ratio=ratio)
-        return b.build()
-
-    mb.baseline.record(pair(2.0), tmp_path / "pair.toml", engines=["lagrangian"])
-    assert mb.baseline.check(pair(2.0), tmp_path / "pair.toml").passed
-    result = mb.baseline.check(pair(3.0), tmp_path / "pair.toml")
-    assert [c.text for c in result.changes] == ["ratio of coupler gear: 2 → 3"]

@@ -81,7 +81,7 @@ def test_a_robot_agrees_and_is_written(here):
 
 def test_everything_from_a_cold_start(tmp_path):
     made = subprocess.run(
-        [sys.executable, "-m", "mbkit", "check", "finger_edu", "--full", "--out", "out"],
+        [sys.executable, "-m", "mbkit", "check", "pendulum", "--full", "--out", "out"],
         cwd=tmp_path,
         env=os.environ
         | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "PYTHONIOENCODING": "ascii", "MBKIT_COMPILE": "1"},
@@ -90,10 +90,10 @@ def test_everything_from_a_cold_start(tmp_path):
     )
     text = made.stdout.decode("utf-8")
     assert made.returncode == 0, text + made.stderr.decode()
-    for wanted in ("✓ fingeredu", "Rollouts", "Error against run time", "What a call leaves out", "contacts"):
+    for wanted in ("✓ pendulum", "Rollouts", "Error against run time", "What a call leaves out", "contacts"):
         assert wanted in text
     assert made.stderr == b""
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"finger_edu.html", "finger_edu.json"}
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"pendulum.html", "pendulum.json"}
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
@@ -121,9 +121,8 @@ def test_files_have_the_robots_own_name_whatever_its_case_was(here, command, fil
 
 
 @pytest.mark.usefixtures("here")
-@pytest.mark.parametrize("width", ["40", "80"])
-def test_no_name_of_a_robot_is_cut(monkeypatch, width):
-    monkeypatch.setenv("COLUMNS", width)
+def test_no_name_of_a_robot_is_cut(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
     assert "…" not in call("robots").output
 
 
@@ -142,11 +141,6 @@ def test_a_folder_is_told_with_the_descriptions_in_it(here):
     result = call("check", "things")
     assert result.exit_code == 2
     assert os.path.join("urdf", "arm.urdf") in result.stderr
-
-
-def test_a_robots_file_has_the_name_that_was_asked_for(here):
-    assert call("check", "double_pendulum", *QUICK).exit_code == 0
-    assert (here / "mbkit-report" / "double_pendulum.html").exists()
 
 
 def test_json_is_all_there_is_on_stdout(here):
@@ -170,8 +164,7 @@ def test_a_catalog_system_a_file_and_a_model_itself(here):
 
     robot = find("finger_edu")
     assert robot is not None
-    assert call("check", str(robot.path), "--floating-base", *QUICK).exit_code == 0
-    assert "nv 9" in call("check", "finger_edu", "--floating-base", *QUICK).stdout
+    assert "nv 9" in call("check", str(robot.path), "--floating-base", *QUICK).stdout
 
 
 @pytest.mark.usefixtures("here")
@@ -414,9 +407,11 @@ def test_interrupting_all_shows_and_writes_what_is_finished(here, monkeypatch):
 # Many robots.
 
 
-def test_robots_end_in_agreement_or_a_named_reason_in_any_executor():
+def test_robots_end_in_agreement_or_a_named_reason_in_any_executor(monkeypatch):
+    # The terms of bodies are compared by tests/test_all_robots.py.
+    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "BODY_TERMS", ())
     with ThreadPoolExecutor(1) as executor:
-        found = {o.robot: o for o in all_robots(["ur3", "hector", "romeo_small"], samples=4, executor=executor)}
+        found = {o.robot: o for o in all_robots(["ur3", "hector", "romeo_small"], samples=1, executor=executor)}
     assert found["ur_description/ur3_robot"].status == "agree"
     assert found["hector_description/quadrotor_base"].status == "refused"
     assert found["hector_description/quadrotor_base"].reason.startswith("no joints")

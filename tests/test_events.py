@@ -159,16 +159,8 @@ def test_events_see_unit_quaternions_and_held_torques() -> None:
         assert np.array_equal(run.t[:-1], [0.0, 0.01, 0.02])
         # The end is that of a run which has the time among those that it saves.
         held = np.concatenate([tau[:2], tau[2:3], tau[2:3], tau[3:]])
-        other = simulate(
-            dynamics(model),
-            q0,
-            [1.0, 20.0, -4.0],
-            0.05,
-            "dop853",
-            rtol=1e-12,
-            torque=held,
-            save=[*save[:3], 0.025, *save[3:]],
-        )
+        given = {"rtol": 1e-12, "torque": held, "save": [*save[:3], 0.025, *save[3:]]}
+        other = simulate(dynamics(model), q0, [1.0, 20.0, -4.0], 0.05, "dop853", **given)
         assert run.v[-1] == pytest.approx(other.v[3], abs=1e-5)
     assert seen == pytest.approx(np.ones(len(seen)), abs=1e-12)
 

@@ -134,23 +134,34 @@ def columns(points: np.ndarray) -> list[np.ndarray]:
 def everything() -> ca.Function:
     """Every function and decision of two numbers between 0 and 1, one output each."""
     shifted = [f.casadi(*((X + 1 if f.name == "acosh" else X), Y)[: f.arguments]) for f in TABLE]
-    return function(*shifted, *decisions().values())
+    return function(*shifted, *decisions())
 
 
-def decisions() -> dict[str, Any]:
-    return {
-        "fmin": ca.fmin(X, Y),
-        "fmax": ca.fmax(X, Y),
-        "lt": X < Y,
-        "le": X <= Y,
-        "eq": ca.eq(X, Y),
-        "ne": ca.ne(X, Y),
-        "and": ca.logic_and(X, Y),
-        "or": ca.logic_or(X, Y),
-        "not": ca.logic_not(X),
-        "sign": ca.sign(X),
-        "if_else": ca.if_else(ca.logic_and(X > 0, ca.logic_not(Y > X)), X, 2 * Y),
-    }
+def _unless_nan(choose: Callable[[float, float], float]) -> Callable[[float, float], float]:
+    return lambda x, y: math.nan if math.isnan(x + y) else choose(x, y)
+
+
+#: Decisions: in CasADi, and in Python's own numbers.
+DECISIONS: dict[str, tuple[Any, Callable[[float, float], float]]] = {
+    "fmin": (ca.fmin(X, Y), _unless_nan(min)),
+    "fmax": (ca.fmax(X, Y), _unless_nan(max)),
+    "lt": (X < Y, lambda x, y: x < y),
+    "le": (X <= Y, lambda x, y: x <= y),
+    "eq": (ca.eq(X, Y), lambda x, y: x == y),
+    "ne": (ca.ne(X, Y), lambda x, y: x != y),
+    "and": (ca.logic_and(X, Y), lambda x, y: x != 0 and y != 0),
+    "or": (ca.logic_or(X, Y), lambda x, y: x != 0 or y != 0),
+    "not": (ca.logic_not(X), lambda x, _: x == 0),
+    "sign": (ca.sign(X), lambda x, _: x if math.isnan(x) else float(x > 0) - float(x < 0)),
+    "if_else": (
+        ca.if_else(ca.logic_and(X > 0, ca.logic_not(Y > X)), X, 2 * Y),
+        lambda x, y: x if x > 0 and not y > x else 2 * y,
+    ),
+}
+
+
+def decisions() -> list[Any]:
+    return [written for written, _ in DECISIONS.values()]
 
 
 def read_exactly(x: Any) -> Any:
@@ -229,32 +240,9 @@ def test_jacobians_are_the_derivatives(f: Function, how: Any) -> None:
 # Decisions, and what is no number
 
 
-def _fmin(x: float, y: float) -> float:
-    return math.nan if math.isnan(x + y) else min(x, y)
-
-
-def _fmax(x: float, y: float) -> float:
-    return math.nan if math.isnan(x + y) else max(x, y)
-
-
-DECIDED: dict[str, Callable[[float, float], float]] = {
-    "fmin": _fmin,
-    "fmax": _fmax,
-    "lt": lambda x, y: x < y,
-    "le": lambda x, y: x <= y,
-    "eq": lambda x, y: x == y,
-    "ne": lambda x, y: x != y,
-    "and": lambda x, y: x != 0 and y != 0,
-    "or": lambda x, y: x != 0 or y != 0,
-    "not": lambda x, _: x == 0,
-    "sign": lambda x, _: x if math.isnan(x) else float(x > 0) - float(x < 0),
-    "if_else": lambda x, y: x if x > 0 and not y > x else 2 * y,
-}
-
-
 @pytest.mark.parametrize("how", ["machine code", "interpreter", *BACKENDS])
 def test_decisions_are_the_same_everywhere(how: Any) -> None:
-    made = function(*decisions().values())
+    made = function(*decisions())
     points = np.array(list(itertools.product([0.0, 1.0, -2.0, 0.5, np.nan], repeat=2)))
     if how in BACKENDS:
         own = arithmetic(how)
@@ -262,7 +250,7 @@ def test_decisions_are_the_same_everywhere(how: Any) -> None:
     else:
         out = (built(made) if how == "machine code" else Machine(made))(*columns(points))[0]
     for got, (x, y) in zip(out[:, :, 0], points, strict=True):
-        for value, (name, decide) in zip(got, DECIDED.items(), strict=True):
+        for value, (name, (_, decide)) in zip(got, DECISIONS.items(), strict=True):
             if how == "interpreter" and name in ("fmin", "fmax") and math.isnan(x + y):
                 continue  # CasADi's machine has C's, which pass over what is no number
             np.testing.assert_equal(value, float(decide(x, y)), err_msg=f"{name} of {x}, {y}")
@@ -313,7 +301,7 @@ def test_no_choice_hides_what_is_no_number(hide: Any) -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_what_is_read_and_not_finite_is_found_whatever_a_function_makes_of_it(bad: float) -> None:
     """exp(-inf) is 0, atan(inf) a number, NaN to the power of 0 is 1."""
-    for made in [f.casadi(*arguments(f)) for f in TABLE] + list(decisions().values()):
+    for made in [f.casadi(*arguments(f)) for f in TABLE] + decisions():
         code = built(function(made))
         for i in range(2):
             points = np.zeros((9, 2))
@@ -475,14 +463,11 @@ def test_a_system_of_such_functions_moves_as_with_dop853() -> None:
         integrator.state[:] = start
         integrator.propagate_until(3.0)
         series = integrator.state.copy()
-    run = solve_ivp(
-        lambda _, y: np.concatenate([x.ravel() for x in code(y[:3], y[3:], rest)]),
-        (0.0, 3.0),
-        start,
-        method="DOP853",
-        rtol=1e-13,
-        atol=1e-14,
-    )
+
+    def rates(_: float, y: np.ndarray) -> np.ndarray:
+        return np.concatenate([x.ravel() for x in code(y[:3], y[3:], rest)])
+
+    run = solve_ivp(rates, (0.0, 3.0), start, method="DOP853", rtol=1e-13, atol=1e-14)
     # Some hundred steps of 1e-13 each at most, in a motion that spreads little in 3 s.
     np.testing.assert_allclose(series, run.y[:, -1], rtol=0, atol=1e-11)
 
@@ -509,6 +494,6 @@ def test_an_operation_that_no_backend_has_is_named(e: Any, told: str) -> None:
 def test_every_operation_has_a_place_in_every_backend() -> None:
     heyoka = pytest.importorskip("heyoka")
     names = {*program_module._UNARY.values(), *program_module._BINARY.values()}
-    assert {o.name for o in program(everything()).operations} >= {*CALLS, *DECIDED} - {"if_else"}
+    assert {o.name for o in program(everything()).operations} >= {*CALLS, *DECISIONS} - {"if_else"}
     for known in (extended_precision._functions(arithmetic()), taylor._functions(heyoka)):
         assert known.keys() == names
