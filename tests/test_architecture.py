@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -73,6 +74,18 @@ def literals(path: Path) -> list[tuple[int, str]]:
     ]
 
 
+def words_of(path: Path) -> Iterator[str]:
+    """Yield the names and the words of strings of a module, without docstrings."""
+    for node in nodes(path):
+        for field in ("name", "id", "attr", "arg"):
+            if isinstance(name := getattr(node, field, None), str):
+                yield name
+        if isinstance(node, ast.ImportFrom):
+            yield (node.module or "").rpartition(".")[2]
+    for _, text in literals(path):
+        yield from re.findall(r"\w+", text)
+
+
 def uses(names: Iterable[str], allowed: Iterable[str]) -> list[str]:
     """Return where a name stands as a string outside of files and folders (which end in a slash)."""
     names, allowed = frozenset(names), tuple(allowed)
@@ -122,6 +135,16 @@ def test_folders_hold_few_modules():
     folders = {path.parent for path in FILES.values()}
     sizes = {f.relative_to(ROOT).as_posix(): sum(p.name != "__init__.py" for p in f.glob("*.py")) for f in folders}
     assert {n: k for n, k in sizes.items() if k > LARGE_FOLDERS.get(n, MAX_MODULES)} == {}
+
+
+def test_the_price_of_a_change_is_that_of_the_book():
+    """Of each row of the table: where the example's name stands in code, without docstrings and comments."""
+    page = (ROOT.parent / "notebooks" / "carry_on" / "extend.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([^|]+) \| `(\w+)` \| (`[^|]+`) \|$", page, flags=re.MULTILINE)
+    words = {name: set(words_of(path)) for name, path in FILES.items()}
+    found = {what: {name for name, of in words.items() if example in of} for what, example, _ in rows}
+    assert found == {what: set(re.findall(r"`([^`]+)`", files)) for what, _, files in rows}
+    assert len(rows) >= 9
 
 
 def test_validation_scripts_import_names_that_exist():
