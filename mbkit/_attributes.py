@@ -1,4 +1,4 @@
-"""Attributes that stay as they are, and errors that know what others call them."""
+"""Read-only attributes, and `AttributeError`s that name the attribute of the same meaning."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ELSEWHERE: Final = {
 
 
 class ReadOnly:
-    """An object whose methods and public attributes nobody sets again."""
+    """An object whose methods and public attributes are read-only."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not name.startswith("_") and (name == "model" or callable(getattr(type(self), name, None))):

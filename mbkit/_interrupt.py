@@ -69,7 +69,7 @@ _interrupts = _Interrupts()
 
 
 def _install() -> None:
-    """Listen to Ctrl-C in this process, unless whoever started it has it ignored or listens already."""
+    """Listen to Ctrl-C in this process, unless its parent ignores it or a listener is there already."""
     if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         return
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
@@ -98,7 +98,7 @@ def at_end(action: Callable[[], object], *, remove: bool = False) -> None:
 
 
 def _listen(listening: int) -> None:
-    """Do in a thread what the main thread does not come to, because it is in a library."""
+    """End the command from a thread while the main thread is in a library."""
     while True:
         _interrupts.heard += os.read(listening, 64).count(signal.SIGINT)
         time.sleep(_PATIENCE)
@@ -107,7 +107,7 @@ def _listen(listening: int) -> None:
 
 
 def _begin_end() -> None:
-    """Say that the command was interrupted, be silent, and end it when the main thread has not in time."""
+    """Print that the command was interrupted, print nothing more, and end it if the main thread does not in time."""
     with _interrupts.lock:
         if _interrupts.ending:
             return

@@ -84,7 +84,7 @@ class Composite:
         )
 
     def turning(self, w: Vector) -> Composite:
-        """Return it with the rates that axes see in which these axes turn at w."""
+        """Return the inertia with its rates seen from axes in which the link's axes turn at w."""
         I = self.inertia.inertia
         columns = [cross3(w, [I[SYMMETRIC[i][j]] for i in range(3)]) for j in range(3)]
         change = [columns[j][i] + columns[i][j] for i in range(3) for j in range(i, 3)]
@@ -96,7 +96,7 @@ class Composite:
         )
 
     def rotated(self, R: Rotation) -> Composite:
-        """Return it in the axes of the parent."""
+        """Return the same in the axes of the parent."""
         return Composite(
             self.inertia.rotated(R),
             to_parent(R, self.moment_rate),
@@ -105,7 +105,7 @@ class Composite:
         )
 
     def shifted(self, r: Vector, velocity: Vector) -> Composite:
-        """Return it about the origin that is at -r from its own, from which its own moves at `velocity`."""
+        """Return the inertia about an origin at -r from its own, relative to which its own moves at `velocity`."""
         if vanishes(r) and vanishes(velocity):
             return self
         moved = self.inertia.shifted(r)

@@ -51,7 +51,7 @@ _MOST_LOST: Final = 2.0
 
 
 def elimination_of(model: Model) -> Elimination:
-    """Return what a model's forward dynamics comes from, where nobody chooses: the quickest that keeps the digits."""
+    """Return the default elimination of a model's forward dynamics: the fastest that keeps the digits."""
     if model.energy_equations is not None:
         return "mass matrix"
     return "least constraint" if loses_digits(model) else "links"

@@ -248,7 +248,7 @@ class CentralInertia:
         )
 
     def in_parent(self, link: Link) -> CentralInertia:
-        """Return it in the frame of the link's parent."""
+        """Return the inertia in the frame of the link's parent."""
         centre = add(to_parent(link.turn, self.centre), link.slide)
         centre = add(to_parent(link.fixed, centre), link.translation)
         return CentralInertia(self.mass, centre, exact_congruence(link.rotation, self.inertia))

@@ -82,11 +82,11 @@ class Inertia:
         return self + Inertia(-other.mass, moment, inertia)
 
     def rotated(self, R: Rotation) -> Inertia:
-        """Return it in the axes of the parent."""
+        """Return the same in the axes of the parent."""
         return Inertia(self.mass, to_parent(R, self.moment), congruence(R, self.inertia))
 
     def shifted(self, r: Vector) -> Inertia:
-        """Return it about the origin that is at -r from its own."""
+        """Return the inertia about an origin at -r from its own."""
         at = [m + r_i * self.mass for m, r_i in zip(self.moment, r, strict=True)]
         both = add(self.moment, at)
         trace = dot3(both, r)
@@ -102,7 +102,7 @@ class Inertia:
 
     @property
     def rounded(self) -> Inertia:
-        """It in doubles; parts that are expressions stay."""
+        """The matter in doubles; parts that are expressions stay."""
         return Inertia(_rounded(self.mass), [_rounded(x) for x in self.moment], [_rounded(x) for x in self.inertia])
 
 

@@ -193,7 +193,7 @@ class Values:
 
     @property
     def constant_values(self) -> Array:
-        """What they stand for."""
+        """The numbers that the symbols stand for."""
         first = self.named if self._symbolic else ()
         return np.array([*(self.model.parameters[n] for n in first), *self._pool], dtype=np.float64)
 

@@ -177,7 +177,7 @@ class Manifold:
         return self.call("all_rows", q)[1]
 
     def still_open(self, q: Array) -> list[str]:
-        """Return what is open at a configuration where the independent rows are zero: others, and half a turn."""
+        """Return the rows that stay open where the independent rows are zero: dependent ones, and half a turn."""
         f, J, ways = self.call("all_rows", q)
         scale = np.maximum(np.abs(J[: len(f)]).sum(axis=1), 1.0) * max(1.0, float(np.abs(q).max()))
         names = self.equations.all_constraints.names
@@ -303,7 +303,7 @@ class Manifold:
         return q, v + least_change(x.W, x.J / x.scale[:, None], -x.rate / x.scale, AT_POSE)
 
     def project(self, q: Array, v: Array, held: Collection[int] = ()) -> tuple[Array, Array]:
-        """Return the nearest consistent state, in the metric of the mass matrix there; InputError if there is none.
+        """Return the nearest consistent state, in the metric of the mass matrix; `InputError` if none is consistent.
 
         The velocities `held`, and what they move, stay as they are.
         """
@@ -476,7 +476,7 @@ def pulled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
 
 
 def projected(dyn: Dynamics, q: Array, v: Array, hold: Sequence[str] = ()) -> tuple[Array, Array]:
-    """Return the nearest consistent state; an `InputError` where there is none or the constraints are redundant."""
+    """Return the nearest consistent state; `InputError` where no state is, or where the constraints are redundant."""
     manifold, (coordinates, held) = manifold_of(dyn), held_parts(dyn.model, hold)
     names = ", ".join(hold)
     try:

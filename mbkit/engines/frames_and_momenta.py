@@ -1,4 +1,4 @@
-"""What scripts ask of the bodies: motion of frames, centre of mass, momentum. A part of `Dynamics`.
+"""Motion of frames, centre of mass and momentum. A part of `Dynamics`.
 
 **Axes** name the point and the axes of a six-vector, linear then angular. ``"local"``: the frame's origin, in the
 frame's axes. ``"local_world_aligned"``: the frame's origin, in the world's axes. ``"world"``: the point of the frame's

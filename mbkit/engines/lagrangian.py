@@ -197,7 +197,7 @@ class LagrangianDynamics(Dynamics):
 
     @cached_property
     def elimination(self) -> Elimination:
-        """What accelerations come from."""
+        """The elimination that gives accelerations."""
         return self._chosen or elimination_of(self.model)
 
     @cached_property

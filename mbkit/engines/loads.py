@@ -361,7 +361,7 @@ class _Balance:
                 self._add(body, force, np.cross(point, force))
 
     def residual(self) -> Array:
-        """Return what is left of the forces and moments once the rates of momentum are taken off."""
+        """Return forces and moments less the rates of momentum: the residual of the balance."""
         dyn, bodies = self._dyn, self._model.bodies
         mass = np.array([b.mass for b in bodies])[:, None]
         com, inertia = np.array([b.com for b in bodies]), np.array([b.inertia for b in bodies])

@@ -23,7 +23,7 @@ _ROUNDING: Final = 1e-13
 
 
 class Stability(Protocol):
-    """What a step of a method does to linear systems."""
+    """Stability of a method: its step on linear systems."""
 
     def matrix(self, h: float, A: Array, B: Array) -> Array:
         """Return the (2n, 2n) matrix of a step of h seconds on (x, ẋ) of ẍ = A x + B ẋ."""

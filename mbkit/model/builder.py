@@ -736,7 +736,7 @@ def with_loops(model: Model, loops: Iterable[Mapping[str, Any]]) -> Model:
 
 
 def _resolve(joints: Iterable[Joint], bindings: Iterable[Binding]) -> tuple[tuple[Joint, ...], tuple[Binding, ...]]:
-    """Let every mimic joint point at a joint that is free itself."""
+    """Make every mimic joint follow a joint that is independent."""
     by_name = {j.name: j for j in joints}
     bound: dict[tuple[str, str], Number] = {(b.part, b.field): b.expression for b in bindings if b.where == "joints"}
     changed = {}

@@ -378,7 +378,7 @@ class Description:
 
     @cached_property
     def needs(self) -> Needs:
-        """What this description needs from an engine."""
+        """Features that this description needs from an engine."""
         bound = (b.field for b in self.bindings)
         held = self.loops, self.prescribed, self.no_slip
         return Needs.of(

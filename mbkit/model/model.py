@@ -38,7 +38,7 @@ _checked: Final = ContextVar("checked", default=True)
 
 @contextmanager
 def unchecked() -> Iterator[None]:
-    """Let models come into being unchecked: within a builder that checks them, or as a mistake that is looked for."""
+    """Create models without checks: in a builder that checks them, or with a defect on purpose."""
     token = _checked.set(False)
     try:
         yield

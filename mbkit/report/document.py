@@ -1,4 +1,4 @@
-"""What people are shown of a result: sections of paragraphs, tables, lists, facts and figures.
+"""The document of a result: sections of paragraphs, tables, lists, facts and figures.
 
 A view makes one document of a result; `terminal` and `page` render it. A terminal has room for the verdict and what
 leads to it, a page for everything: `on` says where a part is shown.
@@ -123,7 +123,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Figure:
-    """A drawing of a page as an SVG element, with its caption; where `draw` returns nothing, there is none."""
+    """A drawing of a page as an SVG element with its caption; empty where `draw` returns None."""
 
     draw: Callable[[], str]
     caption: str

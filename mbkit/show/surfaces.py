@@ -110,7 +110,7 @@ def _clustered(surface: Surface, cell: float) -> Surface:
 
 
 def cleaned(vertices: Any, triangles: Any, color: Color | None = None) -> Surface:
-    """Return a surface without triangles of no extent, repeated ones, and unused vertices; ValueError if it is none."""
+    """Return a surface without degenerate or repeated triangles and unused vertices; `ValueError` if none is left."""
     V, T = np.asarray(vertices, dtype=np.float64).reshape(-1, 3), np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
     if not len(T) or T.min() < 0 or T.max() >= len(V) or not np.isfinite(V).all():
         raise ValueError("no triangles, or some with vertices that are not there")

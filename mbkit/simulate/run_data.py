@@ -29,7 +29,7 @@ Acting = tuple[tuple[Frame, ...], str]
 
 @dataclass(frozen=True, eq=False)
 class RunSettings:
-    """What a run was started with, for checks afterwards."""
+    """The start of a run, for checks afterwards."""
 
     t0: float
     q0: Array

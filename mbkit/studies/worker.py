@@ -339,7 +339,7 @@ def in_worker() -> bool:
 
 
 def report_stage(name: str) -> None:
-    """Tell the parent what a call begins now, which has a time limit of its own; does nothing in other processes."""
+    """Report to the parent the part of a call that begins, which has its own time limit; without effect elsewhere."""
     if _to_parent is not None:
         _to_parent.send(("stage", name))
 

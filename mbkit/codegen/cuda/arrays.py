@@ -157,7 +157,7 @@ class DeviceArray:
         return self.seen(lambda x: x[key])
 
     def as_batch(self) -> Place:
-        """Return it as (N, n), as a kernel takes it."""
+        """Return the array as (N, n), the shape that a kernel takes."""
         return Place(self._address, 1 if self._strides[-1] == 1 else self.shape[0], self._strides[0])
 
     def seen(self, view: Callable[[Array], Array]) -> DeviceArray:
@@ -187,7 +187,7 @@ class DeviceArray:
 
     @property
     def __cuda_array_interface__(self) -> dict[str, Any]:
-        """What Numba's protocol asks for."""
+        """The description by Numba's protocol."""
         strides = tuple(8 * s for s in self._strides)
         facts = {"shape": self.shape, "typestr": "<f8", "data": (self._address, False), "strides": strides}
         return facts | {"version": 3, "stream": _STREAM}

@@ -159,7 +159,7 @@ class Device:
 
 
 def in_parts(count: int, work: Callable[[slice], None]) -> None:
-    """Do some work on all of a batch, or on part after part where the GPU has no room for all."""
+    """Run `work` on the whole batch, or on one part after the other where the GPU has no room for all."""
     start, size = 0, count
     while start < count:
         try:

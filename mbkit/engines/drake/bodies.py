@@ -31,7 +31,7 @@ def _linear_first(spatial: Any) -> Array:
 
 
 class DrakeBodies:
-    """What Drake says of frames, of the whole, and of loads; `DrakeDynamics` inherits it."""
+    """Drake's quantities of frames, of the whole system, and loads; `DrakeDynamics` inherits it."""
 
     model: Model
     maps: DrakeModel

@@ -28,7 +28,7 @@ _SYMMETRIC = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
 class MujocoBodies:
-    """What MuJoCo says of frames, of the whole, and of loads; `MujocoDynamics` inherits it."""
+    """MuJoCo's quantities of frames, of the whole system, and loads; `MujocoDynamics` inherits it."""
 
     model: Model
     _m: Any

@@ -373,7 +373,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         return law(self._m, self._d, M, self.softness, lambda a: self._force(a - b), self._columns)
 
     def _accelerated(self, tau: Array) -> None:
-        """Let MuJoCo compute its accelerations at the state that is in."""
+        """Have MuJoCo compute its accelerations at the state in its data."""
         self._d.qfrc_applied[:] = self._to_engine(tau)
         mujoco.mj_forward(self._m, self._d)
         self._d.qfrc_applied[:] = 0.0

@@ -27,7 +27,7 @@ _REFERENCE_FRAMES: Final = {
 
 
 class PinocchioBodies:
-    """What Pinocchio says of frames, of the whole, and of loads; `PinocchioDynamics` inherits it."""
+    """Pinocchio's quantities of frames, of the whole system, and loads; `PinocchioDynamics` inherits it."""
 
     model: Model
     _m: Any

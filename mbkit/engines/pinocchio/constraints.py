@@ -214,7 +214,7 @@ class PinConstraints:
         return np.asarray(-self._d.constraint_chol.D[:rows])
 
     def iterated(self, q: Array, v: Array, force: Array) -> Array | None:
-        """Return v̇ of constraintDynamics under a force without h, all of it Pinocchio's; None where it is none."""
+        """Return v̇ of constraintDynamics under a force without h, all by Pinocchio; None where it is refused."""
         m, d, mu = self._m, self._d, self._mu
         models, data = self._rigid
         settings = pin.ProximalSettings(_ACCURACY, _ACCURACY, mu, _ITERATIONS)

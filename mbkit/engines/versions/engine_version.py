@@ -63,7 +63,7 @@ class EngineVersion:
         return environment.exists(self.package.distribution, self.version)
 
     def interpreter(self) -> Path:
-        """Return the interpreter of its environment, which is made where there is none."""
+        """Return the interpreter of its environment; make the environment first if it is missing."""
         return environment.interpreter(self.package.distribution, self.version, self.package.module)
 
     def __str__(self) -> str:

@@ -78,7 +78,7 @@ class EngineProcess:
         return head, out
 
     def start(self) -> int:
-        """Start the process where there is none, and return its generation."""
+        """Start the process unless it runs, and return its generation."""
         with self._lock:
             self._start()
             return self.generation

@@ -87,7 +87,7 @@ Motion = Prescribed | FormulaMotion | SplineMotion
 
 
 class MotionLaw(NamedTuple):
-    """What others ask of a law.
+    """The properties of a law that other modules read.
 
     Attributes
     ----------

@@ -137,7 +137,7 @@ class StepRateMonitor:
         self._ends = [*self._ends, *steps.t[1:].tolist()][-_RECENT - 1 :]
 
     def due(self) -> bool:
-        """Return whether it is time for a check."""
+        """Return whether a check is due."""
         due = self.missing <= 0
         if due:
             self._next = self._later * self._marks[-1][0]

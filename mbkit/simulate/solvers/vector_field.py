@@ -194,7 +194,7 @@ class Rates:
         return np.concatenate(self._field.settled(t, y[:nq], y[nq:])) if self._field.projects else y
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
-        """Return ẏ; NaN where there is none, so that a step is tried again, smaller."""
+        """Return ẏ; NaN where it cannot be computed, so that the solver tries a smaller step."""
         # Never call the user's function on a non-finite state; testing the norm is cheapest.
         if not float(y @ y) < BOUND**2:
             return np.full(len(y), np.nan)

@@ -374,7 +374,7 @@ def _versions_between(engine: str, recorded: Baseline, now: BaselineResult) -> t
 
 
 def _announce(lines: Sequence[EngineVersion]) -> None:
-    """Say what the search takes at most, before it begins."""
+    """Announce the largest effort of the search, before it begins."""
     package, steps = lines[0].package, 2 + math.ceil(math.log2(max(1, len(lines) - 1)))
     made = min(steps, sum(not x.installed for x in lines))
     print(

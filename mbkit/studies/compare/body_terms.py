@@ -33,7 +33,7 @@ WRENCH: Final = (3.0, -2.0, 5.0, 0.4, 0.7, -0.3)
 
 @dataclass(frozen=True)
 class BodyScales(Scales):
-    """What errors of bodies are measured against, per sample."""
+    """Scales of the errors of bodies, per sample."""
 
     columns: Array = None  # type: ignore[assignment]  # (N, 2, nv), norms of J's linear and angular columns
     velocity: Array = None  # type: ignore[assignment]  # (N, 2), U and W of the frame

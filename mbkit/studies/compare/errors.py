@@ -31,7 +31,7 @@ _REDUNDANT: Final = 1e-11
 
 @dataclass(frozen=True)
 class Scales:
-    """What errors are measured against, per sample."""
+    """Scales of the errors, per sample."""
 
     M: Array  # (N, nv, nv)
     diagonal: Array  # (N, nv), of M

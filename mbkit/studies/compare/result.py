@@ -273,12 +273,12 @@ class Comparison(ResultTable):
 
     @property
     def _beyond(self) -> list[RolloutRow | Omission]:
-        """What failed beyond the terms."""
+        """The failures beyond the terms."""
         return [*(r for r in self.rollouts if r.passed is False), *(o for o in self.omissions if o.fault)]
 
     @property
     def shortened(self) -> tuple[str, ...]:
-        """What is missing, of terms, engines, whole studies, curves, and horizons that were cut."""
+        """What the comparison left out: terms, engines, studies, curves, and horizons that were cut."""
         out = [f"not compared: {', '.join(self.not_compared)}"] if self.not_compared else []
         absent = dict.fromkeys(r.engine for r in self.refusals if not r.term and r.engine not in self.engines)
         out += [f"{', '.join(absent)} left out"] if absent else []

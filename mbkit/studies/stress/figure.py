@@ -125,7 +125,7 @@ def figure(
 
 
 def _axes(ax: Axes | None, rows: int, height: float) -> Axes:
-    """Return an axes with so many rows of a height, in, in a figure of its own where there is none."""
+    """Return axes with so many rows of a height, in; in a new figure where none is given."""
     # Figure without pyplot: no window system, nothing to close.
     from matplotlib.figure import Figure
 

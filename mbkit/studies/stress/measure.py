@@ -90,7 +90,7 @@ def reference_motion(problem: Problem, times: Array, wanted: float, seconds: flo
     if best is None or best.floor > wanted:
         try:
             if left < _MIN_SERIES:
-                raise NumericalError("the time was up")
+                raise NumericalError("stopped at its time limit")
             known = reference(problem.model, problem.q, problem.v, float(times[-1]), times, seconds=left)
             if len(known.t) < len(times):
                 raise NumericalError(known.how)

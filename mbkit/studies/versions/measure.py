@@ -60,7 +60,7 @@ class Case:
 
 @dataclass
 class Measured:
-    """Values by robot and term, or the reason why there is none; times over the last version's by robot."""
+    """Values by robot and term, or the reason why a value is missing; times over the last version's by robot."""
 
     values: dict[tuple[str, str], Array] = field(default_factory=dict)
     reasons: dict[tuple[str, str], str] = field(default_factory=dict)

@@ -167,7 +167,7 @@ def middles(done: Iterable[int], missing: Container[int], differ: Callable[[int,
 
 
 class _Study:
-    """What was measured so far."""
+    """The measurements so far."""
 
     def __init__(
         self,
@@ -191,7 +191,7 @@ class _Study:
         self._new = [x for x in versions if not x.installed]
 
     def announce(self, first: int) -> None:
-        """Say what the study takes, before it begins."""
+        """Announce the effort of the study, before it begins."""
         package = self._versions[0].package
         made = min(len(self._new), first)
         stay = made - len(self._removed) - self._last_removed

@@ -514,7 +514,7 @@ def _search(motion: Motion, deadline: Deadline, seconds: float) -> tuple[list[Kn
 
 
 def _quadruple_seconds(motion: Motion, steps: float) -> float:
-    """Return about how long two runs of so many steps take in quadruple precision; infinite where there is none."""
+    """Return about how long two runs of so many steps take in quadruple precision, s; infinite without it."""
     try:
         order, operations = order_of(precision(113).eps), taylor_system(motion.equations).operations
     except UnsupportedError:

@@ -217,7 +217,7 @@ class _Run:
     times: list[float] = field(default_factory=list)
 
     def point(self, setting: Literal["dt", "rtol"]) -> PrecisionPoint:
-        """Return it for a result."""
+        """Return the curve for a result."""
         # The first run counts only if it was not repeated.
         times = self.times or [self.first]
         low, median, high = map(float, np.percentile(times, [25, 50, 75]))
