@@ -22,6 +22,7 @@ from mbkit.engines.frames_and_momenta import (
     ALIGNED,
     JOINT,
     LOCAL,
+    FrameByFrame,
     FramesAndMomenta,
     axes_named,
     composite_rounding,
@@ -654,7 +655,7 @@ class WrenchedDynamics(Dynamics):
         return self._bare._evaluate("forward_dynamics_with_wrenches", *self._acting, **states)
 
 
-class MappedDynamics(Dynamics):
+class MappedDynamics(FrameByFrame, Dynamics):
     """An engine of single states with velocities of its own, v_engine = T v.
 
     Entry i is full velocity `_v_index[i]`; then rotations, set with each state, turn three entries each. T is
@@ -700,16 +701,6 @@ class MappedDynamics(Dynamics):
         out = np.empty_like(f)
         out[self._v_index] = f
         return out
-
-    def _pose(self, q: Array, frames: tuple[Frame, ...]) -> Array:
-        X = np.tile(np.eye(4), (len(frames), 1, 1))
-        for k, frame in enumerate(frames):
-            X[k, :3, :3], X[k, :3, 3] = self._placement(q, frame)
-        return X
-
-    def _placement(self, q: Array, frame: Frame) -> tuple[Array, Array]:
-        """Return R_WF and p_WF."""
-        raise NotImplementedError
 
 
 _X, _Y, _Z = np.eye(3)
