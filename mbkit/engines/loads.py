@@ -27,6 +27,8 @@ Wrenches = Mapping[str, ArrayLike]
 QUANTITIES: Final = ("mass_matrix_inverse", "generalized_force", "joint_wrenches", "newton_euler_residual")
 #: Quantity -> the one that it follows from.
 FOLLOWING: Final = {"newton_euler_residual": "joint_wrenches"}
+#: What needs the force on each body.
+OF_SINGLE_BODIES: Final = frozenset({"joint_wrenches", "undetermined_loads", "loads_under_force", "loads_of_motion"})
 
 
 class Loads:

@@ -23,7 +23,7 @@ from pydrake.multibody.tree import MultibodyForces, MultibodyForces_
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._fork import fork_safe
-from mbkit.engines import regressors
+from mbkit.engines import closed_loops, loads, regressors
 from mbkit.engines.base import MappedDynamics, require_tree
 from mbkit.engines.constrained import QUANTITIES as CONSTRAINT_QUANTITIES
 from mbkit.engines.drake.bodies import DrakeBodies
@@ -37,7 +37,10 @@ SAP: Final = "drake_sap"
 NO_CONSTRAINTS: Final = "Drake's continuous plant has no constraints between bodies"
 _WITHOUT_LOOPS: Final = {
     **dict.fromkeys(
-        ("forward_dynamics", "forward_dynamics_derivatives", *CONSTRAINT_QUANTITIES),
+        (
+            *("forward_dynamics", "forward_dynamics_derivatives", *CONSTRAINT_QUANTITIES),
+            *(*closed_loops.QUANTITIES, *loads.OF_SINGLE_BODIES),
+        ),
         f"{NO_CONSTRAINTS}; mbkit.simulate(..., method={SAP!r}) runs its discrete one, and "
         "mbkit.dynamics(model, 'lagrangian') has the terms",
     )
