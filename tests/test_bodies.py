@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import re
 import warnings
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import pytest
 import mbkit as mb
 from mbkit.engines import ENGINES, frames_and_momenta, loads
 from mbkit.engines.frames_and_momenta import ALIGNED, AXES, CLASSICAL, LOCAL, SPATIAL
+from mbkit.engines.registry import composes
 from mbkit.errors import KnownDefectWarning, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import simulate
@@ -434,3 +437,20 @@ def test_a_frame_has_not_the_name_of_another_body():
     b.add_frame("a", body="b")
     with pytest.raises(mb.errors.ModelError, match="frame 'a' on body 'b' has the name of another body"):
         b.build()
+
+
+def test_the_book_says_which_quantities_of_an_engine_are_its_own():
+    root = Path(mb.__file__).parent
+    page = (root.parent / "notebooks" / "reference" / "engines.md").read_text("utf-8")
+    table = page.split("| quantity | Pinocchio | MuJoCo | Drake |\n")[1].split("\n\n")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[1:]]
+    assert {"jacobian_dot_v", "locked_inertia", "joint_wrenches"} <= {row[0].strip("`") for row in rows}
+    for name, *cells in rows:
+        quantity = re.match(r"`?([a-z_ ]+)", name)[1].strip().replace(" ", "_")
+        for engine, cell in zip(("pinocchio", "mujoco", "drake"), cells, strict=True):
+            if not cell:
+                continue
+            assert cell.startswith("composed") == composes(ENGINES[engine].load(), quantity), (name, engine)
+            source = "".join(path.read_text("utf-8") for path in (root / "engines" / engine).glob("*.py"))
+            for function in re.findall(r"`[\w.]*?(\w+)`", cell):
+                assert function in source, (name, engine)

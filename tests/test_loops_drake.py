@@ -87,7 +87,7 @@ def test_drake_s_continuous_plant_refuses_to_accelerate_loops_and_has_the_tree_s
     )
 
 
-@pytest.mark.parametrize("quantity", ["forward_dynamics", *QUANTITIES])
+@pytest.mark.parametrize("quantity", ["forward_dynamics", *QUANTITIES, "actuator_forces", "loop_wrenches"])
 def test_terms_of_constrained_motion_are_refused_with_the_reason(quantity: str) -> None:
     dyn, q, v = four_bar()
     assert quantity not in dyn.supports

@@ -22,6 +22,7 @@ from mbkit.engines.frames_and_momenta import (
     ALIGNED,
     JOINT,
     LOCAL,
+    FrameByFrame,
     FramesAndMomenta,
     axes_named,
     composite_rounding,
@@ -59,8 +60,6 @@ _OF_BODIES: Final = frozenset(
     {*frames_and_momenta.QUANTITIES, *loads.QUANTITIES, *regressors.QUANTITIES, *closed_loops.OF_BODIES}
     - {"mass_matrix_inverse"}
 )
-#: What needs the force on each body.
-_OF_OWN_LOADS: Final = frozenset({"joint_wrenches", "undetermined_loads", "loads_under_force", "loads_of_motion"})
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
 #: Names in a list of an error message.
@@ -197,7 +196,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         elif not self.model.loops:
             given -= closed_loops.OF_BODIES
         if self.model.forces or self.model.no_slip:
-            given = {x for x in given if not {x, needed[x]} & _OF_OWN_LOADS}
+            given = {x for x in given if not {x, needed[x]} & loads.OF_SINGLE_BODIES}
         return frozenset(given if self.model.has_bodies else given - _OF_BODIES)
 
     def __repr__(self) -> str:
@@ -514,7 +513,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         """Return the adapter's method for a quantity; raise `UnsupportedError` where it has none."""
         if quantity in _OF_BODIES:
             self.model.require_bodies(quantity)
-        if quantity in _OF_OWN_LOADS and (self.model.forces or self.model.no_slip):
+        if quantity in loads.OF_SINGLE_BODIES and (self.model.forces or self.model.no_slip):
             which, feature = ("forces by functions", "forces") if self.model.forces else ("contacts", "no_slip")
             raise UnsupportedError(
                 f"{self.engine} cannot give {quantity} of {self.model.name}: {which} are known by what they do to the "
@@ -654,7 +653,7 @@ class WrenchedDynamics(Dynamics):
         return self._bare._evaluate("forward_dynamics_with_wrenches", *self._acting, **states)
 
 
-class MappedDynamics(Dynamics):
+class MappedDynamics(FrameByFrame, Dynamics):
     """An engine of single states with velocities of its own, v_engine = T v.
 
     Entry i is full velocity `_v_index[i]`; then rotations, set with each state, turn three entries each. T is
@@ -700,16 +699,6 @@ class MappedDynamics(Dynamics):
         out = np.empty_like(f)
         out[self._v_index] = f
         return out
-
-    def _pose(self, q: Array, frames: tuple[Frame, ...]) -> Array:
-        X = np.tile(np.eye(4), (len(frames), 1, 1))
-        for k, frame in enumerate(frames):
-            X[k, :3, :3], X[k, :3, 3] = self._placement(q, frame)
-        return X
-
-    def _placement(self, q: Array, frame: Frame) -> tuple[Array, Array]:
-        """Return R_WF and p_WF."""
-        raise NotImplementedError
 
 
 _X, _Y, _Z = np.eye(3)

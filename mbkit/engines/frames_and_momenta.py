@@ -8,7 +8,7 @@ Pinocchio's names and meanings.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -23,10 +23,11 @@ from mbkit._check import WORLD as WORLD
 from mbkit._check import Array
 from mbkit._check import axes_named as axes_named
 from mbkit.errors import InputError
-from mbkit.model import Frame, Model
+from mbkit.model import Body, Frame, Model
 from mbkit.spatial import skew
 
 _OF_TWO_AXES: Final = ("pose", "jacobian")
+_EYE, _LAST_ROW = np.eye(3), np.eye(4)[3]
 #: Quantities of this part of the protocol.
 QUANTITIES: Final = (
     *("pose", "jacobian", "velocity", "acceleration", "jacobian_dot_v"),
@@ -364,6 +365,129 @@ class FramesAndMomenta:
         return self._evaluate("locked_inertia", q=q)
 
 
+class Composed:
+    """Quantities by formulas from an engine's other ones, for an engine that has no function of its own for them."""
+
+    model: Model
+    _mass_matrix: Callable[[Array], Array]
+    _pose: Callable[..., Array]
+    _velocity: Callable[..., Array]
+    _acceleration: Callable[..., Array]
+    _center_of_mass: Callable[[Array], Array]
+    _centroidal_momentum: Callable[[Array, Array], Array]
+
+    def _mass_matrix_inverse(self, q: Array) -> Array:
+        return np.asarray(np.linalg.inv(self._mass_matrix(q)))
+
+    def _centroidal_momentum_matrix(self, q: Array) -> Array:
+        """Return the momentum of each velocity."""
+        nv = self.model.nv
+        return np.array([self._centroidal_momentum(q, unit) for unit in np.eye(nv)]).reshape(nv, 6).T
+
+    def _centroidal_momentum_bias(self, q: Array, v: Array) -> Array:
+        """Return what the bodies' momenta change by, about p_G, at v̇ = 0."""
+        bodies = self.model.bodies
+        frames = tuple(Frame(b.name, b.name, _EYE, np.zeros(3)) for b in bodies)
+        acceleration = self._acceleration(q, v, np.zeros_like(v), frames, LOCAL, CLASSICAL)
+        rates = momentum_rates(bodies, self._velocity(q, v, frames, LOCAL)[:, 3:], acceleration)
+        X, center = self._pose(q, frames), self._center_of_mass(q)
+        force, moment = (np.einsum("nij,nj->ni", X[:, :3, :3], x) for x in np.split(rates, 2, axis=-1))
+        arm = np.einsum("nij,nj->ni", X[:, :3], [[*b.com, 1.0] for b in bodies]) - center
+        return np.concatenate([force.sum(axis=0), (moment + np.cross(arm, force)).sum(axis=0)])
+
+
+class FrameByFrame:
+    """Frames of an engine that tells of one point of a body at a time. A part of adapters.
+
+    A state is put in first. What the engine says then is in world axes, linear first; rows of its Jacobians are for its
+    own velocities, v_engine = T v.
+    """
+
+    #: Put a state in; return b of a_engine = T a + b.
+    _place: Callable[..., Array]
+    #: R_WF and p_WF of a frame, and what the engine needs to tell of that point.
+    _placed: Callable[[Frame], tuple[Array, Array, Any]]
+    #: Of p_WF and the same: Jacobians of the point and of turning.
+    _point_jacobian: Callable[[Array, Any], tuple[Array, Array]]
+    _columns: Callable[[Array], Array]
+
+    def _each(self, frames: tuple[Frame, ...], of: Callable[[Array, Array, Any], Array]) -> Array:
+        return np.array([of(*self._placed(frame)) for frame in frames])
+
+    def _pose(self, q: Array, frames: tuple[Frame, ...]) -> Array:
+        self._place(q)
+        return self._each(frames, lambda R, p, _: np.vstack([np.column_stack([R, p]), _LAST_ROW]))
+
+    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
+        self._place(q)
+        return self._each(frames, lambda R, p, at: self._columns(seen_from(R, p, *self._point_jacobian(p, at), axes)))
+
+
+class MovingFrames(FrameByFrame):
+    """Rates of frames, and wrenches on them, for an engine that tells the motion of points."""
+
+    #: Put a state and its accelerations in, as if there were no forces.
+    _move: Callable[[Array, Array, Array], None]
+    #: Of p_WF and the same as for Jacobians: velocity; acceleration of the point, of its ω too; J̇ v in the engine's
+    #: velocities.
+    _twist: Callable[[Array, Any], Array]
+    _point_acceleration: Callable[[Array, Any, Array], Array]
+    _point_rate: Callable[[Array, Any], Array]
+
+    def _velocity(self, q: Array, v: Array, frames: tuple[Frame, ...], axes: str) -> Array:
+        self._place(q, v)
+
+        def seen(R: Array, p: Array, at: Any) -> Array:
+            linear, angular = np.split(self._twist(p, at), 2)
+            return seen_from(R, p, linear, angular, axes)
+
+        return self._each(frames, seen)
+
+    def _acceleration(self, q: Array, v: Array, a: Array, frames: tuple[Frame, ...], axes: str, kind: str) -> Array:
+        self._move(q, v, a)
+
+        def seen(R: Array, p: Array, at: Any) -> Array:
+            twist = self._twist(p, at)
+            return accelerated(R, p, twist, self._point_acceleration(p, at, twist[3:]), axes, kind)
+
+        return self._each(frames, seen)
+
+    def _jacobian_dot_v(self, q: Array, v: Array, frames: tuple[Frame, ...], axes: str) -> Array:
+        b, kind = self._place(q, v), CLASSICAL if axes == ALIGNED else SPATIAL
+
+        def rate(R: Array, p: Array, at: Any) -> Array:
+            # J = J_engine T, so J̇ v is J̇_engine v_engine + J_engine b.
+            out = self._point_rate(p, at)
+            if b.any():
+                out = out + np.concatenate(self._point_jacobian(p, at)) @ b
+            return accelerated(R, p, self._twist(p, at), out, axes, kind)
+
+        return self._each(frames, rate)
+
+    def _external(
+        self, wrenches: Array, frames: tuple[Frame, ...], axes: str
+    ) -> Iterator[tuple[Array, Array, Array, Any]]:
+        """Yield force, moment and their point in world axes, and the engine's place, of wrenches at the state."""
+        for frame, wrench in zip(frames, wrenches.reshape(-1, 6), strict=True):
+            R, p, at = self._placed(frame)
+            force, moment = wrench[:3], wrench[3:]
+            if axes == LOCAL:
+                force, moment = R @ force, R @ moment
+            yield force, moment, np.zeros(3) if axes == WORLD else p, at
+
+
+def momentum_rates(bodies: Sequence[Body], w: Array, acceleration: Array) -> Array:
+    """Return m a_G and d/dt (I ω) of bodies, (..., n, 6), in their own axes.
+
+    They come from the angular velocities, (..., n, 3), and the classical accelerations of the bodies' origins.
+    """
+    mass, com, inertia = (np.array([getattr(b, name) for b in bodies]) for name in ("mass", "com", "inertia"))
+    linear, angular = np.split(acceleration, 2, axis=-1)
+    force = mass[:, None] * (linear + np.cross(angular, com) + np.cross(w, np.cross(w, com)))
+    I_w, I_a = (np.einsum("nij,...nj->...ni", inertia, x) for x in (w, angular))
+    return np.concatenate([force, I_a + np.cross(w, I_w)], axis=-1)
+
+
 # What an engine's formula for M must lose: the diagonal is M_jj = sᵀ I_C s, with the composite inertia I_C of all that
 # joint j moves and its axis s (Featherstone 2008, Rigid Body Dynamics Algorithms, eq. 6.11). An engine turns I_C about
 # some point, so that its entries round by eps ‖I_C‖; where a heavy or far body hardly turns with the joint, M_jj is the
@@ -372,7 +496,6 @@ class FramesAndMomenta:
 #: Points about which an engine writes composite inertias: of each joint its own origin, the centre of mass of the tree
 #: that the joint belongs to, or the world's origin.
 JOINT, TREE = "joint", "tree"
-_EYE: Final = np.eye(3)
 
 
 def composite_rounding(dyn: Any, q: Array, about: str) -> float:

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, rows
-from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, Parts, axes_named
+from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, Parts, axes_named, momentum_rates
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Joint, Model, PointSpring
 from mbkit.model.parts import Loop
@@ -27,14 +27,19 @@ Wrenches = Mapping[str, ArrayLike]
 QUANTITIES: Final = ("mass_matrix_inverse", "generalized_force", "joint_wrenches", "newton_euler_residual")
 #: Quantity -> the one that it follows from.
 FOLLOWING: Final = {"newton_euler_residual": "joint_wrenches"}
+#: What needs the force on each body.
+OF_SINGLE_BODIES: Final = frozenset({"joint_wrenches", "undetermined_loads", "loads_under_force", "loads_of_motion"})
 
 
 class Loads:
     """Wrenches on bodies and in joints; `Dynamics` inherits it."""
 
+    #: Of inverse and forward dynamics those whose methods take wrenches, frames and axes behind their arguments.
+    _takes_wrenches: ClassVar[tuple[str, ...]] = ()
     model: Model
     _evaluate: Callable[..., Array]
     # Of the other parts of `Dynamics`.
+    _mass_matrix: Callable[[Array], Array]
     _inverse_dynamics: Callable[..., Any]
     _forward_dynamics: Callable[..., Any]
     _jacobian: Callable[..., Array]
@@ -94,15 +99,21 @@ class Loads:
         frames, stacked = self._stacked_wrenches(wrenches)
         return self._evaluate("generalized_force", frames, axes_named(axes), q=q, wrenches=stacked)
 
-    def _inverse_dynamics_with_wrenches(
-        self, q: Array, v: Array, a: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str
-    ) -> Any:
-        return self._inverse_dynamics(q, v, a) - self._generalized_force(q, wrenches, frames, axes)
+    def _inverse_dynamics_with_wrenches(self, q: Array, v: Array, a: Array, *acting: Any) -> Any:
+        if "inverse_dynamics" in self._takes_wrenches:
+            return self._inverse_dynamics(q, v, a, *acting)
+        return self._inverse_dynamics(q, v, a) - self._generalized_force(q, *acting)
 
-    def _forward_dynamics_with_wrenches(
-        self, q: Array, v: Array, tau: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str
-    ) -> Any:
-        return self._forward_dynamics(q, v, tau + self._generalized_force(q, wrenches, frames, axes))
+    def _forward_dynamics_with_wrenches(self, q: Array, v: Array, tau: Array, *acting: Any) -> Any:
+        if "forward_dynamics" in self._takes_wrenches:
+            return self._forward_dynamics(q, v, tau, *acting)
+        return self._forward_dynamics(q, v, tau + self._generalized_force(q, *acting))
+
+    def _solved_motion(self, q: Array, v: Array, tau: Array, *acting: Any) -> Array:
+        """Return v̇ by a solution with M, where the engine's own forward dynamics does not know all that acts."""
+        inverse = self._inverse_dynamics_with_wrenches if acting else self._inverse_dynamics
+        rest = inverse(q, v, np.zeros(self.model.nv), *acting)
+        return np.asarray(np.linalg.solve(self._mass_matrix(q), tau - rest))
 
     def _generalized_force(self, q: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str) -> Any:
         """Return Σ Jᵀ w at one state, with the engine's own Jacobians."""
@@ -363,18 +374,17 @@ class _Balance:
     def residual(self) -> Array:
         """Return forces and moments less the rates of momentum: the residual of the balance."""
         dyn, bodies = self._dyn, self._model.bodies
-        mass = np.array([b.mass for b in bodies])[:, None]
-        com, inertia = np.array([b.com for b in bodies]), np.array([b.inertia for b in bodies])
+        com = np.array([b.com for b in bodies])
         R = self._X[:, :, :3, :3].swapaxes(2, 3)
         # Frames of the bodies' names may be other ones than their own; their motion is turned into the bodies' axes.
         frames = [self._model.frame(name) for name in self._names]
         turn = np.array([f.rotation for f in frames])
-        arm = com - np.array([f.translation for f in frames])
+        arm = -np.array([f.translation for f in frames])
         local = dyn.acceleration(self._q, self._v, self._a, self._names, LOCAL, CLASSICAL)
         linear, angular = _times(turn, local[..., :3]), _times(turn, local[..., 3:])
         w = _times(turn, dyn.velocity(self._q, self._v, self._names, LOCAL)[..., 3:])
-        central = linear + np.cross(angular, arm) + np.cross(w, np.cross(w, arm))
-        force = self._force + mass * _times(R, self._model.gravity) - mass * central
+        own = linear + np.cross(angular, arm) + np.cross(w, np.cross(w, arm))
+        weight = np.array([b.mass for b in bodies])[:, None] * _times(R, self._model.gravity)
         # Gravity acts at the centre of mass.
-        moment = self._moment - np.cross(com, self._force)
-        return np.concatenate([force, moment - _times(inertia, angular) - np.cross(w, _times(inertia, w))], axis=-1)
+        acting = np.concatenate([self._force + weight, self._moment - np.cross(com, self._force)], axis=-1)
+        return np.asarray(acting - momentum_rates(bodies, w, np.concatenate([own, angular], axis=-1)))

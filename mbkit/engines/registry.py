@@ -12,7 +12,9 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, Final
 
+from mbkit.engines import closed_loops, loads
 from mbkit.engines.base import Dynamics
+from mbkit.engines.frames_and_momenta import Composed
 from mbkit.engines.versions.engine_version import EngineVersion
 from mbkit.engines.versions.engine_version import engine as named_version
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
@@ -201,6 +203,18 @@ def registered_engines() -> tuple[EngineInfo, ...]:
                 pickle.dumps(info)
                 out.append(info)
     return tuple(out)
+
+
+def composes(adapter: type[Dynamics], quantity: str) -> bool:
+    """Return whether an engine's adapter takes a quantity from a formula of the protocol, of its other quantities.
+
+    `quantity` is the name of a method that the adapter has, or of inverse or forward dynamics ``"..._with_wrenches"``.
+    """
+    if quantity in loads.FOLLOWING | closed_loops.FOLLOWING:
+        return True
+    if quantity.removesuffix("_with_wrenches") in adapter._takes_wrenches:
+        return False
+    return next(x for x in adapter.__mro__ if f"_{quantity}" in vars(x)) in (Composed, *Dynamics.__mro__)
 
 
 def _place(info: EngineInfo) -> tuple[str, str]:

@@ -9,6 +9,7 @@ b = R (ω × v) in the linear rows.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from functools import cached_property
 from typing import Any, ClassVar, Final
@@ -22,7 +23,7 @@ from pydrake.multibody.tree import MultibodyForces, MultibodyForces_
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._fork import fork_safe
-from mbkit.engines import regressors
+from mbkit.engines import closed_loops, loads, regressors
 from mbkit.engines.base import MappedDynamics, require_tree
 from mbkit.engines.constrained import QUANTITIES as CONSTRAINT_QUANTITIES
 from mbkit.engines.drake.bodies import DrakeBodies
@@ -36,7 +37,10 @@ SAP: Final = "drake_sap"
 NO_CONSTRAINTS: Final = "Drake's continuous plant has no constraints between bodies"
 _WITHOUT_LOOPS: Final = {
     **dict.fromkeys(
-        ("forward_dynamics", "forward_dynamics_derivatives", *CONSTRAINT_QUANTITIES),
+        (
+            *("forward_dynamics", "forward_dynamics_derivatives", *CONSTRAINT_QUANTITIES),
+            *(*closed_loops.QUANTITIES, *loads.OF_SINGLE_BODIES),
+        ),
         f"{NO_CONSTRAINTS}; mbkit.simulate(..., method={SAP!r}) runs its discrete one, and "
         "mbkit.dynamics(model, 'lagrangian') has the terms",
     )
@@ -60,6 +64,7 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
     engine = "drake"
     lacks_derivatives = lacks_constraints = ""
     soft_constraints = True
+    _takes_wrenches = ("inverse_dynamics", "forward_dynamics")
     refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "Drake forms C v without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no CasADi form; mbkit.dynamics(model, 'lagrangian') has",
@@ -110,7 +115,7 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
                 b[iv + 3 : iv + 6] = R @ np.cross(own[iv : iv + 3], own[iv + 3 : iv + 6])
         return x, u if v is None else self._to_engine(v), b
 
-    def _set(self, q: Array, v: Array | None = None) -> Array:
+    def _place(self, q: Array, v: Array | None = None) -> Array:
         """Put a state into Drake; return b of a_drake = T a + b."""
         x, u, b = self.to_drake(q, v)
         self.put(self.plant, self._context, x, u)
@@ -136,11 +141,11 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
     # The protocol.
 
     def _mass_matrix(self, q: Array) -> Array:
-        self._set(q)
+        self._place(q)
         return self._columns(self._columns(self.plant.CalcMassMatrix(self._context)).T)
 
     def _gravity(self, q: Array) -> Array:
-        self._set(q)
+        self._place(q)
         return self._force(-self.plant.CalcGravityGeneralizedForces(self._context))
 
     def _coriolis_force(self, q: Array, v: Array) -> Array:
@@ -148,7 +153,7 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
 
     def _bias(self, q: Array, v: Array) -> Array:
         """Return C v, and M b of the change of velocities."""
-        b = self._set(q, v)
+        b = self._place(q, v)
         out = self.plant.CalcBiasTerm(self._context)
         return np.asarray(out + self.plant.CalcMassMatrix(self._context) @ b if b.any() else out)
 
@@ -164,7 +169,7 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
         return self._force(plant.CalcGeneralizedForces(context, forces))
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array, *acting: Any) -> Array:
-        b = self._set(q, v)
+        b = self._place(q, v)
         forces = MultibodyForces(self.plant)
         self.plant.CalcForceElementsContribution(self._context, forces)
         if acting:
@@ -210,16 +215,16 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
         plant = self.plant.ToAutoDiffXd()
         return plant, plant.CreateDefaultContext()
 
-    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array, *acting: Any) -> Array:
         if self.model.layout.reduced:
-            zero = np.zeros(self.model.nv)
-            return np.asarray(np.linalg.solve(self._mass_matrix(q), tau - self._inverse_dynamics(q, v, zero)))
-        b = self._set(q, v)
+            return self._solved_motion(q, v, tau, *acting)
+        b = self._place(q, v)
         self._applied.FixValue(self._context, self._to_engine(tau))
-        return self._force(self._acceleration_port.Eval(self._context) - b)
+        with self._pushed(*acting) if acting else contextlib.nullcontext():
+            return self._force(self._acceleration_port.Eval(self._context) - b)
 
     def _kinetic_energy(self, q: Array, v: Array) -> Any:
-        self._set(q, v)
+        self._place(q, v)
         return self.plant.CalcKineticEnergy(self._context)
 
     def _potential_energy(self, q: Array) -> Any:

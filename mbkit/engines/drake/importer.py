@@ -104,7 +104,7 @@ class _Read(DrakeDynamics):
 
     def _passive(self, q: Array, v: Array) -> Array:
         plant, context, forces = self.plant, self._context, MultibodyForces(self.plant)
-        self._set(q, v)
+        self._place(q, v)
         plant.CalcForceElementsContribution(context, forces)
         # Gravity is among Drake's force elements.
         weight = plant.CalcGravityGeneralizedForces(context)

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, SPATIAL, WORLD, accelerated, seen_from
+from mbkit.engines.frames_and_momenta import Composed, MovingFrames
 from mbkit.engines.mujoco.model import MujocoModel
 from mbkit.errors import UnsupportedError
 from mbkit.model import Frame, Joint, Model
@@ -27,7 +27,7 @@ _BODY_FRAME = mujoco.mjtObj.mjOBJ_XBODY
 _SYMMETRIC = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
-class MujocoBodies:
+class MujocoBodies(MovingFrames, Composed):
     """MuJoCo's quantities of frames, of the whole system, and loads; `MujocoDynamics` inherits it."""
 
     model: Model
@@ -42,9 +42,6 @@ class MujocoBodies:
     _to_engine: Callable[[Array], Array]
     _columns: Callable[[Array], Array]
     _force: Callable[[Array], Array]
-    _mass_matrix: Callable[[Array], Array]
-    _forward_dynamics: Callable[..., Array]
-    _with_loops: Callable[[], contextlib.AbstractContextManager[None]]
 
     def _place(self, q: Array, v: Array | None = None) -> Array:
         """Put a state in, with poses and velocities of the bodies; return b of a_mj = T a + b."""
@@ -87,66 +84,28 @@ class MujocoBodies:
         R = self._d.xmat[body].reshape(3, 3)
         return R @ frame.rotation, self._d.xpos[body] + R @ frame.translation, body
 
-    def _pose(self, q: Array, frames: tuple[Frame, ...]) -> Array:
-        self._place(q)
-        X = np.tile(np.eye(4), (len(frames), 1, 1))
-        for k, frame in enumerate(frames):
-            X[k, :3, :3], X[k, :3, 3], _ = self._placed(frame)
-        return X
-
-    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
-        self._place(q)
-        out = []
-        for frame in frames:
-            R, p, body = self._placed(frame)
-            out.append(self._columns(seen_from(R, p, *self._point_jacobian(mujoco.mj_jac, p, body), axes)))
-        return np.array(out)
-
-    def _point_jacobian(self, of: Callable[..., None], p: Array, body: int) -> tuple[Array, Array]:
+    def _point_jacobian(self, p: Array, body: int, of: Callable[..., None] = mujoco.mj_jac) -> tuple[Array, Array]:
         linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
         of(self._m, self._d, linear, angular, p, body)
         return linear, angular
 
     def _twist(self, p: Array, body: int) -> Array:
-        """Return velocities, (6,), of a body's point in world axes, linear first."""
         six = np.zeros(6)
         mujoco.mj_objectVelocity(self._m, self._d, _BODY_FRAME, body, six, 0)
         return np.concatenate([six[3:] + skew(six[:3]) @ (p - self._d.xpos[body]), six[:3]])
 
-    def _velocity(self, q: Array, v: Array, frames: tuple[Frame, ...], axes: str) -> Array:
-        self._place(q, v)
-        out = []
-        for frame in frames:
-            R, p, body = self._placed(frame)
-            twist = self._twist(p, body)
-            out.append(seen_from(R, p, twist[:3], twist[3:], axes))
-        return np.array(out)
-
-    def _acceleration(self, q: Array, v: Array, a: Array, frames: tuple[Frame, ...], axes: str, kind: str) -> Array:
+    def _move(self, q: Array, v: Array, a: Array) -> None:
         with self._without_forces():
             self._accelerate(q, v, a)
-        out, six = [], np.zeros(6)
-        for frame in frames:
-            R, p, body = self._placed(frame)
-            twist, arm = self._twist(p, body), p - self._d.xpos[body]
-            turning = skew(twist[3:])
-            # Of the point at the body's origin: MuJoCo adds ω × v to the spatial one.
-            mujoco.mj_objectAcceleration(self._m, self._d, _BODY_FRAME, body, six, 0)
-            classical = np.concatenate([six[3:] + (skew(six[:3]) + turning @ turning) @ arm, six[:3]])
-            out.append(accelerated(R, p, twist, classical, axes, kind))
-        return np.array(out)
 
-    def _jacobian_dot_v(self, q: Array, v: Array, frames: tuple[Frame, ...], axes: str) -> Array:
-        b = self._place(q, v)
-        out = []
-        for frame in frames:
-            R, p, body = self._placed(frame)
-            # J = J_mj T, so J̇ v is J̇_mj v_mj + J_mj b.
-            rates = self._point_jacobian(mujoco.mj_jacDot, p, body), self._point_jacobian(mujoco.mj_jac, p, body)
-            classical = np.concatenate([dJ @ self._d.qvel + J @ b for dJ, J in zip(*rates, strict=True)])
-            kind = CLASSICAL if axes == ALIGNED else SPATIAL
-            out.append(accelerated(R, p, self._twist(p, body), classical, axes, kind))
-        return np.array(out)
+    def _point_acceleration(self, p: Array, body: int, w: Array) -> Array:
+        six, turning = np.zeros(6), skew(w)
+        # Of the point at the body's origin: MuJoCo adds ω × v to the spatial one.
+        mujoco.mj_objectAcceleration(self._m, self._d, _BODY_FRAME, body, six, 0)
+        return np.concatenate([six[3:] + (skew(six[:3]) + turning @ turning) @ (p - self._d.xpos[body]), six[:3]])
+
+    def _point_rate(self, p: Array, body: int) -> Array:
+        return np.asarray(np.concatenate(self._point_jacobian(p, body, mujoco.mj_jacDot)) @ self._d.qvel)
 
     # The whole: the subtree of the world.
 
@@ -184,8 +143,7 @@ class MujocoBodies:
 
     def _momentum_rate(self, q: Array, v: Array, a: Array) -> Array:
         """Return the rate of the momentum about p_G: without gravity all that bodies exert on the world, turned."""
-        with self._without_forces():
-            self._accelerate(q, v, a)
+        self._move(q, v, a)
         return sum((self._held(i) for i in range(1, self._m.nbody) if not self._m.body_parentid[i]), np.zeros(6))
 
     def _held(self, body: int) -> Array:
@@ -208,7 +166,7 @@ class MujocoBodies:
 
     def _mass_matrix_inverse(self, q: Array) -> Array:
         if self._reduced:
-            return np.asarray(np.linalg.inv(self._mass_matrix(q)))
+            return super()._mass_matrix_inverse(q)
         self._set(q)
         mujoco.mj_fwdPosition(self._m, self._d)
         out = np.zeros((self._m.nv, self._m.nv))
@@ -217,17 +175,6 @@ class MujocoBodies:
         return self._columns(self._columns(out).T)
 
     # Loads
-
-    def _external(
-        self, wrenches: Array, frames: tuple[Frame, ...], axes: str
-    ) -> Iterator[tuple[Array, Array, Array, int]]:
-        """Yield force and moment in world axes, their point, and the body, of wrenches at the state that is in."""
-        for frame, wrench in zip(frames, wrenches.reshape(-1, 6), strict=True):
-            R, p, body = self._placed(frame)
-            force, moment = wrench[:3], wrench[3:]
-            if axes == LOCAL:
-                force, moment = R @ force, R @ moment
-            yield force, moment, np.zeros(3) if axes == WORLD else p, body
 
     def _generalized_force(self, q: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str) -> Array:
         self._place(q)
@@ -248,14 +195,6 @@ class MujocoBodies:
             yield
         finally:
             applied[:] = 0.0
-
-    def _forward_dynamics_with_wrenches(
-        self, q: Array, v: Array, tau: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str
-    ) -> Array:
-        if self._reduced:
-            return self._forward_dynamics(q, v, tau + self._generalized_force(q, wrenches, frames, axes))
-        with self._with_loops(), self._applied(q, wrenches, frames, axes):
-            return self._forward_dynamics(q, v, tau)
 
     def _joint_wrenches(self, q: Array, v: Array, a: Array, *given: Any) -> Array:
         *wrenches, joints, frames, axes = given

@@ -67,6 +67,7 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
     engine = "mujoco"
     lacks_constraints = ""
     soft_constraints = True
+    _takes_wrenches = ("forward_dynamics",)
     # mj_comPos and mj_crb
     inertias_about: ClassVar[dict[str, str]] = {"": TREE}
     lacks_derivatives = (
@@ -337,15 +338,11 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
         mujoco.mj_inverse(self._m, self._d)
         return self._directed(self._force(self._d.qfrc_inverse))
 
-    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array, *acting: Any) -> Array:
         if self._reduced:
             # A mimic joint inside MuJoCo would be a soft equality: reduce instead.
-            M = self._mass_matrix(q)
-            b = self._set(q, v)
-            self._velocities()
-            rest = self._force(self._d.qfrc_passive - self._d.qfrc_bias - self._times_mass(b))
-            return self._directed(np.linalg.solve(M, tau + rest))
-        with self._with_loops():
+            return self._solved_motion(q, v, tau, *acting)
+        with self._with_loops(), self._applied(q, *acting) if acting else contextlib.nullcontext():
             b = self._set(q, v)
             self._accelerated(tau)
             if self.model.needs.loops:

@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from mbkit._check import Array
-from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, WORLD
+from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, WORLD, Composed
 from mbkit.engines.pinocchio.model import OnBody, PinModel, PointSprings, inertia_of
 from mbkit.model import Frame, Joint, Model
 
@@ -26,7 +26,7 @@ _REFERENCE_FRAMES: Final = {
 }
 
 
-class PinocchioBodies:
+class PinocchioBodies(Composed):
     """Pinocchio's quantities of frames, of the whole system, and loads; `PinocchioDynamics` inherits it."""
 
     model: Model
@@ -40,9 +40,6 @@ class PinocchioBodies:
     # Of the other part.
     _full_q: Callable[[Array], Array]
     _full_v: Callable[[Array], Array]
-    _inverse_dynamics: Callable[..., Array]
-    _forward_dynamics: Callable[..., Array]
-    _generalized_force: Callable[..., Array]
     _joints_of: Callable[[Callable[[Array, Array], bool]], str]
 
     def _columns(self, J: Any) -> Array:
@@ -208,19 +205,9 @@ class PinocchioBodies:
             out[self._pin.bodies[body][0]] += force
         return out
 
-    def _inverse_dynamics_with_wrenches(
-        self, q: Array, v: Array, a: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str
-    ) -> Array:
-        outside = self._on_joints(self._applied(self._full_q(q), wrenches, frames, axes))
-        return self._inverse_dynamics(q, v, a, outside)
-
-    def _forward_dynamics_with_wrenches(
-        self, q: Array, v: Array, tau: Array, wrenches: Array, frames: tuple[Frame, ...], axes: str
-    ) -> Array:
-        if self.model.constrained:
-            return self._forward_dynamics(q, v, tau + self._generalized_force(q, wrenches, frames, axes))
-        outside = self._on_joints(self._applied(self._full_q(q), wrenches, frames, axes))
-        return self._forward_dynamics(q, v, tau, outside)
+    def _outside(self, q: Array, *acting: Any) -> list[Any]:
+        """Return what stands behind the arguments of `rnea` and `aba` for wrenches on frames, where there are some."""
+        return [self._on_joints(self._applied(q, *acting))] if acting else []
 
     def _joint_wrenches(self, q: Array, v: Array, a: Array, *given: Any) -> Array:
         *wrenches, joints, frames, axes = given

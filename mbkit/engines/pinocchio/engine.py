@@ -138,6 +138,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         "constraint_rate_gradient": "its derivatives are of trees; mbkit.dynamics(model, 'lagrangian') has this one",
     }
     lacks_constraints = ""
+    _takes_wrenches = ("inverse_dynamics", "forward_dynamics")
     # computeMinverse
     inertias_about: ClassVar[dict[str, str]] = {"mass_matrix_inverse": WORLD}
     _batches = False
@@ -255,7 +256,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
 
     def _mass_matrix_inverse(self, q: Array) -> Array:
         if self._reduced or self._joint_passive.armature is not None:
-            return np.asarray(np.linalg.inv(self._mass_matrix(q)))
+            return super()._mass_matrix_inverse(q)
         return self._matrix(pin.computeMinverse(self._m, self._d, self._full_q(q)))
 
     def _gravity(self, q: Array) -> Array:
@@ -264,26 +265,25 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
     def _nle(self, q: Array, v: Array) -> Array:
         return self._force(pin.nonLinearEffects(self._m, self._d, self._full_q(q), self._full_v(v)))
 
-    def _inverse_dynamics(self, q: Array, v: Array, a: Array, *outside: Any) -> Array:
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array, *acting: Any) -> Array:
         q, v = self._full_q(q), self._full_v(v)
         a, rotors = self._full_v(a), self._joint_passive.armature
-        out: Array = pin.rnea(self._m, self._d, q, v, a, *outside)
+        out: Array = pin.rnea(self._m, self._d, q, v, a, *self._outside(q, *acting))
         out -= self._full_passive(q, v)
         if rotors is not None:
             out += rotors @ a
         return self._force(out)
 
-    def _forward_dynamics(self, q: Array, v: Array, tau: Array, *outside: Any) -> Array:
+    def _forward_dynamics(self, q: Array, v: Array, tau: Array, *acting: Any) -> Array:
         if self.model.constrained:
-            return self._constrained_motion(q, v, tau)
+            return self._constrained_motion(q, v, tau + self._generalized_force(q, *acting) if acting else tau)
+        if self._reduced or self._joint_passive.armature is not None:
+            # ABA knows neither mimic joints nor rotors between joints.
+            return self._solved_motion(q, v, tau, *acting)
         q, v = self._full_q(q), self._full_v(v)
-        m, d, passive = self._m, self._d, self._full_passive(q, v)
-        if not self._reduced and self._joint_passive.armature is None:
-            # G only puts the joints in order, so its transpose puts them back.
-            return self._force(pin.aba(m, d, q, v, self._full_v(tau) + passive, *outside))
-        # ABA knows neither mimic joints nor rotors between joints: solve GᵀMG a = τ + Gᵀ(passive - nle).
-        M, h = self._matrix(self._full_mass_matrix(q)), pin.rnea(m, d, q, v, np.zeros(m.nv), *outside)
-        return np.asarray(np.linalg.solve(M, tau + self._force(passive - h)))
+        # G only puts the joints in order, so its transpose puts them back.
+        force = self._full_v(tau) + self._full_passive(q, v)
+        return self._force(pin.aba(self._m, self._d, q, v, force, *self._outside(q, *acting)))
 
     def _full_passive(self, q: Array, v: Array) -> Array:
         out = self._joint_passive.force(q, v)

@@ -11,7 +11,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.base import MappedDynamics, require_no_forces
 from mbkit.engines.elements.passive import JointPassive, pull
-from mbkit.engines.frames_and_momenta import ALIGNED, seen_from
+from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.versions.description import CONVENTIONS, places, travelling
 from mbkit.engines.versions.engine_version import EngineVersion
 from mbkit.engines.versions.process import RemoteError, new_key, process_of
@@ -160,8 +160,8 @@ class VersionDynamics(MappedDynamics):
         return out
 
     def _gap(self, q: Array, ends: tuple[Frame, ...]) -> Array:
-        a, b = (self._placement(q, end)[1] for end in ends)
-        return b - a
+        a, b = self._pose(q, ends)[:, :3, 3]
+        return np.asarray(b - a)
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         x, u, b = self._native(q, v)
@@ -171,8 +171,7 @@ class VersionDynamics(MappedDynamics):
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
         if self.model.layout.reduced or self._rotors is not None:
-            rest = self._inverse_dynamics(q, v, np.zeros(self.model.nv))
-            return np.asarray(np.linalg.solve(self._mass_matrix(q), tau - rest))
+            return self._solved_motion(q, v, tau)
         tau, (x, u, b) = tau + self._passive_beside(q, v), self._native(q, v)
         return self._force(self._ask("forward_dynamics", x, u, self._to_engine(tau))[0] - b)
 
@@ -188,17 +187,17 @@ class VersionDynamics(MappedDynamics):
         between = sum(0.5 * s.stiffness * (length - s.rest_length) ** 2 for s, length in lengths)
         return own + self._beside.energy(self.model.layout.expand_q(q)) + between
 
-    def _of_frame(self, q: Array, frame: Frame) -> tuple[Array, Array, Array, Array]:
-        """Return R_WF and p_WF, and the Jacobians of the origin and of turning in world axes."""
-        R, p, linear, angular = self._ask("frame", self._native(q)[0], body=frame.body)
+    def _place(self, q: Array, v: Array | None = None) -> Array:
+        self._x, _, b = self._native(q, v)
+        return b
+
+    def _placed(self, frame: Frame) -> tuple[Array, Array, Any]:
+        R, p, linear, angular = self._ask("frame", self._x, body=frame.body)
         arm = R @ frame.translation
-        return R @ frame.rotation, p + arm, linear - spatial.skew(arm) @ angular, angular
+        return R @ frame.rotation, p + arm, (linear - spatial.skew(arm) @ angular, angular)
 
-    def _placement(self, q: Array, frame: Frame) -> tuple[Array, Array]:
-        return self._of_frame(q, frame)[:2]
-
-    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
-        return np.array([self._columns(seen_from(*self._of_frame(q, frame), axes)) for frame in frames])
+    def _point_jacobian(self, p: Array, at: Any) -> Any:  # noqa: ARG002  # the engine's answer has both
+        return at
 
     # Beside the protocol.
 
