@@ -351,14 +351,12 @@ def test_no_other_file_is_opened_and_what_would_open_one_is_told(tmp_path: Path)
 
 
 def test_a_quadruped_and_a_humanoid_with_a_floating_base() -> None:
-    solo = mb.compare_parsers("solo8", floating_base=True, samples=1)
-    assert solo.agree
-    assert solo.floating_base
-    assert max(s.worst for p in solo.importers for s in p.stages if s.name in ("M", "g", "nle")) < 1e-12
     # An inertia at the base that no body has: it moves nothing while the base stands, and does when it floats.
     anymal = mb.compare_parsers("anymal", floating_base=True, samples=1)
     pinocchio, mujoco, drake = anymal.importers
+    assert anymal.floating_base
     assert pinocchio.agrees
+    assert max(s.worst for s in pinocchio.stages if s.name in ("M", "g", "nle")) < 1e-12
     assert "positive eigenvalues" in mujoco.refused
     assert drake.explanation is not None
     assert drake.explanation.explained

@@ -113,19 +113,22 @@ def run(project: Path, *arguments: str) -> tuple[int, str]:
     return made.returncode, made.stdout + made.stderr
 
 
-@pytest.mark.parametrize(("page", "robots", "passed"), [("README.md", 2, 4), ("notebooks/start/robot_ci.md", 1, 4)])
-def test_the_examples_of_the_documentation_record_and_check(project, page, robots, passed):
-    blocks = re.findall(r"^```python\n(.*?)^```$", (TOP / page).read_text(encoding="utf-8"), flags=re.M | re.S)
-    (example,) = (code for code in blocks if "mbkit_baseline" in code)
-    (project / "test_robots.py").write_text(example)
+def test_the_examples_of_the_documentation_record_and_check(project):
+    robots = {"README.md": 2, "notebooks/start/robot_ci.md": 1}
+    for page in robots:
+        blocks = re.findall(r"^```python\n(.*?)^```$", (TOP / page).read_text(encoding="utf-8"), flags=re.M | re.S)
+        (example,) = (code for code in blocks if "mbkit_baseline" in code)
+        (project / f"test_{Path(page).stem}.py").write_text(example)
+    (project / "test_robots.py").unlink()
     status, out = run(project, "--mbkit-regen")
     assert status == 0, out
-    assert f"{passed} passed" in out
-    assert len(list((project / "baselines" / "test_robots").iterdir())) == robots
+    assert "8 passed" in out
+    for page, count in robots.items():
+        assert len(list((project / "baselines" / f"test_{Path(page).stem}").iterdir())) == count
 
 
 def test_a_project_records_under_xdist_and_is_told_what_changed(project):
-    status, out = run(project, "-n", "2", "--mbkit-regen", "-k", "recorded and arm")
+    status, out = run(project, "-n", "1", "--mbkit-regen", "-k", "recorded and arm")
     assert status == 0, out
     assert "1 passed" in out
     folder = project / "baselines" / "test_robots"

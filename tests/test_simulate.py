@@ -1,5 +1,5 @@
 # Torques and stub engines have the signature they are called with.
-# ruff: noqa: ARG001, ARG002, ARG005
+# ruff: noqa: ARG002, ARG005
 """Integrators: their order, MuJoCo's own steps, published figures, and runs that go wrong."""
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from mbkit.errors import (
     MbkitWarning,
     NumericalError,
     OutputError,
-    TorqueError,
     UnknownNameError,
     UnsupportedError,
 )
@@ -620,35 +619,6 @@ def test_a_callable_sees_stage_times_and_body_velocities() -> None:
     assert np.abs(fine.v[-1] - simulate(dyn, q0, v0, 0.01, "rk4", dt=1e-4).v[-1]).max() > 1e-3
 
 
-@pytest.mark.parametrize("method", [*FIXED, "dop853"])
-@pytest.mark.parametrize("states", [[0.1], [[0.1], [0.2]]])
-def test_torque_callables_that_misbehave(method: str, states: Any) -> None:
-    dyn = dynamics(catalog.pendulum())
-    save = [0.0, 1.0]
-    for wrong, message in (
-        (lambda t, q, v: [0.0, 0.0], r"torque: expected shape \(1,\), got \(2,\); it is what the callable returned at"),
-        (lambda t, q, v: [np.nan], r"torque: nan at index .*the callable returned"),
-        (lambda t, q, v: None, r"torque: expected real numbers.*the callable returned"),
-        (lambda t, q, v: 0.0, r"torque: expected shape \(1,\), got \(\)"),
-    ):
-        with pytest.raises(InputError, match=message):
-            simulate(dyn, states, [0.0], 1.0, method, torque=wrong, save=save)
-
-    def raising(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        raise ZeroDivisionError("mine")
-
-    with pytest.raises(TorqueError, match=r"the callable raised ZeroDivisionError at t = 0 s.*: mine"):
-        simulate(dyn, states, [0.0], 1.0, method, torque=raising, save=save)
-
-    def interrupted(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        if t > 0.5:
-            raise KeyboardInterrupt
-        return np.zeros(1)
-
-    with pytest.raises(KeyboardInterrupt):
-        simulate(dyn, states, [0.0], 1.0, method, torque=interrupted, save=save, progress=True)
-
-
 # Divergence
 
 
@@ -762,14 +732,8 @@ def test_a_rotation_that_overflows_is_a_divergence(method: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dt": 0.0}, r"dt: expected a number above 0"),
-        ({"dt": -1e-3}, r"dt: expected a number above 0"),
-        ({"dt": np.nan}, r"dt: expected a finite number"),
-        ({"dt": "fast"}, r"dt: expected a number"),
         ({"dt": 1e-300}, r"dt: .* expected a larger step"),
         ({"dt": 1e-12}, r"save: .* GiB; keep fewer"),
-        ({"duration": -1.0}, r"duration: expected a number of at least 0"),
-        ({"duration": np.inf}, r"duration: expected a finite number"),
         ({"q0": [0.0]}, r"q0: expected shape \(7,\) or \(N, 7\), got \(1,\); free_body has nq = 7"),
         ({"v0": np.zeros(7)}, r"v0: expected shape \(6,\)"),
         ({"q0": [0, 0, 0, 0, 0, 0, 2.0]}, r"q0: the quaternion of joint 'float'.*norm 2"),
@@ -778,14 +742,11 @@ def test_a_rotation_that_overflows_is_a_divergence(method: str) -> None:
         ({"q0": np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1)), "v0": np.zeros((3, 6))}, r"batches of different sizes"),
         ({"torque": np.zeros(5)}, r"torque: expected shape \(6,\) or \(10, 6\), got \(5,\).*10 steps"),
         ({"torque": np.zeros((11, 6))}, r"torque: expected shape .*\(10, 6\), got \(11, 6\)"),
-        ({"torque": np.full(6, np.nan)}, r"torque: nan"),
         ({"torque": [[0.0], [0.0, 1.0]]}, r"torque: .*different lengths"),
         ({"save": 0}, r"save: expected a count of at least 1"),
         ({"save": True}, r"save: expected increasing times"),
         ({"save": []}, r"save: expected increasing times"),
         ({"save": [0.0, 0.0005]}, r"save: 0.0005 s is not a step"),
-        ({"save": [0.005, 0.001]}, r"save: expected increasing times"),
-        ({"save": [0.0, 0.02]}, r"save: expected times between 0 and 0.01"),
         ({"rtol": 1e-6}, r"rtol: rk4 has a fixed step"),
         ({"method": "dop853", "rtol": 1e-15}, r"rtol: expected at least 2.22e-14"),
         ({"method": "dop853", "rtol": -1.0}, r"rtol: expected a number above 0"),
@@ -793,7 +754,6 @@ def test_a_rotation_that_overflows_is_a_divergence(method: str) -> None:
         ({"method": "dop853", "save": 5}, r"save: expected a grid of times for an adaptive method"),
         ({"method": "dop853", "q0": np.tile([0, 0, 0, 0, 0, 0, 1.0], (2, 1))}, r"save: expected a grid of times"),
         ({"method": 4}, r"method: expected a name"),
-        ({"progress": 3}, r"progress: expected None, True or a callable"),
     ],
 )
 def test_bad_input_is_named(change: dict[str, Any], message: str) -> None:
@@ -870,12 +830,6 @@ def test_progress_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         assert told[-1] == 1.0
     monkeypatch.setattr(progress, "_PATIENCE", 0.0)
     assert simulate(dyn, [1.0], [0.0], 0.05, progress=True).stats.finished
-
-
-def test_the_same_inputs_give_the_same_bits() -> None:
-    model, q, v = tumbling()
-    runs = [simulate(dynamics(model), q, v, 0.05).q for _ in range(2)]
-    assert np.array_equal(*runs)
 
 
 def test_what_belongs_to_simulate_is_there_at_once() -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import sys
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -169,36 +171,16 @@ def test_as_many_environments_stay_as_are_to_be_kept(tmp_path, monkeypatch, caps
     assert [v for v in (*names, "1.6") if environment.exists("mujoco", v)] == left
 
 
-def executors():
-    yield "threads", lambda _: ThreadPoolExecutor(2)
-    yield "dask", _dask
-
-
-def _dask(folder: Path):
-    distributed = pytest.importorskip("distributed")
-    import contextlib
-
-    import dask
-
-    @contextlib.contextmanager
-    def two_workers():
-        with (
-            dask.config.set({"temporary-directory": str(folder)}),
-            distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-            distributed.Client(cluster) as client,
-            client.get_executor() as executor,
-        ):
-            yield executor
-
-    return two_workers()
-
-
-@pytest.mark.parametrize("make", [x for _, x in executors()], ids=[name for name, _ in executors()])
-def test_executors_find_the_same(make, tmp_path):
+@pytest.mark.parametrize(
+    "executor",
+    [partial(ThreadPoolExecutor, 2), partial(ProcessPoolExecutor, 1, get_context("spawn"))],
+    ids=["threads", "processes"],
+)
+def test_executors_find_the_same(executor):
     names = [made(f"1.{k}", wrong(1.001) if k == 2 else "") for k in range(4)]
     alone = mb.versions(pendulum(), "mujoco", names, samples=2)
-    with make(tmp_path) as executor:
-        result = mb.versions(pendulum(), "mujoco", names, samples=2, executor=executor)
+    with executor() as pool:
+        result = mb.versions(pendulum(), "mujoco", names, samples=2, executor=pool)
     assert found(result) == found(alone) == [("g", "1.2", AWAY), ("g", "1.3", TOWARDS)]
     assert [(r.term, r.version, r.digits) for r in result.rows] == [(r.term, r.version, r.digits) for r in alone.rows]
 

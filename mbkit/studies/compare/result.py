@@ -278,7 +278,7 @@ class Comparison(ResultTable):
 
     @property
     def shortened(self) -> tuple[str, ...]:
-        """What the comparison left out: terms, engines, studies, curves, and horizons that were cut."""
+        """Terms, engines, studies and curves that the comparison left out, and horizons that were cut."""
         out = [f"not compared: {', '.join(self.not_compared)}"] if self.not_compared else []
         absent = dict.fromkeys(r.engine for r in self.refusals if not r.term and r.engine not in self.engines)
         out += [f"{', '.join(absent)} left out"] if absent else []

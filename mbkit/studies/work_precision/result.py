@@ -104,7 +104,7 @@ class WorkPrecision(ResultTable):
 
     @property
     def shortened(self) -> tuple[str, ...]:
-        """What the study left out: curves that failed or ran out of time, a horizon that was cut."""
+        """Curves that failed or ran out of time, and a horizon that was cut."""
         out = [] if self.complete else ["interrupted"]
         if failed := self.failed:
             names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in failed))
