@@ -32,14 +32,6 @@ import pinocchio as pin
 
 from mbkit._check import Array
 from mbkit.engines.base import first_names
-from mbkit.engines.closed_loops.frame_rows import (
-    MovingFrame,
-    Rows,
-    contact_rows,
-    coupler_rows,
-    loop_rows,
-    motion_rows,
-)
 from mbkit.engines.pinocchio.model import PinModel
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Model
@@ -48,6 +40,7 @@ from mbkit.model.rolling import NO_SLIP_ROWS
 
 if TYPE_CHECKING:
     from mbkit.derivation.constraints import RowChoice
+    from mbkit.engines.closed_loops.frame_rows import MovingFrame, Rows
 
 #: Kinds of loops that Pinocchio's rigid constraints have.
 _RIGID: Final = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.CONTACT_6D}
@@ -68,6 +61,9 @@ _LOCAL: Final = pin.ReferenceFrame.LOCAL
 
 def _frame(m: Any, d: Any, G: Array | None, joint: int, X_JF: Any) -> MovingFrame:
     """Return how a frame on a joint moves."""
+    # The import loads CasADi, which trees never need here.
+    from mbkit.engines.closed_loops.frame_rows import MovingFrame
+
     X = d.oMi[joint] * X_JF
     # Of the world's joint in a model without others, Pinocchio would read beyond an array.
     J = np.zeros((6, m.nv))
@@ -131,6 +127,8 @@ class PinConstraints:
 
     def every(self, q: Array, v: Array) -> Rows:
         """Return all rows of loops, those that say nothing among them."""
+        from mbkit.engines.closed_loops.frame_rows import Rows, loop_rows
+
         self._move(q, v)
         parts = [
             loop_rows(loop, *(_frame(self._m, self._d, self._G, *end) for end in ends))
@@ -144,6 +142,8 @@ class PinConstraints:
 
     def _contacts(self) -> tuple[list[Rows], list[Rows]]:
         """Return the rows of contacts that hold positions, and those that hold velocities, after `every`."""
+        from mbkit.engines.closed_loops.frame_rows import contact_rows
+
         m, d, held, moving = self._m, self._d, [], []
         with np.errstate(divide="ignore", invalid="ignore"):
             for part, ends in zip(self._model.no_slip, self._touching, strict=True):
@@ -154,6 +154,8 @@ class PinConstraints:
 
     def all_rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
         """Return the rows of loops, couplers, motions and contacts; `given` are q and v of the description."""
+        from mbkit.engines.closed_loops.frame_rows import Rows, coupler_rows, motion_rows
+
         loops = self.every(q, v)
         held, moving = self._contacts()
         others = coupler_rows(self._model, *given), motion_rows(self._model, self._laws, self._time, *given)
