@@ -13,28 +13,39 @@ from weakref import WeakValueDictionary
 
 Lock = TypeVar("Lock")
 
-#: In the order of their creation, so that two threads that fork at once take them in the same order.
 _LOCKS: Final[WeakValueDictionary[int, Any]] = WeakValueDictionary()
 _NUMBERS: Final = count()
 _TAKEN: Final[list[list[Any]]] = []
 
 
 def fork_safe(lock: Lock) -> Lock:
-    """Return the lock, a context manager that may be entered twice; a fork waits for it from now on."""
+    """Return the lock, which its thread may take twice; a fork waits for it from now on."""
     _LOCKS[next(_NUMBERS)] = lock
     return lock
 
 
 def _take() -> None:
-    locks = [lock for _, lock in sorted(_LOCKS.items())]
-    for lock in locks:
-        lock.__enter__()
-    _TAKEN.append(locks)
+    """Take all locks, and hold none while it waits for one: other threads take several, in orders of their own."""
+    locks, first = list(_LOCKS.values()), 0
+    while True:
+        # The one that was not free comes first.
+        locks = [*locks[first:], *locks[:first]]
+        # Only the first is waited for.
+        busy = next((k for k, lock in enumerate(locks) if not lock.acquire(blocking=k == 0)), None)
+        if busy is None:
+            _TAKEN.append(locks)
+            return
+        _free(locks[:busy])
+        first = busy
+
+
+def _free(locks: list[Any]) -> None:
+    for lock in reversed(locks):
+        lock.release()
 
 
 def _release() -> None:
-    for lock in reversed(_TAKEN.pop()):
-        lock.__exit__(None, None, None)
+    _free(_TAKEN.pop())
 
 
 if hasattr(os, "register_at_fork"):

@@ -11,6 +11,7 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 import warnings
 import weakref
 from collections import Counter
@@ -25,6 +26,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mbkit as mb
+from mbkit import _fork
 from mbkit.codegen import backend, disk_cache, jit, simd_kernel
 from mbkit.codegen.compiled import Call, Compiled, KernelSequence, compiled
 from mbkit.codegen.interpreter import Machine
@@ -631,3 +633,29 @@ def test_a_command_refuses_a_level_that_is_none() -> None:
     done = subprocess.run([sys.executable, "-c", code, "robots"], env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "MBKIT_CPU: expected a level" in done.stderr
+
+
+def test_a_fork_waits_for_locks_that_a_thread_takes_in_any_order():
+    older, newer = (_fork.fork_safe(threading.RLock()) for _ in range(2))
+    done, begun = threading.Event(), threading.Event()
+
+    def work():
+        while not done.is_set():
+            for one, other in ((newer, older), (older, newer)):
+                with one:
+                    begun.set()
+                    time.sleep(1e-4)
+                    with other:
+                        pass
+
+    def forks():
+        begun.wait()
+        for _ in range(50):
+            _fork._take()
+            _fork._release()
+        done.set()
+
+    threads = [threading.Thread(target=target, daemon=True) for target in (work, forks)]
+    for thread in threads:
+        thread.start()
+    assert done.wait(timeout=60)

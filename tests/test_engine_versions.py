@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import entry_points
 from importlib.metadata import version as installed
 from pathlib import Path
@@ -108,6 +109,22 @@ TERMS = {
     "inverse_dynamics": 3,
     "forward_dynamics": 3,
 }
+
+
+@pytest.mark.parametrize("name", ["springs", "turning"])
+def test_threads_that_share_a_version_get_the_poses_of_their_own_states(name):
+    model = MODELS[name]()
+    dyn, (q, v) = mb.dynamics(model, present("mujoco", "1.0")), model.random_state(0, 60)
+    frame = model.bodies[-1].name
+    whole = [(dyn.pose(x, frame), dyn.jacobian(x, frame), dyn.coriolis_force(x, y)) for x, y in zip(q, v, strict=True)]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(
+            pool.map(
+                lambda k: (dyn.pose(q[k], frame), dyn.jacobian(q[k], frame), dyn.coriolis_force(q[k], v[k])), range(60)
+            )
+        )
+    for mine, others in zip(whole, found, strict=True):
+        assert all(np.array_equal(x, y) for x, y in zip(mine, others, strict=True))
 
 
 @pytest.mark.parametrize("engine", ENGINES)

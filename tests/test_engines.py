@@ -6,6 +6,7 @@ import inspect
 import os
 import pickle
 import re
+import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
@@ -499,17 +500,38 @@ def test_dynamics_can_be_pickled(engine):
     assert np.array_equal(pickle.loads(pickle.dumps(dyn)).nle(q, v), dyn.nle(q, v))
 
 
+SHARED = {
+    "panda": lambda: mb.load("panda"),
+    "floating": lambda: mb.load("solo12", floating_base=True),
+    "four_bar": mb.catalog.four_bar,
+}
+
+
 @pytest.mark.parametrize("engine", list(ENGINES))
-def test_threads_that_share_an_engine_get_right_numbers_or_are_told(engine):
-    """MuJoCo's and CasADi's engines lock; Pinocchio's calls hold the interpreter's own lock."""
-    model = mb.load("panda")
-    dyn = mb.dynamics(model, engine)
-    q, v, _, tau = states(model, 20)
-    expected = [dyn.forward_dynamics(*x) for x in zip(q, v, tau, strict=True)]
-    with ThreadPoolExecutor(4) as pool:
-        for _ in range(3):
-            got = list(pool.map(dyn.forward_dynamics, q, v, tau))
-            assert np.array_equal(got, expected)
+@pytest.mark.parametrize("name", SHARED)
+def test_threads_that_share_an_engine_get_the_values_of_their_own_states(name, engine):
+    """Whichever instruction one thread is interrupted at."""
+    model = SHARED[name]()
+    dyn, frame = mb.dynamics(model, engine), model.bodies[-1].name
+    q, v, a, tau = states(model, 12)
+    if model.constrained:
+        q, v = mb.dynamics(model, "lagrangian").project(q, v)
+    of_frames = {"pose": (q,), "jacobian": (q,), "acceleration": (q, v, a)}
+    of_states = {"coriolis_force": (q, v), "inverse_dynamics": (q, v, a), "constraint_bias": (q, v)}
+    with_wrenches = {"forward_dynamics": (q, v, tau)}
+    before = sys.getswitchinterval()
+    for kind, more in ((of_frames, (frame,)), (of_states, ()), (with_wrenches, ({frame: np.arange(6.0)},))):
+        for quantity in {*kind} & dyn.supports:
+            call = partial(lambda of, more, *row: of(*row, *more), getattr(dyn, quantity), more)
+            rows = [*zip(*kind[quantity], strict=True)]
+            expected = [call(*row) for row in rows]
+            sys.setswitchinterval(1e-6)
+            try:
+                with ThreadPoolExecutor(4) as pool:
+                    got = list(pool.map(call, *zip(*3 * rows, strict=True)))
+            finally:
+                sys.setswitchinterval(before)
+            assert all(np.array_equal(x, y) for x, y in zip(got, 3 * expected, strict=True)), quantity
 
 
 def test_mujoco_writes_no_log_and_gives_no_number_where_there_is_none(tmp_path, monkeypatch, capfd):

@@ -49,9 +49,10 @@ class Loaded:
 
 #: One thread compiles at a time: LLVM's own tables are shared by the process.
 COMPILING: Final = fork_safe(threading.RLock())
-if hasattr(llvm.ffi.lib, "_lock"):
+_OF_LLVMLITE: Final = getattr(getattr(llvm.ffi.lib, "_lock", None), "_lock", None)
+if _OF_LLVMLITE is not None:
     # Modules are also freed outside of COMPILING, under the lock of llvmlite itself.
-    fork_safe(llvm.ffi.lib._lock)
+    fork_safe(_OF_LLVMLITE)
 
 
 #: Levels of x86-64 (System V ABI, AMD64 supplement, table 3.1): what a processor needs for each, and the doubles in

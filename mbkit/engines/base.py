@@ -6,7 +6,9 @@ quantities that follow from others are here.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from functools import cached_property
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar
@@ -16,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._attributes import ReadOnly, single_values
 from mbkit._check import Array, all_finite, batch_of, rows
+from mbkit._fork import fork_safe
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
 from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
 from mbkit.engines.frames_and_momenta import (
@@ -159,6 +162,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     bits: ClassVar[int] = DOUBLE_BITS
     #: Whether the adapter's own terms hold the forces that are given by functions; else they are added to them.
     has_elements: ClassVar[bool] = False
+    #: Whether an evaluation uses memory of the object, so that one thread at a time may evaluate.
+    _one_at_a_time: ClassVar[bool] = True
     #: Whether the adapter's methods take batches too, all of one size, and not single states alone.
     _batches: ClassVar[bool] = True
     #: Frames whose wrenches stand behind τ in that argument, six numbers each, and their axes.
@@ -182,6 +187,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
             require_tree(model, self.engine, self.lacks_constraints)
         #: Whether the first accelerations look whether their state satisfies the constraints.
         self.looks = model.constrained and not self.soft_constraints
+        self._lock: Any = fork_safe(threading.RLock()) if self._one_at_a_time else nullcontext()
         # Also where a copy begins again.
         vars(self)["model"] = model
 
@@ -546,9 +552,11 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         method = self._method(quantity)
         states, size = self._states(arguments)
         try:
-            value = self._value(method, [*states.values()], more, size)
-            # One state's value may be the engine's own memory.
-            out = np.array(value, dtype=np.float64, copy=None if self._batches or size is not None else True)
+            # Two threads in here would mix their states.
+            with self._lock:
+                value = self._value(method, [*states.values()], more, size)
+                # One state's value may be the engine's own memory.
+                out = np.array(value, dtype=np.float64, copy=None if self._batches or size is not None else True)
         except np.linalg.LinAlgError:
             raise NumericalError(
                 f"{self.engine}: {quantity} of {self.model.name}: the mass matrix is singular{self._suspects()}"

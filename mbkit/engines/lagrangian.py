@@ -158,6 +158,7 @@ class LagrangianDynamics(Dynamics):
 
     engine = "lagrangian"
     derived = has_elements = True
+    _one_at_a_time = False
     takes_parameters = True
     takes_written = True
     lacks_derivatives = lacks_constraints = ""

@@ -10,6 +10,7 @@ shows that eps as error. Rotation matrices and axes, orthonormal to rounding onl
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from copy import copy
 from functools import cached_property
@@ -112,6 +113,7 @@ class OracleDynamics(Dynamics):
     bits = 113
     has_elements = True
     takes_written = True
+    _one_at_a_time = False
     lacks_derivatives = lacks_constraints = ""
     refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}
 
@@ -137,8 +139,8 @@ class OracleDynamics(Dynamics):
         #: One row, the same for all states; nothing where no number is a symbol.
         self._constants = [values[None]] if values.size else []
         self._programs: dict[tuple[Any, ...], Extended] = {}
-        #: The last value, in all its digits.
-        self._last: Any = None
+        #: The last value of each thread, in all its digits.
+        self._values = threading.local()
         self._held: tuple[_Key, _Key, dict[str, Any]] | None = None
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
@@ -195,8 +197,8 @@ class OracleDynamics(Dynamics):
     # The methods of quantities take batches, and return 113-bit numbers.
 
     def _value(self, method: Callable[..., Any], states: list[Array], more: tuple[Any, ...], size: int | None) -> Any:
-        self._last = method(*(np.atleast_2d(x) for x in states), *more)
-        high, _ = self._arithmetic.pair(self._last)
+        self._values.last = method(*(np.atleast_2d(x) for x in states), *more)
+        high, _ = self._arithmetic.pair(self._values.last)
         return high[0] if size is None else high
 
     def _exact(self, quantity: str, arguments: tuple[Any, ...]) -> Any:
@@ -212,7 +214,7 @@ class OracleDynamics(Dynamics):
         else:
             out = np.asarray(getattr(self, quantity)(*arguments))
         # The method has checked all, and gave its value the shape.
-        return self._last.reshape(out.shape)
+        return self._values.last.reshape(out.shape)
 
     def _normalized(self, q: Array) -> Any:
         """Return q with quaternions of unit length."""
@@ -316,7 +318,7 @@ class OracleDynamics(Dynamics):
         return self._run(("loads", joints, frames, axes, moved), *states)[0]
 
     def _only(self, out: Array, first: int, last: int) -> Array:
-        self._last = self._last[:, first:last]
+        self._values.last = self._values.last[:, first:last]
         return super()._only(out, first, last)
 
     _kinetic_energy, _potential_energy, _energy_rate = map(

@@ -1,4 +1,4 @@
-"""Forces and motion of mechanisms: of actuators, in joints and loops, and seen from independent coordinates."""
+"""Mechanisms: forces of actuators, in joints and loops, motion by independent coordinates, rows from moving frames."""
 
 from typing import Final
 

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.codegen.backend import DERIVING
 from mbkit.codegen.interpreter import Machine
 from mbkit.model import Model
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
@@ -98,6 +99,11 @@ def _evaluated(machine: Machine, frames: Sequence[MovingFrame], numbers: Sequenc
 
 
 @lru_cache(maxsize=64)
+def _kept(make: Callable[[str], Machine], kind: str) -> Machine:
+    with DERIVING:
+        return make(kind)
+
+
 def _loop(kind: str) -> Machine:
     poses, length = _Poses(3), ca.SX.sym("length")
     to = poses.R[2].T
@@ -108,10 +114,9 @@ def _loop(kind: str) -> Machine:
 
 def loop_rows(loop: Loop, a: MovingFrame, b: MovingFrame, carrier: MovingFrame) -> Rows:
     """Return the rows of a loop, in the axes of the body that carries both its ends."""
-    return _evaluated(_loop(loop.kind), (a, b, carrier), [loop.length])
+    return _evaluated(_kept(_loop, loop.kind), (a, b, carrier), [loop.length])
 
 
-@lru_cache(maxsize=16)
 def _contact(kind: str) -> Machine:
     poses = _Poses(2)
     # The directions on both bodies, and two along the plane.
@@ -133,7 +138,7 @@ def contact_rows(part: NoSlip, a: MovingFrame, b: MovingFrame) -> tuple[Rows, Ro
     Both frames have the axes of their bodies; rows are in world axes.
     """
     numbers = [*part.axis_a, *part.axis_b, *tangents(part.axis_b).ravel(), part.radius, part.speed]
-    rows = _evaluated(_contact(part.kind), (a, b), numbers)
+    rows = _evaluated(_kept(_contact, part.kind), (a, b), numbers)
     first = len(NO_SLIP_ROWS[part.kind][0])
     return rows[:first], rows[first:]
 

@@ -10,7 +10,6 @@ b = R (ω × v) in the linear rows.
 from __future__ import annotations
 
 import contextlib
-import threading
 from functools import cached_property
 from typing import Any, ClassVar, Final
 
@@ -22,7 +21,6 @@ from pydrake.multibody.tree import MultibodyForces, MultibodyForces_
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit._fork import fork_safe
 from mbkit.engines import closed_loops, loads, regressors
 from mbkit.engines.base import MappedDynamics, require_tree
 from mbkit.engines.constrained import QUANTITIES as CONSTRAINT_QUANTITIES
@@ -83,19 +81,16 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
         self._applied = self.plant.get_applied_generalized_force_input_port()
         self._acceleration_port = self.plant.get_generalized_acceleration_output_port()
         self._context = self.plant.CreateDefaultContext()
-        self._lock = fork_safe(threading.RLock())
 
     def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
-        # One context: two threads in here would mix their states.
-        with self._lock:
-            try:
-                return super()._evaluate(quantity, *more, **arguments)
-            except (RuntimeError, SystemExit) as error:
-                # Drake's failed demands come as either.
-                if isinstance(error, NotImplementedError):
-                    raise
-                reason = str(error).strip().splitlines()[0]
-                raise NumericalError(f"drake: {quantity} of {self.model.name}: {reason}{self._suspects()}") from None
+        try:
+            return super()._evaluate(quantity, *more, **arguments)
+        except (RuntimeError, SystemExit) as error:
+            # Drake's failed demands come as either.
+            if isinstance(error, NotImplementedError):
+                raise
+            reason = str(error).strip().splitlines()[0]
+            raise NumericalError(f"drake: {quantity} of {self.model.name}: {reason}{self._suspects()}") from None
 
     # Between the description's numbers and Drake's.
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -21,7 +20,6 @@ from numpy.typing import ArrayLike
 
 from mbkit._attributes import single_values
 from mbkit._check import Array, batch_of, count, real
-from mbkit._fork import fork_safe
 from mbkit._warn import warn
 from mbkit.engines import known_defects, regressors
 from mbkit.engines.base import MappedDynamics, require_no_forces
@@ -114,7 +112,6 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
             self._m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
             self._d = mujoco.MjData(self._m)
         self._reduced = self.model.layout.reduced
-        self._lock = fork_safe(threading.RLock())
 
     def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
         if quantity.removesuffix("_with_wrenches") in _OF_MASS and self.model.couplings and self._torn_couplings:

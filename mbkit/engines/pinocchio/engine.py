@@ -170,10 +170,20 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         if tiny := self._tiny_bodies():
             known_defects.announce(known_defects.TINY_MASS, f"the mass of body {tiny}")
 
+    def _locked(self, method: Call) -> Call:
+        lock = self._lock
+
+        def call(*states: Array) -> Any:
+            with lock:
+                return method(*states)
+
+        return call
+
     def _install_direct_calls(self) -> None:
         """Put calls for one state in the place of this object's methods."""
-        m, d, needs, damping = self._m, self._d, self.model.needs, self._joint_passive.damping
-        bare: dict[str, Call] = {name: getattr(self, f"_{name}") for name in _DIRECT}
+        # One call of Pinocchio's holds the interpreter's lock, and needs no other on data that nothing else uses.
+        m, d, needs, damping = self._m, self._m.createData(), self.model.needs, self._joint_passive.damping
+        bare: dict[str, Call] = {name: self._locked(getattr(self, f"_{name}")) for name in _DIRECT}
         # What is mixed by G_q q spreads a NaN to every coordinate.
         unread: dict[str, set[int]] = {}
         if self._direct:
@@ -194,7 +204,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
                 own = {name: own[name] for name in ("gravity", "nle")}
             bare |= own
         if self.model.constrained:
-            bare["forward_dynamics"] = self._forward_dynamics
+            bare["forward_dynamics"] = self._locked(self._forward_dynamics)
         if self.model.forces:
             # They are added the checked way.
             del bare["inverse_dynamics"], bare["forward_dynamics"]
