@@ -15,6 +15,8 @@ Lock = TypeVar("Lock")
 
 _LOCKS: Final[WeakValueDictionary[int, Any]] = WeakValueDictionary()
 _NUMBERS: Final = count()
+#: Seconds of the first while.
+_PATIENCE: Final = 0.02
 _TAKEN: Final[list[list[Any]]] = []
 
 
@@ -25,18 +27,22 @@ def fork_safe(lock: Lock) -> Lock:
 
 
 def _take() -> None:
-    """Take all locks, and hold none while it waits for one: other threads take several, in orders of their own."""
-    locks, first = list(_LOCKS.values()), 0
+    """Take all locks, though other threads take several of them in orders of their own.
+
+    It waits for the first as long as that takes, holding none, and for each other one for a while: two threads that
+    wait for each other part then. The while doubles, as some work takes long.
+    """
+    locks, busy, patience = list(_LOCKS.values()), 0, _PATIENCE
     while True:
-        # The one that was not free comes first.
-        locks = [*locks[first:], *locks[:first]]
-        # Only the first is waited for.
-        busy = next((k for k, lock in enumerate(locks) if not lock.acquire(blocking=k == 0)), None)
-        if busy is None:
+        locks = [*locks[busy:], *locks[:busy]]
+        times = (-1.0, *[patience] * (len(locks) - 1))
+        waited = (lock.acquire(timeout=time) for lock, time in zip(locks, times, strict=False))
+        held = next((k for k, taken in enumerate(waited) if not taken), len(locks))
+        if held == len(locks):
             _TAKEN.append(locks)
             return
-        _free(locks[:busy])
-        first = busy
+        _free(locks[:held])
+        busy, patience = held, 2.0 * patience
 
 
 def _free(locks: list[Any]) -> None:

@@ -644,13 +644,14 @@ def test_a_fork_waits_for_locks_that_a_thread_takes_in_any_order():
             for one, other in ((newer, older), (older, newer)):
                 with one:
                     begun.set()
-                    time.sleep(1e-4)
+                    time.sleep(1e-3)
                     with other:
                         pass
+                time.sleep(1e-4)
 
     def forks():
         begun.wait()
-        for _ in range(50):
+        for _ in range(10):
             _fork._take()
             _fork._release()
         done.set()
@@ -658,4 +659,26 @@ def test_a_fork_waits_for_locks_that_a_thread_takes_in_any_order():
     threads = [threading.Thread(target=target, daemon=True) for target in (work, forks)]
     for thread in threads:
         thread.start()
+    assert done.wait(timeout=60)
+
+
+def test_a_fork_gets_its_turn_between_threads_that_are_always_busy():
+    """Each holds a lock of its own nearly all the time."""
+    done = threading.Event()
+
+    def work():
+        own = _fork.fork_safe(threading.RLock())
+        while not done.is_set():
+            with own:
+                time.sleep(5e-3)
+            time.sleep(1e-4)
+
+    def forks():
+        for _ in range(5):
+            _fork._take()
+            _fork._release()
+        done.set()
+
+    for target in (work, work, work, forks):
+        threading.Thread(target=target, daemon=True).start()
     assert done.wait(timeout=60)
