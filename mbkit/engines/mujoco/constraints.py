@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
 import numpy as np
@@ -29,6 +29,9 @@ from mbkit import spatial
 from mbkit._check import Array, real, rows
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
+
+if TYPE_CHECKING:
+    from mbkit.engines.closed_loops.frame_rows import Rows
 
 #: Bounds that MuJoCo keeps an impedance in, and the least size that it divides by (mjMINIMP, mjMAXIMP, mjMINVAL).
 _LEAST, _MOST = 1e-4, 0.9999
@@ -218,12 +221,8 @@ def _bias(m: Any, d: Any, i: int) -> Array:
 
 def _motion(m: Any, d: Any, site: int) -> tuple[Array, Array]:
     """Return J v and J̇ v of a site, (6,) each, in world axes, linear first."""
-    out = []
-    for of in (mujoco.mj_jac, mujoco.mj_jacDot):
-        J = np.zeros((6, m.nv))
-        of(m, d, J[:3], J[3:], d.site_xpos[site], m.site_bodyid[site])
-        out.append(J @ d.qvel)
-    return out[0], out[1]
+    at = d.site_xpos[site], m.site_bodyid[site]
+    return _jacobian(mujoco.mj_jac, m, d, *at) @ d.qvel, _jacobian(mujoco.mj_jacDot, m, d, *at) @ d.qvel
 
 
 def _quaternion(m: Any, d: Any, site: int) -> Array:
@@ -236,26 +235,14 @@ def _times(p: Array, q: Array) -> Array:
     return np.append(p[3] * q[:3] + q[3] * p[:3] + np.cross(p[:3], q[:3]), p[3] * q[3] - p[:3] @ q[:3])
 
 
-# The rows of `mbkit.derivation.constraints`, from the motion of sites
+# The rows of the contract, from the motion of sites
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """Return a × b of columns."""
-    return np.cross(a, b, axis=0)
-
-
-class LoopRows:
-    """f, J and γ of the loops, in the axes of the body that carries both ends of each, and of couplers."""
+class LoopEnds:
+    """Which sites are the ends of each loop, and which body carries both."""
 
     def __init__(self, m: Any, description: Model, bodies: Mapping[str, int]) -> None:
-        self._m = m
-        #: Equalities of couplers: entries in qpos and qvel of both joints, and the polynomial's first coefficients.
-        self._couplers = [
-            (*(m.jnt_qposadr[j] for j in pair), *(m.jnt_dofadr[j] for j in pair), *m.eq_data[i, :2])
-            for i in np.flatnonzero(m.eq_type == OF_JOINTS)
-            for pair in [(m.eq_obj1id[i], m.eq_obj2id[i])]
-        ]
-        self._loops: list[tuple[int, int, int, bool]] = []
+        self._model, self._placed = description, []
         for k, loop in enumerate(description.loops):
             carrier = description.carrier(loop)
             if carrier not in bodies:
@@ -263,88 +250,29 @@ class LoopRows:
                     f"mujoco: loop {loop.name!r} has its rows in the axes of {carrier!r}, a body without mass between "
                     "two joints, which MuJoCo holds as two joints of one body"
                 )
-            self._loops.append((*(m.site(f"loop{k}.{end}").id for end in "ab"), bodies[carrier], loop.kind == "frame"))
+            self._placed.append((*(m.site(f"loop{k}.{end}").id for end in "ab"), bodies[carrier]))
 
-    def residual(self, d: Any) -> Array:
-        """Return f at the poses that are in."""
-        out = []
-        for a, b, carrier, frame in self._loops:
-            R, pairs = d.xmat[carrier].reshape(3, 3), self._values(d, a, b, frame)
-            out += [R.T @ x for x in pairs]
-        out += [
-            np.array([d.qpos[at] - (ratio * d.qpos[leading] + offset)])
-            for at, leading, _, _, offset, ratio in self._couplers
-        ]
-        return np.concatenate(out)
+    def rows(self, m: Any, d: Any, columns: Callable[[Array], Array], b0: Array, given: tuple[Array, Array]) -> Rows:
+        """Return all rows of loops and couplers at the state that is in, where MuJoCo's accelerations are b0.
 
-    @staticmethod
-    def _values(d: Any, a: int, b: int, frame: bool) -> list[Array]:
-        """Return the gap, and of frames ½ Σ b_k × a_k, in world axes."""
-        gap = d.site_xpos[a] - d.site_xpos[b]
-        A, B = (d.site_xmat[s].reshape(3, 3) for s in (a, b))
-        return [gap, 0.5 * _cross(B, A).sum(axis=1)] if frame else [gap]
+        `columns` turns a Jacobian into the description's coordinates; `given` are q and v of the description.
+        """
+        # The import loads CasADi, which trees never need here.
+        from mbkit.engines.closed_loops.frame_rows import MovingFrame, Rows, coupler_rows, loop_rows
 
-    def jacobian(self, d: Any) -> Array:
-        """Return J in MuJoCo's velocities."""
-        out = []
-        for a, b, carrier, frame in self._loops:
-            (va, wa), (vb, wb) = (self._columns(mujoco.mj_jac, d, s) for s in (a, b))
-            wc = self._jacobian(mujoco.mj_jac, d, d.xpos[carrier], carrier)[1]
-            R = d.xmat[carrier].reshape(3, 3)
-            changes = [va - vb, *([self._turn(d, a, b, wa, wb)] if frame else [])]
-            for x, change in zip(self._values(d, a, b, frame), changes, strict=True):
-                out.append(R.T @ (change - _cross(wc, x[:, None])))
-        for _, _, at, leading, _, ratio in self._couplers:
-            row = np.zeros((1, self._m.nv))
-            row[0, at], row[0, leading] = 1.0, -ratio
-            out.append(row)
-        return np.concatenate(out)
+        def frame(p: Array, R: Array, body: int) -> MovingFrame:
+            J, dJ = _jacobian(mujoco.mj_jac, m, d, p, body), _jacobian(mujoco.mj_jacDot, m, d, p, body)
+            return MovingFrame(R.reshape(3, 3), p, columns(J), J @ d.qvel, dJ @ d.qvel + J @ b0)
 
-    @staticmethod
-    def _turn(d: Any, a: int, b: int, wa: Array, wb: Array) -> Array:
-        """Return the rate of ½ Σ b_k × a_k for columns of angular velocities."""
-        A, B = (d.site_xmat[s].reshape(3, 3).T[:, :, None] for s in (a, b))
-        return np.asarray(
-            0.5 * sum(_cross(_cross(wb, y), x) + _cross(y, _cross(wa, x)) for x, y in zip(A, B, strict=True))
-        )
+        parts = []
+        for loop, (*ends, carrier) in zip(self._model.loops, self._placed, strict=True):
+            a, b = (frame(d.site_xpos[s], d.site_xmat[s], m.site_bodyid[s]) for s in ends)
+            parts.append(loop_rows(loop, a, b, frame(d.xpos[carrier], d.xmat[carrier], carrier)))
+        return Rows.stacked([*parts, *coupler_rows(self._model, *given)])
 
-    def bias(self, d: Any, b0: Array) -> Array:
-        """Return γ at the velocities that are in, where MuJoCo's accelerations are b0."""
-        out = []
-        for a, b, carrier, frame in self._loops:
-            (va, wa, la, ga), (vb, wb, lb, gb) = (
-                self._rates(d, d.site_xpos[s], self._m.site_bodyid[s], b0) for s in (a, b)
-            )
-            _, wc, _, gc = self._rates(d, d.xpos[carrier], carrier, b0)
-            R = d.xmat[carrier].reshape(3, 3)
-            rates, seconds = [va - vb], [la - lb]
-            if frame:
-                A, B = (d.site_xmat[s].reshape(3, 3) for s in (a, b))
-                first = [np.cross(w, x, axisb=0).T for w, x in ((wa, A), (wb, B))]
-                second = [
-                    np.cross(g, x, axisb=0).T + np.cross(w, y, axisb=0).T
-                    for g, w, x, y in ((ga, wa, A, first[0]), (gb, wb, B, first[1]))
-                ]
-                rates.append(0.5 * (_cross(first[1], A) + _cross(B, first[0])).sum(axis=1))
-                seconds.append(
-                    0.5 * (_cross(second[1], A) + 2 * _cross(first[1], first[0]) + _cross(B, second[0])).sum(axis=1)
-                )
-            for x, dx, ddx in zip(self._values(d, a, b, frame), rates, seconds, strict=True):
-                seen = ddx - 2 * np.cross(wc, dx) - np.cross(gc, x) + np.cross(wc, np.cross(wc, x))
-                out.append(R.T @ seen)
-        return np.concatenate([*out, np.zeros(len(self._couplers))])
 
-    def _columns(self, of: Any, d: Any, site: int) -> tuple[Array, Array]:
-        return self._jacobian(of, d, d.site_xpos[site], self._m.site_bodyid[site])
-
-    def _jacobian(self, of: Any, d: Any, p: Array, body: int) -> tuple[Array, Array]:
-        linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
-        of(self._m, d, linear, angular, p, body)
-        return linear, angular
-
-    def _rates(self, d: Any, p: Array, body: int, b0: Array) -> tuple[Array, Array, Array, Array]:
-        """Return linear and angular velocity of a point, and its accelerations at b0."""
-        linear, angular = self._jacobian(mujoco.mj_jac, d, p, body)
-        dlinear, dangular = self._jacobian(mujoco.mj_jacDot, d, p, body)
-        v = d.qvel
-        return linear @ v, angular @ v, dlinear @ v + linear @ b0, dangular @ v + angular @ b0
+def _jacobian(of: Callable[..., None], m: Any, d: Any, p: Array, body: int) -> Array:
+    """Return the Jacobian of a point's velocity, or its rate, (6, nv) in world axes, linear first."""
+    J = np.zeros((6, m.nv))
+    of(m, d, J[:3], J[3:], p, body)
+    return J

@@ -23,15 +23,17 @@ from mbkit._check import Array, batch_of, count, real
 from mbkit._warn import warn
 from mbkit.engines import known_defects, regressors
 from mbkit.engines.base import MappedDynamics, require_no_forces
+from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.mujoco.bodies import MujocoBodies
-from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopRows, Softness, law
+from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopEnds, Softness, law
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
 
 if TYPE_CHECKING:
+    from mbkit.engines.closed_loops.frame_rows import Rows
     from mbkit.show import Kind
 
 #: Quantities that M is part of.
@@ -41,7 +43,7 @@ _OF_MASS: Final = ("mass_matrix", "mass_matrix_inverse", "inverse_dynamics", "fo
 _TOLD: Final[set[tuple[str, Softness]]] = set()
 
 
-class MujocoDynamics(MujocoBodies, MappedDynamics):
+class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
     """MuJoCo on a description.
 
     Attributes
@@ -154,20 +156,15 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
 
     # Loops.
 
-    @cached_property
-    def _kept(self) -> list[int]:
-        """The rows that say something; an `InputError` for loops that never meet or that no joint moves."""
-        if not self.model.needs.loops:
-            return []
-        # The import loads CasADi.
-        from mbkit.derivation.constraints import choose_rows
-
-        return list(choose_rows(self.model).kept)
+    def _require_loops_that_meet(self) -> None:
+        """Raise `InputError` for loops that never meet or that no joint moves."""
+        if self.model.needs.loops:
+            _ = self._row_choice
 
     @contextlib.contextmanager
     def _with_loops(self) -> Iterator[None]:
         """Evaluate with MuJoCo's equality constraints, on data of their own."""
-        _ = self._kept
+        self._require_loops_that_meet()
         tree = self._m, self._d
         self._m, self._d = self._closed
         if self._d is not tree[1]:
@@ -219,31 +216,12 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
             return self._law(b)
 
     @cached_property
-    def _rows(self) -> tuple[LoopRows, list[int]]:
-        """The rows of the loops, and which of them say something."""
-        return LoopRows(self.mj_model, self.model, self._maps.bodies), self._kept
+    def _loop_ends(self) -> LoopEnds:
+        return LoopEnds(self.mj_model, self.model, self._maps.bodies)
 
-    def _constraint_residual(self, q: Array) -> Array:
-        rows, kept = self._rows
-        self._place(q)
-        return rows.residual(self._d)[kept]
-
-    def _constraint_jacobian(self, q: Array) -> Array:
-        rows, kept = self._rows
-        self._place(q)
-        return self._columns(rows.jacobian(self._d)[kept])
-
-    def _every_jacobian(self, q: Array) -> Array:
-        self._place(q)
-        return self._columns(self._rows[0].jacobian(self._d))
-
-    def _constraint_rate(self, q: Array, v: Array) -> Array:
-        return np.asarray(self._constraint_jacobian(q) @ v)
-
-    def _constraint_bias(self, q: Array, v: Array) -> Array:
-        rows, kept = self._rows
+    def _every_row(self, q: Array, v: Array) -> Rows:
         b = self._place(q, v)
-        return rows.bias(self._d, b)[kept]
+        return self._loop_ends.rows(self._m, self._d, self._columns, b, (q, v))
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Array:
         with self._with_loops():
@@ -438,7 +416,8 @@ class MujocoDynamics(MujocoBodies, MappedDynamics):
             raise InputError(f"tau: expected shape ({steps}, {self.model.nv}), one row a step, got {np.shape(tau)}")
         if self._lines:
             self.passive(q0, v0)  # raises where a spring has no direction to start in
-        model, _ = copy.copy(self.mj_model), self._kept
+        self._require_loops_that_meet()
+        model = copy.copy(self.mj_model)
         model.body_gravcomp[:] = self._gravcomp
         if self.model.needs.loops and 0 < self.softness.solref[0] < 2 * dt:
             warn(

@@ -32,6 +32,7 @@ import pinocchio as pin
 
 from mbkit._check import Array
 from mbkit.engines.base import first_names
+from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
 from mbkit.engines.pinocchio.model import PinModel
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Model
@@ -160,10 +161,6 @@ class PinConstraints:
         held, moving = self._contacts()
         others = coupler_rows(self._model, *given), motion_rows(self._model, self._laws, self._time, *given)
         return Rows.stacked([loops, *others[0], *others[1], *held, *moving])
-
-    def rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
-        """Return the rows that say something."""
-        return self.all_rows(q, v, given)[list(self.choice.kept)]
 
     @cached_property
     def _laws(self) -> list[Callable[[float], tuple[float, float, float]]]:
@@ -326,10 +323,9 @@ class PinConstraints:
         )
 
 
-class PinocchioConstrained:
+class PinocchioConstrained(RowsOfFrames):
     """Quantities of constraints; `PinocchioDynamics` inherits it."""
 
-    model: Model
     _held: PinConstraints
     # Of the other parts.
     _full_q: Callable[[Array], Array]
@@ -347,29 +343,8 @@ class PinocchioConstrained:
             raise UnsupportedError(f"constraint_solver: {self.model.name} has no loops and no other constraints")
         return self._held.solver
 
-    def _rows(self, q: Array, v: Array | None = None) -> Rows:
-        v = np.zeros(self.model.nv) if v is None else v
-        return self._held.rows(self._full_q(q), self._full_v(v), (q, v))
-
-    @property
-    def _row_choice(self) -> RowChoice:
-        return self._held.choice
-
-    def _every_jacobian(self, q: Array) -> Array:
-        zero = np.zeros(self.model.nv)
-        return self._held.all_rows(self._full_q(q), self._full_v(zero), (q, zero)).J
-
-    def _constraint_residual(self, q: Array) -> Array:
-        return self._rows(q).f[: self._held.choice.positions]
-
-    def _constraint_jacobian(self, q: Array) -> Array:
-        return self._rows(q).J
-
-    def _constraint_rate(self, q: Array, v: Array) -> Array:
-        return self._rows(q, v).rate
-
-    def _constraint_bias(self, q: Array, v: Array) -> Array:
-        return self._rows(q, v).gamma
+    def _every_row(self, q: Array, v: Array) -> Rows:
+        return self._held.all_rows(self._full_q(q), self._full_v(v), (q, v))
 
     def _constrained_motion(self, q: Array, v: Array, tau: Array) -> Array:
         """Return v̇ under the constraints."""
