@@ -38,7 +38,7 @@ from mbkit.model import Model, NoSlip
 from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.joint_types import cross3
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
-from mbkit.model.manifold import random_state
+from mbkit.model.manifold import random_state, shortened_steps
 from mbkit.model.parts import Loop
 from mbkit.model.rolling import LIES_FLAT, NO_SLIP_ROWS, Contact, contact
 from mbkit.model.validation import sample_mass_matrix
@@ -384,24 +384,18 @@ class _Numbers:
 
     def closed(self, q: Array, kept: list[int]) -> Array | None:
         """Return a configuration near q where these rows are zero, by damped Gauss-Newton; None where it ends else."""
-        f, J = (x[kept] for x in self(q))
-        for _ in range(_STEPS):
-            size = float(np.linalg.norm(f))
-            if size < _CLOSED * 1e-3:
-                break
-            step, length = np.linalg.lstsq(J, -f, rcond=1e-10)[0], 1.0
-            while length > 1e-6:
-                beyond = self.model.integrate(q, length * step)
-                f1, J1 = (x[kept] for x in self(beyond))
-                if np.linalg.norm(f1) < size:
-                    break
-                length *= 0.5
-            else:
-                break
-            q, f, J = beyond, f1, J1
+
+        def terms(x: Array) -> tuple[float, tuple[Array, Array]]:
+            f, J = (rows[kept] for rows in self(x))
+            return float(np.linalg.norm(f)), (f, J)
+
+        def step(f: Array, J: Array) -> Array:
+            return np.asarray(np.linalg.lstsq(J, -f, rcond=1e-10)[0])
+
+        q, size, _ = shortened_steps(self.model, q, terms, step, enough=_CLOSED * 1e-3, most=_STEPS)
         # Half a turn away the sine of a frame's angle is zero too, and its rows depend on each other.
         turned = np.array(self._call(q, self._parameters)[3])
-        return q if np.linalg.norm(f) < _CLOSED and (turned >= 0).all() else None
+        return q if size < _CLOSED and (turned >= 0).all() else None
 
 
 #: The name under which a model keeps its own.

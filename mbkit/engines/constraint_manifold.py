@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit._reproducible import pivoted
-from mbkit.derivation.constraints import discs_of, independent_rows
+from mbkit.derivation.constraints import DEPENDENT, discs_of, independent_rows
 from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
@@ -26,7 +26,7 @@ from mbkit.engines.constrained import CONSISTENT
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.manifold import random_state
+from mbkit.model.manifold import random_state, shortened_steps
 
 _EPS: Final = float(np.finfo(float).eps)
 #: Rounds of the projection's iterations.
@@ -368,26 +368,18 @@ class Manifold:
     def restored(self, q: Array, v: Array, held: Collection[int] = ()) -> Array:
         """Return a configuration with f = 0, by steps that are the least in the mass matrix's metric."""
         free = self._free(held)
-        x, terms = q, self._terms(q, v)
-        scale = terms.scale[: len(terms.f)]
-        best = float(np.linalg.norm(terms.f / scale))
-        for _ in range(_MOST):
-            if best <= 4 * _EPS * (1 + float(np.abs(x).max())):
-                break
-            step, length = least_change(terms.V, terms.held, -terms.f, free=free), 1.0
-            while length > 1e-6:
-                moved = self.dyn.model.integrate(x, length * step)
-                beyond = self._terms(moved, v)
-                size = float(np.linalg.norm(beyond.f / beyond.scale[: len(beyond.f)]))
-                if size < best:
-                    break
-                length *= 0.5
-            else:
-                break
-            x, terms, best = moved, beyond, size
-        if not best <= 1e-10 * (1 + float(np.abs(x).max())):
+
+        def terms(x: Array) -> tuple[float, tuple[_Terms]]:
+            rows = self._terms(x, v)
+            return float(np.linalg.norm(rows.f / rows.scale[: len(rows.f)])), (rows,)
+
+        def step(rows: _Terms) -> Array:
+            return least_change(rows.V, rows.held, -rows.f, free=free)
+
+        x, size, (rows,) = shortened_steps(self.dyn.model, q, terms, step, enough=4 * _EPS, most=_MOST)
+        if not size <= 1e-10 * (1 + float(np.abs(x).max())):
             raise InputError(
-                f"q: {self.dyn.model.name} has no consistent state near it; f = {_residuals(terms.f)} is the "
+                f"q: {self.dyn.model.name} has no consistent state near it; f = {_residuals(rows.f)} is the "
                 "least reached"
             )
         if still := self.still_open(x):
@@ -603,8 +595,6 @@ _STEPS: Final = 100
 #: Configurations near a pose at which J is evaluated too, and how far they are away, rad or m.
 _BESIDE: Final = 4
 _ASIDE: Final = 0.05
-#: Remainder of a row that follows from the others, relative to the row's size.
-_DEPENDENT: Final = 1e-7
 #: Of a row's size beside the pose: its slope where a square is nearly zero.
 _FLAT: Final = 1e-4
 #: A slope that is rounding alone.
@@ -726,32 +716,26 @@ def _explain(manifold: Manifold, starts: list[Array], scale: Array, sizes: Array
 
 def _nearest(manifold: Manifold, q: Array, scale: Array) -> tuple[Array, Array]:
     """Return where damped Gauss-Newton ends, and the scaled f there."""
-    f = manifold.value(q)
-    scale = scale[: len(f)]
-    f = f / scale
-    for _ in range(_STEPS):
-        step = least_change(np.eye(manifold.dyn.model.nv), manifold.position_jacobian(q) / scale[:, None], -f)
-        length = 1.0
-        while length > 1e-9:
-            moved = manifold.dyn.model.integrate(q, length * step)
-            beyond = manifold.value(moved) / scale
-            if np.linalg.norm(beyond) < (1 - 1e-4 * length) * np.linalg.norm(f):
-                break
-            length *= 0.5
-        else:
-            break
-        q, f = moved, beyond
-        if np.linalg.norm(f) < 1e-13:
-            break
+
+    def terms(x: Array) -> tuple[float, tuple[Array, Array]]:
+        f, J = manifold.call("constraint_rows", x)
+        unit = 1.0 / scale[: len(f)]
+        left = unit * f[:, 0]
+        return float(np.linalg.norm(left)), (left, unit[:, None] * J[: len(f)])
+
+    def step(f: Array, J: Array) -> Array:
+        return np.asarray(np.linalg.lstsq(J, -f, rcond=1e-12)[0])
+
+    q, _, (f, _) = shortened_steps(manifold.dyn.model, q, terms, step, enough=1e-13, most=_STEPS)
     return q, f
 
 
 def _dependent(J: Array) -> tuple[Array, Array]:
     """Return the rows that the others imply, and those others that are needed for it."""
-    if len(J) and len(J) <= J.shape[1] and singular_values(J)[-1] > _DEPENDENT:
+    if len(J) and len(J) <= J.shape[1] and singular_values(J)[-1] > DEPENDENT:
         # No remainder is smaller than the smallest singular value; this is the quicker answer.
         return np.empty(0, dtype=int), np.empty(0, dtype=int)
-    order, *_ = pivoted(J, _DEPENDENT)
+    order, *_ = pivoted(J, DEPENDENT)
     kept, dependent = np.array(order, dtype=int), np.setdiff1d(np.arange(len(J)), order)
     if not len(dependent) or not len(kept):
         return dependent, np.empty(0, dtype=int)

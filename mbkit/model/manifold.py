@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from mbkit.model.description import Description
 #: Largest error of a caller's quaternion, in its norm or the square of that: rounding is accepted, a rotation that
 #: engines would read differently is not.
 NEAR_UNIT: Final = 1e-9
+#: Part of a Gauss-Newton step below which a residual that does not fall is at its least.
+_SHORTEST: Final = 1e-6
 
 
 def check_quaternions(model: Description, q: Array, name: str = "q") -> None:
@@ -162,3 +165,35 @@ def magnitude(*states: Array) -> float:
     """
     largest = max(float(np.abs(y).max(initial=0.0)) for y in states)
     return float(10.0 ** np.ceil(np.log10(largest))) if largest > _COMMON else 1.0
+
+
+def shortened_steps(
+    model: Description,
+    q: Array,
+    terms: Callable[[Array], tuple[float, tuple[Any, ...]]],
+    step: Callable[..., Array],
+    *,
+    enough: float,
+    most: int,
+) -> tuple[Array, float, tuple[Any, ...]]:
+    """Return where damped Gauss-Newton ends, with the size of the residual there and its terms.
+
+    `terms` gives the size and what `step` takes: a change of q that would be the whole way if the rows were straight.
+    It is halved until the size falls. The search ends where the size is at most `enough`, relative to q's size where
+    that is above 1, after `most` steps, and where no step makes it smaller.
+    """
+    size, here = terms(q)
+    for _ in range(most):
+        if size <= enough * (1.0 + float(np.abs(q).max(initial=0.0))):
+            break
+        whole, length = step(*here), 1.0
+        while length > _SHORTEST:
+            beyond = integrate(model, q, length * whole)
+            size_beyond, there = terms(beyond)
+            if size_beyond < size:
+                break
+            length *= 0.5
+        else:
+            break
+        q, size, here = beyond, size_beyond, there
+    return q, size, here

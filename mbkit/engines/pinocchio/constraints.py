@@ -32,6 +32,7 @@ import pinocchio as pin
 
 from mbkit._check import Array
 from mbkit.engines.base import first_names
+from mbkit.engines.closed_loops.actuation import spread
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
 from mbkit.engines.pinocchio.model import PinModel
 from mbkit.errors import NumericalError, UnsupportedError
@@ -300,11 +301,7 @@ class PinConstraints:
             raise NumericalError(
                 f"pinocchio: the mass matrix of {self._model.name} is singular on what its constraints leave free"
             )
-        if k < len(rows.J):
-            # Jᵀ λ = J_allᵀ μ with J_all = C J, for every μ with Cᵀ μ = λ.
-            C = np.linalg.lstsq(J.T, rows.J.T, rcond=None)[0].T
-            forces = np.linalg.lstsq(C.T, forces, rcond=None)[0]
-        return a, forces
+        return a, spread(J, rows.J, forces)
 
     def _singular(self, J: Array) -> str:
         # The smallest singular value's vector says which rows depend on each other.
