@@ -12,7 +12,8 @@ from mbkit._check import Array, real
 from mbkit.errors import InputError
 from mbkit.model import Model
 
-Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "large", "long", "step"]
+#: In the order of a study: stiff ones first, those that take longest last.
+Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "large", "step", "long"]
 #: The error of q along a run, of the energy along a run, or of terms at states.
 Measure = Literal["motion", "energy", "terms"]
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, get_args
 
 from mbkit.errors import UnknownNameError
-from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.cases import loops, rigid, springs
+from mbkit.studies.stress.case import Case, Family
+from mbkit.studies.stress.cases._common import TABLE
+
+# They fill the table, in this order within a family.
+from mbkit.studies.stress.cases import springs, rigid, loops  # noqa: F401  # isort: skip
 
 __all__ = ["CASES", "get", "names"]
 
-_FAMILIES: Final = (
-    *(springs.CASES, loops.DRIVEN_CASES, rigid.MASS_CASES, loops.REDUNDANT_CASES, rigid.LENGTH_CASES),
-    *(rigid.SPIN_CASES, rigid.SINGULAR_CASES, loops.SINGULAR_CASES, rigid.LARGE_CASES, springs.STEP_CASES),
-    *(springs.LONG_CASES, loops.LONG_CASES),
-)
-#: Name -> case: stiff ones first, those that take longest last.
-CASES: Final[dict[str, Case]] = {case.name: case for family in _FAMILIES for case in family}
+#: Name -> case, family by family.
+CASES: Final[dict[str, Case]] = {c.name: c for c in sorted(TABLE, key=lambda c: get_args(Family).index(c.family))}
 
 
 def names() -> tuple[str, ...]:

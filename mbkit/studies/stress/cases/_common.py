@@ -1,9 +1,10 @@
-"""What the families of cases share: registration, values over decades, and problems of motions and of terms."""
+"""What the families of cases share: their table, values over decades, and problems of motions and of terms."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +15,7 @@ from mbkit.studies.stress.case import Case, Family, Problem
 
 #: From times (K,) to q (K, nq).
 Exact = Callable[[Array], Array]
-Make = Callable[[float], Problem]
+Make = TypeVar("Make", bound=Callable[..., Problem])
 #: Name with unit -> number, for the report.
 Facts = dict[str, float]
 
@@ -23,20 +24,37 @@ EPS: Final = float(np.finfo(float).eps)
 SWING: Final = (0.0, -1.0, 0.0)
 
 
-def register(
-    cases: list[Case],
-    family: Family,
-    parameter: str,
-    unit: str,
-    values: tuple[float, ...],
-    quick: tuple[float, ...],
-    **more: Any,
-) -> Callable[[Make], Make]:
-    """Return a decorator that adds a function as a case, with its name and its docstring of one sentence."""
+#: All cases, as the modules of this package write them down.
+TABLE: Final[list[Case]] = []
+
+
+class Series:
+    """What the cases of one sweep have in common; it decorates the function that makes the problems of one."""
+
+    def __init__(
+        self,
+        family: Family,
+        parameter: str,
+        unit: str,
+        values: tuple[float, ...],
+        quick: tuple[float, ...],
+        **more: Any,
+    ) -> None:
+        self._swept, self._more = (family, parameter, unit, values, quick), more
+
+    def __call__(self, make: Make) -> Make:
+        return rows(self.row(make.__name__, " ".join((make.__doc__ or "").split())))(make)
+
+    def row(self, name: str, about: str, **numbers: Any) -> Callable[[Callable[..., Problem]], Case]:
+        """Return a case but for the function that makes its problems, which gets these numbers besides the value."""
+        return lambda make: Case(name, about, *self._swept, partial(make, **numbers), **self._more)
+
+
+def rows(*some: Callable[[Callable[..., Problem]], Case]) -> Callable[[Make], Make]:
+    """Return a decorator that adds the cases of these rows, whose problems the function makes."""
 
     def add(make: Make) -> Make:
-        about = " ".join((make.__doc__ or "").split())
-        cases.append(Case(make.__name__, about, family, parameter, unit, values, quick, make, **more))
+        TABLE.extend(row(make) for row in some)
         return make
 
     return add

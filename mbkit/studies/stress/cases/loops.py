@@ -14,12 +14,17 @@ from mbkit._check import Array
 from mbkit.engines.consistent.random_states import states_of
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.parts import Prescribed
-from mbkit.studies.stress.case import Case, Problem
-from mbkit.studies.stress.cases._common import EPS, motion, powers, register
+from mbkit.studies.stress.case import Problem
+from mbkit.studies.stress.cases._common import EPS, Series, motion, powers
 
 #: Of the four-bar that is cut down to a change point: crank, coupler, rocker, m.
 _CRANK, _COUPLER, _ROCKER = 0.3, 0.9, 0.7
-_WHY: Final = "what a run loses where rows nearly depend on each other shows in its energy"
+_near = Series(
+    *("near-singular", "distance", "m", powers(-1, -7), (1e-1, 1e-3, 1e-5)),
+    measure="energy",
+    bar=1e-6,
+    why="what a run loses where rows nearly depend on each other shows in its energy",
+)
 
 
 def pose(theta: Array, ground: float) -> Array:
@@ -43,11 +48,7 @@ def _moving(model: Model, q: ArrayLike, v: ArrayLike, duration: float, **facts: 
     return Problem(model, *start, duration=duration, facts=facts)
 
 
-SINGULAR_CASES: Final[list[Case]] = []
-_NEAR: Final = ("near-singular", "distance", "m", powers(-1, -7), (1e-1, 1e-3, 1e-5))
-
-
-@register(SINGULAR_CASES, *_NEAR, measure="energy", bar=1e-6, why=_WHY)
+@_near
 def change_point(distance: float) -> Problem:
     """A four-bar swings past the pose in which its rods would lie in line if the ground were shorter by so much."""
     ground = _COUPLER + _CRANK - _ROCKER + distance
@@ -56,7 +57,7 @@ def change_point(distance: float) -> Problem:
     return _moving(model, pose(np.array([1.5]), ground)[0], [-3.0, 3.0, 0.0], 1.0)
 
 
-@register(SINGULAR_CASES, *_NEAR, measure="energy", bar=1e-6, why=_WHY)
+@_near
 def dead_centre(distance: float) -> Problem:
     """A slider-crank turns past the pose in which its piston stands nearly on the crank's axis."""
     # Of equal lengths crank and rod fold onto each other there, and the piston could stand still from then on.
@@ -64,11 +65,8 @@ def dead_centre(distance: float) -> Problem:
     return _moving(model, [0.0, 0.0, 0.0], [2.0, -4.0, 0.0], 2.0)
 
 
-REDUNDANT_CASES: Final[list[Case]] = []
-
-
-@register(
-    *(REDUNDANT_CASES, "mass ratio", "one bar over the others", "", powers(0, 9), (1.0, 1e3, 1e6)),
+@Series(
+    *("mass ratio", "one bar over the others", "", powers(0, 9), (1.0, 1e3, 1e6)),
     measure="energy",
     bar=1e-6,
     why="a row that follows from the others may cost the digits of all of them",
@@ -83,12 +81,11 @@ def heavy_bricard(ratio: float) -> Problem:
     return _moving(model, q, np.zeros(model.nv), 1.0)
 
 
-DRIVEN_CASES: Final[list[Case]] = []
 #: Of a drive: amplitude, m, and frequency, rad/s.
 _AMPLITUDE, _FREQUENCY = 0.1, 3.0
 
 
-@register(DRIVEN_CASES, "stiffness", "stiffness", "N/m", powers(2, 12), (1e2, 1e6, 1e10))
+@Series("stiffness", "stiffness", "N/m", powers(2, 12), (1e2, 1e6, 1e10))
 def stiff_drive(stiffness: float) -> Problem:
     """A mass of 1 kg on a spring follows a carriage whose motion is prescribed, for 2 s."""
     b, along = ModelBuilder("driven_mass", gravity=(0.0, 0.0, 0.0)), (1.0, 0.0, 0.0)
@@ -109,14 +106,13 @@ def stiff_drive(stiffness: float) -> Problem:
     return motion(b.build(), [0.0, 0.0], _FREQUENCY * size, 2.0, exact, 16 * EPS * _AMPLITUDE, source, facts, scale=0.1)
 
 
-LONG_CASES: Final[list[Case]] = []
 #: Of a crank that turns steadily, rad/s, and its ground, m; the four-bar of `validation.four_bar` has the same.
 _RATE, _GROUND = 5.0, 1.0
 _STEP: Final = 4e-3
 
 
-@register(
-    *(LONG_CASES, "long", "steps", "", powers(3, 6), (1e3, 1e4, 1e5)),
+@Series(
+    *("long", "steps", "", powers(3, 6), (1e3, 1e4, 1e5)),
     methods=("rk4", "semi_implicit_euler", "gauss4"),
     patience=6.0,
 )

@@ -15,19 +15,19 @@ from mbkit import catalog, lagrangian
 from mbkit._check import Array
 from mbkit.load import load
 from mbkit.model import Body, Model, ModelBuilder
-from mbkit.studies.stress.case import Case, Problem
+from mbkit.studies.stress.case import Problem
 from mbkit.studies.stress.cases import exact_motions
-from mbkit.studies.stress.cases._common import EPS, SWING, Exact, Facts, motion, powers, register, terms_at
+from mbkit.studies.stress.cases._common import EPS, SWING, Exact, Facts, Series, motion, powers, rows, terms_at
 
 # Heavy beside light: masses that differ along a chain, and in a robot's hand
 
-MASS_CASES: Final[list[Case]] = []
-_masses = partial(register, MASS_CASES, "mass ratio")
+_masses = partial(Series, "mass ratio")
 
 _UP: Final = (powers(0, 9), (1.0, 1e3, 1e6, 1e9))
 _DOWN: Final = (powers(0, -9), (1.0, 1e-3, 1e-6, 1e-9))
-_RATIO: Final = "last over first mass"
-_ARM: Final = (1.0, 1.0, 1.0)
+_UPWARD: Final = ("last over first mass", "", *_UP)
+_DOWNWARD: Final = ("last over first mass", "", *_DOWN)
+_LOADED: Final = ("load", "kg", *_UP)
 
 
 def rods(name: str, masses: Sequence[float], load_mass: float = 0.0) -> Model:
@@ -45,11 +45,6 @@ def rods(name: str, masses: Sequence[float], load_mass: float = 0.0) -> Model:
     return b.build()
 
 
-def _graded(ratio: float) -> tuple[float, ...]:
-    """Return the masses of five rods, each by the same factor heavier than the one before."""
-    return tuple(ratio ** (i / 4 - 0.5) for i in range(5))
-
-
 def _facts(model: Model) -> Facts:
     masses = [body.mass for body in model.bodies if body.mass > 0]
     return {"heaviest over lightest body": max(masses) / min(masses)}
@@ -59,52 +54,46 @@ def _terms(model: Model) -> Problem:
     return terms_at(model, facts=_facts(model))
 
 
-def _swinging(name: str, masses: Sequence[float], load_mass: float = 0.0, *, taut: bool = True) -> Problem:
-    """Let a chain go at rest, its first rod half a radian from below, for 1 s."""
-    model, chain, angle = rods(name, masses, load_mass), exact_motions.HangingChain(masses, load_mass), 0.5
+@rows(
+    _masses(*_UPWARD).row(
+        "heavy_tip", "A taut chain of five rods, each heavier than the one above, swings from 0.5 rad for 1 s."
+    ),
+    _masses(*_UPWARD, measure="terms").row(
+        "heavy_tip_terms", "Terms of a chain of five rods, each heavier than the one above.", terms=True
+    ),
+    _masses(*_DOWNWARD).row(
+        *("light_tip", "A chain of five rods, each lighter than the one above, swings from 0.5 rad for 1 s."),
+        taut=False,
+    ),
+    _masses(*_DOWNWARD, measure="terms").row(
+        "light_tip_terms", "Terms of a chain of five rods, each lighter than the one above.", terms=True
+    ),
+    _masses(*_LOADED).row(
+        "loaded_arm", "A taut arm of three rods of 1 kg swings from 0.5 rad for 1 s with a load at its end.", arm=True
+    ),
+    _masses(*_LOADED, measure="terms").row(
+        "loaded_arm_terms", "Terms of an arm of three rods of 1 kg with a load at its end.", arm=True, terms=True
+    ),
+)
+def _chain(value: float, *, arm: bool = False, terms: bool = False, taut: bool = True) -> Problem:
+    """Return an arm with a load, or five rods, each by the same factor heavier than the one before.
+
+    Unless its terms are asked for, it is let go at rest, its first rod half a radian from below, for 1 s.
+    """
+    name, masses, load_mass = "graded_chain", [value ** (i / 4 - 0.5) for i in range(5)], 0.0
+    if arm:
+        name, masses, load_mass = "loaded_arm", [1.0, 1.0, 1.0], value
+    model = rods(name, masses, load_mass)
+    if terms:
+        return _terms(model)
+    chain, angle = exact_motions.HangingChain(masses, load_mass), 0.5
     q = chain.taut(angle) if taut else np.array([angle, *[0.0] * (len(masses) - 1)])
     source = "collocation in angles from the vertical, Radau IIA of order 15"
     # The error was measured against Taylor series with 34 digits.
     return motion(model, q, 0.0, 1.0, chain.motion(q, 1.0), 1e-11, source, _facts(model))
 
 
-@_masses(_RATIO, "", *_UP)
-def heavy_tip(ratio: float) -> Problem:
-    """A taut chain of five rods, each heavier than the one above, swings from 0.5 rad for 1 s."""
-    return _swinging("graded_chain", _graded(ratio))
-
-
-@_masses(_RATIO, "", *_UP, measure="terms")
-def heavy_tip_terms(ratio: float) -> Problem:
-    """Terms of a chain of five rods, each heavier than the one above."""
-    return _terms(rods("graded_chain", _graded(ratio)))
-
-
-@_masses(_RATIO, "", *_DOWN)
-def light_tip(ratio: float) -> Problem:
-    """A chain of five rods, each lighter than the one above, swings from 0.5 rad for 1 s."""
-    return _swinging("graded_chain", _graded(ratio), taut=False)
-
-
-@_masses(_RATIO, "", *_DOWN, measure="terms")
-def light_tip_terms(ratio: float) -> Problem:
-    """Terms of a chain of five rods, each lighter than the one above."""
-    return _terms(rods("graded_chain", _graded(ratio)))
-
-
-@_masses("load", "kg", *_UP)
-def loaded_arm(mass: float) -> Problem:
-    """A taut arm of three rods of 1 kg swings from 0.5 rad for 1 s with a load at its end."""
-    return _swinging("loaded_arm", _ARM, mass)
-
-
-@_masses("load", "kg", *_UP, measure="terms")
-def loaded_arm_terms(mass: float) -> Problem:
-    """Terms of an arm of three rods of 1 kg with a load at its end."""
-    return _terms(rods("loaded_arm", _ARM, mass))
-
-
-@_masses("load", "kg", *_UP, measure="terms")
+@_masses(*_LOADED, measure="terms")
 def hand_load(mass: float) -> Problem:
     """Terms of Panda, of 17 kg, with a load in its hand."""
     model = load("panda")
@@ -143,7 +132,6 @@ def robots_as_found(ratio: float) -> Problem:
 
 # Chains from short to long
 
-LENGTH_CASES: Final[list[Case]] = []
 _LENGTHS: Final = tuple(2.0**k for k in range(1, 9))
 
 
@@ -158,7 +146,7 @@ def straight_inertia(n: int) -> Array:
 
 
 # The longest take a minute to derive, with 34 digits.
-@register(LENGTH_CASES, "length", "rods", "", _LENGTHS, (2.0, 8.0, 32.0), measure="terms", patience=6.0)
+@Series("length", "rods", "", _LENGTHS, (2.0, 8.0, 32.0), measure="terms", patience=6.0)
 def chain(n: float) -> Problem:
     """Terms of a planar chain of thin rods, straight and bent: its condition number grows as the fourth power."""
     count = round(n)
@@ -169,8 +157,7 @@ def chain(n: float) -> Problem:
 
 # Fast turns, and many of them
 
-SPIN_CASES: Final[list[Case]] = []
-_spin = partial(register, SPIN_CASES, "spin")
+_spin = partial(Series, "spin")
 _SPINS: Final = (powers(0, 6), (1.0, 1e2, 1e4, 1e6))
 #: Of Gazebo's "boxes" benchmark, complex case without gravity: nearly about the middle axis, rad/s.
 _BOX_SPIN: Final = (0.1, 5.0, 0.1)
@@ -245,8 +232,7 @@ def quaternion_drift(steps: float) -> Problem:
 
 # Poses at which something divides by nearly nothing
 
-SINGULAR_CASES: Final[list[Case]] = []
-_near = partial(register, SINGULAR_CASES, "near-singular")
+_near = partial(Series, "near-singular")
 
 
 def _suspended(inertia: tuple[float, float, float]) -> Model:
@@ -322,8 +308,7 @@ def massless_link(mass: float) -> Problem:
 
 # Numbers that are large, or very small, though the motion is an ordinary one
 
-LARGE_CASES: Final[list[Case]] = []
-_large = partial(register, LARGE_CASES, "large")
+_large = partial(Series, "large")
 
 _FAR: Final = ((1.0, 1e2, 1e4, 1e6, 1e7, 1e8, 1e9), (1.0, 1e4, 1e7, 1e9))
 _PLACE: Final = np.array([1.0, -1.0, 0.5])
@@ -398,37 +383,31 @@ def weak_gravity(gravity: float) -> Problem:
 
 
 _HUGE: Final = (
-    (1.0, 1e3, 1e6, 1e9, 1e12, 1e15, 1e20, 1e50, 1e100, 1e150, 1e200, 1e250, 1e300),
+    *("inertia", "kg m²", (1.0, 1e3, 1e6, 1e9, 1e12, 1e15, 1e20, 1e50, 1e100, 1e150, 1e200, 1e250, 1e300)),
     (1.0, 1e15, 1e150, 1e300),
 )
 _TINY: Final = (
-    (1.0, 1e-3, 1e-6, 1e-9, 1e-12, 1e-15, 1e-16, 1e-20, 1e-50, 1e-100, 1e-200, 1e-300, 1e-310),
+    *("inertia", "kg m²", (1.0, 1e-3, 1e-6, 1e-9, 1e-12, 1e-15, 1e-16, 1e-20, 1e-50, 1e-100, 1e-200, 1e-300, 1e-310)),
     (1.0, 1e-12, 1e-16, 1e-310),
 )
 
 
-# The motion of a pendulum of 1 m does not depend on its mass, but all forces do.
-
-
-@_large("inertia", "kg m²", *_HUGE)
-def huge_inertia(inertia: float) -> Problem:
-    """A pendulum of 1 m swings from 1 rad for 1 s, ever heavier."""
+@rows(
+    _large(*_HUGE).row("huge_inertia", "A pendulum of 1 m swings from 1 rad for 1 s, ever heavier."),
+    _large(*_TINY).row(
+        "tiny_inertia", "A pendulum of 1 m swings from 1 rad for 1 s, ever lighter, down to subnormal numbers."
+    ),
+)
+def _of_inertia(inertia: float) -> Problem:
+    # The motion does not depend on the mass, but all forces do.
     return _swing(catalog.pendulum(mass=inertia), 9.81, 0.0, 1.0, 16 * EPS)
 
 
-@_large("inertia", "kg m²", *_TINY)
-def tiny_inertia(inertia: float) -> Problem:
-    """A pendulum of 1 m swings from 1 rad for 1 s, ever lighter, down to subnormal numbers."""
-    return _swing(catalog.pendulum(mass=inertia), 9.81, 0.0, 1.0, 16 * EPS)
-
-
-@_large("inertia", "kg m²", *_HUGE, measure="terms")
-def huge_inertia_terms(inertia: float) -> Problem:
-    """Terms of a double pendulum of 1 m each, ever heavier."""
-    return terms_at(catalog.double_pendulum(mass1=inertia, mass2=inertia), force=inertia)
-
-
-@_large("inertia", "kg m²", *_TINY, measure="terms")
-def tiny_inertia_terms(inertia: float) -> Problem:
-    """Terms of a double pendulum of 1 m each, ever lighter, down to subnormal numbers."""
+@rows(
+    _large(*_HUGE, measure="terms").row("huge_inertia_terms", "Terms of a double pendulum of 1 m each, ever heavier."),
+    _large(*_TINY, measure="terms").row(
+        "tiny_inertia_terms", "Terms of a double pendulum of 1 m each, ever lighter, down to subnormal numbers."
+    ),
+)
+def _terms_of_inertia(inertia: float) -> Problem:
     return terms_at(catalog.double_pendulum(mass1=inertia, mass2=inertia), force=inertia)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
@@ -13,14 +12,13 @@ import numpy as np
 from mbkit import catalog
 from mbkit._check import Array
 from mbkit.model import Model, ModelBuilder
-from mbkit.studies.stress.case import Case, Problem
+from mbkit.studies.stress.case import Problem
 from mbkit.studies.stress.cases import exact_motions
-from mbkit.studies.stress.cases._common import EPS, SWING, Facts, Make, motion, powers, register
+from mbkit.studies.stress.cases._common import EPS, SWING, Facts, Series, motion, powers, rows
 
-CASES: Final[list[Case]] = []
 _RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))
-_joint = register(CASES, "stiffness", "stiffness", "N m/rad", *_RANGE)
-_point = register(CASES, "stiffness", "stiffness", "N/m", *_RANGE)
+_joint = Series("stiffness", "stiffness", "N m/rad", *_RANGE)
+_point = Series("stiffness", "stiffness", "N/m", *_RANGE)
 
 #: Of slow motions, measured against Taylor series with 34 digits.
 _SLOW_FLOOR: Final = 1e-11
@@ -54,29 +52,28 @@ def _released_hinge(
     return motion(b.build(), np.ones(1), 0.0, duration, exact, floor, source, facts, **more)
 
 
+@rows(
+    _joint.row(
+        "joint_spring",
+        "A body on a hinge with a spring rings for 1 s: every period of it has to be right.",
+        damping=0.0,
+    ),
+    _joint.row(
+        "lightly_damped_joint_spring",
+        "A body on a hinge rings for 1 s, in which a light damper takes a tenth of it.",
+        damping=0.2,
+    ),
+    _joint.row(
+        "critically_damped_joint_spring",
+        "A body on a hinge with a spring and critical damping comes to rest, the sooner the stiffer.",
+        damping=None,
+    ),
+)
 def _joint_spring(stiffness: float, damping: float | None) -> Problem:
     """Return 1 s of the hinge; without a damping it is the critical one."""
     frequency = math.sqrt(stiffness)
     damping = 2 * frequency if damping is None else damping
     return _released_hinge(stiffness, damping, 1.0, 4 * EPS * (1 + frequency), _facts(frequency, 1.0))
-
-
-@_joint
-def joint_spring(stiffness: float) -> Problem:
-    """A body on a hinge with a spring rings for 1 s: every period of it has to be right."""
-    return _joint_spring(stiffness, damping=0.0)
-
-
-@_joint
-def lightly_damped_joint_spring(stiffness: float) -> Problem:
-    """A body on a hinge rings for 1 s, in which a light damper takes a tenth of it."""
-    return _joint_spring(stiffness, damping=0.2)
-
-
-@_joint
-def critically_damped_joint_spring(stiffness: float) -> Problem:
-    """A body on a hinge with a spring and critical damping comes to rest, the sooner the stiffer."""
-    return _joint_spring(stiffness, damping=None)
 
 
 def _slow(
@@ -118,6 +115,14 @@ def stiff_joint(stiffness: float) -> Problem:
     return _slow(replace(model, joints=(first, held)), residual, torque, stiffness, 1.0, facts)
 
 
+@rows(
+    _point.row(
+        "point_spring",
+        "A mass circles on a point spring for 2 s and does not ring; the stiff direction turns with it.",
+        damped=False,
+    ),
+    _point.row("damped_point_spring", "A mass circles on a critically damped point spring for 2 s.", damped=True),
+)
 def _conical(stiffness: float, damped: bool) -> Problem:
     """Return a mass that circles on a point spring of 1 m, without ringing, for 2 s.
 
@@ -145,18 +150,14 @@ def _conical(stiffness: float, damped: bool) -> Problem:
     return motion(b.build(), q, v, duration, circle, floor, source, facts, scale=radius)
 
 
-@_point
-def point_spring(stiffness: float) -> Problem:
-    """A mass circles on a point spring for 2 s and does not ring; the stiff direction turns with it."""
-    return _conical(stiffness, damped=False)
-
-
-@_point
-def damped_point_spring(stiffness: float) -> Problem:
-    """A mass circles on a critically damped point spring for 2 s."""
-    return _conical(stiffness, damped=True)
-
-
+@rows(
+    _point.row("elastic_pendulum", "An elastic pendulum swings from 1 rad for 2 s and hardly rings.", damped=False),
+    _point.row(
+        "damped_elastic_pendulum",
+        "An elastic pendulum with critical damping along its spring swings from 1 rad for 2 s.",
+        damped=True,
+    ),
+)
 def _elastic_pendulum(stiffness: float, damped: bool) -> Problem:
     """Return an elastic pendulum let go 1 rad from below, stretched as the weight alone would stretch it."""
     g, theta, duration = 1.0, 1.0, 2.0
@@ -178,18 +179,6 @@ def _elastic_pendulum(stiffness: float, damped: bool) -> Problem:
 
 
 @_point
-def elastic_pendulum(stiffness: float) -> Problem:
-    """An elastic pendulum swings from 1 rad for 2 s and hardly rings."""
-    return _elastic_pendulum(stiffness, damped=False)
-
-
-@_point
-def damped_elastic_pendulum(stiffness: float) -> Problem:
-    """An elastic pendulum with critical damping along its spring swings from 1 rad for 2 s."""
-    return _elastic_pendulum(stiffness, damped=True)
-
-
-@_point
 def ringing_elastic_pendulum(stiffness: float) -> Problem:
     """An elastic pendulum turns without gravity for 2 s; its spring rings with the same energy at any stiffness."""
     push, turn, duration = 0.3, 0.5, 2.0
@@ -204,7 +193,7 @@ def ringing_elastic_pendulum(stiffness: float) -> Problem:
     )
 
 
-@register(CASES, "stiffness", "damping", "N s/m", *_RANGE)
+@Series("stiffness", "damping", "N s/m", *_RANGE)
 def stiff_damping(damping: float) -> Problem:
     """A cart on a soft spring pulls another one by a damper, for 2 s."""
     b, along = ModelBuilder("two_carts", gravity=(0.0, 0.0, 0.0)), (1.0, 0.0, 0.0)
@@ -218,7 +207,7 @@ def stiff_damping(damping: float) -> Problem:
     return motion(b.build(), [1.0, 0.0], 0.0, 2.0, exact, 16 * EPS, "linear modes with 50 digits", facts)
 
 
-@register(CASES, "stiffness", "cart mass", "kg", powers(0, -12, 2), (1.0, 1e-4, 1e-8, 1e-12))
+@Series("stiffness", "cart mass", "kg", powers(0, -12, 2), (1.0, 1e-4, 1e-8, 1e-12))
 def light_cart_pole(cart: float) -> Problem:
     """A pole falls from the horizontal for 10 s; the lighter the cart, the shorter the jerk below."""
     theta = math.pi / 2
@@ -231,7 +220,7 @@ def light_cart_pole(cart: float) -> Problem:
     return motion(catalog.cart_pole(cart_mass=cart), [0.0, theta], 0.0, 10.0, exact, floor, source, facts)
 
 
-@register(CASES, "stiffness", "bending stiffness", "N m²", powers(5, 15, 2), (1e5, 1e9, 1e13))
+@Series("stiffness", "bending stiffness", "N m²", powers(5, 15, 2), (1e5, 1e9, 1e13))
 def flexible_appendage(stiffness: float) -> Problem:
     """A hub swings slowly on a torsion spring and bends two beams that get stiffer and stiffer."""
     soft, angle, duration = 1000.0, 0.01, 2.0
@@ -299,7 +288,6 @@ def largest_step(_engine: str, method: str, *, frequency: float, damping: float)
     return math.inf if method in _UNLIMITED else None
 
 
-STEP_CASES: Final[list[Case]] = []
 #: Enough for a growth of a fifth a step to pass any bar; few enough for slow evaluations.
 _STEPS: Final = 200
 # Steps close to either side of what theory says of one of the methods, and coarse ones elsewhere.
@@ -310,38 +298,35 @@ _AROUND_OVER: Final = (0.1, 1.0, 1.4, 1.85, 2.1, 2.4, 2.65, 3.0, 10.0, 50.0, 190
 _OVER, _SOFT = 5.0, 0.1
 
 
-def _step(
-    values: tuple[float, ...], quick: tuple[float, ...], frequency: float = 1.0, damping: float = 0.0
-) -> Callable[[Make], Make]:
-    """Return the decorator of a case whose linear theory is that of an oscillator with this ω and ζ."""
+def _step(values: tuple[float, ...], quick: tuple[float, ...], frequency: float = 1.0, damping: float = 0.0) -> Series:
+    """Return what cases share whose linear theory is that of an oscillator with this ω and ζ."""
     why = "the test is for growth, not accuracy: a stable run stays near its start, an unstable one grows in each step"
     more: dict[str, Any] = {"bar": 100.0, "why": why, "methods": _FIXED}
     theory = partial(largest_step, frequency=frequency, damping=damping)
-    return register(STEP_CASES, "step", "step", "s", values, quick, theory=theory, **more)
+    return Series("step", "step", "s", values, quick, theory=theory, **more)
 
 
-def _hinge_steps(step: float, frequency: float, damping: float, facts: Facts) -> Problem:
-    stiffness, duration = frequency**2, _STEPS * step
+_OSCILLATOR: Final = _step(_AROUND, (1.0, 1.9, 2.1, 2.7, 3.0, 100.0))
+_CRITICAL: Final = _step(_AROUND_CRITICAL, (0.78, 0.88, 2.6, 3.0, 4.6, 5.1, 100.0), damping=1.0)
+_OVERDAMPED: Final = _step(_AROUND_OVER, (1.85, 2.1, 2.65, 3.0, 190.0, 215.0), frequency=_SOFT, damping=_OVER)
+
+
+@rows(
+    _OSCILLATOR.row("step_oscillator", "A body on a spring of 1 rad/s, 200 steps."),
+    _CRITICAL.row("step_critically_damped", "A body on a critically damped spring of 1 rad/s, 200 steps.", damping=1.0),
+    _OVERDAMPED.row(
+        "step_overdamped",
+        "A body on a spring with a strong damper, whose rates are 0.99 and 0.01 /s, 200 steps.",
+        frequency=_SOFT,
+        damping=_OVER,
+    ),
+)
+def _hinge_steps(step: float, frequency: float = 1.0, damping: float = 0.0) -> Problem:
+    duration, facts = _STEPS * step, {"fastest frequency, rad/s": frequency}
+    if damping:
+        facts = {"fastest rate, 1/s": frequency * (damping + math.sqrt(damping**2 - 1))}
     floor = 16 * EPS * (1 + duration)
-    return _released_hinge(stiffness, 2 * damping * frequency, duration, floor, facts, dt=step)
-
-
-@_step(_AROUND, (1.0, 1.9, 2.1, 2.7, 3.0, 100.0))
-def step_oscillator(step: float) -> Problem:
-    """A body on a spring of 1 rad/s, 200 steps."""
-    return _hinge_steps(step, 1.0, 0.0, {"fastest frequency, rad/s": 1.0})
-
-
-@_step(_AROUND_CRITICAL, (0.78, 0.88, 2.6, 3.0, 4.6, 5.1, 100.0), damping=1.0)
-def step_critically_damped(step: float) -> Problem:
-    """A body on a critically damped spring of 1 rad/s, 200 steps."""
-    return _hinge_steps(step, 1.0, 1.0, {"fastest rate, 1/s": 1.0})
-
-
-@_step(_AROUND_OVER, (1.85, 2.1, 2.65, 3.0, 190.0, 215.0), frequency=_SOFT, damping=_OVER)
-def step_overdamped(step: float) -> Problem:
-    """A body on a spring with a strong damper, whose rates are 0.99 and 0.01 /s, 200 steps."""
-    return _hinge_steps(step, _SOFT, _OVER, {"fastest rate, 1/s": _SOFT * (_OVER + math.sqrt(_OVER**2 - 1))})
+    return _released_hinge(frequency**2, 2 * damping * frequency, duration, floor, facts, dt=step)
 
 
 @_step(tuple(1e-3 * x for x in _AROUND[:-1]), tuple(1e-3 * x for x in (1.0, 1.9, 2.1, 2.7, 3.0, 10.0)), frequency=1e3)
@@ -353,18 +338,12 @@ def step_point_spring(step: float) -> Problem:
 
 # Many steps, and whether the energy stays
 
-LONG_CASES: Final[list[Case]] = []
 #: RK4 drifts over the bar between a million steps and ten, the midpoint rule never does.
 _STEP: Final = 4e-3
 
 
-@register(
-    LONG_CASES,
-    "long",
-    "steps",
-    "",
-    powers(3, 7),
-    (1e3, 1e4, 1e5),
+@Series(
+    *("long", "steps", "", powers(3, 7), (1e3, 1e4, 1e5)),
     measure="energy",
     bar=1e-3,
     why="along a chaotic motion only conserved quantities can be compared; a thousandth of the energy is half a "
