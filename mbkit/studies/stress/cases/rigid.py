@@ -270,7 +270,7 @@ def wrist(distance: float) -> Problem:
 
 
 @_near("distance at the end", "rad", (0.5, *powers(-1, -7)), (0.5, 1e-2, 1e-4, 1e-6))
-def dead_centre(distance: float) -> Problem:
+def massless_crank(distance: float) -> Problem:
     """A piston pushes a massless crank to its dead centre: how near can a run come?"""
     # It moves without force. x = r cos θ + l cos φ and sin φ = (r/l) sin θ give 4 r x sin²(θ/2) = δ (2 l - δ), where
     # δ = r + l - x is left of the way.
