@@ -12,6 +12,7 @@ import os
 import platform
 import re
 import tempfile
+import time
 import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -24,7 +25,7 @@ from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 
-from mbkit._escape import csv_text, html, markdown
+from mbkit._escape import csv_text, html, markdown, one_line
 from mbkit._version import __version__
 from mbkit.engines.registry import ENGINES
 from mbkit.errors import InputError, OutputError
@@ -131,6 +132,20 @@ def columns_of(kind: type) -> tuple[Column, ...]:
     return tuple(Column(f.name, attrgetter(f.name)) for f in fields(kind) if f.type in plain)
 
 
+def columns(part: int, *names: str) -> list[Column]:
+    """Return a column for each attribute of one part of a row."""
+
+    def column(name: str) -> Column:
+        return Column(name, lambda row: getattr(row[part], name))
+
+    return [column(name) for name in names]
+
+
+def counted(n: int, noun: str) -> str:
+    """Return how many there are of something."""
+    return f"{n} {noun}{'s' * (n != 1)}"
+
+
 @dataclass(frozen=True)
 class Table:
     """Rows of any kind, and the columns to read from each."""
@@ -184,6 +199,9 @@ def block_html(block: Block) -> str:
 class ResultTable:
     """Base of the results of studies: `_blocks` for people, `_csv_columns` of `_csv_rows` for programs."""
 
+    #: The attribute by which a repr calls the result, and the one with a row for each line of CSV.
+    _called: ClassVar[str] = "model"
+    _listed: ClassVar[str] = "rows"
     #: Properties that stand in the plain data beside the fields.
     _derived: ClassVar[Sequence[str]] = ()
     _csv_columns: ClassVar[Sequence[Column]] = ()
@@ -193,7 +211,12 @@ class ResultTable:
         raise NotImplementedError
 
     def _csv_rows(self) -> Iterable[Any]:
-        raise NotImplementedError
+        rows: Iterable[Any] = getattr(self, self._listed)
+        return rows
+
+    def __repr__(self) -> str:
+        result: Any = self
+        return f"<{type(self).__name__} of {getattr(self, self._called)!r}: {one_line(result.verdict)}>"
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data."""
@@ -329,6 +352,11 @@ def _versions(packages: tuple[str, ...]) -> dict[str, str]:
         except metadata.PackageNotFoundError:
             out[package] = "not installed"
     return out
+
+
+def provenance(begun: float) -> dict[str, Any]:
+    """Return what ends a result: versions, processor, and the seconds since a time of `time.perf_counter`."""
+    return {"versions": versions(), "processor": processor(), "seconds": time.perf_counter() - begun}
 
 
 def processor() -> str:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from mbkit._escape import one_line
 from mbkit.studies.baseline.description import Change
-from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of
+from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of, counted
 from mbkit.studies.versions.result import ASIDE, AWAY, TOWARDS, digits_text
 
 Status = Literal["same", "versions", "numbers", "description", "skipped"]
@@ -63,7 +62,7 @@ class VersionChange:
         return f"{self.package} {self.old} → {self.new}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BaselineResult(ResultTable):
     """A model held against a baseline, or one baseline against another.
 
@@ -102,21 +101,21 @@ class BaselineResult(ResultTable):
         how = "missing, which fails (strict)" if self.strict else "skipped"
         missing = f"; {', '.join(r.engine for r in self.skipped)} {how}" if self.skipped else ""
         if self.question == "diff":
-            parameters = f"{_count(self.changes, 'parameter')} of the description"
+            parameters = f"{counted(len(self.changes), 'parameter')} of the description"
             sentences = {
                 "same": "the same robot, with the same numbers",
                 "versions": f"the same numbers, of other versions: {self._version_text()}",
                 "numbers": "the same description, with other numbers",
-                "description": f"{parameters} differ{'s' if _one(self.changes) else ''}",
+                "description": f"{parameters} differ{'s' * (len(self.changes) == 1)}",
             }
             return sentences[self.status]
         if self.status == "skipped":
             return f"nothing was checked: {', '.join(f'{r.engine} ({r.reason})' for r in self.skipped)}"
         if self.status == "description":
-            return f"the description changed in {_count(self.changes, 'parameter')}"
+            return f"the description changed in {counted(len(self.changes), 'parameter')}"
         if self.status == "numbers":
             names = ", ".join(dict.fromkeys(r.engine for r in self.moved))
-            return f"{_count(self.moved, 'number')} moved: {names}{missing}"
+            return f"{counted(len(self.moved), 'number')} moved: {names}{missing}"
         agreement = f"{', '.join(self.engines)}; largest error {self.worst:.1e}"
         if self.status == "versions":
             return f"as recorded ({agreement}), by other versions: {self._version_text()}; rebaseline?{missing}"
@@ -168,17 +167,12 @@ class BaselineResult(ResultTable):
         return "\n".join(out)
 
     _derived = ("passed", "verdict")
+    _listed = "moved"
     _csv_columns = columns_of(ChangedNumber)
-
-    def _csv_rows(self) -> tuple[ChangedNumber, ...]:
-        return self.moved
 
     def _blocks(self) -> Iterator[Block]:
         yield Title(self.model, f": {self.verdict}")
         yield Items(f"{what}: {text}" for what, text in self.lines(everything=True))
-
-    def __repr__(self) -> str:
-        return f"<BaselineResult of {self.model!r}: {one_line(self.verdict)}>"
 
 
 @dataclass(frozen=True)
@@ -259,7 +253,7 @@ class Examined:
     outcome: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class BisectResult(ResultTable):
     """Where what fails of a baseline began.
 
@@ -275,6 +269,7 @@ class BisectResult(ResultTable):
     notes: tuple[str, ...] = ()
 
     _derived = ("passed", "verdict")
+    _listed = "onsets"
     _csv_columns = columns_of(Onset)
 
     @property
@@ -302,21 +297,7 @@ class BisectResult(ResultTable):
     def _name(onset: Onset) -> str:
         return onset.first_bad if onset.kind == "version" else onset.first_bad[:10] or "(not committed)"
 
-    def _csv_rows(self) -> tuple[Onset, ...]:
-        return self.onsets
-
     def _blocks(self) -> Iterator[Block]:
         yield Title(self.model, f": {self.verdict}")
         yield Items(f"{what}: {text}" for what, text in self.lines())
         yield Table([Column("examined", lambda x: x.name), Column("outcome", lambda x: x.outcome)], self.examined)
-
-    def __repr__(self) -> str:
-        return f"<BisectResult of {self.model!r}: {one_line(self.verdict)}>"
-
-
-def _one(items: Sequence[object]) -> bool:
-    return len(items) == 1
-
-
-def _count(items: Sequence[object], noun: str) -> str:
-    return f"{len(items)} {noun}{'' if _one(items) else 's'}"

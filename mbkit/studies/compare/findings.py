@@ -11,6 +11,7 @@ from mbkit.model import Model
 from mbkit.model.description import SERVOS
 from mbkit.model.joint_numbers import dry_friction, owners, per_velocity
 from mbkit.studies.compare.result import ACTUATORS, FRICTION, LIMITS, STIFF, Finding
+from mbkit.studies.results import counted
 
 #: The step of the rollouts, s.
 STEP: Final = 1e-3
@@ -38,7 +39,7 @@ def _friction(model: Model, forces: Array) -> Finding | None:
         return None
     says = (
         f"no engine applies it: {friction} (gravity, velocities, springs and dampers, at the median state); "
-        f"{_counted(len(friction.joints))} in all"
+        f"{counted(len(friction.joints), 'joint')} in all"
     )
     return Finding(FRICTION, says, friction.joints, friction.ratio)
 
@@ -54,7 +55,7 @@ def _limits(model: Model) -> Finding | None:
     for kind, joints in having.items():
         if joints:
             alike.setdefault(tuple(joints), []).append(kind)
-    parts = [f"{', '.join(some)} of {_counted(len(joints))}" for joints, some in alike.items()]
+    parts = [f"{', '.join(some)} of {counted(len(joints), 'joint')}" for joints, some in alike.items()]
     if not parts:
         return None
     every = tuple(dict.fromkeys(name for some in alike for name in some))
@@ -95,7 +96,3 @@ def _mobility(M: Array, J: Array | None) -> Array:
         return free @ np.linalg.solve(free.T @ M @ free, free.T)
     except np.linalg.LinAlgError:
         return np.zeros_like(M)
-
-
-def _counted(n: int) -> str:
-    return f"{n} joint{'s' * (n != 1)}"

@@ -182,7 +182,7 @@ _COLUMNS: Final = (
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison(ResultTable):
     """Several engines on one description: do they agree, to how many digits, at what cost.
 
@@ -339,17 +339,11 @@ class Comparison(ResultTable):
     _derived = ("passed", "verdict", "digits", "shortened")
     _csv_columns = columns_of(Row)
 
-    def _csv_rows(self) -> tuple[Row, ...]:
-        return self.rows
-
     def _blocks(self) -> Iterator[Block]:
         yield Title(self.model, f": {self.verdict}")
         yield Items(f"{x.kind}: {x.says}" for x in self.findings)
         yield Table(_COLUMNS, self.rows)
         yield Items(f"{r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in self.refusals)
-
-    def __repr__(self) -> str:
-        return f"<Comparison of {self.model!r}: {one_line(self.verdict)}>"
 
 
 def figure(result: Comparison, palette: Palette, ax: Axes | None = None) -> Figure:

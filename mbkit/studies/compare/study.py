@@ -304,9 +304,7 @@ def compare(
         rows=tuple(rows),
         refusals=tuple(refusals),
         setup=setup,
-        versions=results.versions(),
-        processor=results.processor(),
-        seconds=time.perf_counter() - begun,
+        **results.provenance(begun),
         **result,
     )
 

@@ -120,10 +120,8 @@ class Explanation(ResultTable):
         return f"{head}, for {_counted(count, 'reason')}{left}{beside}"
 
     _derived = ("verdict",)
+    _listed = "causes"
     _csv_columns = (*columns_of(Cause), Column("effect", lambda cause: effect(cause)))
-
-    def _csv_rows(self) -> tuple[Cause, ...]:
-        return self.causes
 
     def _blocks(self) -> Iterator[Block]:
         yield Title(f"{self.a} and {self.b}", f": {self.verdict}")

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from operator import itemgetter
 from typing import ClassVar, Final
 
-from mbkit._escape import one_line
 from mbkit.studies.explain.result import Explanation, grouped
-from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title
+from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns
 
 #: The terms that each engine computes by itself, on its own model.
 TERMS: Final = ("M", "g", "nle", "passive")
@@ -60,7 +59,7 @@ class Parsed:
         return bool(self.stages) and all(s.same for s in self.stages if s.name in DECIDING)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ParserComparison(ResultTable):
     """A file through several importers.
 
@@ -118,14 +117,11 @@ class ParserComparison(ResultTable):
         return f"reading of {self.reference}" if self.reference else ""
 
     _derived = ("agree", "verdict")
+    _called = "source"
     _csv_columns = (
-        Column("engine", lambda row: row[0].engine),
-        Column("version", lambda row: row[0].version),
+        *columns(0, "engine", "version"),
         Column("stage", lambda row: row[1].name),
-        Column("same", lambda row: row[1].same),
-        Column("worst", lambda row: row[1].worst),
-        Column("where", lambda row: row[1].where),
-        Column("says", lambda row: row[1].says),
+        *columns(1, "same", "worst", "where", "says"),
     )
 
     def _csv_rows(self) -> list[tuple[Parsed, Stage]]:
@@ -150,9 +146,6 @@ class ParserComparison(ResultTable):
                 yield f"{kind}: {says} ({what})"
             yield from (f"{p.engine}: {note}" for note in p.notes)
         yield from (*self.notes, *([self.faults] if self.faults else []))
-
-    def __repr__(self) -> str:
-        return f"<ParserComparison of {self.source!r}: {one_line(self.verdict)}>"
 
 
 def _cell(stage: Stage) -> str:

@@ -418,9 +418,7 @@ def compare_parsers(
         samples=samples,
         seed=seed,
         tolerance=tolerance,
-        versions=results.versions(),
-        processor=results.processor(),
-        seconds=time.perf_counter() - begun,
+        **results.provenance(begun),
     )
 
 

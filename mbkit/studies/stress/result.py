@@ -7,11 +7,11 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from mbkit._check import real
 from mbkit.errors import UnknownNameError
-from mbkit.studies.results import NO_LIMIT, Block, Column, ResultTable, Table, Title
+from mbkit.studies.results import NO_LIMIT, Block, Column, ResultTable, Table, Title, columns, counted
 from mbkit.studies.stress.figure import figure
 from mbkit.studies.stress.measurements import CaseResult, Measurement, Outcome, Row
 from mbkit.studies.study_runs import OUT_OF_TIME
@@ -45,8 +45,7 @@ class SilentFailure:
     cell: Measurement
 
 
-@dataclass(frozen=True)
-class _Item:
+class _Item(NamedTuple):
     """A line of the CSV file."""
 
     case: CaseResult
@@ -56,11 +55,6 @@ class _Item:
     @property
     def outcome(self) -> Outcome:
         return self.cell.outcome(self.case.bar)
-
-
-def _columns(part: str, *names: str) -> list[Column]:
-    """Return columns for attributes of a part of an item."""
-    return [Column(name, attrgetter(f"{part}.{name}")) for name in names]
 
 
 @dataclass(frozen=True)
@@ -89,13 +83,13 @@ class StressResult(ResultTable):
 
     _csv_columns: ClassVar = (
         Column("case", attrgetter("case.name")),
-        *_columns("case", "parameter", "unit"),
-        *_columns("cell", "value"),
-        *_columns("row", "engine", "method", "setting"),
+        *columns(0, "parameter", "unit"),
+        *columns(2, "value"),
+        *columns(1, "engine", "method", "setting"),
         Column("outcome", attrgetter("outcome")),
-        *_columns("cell", "end", "error", "floor", "energy", "seconds", "steps"),
+        *columns(2, "end", "error", "floor", "energy", "seconds", "steps"),
         Column("warnings", lambda item: "; ".join(item.cell.warnings)),
-        *_columns("cell", "note"),
+        *columns(2, "note"),
     )
 
     @property
@@ -180,8 +174,7 @@ class StressResult(ResultTable):
     def __repr__(self) -> str:
         counts = Counter(item.outcome for item in self._csv_rows())
         outcomes = ", ".join(f"{n} {how}" for how, n in counts.most_common())
-        plural = "s" * (len(self.cases) != 1)
-        return f"<StressResult of {len(self.cases)} case{plural}: {outcomes or 'nothing run'}>"
+        return f"<StressResult of {counted(len(self.cases), 'case')}: {outcomes or 'nothing run'}>"
 
 
 def _bar(case: CaseResult, other: float | None) -> float:

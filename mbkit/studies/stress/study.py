@@ -434,9 +434,7 @@ def stress(
         return StressResult(
             cases=tuple(sweep.result() for sweep in sweeps),
             complete=complete,
-            versions=results.versions(),
-            processor=results.processor(),
-            seconds=time.perf_counter() - begun,
+            **results.provenance(begun),
             settings=settings,
         )
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, ClassVar, Final
 
-from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
+from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of, counted
 
 #: Where a number went.
 TOWARDS: Final = "towards the truth"
@@ -117,9 +118,6 @@ class VersionsResult(ResultTable):
     _derived: ClassVar = ("same", "verdict")
     _csv_columns = columns_of(VersionRow)
 
-    def _csv_rows(self) -> Iterable[VersionRow]:
-        return self.rows
-
     @property
     def same(self) -> bool:
         """Whether no number moved, and every version could be measured."""
@@ -136,8 +134,8 @@ class VersionsResult(ResultTable):
             said = f"no number moved by more than {self.settings['tolerance']:g}"
         else:
             away = sum(c.direction in (AWAY, REFUSED) for c in self.changes)
-            said = f"{_counted(len(self.changes), 'change')}, {away} of them away from the truth or to no value"
-        lost = f"; {_counted(len(self.missing), 'version')} could not be measured" if self.missing else ""
+            said = f"{counted(len(self.changes), 'change')}, {away} of them away from the truth or to no value"
+        lost = f"; {counted(len(self.missing), 'version')} could not be measured" if self.missing else ""
         return head + said + lost
 
     def row(self, robot: str, version: str, term: str) -> VersionRow:
@@ -157,7 +155,7 @@ class VersionsResult(ResultTable):
             cells.setdefault((robot, texts), []).append(term)
         rows = [(robot, ", ".join(terms), *texts) for (robot, texts), terms in cells.items()]
         heads = ("robot", "terms", *self.measured)
-        return [Column(head, _at(k), right=k > 1) for k, head in enumerate(heads)], rows
+        return [Column(head, itemgetter(k), right=k > 1) for k, head in enumerate(heads)], rows
 
     def _blocks(self) -> Iterator[Block]:
         yield Title(self.engine, f": {self.verdict}")
@@ -170,11 +168,3 @@ class VersionsResult(ResultTable):
 
     def __repr__(self) -> str:
         return f"<VersionsResult: {self.verdict}>"
-
-
-def _counted(n: int, what: str) -> str:
-    return f"{n} {what}{'s' * (n != 1)}"
-
-
-def _at(k: int) -> Any:
-    return lambda row: row[k]

@@ -8,22 +8,13 @@ from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
-from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, block_html
+from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, block_html, columns, counted
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, pareto_front
 from mbkit.studies.work_precision.figure import figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-def _columns(part: int, *names: str) -> list[Column]:
-    """Return columns for attributes of a part of (curve, point)."""
-
-    def column(name: str) -> Column:
-        return Column(name, lambda row: getattr(row[part], name))
-
-    return [column(name) for name in names]
 
 
 @dataclass(frozen=True)
@@ -69,14 +60,14 @@ class WorkPrecision(ResultTable):
     settings: dict[str, Any] = field(default_factory=dict)
 
     _csv_columns: ClassVar = (
-        *_columns(0, "engine", "method"),
-        *_columns(1, "setting", "value", "error", "energy", "seconds", "spread"),
+        *columns(0, "engine", "method"),
+        *columns(1, "setting", "value", "error", "energy", "seconds", "spread"),
         Column("first_run", lambda row: row[0].compile + row[1].seconds),
-        *_columns(1, "steps", "evaluations"),
-        *_columns(0, "order"),
+        *columns(1, "steps", "evaluations"),
+        *columns(0, "order"),
         Column("expected_order", lambda row: row[0].expected),
         Column("front", itemgetter(2)),
-        *_columns(1, "note"),
+        *columns(1, "note"),
     )
 
     def rows(self) -> Iterator[tuple[Curve, PrecisionPoint]]:
@@ -108,15 +99,15 @@ class WorkPrecision(ResultTable):
         out = [] if self.complete else ["interrupted"]
         if failed := self.failed:
             names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in failed))
-            out.append(f"{_counted(len(names), 'curve')} left out: {', '.join(names)}")
+            out.append(f"{counted(len(names), 'curve')} left out: {', '.join(names)}")
         out += [self.bounded] if self.bounded else []
         ended = [f"{c.engine} {c.method}" for c in self.curves if c.ended]
         if ended:
-            out.append(f"{_counted(len(ended), 'curve')} ended by time: {', '.join(ended)}")
+            out.append(f"{counted(len(ended), 'curve')} ended by time: {', '.join(ended)}")
         none = {(r.engine, r.term) for r in self.failed}
         lost = sum(math.isnan(p.seconds) for c, p in self.rows() if (c.engine, c.method) not in none)
         if lost:
-            out.append(f"{_counted(lost, 'setting')} not run")
+            out.append(f"{counted(lost, 'setting')} not run")
         if self.duration < self.asked * (1 - 1e-9):
             out.append(f"horizon cut from {self.asked:g} s to {self.duration:g} s")
         return tuple(out)
@@ -173,7 +164,7 @@ class WorkPrecision(ResultTable):
     def __repr__(self) -> str:
         count = sum(len(c.points) for c in self.curves)
         missing = "".join(f"; {x}" for x in self.shortened)
-        curves = _counted(len(self.curves), "curve")
+        curves = counted(len(self.curves), "curve")
         return f"<WorkPrecision of {self.model!r}: {curves}, {count} points, {self.duration:g} s{missing}>"
 
     def _repr_html_(self) -> str:
@@ -210,7 +201,3 @@ _CURVE_COLUMNS: Final = (
     Column("its run time", lambda c: _least(c, lambda p: f"{p.seconds:.3g} s", ""), right=True),
     Column("compile", lambda c: f"{c.compile:.3g} s", right=True),
 )
-
-
-def _counted(n: int, what: str) -> str:
-    return f"{n} {what}{'s' * (n != 1)}"

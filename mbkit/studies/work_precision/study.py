@@ -196,9 +196,7 @@ def work_precision(
             curves=tuple(curve for curve, _ in outcomes if curve is not None),
             refusals=tuple(refusal for _, refusal in outcomes if refusal is not None),
             complete=complete,
-            versions=results.versions(),
-            processor=results.processor(),
-            seconds=time.perf_counter() - begun,
+            **results.provenance(begun),
             settings={
                 "seed": seed,
                 "repeats": repeats,
