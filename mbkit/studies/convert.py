@@ -22,10 +22,11 @@ from mbkit.load import load
 from mbkit.load.urdf_writer import urdf_text
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
+from mbkit.model.joint_numbers import owners
 from mbkit.studies._targets import with_values
 from mbkit.studies.explain.result import Cause
 from mbkit.studies.explain.study import explain
-from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of, velocity_joints
+from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of
 
 FORMATS: Final = ("mjcf", "urdf")
 #: What rounding of rotations and of principal axes may cost.
@@ -151,7 +152,7 @@ def _to_mjcf(model: Model) -> Converted:
         own = dynamics(model, DERIVED, compile=False).constraint_residual(at.q)
         if not np.abs(back.constraint_residual(at.q) - own).max() < _TOLERANCE * max(1.0, np.abs(own).max()):
             raise MbkitError(f"convert: loops of {model.name} read back otherwise; please report this model")
-    difference = gaps(model_terms(model, at), values, at.v, velocity_joints(model))
+    difference = gaps(model_terms(model, at), values, at.v, owners(model))
     if not difference.comparable or difference.worst > _TOLERANCE:
         why = f"MuJoCo wants inertias with A + B >= C of {', '.join(lifted)}" if lifted else "please report this model"
         off = f"{difference.worst:.1e} at {difference.joint}"
@@ -170,8 +171,7 @@ def _to_urdf(model: Model) -> Converted:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.urdf"
         path.write_text(text, encoding="utf-8")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MbkitWarning)
+        with warnings.catch_warnings(action="ignore", category=MbkitWarning):
             back = load(path, gravity=model.gravity, nonphysical="warn")
     explanation = explain(model, back, samples=_STATES, tolerance=_TOLERANCE, names=("description", "URDF"))
     acting: tuple[Cause, ...] = explanation.acting

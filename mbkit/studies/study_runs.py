@@ -83,8 +83,7 @@ def patience(seconds: float, clock: Callable[[], float] = time.perf_counter) -> 
 
 def quiet_simulate(*args: object, **kwargs: object) -> Trajectory:
     """Simulate without the warning of a divergence, which the caller reads from the statistics."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MbkitWarning)
+    with warnings.catch_warnings(action="ignore", category=MbkitWarning):
         return simulate(*args, **kwargs)  # type: ignore[arg-type]
 
 
@@ -121,8 +120,7 @@ def cpu_limit(seconds: float) -> Iterator[None]:
 def heard_warnings() -> Iterator[list[str]]:
     """Collect the library's warnings, each once."""
     heard: list[str] = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as caught:
         yield heard
     heard += dict.fromkeys(" ".join(str(w.message).split()) for w in caught if issubclass(w.category, MbkitWarning))
 

@@ -210,8 +210,7 @@ def _by_commits(
             file = history.within(folder, source)
             own = options | ({"loops": str(history.within(folder, beside[0]))} if beside else {})
             try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", MbkitWarning)
+                with warnings.catch_warnings(action="ignore", category=MbkitWarning):
                     then = load(file, **own)
             except MbkitError as error:
                 raise UnsupportedError(describe(error).replace(f"{folder}{os.sep}", "")) from None
@@ -401,7 +400,7 @@ class _EngineStudy:
         try:
             values, refusals = evaluated(dynamics(self._model, version), recorded)
         except UnsupportedError as error:
-            if not self._refused_whole:
+            if "everything" not in self._now:
                 raise
             return {"everything": self._row(Refusal(self.engine, "", str(error)))}
         finally:
@@ -415,10 +414,6 @@ class _EngineStudy:
         self._errors[version.version] = errors
         rows, _ = differences(recorded, self.engine, values, own)
         return {r.term: _Row(replace(r, cause=""), errors.get(r.term, math.nan)) for r in rows if r.term in self._now}
-
-    @property
-    def _refused_whole(self) -> bool:
-        return "everything" in self._now
 
     def _row(self, refusal: Refusal) -> _Row:
         number = replace(self._now["everything"], reason=f"no longer: {refusal.reason}", cause="")

@@ -299,8 +299,7 @@ def links_of(model: Model, target: str, options: Mapping[str, Any], baseline: Pa
     if path is None:
         return {}
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MbkitWarning)
+        with warnings.catch_warnings(action="ignore", category=MbkitWarning):
             # By its own name: a robot's inconsistent bodies stay as written.
             if load(resolved(target, baseline), **resolved_options(options, baseline)).digest != model.digest:
                 return {}

@@ -396,9 +396,8 @@ def evaluate(
     calls[ROLLOUT] = partial(_rollout_end, dyn, at, rollout)
     if frames:
         calls[FRAMES] = partial(_frames_at, dyn, at, list(frames))
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore", category=KnownDefectWarning):
         # A defect that was there before is recorded, and no news.
-        warnings.simplefilter("ignore", KnownDefectWarning)
         for name, call in calls.items():
             try:
                 values[name] = call()

@@ -135,9 +135,8 @@ def outcome_of(
     mimic: Literal["reduce", "free"],
 ) -> RobotOutcome:
     """Compare one robot, and return how it ended."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(action="ignore", category=MbkitWarning):
         # Nonphysical bodies are in the comparison's facts.
-        warnings.simplefilter("ignore", MbkitWarning)
         try:
             model = load(name, floating_base=floating_base, mimic=mimic)
         except MbkitError as error:

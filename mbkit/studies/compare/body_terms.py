@@ -116,10 +116,6 @@ def _jacobian_errors(error: Array, reference: Array, scales: BodyScales) -> Erro
     )
 
 
-def _velocity_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001  # as the others
-    return _halves(error, *scales.velocity.T)
-
-
 def _acceleration_of_frame_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001
     return _halves(error, *scales.acceleration.T)
 
@@ -146,10 +142,6 @@ def _mechanism_load_errors(error: Array, reference: Array, scales: BodyScales) -
     """Measure loads that follow from the forces in loops, per condition of all equations as these are."""
     e = _load_errors(error, reference, scales)
     return Errors(e.absolute, e.relative / scales.of_accelerations, e.per_velocity)
-
-
-def _momentum_rate_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
-    return _forces(error[:, None], reference[:, None], scales.curved, scales.reach)
 
 
 def _forces(error: Array, reference: Array, force: Array, arm: Array) -> Errors:
@@ -217,27 +209,25 @@ def _wrench(model: Model) -> tuple[Any, ...]:
     return ({farthest(model): WRENCH},)
 
 
-def _nothing(model: Model) -> tuple[Any, ...]:  # noqa: ARG001  # as the others
-    return ()
-
-
 _Measure = Callable[[Array, Array, Any], Errors]
 
 
-def _term(name: str, quantity: str, arguments: str, errors: _Measure, more: Callable[[Model], Any] = _nothing) -> Term:
-    return Term(name, quantity, tuple(arguments.split()), errors, more)
+def _term(name: str, quantity: str, arguments: str, errors: _Measure, *more: Callable[[Model], Any]) -> Term:
+    return Term(name, quantity, tuple(arguments.split()), errors, *more)
 
 
 #: Compared after the terms of the equation of motion, where there are bodies with mass.
 BODY_TERMS: Final = (
     _term("pose", "pose", "q", _pose_errors, _frame),
     _term("Jacobian", "jacobian", "q", _jacobian_errors, _frame),
-    _term("velocity", "velocity", "q v", _velocity_errors, _frame),
+    _term("velocity", "velocity", "q v", lambda e, _, scales: _halves(e, *scales.velocity.T), _frame),
     _term("acceleration", "acceleration", "q v a", _acceleration_of_frame_errors, _frame),
     _term("J̇ v", "jacobian_dot_v", "q v", _acceleration_of_frame_errors, _frame),
     _term("centre of mass", "center_of_mass", "q", _center_errors),
     _term("A_G", "centroidal_momentum_matrix", "q", _momentum_matrix_errors),
-    _term("Ȧ_G v", "centroidal_momentum_bias", "q v", _momentum_rate_errors),
+    _term(
+        "Ȧ_G v", "centroidal_momentum_bias", "q v", lambda e, x, s: _forces(e[:, None], x[:, None], s.curved, s.reach)
+    ),
     _term("locked inertia", "locked_inertia", "q", _locked_inertia_errors),
     _term("M⁻¹", "mass_matrix_inverse", "q", _inverse_errors),
     _term("joint loads", JOINT_LOADS, "q v a", _load_errors),

@@ -18,6 +18,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import STANDARD, find_engine
 from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError
 from mbkit.model import Model
+from mbkit.model.joint_numbers import owners
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import engine_names, with_values
@@ -82,7 +83,7 @@ class Judge:
         if model.has_bodies and model.mass:
             self.terms += MECHANISM_TERMS if model.constrained else BODY_TERMS
             self.scales = BodyScales.around(self.scales, oracle, at)
-        self.joint_of = [j.name for j in model.independent_joints for _ in range(j.type.nv)]
+        self.joint_of = owners(model)
 
     def rows(self, tell: Progress) -> tuple[list[Row], list[Refusal]]:
         """Return a row per term and engine."""
@@ -106,8 +107,7 @@ class Judge:
         defects: dict[str, str] = {}
         broken: dict[str, str] = {}
         for name, dyn in self.engines.items():
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always")
+            with warnings.catch_warnings(record=True, action="always") as caught:
                 try:
                     values[name] = term.call(dyn, self.at)
                 except NumericalError as error:
@@ -121,8 +121,7 @@ class Judge:
             # All alike: the model, not an engine. Named, and not counted as agreement.
             self.refusals += [Refusal(name, term.name, why) for name, why in broken.items()]
             return []
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", KnownDefectWarning)
+        with warnings.catch_warnings(action="ignore", category=KnownDefectWarning):
             times = interleaved({name: term.single(self.engines[name], self.at) for name in values})
         reference, high, low = self._reference(term, values)
         worst, nowhere, untimed = (np.inf,) * 4, ("", (), ()), (np.nan, np.nan)
@@ -350,8 +349,7 @@ def _build(
     for k, name in enumerate(names):
         tell(0.05 * k / len(names), f"building {name}")
         start = time.perf_counter()
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", KnownDefectWarning)
+        with warnings.catch_warnings(record=True, action="always", category=KnownDefectWarning) as caught:
             try:
                 # A few dozen states are no reason to compile; run times are.
                 engines[name] = dynamics(model, name, **({} if compile else find_engine(name).brief))

@@ -21,11 +21,12 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, UnsupportedError
 from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Model
+from mbkit.model.joint_numbers import owners
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.hypotheses import body_mistakes, joint_mistakes, number_text
 from mbkit.studies.explain.merged_model import MergedModel, merge, with_mass_properties
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, gaps, model_terms, velocity_joints
+from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, gaps, model_terms
 
 #: Pairs of joints tried in each other's place.
 _MAX_SWAPS: Final = 400
@@ -92,7 +93,7 @@ class _Engines:
         self.a, self.b, self.tolerance, self.name = a, b, out.tolerance, out.b
         self.model = b.model
         self.at = terms.states_of(self.model, out.samples, out.seed)
-        self.owners = velocity_joints(self.model)
+        self.owners = owners(self.model)
         self.values = {dyn: evaluated(dyn, self.at) for dyn in (a, b)}
         for dyn, values in self.values.items():
             if "M" not in values:
@@ -125,8 +126,7 @@ class _Engines:
             values: dict[Dynamics, Array] = {}
             known: dict[Dynamics, list[str]] = {}
             for dyn in (self.a, self.b):
-                with warnings.catch_warnings(record=True) as caught:
-                    warnings.simplefilter("always")
+                with warnings.catch_warnings(record=True, action="always") as caught:
                     try:
                         values[dyn] = np.asarray(getattr(dyn, quantity)(self.at.q, self.at.v))
                     except MbkitError:
@@ -387,6 +387,6 @@ class _Engines:
                 one, other = (evaluated(type(x)(some), at) for x in (self.a, self.b))
             except MbkitError:
                 return False
-            return gaps(one, other, at.v, velocity_joints(some)).worst > self.tolerance
+            return gaps(one, other, at.v, owners(some)).worst > self.tolerance
 
         return terms.minimal_differing_subtree(whole, differs)

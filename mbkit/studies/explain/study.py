@@ -13,6 +13,7 @@ from mbkit.engines import Dynamics
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import GravityCompensation, Model
 from mbkit.model.elements.forces import by_functions
+from mbkit.model.joint_numbers import owners
 from mbkit.model.model import unchecked
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.engine_differences import engine_causes
@@ -227,7 +228,7 @@ class _Descriptions:
         if a.velocity_names != b.velocity_names or not a.nv:
             return Gaps(comparable=False)
         at = states_of(b, self.samples, self.seed)
-        return terms.gaps(model_terms(a, at), model_terms(b, at), at.v, terms.velocity_joints(a))
+        return terms.gaps(model_terms(a, at), model_terms(b, at), at.v, owners(a))
 
     def _gaps_by_name(self, one: MergedModel, other: MergedModel) -> Gaps | None:
         """Return the differences of terms with joints matched by name, where the names are the same."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -84,16 +84,10 @@ def states_of(model: Model, samples: int, seed: int) -> States:
     return States(*tree.random_state(np.random.default_rng(seed), samples))
 
 
-def velocity_joints(model: Model) -> list[str]:
-    """Return the joint of each velocity."""
-    return [j.name for j in model.independent_joints for _ in range(j.type.nv)]
-
-
 def model_terms(model: Model, at: States) -> Values:
     """Return all terms of a description, by Pinocchio."""
     still = [f for f in CONSTRAINT_FEATURES if getattr(model, f)]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NonPhysicalWarning)
+    with warnings.catch_warnings(action="ignore", category=NonPhysicalWarning):
         return evaluated(dynamics(model.without(*still)), at)
 
 
@@ -101,8 +95,7 @@ def evaluated(dyn: Dynamics, at: States) -> Values:
     """Return all terms that an engine can compute."""
     out: Values = {}
     for term, quantity, arguments in TERMS:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", KnownDefectWarning)
+        with warnings.catch_warnings(action="ignore", category=KnownDefectWarning):
             try:
                 out[term] = getattr(dyn, quantity)(*(getattr(at, x) for x in arguments))
             except MbkitError:
@@ -217,14 +210,12 @@ def part(model: Model, joints: Collection[str]) -> Model:
     """
     out = restricted(model, joints)
     bodies = {b.name for b in out.bodies}
+    free: dict[str, Any] = dict.fromkeys(CONSTRAINT_FEATURES, ())
     return replace(
         out,
         joints=tuple(j if j.parent in bodies else replace(j, parent="world") for j in out.joints),
         couplings=tuple(c for c in model.couplings if set(c.joints) <= set(joints)),
-        loops=(),
-        couplers=(),
-        prescribed=(),
-        no_slip=(),
+        **free,
     )
 
 

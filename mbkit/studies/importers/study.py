@@ -26,6 +26,7 @@ from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_reader import urdf_links
 from mbkit.model import Coupler, Loop, Model
 from mbkit.model.elements.forces import by_functions
+from mbkit.model.joint_numbers import owners
 from mbkit.model.validation import listing
 from mbkit.studies import results
 from mbkit.studies.explain.hypotheses import angle_of, number_text
@@ -33,7 +34,7 @@ from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_s
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
-from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of, velocity_joints
+from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
 from mbkit.studies.importers.loops import (
     WrittenLoops,
     activated,
@@ -167,11 +168,13 @@ def stages(
     if not structural:
         at = states_of(one.model, samples, seed)
         ours = model_terms(one.model, at)
-        source = reference if isinstance(reference, Imported) else _imported(whole) if whole.forces else None
+        source = reference if isinstance(reference, Imported) else None
+        if source is None and whole.forces:
+            source = Imported(whole, lambda q, v, _: model_terms(whole, States(q, v)), ())
         if source is not None:
             ours = _own_terms_of(one.model, source, {j.name: j.name for j in one.model.joints}, at)
         theirs_ = _own_terms_of(one.model, imported, matching.to_b, at)
-        apart = gaps(ours, theirs_, at.v, velocity_joints(one.model))
+        apart = gaps(ours, theirs_, at.v, owners(one.model))
     by_term = {g.term: g for g in apart.terms}
     for name in TERMS:
         if g := by_term.get(name):
@@ -257,11 +260,6 @@ def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict
     return out
 
 
-def _imported(model: Model) -> Imported:
-    """Return a description as if it was an importer's, with all of its terms."""
-    return Imported(model, lambda q, v, _: model_terms(model, States(q, v)), ())
-
-
 def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
     """Return the engine's own terms in the reference's coordinates; `names` has its joint for each of these."""
     theirs = imported.model.layout
@@ -280,7 +278,7 @@ def own_terms(
 ) -> tuple[list[Cause], list[str], bool]:
     """Return what acts in an importer's model beside bodies and joints, what does not, and whether that is all."""
     at = states_of(imported.model, samples, seed)
-    owners = velocity_joints(imported.model)
+    joints = owners(imported.model)
     whole, described = imported.terms(at.q, at.v, ()), model_terms(imported.model, at)
     bare = imported.terms(at.q, at.v, tuple(x.key for x in imported.beside)) if imported.beside else whole
     causes, idle = [], []
@@ -289,14 +287,14 @@ def own_terms(
         rest = {} if extra.without is None else model_terms(extra.without, at)
         part = {name: x - rest[name] for name, x in described.items() if name in rest}
         bare = _with(bare, part)
-        if gaps(whole, without, at.v, owners).worst <= tolerance:
+        if gaps(whole, without, at.v, joints).worst <= tolerance:
             idle.append(f"{extra.says}; in no term while controls are zero")
             continue
-        apart = gaps(whole, _with(without, part), at.v, owners)
+        apart = gaps(whole, _with(without, part), at.v, joints)
         if not apart.worst <= tolerance:
             says = f"{engine}: {extra.says}{', and acts otherwise than described' if part else ''}"
             causes.append(Cause(extra.kind, extra.says, says, None, None, apart.effects, acts=True))
-    apart = gaps(bare, described, at.v, owners)
+    apart = gaps(bare, described, at.v, joints)
     held = apart.worst <= tolerance
     if not held:
         says = f"{engine}: its own terms are not those of its bodies and joints, most at {apart.joint or 'no joint'}"
@@ -509,8 +507,7 @@ def _path(source: str | os.PathLike[str]) -> Path:
 
 
 def _written(stripped: Stripped, floating_base: bool, *, loops: bool = False) -> Model:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MbkitWarning)
+    with warnings.catch_warnings(action="ignore", category=MbkitWarning):
         if stripped.format == "urdf":
             return urdf_links(stripped.root, str(stripped.path), floating_base=floating_base)
         return model_of_mjcf(

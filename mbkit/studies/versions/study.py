@@ -223,7 +223,7 @@ class _Study:
 
     def _keys(self) -> list[tuple[str, str]]:
         names = [case.name for case in self._cases]
-        keys = dict.fromkeys(key for k in sorted(self._done) for key in _all_keys(self._done[k]))
+        keys = dict.fromkeys(key for _, x in sorted(self._done.items()) for key in (*x.values, *x.reasons))
         return sorted(keys, key=lambda key: names.index(key[0]))
 
     def _moved(self, key: tuple[str, str], i: int, j: int) -> float:
@@ -267,7 +267,7 @@ class _Study:
                 )
                 before = k
         if self._last_removed:
-            _remove(self._versions[-1])
+            environment.remove(self._versions[-1].package.distribution, self._versions[-1].version)
         return VersionsResult(
             engine,
             tuple(self._versions[k].version for k in done),
@@ -279,10 +279,6 @@ class _Study:
             processor(),
             time.perf_counter() - self._start,
         )
-
-
-def _all_keys(done: Measured) -> list[tuple[str, str]]:
-    return list(dict.fromkeys([*done.values, *done.reasons]))
 
 
 def _one_by_one(calls: Mapping[str, Any]) -> Iterable[tuple[str, Measured | Exception]]:
@@ -304,7 +300,3 @@ def direction_of(old: float, new: float) -> str:
     if math.isnan(old) or math.isnan(new):
         return REFUSED if math.isnan(new) else GIVEN
     return TOWARDS if new * _CLEAR < old else AWAY if old * _CLEAR < new else ASIDE
-
-
-def _remove(version: EngineVersion) -> None:
-    environment.remove(version.package.distribution, version.version)

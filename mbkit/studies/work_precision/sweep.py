@@ -454,7 +454,10 @@ class Sweep:
     def _here(self) -> Iterator[tuple[float, str]]:
         until = self.budget.until(_COMPILED, _MIN_PART)
         # Jacobians and series take longest to derive; they come last, so that the others have their time.
-        for k, one in enumerate(sorted(self._curves, key=_derivation_cost)):
+        by_cost = sorted(
+            self._curves, key=lambda x: (x.settings.info.stages == 0, find_engine(x.settings.engine).derived)
+        )
+        for k, one in enumerate(by_cost):
             yield 0.2 * k / len(self._curves), f"compiling {one.settings.method} on {one.settings.engine}"
             if k and time.process_time() > until:
                 one.give_up(OUT_OF_TIME)
@@ -523,7 +526,3 @@ def _measure(problem: Problem, settings: Settings, repeats: int, seed: int, budg
     sweep = Sweep(problem, [settings], repeats, seed, replace(budget, begun=time.process_time()))
     deque(sweep.steps(), maxlen=0)
     return sweep.outcomes()[0]
-
-
-def _derivation_cost(one: CurveMeasurement) -> tuple[bool, bool]:
-    return one.settings.info.stages == 0, find_engine(one.settings.engine).derived
