@@ -179,25 +179,11 @@ class BaselineResult(ResultTable):
 class Onset:
     """Where something that fails now began to: the first version of an engine, or the first commit, that has it.
 
-    Attributes
-    ----------
-    kind : {"version", "commit"}
-    engine : str
-        Empty for a commit.
-    first_bad, last_good : str
-        Versions, or hashes. Empty as `first_bad` means changes that are not committed.
-    skipped : tuple of str
-        What lies between the two and could not be examined.
-    date, subject : str
-        Of the commit, ISO 8601.
-    changes : tuple of Change
-        Parameters that differ from the recorded ones since.
-    moved : tuple of ChangedNumber
-        Numbers that differ since, the worst first.
-    direction : str
-        Where the worst number went.
-    digits_before, digits : float
-        Of it that are right by the oracle; NaN without a number.
+    `engine` is empty for a commit. `first_bad` and `last_good` are versions, or hashes; an empty `first_bad` means
+    changes that are not committed. `skipped` lies between the two and could not be examined. `date` (ISO 8601) and
+    `subject` are the commit's. `changes` are the parameters that differ from the recorded ones since, `moved` the
+    numbers that do, the worst first; `direction` is where the worst went, and `digits_before` and `digits` are those of
+    it that are right by the oracle, NaN without a number.
     """
 
     kind: Literal["version", "commit"]

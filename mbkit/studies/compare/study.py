@@ -255,10 +255,6 @@ def compare(
     progress : callable, optional
         Called as ``progress(fraction, text)``.
 
-    Returns
-    -------
-    Comparison
-
     Raises
     ------
     InputError, UnknownNameError

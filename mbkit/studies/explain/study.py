@@ -66,10 +66,6 @@ def explain(
     names : (str, str), optional
         Names of the two sides; by default those of their models or engines.
 
-    Returns
-    -------
-    Explanation
-
     Raises
     ------
     InputError

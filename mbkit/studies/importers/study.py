@@ -367,10 +367,6 @@ def compare_parsers(
     seconds : float
         Processor time that an importer may take over the file.
 
-    Returns
-    -------
-    ParserComparison
-
     Raises
     ------
     LoadError

@@ -32,27 +32,15 @@ GROSS: Final = 1e-2
 
 @dataclass(frozen=True)
 class Measurement:
-    """One engine and method at one value.
+    """One engine and method at one value of the case's parameter.
 
-    Attributes
-    ----------
-    value : float
-        Of the case's parameter.
-    end : str
-        ``"finished"``; ``"diverged"`` where the run said so itself; ``"nan"`` where numbers are not finite and nothing
-        was said; ``"refused"``, an error of its own; ``"slow"``, stopped at the time allowed; ``"died"``, the process
-        ended or took too much memory; ``"not run"``.
-    error, floor : float
-        Relative to the problem's scale (motion, terms), or of the energy where that is the measure; NaN where there is
-        none, or no truth to measure it by. And the error of that truth.
-    energy : float
-        Largest relative energy error, NaN where forces do work or nothing was integrated.
-    seconds : float
-        Processor time of the run, or of one evaluation of a term, without compilation.
-    steps : int
-    warnings : tuple of str
-    note : str
-        Why it ended, what was chosen.
+    `end` is ``"finished"``; ``"diverged"`` where the run said so itself; ``"nan"`` where numbers are not finite and
+    nothing was said; ``"refused"``, an error of its own; ``"slow"``, stopped at the time allowed; ``"died"``, the
+    process ended or took too much memory; ``"not run"``. `error` is relative to the problem's scale (motion, terms), or
+    of the energy where that is the measure, and NaN where there is none, or no truth to measure it by; `floor` is the
+    error of that truth. `energy` is the largest relative energy error, NaN where forces do work or nothing was
+    integrated. `seconds` are processor time of the run, or of one evaluation of a term, without compilation. `note`
+    says why it ended, and what was chosen.
     """
 
     value: float
@@ -91,12 +79,8 @@ class Measurement:
 class BreakingPoint:
     """Where an engine and method breaks.
 
-    Attributes
-    ----------
-    held : float or None
-        The last value up to which all milder ones held, too; None where the mildest did not.
-    failed, how, cell : float or None, str, and Measurement or None
-        The first value that did not hold, its outcome and measurement; None and empty where all held.
+    `held` is the last value up to which all milder ones held, too, and None where the mildest did not. `failed`, `how`
+    and `cell` are the first value that did not hold, its outcome and measurement; None and empty where all held.
     """
 
     held: float | None
@@ -107,18 +91,10 @@ class BreakingPoint:
 
 @dataclass(frozen=True)
 class Row:
-    """One engine and method over all values of a case.
+    """One engine and method over all values of a case; for terms, the method is the term.
 
-    Attributes
-    ----------
-    engine, method : str
-        For terms, the method is the term.
-    cells : tuple of Measurement
-        In the order of the case's values.
-    setting : str
-        The step or tolerance.
-    theory : float or None
-        Where linear theory lets it break; infinite where it does not, ``"no limit"`` in JSON.
+    `cells` are in the order of the case's values, and `setting` is the step or tolerance. `theory` is where linear
+    theory lets it break; infinite where it does not, ``"no limit"`` in JSON.
     """
 
     engine: str
@@ -148,15 +124,8 @@ class Row:
 class CaseResult:
     """All engines and methods on one case.
 
-    Attributes
-    ----------
-    name, about, family, parameter, unit, measure, why : str
-        As of the `Case`.
-    bar : float
-        The one that counts here.
-    values, truths, facts : tuple of float, of str and of dict
-        The values, how the truth of each is known and to which floor, and further numbers of each.
-    rows : tuple of Row
+    What a `Case` has is as there, but `bar` is the one that counts here. `truths` say how the truth of each of the
+    `values` is known and to which floor, and `facts` are further numbers of each.
     """
 
     name: str

@@ -61,17 +61,8 @@ class _Item(NamedTuple):
 class StressResult(ResultTable):
     """How far each engine and method held in every case.
 
-    Attributes
-    ----------
-    cases : tuple of CaseResult
-    complete : bool
-        False for a study that was interrupted.
-    versions : dict
-    processor : str
-    seconds : float
-        Of the whole study.
-    settings : dict
-        Steps, tolerances, bounds of time and memory.
+    `complete` is False for a study that was interrupted, `seconds` is the time of the whole study, and `settings` are
+    steps, tolerances, bounds of time and memory.
     """
 
     cases: tuple[CaseResult, ...]

@@ -22,22 +22,11 @@ GIVEN: Final = "given since"
 class VersionRow:
     """One term of one robot in one version.
 
-    Attributes
-    ----------
-    robot, version, term : str
-        A term that begins with ``file`` is of the model that the version's own parser read.
-    digits : float
-        That are right, by the oracle, in the worst state; NaN without a value.
-    moved : float
-        How far the value is from that of the version before, relative as errors are; NaN without one.
-    changed : bool
-        Whether it moved by more than the tolerance, or began or ceased to be there.
-    direction : str
-        Where it went.
-    time_ratio : float
-        Time of one forward dynamics over that of the last version, measured alternately; NaN for files.
-    reason : str
-        Why there is no value.
+    A `term` that begins with ``file`` is of the model that the version's own parser read. `digits` are those that are
+    right, by the oracle, in the worst state; NaN without a value. `moved` is how far the value is from that of the
+    version before, relative as errors are, NaN without one; `changed` says whether it moved by more than the tolerance,
+    or began or ceased to be there, and `direction` where it went. `time_ratio` is the time of one forward dynamics over
+    that of the last version, measured alternately; NaN for files. `reason` says why there is no value.
     """
 
     robot: str
@@ -86,23 +75,9 @@ def digits_text(digits: float, places: int = 1) -> str:
 class VersionsResult(ResultTable):
     """Terms of an engine's versions against the oracle.
 
-    Attributes
-    ----------
-    engine : str
-    measured : tuple of str
-        Versions, oldest first.
-    rows : tuple of VersionRow
-        By robot, term and version.
-    changes : tuple of Change
-        What moved, in the same order.
-    missing : tuple of (str, str)
-        Versions without an environment or a process, each with the reason.
-    settings : dict
-    versions : dict of str to str
-        Of what else took part, such as the oracle.
-    processor : str
-    seconds : float
-        Of the whole.
+    `measured` are its versions, oldest first. `rows` are by robot, term and version, and `changes`, what moved, in the
+    same order. `missing` are versions without an environment or a process, each with the reason. `versions` are those
+    of what else took part, such as the oracle, and `seconds` is the time of the whole.
     """
 
     engine: str

@@ -82,10 +82,6 @@ def versions(
     progress : callable, optional
         Gets a fraction and a text.
 
-    Returns
-    -------
-    VersionsResult
-
     Raises
     ------
     UnknownNameError

@@ -22,26 +22,14 @@ _MIN_POINTS: Final = 3
 
 @dataclass(frozen=True)
 class PrecisionPoint:
-    """One engine, method and step or tolerance.
+    """One engine, method and step, s, or tolerance.
 
-    Attributes
-    ----------
-    setting : {"dt", "rtol"}
-    value : float
-        Of the setting, s or 1.
-    error : float
-        Largest difference of q to the reference over the saved times, rad or m; NaN where the run did not reach the
-        end.
-    energy : float
-        Largest ``|E(t) - E(0)|`` at the saved times, relative to the larger of the largest kinetic energy and the
-        change of potential energy; NaN with dampers or applied forces, whose work is not known well enough.
-    seconds, spread : float
-        Run time, median of the repetitions and half their interquartile range (NaN for one run), without derivation and
-        compilation.
-    steps, evaluations, repeats : int
-        Of one run, 0 where the engine does not report them; and the number of timings.
-    note : str
-        Why there is no error, or no energy.
+    `error` is the largest difference of q to the reference over the saved times, rad or m; NaN where the run did not
+    reach the end. `energy` is the largest ``|E(t) - E(0)|`` at these times, relative to the larger of the largest
+    kinetic energy and the change of potential energy; NaN with dampers or applied forces, whose work is not known well
+    enough. `seconds` is the run time, median of so many `repeats`, without derivation and compilation, and `spread`
+    half their interquartile range, NaN for one run. `steps` and `evaluations` are of one run, 0 where the engine does
+    not report them. `note` says why there is no error, or no energy.
     """
 
     setting: Literal["dt", "rtol"]
@@ -58,22 +46,13 @@ class PrecisionPoint:
 
 @dataclass(frozen=True)
 class Curve:
-    """All settings of one engine and method.
+    """All settings of one engine and method: its points in the order of the sweep, coarse to fine.
 
-    Attributes
-    ----------
-    engine, method : str
-    points : tuple of PrecisionPoint
-        In the order of the sweep, coarse to fine.
-    order, order_points : float and int
-        `observed_order`, NaN where fewer than three points show it, and the points in the regression.
-    expected : float
-        The method's own order; NaN for adaptive methods.
-    compile : float
-        Seconds of derivation, compilation and construction with empty caches, up to the first step; NaN where that
-        failed. For a method that is compiled for each tolerance, of one tolerance.
-    ended : str
-        Why there are no finer settings, where time ran out.
+    `order` is the `observed_order`, NaN where fewer than three points show it, and `order_points` is the number of
+    points in its regression; `expected` is the method's own order, NaN for adaptive methods. `compile` are the seconds
+    of derivation, compilation and construction with empty caches, up to the first step; NaN where that failed. For a
+    method that is compiled for each tolerance, they are of one tolerance. `ended` says why there are no finer settings,
+    where time ran out.
     """
 
     engine: str

@@ -21,26 +21,14 @@ if TYPE_CHECKING:
 class WorkPrecision(ResultTable):
     """Error against run time for every engine and method of a study.
 
-    Attributes
-    ----------
-    model, facts : str and dict
-        The model's name, and its nq, nv, mass, digest, needs and notes.
-    duration, asked : float
-        Horizon on which errors are measured, and the one of the arguments, s.
-    reference, floor : str and float
-        How the reference was computed, and why the horizon was cut if it was; how well it is known, rad or m.
-    q0, v0 : tuple of float
-        Start.
-    curves : tuple of Curve
-    refusals : tuple of Refusal
-        Engines and methods that failed, with the reason.
-    complete : bool
-        False after an interruption.
-    versions, processor, seconds : dict, str and float
-        Of the whole study.
-    settings : dict
-        seed, repeats, steps, tolerances, torque, the saved times, the executor, and how run times were measured: those
-        of worker processes, which share the cores, cannot be compared with those of another study.
+    `facts` has nq, nv, mass, digest, needs and notes of the model. `duration` is the horizon on which errors are
+    measured, and `asked` the one of the arguments, s. `reference` says how the reference was computed, and why the
+    horizon was cut if it was; `floor` is how well it is known, rad or m. The motion starts at `q0` and `v0`.
+    `refusals` are engines and methods that failed, with the reason. `complete` is False after an interruption, and
+    `seconds` is the time of the whole study.
+
+    `settings` has seed, repeats, steps, tolerances, torque, the saved times, the executor, and how run times were
+    measured: those of worker processes, which share the cores, cannot be compared with those of another study.
     """
 
     model: str
