@@ -20,15 +20,8 @@ STEP: Final = 1e-3
 def findings(model: Model, forces: Array, M: Array, J: Array | None = None) -> tuple[Finding, ...]:
     """Return the servos of the file, dry friction beside the other forces, limits, and stiff joints.
 
-    Parameters
-    ----------
-    model : Model
-    forces : (N, nv) array
-        Sum of the sizes of gravity, velocity and passive forces at some states.
-    M : (N, nv, nv) array
-        Mass matrices there.
-    J : (N, m, nv) array, optional
-        Jacobians of the constraints there.
+    `forces` are the sums of the sizes of gravity, velocity and passive forces at some states, (N, nv), `M` and `J` the
+    mass matrices and the Jacobians of the constraints there, (N, nv, nv) and (N, m, nv).
     """
     servos = [Finding(ACTUATORS, note, ()) for note in model.notes if note.startswith(SERVOS)]
     return tuple(x for x in (*servos, _friction(model, forces), _limits(model), *stiff_joints(model, M, J)) if x)

@@ -6,7 +6,7 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
@@ -46,22 +46,20 @@ from mbkit.studies.work_precision.study import work_precision
 _AS_IT_IS: Final = "; returned as it is"
 
 
+@dataclass(eq=False)
 class Judge:
     """Evaluates every term in every engine against the oracle, or the first engine where it has no value."""
 
-    def __init__(
-        self,
-        model: Model,
-        engines: dict[str, Dynamics],
-        oracle: OracleDynamics,
-        at: States,
-        tolerance: float,
-        defects: Mapping[str, str] | None = None,
-    ) -> None:
-        self.model, self.engines, self.oracle = model, engines, oracle
-        #: Defects that engines announced when they were built.
-        self.defects = defects or {}
-        self.at, self.tolerance = at, tolerance
+    model: Model
+    engines: Mapping[str, Dynamics]
+    oracle: OracleDynamics
+    at: States
+    tolerance: float
+    #: Defects that engines announced when they were built.
+    defects: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        model, oracle, at = self.model, self.oracle, self.at
         self.refusals: list[Refusal] = []
         #: Of each engine with soft constraints the digits of the rigid acceleration that are left, at the median state.
         self.softness: dict[str, float] = {}
@@ -324,10 +322,10 @@ def _beyond_terms(
         studies.append((0.9, "omissions", "what was left out", partial(omissions, model, engines, seed)))
     result: dict[str, Any] = {}
     refusals: list[Refusal] = []
-    for fraction, field, name, call in studies:
+    for fraction, part, name, call in studies:
         tell(fraction, name)
         try:
-            result[field] = call()
+            result[part] = call()
         except MbkitError as error:
             refusals.append(Refusal("", name, str(error)))
     return result, refusals

@@ -105,15 +105,12 @@ class Row:
 
     def breaking(self, bar: float) -> BreakingPoint:
         """Return the last value that held and the first that did not."""
-        held: float | None = None
-        for cell in self.cells:
-            how = cell.outcome(bar)
-            if how in ("not run", "unjudged"):
-                break
-            if how != "held":
-                return BreakingPoint(held, cell.value, how, cell)
-            held = cell.value
-        return BreakingPoint(held, None, "", None)
+        at = self.reach(bar)
+        held = self.cells[at - 1].value if at else None
+        how = self.cells[at].outcome(bar) if at < len(self.cells) else "not run"
+        if how in ("not run", "unjudged"):
+            return BreakingPoint(held, None, "", None)
+        return BreakingPoint(held, self.cells[at].value, how, self.cells[at])
 
     def reach(self, bar: float) -> int:
         """Return how many values held before the first that did not."""

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Any, Final
@@ -162,24 +163,23 @@ def middles(done: Iterable[int], missing: Container[int], differ: Callable[[int,
     return out
 
 
+@dataclass(eq=False)
 class _Study:
     """The measurements so far."""
 
-    def __init__(
-        self,
-        cases: tuple[Case, ...],
-        versions: list[EngineVersion],
-        tolerance: float,
-        keep: int | None,
-        executor: Executor | None,
-        progress: Progress,
-    ) -> None:
-        self._cases, self._versions, self._tolerance = cases, versions, tolerance
-        self._executor, self._progress = executor, progress
+    cases: tuple[Case, ...]
+    versions: list[EngineVersion]
+    tolerance: float
+    keep: int | None
+    executor: Executor | None
+    progress: Progress
+
+    def __post_init__(self) -> None:
+        versions, keep = self.versions, self.keep
         self._start = time.perf_counter()
         self._done: dict[int, Measured] = {}
         self._missing: dict[int, str] = {}
-        self._truths = {case.name: Truth(case) for case in cases}
+        self._truths = {case.name: Truth(case) for case in self.cases}
         # The last one is timed beside all others, and goes at the end.
         made = [x for x in versions[:-1] if not x.installed]
         self._removed = set(made[max(0, (keep or 1) - 1) :]) if keep is not None else set()
@@ -188,11 +188,11 @@ class _Study:
 
     def announce(self, first: int) -> None:
         """Announce the effort of the study, before it begins."""
-        package = self._versions[0].package
+        package = self.versions[0].package
         made = min(len(self._new), first)
         stay = made - len(self._removed) - self._last_removed
         print(
-            f"mbkit: {first} of {len(self._versions)} versions of {self._versions[0].engine}, and more where numbers "
+            f"mbkit: {first} of {len(self.versions)} versions of {self.versions[0].engine}, and more where numbers "
             f"moved; {made} environments are made, some {made * package.seconds:.0f} s and "
             f"{max(stay, min(made, 2)) * package.megabytes:.0f} MB of disk",
             file=sys.stderr,
@@ -201,15 +201,15 @@ class _Study:
 
     def measure(self, which: Sequence[int]) -> None:
         """Measure versions by number."""
-        last = self._versions[-1]
+        last = self.versions[-1]
         calls = {}
         for k in which:
-            version = self._versions[k]
-            calls[str(k)] = partial(measured, version, last, self._cases, version in self._removed)
-        finished = run(calls, executor=self._executor) if self._executor else _one_by_one(calls)
+            version = self.versions[k]
+            calls[str(k)] = partial(measured, version, last, self.cases, version in self._removed)
+        finished = run(calls, executor=self.executor) if self.executor else _one_by_one(calls)
         for n, (name, outcome) in enumerate(finished):
-            version = self._versions[int(name)]
-            self._progress((n + 1) / len(calls), version.name)
+            version = self.versions[int(name)]
+            self.progress((n + 1) / len(calls), version.name)
             if isinstance(outcome, UnknownNameError):
                 raise outcome
             if isinstance(outcome, Exception):
@@ -218,7 +218,7 @@ class _Study:
                 self._done[int(name)] = outcome
 
     def _keys(self) -> list[tuple[str, str]]:
-        names = [case.name for case in self._cases]
+        names = [case.name for case in self.cases]
         keys = dict.fromkeys(key for _, x in sorted(self._done.items()) for key in (*x.values, *x.reasons))
         return sorted(keys, key=lambda key: names.index(key[0]))
 
@@ -233,7 +233,7 @@ class _Study:
         """Return versions in the middle between two that differ and are not neighbours."""
 
         def differ(i: int, j: int) -> bool:
-            return any(self._moved(key, i, j) > self._tolerance for key in self._keys())
+            return any(self._moved(key, i, j) > self.tolerance for key in self._keys())
 
         return middles(self._done, self._missing, differ)
 
@@ -248,28 +248,28 @@ class _Study:
                 errors[k] = math.nan if value is None else self._truths[key[0]].error(key[1], value)
                 moved = math.nan if before is None else self._moved(key, before, k)
                 direction = ""
-                if before is not None and moved > self._tolerance:
+                if before is not None and moved > self.tolerance:
                     direction = direction_of(errors[before], errors[k])
-                    names = self._versions[before].version, self._versions[k].version
+                    names = self.versions[before].version, self.versions[k].version
                     both = digits_of(errors[before]), digits_of(errors[k])
                     changes.append(Change(*key, *names, *both, direction, k == before + 1))
                 ratio = self._done[k].ratios.get(key[0], math.nan)
                 reason = self._done[k].reasons.get(key, "")
                 apart = moved if math.isfinite(moved) else math.nan
                 digits = digits_of(errors[k])
-                version = self._versions[k].version
+                version = self.versions[k].version
                 rows.append(
                     VersionRow(key[0], version, key[1], digits, apart, bool(direction), direction, ratio, reason)
                 )
                 before = k
         if self._last_removed:
-            environment.remove(self._versions[-1].package.distribution, self._versions[-1].version)
+            environment.remove(self.versions[-1].package.distribution, self.versions[-1].version)
         return VersionsResult(
             engine,
-            tuple(self._versions[k].version for k in done),
+            tuple(self.versions[k].version for k in done),
             tuple(rows),
             tuple(changes),
-            tuple((self._versions[k].version, self._missing[k]) for k in sorted(self._missing)),
+            tuple((self.versions[k].version, self._missing[k]) for k in sorted(self._missing)),
             dict(settings),
             installed_versions(),
             processor(),
