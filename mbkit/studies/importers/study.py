@@ -380,9 +380,8 @@ def compare_parsers(
             raise UnknownNameError("importer", str(name), IMPORTERS)
     if isinstance(importers, str) or not importers:
         raise InputError(f"importers: expected some of {', '.join(IMPORTERS)}, got {importers!r}")
-    count("samples", samples, least=1)
-    count("seed", seed)
-    real("tolerance", tolerance, positive=True)
+    asked: dict[str, Any] = {"samples": count("samples", samples, least=1), "seed": count("seed", seed)}
+    asked["tolerance"] = real("tolerance", tolerance, positive=True)
     real("seconds", seconds, positive=True)
     stripped = strip(_path(source), floating_base=floating_base)
     engines = tuple(dict.fromkeys(importers))
@@ -397,7 +396,7 @@ def compare_parsers(
                 parsed[engine] = Parsed(engine, _version(engine), notes=notes)
                 continue
             try:
-                parsed[engine] = _compared(engine, imported, reference, loops, label, samples, seed, tolerance)
+                parsed[engine] = _compared(engine, imported, reference, loops, label, asked)
             except ImporterError as error:
                 refused[engine] = str(error)
     parsed |= {engine: Parsed(engine, _version(engine), why) for engine, why in refused.items()}
@@ -409,9 +408,7 @@ def compare_parsers(
         faults=faults,
         importers=tuple(parsed[engine] for engine in engines),
         notes=tuple(_notes(stripped)),
-        samples=samples,
-        seed=seed,
-        tolerance=tolerance,
+        **asked,
         **results.provenance(begun),
     )
 
@@ -443,25 +440,21 @@ def _compared(
     reference: Model | Imported,
     loops: WrittenLoops,
     label: str,
-    samples: int,
-    seed: int,
-    tolerance: float,
+    asked: Mapping[str, Any],
 ) -> Parsed:
-    """Return an importer's reading, compared with the reference."""
+    """Return an importer's reading, compared with the reference at the states and to the tolerance asked for."""
     described = reference.model if isinstance(reference, Imported) else reference
     unmatched = by_functions(described)
     explanation = explain(
         replace(described, forces=tuple(f for f in described.forces if f not in unmatched)),
-        *(imported.model,),
-        samples=samples,
-        seed=seed,
-        tolerance=tolerance,
+        imported.model,
         names=(label, engine),
+        **asked,
     )
-    compared = stages(reference, loops, imported, samples, seed, tolerance)
-    causes, idle, held = own_terms(engine, imported, samples, seed, tolerance)
+    compared = stages(reference, loops, imported, **asked)
+    causes, idle, held = own_terms(engine, imported, **asked)
     if isinstance(reference, Imported):
-        theirs, _, also = own_terms(label, reference, samples, seed, tolerance)
+        theirs, _, also = own_terms(label, reference, **asked)
         causes, held = [*theirs, *causes], held and also
     notes = (*explanation.notes, *imported.notes, *idle)
     if unmatched:
