@@ -143,6 +143,7 @@ class Identification(ResultTable):
     source: Model | None = None
     cutoff: float | None = None
 
+    _listed: ClassVar = "parameters"
     _csv_columns: ClassVar = (*columns_of(IdentifiedParameter), Column("determined", attrgetter("determined")))
 
     @property
@@ -229,9 +230,6 @@ class Identification(ResultTable):
         yield Table(_COLUMNS, self.parameters)
         yield Table(_RESIDUALS, self.residuals)
         yield Items(f"the data cannot tell {x.text}" for x in self.undetermined)
-
-    def _csv_rows(self) -> tuple[IdentifiedParameter, ...]:
-        return self.parameters
 
 
 def _velocities(model: Model, joint: Joint) -> tuple[str, ...]:

@@ -22,14 +22,9 @@ _BETWEEN: Final = 5.0
 
 
 class InterruptedSweepError(KeyboardInterrupt):
-    """A study was interrupted by Ctrl-C; `result` holds the part that was finished.
+    """A study was interrupted by Ctrl-C; `result` holds the part that was finished, with ``complete=False``.
 
     A `KeyboardInterrupt`, so that a program that does not handle it ends as usual.
-
-    Attributes
-    ----------
-    result : WorkPrecision or StressResult
-        With ``complete=False``.
     """
 
     def __init__(self, result: Any) -> None:

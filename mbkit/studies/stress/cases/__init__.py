@@ -30,13 +30,7 @@ def names() -> tuple[str, ...]:
 
 
 def get(name: str) -> Case:
-    """Return the case of this name.
-
-    Raises
-    ------
-    UnknownNameError
-        With near names.
-    """
+    """Return the case of this name; `UnknownNameError` with near names where there is none."""
     if name not in CASES:
         raise UnknownNameError("case", str(name), CASES)
     return CASES[name]

@@ -22,8 +22,6 @@ Facts = dict[str, float]
 EPS: Final = float(np.finfo(float).eps)
 #: The axis of a hinge about which a body that hangs down swings.
 SWING: Final = (0.0, -1.0, 0.0)
-
-
 #: All cases, as the modules of this package write them down.
 TABLE: Final[list[Case]] = []
 
