@@ -1,48 +1,274 @@
-"""Child processes of mbkit: started with one channel in a folder of their own, and ended with all that they started."""
+"""Child processes: calls with limits of time and memory, of which a crash ends one process and loses nothing else.
+
+A child is a new program, because engines and threads do not survive a fork: this Python or another, with mbkit or
+without. The two sides exchange messages of bytes; what they mean is for subclasses of `Child`. The other side is
+`mbkit.engines.versions.remote.serve.attend`.
+"""
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
+import re
+import shutil
 import signal
 import socket
+import struct
 import subprocess
+import tempfile
+import time
 from collections.abc import Mapping, Sequence
+from math import inf
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any, Final
+
+from mbkit import _interrupt
+from mbkit.errors import UnsupportedError
+
+OUT_OF_MEMORY: Final = "it took more memory than allowed"
+#: A call that computes little is ended after so many times its processor time on the wall's clock.
+_WALL_PER_CPU: Final = 4.0
+#: The longest and the shortest time between two looks at a process, s.
+_LONGEST_WAIT, _SHORTEST_WAIT = 3600.0, 0.05
+#: Seconds that may pass between two parts of a message.
+_STUCK: Final = 60.0
+#: Characters of a process's output that are read after it died, and of its last line.
+_TAIL, _LAST = 20_000, 300
 
 
-def start_child(
-    command: Sequence[str], folder: Path, channel: socket.socket, environment: Mapping[str, str] | None
-) -> subprocess.Popen[bytes]:
-    """Start a process in a folder, where its output goes to a file; raise `OSError` where it cannot be.
+class WorkerDiedError(RuntimeError):
+    """The process ended without an answer: how, by which signal (such as SIGSEGV), and its last line of output.
 
-    Parameters
-    ----------
-    command : sequence of str
-        Which names the channel's number.
-    folder : Path
-        An empty one, which the caller removes.
-    channel : socket
-        The child's end, which is closed here.
-    environment : dict of str to str or None
-        None is that of this process.
+    `ended` is what its status says, where `how` may know better.
     """
-    with channel, (folder / "output").open("wb") as output:
-        return subprocess.Popen(
-            command,
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
-            pass_fds=[channel.fileno()],
-            env=environment,
-            # Ctrl-C is for its parent, and what it starts ends with it.
-            start_new_session=True,
-        )
+
+    def __init__(self, how: str, signal: str = "", last: str = "", ended: str = "") -> None:
+        super().__init__(how)
+        self.how, self.signal, self.last, self.ended = how, signal, last, ended
 
 
-def kill_child(process: subprocess.Popen[bytes] | None) -> None:
-    """Kill a process and all that it started, if it is still there."""
-    if process is not None:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
+class WorkerTimeoutError(RuntimeError):
+    """A call took longer than allowed; its process was ended after `seconds`."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__(f"stopped after {seconds:.2g} s")
+        self.seconds = seconds
+
+
+class WorkerStartError(UnsupportedError):
+    """Worker processes do not start here."""
+
+
+class WorkerClosedError(RuntimeError):
+    """The worker was closed by another thread."""
+
+
+class Child:
+    """A process that answers one message at a time, in a folder of its own below `home`, where its output goes.
+
+    `generation` counts its starts: what an earlier one held is gone.
+    """
+
+    def __init__(self, home: Path | None = None) -> None:
+        self._home, self._folder = home, Path()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._channel: Connection[Any, Any] | None = None
+        #: Length of the output before the current call.
+        self._output_before = 0
+        #: Whether the process owes an answer.
+        self._busy = self._closed = False
+        self.generation = 0
+
+    def _command(self, handle: int) -> tuple[Sequence[str], Mapping[str, str] | None]:
+        """Return how it is started, with the number of its channel, and in which environment (None: this one)."""
+        raise NotImplementedError
+
+    def _start(self, seconds: float) -> None:
+        """Start the process, which has so long to get ready, unless one runs."""
+        if self._closed:
+            raise WorkerClosedError
+        # An interrupted call would answer what nobody asks any more.
+        if self._process is not None and (self._busy or self._process.poll() is not None):
+            self.end()
+        if self._process is not None:
+            return
+        ours, its = socket.socketpair()
+        self._folder = Path(tempfile.mkdtemp(prefix="mbkit-", dir=self._home))
+        try:
+            with its, (self._folder / "output").open("wb") as output:
+                command, environment = self._command(its.fileno())
+                try:
+                    self._process = subprocess.Popen(
+                        command,
+                        cwd=self._folder,
+                        # Nothing is written there: that it closes tells the process that its parent is gone.
+                        stdin=subprocess.PIPE,
+                        stdout=output,
+                        stderr=output,
+                        pass_fds=[its.fileno()],
+                        env=environment,
+                        # Ctrl-C is for its parent, and what it starts ends with it.
+                        start_new_session=True,
+                    )
+                except OSError as error:
+                    raise WorkerStartError(f"worker: a process cannot be started ({error})") from error
+        except BaseException:
+            ours.close()
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
+        # Neither side waits for ever for the rest of a message.
+        for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
+            ours.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(_STUCK), 0))
+        self._channel, self._output_before = Connection(ours.detach()), 0
+        self.generation += 1
+        _running.add(self)
+        if self._closed:
+            self._kill()
+        self._receive(seconds)
+
+    def _send(self, message: bytes) -> None:
+        """Send a message, whose answer is awaited then."""
+        assert self._channel is not None
+        self._busy = True
+        with contextlib.suppress(OSError):
+            self._output_before = (self._folder / "output").stat().st_size
+        try:
+            self._channel.send_bytes(message)
+        except BlockingIOError:
+            self.end()
+            raise WorkerTimeoutError(_STUCK) from None
+        except OSError:
+            raise self._end_dead() from None
+        except BaseException:
+            self.end()
+            raise
+
+    def _receive(self, seconds: float = inf, deadline: float = inf) -> bytes:
+        """Return the next message, or end the process.
+
+        It may take so many seconds of its processor time, four times as many of the wall's, and until `deadline` on
+        `time.perf_counter`.
+        """
+        if self._process is None or self._channel is None:
+            raise WorkerDiedError("the process is gone")
+        spent, begun = _processor_seconds(self._process.pid) if seconds < inf else 0.0, time.perf_counter()
+        end, last = begun + seconds, min(begun + _WALL_PER_CPU * seconds, deadline)
+        try:
+            while not self._channel.poll(min(max(0.0, min(end, last) - time.perf_counter()), _LONGEST_WAIT)):
+                if time.perf_counter() < min(end, last):
+                    continue
+                # On a busy machine the process may not have had its processor time.
+                missing = seconds - (_processor_seconds(self._process.pid) - spent)
+                if missing <= 0 or end >= last:
+                    raise TimeoutError
+                end = time.perf_counter() + max(missing, _SHORTEST_WAIT)
+            return self._channel.recv_bytes()
+        except (TimeoutError, BlockingIOError):
+            self.end()
+            raise WorkerTimeoutError(time.perf_counter() - begun) from None
+        except (EOFError, OSError):
+            raise self._end_dead() from None
+        except BaseException:
+            self.end()
+            raise
+
+    def _end_dead(self) -> RuntimeError:
+        """Return the exception for a process that is gone."""
+        assert self._process is not None
+        code, output = None, b""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            code = self._process.wait(timeout=5.0)
+        with contextlib.suppress(OSError):
+            output = (self._folder / "output").read_bytes()[self._output_before :][-_TAIL:]
+        self.end()
+        return WorkerClosedError() if self._closed else _death(code, output.decode("utf-8", "replace"))
+
+    def _kill(self) -> None:
+        """Kill the process and all that it started, if it is still there."""
+        if (process := self._process) is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+
+    def close(self) -> None:
+        """End the process for good, from any thread; a call that is under way raises `WorkerClosedError`."""
+        self._closed = True
+        self._kill()
+
+    def end(self) -> None:
+        """End the process and all that it started, and remove its folder; the next call starts another."""
+        if self._process is not None:
+            self._kill()
+            self._process.wait()
+            self._forget()
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _forget(self) -> None:
+        """Forget the process, which has ended or belongs to the process that this is a fork of."""
+        process, channel = self._process, self._channel
+        self._process = self._channel = None
+        self._busy = False
+        _running.discard(self)
+        if process is not None and process.stdin is not None and channel is not None:
+            process.stdin.close()
+            channel.close()
+
+
+_running: Final[set[Child]] = set()
+
+
+def _kill_all() -> None:
+    for child in tuple(_running):
+        child._kill()
+
+
+def end_all() -> None:
+    """End all processes that run."""
+    for child in tuple(_running):
+        child.end()
+
+
+def _forget_all() -> None:
+    for child in tuple(_running):
+        if child._process is not None:
+            # Nothing is left to wait for.
+            child._process.returncode = 0
+        child._forget()
+
+
+atexit.register(end_all)
+_interrupt.at_end(_kill_all)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_all)
+
+
+def _processor_seconds(pid: int) -> float:
+    """Return the processor time of a process, s; the wall's where the system does not say."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+    except OSError:
+        return time.perf_counter()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _death(code: int | None, output: str) -> WorkerDiedError:
+    """Return how a process ended, from its status and its output."""
+    lines = [line[:_LAST] for text in output.splitlines() if (line := " ".join(text.split()))]
+    ended, name = f"ended with status {code}", ""
+    if code is None:
+        ended = "gave up the connection"
+    elif code < 0:
+        with contextlib.suppress(ValueError):
+            name = signal.Signals(-code).name
+        name = name or f"signal {-code}"
+        ended = f"died of {name}"
+        # What came before Python's own report of the crash.
+        crash = re.compile(r"Fatal Python error|Current thread|Thread 0x|Extension modules")
+        lines = lines[: next((k for k, line in enumerate(lines) if crash.match(line)), None)]
+    last = lines[-1] if lines else ""
+    if "std::bad_alloc" in output or "MemoryError" in output or "out of memory" in output.lower():
+        return WorkerDiedError(OUT_OF_MEMORY, "", last, ended)
+    if code == -signal.SIGKILL:
+        return WorkerDiedError("the process was killed, as systems do that have no memory left", name, last, ended)
+    return WorkerDiedError(f"the process {ended}" + (f" ({last})" if last else ""), name, last, ended)

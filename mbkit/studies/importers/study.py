@@ -44,7 +44,7 @@ from mbkit.studies.importers.loops import (
 )
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
-from mbkit.studies.worker import WALL_PER_CPU, Worker, WorkerDiedError, WorkerStartError, WorkerTimeoutError, describe
+from mbkit.studies.worker import Worker, WorkerDiedError, WorkerStartError, WorkerTimeoutError, describe
 
 #: Fields of joints with numbers per velocity, and the stage in which they are compared.
 _NUMBERS: Final = {
@@ -55,11 +55,6 @@ _NUMBERS: Final = {
 
 # Importers run in worker processes, so that none of them can end, hang or fill the user's process. The processes are
 # kept from one comparison to the next: libraries take longer to load than files.
-
-#: Seconds more than all importers may take, after which a process ends that nobody waits for any more.
-_GRACE: Final = 30.0
-#: The most seconds that a reading may have; the system's calls take no more.
-_MAX_SECONDS: Final = 1e6
 
 _workers: Final[dict[Importer, Worker]] = {}
 #: Held by a comparison: each importer's process holds one file.
@@ -85,9 +80,9 @@ class Reading:
     """A file that an engine's importer reads, in at most `seconds` of processor time; so is each call of its terms."""
 
     def __init__(self, engine: str, file: Stripped, floating_base: bool, seconds: float) -> None:
-        self._engine, self._seconds = engine, min(seconds, _MAX_SECONDS)
+        self._engine, self._seconds = engine, seconds
         importer = IMPORTERS[engine]
-        self._worker = _workers.setdefault(importer, Worker(outlives_thread=True))
+        self._worker = _workers.setdefault(importer, Worker())
         self._begin(_read, importer.module, file.text, file.format, floating_base, file.meshes)
 
     def result(self) -> Imported:
@@ -95,16 +90,18 @@ class Reading:
         model, *rest = self._finish()
         return Imported(model, self._terms, *rest)
 
+    def end(self) -> None:
+        """End the importer's process."""
+        self._worker.end()
+
     def _terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> Values:
         self._begin(_terms_of_held, q, v, without)
         terms: Values = self._finish()
         return terms
 
     def _begin(self, function: Callable[..., Any], *args: Any) -> None:
-        # It may be waited for after all others.
-        alarm = len(IMPORTERS) * WALL_PER_CPU * self._seconds + _GRACE
         try:
-            self._worker.begin(function, *args, alarm=alarm)
+            self._worker.begin(function, *args)
         except (WorkerDiedError, WorkerStartError) as error:
             raise ImporterError(self._failure(error)) from None
 
@@ -420,17 +417,23 @@ def _readings(
     begun: dict[str, Reading] = {}
     read: dict[str, Imported] = {}
     refused: dict[str, str] = {}
-    for engine in engines:
-        try:
-            check_installed(engine)
-            begun[engine] = Reading(engine, stripped, floating_base, seconds)
-        except (UnsupportedError, ImporterError) as error:
-            refused[engine] = str(error)
-    for engine, reading in begun.items():
-        try:
-            read[engine] = reading.result()
-        except ImporterError as error:
-            refused[engine] = str(error)
+    try:
+        for engine in engines:
+            try:
+                check_installed(engine)
+                begun[engine] = Reading(engine, stripped, floating_base, seconds)
+            except (UnsupportedError, ImporterError) as error:
+                refused[engine] = str(error)
+        for engine, reading in begun.items():
+            try:
+                read[engine] = reading.result()
+            except ImporterError as error:
+                refused[engine] = str(error)
+    except BaseException:
+        # Nobody waits any more for those that still read.
+        for reading in begun.values():
+            reading.end()
+        raise
     return read, refused
 
 

@@ -1,21 +1,23 @@
-"""Messages of arrays, and the loop of a process that answers them.
+"""What runs in a child process: the loop that answers its parent, and the messages of arrays of an engine's version.
 
-A message is two lengths, a head in JSON and float64 arrays in NumPy's own file format, without pickles. It may come
-from any version of NumPy. The process is started as ``python serve.py HANDLE ENGINE FOLDER``, with an
-inherited socket, in a folder of its own.
+The loop answers any `mbkit._child_process.Child`. A message of arrays is a line of JSON and float64 arrays in NumPy's
+own file format, without pickles. It may come from any version of NumPy. An engine's process is started as
+``python serve.py HANDLE ENGINE FOLDER``, with an inherited socket, in a folder of its own.
 """
 
 from __future__ import annotations
 
+import ctypes
+import faulthandler
 import importlib
 import io
 import json
 import os
 import shutil
 import signal
-import socket
-import struct
 import sys
+import threading
+from multiprocessing.connection import Connection
 
 import numpy as np
 
@@ -24,39 +26,75 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from typing import Any
 
-_LENGTHS = struct.Struct("<QQ")
+#: SIGUSR1, which Linux sends when the parent is gone. Its handler is alarm(2), which takes the signal's number as
+#: seconds: time to remove the folder, after which the kernel ends even a process that hangs in a library.
+_PARENT_GONE = 10
+
+
+def attend(
+    handle: int,
+    folder: str,
+    prepare: Callable[[Connection], Callable[[bytes], bytes]],
+    memory: int = 0,
+    idle: float | None = None,
+) -> None:
+    """Answer messages until the parent is gone, then remove the folder; or until it has asked nothing for so long.
+
+    `prepare` returns what answers. The process may take `memory` bytes (Linux; 0: no limit).
+    """
+    import fcntl
+    import resource
+
+    # Ctrl-C is the parent's.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The parent never writes there, and who reads shall not wait.
+    line = os.dup(0)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    if sys.platform == "linux":
+        libc = ctypes.CDLL(None)
+        libc.signal(_PARENT_GONE, libc.alarm)
+        for key, value in ((fcntl.F_SETSIG, _PARENT_GONE), (fcntl.F_SETOWN, os.getpid()), (fcntl.F_SETFL, os.O_ASYNC)):
+            fcntl.fcntl(line, key, value)
+    ending = threading.Thread(target=_end_after_parent, args=(os.path.abspath(folder), line), daemon=True)
+    ending.start()
+    faulthandler.enable()
+    # A crash leaves no core file behind. What counts is the memory written to, not what LLVM and heyoka only reserve.
+    for kind, most in ((resource.RLIMIT_CORE, 0), *([(resource.RLIMIT_DATA, memory)] if memory else [])):
+        hard = resource.getrlimit(kind)[1]
+        resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+    channel = Connection(handle)
+    answer = prepare(channel)
+    try:
+        channel.send_bytes(b"ready")
+        while channel.poll(idle):
+            channel.send_bytes(answer(channel.recv_bytes()))
+    except (EOFError, OSError):
+        ending.join()
+    # Destructors of loaded libraries could only fail.
+    os._exit(0)
+
+
+def _end_after_parent(folder: str, line: int) -> None:
+    """Wait until the parent is gone, even if it was killed; remove the folder, end this process and what it started."""
+    os.read(line, 1)
+    shutil.rmtree(folder, ignore_errors=True)
+    os.killpg(0, signal.SIGKILL)
 
 
 def packed(head: dict[str, Any], arrays: Sequence[Any] = ()) -> bytes:
     """Return a message."""
     body = io.BytesIO()
+    body.write(json.dumps(dict(head, arrays=len(arrays))).encode() + b"\n")
     for x in arrays:
         np.lib.format.write_array(body, np.asarray(x, dtype="<f8", order="C"), allow_pickle=False)
-    text, data = json.dumps(dict(head, arrays=len(arrays))).encode(), body.getvalue()
-    return _LENGTHS.pack(len(text), len(data)) + text + data
+    return body.getvalue()
 
 
-def unpacked(read: Callable[[int], bytes]) -> tuple[dict[str, Any], list[Any]]:
-    """Return the head and the arrays of a message; `read` returns so many bytes, or raises `EOFError`."""
-    text, data = _LENGTHS.unpack(read(_LENGTHS.size))
-    head = json.loads(read(text).decode())
-    body = io.BytesIO(read(data))
+def unpacked(message: bytes) -> tuple[dict[str, Any], list[Any]]:
+    """Return the head and the arrays of a message."""
+    body = io.BytesIO(message)
+    head = json.loads(body.readline())
     return head, [np.lib.format.read_array(body, allow_pickle=False) for _ in range(head["arrays"])]
-
-
-def reader(channel: socket.socket) -> Callable[[int], bytes]:
-    """Return a function that reads exactly so many bytes."""
-
-    def read(size: int) -> bytes:
-        out = bytearray()
-        while len(out) < size:
-            part = channel.recv(min(size - len(out), 1 << 20))
-            if not part:
-                raise EOFError
-            out += part
-        return bytes(out)
-
-    return read
 
 
 def _answer(adapter: Any, held: dict[int, Any], head: dict[str, Any], arrays: list[Any]) -> bytes:
@@ -78,30 +116,21 @@ def _answer(adapter: Any, held: dict[int, Any], head: dict[str, Any], arrays: li
 
 
 def serve(handle: int, engine: str, folder: str) -> None:
-    """Answer calls until the caller is gone; then remove the folder."""
-    # Ctrl-C is the caller's.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    channel = socket.socket(fileno=handle)
-    read = reader(channel)
-    try:
+    """Answer calls of an engine."""
+
+    def prepare(_: Connection) -> Callable[[bytes], bytes]:
         adapter = importlib.import_module("on_" + engine)
         held: dict[int, Any] = {}
-        channel.sendall(packed({"ready": True}))
-        while True:
-            head, arrays = unpacked(read)
-            # What hangs does not see that its caller is gone; the system ends it then.
-            signal.setitimer(signal.ITIMER_REAL, head.get("alarm", 0.0))
+
+        def answer(message: bytes) -> bytes:
             try:
-                answer = _answer(adapter, held, head, arrays)
+                return _answer(adapter, held, *unpacked(message))
             except (Exception, SystemExit) as error:  # a library may raise anything
-                answer = packed({"error": " ".join(str(error).split()) or type(error).__name__})
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            channel.sendall(answer)
-    except (EOFError, OSError):
-        pass
-    shutil.rmtree(folder, ignore_errors=True)
-    # Destructors of loaded libraries could only fail.
-    os._exit(0)
+                return packed({"error": " ".join(str(error).split()) or type(error).__name__})
+
+        return answer
+
+    attend(handle, folder, prepare)
 
 
 if __name__ == "__main__":
