@@ -13,11 +13,12 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
+from mbkit._child_process import WorkerDiedError
 from mbkit.cli import cli
 from mbkit.errors import OutputError, UnknownNameError
 from mbkit.studies.compare import all_robots as sweeps
 from mbkit.studies.compare.all_robots import RobotOutcome, all_robots
-from mbkit.studies.worker import WorkerDiedError, run
+from mbkit.studies.worker import run
 
 QUICK = ("--no-rollouts", "--samples", "4")
 

@@ -22,6 +22,7 @@ import pytest
 from click.testing import CliRunner
 
 import mbkit as mb
+from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
 from mbkit.cli import cli
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.report.stress_view import headline
@@ -38,7 +39,6 @@ from mbkit.studies.stress.measure import (
 )
 from mbkit.studies.stress.study import CaseSweep
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, cpu_limit
-from mbkit.studies.worker import WorkerDiedError, WorkerTimeoutError
 from tests import stress_cases as own
 
 METHODS = ("rk4", *own.ENDS)

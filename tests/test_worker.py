@@ -14,19 +14,9 @@ from pathlib import Path
 
 import pytest
 
+from mbkit._child_process import OUT_OF_MEMORY, WorkerClosedError, WorkerDiedError, WorkerTimeoutError
 from mbkit.errors import InputError
-from mbkit.studies.worker import (
-    OUT_OF_MEMORY,
-    CallError,
-    RemoteError,
-    Worker,
-    WorkerClosedError,
-    WorkerDiedError,
-    WorkerTimeoutError,
-    in_worker,
-    report_stage,
-    run,
-)
+from mbkit.studies.worker import CallError, RemoteError, Worker, in_worker, report_stage, run
 
 
 class StubbornError(Exception):

@@ -7,6 +7,7 @@ between.
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import pickle
 import sys
@@ -19,9 +20,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from mbkit._child_process import OUT_OF_MEMORY as OUT_OF_MEMORY
 from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError
-from mbkit._child_process import WorkerClosedError as WorkerClosedError
 from mbkit.engines.registry import registered_engines
 from mbkit.engines.versions.remote.serve import attend
 from mbkit.errors import MbkitError
@@ -99,7 +98,7 @@ class Worker(Child):
                 "and a Python with which mbkit can be imported"
             ) from None
         self.stage = ""
-        self._send(pickle.dumps((main, call)))
+        self._send(pickle.dumps(main) + call)
 
     def finish(
         self,
@@ -108,7 +107,9 @@ class Worker(Child):
         deadline: float = inf,
     ) -> Any:
         """Return the result of the call that was begun; see `call`."""
-        limits, kind, value = stage_seconds or {}, "stage", self.stage
+        limits = stage_seconds or {}
+        kind: str = "stage"
+        value: Any = self.stage
         while kind == "stage":
             self.stage = value
             kind, value = pickle.loads(self._receive(limits.get(self.stage, cpu_seconds), deadline))
@@ -150,11 +151,11 @@ def _prepare(channel: Connection[Any, Any]) -> Callable[[bytes], bytes]:
 
 def _answer(message: bytes) -> bytes:
     try:
-        main, call = pickle.loads(message)
-        if main:
+        stream = io.BytesIO(message)
+        if main := pickle.load(stream):
             spawn.prepare(main)
         # Unpickling registers the engines.
-        _, methods, function, args = pickle.loads(call)
+        _, methods, function, args = pickle.load(stream)
     except Exception as error:  # a user's module may raise anything
         return pickle.dumps(("error", CallError(describe(error))))
     METHODS.update((method.name, method) for method in methods)

@@ -36,7 +36,7 @@ class VersionDynamics(MappedDynamics):
 
     Notes
     -----
-    A call takes some 0.2 ms more than the engine: the state goes to another process and the value comes back. Springs,
+    A call takes some 0.1 ms more than the engine: the state goes to another process and the value comes back. Springs,
     dampers and couplings are mbkit's own, from the engine's poses and Jacobians, where the engine's algorithms know
     none (Pinocchio) and where they are not sent (Drake); MuJoCo's are its own.
     """

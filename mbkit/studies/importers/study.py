@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array, count, real
+from mbkit._child_process import WorkerDiedError, WorkerStartError, WorkerTimeoutError
 from mbkit.engines.imported import IMPORTERS, Beside, Imported, Importer, check_installed, reader
 from mbkit.engines.registry import MUJOCO
 from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
@@ -44,7 +45,7 @@ from mbkit.studies.importers.loops import (
 )
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
-from mbkit.studies.worker import Worker, WorkerDiedError, WorkerStartError, WorkerTimeoutError, describe
+from mbkit.studies.worker import Worker, describe
 
 #: Fields of joints with numbers per velocity, and the stage in which they are compared.
 _NUMBERS: Final = {

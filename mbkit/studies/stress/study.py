@@ -17,6 +17,13 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from mbkit._check import count, real
+from mbkit._child_process import (
+    OUT_OF_MEMORY,
+    WorkerClosedError,
+    WorkerDiedError,
+    WorkerStartError,
+    WorkerTimeoutError,
+)
 from mbkit.engines.registry import DERIVED, ENGINES, INDEPENDENT, compared
 from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
@@ -28,18 +35,7 @@ from mbkit.studies.stress.measure import TERMS, Limits, Prepared, condition_numb
 from mbkit.studies.stress.measurements import BAR, CaseResult, Measurement, Row
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
-from mbkit.studies.worker import (
-    OUT_OF_MEMORY,
-    CallError,
-    Worker,
-    WorkerClosedError,
-    WorkerDiedError,
-    WorkerStartError,
-    WorkerTimeoutError,
-    describe,
-    in_worker,
-    processors,
-)
+from mbkit.studies.worker import CallError, Worker, describe, in_worker, processors
 
 #: Seconds that a run may take, and the whole study, quick and not.
 _SECONDS: Final = {True: 0.5, False: 2.0}

@@ -1,7 +1,7 @@
 """What runs in a child process: the loop that answers its parent, and the messages of arrays of an engine's version.
 
-The loop answers any `mbkit._child_process.Child`. A message of arrays is a line of JSON and float64 arrays in NumPy's
-own file format, without pickles. It may come from any version of NumPy. An engine's process is started as
+The loop answers any `mbkit._child_process.Child`. A message of arrays is a line of JSON, with their shapes, and the
+bytes of their numbers: no pickles, and from any version of NumPy. An engine's process is started as
 ``python serve.py HANDLE ENGINE FOLDER``, with an inherited socket, in a folder of its own.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 import faulthandler
 import importlib
-import io
 import json
 import os
 import shutil
@@ -66,7 +65,7 @@ def attend(
     answer = prepare(channel)
     try:
         channel.send_bytes(b"ready")
-        while channel.poll(idle):
+        while idle is None or channel.poll(idle):
             channel.send_bytes(answer(channel.recv_bytes()))
     except (EOFError, OSError):
         ending.join()
@@ -83,18 +82,19 @@ def _end_after_parent(folder: str, line: int) -> None:
 
 def packed(head: dict[str, Any], arrays: Sequence[Any] = ()) -> bytes:
     """Return a message."""
-    body = io.BytesIO()
-    body.write(json.dumps(dict(head, arrays=len(arrays))).encode() + b"\n")
-    for x in arrays:
-        np.lib.format.write_array(body, np.asarray(x, dtype="<f8", order="C"), allow_pickle=False)
-    return body.getvalue()
+    every = [np.asarray(x, dtype="<f8") for x in arrays]
+    text = json.dumps(dict(head, shapes=[x.shape for x in every])).encode()
+    return b"".join([text, b"\n", *(x.tobytes() for x in every)])
 
 
 def unpacked(message: bytes) -> tuple[dict[str, Any], list[Any]]:
     """Return the head and the arrays of a message."""
-    body = io.BytesIO(message)
-    head = json.loads(body.readline())
-    return head, [np.lib.format.read_array(body, allow_pickle=False) for _ in range(head["arrays"])]
+    at = message.index(b"\n") + 1
+    head, arrays = json.loads(message[:at]), []
+    for shape in head.pop("shapes"):
+        arrays.append(np.ndarray(shape, "<f8", message, at).copy())
+        at += arrays[-1].nbytes
+    return head, arrays
 
 
 def _answer(adapter: Any, held: dict[int, Any], head: dict[str, Any], arrays: list[Any]) -> bytes:
