@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +21,7 @@ from typing import Any
 import sympy as sp
 from sympy.physics import mechanics as me
 
+from mbkit.studies.worker import Worker
 from validation.stamp import stamp
 
 
@@ -104,25 +104,22 @@ WAYS: dict[str, Callable[[int], float]] = {
 }
 
 
-def _answer(way: str, n: int, queue: Any) -> None:
+def _answer(way: str, n: int) -> float:
     # Imports and SymPy's own start are nobody's derivation.
     WAYS[way](1)
-    queue.put(WAYS[way](n))
+    return WAYS[way](n)
 
 
 def timed(way: str, n: int, seconds: float) -> float | None:
     """Return seconds, or None where it took longer than allowed."""
-    context = multiprocessing.get_context("spawn")
-    queue = context.Queue()
-    worker = context.Process(target=_answer, args=(way, n, queue))
-    worker.start()
-    # The start of a process is not counted.
-    worker.join(seconds + 20.0)
-    if worker.is_alive():
-        worker.kill()
-        worker.join()
+    worker = Worker()
+    try:
+        # The start of a process is not counted.
+        return worker.call(_answer, way, n, deadline=time.perf_counter() + seconds + 20.0)
+    except Exception:
         return None
-    return float(queue.get(timeout=5.0)) if worker.exitcode == 0 else None
+    finally:
+        worker.end()
 
 
 def main() -> None:

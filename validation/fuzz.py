@@ -17,13 +17,12 @@ process that ends or takes more than a minute. Exit status 1 if there is one.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import sys
-import tempfile
 import time
 import warnings
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import mujoco
@@ -31,8 +30,10 @@ import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
+from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
 from mbkit.engines.mujoco.mjcf_writer import mjcf_text
 from mbkit.errors import MbkitError, MbkitWarning, UnsupportedError
+from mbkit.studies.worker import Worker, describe
 from tests.random_files import EPS, errors, mujoco_terms, mutant, random_mjcf
 from tests.random_trees import ALL, random_tree, states
 from validation import newton_euler
@@ -59,6 +60,7 @@ GOOD = {
 }
 
 
+@cache
 def bases() -> dict[str, bytes]:
     """Return the files that are damaged: name with suffix -> content."""
     out = {f"{name}.urdf": path_of(name).read_bytes() for name in URDFS}
@@ -227,54 +229,37 @@ def tree_outcome(seed: int) -> str:
     return "agrees"
 
 
-# A process that does it, and one that watches.
+# A process does it, and this one watches.
 
 
-def serve(connection, part: str, folder: str) -> None:
-    """Answer seeds with outcomes."""
-    os.chdir(folder)
-    # Pinocchio's parser writes to the error stream what it does not like in shapes and colours.
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
-    files = bases() if part == "mutants" else {}
-    calls = {
-        "mutants": lambda seed: mutant_outcome(seed, Path(folder), files),
-        "random MJCFs": lambda seed: mjcf_outcome(seed, Path(folder)),
-        "random trees": tree_outcome,
-    }
-    while (seed := connection.recv()) is not None:
-        connection.send(calls[part](seed))
+def made_of(part: str, seed: int) -> str:
+    """Return what becomes of a seed, in the folder of this process."""
+    if part == "mutants":
+        return mutant_outcome(seed, Path.cwd(), bases())
+    return mjcf_outcome(seed, Path.cwd()) if part == "random MJCFs" else tree_outcome(seed)
 
 
 def counted(part: str, count: int, seconds: float) -> tuple[Counter[str], dict[str, list[int]]]:
     """Return how often each outcome came, and the seeds of the failures; no seed is begun after `seconds`."""
     found: Counter[str] = Counter()
     failures: dict[str, list[int]] = {}
-    context = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory() as folder:
-        process, begun = None, time.perf_counter()
-        for seed in range(count):
-            if time.perf_counter() - begun > seconds:
-                break
-            if process is None:
-                ours, theirs = context.Pipe()
-                process = context.Process(target=serve, args=(theirs, part, folder), daemon=True)
-                process.start()
-                theirs.close()
-            try:
-                ours.send(seed)
-                made = ours.recv() if ours.poll(PATIENCE) else "took longer than a minute"
-            except (EOFError, OSError):
-                made = "ended the process"
-            if made in ("took longer than a minute", "ended the process"):
-                process.kill()
-                process = None
-            found[made] += 1
-            if not is_good(part, made):
-                failures.setdefault(made, []).append(seed)
-                print(f"{part}, seed {seed}: {made}", flush=True)
-        if process is not None:
-            ours.send(None)
-            process.join()
+    worker, begun = Worker(), time.perf_counter()
+    for seed in range(count):
+        if time.perf_counter() - begun > seconds:
+            break
+        try:
+            made = worker.call(made_of, part, seed, deadline=time.perf_counter() + PATIENCE)
+        except WorkerTimeoutError:
+            made = "took longer than a minute"
+        except WorkerDiedError:
+            made = "ended the process"
+        except Exception as error:
+            made = describe(error)
+        found[made] += 1
+        if not is_good(part, made):
+            failures.setdefault(made, []).append(seed)
+            print(f"{part}, seed {seed}: {made}", flush=True)
+    worker.end()
     return found, failures
 
 
