@@ -12,8 +12,8 @@ import pytest
 from click.testing import CliRunner
 
 import mbkit as mb
+from mbkit._child_process import end_all
 from mbkit.cli import cli
-from mbkit.engines.versions import process
 from mbkit.engines.versions.engine_version import versions_of
 from mbkit.errors import UnsupportedError
 from mbkit.studies import results
@@ -31,9 +31,9 @@ NAMES = ["-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "commit.gp
 @pytest.fixture(autouse=True)
 def environments(tmp_path, monkeypatch):
     monkeypatch.setenv("MBKIT_ENVIRONMENTS", str(tmp_path / "environments"))
-    process._end_all()
+    end_all()
     yield
-    process._end_all()
+    end_all()
 
 
 def bisected(path: Path) -> BisectResult:

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
+from mbkit._child_process import end_all
 from mbkit.engines.registry import find_engine
 from mbkit.engines.versions import environment, process
 from mbkit.engines.versions.dynamics import VersionDynamics
@@ -49,9 +50,9 @@ def present(engine: str, version: str, before: str = "") -> EngineVersion:
 @pytest.fixture(autouse=True)
 def environments(tmp_path, monkeypatch):
     monkeypatch.setenv("MBKIT_ENVIRONMENTS", str(tmp_path / "environments"))
-    process._end_all()
+    end_all()
     yield tmp_path / "environments"
-    process._end_all()
+    end_all()
 
 
 def chain() -> mb.Model:

@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 import mbkit as mb
+from mbkit._child_process import end_all
 from mbkit.cli import cli
 from mbkit.engines.versions import environment, process
 from mbkit.errors import InputError, UnknownNameError
@@ -45,9 +46,9 @@ GRAVITY = "old = E.gravity; E.gravity = lambda self, q: {factor} * old(self, q)"
 @pytest.fixture(autouse=True)
 def environments(tmp_path, monkeypatch):
     monkeypatch.setenv("MBKIT_ENVIRONMENTS", str(tmp_path / "environments"))
-    process._end_all()
+    end_all()
     yield
-    process._end_all()
+    end_all()
 
 
 def made(version: str, alter: str = "") -> str:

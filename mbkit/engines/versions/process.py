@@ -113,8 +113,3 @@ def end(version: EngineVersion) -> None:
     """End the process of a version, where there is one."""
     if own := _processes.get(version.name):
         own.end()
-
-
-def _end_all() -> None:
-    for own in _processes.values():
-        own.end()

@@ -103,7 +103,7 @@ class Reading:
     def _begin(self, function: Callable[..., Any], *args: Any) -> None:
         try:
             self._worker.begin(function, *args)
-        except (WorkerDiedError, WorkerStartError) as error:
+        except (WorkerDiedError, WorkerStartError, WorkerTimeoutError) as error:
             raise ImporterError(self._failure(error)) from None
 
     def _finish(self) -> Any:
