@@ -6,9 +6,11 @@ import base64
 import dataclasses
 import hashlib
 import json
+import os
 import pickle
 import re
 import struct
+import threading
 import zlib
 from pathlib import Path
 
@@ -22,7 +24,7 @@ import mbkit as mb
 from mbkit.errors import InputError, MbkitWarning, OutputError, UnsupportedError
 from mbkit.load import shapes as solids
 from mbkit.model.poses import body_poses, inertia_box
-from mbkit.show import Scene, shapes_of, view
+from mbkit.show import Scene, mesh_files, shapes_of, view
 from mbkit.show.mesh_files import _by_coal, read_surfaces
 from mbkit.show.surfaces import solid, thinned
 from tests.random_trees import IN_MUJOCO, random_tree
@@ -227,6 +229,68 @@ def test_a_broken_mesh_is_one_error(suffix: str, tmp_path: Path) -> None:
         except ValueError:
             continue
         assert all(np.isfinite(s.vertices).all() and s.triangles.max(initial=-1) < len(s.vertices) for s in surfaces)
+
+
+#: 41 nodes with two of the node before in each, and a node in itself.
+TWICE = "".join(f'<node id="n{k}">{2 * f"""<instance_node url="#n{k - 1}"/>"""}</node>' for k in range(1, 42))
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "why"),
+    [
+        ("<node>", f'{TWICE}<node id="n0"/><node>', "more than 200000 elements in them"),
+        ("<node>", '<node id="n"><instance_node url="#n"/>', "nested more than 50 deep"),
+        ("<node>", 100_000 * "<node>", "nested more than 250 deep"),
+        ("<p>0", "<p>1000000000", "vertices that are not there"),
+        ("<p>0", "<p>99999999999999999999", "vertices that are not there"),
+        ("<p>0", "<p>a", "'a'"),
+        ("<vcount>3 4", f"<vcount>{2**63 - 1} {2**63 - 1}", "more corners than there are"),
+        ("<vcount>3 4", f"<vcount>{2**62} {2**62} {2**62} {2**62}", "more corners than there are"),
+        ("0 0 0 1 0 0 0 1", "0 nan 0 1 0 0 0 1", "not finite"),
+        ("<scale>2", "<scale>1e400", "not finite"),
+        ("0 0 0 1 0 0 0 1 0 0 0 1", " ", "no triangles in it"),
+        ("<COLLADA", '<!DOCTYPE x [<!ENTITY a "1">]><COLLADA', "document type declaration"),
+    ],
+)
+def test_a_short_file_takes_neither_time_nor_memory(was: str, now: str, why: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.dae"
+    assert was in DAE
+    path.write_text(DAE.replace(was, now, 1))
+    with pytest.raises(ValueError, match=why):
+        read_surfaces(path)
+
+
+def test_colours_are_numbers_from_pictures_that_fit(tmp_path: Path, monkeypatch) -> None:
+    """A colour that is not finite would leave an empty page, and a pipe keeps its reader waiting."""
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(tmp_path / "a.png")
+    os.mkfifo(tmp_path / "pipe.png")
+    pipe = os.open(tmp_path / "pipe.png", os.O_RDWR)
+    os.write(pipe, (tmp_path / "a.png").read_bytes())
+    # Who opens it gets the picture, and fails below, instead of waiting for ever.
+    end = threading.Timer(2, os.close, [pipe])
+    end.start()
+    given = {"Kd 1 0 0": (1, 0, 0, 1), "Kd nan 0 0": None, "map_Kd a.png": (1, 0, 0, 1), "map_Kd pipe.png": None}
+    for text, color in given.items():
+        (tmp_path / "a.mtl").write_text(f"newmtl red\n{text}\n")
+        (tmp_path / "a.obj").write_text(OBJ.replace("f 1 2 3", "f 1 2 \\\n3"))
+        assert [s.color for s in read_surfaces(tmp_path / "a.obj")] == ([color, None] if color else [None])
+    texture = '<texture texture="i"/></diffuse>'
+    for picture, color in (("a.png", (1, 0, 0, 1)), ("pipe.png", None)):
+        text = re.sub("<color>.*</diffuse>", texture, DAE).replace(
+            "<library_materials>", f'<image id="i"><init_from>{picture}</init_from></image><library_materials>'
+        )
+        (tmp_path / "a.dae").write_text(text)
+        assert read_surfaces(tmp_path / "a.dae")[0].color == color
+    end.cancel()
+    os.close(pipe)
+    (tmp_path / "b.dae").write_text(DAE.replace("<color>1", "<color>inf"))
+    assert read_surfaces(tmp_path / "b.dae")[0].color is None
+    monkeypatch.setattr(mesh_files, "_MOST_PIXELS", 15)
+    (tmp_path / "a.dae").write_text(text.replace("pipe.png", "a.png"))
+    assert read_surfaces(tmp_path / "a.dae")[0].color is None
+    (tmp_path / "a.obj").write_text(OBJ + "".join(f"usemtl {k}\nf 1 2 3\n" for k in range(5000)))
+    with pytest.raises(ValueError, match="more than 5000 materials"):
+        read_surfaces(tmp_path / "a.obj")
 
 
 def test_a_missing_mesh_is_told_once_and_drawn_as_sticks_and_boxes(tmp_path: Path) -> None:

@@ -2,13 +2,18 @@
 
 coal makes one surface of a file and drops its materials, so the two formats that have any are read here. coal 3.0.3
 also gives the triangles of a node's second mesh the vertices of the first one, and each material is a mesh there. Files
-are those of strangers: whatever is wrong with one is a ValueError.
+are those of strangers: whatever is wrong with one is a ValueError. That is why pycollada 0.9.3 and trimesh 5.2.0 do not
+read them: nodes in nodes and texts in archives keep them busy for ever, NaN becomes zero, a mesh without one of its
+materials gets lost (a foot of ANYmal is one), and trimesh rounds colours to bytes.
 """
 
 from __future__ import annotations
 
+import io
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -22,10 +27,15 @@ from mbkit.load.mjcf_attributes import about, read_mesh
 from mbkit.load.xml_reader import Element
 from mbkit.show.surfaces import Color, Indices, Surface, cleaned
 
-#: Nodes in nodes, and surfaces of a file: a node may be there many times.
+#: Nodes in nodes, and elements in nodes, each time that a node is used: a short file can use one for ever.
 _DEEPEST: Final = 50
-_MOST: Final = 5000
+_MOST_ELEMENTS: Final = 200_000
 _MOST_TRIANGLES: Final = 10_000_000
+_MOST_MATERIALS: Final = 5000
+#: Of a texture, 8192 by 8192: decoded it has 256 MiB.
+_MOST_PIXELS: Final = 2**26
+
+MeanColor = Callable[[Path], Color | None]
 
 
 def read_surfaces(path: Path) -> tuple[Surface, ...]:
@@ -34,27 +44,33 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
     if why:
         raise ValueError(why)
     suffix = path.suffix.lower()
+    # A file can name one picture many times.
+    mean_color = cache(_mean_color)
     try:
         if suffix == ".dae":
-            surfaces = list(_Collada(content, path).surfaces())
+            surfaces = list(_Collada(content, path, mean_color).surfaces())
         elif suffix == ".obj":
-            surfaces = _wavefront(content.decode("utf-8", "replace"), path)
+            surfaces = _wavefront(content.decode("utf-8", "replace"), path.parent, mean_color)
         else:
             surfaces = [_by_coal(path)]
     except (LoadError, ArithmeticError, LookupError, TypeError) as error:
         raise ValueError(f"not readable: {error}") from None
     if not surfaces:
         raise ValueError("no triangles in it")
-    return tuple(
-        _joined([s for s in surfaces if s.color == color]) for color in dict.fromkeys(s.color for s in surfaces)
-    )
+    colors: dict[Color | None, list[Surface]] = {}
+    for surface in surfaces:
+        colors.setdefault(surface.color, []).append(surface)
+    return tuple(map(_joined, colors.values()))
 
 
 def _joined(surfaces: list[Surface]) -> Surface:
     """Return surfaces of one colour as one."""
     firsts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
     triangles = [s.triangles + first for s, first in zip(surfaces, firsts, strict=False)]
-    return Surface(np.concatenate([s.vertices for s in surfaces]), np.concatenate(triangles), surfaces[0].color)
+    vertices = np.concatenate([s.vertices for s in surfaces])
+    if not np.isfinite(vertices).all():
+        raise ValueError("vertices that are not finite numbers")
+    return Surface(vertices, np.concatenate(triangles), surfaces[0].color)
 
 
 def _by_coal(path: Path) -> Surface:
@@ -74,12 +90,13 @@ def _by_coal(path: Path) -> Surface:
 # Wavefront OBJ (Alias 1993, Object Files)
 
 
-def _wavefront(text: str, path: Path) -> list[Surface]:
+def _wavefront(text: str, folder: Path, mean_color: MeanColor) -> list[Surface]:
     points: list[list[float]] = []
     faces: dict[str, list[tuple[int, int, int]]] = {}
-    colors: dict[str, Color] = {}
+    libraries: list[str] = []
     own = faces.setdefault("", [])
-    for line in text.splitlines():
+    # A line goes on after a backslash.
+    for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
         kind, _, rest = line.strip().partition(" ")
         if kind == "v":
             points.append([float(x) for x in rest.split()[:3]])
@@ -90,25 +107,37 @@ def _wavefront(text: str, path: Path) -> list[Surface]:
         elif kind == "usemtl":
             own = faces.setdefault(rest.strip(), [])
         elif kind == "mtllib":
-            colors |= _materials(path.parent / Path(rest.strip()).name)
+            libraries.append(Path(rest.strip()).name)
     if any(len(p) != 3 for p in points):
         raise ValueError("a vertex without three coordinates")
-    return [cleaned(points, triangles, colors.get(name)) for name, triangles in faces.items() if triangles]
+    if max(len(faces), len(libraries)) > _MOST_MATERIALS:
+        raise ValueError(f"more than {_MOST_MATERIALS} materials")
+    colors: dict[str, Color | None] = {}
+    for library in dict.fromkeys(libraries):
+        colors |= _materials(folder / library, mean_color)
+    V = np.array(points)
+    return [cleaned(V, triangles, colors.get(name)) for name, triangles in faces.items() if triangles]
 
 
-def _materials(path: Path) -> dict[str, Color]:
+def _materials(path: Path, mean_color: MeanColor) -> dict[str, Color | None]:
     content, _ = read_mesh(path)
-    out: dict[str, Color] = {}
+    out: dict[str, Color | None] = {}
     name = ""
     for line in content.decode("utf-8", "replace").splitlines():
         kind, *words = line.split() or [""]
         if kind == "newmtl":
             name = " ".join(words)
         elif kind == "Kd" and len(words) >= 3 and name not in out:
-            out[name] = (*(float(w) for w in words[:3]), 1.0)  # type: ignore[assignment]
-        elif kind == "map_Kd" and (mean := _mean_color(path.parent / Path(words[-1]).name)):
+            out[name] = _rgb(words)
+        elif kind == "map_Kd" and words and (mean := mean_color(path.parent / Path(words[-1]).name)):
             out[name] = mean
     return out
+
+
+def _rgb(words: Sequence[str]) -> Color | None:
+    """Return a colour, or None where its numbers are not finite."""
+    r, g, b = (float(w) for w in words[:3])
+    return (r, g, b, 1.0) if math.isfinite(r + g + b) else None
 
 
 def _mean_color(image: Path) -> Color | None:
@@ -117,12 +146,15 @@ def _mean_color(image: Path) -> Color | None:
     try:
         from PIL import Image
 
-        with Image.open(image) as picture:
+        # A pipe is not opened, and a picture is decoded only if it fits.
+        with Image.open(io.BytesIO(content)) as picture:
+            if math.prod(picture.size) > _MOST_PIXELS:
+                return None
             r, g, b = np.asarray(picture.convert("RGB").resize((16, 16))).reshape(-1, 3).mean(axis=0) / 255
     except Exception:
         # Any: a texture is not worth an error.
         return None
-    return (float(r), float(g), float(b), 1.0) if content else None
+    return (float(r), float(g), float(b), 1.0)
 
 
 # COLLADA (Barnes and Finch 2008, COLLADA Digital Asset Schema 1.4.1)
@@ -131,28 +163,28 @@ def _mean_color(image: Path) -> Color | None:
 class _Collada:
     """The triangles below the nodes of a file, in metres; like RViz and Assimp in coal, it ignores which way is up."""
 
-    def __init__(self, content: bytes, path: Path) -> None:
-        self.folder = path.parent
+    def __init__(self, content: bytes, path: Path, mean_color: MeanColor) -> None:
+        self.folder, self.mean_color = path.parent, mean_color
         self.root = xml_reader.parse(content, path.name)
         self.by_id = {e.attributes["id"]: e for e in self.root.walk() if "id" in e.attributes}
         units = [u for asset in self.root.all("asset") for u in asset.all("unit")]
         self.unit = float(units[0].attributes.get("meter", 1)) if units else 1.0
-        self.colors: dict[str, Color | None] = {}
-        self.nodes = self.count = 0
+        # A file can use one geometry and one effect many times.
+        self.geometry, self.diffuse = cache(self._geometry), cache(self._diffuse)
+        self.elements = self.count = 0
 
     def surfaces(self) -> Iterator[Surface]:
-        for library in self.root.all("library_visual_scenes"):
-            for scene in library.all("visual_scene"):
-                for node in scene.all("node"):
-                    yield from self._below(node, self.unit * np.eye(4), 0)
+        for scene in (e for library in self.root.all("library_visual_scenes") for e in library.all("visual_scene")):
+            for node in scene.all("node"):
+                yield from self._below(node, self.unit * np.eye(4), 0)
 
     def _target(self, url: str) -> Element | None:
         return self.by_id.get(url.removeprefix("#"))
 
     def _below(self, node: Element, above: Array, depth: int) -> Iterator[Surface]:
-        self.nodes += 1
-        if depth > _DEEPEST or self.nodes > _MOST:
-            raise ValueError(f"more than {_MOST} nodes, or nested more than {_DEEPEST} deep")
+        self.elements += sum(1 for _ in node.walk())
+        if depth > _DEEPEST or self.elements > _MOST_ELEMENTS:
+            raise ValueError(f"nodes nested more than {_DEEPEST} deep, or more than {_MOST_ELEMENTS} elements in them")
         X = above
         for child in node.children:
             if child.tag in ("matrix", "translate", "rotate", "scale"):
@@ -164,28 +196,25 @@ class _Collada:
             elif child.tag == "instance_node" and target:
                 yield from self._below(target, X, depth + 1)
             elif child.tag == "instance_geometry" and target:
-                bound = {
-                    e.attributes.get("symbol", ""): e.attributes.get("target", "")
-                    for e in child.walk()
-                    if e.tag == "instance_material"
-                }
-                yield from self._geometry(target, X, bound)
+                materials = (e.attributes for e in child.walk() if e.tag == "instance_material")
+                bound = {m.get("symbol", ""): m.get("target", "") for m in materials}
+                for symbol, s in self.geometry(target):
+                    self.count += len(s.triangles)
+                    if self.count > _MOST_TRIANGLES:
+                        raise ValueError(f"more than {_MOST_TRIANGLES} triangles")
+                    V = s.vertices @ X[:3, :3].T + X[:3, 3]
+                    yield Surface(V, s.triangles, self._color(bound.get(symbol, symbol)))
 
-    def _geometry(self, geometry: Element, X: Array, bound: dict[str, str]) -> Iterator[Surface]:
-        for mesh in geometry.all("mesh"):
-            for part in mesh.children:
-                if part.tag not in ("triangles", "polylist", "polygons"):
-                    continue
-                stride = 1 + max((int(i.attributes.get("offset", 0)) for i in part.all("input")), default=0)
-                start, positions = self._positions(part)
-                triangles = _triangles(part, stride)[:, start::stride] if positions.size else np.empty((0, 3), int)
-                self.count += len(triangles)
-                if self.count > _MOST_TRIANGLES:
-                    raise ValueError(f"more than {_MOST_TRIANGLES} triangles")
-                if len(triangles):
-                    symbol = part.attributes.get("material", "")
-                    V = positions @ X[:3, :3].T + X[:3, 3]
-                    yield cleaned(V, triangles, self._color(bound.get(symbol, symbol)))
+    def _geometry(self, geometry: Element) -> list[tuple[str, Surface]]:
+        """Return the surfaces of a geometry, in its own axes, with the names of their materials."""
+        found = (e for mesh in geometry.all("mesh") for e in mesh.children)
+        parts = [(e, self._part(e)) for e in found if e.tag in ("triangles", "polylist", "polygons")]
+        return [(e.attributes.get("material", ""), s) for e, s in parts if s]
+
+    def _part(self, part: Element) -> Surface | None:
+        at, positions = self._positions(part)
+        triangles = _triangles(part, at) if positions.size else ()
+        return cleaned(positions, triangles) if len(triangles) else None
 
     def _positions(self, part: Element) -> tuple[int, Array]:
         for given in part.all("input"):
@@ -199,20 +228,17 @@ class _Collada:
         return 0, np.empty((0, 3))
 
     def _color(self, material: str) -> Color | None:
-        if material not in self.colors:
-            self.colors[material] = self._diffuse(material)
-        return self.colors[material]
-
-    def _diffuse(self, material: str) -> Color | None:
         found = self._target(material)
         instance = found.first("instance_effect") if found else None
         effect = self._target(instance.attributes.get("url", "")) if instance else None
-        diffuse = next((e for e in effect.walk() if e.tag == "diffuse"), None) if effect else None
-        if effect is None or diffuse is None:
+        return self.diffuse(effect) if effect else None
+
+    def _diffuse(self, effect: Element) -> Color | None:
+        diffuse = next((e for e in effect.walk() if e.tag == "diffuse"), None)
+        if diffuse is None:
             return None
         if color := diffuse.first("color"):
-            r, g, b, *_ = (float(x) for x in color.text.split())
-            return (r, g, b, 1.0)
+            return _rgb(color.text.split())
         # A texture names a sampler, which names a surface, which names an image.
         name = next((t.attributes.get("texture", "") for t in diffuse.all("texture")), "")
         parameters = {e.attributes.get("sid", ""): e for e in effect.walk() if e.tag == "newparam"}
@@ -221,11 +247,16 @@ class _Collada:
                 name = next((e.text.strip() for e in parameters[name].walk() if e.tag == tag), "")
         image = self._target(name)
         file = next((e.text.strip() for e in image.walk() if e.tag == "init_from"), "") if image else ""
-        return _mean_color(self.folder / file) if file and ":" not in file and not file.startswith("/") else None
+        return self.mean_color(self.folder / file) if file and ":" not in file and not file.startswith("/") else None
 
 
 def _numbers(text: str, kind: type) -> np.ndarray:
-    return np.array(text.split(), dtype=kind)
+    try:
+        # Of a blank text it would make a number.
+        return np.fromstring(text.strip(), dtype=kind, sep=" ")
+    except ValueError:
+        # Slower, but its error names the word.
+        return np.array(text.split(), dtype=kind)
 
 
 def _transform(element: Element) -> Array:
@@ -241,21 +272,22 @@ def _transform(element: Element) -> Array:
     return X
 
 
-def _triangles(part: Element, stride: int) -> Indices:
-    """Return the entries of <p> of each triangle's three corners, (m, 3 stride); polygons become fans."""
-    lists = [_numbers(p.text, int).reshape(-1, stride) for p in part.all("p")]
-    if part.tag == "triangles" or not lists:
-        return np.concatenate(lists).reshape(-1, 3 * stride) if lists else np.empty((0, 3 * stride), int)
-    entries = np.concatenate(lists)
+def _triangles(part: Element, at: int) -> Indices:
+    """Return the vertices of triangles, entry `at` of each corner in <p>; polygons become fans."""
+    stride = 1 + max((int(i.attributes.get("offset", 0)) for i in part.all("input")), default=0)
+    lists = [_numbers(p.text, int).reshape(-1, stride)[:, at] for p in part.all("p")]
+    corners: Indices = np.concatenate([np.empty(0, int), *lists])
+    if part.tag == "triangles":
+        return corners.reshape(-1, 3)
     vcount = part.first("vcount")
-    counts = np.array([len(x) for x in lists]) if vcount is None else _numbers(vcount.text, int)
-    if counts.size and (counts.min() < 0 or counts.sum() > len(entries)):
+    counts = np.array([len(x) for x in lists], int) if vcount is None else _numbers(vcount.text, int)
+    if counts.min(initial=0) < 0 or max(counts.max(initial=0), counts.sum()) > len(corners):
         raise ValueError("more corners than there are in <p>")
     starts = np.cumsum(counts) - counts
     fans = np.maximum(counts - 2, 0)
     first = np.repeat(starts, fans)
     k = np.arange(fans.sum()) - np.repeat(np.cumsum(fans) - fans, fans) + 1
-    return np.concatenate([entries[first], entries[first + k], entries[first + k + 1]], axis=1)
+    return np.stack([corners[first], corners[first + k], corners[first + k + 1]], axis=1)
 
 
 def file_of(reference: str, description: Path, folders: list[Path]) -> Path | None:

@@ -112,7 +112,7 @@ def _clustered(surface: Surface, cell: float) -> Surface:
 def cleaned(vertices: Any, triangles: Any, color: Color | None = None) -> Surface:
     """Return a surface without degenerate or repeated triangles and unused vertices; `ValueError` if none is left."""
     V, T = np.asarray(vertices, dtype=np.float64).reshape(-1, 3), np.asarray(triangles, dtype=np.int64).reshape(-1, 3)
-    if not len(T) or T.min() < 0 or T.max() >= len(V) or not np.isfinite(V).all():
+    if not len(T) or T.min() < 0 or T.max() >= len(V):
         raise ValueError("no triangles, or some with vertices that are not there")
     kept = T[(T[:, 0] != T[:, 1]) & (T[:, 1] != T[:, 2]) & (T[:, 2] != T[:, 0])]
     if len(kept):
@@ -121,4 +121,6 @@ def cleaned(vertices: Any, triangles: Any, color: Color | None = None) -> Surfac
     if not len(kept):
         raise ValueError("all triangles are points or lines")
     used, own = np.unique(kept, return_inverse=True)
+    if not np.isfinite(V[used]).all():
+        raise ValueError("vertices that are not finite numbers")
     return Surface(V[used], own.reshape(-1, 3), color)
