@@ -177,6 +177,10 @@ def test_fewer_triangles_keep_the_extent() -> None:
     for before, after in zip(many, coarse, strict=True):
         gap = np.linalg.norm(before.vertices[:, None] - after.vertices, axis=2).min(axis=1)
         assert gap.max() < 0.35 * np.ptp(before.vertices, axis=0).max()
+    # Links that touch are drawn so.
+    few = thinned(many, 300)[0]
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(few.vertices, axis=0), end(fine.vertices, axis=0), atol=4 * EPS)
 
 
 def test_meshes_have_units_places_and_colours(tmp_path: Path) -> None:

@@ -94,14 +94,17 @@ def thinned(surfaces: Sequence[Surface], most: int) -> list[Surface]:
 
 
 def _clustered(surface: Surface, cell: float) -> Surface:
-    low = surface.vertices.min(axis=0)
+    low, extent = surface.vertices.min(axis=0), np.ptp(surface.vertices, axis=0)
     # A small part stays a solid.
-    cell = min(cell, float(np.ptp(surface.vertices, axis=0).max()) / _CELLS)
+    cell = min(cell, float(extent.max()) / _CELLS)
     cells = np.floor((surface.vertices - low) / cell).astype(np.int64)
     sizes = cells.max(axis=0) + 1
     keys = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
     _, which, counts = np.unique(keys, return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(which, x) for x in surface.vertices.T], axis=1) / counts[:, None]
+    # Means lie inside; without the whole extent links that touch would be drawn apart.
+    own = np.ptp(mean, axis=0)
+    mean = low + (mean - mean.min(axis=0)) * np.divide(extent, own, out=np.ones(3), where=own > 0)
     try:
         return cleaned(mean, which[surface.triangles], surface.color)
     except ValueError:
