@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     from mbkit.model import Model as Model
     from mbkit.model import ModelBuilder as ModelBuilder
     from mbkit.model import Parameter as Parameter
+    from mbkit.model.changes.freeing import scale as scale
+    from mbkit.model.changes.joining import join as join
+    from mbkit.model.changes.variants import variants as variants
     from mbkit.show import show as show
     from mbkit.simulate import Trajectory as Trajectory
     from mbkit.simulate import sensitivities as sensitivities
@@ -74,11 +77,14 @@ _HOME = {
     "excitation": "mbkit.identify",
     "explain": "mbkit.studies.explain",
     "identify": "mbkit.identify",
+    "join": "mbkit.model.changes.joining",
     "load": "mbkit.load",
     "operational_space": "mbkit.engines.operational_space",
     "robots": "mbkit.load",
+    "scale": "mbkit.model.changes.freeing",
     "sensitivities": "mbkit.simulate",
     "stress": "mbkit.studies",
+    "variants": "mbkit.model.changes.variants",
     "versions": "mbkit.studies.versions",
     "work_precision": "mbkit.studies",
 }

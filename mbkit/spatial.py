@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mbkit._check import Array, finite_array
 from mbkit.errors import InputError
@@ -29,6 +30,7 @@ __all__ = [
     "matrix_from_rpy",
     "multiply",
     "normalized",
+    "pose",
     "pose_error",
     "quaternion_from_matrix",
     "rotate",
@@ -255,6 +257,30 @@ def log_se3(p: Array, quaternion: Array) -> Array:
     """
     w = log_quaternion(quaternion)
     return np.concatenate([np.einsum("...ij,...j->...i", left_jacobian_inverse(w), p), w], axis=-1)
+
+
+def pose(translation: ArrayLike = (0.0, 0.0, 0.0), *, rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+    """Return the homogeneous matrix, (4, 4), of a translation in m and of URDF's roll, pitch, yaw in rad.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> mb.spatial.pose((0, 0, 0.5))[:, 3]
+    array([0. , 0. , 0.5, 1. ])
+    """
+    X = np.eye(4)
+    X[:3, :3] = matrix_from_rpy(*finite_array("rpy", rpy, (3,)))
+    X[:3, 3] = finite_array("translation", translation, (3,))
+    return X
+
+
+def checked_pose(name: str, X: ArrayLike) -> Array:
+    """Return a homogeneous matrix, (4, 4), or raise `InputError` for another one."""
+    out = finite_array(name, X, (4, 4))
+    R = out[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0 or (out[3] != [0.0, 0.0, 0.0, 1.0]).any():
+        raise InputError(f"{name}: expected a homogeneous matrix, R and p with the row 0 0 0 1 below, got another one")
+    return out
 
 
 @_takes((4, 4), (4, 4))

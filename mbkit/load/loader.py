@@ -24,6 +24,7 @@ from mbkit.load import xml_reader
 from mbkit.load.added_loops import Loops, add_loops
 from mbkit.load.urdf_reader import examine
 from mbkit.model import Model
+from mbkit.model.changes.joining import mounted
 from mbkit.model.validation import scale_doubts
 
 # `Path` drops one of the two slashes.
@@ -77,6 +78,7 @@ def load(
     meshes: Literal["auto", "never"] = "auto",
     loops: bool | Loops = True,
     actuators: bool = False,
+    mount: ArrayLike | None = None,
 ) -> Model:
     """Load a robot by name, or a URDF or MJCF file.
 
@@ -113,6 +115,9 @@ def load(
         force of the drives, so that ``inverse_dynamics`` at rest is gravity. With True a position servo becomes a
         spring of stiffness `kp` about zero and a damper `kv`, as MuJoCo computes at ``ctrl = 0``. Their rotors'
         inertia acts in both cases.
+    mount : (4, 4) array_like, optional
+        Where the robot's ground stands in the world, as a homogeneous matrix: a ceiling, a wall or a tilted base.
+        `mbkit.spatial.pose` makes one. For a fixed base; q places a floating one.
 
     Returns
     -------
@@ -178,6 +183,8 @@ def load(
         raise xml_reader.unknown_root(path, root)
     if added is not None:
         model = add_loops(model, added)
+    if mount is not None:
+        model = mounted(model, mount)
     doubts = scale_doubts(model)
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)

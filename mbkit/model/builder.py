@@ -16,6 +16,8 @@ from mbkit._check import Array, _as_float, finite_array, real, shown
 from mbkit._reproducible import length
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
 from mbkit.model.elements.declare import ElementBuilder
+from mbkit.model.elements.editing import NUMBERS_OF_JOINTS, EditingBuilder
+from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.loops import LOOP_KINDS, LoopKind
 from mbkit.model.model import Model, unchecked
@@ -246,12 +248,7 @@ def shape_of(value: Any) -> tuple[int, ...] | None:
         return None
 
 
-#: Kinds of parts, as a description names them.
-_OF_TREES: Final = ("bodies", "joints", "frames")
-_CONNECTING: Final = ("springs", "couplings", "loops", "couplers", "prescribed", "forces", "no_slip")
-
-
-class ModelBuilder(ElementBuilder):
+class ModelBuilder(ElementBuilder, EditingBuilder):
     """Collects bodies, joints and forces, and builds a frozen `Model` of them.
 
     A faulty call is remembered and not raised: `build` reports all faults in one `ModelError`. Parts may be declared
@@ -280,8 +277,11 @@ class ModelBuilder(ElementBuilder):
         self._name = self._read.name("name", name)
         self._bindings: list[Binding] = []
         self._gravity = self._numbers("gravity", "", gravity=self._read.quantities("gravity", gravity, 3))["gravity"]
-        self._parts: dict[str, list[Any]] = {kind: [] for kind in (*_OF_TREES, *_CONNECTING)}
+        self._parts: dict[str, list[Any]] = {kind: [] for kind in KINDS_OF_PARTS}
         self._notes: list[str] = []
+        #: Of a model that is edited: bodies that were used as written, and where its shapes are.
+        self._odd: dict[str, str] = {}
+        self._sources: list[tuple[str, str]] = []
 
     def add_body(
         self,
@@ -366,23 +366,35 @@ class ModelBuilder(ElementBuilder):
             kind, axis, axis2, pitch, mimic = FIXED.name, None, None, 0.0, None
             lower = upper = velocity_limit = effort_limit = None
             armature = damping = friction = stiffness = rest = 0.0
-        type_ = kind_of(kind)
-        follows = None if mimic is None else read.mimic(item, mimic)
-        per_velocity = {"armature": armature, "damping": damping, "stiffness": stiffness, "rest": rest}
-        ready = {
-            "kind": kind,
-            "rotation": read.orientation(item, rotation, rpy),
-            "axes": read.axes(item, type_, axis, axis2),
-            "lower": read.limits(f"{item}: lower", lower, type_.nq, -np.inf),
-            "upper": read.limits(f"{item}: upper", upper, type_.nq, np.inf),
-            "velocity_limit": read.limits(f"{item}: velocity_limit", velocity_limit, type_.nv, np.inf),
-            "effort_limit": read.limits(f"{item}: effort_limit", effort_limit, type_.nv, np.inf),
-            "friction": read.array(f"{item}: friction", friction, (type_.nv,), each=True),
-            "mimic": follows and Mimic(follows[0], **self._numbers("joints", name, **follows[1])),
-            **{n: read.quantities(f"{item}: {n}", x, type_.nv, each=True) for n, x in per_velocity.items()},
-        }
+        limits = lower, upper, velocity_limit, effort_limit
+        numbers = armature, damping, friction, stiffness, rest
+        given: dict[str, Any] = dict(zip(NUMBERS_OF_JOINTS, (*limits, *numbers), strict=True))
+        given |= {"axes": (axis, axis2)} | ({} if mimic is None else {"mimic": mimic})
+        turn = {"kind": kind, "rotation": read.orientation(item, rotation, rpy)}
+        ready = turn | self._joint_fields(name, kind_of(kind), given)
+        if (follows := ready.pop("mimic", None)) is not None:
+            ready["mimic"] = Mimic(follows[0], **self._numbers("joints", name, **follows[1]))
         values = {"parent": parent, "child": child, "translation": translation, "pitch": pitch}
         self._add(Joint, "joints", "joint", name, values, ready)
+
+    def _joint_fields(self, name: str, type_: JointType, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what a joint's arguments say, by field; of a mimic the leader, and ratio and offset."""
+        read, out = self._read, {}
+        for field, x in given.items():
+            item = f"joint {name!r}: {field}"
+            if field == "axes":
+                out[field] = read.axes(f"joint {name!r}", type_, *x)
+            elif field in ("lower", "upper"):
+                out[field] = read.limits(item, x, type_.nq, -np.inf if field == "lower" else np.inf)
+            elif field.endswith("_limit"):
+                out[field] = read.limits(item, x, type_.nv, np.inf)
+            elif field == "friction":
+                out[field] = read.array(item, x, (type_.nv,), each=True)
+            elif field != "mimic":
+                out[field] = read.quantities(item, x, type_.nv, each=True)
+            elif (follows := read.mimic(f"joint {name!r}", x)) is not None:
+                out[field] = follows
+        return out
 
     def add_frame(
         self,
@@ -662,24 +674,26 @@ class ModelBuilder(ElementBuilder):
             # Mimic joints without leaders, and joints that move nothing, are for a connected tree only.
             model = self._assemble(*_resolve(joints, self._bindings))
             inconsistent = suspects(model, point_masses=point_masses)
+        # What a model was used with already stays used.
+        known = {n for n, why in inconsistent if self._odd.get(n) == why}
         negative = {b.name for b in bodies if b.mass < 0}
         static = static_bodies(joints) - negative
         idle = fault_sentences([(n, why) for n, why in inconsistent if n in static], parts)
         inconsistent = tuple((n, why) for n, why in inconsistent if n not in static)
-        if nonphysical == "error" and (refused := [(n, why) for n, why in inconsistent if n not in negative]):
+        if nonphysical == "error" and (refused := [(n, why) for n, why in inconsistent if n not in negative | known]):
             faults += fault_sentences(refused, parts)
             faults[-1] += '; correct it, or take it as written with nonphysical="warn"'
         faults += fault_sentences([(n, why) for n, why in inconsistent if n in negative], parts)
         if faults:
             raise ModelError(self._name, faults)
-        if inconsistent:
-            impossible = "; ".join(fault_sentences(inconsistent, parts))
+        if new := [(n, why) for n, why in inconsistent if n not in known]:
+            impossible = "; ".join(fault_sentences(new, parts))
             message = f"{self._name}: physically impossible, used as written: {impossible}"
             warnings.warn(message, NonPhysicalWarning, stacklevel=2)
-        notes = (*model.notes, *(f"never moves, so this cannot act: {text}" for text in idle))
+        notes = dict.fromkeys((*model.notes, *(f"never moves, so this cannot act: {text}" for text in idle)))
         # Tables of motions need not begin at time 0.
         with unchecked():
-            return replace(model, notes=notes, nonphysical=inconsistent, time=float(np.clip(0.0, *model.interval)))
+            return replace(model, notes=(*notes,), nonphysical=inconsistent, time=float(np.clip(0.0, *model.interval)))
 
     def _add(
         self,
@@ -692,9 +706,14 @@ class ModelBuilder(ElementBuilder):
     ) -> None:
         """Read a part's fields by `_READERS`, keep the bindings of its expressions, and add it."""
         name = self._read.name(f"{what} name", name)
-        fields = {n: _READERS[n](self._read, f"{what} {name!r}: {n}", x) for n, x in values.items()}
-        numbers = self._numbers(where, name, **fields, **ready)
+        numbers = self._numbers(where, name, **self._read_fields(f"{what} {name!r}", values), **ready)
         self._parts[where].append(part(name, **numbers))
+
+    def _read_fields(self, item: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {n: _READERS[n](self._read, f"{item}: {n}", x) for n, x in values.items()}
+
+    def _holding(self) -> Model:
+        return self._assemble(self._parts["joints"], self._bindings)
 
     def _numbers(self, where: str, part: str, **fields: Any) -> dict[str, Any]:
         """Return a part's fields as floats, and remember which of them stand for expressions."""
@@ -715,7 +734,12 @@ class ModelBuilder(ElementBuilder):
         # `build` tells all faults at once.
         with unchecked():
             return Model(
-                name=self._name, gravity=self._gravity, notes=tuple(self._notes), bindings=tuple(bindings), **parts
+                name=self._name,
+                gravity=self._gravity,
+                notes=tuple(self._notes),
+                bindings=tuple(bindings),
+                drawn_from=tuple(self._sources),
+                **parts,
             )
 
 

@@ -256,6 +256,12 @@ class Description:
         At which motions prescribed in time are taken, s; neither does it count.
     forces : tuple of JointForce, FrameForce, Bushing or GravityCompensation
         Given by functions of the time and the state, and what holds the weight of bodies.
+    drawn_from : tuple of (str, str)
+        Of a model that was edited, locked or joined: files with shapes to draw, each with the prefix of the names of
+        its bodies. No file describes such a model, and its `source` is empty.
+    locked : tuple of (str, tuple of float, int)
+        Joints that `lock` fixed, their coordinates, and how many velocities each had. Neither of both counts for
+        equality.
     """
 
     name: str
@@ -275,6 +281,8 @@ class Description:
     couplers: tuple[Coupler, ...] = ()
     forces: tuple[Force, ...] = ()
     no_slip: tuple[NoSlip, ...] = ()
+    drawn_from: tuple[tuple[str, str], ...] = ()
+    locked: tuple[tuple[str, tuple[float, ...], int], ...] = ()
     layout: Layout = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -293,6 +301,11 @@ class Description:
 
     def __hash__(self) -> int:
         return hash(self.digest)
+
+    @property
+    def sources(self) -> tuple[tuple[str, str], ...]:
+        """Files with shapes to draw, each with the prefix of the names of its bodies."""
+        return (("", self.source),) if self.source else self.drawn_from
 
     # Sizes and names
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
@@ -291,6 +291,92 @@ class Model(Description):
             model = model._without(feature)
         return model
 
+    def lock(self, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike | None = None) -> Model:
+        """Return the model with some joints fixed: its terms are those of this one with these velocities zero.
+
+        Bodies and frames stay, and what they carry. What follows a locked joint is locked with it: joints that mimic
+        it, and those that a coupler ties to it. A loop stays, unless nothing moves its ends any more. `full_state` and
+        `reduced_state` bring q and v from one model to the other.
+
+        Parameters
+        ----------
+        joints : mapping of str to float or array_like, or sequence of str
+            Joints and their coordinates, in rad and m; or names, with the coordinates in `q`.
+        q : (nq,) array_like, optional
+            A whole configuration; by default the neutral one.
+
+        Raises
+        ------
+        UnknownNameError
+            No joint of this name.
+        InputError
+            A joint without a coordinate of its own, a value beyond limits, a loop or a coupler that is open at these
+            values, a prescribed motion, and others that the message names.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> robot = mb.load("panda")
+        >>> arm = robot.lock({"panda_finger_joint1": 0.02})
+        >>> arm.nv, float(arm.full_state(arm.neutral())[0][-1])
+        (7, 0.02)
+        """
+        locked: Model = _changes("locking").lock(self, joints, q)
+        return locked
+
+    def full_state(self, q: ArrayLike, v: ArrayLike | None = None) -> tuple[Array, Array]:
+        """Return q and v of the model that was locked, from those of this one; locked joints have their values.
+
+        Parameters
+        ----------
+        q : (nq,) or (N, nq) array_like
+        v : (nv,) or (N, nv) array_like, optional
+            Or an acceleration; zero without.
+        """
+        full: tuple[Array, Array] = _changes("locking").full_state(self, q, v)
+        return full
+
+    def reduced_state(self, q: ArrayLike, v: ArrayLike | None = None) -> tuple[Array, Array]:
+        """Return this model's q and v, from those of the model that was locked.
+
+        Parameters
+        ----------
+        q, v : arrays
+            Of the model before `lock`, one state or a batch. Numbers of locked joints are left out.
+        """
+        reduced: tuple[Array, Array] = _changes("locking").reduced_state(self, q, v)
+        return reduced
+
+    def with_free(self, *paths: Any) -> Model:
+        """Return the same model with numbers that are parameters, by path, for `Dynamics.at` and batches of variants.
+
+        Parameters
+        ----------
+        *paths : str or Scale
+            ``"body.mass"``, ``"body.com"``, ``"body.inertia"``, ``"joint.damping"``, ``"joint.armature"`` and other
+            numbers that `set_body`, `set_joint` and the like change; ``"gravity"``; wildcards such as ``"*.damping"``.
+            Each number becomes a parameter of its path's name with its present value; of a vector each component, as
+            ``"body.com.x"``. A wildcard leaves out what is zero, and bodies that never move. `mbkit.scale` makes one
+            factor of many numbers.
+
+        Raises
+        ------
+        InputError
+            A path that fits nothing, or a link that was merged with a body, which the message names.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> robot = mb.load("ur5").with_free("wrist_3_link.mass", mb.scale("*.inertia"))
+        >>> dict(robot.parameters)
+        {'wrist_3_link.mass': 0.1879, 'scale(*.inertia)': 1.0}
+        >>> dyn = mb.dynamics(robot, "lagrangian").at(**{"wrist_3_link.mass": [0.2, 0.4, 0.8]})
+        >>> dyn.gravity([0.0] * 6).shape
+        (3, 6)
+        """
+        free: Model = _changes("freeing").with_free(self, paths)
+        return free
+
     def with_parameters(self, /, **values: float) -> Model:
         """Return the same description with plain numbers, by name, for some or all parameters; the time stays one.
 
@@ -380,6 +466,11 @@ class Model(Description):
             f"{self._mass_text()}{self._servos_text()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
+
+
+def _changes(name: str) -> Any:
+    # By name: what changes a model makes one, and stands a floor above.
+    return import_module(f"mbkit.model.changes.{name}")
 
 
 def _states_of(model: Model) -> Any:

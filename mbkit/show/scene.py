@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -71,8 +70,8 @@ def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
     require_bodies(model)
     found = Visuals()
     try:
-        for which in () if kind == "sticks" or not model.source else (kind, *(s for s in SHAPES[:2] if s != kind)):
-            found = read_visuals(model, Path(model.source), which)
+        for which in () if kind == "sticks" or not model.sources else (kind, *(s for s in SHAPES[:2] if s != kind)):
+            found = read_visuals(model, which)
             # A few contact shapes are no picture of a robot.
             few = which != kind and 2 * len({s.body for s in found.shapes}) < len(model.bodies)
             if (found.shapes and not few) or found.missing:
@@ -80,7 +79,10 @@ def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
             found = Visuals()
     except LoadError as error:
         warn(f"{model.name}: its shapes are not read, and it is drawn as capsules and boxes: {error}", MbkitWarning)
-    bodies = {frame.body for name in found.missing if name != "world" for frame in [model.frame(name)]}
+    bodies = {model.frame(name).body for name in found.missing if name != "world"}
+    if found.shapes and model.drawn_from:
+        # Of what was added to the robot there is no file.
+        bodies |= {body.name for body in model.bodies if body.mass} - {s.body for s in found.shapes}
     if found.missing:
         several = listing([f"{name} ({why})" for name, why in found.missing.items()], 3)
         warn(f"{model.name}: meshes that cannot be read are drawn as capsules and boxes: {several}", MbkitWarning)

@@ -6,7 +6,7 @@ import hashlib
 import os
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +20,7 @@ from mbkit.load.mjcf_attributes import Compiler, mesh_assets, mesh_name, read_me
 from mbkit.load.mjcf_reader import write_out_attached
 from mbkit.load.shapes import SIZES
 from mbkit.load.xml_reader import Element, Reader, element_text
-from mbkit.model import Model
+from mbkit.model import Frame, Model
 from mbkit.show.mesh_files import file_of, read_surfaces
 from mbkit.show.surfaces import Color, Surface, cleaned, solid
 
@@ -73,15 +73,34 @@ class Visuals:
     missing: dict[str, str] = field(default_factory=dict)
 
 
-def read_visuals(model: Model, source: Path, kind: str) -> Visuals:
-    """Return the "visual" or "collision" shapes of a file that describes the model; `LoadError` if it is unreadable."""
-    root = xml_reader.read(source)
-    if root.tag == "robot":
-        return _Urdf(model, source, root).visuals(kind)
-    return _mjcf(model, source, xml_reader.with_includes(root, source), kind)
+@dataclass(frozen=True)
+class _Bodies:
+    """The bodies of a model whose names begin with a prefix, such as those of one of several joined files."""
+
+    model: Model
+    prefix: str
+
+    def frame(self, name: str) -> Frame:
+        """Return a frame by its name in the file."""
+        return self.model.frame(name if name == "world" else self.prefix + name)
 
 
-def _place(model: Model, name: str) -> tuple[str, Array, Array] | None:
+def read_visuals(model: Model, kind: str) -> Visuals:
+    """Return the "visual" or "collision" shapes of the files of a model; `LoadError` if one is unreadable."""
+    out = Visuals()
+    for prefix, source in model.sources:
+        bodies, path = _Bodies(model, prefix), Path(source)
+        root = xml_reader.read(path)
+        if root.tag == "robot":
+            own = _Urdf(bodies, path, root).visuals(kind)
+        else:
+            own = _mjcf(bodies, path, xml_reader.with_includes(root, path), kind)
+        out.shapes += [replace(x, name=prefix + x.name) for x in own.shapes]
+        out.missing |= {name if name == "world" else prefix + name: why for name, why in own.missing.items()}
+    return out
+
+
+def _place(model: _Bodies, name: str) -> tuple[str, Array, Array] | None:
     """Return body, R and p of the frame of a link or body, or None where the model has none of that name."""
     try:
         frame = model.frame(name)
@@ -93,7 +112,7 @@ def _place(model: Model, name: str) -> tuple[str, Array, Array] | None:
 class _Urdf:
     """A URDF's <visual> and <collision> elements (ROS wiki, urdf/XML/link)."""
 
-    def __init__(self, model: Model, source: Path, robot: Element) -> None:
+    def __init__(self, model: _Bodies, source: Path, robot: Element) -> None:
         self.model, self.source, self.robot = model, source, robot
         folders = os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)
         folders += [f"{p}/share" for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
@@ -190,7 +209,7 @@ def _rgba(material: Element) -> Color | None:
 # MJCF, by MuJoCo's compiler: defaults, frames, materials, inline meshes and sizes that are fitted to meshes
 
 
-def _mjcf(model: Model, source: Path, mujoco: Element, kind: str) -> Visuals:
+def _mjcf(model: _Bodies, source: Path, mujoco: Element, kind: str) -> Visuals:
     out, assets = Visuals(), dict[str, bytes]()
     settings = Compiler.of(mujoco, Reader())
     write_out_attached(mujoco, source, settings, Reader())
@@ -249,7 +268,7 @@ def _compiled(text: str, assets: dict[str, bytes], source: Path) -> Any:
         mujoco.set_mju_user_warning(before)
 
 
-def _geoms(model: Model, compiled: Any, kind: str) -> Iterator[Shape]:
+def _geoms(model: _Bodies, compiled: Any, kind: str) -> Iterator[Shape]:
     meshes: dict[int, tuple[Surface, ...]] = {}
     for k in range(compiled.ngeom):
         geom = compiled.geom(k)

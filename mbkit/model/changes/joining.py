@@ -1,0 +1,147 @@
+"""Join two models into one, and mount a model on a tilted base."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit import spatial
+from mbkit._check import Array, shown
+from mbkit.errors import InputError
+from mbkit.model.builder import ModelBuilder, expect_model
+from mbkit.model.elements.references import KINDS_OF_PARTS, hung_on, renamed
+from mbkit.model.model import Model
+
+#: Kinds of parts that share one set of names each.
+_NAMED: Final = (("bodies", "frames"), *((kind,) for kind in KINDS_OF_PARTS if kind not in ("bodies", "frames")))
+#: Parts that may hang on the ground.
+_PLACED: Final = ("joints", "springs", "loops", "forces", "no_slip")
+
+
+def read_pose(name: str, pose: ArrayLike | None) -> tuple[Array, Array]:
+    """Return R and p of a homogeneous matrix, (4, 4); the identity for None."""
+    if pose is None:
+        return np.eye(3), np.zeros(3)
+    X = spatial.checked_pose(name, pose)
+    return X[:3, :3], X[:3, 3]
+
+
+def mounted(model: Model, pose: ArrayLike) -> Model:
+    """Return a model whose ground is turned and moved against the world, as on a ceiling or a tilted base.
+
+    Gravity and the world stay; what hangs on the ground moves by the pose, (4, 4).
+
+    Raises
+    ------
+    InputError
+        A pose that is none, and a free joint on the ground, which has no mount.
+    """
+    R, p = read_pose("mount", pose)
+    if floating := [j.name for j in model.joints if j.parent == "world" and j.type.floating]:
+        raise InputError(
+            f"mount: {model.name} floats on joint {floating[0]!r}; a mount is for a fixed base, and q places a free one"
+        )
+    bindings = list(model.bindings)
+    parts: dict[str, Any] = {
+        kind: tuple(hung_on(x, kind, "world", R, p, bindings) for x in getattr(model, kind)) for kind in _PLACED
+    }
+    note = f"mounted at {np.round(p, 6).tolist()} m, roll, pitch, yaw {_degrees(R)} degrees"
+    return replace(model, **parts, bindings=tuple(bindings), notes=(*model.notes, note))
+
+
+def _degrees(R: Array) -> list[float]:
+    return [round(float(x) + 0.0, 4) for x in np.degrees(spatial.rpy_from_matrix(R))]
+
+
+def join(
+    base: Model,
+    arm: Model,
+    *,
+    at: str,
+    pose: ArrayLike | None = None,
+    prefix: str = "",
+    name: str | None = None,
+) -> Model:
+    """Put one model on a frame of another: an arm on a cart, a hand on an arm, two arms on one body.
+
+    What hangs on the ground of `arm` hangs on the body of the frame instead. The world, gravity and the file of shapes
+    are those of `base`. Coordinates of `base` come first.
+
+    Parameters
+    ----------
+    base, arm : Model
+        Neither is changed. Parameters of the same name become one.
+    at : str
+        A frame or body of `base`, or ``"world"``.
+    pose : (4, 4) array_like, optional
+        Where the ground of `arm` stands in that frame, as a homogeneous matrix; `mbkit.spatial.pose` makes one.
+    prefix : str
+        Before the names of all parts of `arm`, such as ``"left_"``.
+    name : str, optional
+        Of the whole; by default that of `base`.
+
+    Returns
+    -------
+    Model
+
+    Raises
+    ------
+    InputError
+        Names that both have, an arm that floats, and a pose that is none.
+    UnknownNameError
+        No frame of this name.
+    ModelError
+        Parameters of the same name with two values.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> torso = mb.ModelBuilder("torso")
+    >>> torso.add_body("torso", mass=20.0, inertia=(1.0, 1.0, 0.5))
+    >>> torso.add_joint("float", "free", parent="world", child="torso")
+    >>> robot = torso.build()
+    >>> for side, y in (("left_", 0.2), ("right_", -0.2)):
+    ...     place = mb.spatial.pose((0, y, 0.3), rpy=(0, 1.57, 0))
+    ...     robot = mb.join(robot, mb.load("ur5"), at="torso", pose=place, prefix=side)
+    >>> robot.nv, robot.joint_names[1], robot.joint_names[7]
+    (18, 'left_shoulder_pan_joint', 'right_shoulder_pan_joint')
+    """
+    base, arm = expect_model(base, "base"), expect_model(arm, "arm")
+    if not isinstance(prefix, str):
+        raise InputError(f"prefix: expected text, got {shown(prefix)}")
+    for model in (base, arm):
+        model.require_bodies("join")
+    frame = base.frame(at)
+    R, p = read_pose("pose", pose)
+    if at != "world" and (floating := [j.name for j in arm.joints if j.parent == "world" and j.type.floating]):
+        raise InputError(
+            f"arm: {arm.name} floats on joint {floating[0]!r}, so that nothing would hold it at {at!r}; load it with "
+            "floating_base=False, or remove that joint"
+        )
+    parts, bindings = renamed(arm, prefix)
+    _require_other_names(base, parts, prefix)
+    R, p = frame.rotation @ R, frame.translation + frame.rotation @ p
+    b = ModelBuilder.of(base)
+    for kind in KINDS_OF_PARTS:
+        b._parts[kind] += [hung_on(x, kind, frame.body, R, p, bindings) for x in parts[kind]]
+    b._bindings += [x for x in bindings if x.where != "gravity"]
+    b._odd |= {prefix + body: why for body, why in arm.nonphysical}
+    b._name = base.name if name is None else b._read.name("name", name)
+    b._notes += [f"{prefix or arm.name}: {text}" for text in arm.notes]
+    b.note(f"joined: {arm.name} at {at!r}" + (f" with the prefix {prefix!r}" if prefix else ""))
+    b._sources += [(prefix + start, source) for start, source in arm.sources]
+    return b.build()
+
+
+def _require_other_names(base: Model, parts: dict[str, list[Any]], prefix: str) -> None:
+    for kinds in _NAMED:
+        there = {x.name for kind in kinds for x in getattr(base, kind)}
+        both = [x.name for kind in kinds for x in parts[kind] if x.name in there]
+        if both:
+            more = f" and {len(both) - 1} more" if len(both) > 1 else ""
+            raise InputError(
+                f"prefix: with {prefix!r} both models have {kinds[0]} of the name {both[0]!r}{more}; give another one"
+            )

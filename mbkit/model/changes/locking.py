@@ -1,0 +1,330 @@
+"""Lock joints: the reduced model has the rows and columns of M that are left, and the bias with these velocities zero.
+
+A locked joint is a fixed one with the placement that its coordinates give, so that bodies, frames and all that hangs on
+them stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, batch_of, finite_array, rows, shown
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.model.elements.forces import RATE, Force, GravityCompensation, JointForce, coordinate_arguments
+from mbkit.model.elements.formula import Formula, Operation
+from mbkit.model.elements.references import entries, moved_by, with_fields
+from mbkit.model.joint_types import FIXED
+from mbkit.model.loops import LOOP_ROWS, LoopEnds
+from mbkit.model.model import Model
+from mbkit.model.parameters import Binding
+from mbkit.model.parts import Joint, JointCoupling, Loop
+from mbkit.model.poses import body_poses
+
+#: Of limits and of what is closed: digits of a typed number.
+_TYPED: Final = 1e-8
+#: Numbers of a joint that a fixed one has none of.
+_OF_MOTION: Final = ("pitch", "armature", "damping", "stiffness", "rest", "ratio", "offset")
+
+#: Coordinates of the locked joints by name, of those that follow too.
+Values = dict[str, Array]
+
+
+def lock(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike | None) -> Model:
+    """Return a model with joints fixed, as `Model.lock` says."""
+    model.require_bodies("lock")
+    given = _given(model, joints, q)
+    values = _with_followers(model, given)
+    _refuse_driven(model, values)
+    bindings, notes = list(model.bindings), []
+    parts: dict[str, Any] = {"joints": tuple(_fixed(j, values, bindings) for j in model.joints)}
+    parts["couplers"] = tuple(x for x in model.couplers if x.joint not in values)
+    couplings = [_shortened(x, values, bindings) for x in model.couplings]
+    parts["couplings"] = tuple(x for x in couplings if x is not None)
+    parts["forces"] = tuple(x for force in model.forces for x in _acting(model, force, values))
+    for kind in ("couplers", "couplings", "forces"):
+        names = {x.name for x in parts[kind]}
+        gone = [x.name for x in getattr(model, kind) if x.name not in names]
+        bindings = [b for b in bindings if b.where != kind or b.part in names]
+        notes += [f"{kind.removesuffix('s')} {name!r} acts on locked joints alone, and is gone" for name in gone]
+    followers = ", ".join(name for name in values if name not in given)
+    listed = ", ".join(f"{name} at {_short(x)}" for name, x in given.items())
+    notes.insert(0, f"locked: {listed}" + (f"; with them {followers}" if followers else ""))
+    out = replace(
+        model,
+        **parts,
+        bindings=tuple(bindings),
+        source="",
+        drawn_from=model.sources,
+        locked=(*model.locked, *(_kept(model.joint(name), x) for name, x in values.items() if _free(model, name))),
+    )
+    closed, more = _closed_for_good(out)
+    kept = tuple(x for x in out.loops if x not in closed)
+    left = {x.name for x in closed}
+    bindings = [b for b in out.bindings if b.where != "loops" or b.part not in left]
+    return replace(out, loops=kept, bindings=tuple(bindings), notes=(*out.notes, *notes, *more))
+
+
+def _kept(joint: Joint, x: Array) -> tuple[str, tuple[float, ...], int]:
+    return joint.name, tuple(x.tolist()), joint.type.nv
+
+
+def _short(x: Array) -> str:
+    return f"{x[0]:g}" if len(x) == 1 else str(np.round(x, 6).tolist())
+
+
+def _free(model: Model, name: str) -> bool:
+    return model.joint(name).mimic is None
+
+
+def _given(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike | None) -> Values:
+    """Return the coordinates of the joints that the caller locks."""
+    if isinstance(joints, str) or not isinstance(joints, (Mapping, Sequence)):
+        raise InputError(f"joints: expected a mapping from names to values or a list of names, got {shown(joints)}")
+    if isinstance(joints, Mapping) and q is not None:
+        raise InputError("q: values stand in the mapping; give names alone with a whole configuration")
+    for name in joints:
+        if not isinstance(name, str) or name not in {j.name for j in model.joints}:
+            raise UnknownNameError("joint", name, model.joint_names)
+        joint = model.joint(name)
+        if joint.mimic:
+            raise InputError(f"joints: {name!r} follows {joint.mimic.joint!r}; lock that one, and it is locked too")
+        if not joint.type.nv:
+            raise InputError(f"joints: {name!r} is fixed already")
+    if isinstance(joints, Mapping):
+        given = {name: _coordinates(model.joint(name), x) for name, x in joints.items()}
+    else:
+        whole = model.neutral() if q is None else model.check_q(q)
+        if whole.ndim > 1:
+            raise InputError(f"q: expected one configuration, got shape {whole.shape}")
+        given = {name: whole[model.layout.q[name]] for name in joints}
+    for name, x in given.items():
+        joint = model.joint(name)
+        room = _TYPED * np.maximum(1.0, np.abs(x))
+        if (x < joint.lower - room).any() or (x > joint.upper + room).any():
+            raise InputError(
+                f"joints: {name!r} at {_short(x)} is beyond its limits, {_short(joint.lower)} to {_short(joint.upper)}"
+            )
+    return given
+
+
+def _coordinates(joint: Joint, value: Any) -> Array:
+    item, n = f"joints: {joint.name!r}", joint.type.nq
+    if n == 1 and np.shape(value) == ():
+        value = [value]
+    x = finite_array(item, value, (n,))
+    k = joint.type.quaternion
+    if k is not None and abs(float(np.linalg.norm(x[k:])) - 1.0) > _TYPED:
+        raise InputError(f"{item}: expected a quaternion x, y, z, w of length 1, got {x[k:].tolist()}")
+    return x
+
+
+def _with_followers(model: Model, given: Values) -> Values:
+    """Return the locked coordinates with those that mimic joints and couplers follow from them."""
+    values = dict(given)
+    ties = list(model.couplers)
+    while True:
+        tied = next((c for c in ties if c.joint in values or c.leader in values), None)
+        if tied is None:
+            break
+        ties.remove(tied)
+        item = f"joints: coupler {tied.name!r}"
+        if tied.leader in values:
+            follows = np.array([float(tied.polynomial(values[tied.leader][0]))])
+            name = tied.joint
+        elif tied.curve.any() or not tied.ratio:
+            raise InputError(f"{item} does not tell {tied.leader!r} from {tied.joint!r}; lock {tied.leader!r} instead")
+        else:
+            follows, name = (values[tied.joint] - tied.offset) / tied.ratio, tied.leader
+        if not np.isfinite(follows).all():
+            raise InputError(f"{item} has a parameter without a value; give it first")
+        there = values.setdefault(name, follows)
+        if abs(there[0] - follows[0]) > _TYPED * max(1.0, abs(follows[0])):
+            raise InputError(f"{item} asks for {name!r} at {follows[0]:g}, and it is locked at {there[0]:g}")
+    for joint in model.joints:
+        if joint.mimic and joint.mimic.joint in values:
+            values[joint.name] = joint.mimic.ratio * values[joint.mimic.joint] + joint.mimic.offset
+    return values
+
+
+def _refuse_driven(model: Model, values: Values) -> None:
+    if driven := [x.joint for x in model.prescribed if x.joint in values]:
+        raise InputError(f"joints: {driven[0]!r} is moved by a prescribed motion; remove it with without('prescribed')")
+    for b in model.bindings:
+        if b.where == "joints" and b.part in values and b.field in ("pitch", "ratio", "offset"):
+            raise InputError(
+                f"joints: {b.part!r} has a parameter as its {b.field}, on which its locked place would depend; give it "
+                "with with_parameters first"
+            )
+
+
+def _fixed(joint: Joint, values: Values, bindings: list[Binding]) -> Joint:
+    if joint.name not in values:
+        return joint
+    R, p = (np.array(x, dtype=float) for x in joint.type.placement(np, joint, list(values[joint.name])))
+    place = moved_by(np.eye(3), joint.rotation @ p, entries(joint, "joints", "translation", bindings))
+    bindings[:] = [b for b in bindings if (b.where, b.part) != ("joints", joint.name) or b.field not in _OF_MOTION]
+    empty = dict.fromkeys(
+        ("lower", "upper", "velocity_limit", "effort_limit", "armature", "damping", "friction", "stiffness", "rest"),
+        np.zeros(0),
+    )
+    still = replace(
+        joint,
+        kind=FIXED.name,
+        rotation=joint.rotation @ R,
+        axes=np.zeros((0, 3)),
+        pitch=0.0,
+        mimic=None,
+        **empty,  # type: ignore[arg-type]  # arrays
+    )
+    return with_fields(still, "joints", {"translation": place}, bindings)  # type: ignore[no-any-return]  # a Joint
+
+
+def _shortened(coupling: JointCoupling, values: Values, bindings: list[Binding]) -> JointCoupling | None:
+    """Return a coupling with the locked part of its length in its rest length; None where nothing is left."""
+    moving = [k for k, name in enumerate(coupling.joints) if name not in values]
+    if len(moving) == len(coupling.joints):
+        return coupling
+    if not moving:
+        return None
+    factors = entries(coupling, "couplings", "factors", bindings)
+    rest = entries(coupling, "couplings", "rest_length", bindings)
+    for k, name in enumerate(coupling.joints):
+        if name in values and values[name][0]:
+            rest = rest - factors[k] * float(values[name][0])
+    fields = {"factors": factors[moving], "rest_length": rest}
+    shorter = replace(coupling, joints=tuple(coupling.joints[k] for k in moving), factors=np.ones(len(moving)))
+    return with_fields(shorter, "couplings", fields, bindings)  # type: ignore[no-any-return]  # a coupling
+
+
+def _acting(model: Model, force: Force, values: Values) -> Iterator[Force]:
+    """Yield a force with numbers for locked coordinates, unless it acts on these alone."""
+    if isinstance(force, GravityCompensation):
+        yield replace(force, without=tuple(name for name in force.without if name not in values))
+        return
+    own = {*force.own(model), *force.symbols}
+    others = coordinate_arguments(model)
+    if isinstance(force, JointForce) and force.joint in values:
+        if force.potential and (more := [x for x in force.potential.arguments if x in others and x not in own]):
+            raise InputError(
+                f"joints: the potential of force {force.name!r} at {force.joint!r} acts on {more[0]!r} too; remove it "
+                "or write it as a force"
+            )
+        return
+    numbers = _locked_arguments(model, values)
+    numbers = {name: x for name, x in numbers.items() if name not in own}
+    filled = {n: _filled(x, numbers) for n in ("formula", "potential") if (x := getattr(force, n)) is not None}
+    yield replace(force, **filled)  # type: ignore[type-var]  # every force is a dataclass
+
+
+def _locked_arguments(model: Model, values: Values) -> dict[str, float]:
+    out: dict[str, float] = {}
+    for name, x in values.items():
+        if not _free(model, name):
+            continue
+        joint, first_q, first_v = model.joint(name), model.layout.q[name].start, model.layout.v[name].start
+        out |= {model.coordinate_names[first_q + k]: float(x[k]) for k in range(joint.type.nq)}
+        out |= {model.velocity_names[first_v + k] + RATE: 0.0 for k in range(joint.type.nv)}
+    return out
+
+
+def _filled(formula: Formula, numbers: Mapping[str, float]) -> Formula:
+    """Return a formula with numbers in the place of some arguments."""
+    kept = tuple(name for name in formula.arguments if name not in numbers)
+    if len(kept) == len(formula.arguments):
+        return formula
+    operations: list[Operation] = []
+    for name, operands, value in formula.operations:
+        argument = formula.arguments[operands[0]] if name == "input" else ""
+        if name == "input" and argument in numbers:
+            operations.append(("const", (), numbers[argument]))
+        else:
+            operations.append((name, (kept.index(argument),) if name == "input" else operands, value))
+    return Formula(kept, tuple(operations), formula.outputs)
+
+
+def _closed_for_good(model: Model) -> tuple[list[Loop], list[str]]:
+    """Return the loops whose ends nothing moves any more, and what to say of them; `InputError` where one is open."""
+    closed, notes = [], []
+    moves = {j.name for j in model.joints if j.type.nv}
+    for loop in model.loops:
+        if (model.moving(loop.body_a) ^ model.moving(loop.body_b)) & moves:
+            continue
+        size = max(map(abs, _residual(model, loop)))
+        if not size <= _TYPED:
+            raise InputError(
+                f"joints: locked there, loop {loop.name!r} is open by {size:.3g} and nothing moves it; take the values "
+                "of a state that project returns"
+            )
+        closed.append(loop)
+        notes.append(f"loop {loop.name!r} is closed by the locked joints, and is gone")
+    for part in model.no_slip:
+        if not (model.moving(part.body_a) ^ model.moving(part.body_b)) & moves:
+            raise InputError(f"joints: with them locked, nothing moves no slip {part.name!r}; remove it, or lock fewer")
+    return closed, notes
+
+
+def _residual(model: Model, loop: Loop) -> list[float]:
+    poses = body_poses(model, model.neutral()[None])
+    carrier = poses[model.carrier(loop)][0][0]
+    ends = []
+    for body, R, p in (
+        (loop.body_a, loop.rotation_a, loop.translation_a),
+        (loop.body_b, loop.rotation_b, loop.translation_b),
+    ):
+        R_WB, p_WB = poses[body][0][0], poses[body][1][0]
+        ends.append((carrier.T @ (p_WB + R_WB @ p), (carrier.T @ R_WB @ R).T.tolist()))
+    (p_a, a), (p_b, b) = ends
+    return [float(x) for x in LOOP_ROWS[loop.kind][1](LoopEnds((p_a - p_b).tolist(), a, b, loop.length))]
+
+
+# States of both
+
+
+class _Before(NamedTuple):
+    """A joint with coordinates before locking: its locked ones, or None, and how many q and v it has."""
+
+    name: str
+    locked: tuple[float, ...] | None
+    nq: int
+    nv: int
+
+
+def _before(model: Model) -> list[_Before]:
+    """Return the joints of the model that was locked, in their order."""
+    if not model.locked:
+        raise InputError(f"{model.name} has no locked joints; lock makes a model that has")
+    every = {name: _Before(name, x, len(x), nv) for name, x, nv in model.locked}
+    every |= {j.name: _Before(j.name, None, j.type.nq, j.type.nv) for j in model.independent_joints}
+    return [every[j.name] for j in model.joints if j.name in every]
+
+
+def full_state(model: Model, q: ArrayLike, v: ArrayLike | None) -> tuple[Array, Array]:
+    """Return q and v of the model that was locked, as `Model.full_state` says."""
+    joints = _before(model)
+    q, v = model.check_q(q), model.check_v(np.zeros(model.nv) if v is None else v)
+    batch_of(q=q, v=v)
+    lead = np.broadcast_shapes(q.shape[:-1], v.shape[:-1])
+    whole_q, whole_v = (np.zeros((*lead, n)) for n in (sum(x.nq for x in joints), sum(x.nv for x in joints)))
+    at_q = at_v = 0
+    for name, locked, nq, nv in joints:
+        whole_q[..., at_q : at_q + nq] = q[..., model.layout.q[name]] if locked is None else locked
+        if locked is None:
+            whole_v[..., at_v : at_v + nv] = v[..., model.layout.v[name]]
+        at_q, at_v = at_q + nq, at_v + nv
+    return whole_q, whole_v
+
+
+def reduced_state(model: Model, q: ArrayLike, v: ArrayLike | None) -> tuple[Array, Array]:
+    """Return q and v of the locked model, as `Model.reduced_state` says."""
+    joints = _before(model)
+    of_q = np.repeat([x.locked is None for x in joints], [x.nq for x in joints])
+    of_v = np.repeat([x.locked is None for x in joints], [x.nv for x in joints])
+    q = rows("q", q, len(of_q), f"{model.name} before lock", "nq")
+    v = rows("v", np.zeros(len(of_v)) if v is None else v, len(of_v), f"{model.name} before lock", "nv")
+    batch_of(q=q, v=v)
+    return model.check_q(q[..., of_q]), model.check_v(v[..., of_v])

@@ -1,0 +1,283 @@
+"""Many variants of one model: numbers drawn at random, reproducibly, and always of bodies that can be.
+
+The inertia of a body is drawn by the Cholesky factor of its pseudo-inertia J, which is positive definite for every
+distribution of mass: J' = L T Tᵀ Lᵀ with J = L Lᵀ and T lower triangular, its diagonal log-normal and the entries below
+it normal. The spread is that of T, whatever units and axes (Wensing, Kim and Slotine 2018, Linear matrix inequalities
+for physically consistent inertial parameter identification; Rucker and Wensing 2022, Smooth parameterization of
+rigid-body inertia).
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array, count, finite_array, real, shown
+from mbkit._escape import csv_text, html
+from mbkit.errors import InputError, OutputError
+from mbkit.model.builder import expect_model
+from mbkit.model.changes.freeing import SYMMETRIC, Number, Scale, chosen, numbers_of, with_free
+from mbkit.model.model import Model
+
+#: What a spread says of a path: a size, the ends of a uniform range, or a function of a generator and how many to draw.
+Spread = float | tuple[float, float] | Callable[[np.random.Generator, int], Any]
+#: Numbers whose sign is free and whose zero means nothing: a spread is a standard deviation in their units.
+_PLACES: Final = ("com", "translation", "translation_a", "translation_b", "point_a", "point_b", "rest", "offset")
+_ADDED: Final = (*_PLACES, "gravity", "rate", "phase")
+#: All ten numbers of a body together.
+_INERTIAL: Final = ".inertial"
+_NOT_NEGATIVE: Final = ("mass", "armature", "damping", "stiffness", "length", "radius")
+#: Of a moment of inertia: rounding.
+_ROUNDED: Final = 1e-12
+_SHOWN: Final = 12
+_LOWER: Final = np.tril_indices(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Variants:
+    """Variants of a model, as parameters and their values.
+
+    Attributes
+    ----------
+    model : Model
+        With the varied numbers as parameters.
+    values : dict of str to (n,) array
+        Drawn values of each parameter.
+    seed : int
+    """
+
+    model: Model
+    values: Mapping[str, Array]
+    seed: int
+
+    def __len__(self) -> int:
+        return len(next(iter(self.values.values())))
+
+    def __getitem__(self, k: int) -> Model:
+        """Return variant k as a model of plain numbers, for every engine."""
+        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not -len(self) <= k < len(self):
+            raise InputError(f"variant: expected a whole number below {len(self)}, got {shown(k)}")
+        return self.model.with_parameters(**{name: float(x[k]) for name, x in self.values.items()})
+
+    def dynamics(self, **options: Any) -> Any:
+        """Return the own derivation's dynamics of all variants, one a member of each batch; derived once.
+
+        Parameters
+        ----------
+        **options
+            Those of ``mbkit.dynamics(model, "lagrangian", ...)``.
+        """
+        # By name: a description knows no engine.
+        dyn = import_module("mbkit.engines").dynamics(self.model, "lagrangian", **options)
+        return dyn.at(**self.values)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the seed and the values by name, as JSON takes them."""
+        values = {name: x.tolist() for name, x in self.values.items()}
+        return {"model": self.model.name, "seed": self.seed, "values": values}
+
+    def to_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write a table of what was drawn, a row a variant."""
+        try:
+            with Path(path).open("w", newline="", encoding="utf-8") as file:
+                write = csv.writer(file)
+                write.writerow(["variant", *map(csv_text, self.values)])
+                write.writerows(
+                    [k, *map(repr, row)] for k, row in enumerate(np.stack([*self.values.values()], 1).tolist())
+                )
+        except OSError as error:
+            raise OutputError(f"{path}: {error.strerror or error}") from None
+
+    def _summary(self) -> list[tuple[str, str, str, str, str]]:
+        nominal = self.model.parameters
+        return [
+            (name, f"{nominal[name]:.4g}", f"{x.mean():.4g}", f"{x.std():.2g}", f"{x.min():.4g} to {x.max():.4g}")
+            for name, x in self.values.items()
+        ]
+
+    def __repr__(self) -> str:
+        return f"<Variants of {self.model.name!r}: {len(self)} of {len(self.values)} numbers, seed {self.seed}>"
+
+    def __str__(self) -> str:
+        rows = [("number", "nominal", "mean", "std", "range"), *self._summary()]
+        more = len(rows) - 1 - _SHOWN
+        widths = [max(len(row[k]) for row in rows[: _SHOWN + 1]) for k in range(5)]
+        lines = ["  ".join(x.ljust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows[: _SHOWN + 1]]
+        head = f"{self.model.name}: {len(self)} variants, seed {self.seed}"
+        return "\n".join([head, *lines, *([f"and {more} more numbers"] if more > 0 else [])])
+
+    def _repr_html_(self) -> str:
+        head = "".join(f"<th>{x}</th>" for x in ("number", "nominal", "mean", "std", "range"))
+        rows = "".join(f"<tr>{''.join(f'<td>{html(x)}</td>' for x in row)}</tr>" for row in self._summary())
+        title = f"<p><b>{html(self.model.name)}</b>: {len(self)} variants, seed {self.seed}</p>"
+        return f"{title}<table><tr>{head}</tr>{rows}</table>"
+
+
+def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, seed: int = 0) -> Variants:
+    """Draw variants of a model: other masses, inertias, friction, payloads, gravity.
+
+    Parameters
+    ----------
+    robot : Model
+    spread : mapping
+        From paths, as `Model.with_free` takes them, or a `scale`, to how far their numbers spread. One number is the
+        standard deviation of the logarithm, so that masses, dampers and the like keep their sign (0.1 is about 10 %);
+        of places, ``com``, ``rest`` and gravity it is that of the number itself, in m, rad or m/s². Two numbers are the
+        ends of a uniform range; a function gets a `numpy.random.Generator` and how many numbers to return.
+
+        ``"link.inertia"`` draws the six numbers about the centre of mass, and ``"link.inertial"`` all ten numbers of a
+        body together, by their pseudo-inertia: every draw is a body that can be.
+    size : int
+        How many variants.
+    seed : int
+        The same numbers for the same seed, whatever else is varied beside a path.
+
+    Returns
+    -------
+    Variants
+
+    Raises
+    ------
+    InputError
+        A path that fits nothing, a spread that is none, and draws that no body can have, by name.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> many = mb.variants(mb.load("ur5"), {"*.mass": 0.1, "forearm_link.inertia": 0.2}, size=100, seed=1)
+    >>> many
+    <Variants of 'ur5': 100 of 14 numbers, seed 1>
+    >>> many.dynamics().mass_matrix([0.0] * 6).shape, many[7].nv
+    ((100, 6, 6), 6)
+    """
+    model = expect_model(robot, "robot")
+    model.require_bodies("variants")
+    count("size", size)
+    count("seed", seed, least=0)
+    if not isinstance(spread, Mapping) or not spread:
+        raise InputError(f"spread: expected a mapping from paths to spreads, got {shown(spread)}")
+    values: dict[str, Array] = {}
+    paths: list[Any] = []
+    for path, how in spread.items():
+        rng = np.random.default_rng([seed, zlib.crc32(str(path).encode())])
+        drawn = _drawn(model, path, how, rng, size)
+        if twice := [name for name in drawn if name in values]:
+            raise InputError(f"spread: {twice[0]!r} is in two entries of the spread; draw it by one")
+        values |= drawn
+        paths += [path] if isinstance(path, Scale) else [*drawn]
+    free = with_free(model, paths)
+    _require_bodies_that_can_be(model, values, size)
+    return Variants(free, values, seed)
+
+
+def _drawn(model: Model, path: Any, how: Spread, rng: np.random.Generator, size: int) -> dict[str, Array]:
+    """Return the draws of one entry of a spread, by parameter."""
+    item = f"spread: {str(path)!r}"
+    if isinstance(path, Scale):
+        return {path.name: _numbers(item, 1.0, how, rng, size, added=False)}
+    if not isinstance(path, str):
+        raise InputError(f"spread: expected paths such as '*.mass' or a scale, got {shown(path)}")
+    if path.endswith(_INERTIAL):
+        bodies = dict.fromkeys(x.part for x in chosen(model, f"{path.removesuffix(_INERTIAL)}.mass"))
+        return {k: x for name in bodies for k, x in _bodies_drawn(model, name, _size(item, how), rng, size).items()}
+    numbers = chosen(model, path)
+    out: dict[str, Array] = {}
+    if not callable(how) and np.ndim(how) == 0:
+        for name in dict.fromkeys(x.part for x in numbers if x.field == "inertia"):
+            six = [x for x in numbers if (x.part, x.field) == (name, "inertia")]
+            # A single moment is a number like others.
+            if len(six) == len(SYMMETRIC):
+                out |= _bodies_drawn(model, name, _size(item, how), rng, size, about_com=True)
+                numbers = [x for x in numbers if x not in six]
+    for x in numbers:
+        out[x.path] = _numbers(f"{item}: {x.path}", x.value, how, rng, size, added=x.field in _ADDED)
+    return out
+
+
+def _size(item: str, how: Spread) -> float:
+    if callable(how) or np.ndim(how):
+        raise InputError(f"{item}: expected one number for a whole inertia, got {shown(how)}")
+    return real(item, how, positive=True)
+
+
+def _numbers(item: str, nominal: float, how: Spread, rng: np.random.Generator, size: int, *, added: bool) -> Array:
+    if callable(how):
+        return finite_array(item, how(rng, size), (size,))
+    if np.ndim(how) == 0:
+        away = real(item, how, positive=True) * rng.standard_normal(size)
+        return np.asarray(nominal + away if added else nominal * np.exp(away))
+    low, high = finite_array(item, how, (2,))
+    if low > high:
+        raise InputError(f"{item}: expected the lower end first, got {low:g} and {high:g}")
+    return rng.uniform(low, high, size)
+
+
+def _bodies_drawn(
+    model: Model, name: str, spread: float, rng: np.random.Generator, size: int, *, about_com: bool = False
+) -> dict[str, Array]:
+    """Return draws of a body's inertial numbers by the Cholesky factor of its pseudo-inertia."""
+    body = model.body(name)
+    if not body.mass > 0:
+        raise InputError(f"spread: body {name!r} has no mass, so that no inertia is drawn about it; give a range")
+    # Second moments about the centre of mass, m (Σ_c + c cᵀ) below m and m c.
+    second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
+    try:
+        # A rod or a point has none across.
+        L = np.linalg.cholesky(second + _ROUNDED * max(np.trace(second), body.mass * 1e-9) * np.eye(3))
+    except np.linalg.LinAlgError:
+        raise InputError(
+            f"spread: body {name!r} has an inertia that no matter has, so that none is drawn about it; correct it"
+        ) from None
+    T = np.zeros((size, 3, 3))
+    T[:, *_LOWER] = spread * rng.standard_normal((size, 6))
+    diagonal = np.arange(3)
+    T[:, diagonal, diagonal] = np.exp(T[:, diagonal, diagonal])
+    factor = L @ T
+    moments = factor @ factor.swapaxes(1, 2)
+    out: dict[str, Array] = {}
+    if not about_com:
+        # The whole factor: the mass's own entry, and below it the centre of mass, in lengths of the body.
+        out[f"{name}.mass"] = body.mass * np.exp(2 * spread * rng.standard_normal(size))
+        away = spread * rng.standard_normal((size, 3)) @ L.T / np.sqrt(body.mass)
+        out |= {f"{name}.com.{axis}": body.com[k] + away[:, k] for k, axis in enumerate("xyz")}
+        moments = moments * (out[f"{name}.mass"] / body.mass)[:, None, None]
+    inertias = np.trace(moments, axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments
+    wanted = [x for x in numbers_of(model) if (x.where, x.part, x.field) == ("bodies", name, "inertia")]
+    return out | {x.path: inertias[:, x.indices[0][0], x.indices[0][1]] for x in wanted}
+
+
+def _require_bodies_that_can_be(model: Model, values: Mapping[str, Array], size: int) -> None:
+    """Refuse draws that no body, damper or spring can have (InputError)."""
+    free: dict[str, list[Number]] = {}
+    for x in numbers_of(model):
+        if x.path in values:
+            free.setdefault(x.part, []).append(x)
+            bad = np.flatnonzero(values[x.path] < 0)
+            if x.field in _NOT_NEGATIVE and x.value >= 0 and len(bad):
+                raise InputError(
+                    f"spread: {x.path!r} is negative in {len(bad)} of {size} variants, such as "
+                    f"{values[x.path][bad[0]]:.3g} in {bad[0]}; a number instead of a range keeps its sign"
+                )
+    for body in model.bodies:
+        own = [x for x in free.get(body.name, ()) if x.field == "inertia"]
+        if not own:
+            continue
+        inertias = np.tile(body.inertia, (size, 1, 1))
+        for x in own:
+            for index in x.indices:
+                inertias[:, index[0], index[1]] = values[x.path]
+        trace = np.trace(inertias, axis1=1, axis2=2)
+        least = np.linalg.eigvalsh(0.5 * trace[:, None, None] * np.eye(3) - inertias)[:, 0]
+        if len(bad := np.flatnonzero(least < -_ROUNDED * np.abs(trace))):
+            raise InputError(
+                f"spread: {body.name!r} has an inertia that no matter has in {len(bad)} of {size} variants, such as "
+                f"{bad[0]}; one number for {body.name + '.inertia'!r} draws inertias that can be"
+            )

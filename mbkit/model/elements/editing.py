@@ -1,0 +1,393 @@
+"""The part of `ModelBuilder` that changes a description which is already there: a loaded robot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mbkit._check import Array, shown
+from mbkit.errors import nearest
+from mbkit.model.elements.references import KINDS_OF_PARTS, moved_by, names_in, renamed
+from mbkit.model.parameters import Binding, Number, split
+from mbkit.model.parts import Body, Frame, Joint, Mimic
+
+_Vector = ArrayLike | Sequence[Number]
+_Numbers = ArrayLike | Sequence[Number] | Number
+#: What a kind of part is called, where it is not the plural's singular.
+_CALLED: Final = {"bodies": "body", "prescribed": "prescribed", "forces": "force", "no_slip": "no slip"}
+#: Arguments of joints that are limits or one number for each velocity.
+NUMBERS_OF_JOINTS: Final = (
+    *("lower", "upper", "velocity_limit", "effort_limit"),
+    *("armature", "damping", "friction", "stiffness", "rest"),
+)
+
+
+def called(kind: str) -> str:
+    """Return the word for one part of a kind."""
+    return _CALLED.get(kind, kind.removesuffix("s"))
+
+
+class EditingBuilder:
+    """Changes parts by name; `ModelBuilder` inherits it.
+
+    Like the methods that add parts, these remember a fault, and `build` reports all of them. None stands for "as it
+    is".
+    """
+
+    _read: Any
+    _name: str
+    _gravity: Array
+    _bindings: list[Binding]
+    _parts: dict[str, list[Any]]
+    _notes: list[str]
+    _odd: dict[str, str]
+    _sources: list[tuple[str, str]]
+    _read_fields: Callable[..., dict[str, Any]]
+    _joint_fields: Callable[..., dict[str, Any]]
+    add_body: Callable[..., None]
+    add_joint: Callable[..., None]
+    note: Callable[[str], None]
+
+    @classmethod
+    def of(cls, model: Any) -> Self:
+        """Return a builder that holds everything of a model, to change it; the model stays as it is.
+
+        Parameters
+        ----------
+        model : Model
+            Such as `mbkit.load` returns.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder.of(mb.load("ur5"))
+        >>> b.set_body("wrist_3_link", mass=0.5)
+        >>> b.add_payload("load", at="tool0", mass=2.0, com=(0, 0, 0.1))
+        >>> robot = b.build()
+        >>> round(robot.mass - mb.load("ur5").mass, 4)
+        2.3121
+        >>> robot.notes[-1]
+        "added payload 'load' of 2 kg at 'tool0'"
+        """
+        model.require_bodies("ModelBuilder.of")
+        out = cls(model.name)  # type: ignore[call-arg]  # the whole builder's
+        out._gravity = model.gravity
+        out._bindings = list(model.bindings)
+        out._parts = {kind: list(getattr(model, kind)) for kind in KINDS_OF_PARTS}
+        out._notes, out._odd, out._sources = list(model.notes), dict(model.nonphysical), list(model.sources)
+        return out
+
+    # Change
+
+    def set_gravity(self, gravity: _Vector) -> None:
+        """Set the acceleration of gravity, (3,), m/s², in world axes."""
+        value = self._read.quantities("gravity", gravity, 3)
+        numbers, new = split("gravity", "", {"gravity": value})
+        self._bindings = [b for b in self._bindings if b.where != "gravity"] + [*new]
+        self._notes.append(f"changed gravity from {_short(self._gravity)} to {_short(numbers['gravity'])}")
+        self._gravity = numbers["gravity"]
+
+    def set_body(
+        self,
+        name: str,
+        *,
+        mass: Number | None = None,
+        com: _Vector | None = None,
+        inertia: ArrayLike | Sequence[Any] | None = None,
+    ) -> None:
+        """Set numbers of a body.
+
+        Parameters
+        ----------
+        name : str
+            A body; a link that a URDF's loader merged with another one is a frame, and its body holds its inertia.
+        mass : float, optional
+            kg.
+        com : (3,) array_like, optional
+            Centre of mass in body axes, m. The inertia stays what it is about the centre of mass.
+        inertia : (3, 3) or (3,) array_like, optional
+            About the centre of mass, in body axes (or its diagonal), kg m².
+        """
+        self._set("bodies", name, {"mass": mass, "com": com, "inertia": inertia})
+
+    def set_joint(
+        self,
+        name: str,
+        *,
+        translation: _Vector | None = None,
+        rotation: ArrayLike | None = None,
+        rpy: ArrayLike | None = None,
+        axis: ArrayLike | None = None,
+        axis2: ArrayLike | None = None,
+        pitch: Number | None = None,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        velocity_limit: ArrayLike | None = None,
+        effort_limit: ArrayLike | None = None,
+        armature: _Numbers | None = None,
+        damping: _Numbers | None = None,
+        friction: ArrayLike | None = None,
+        stiffness: _Numbers | None = None,
+        rest: _Numbers | None = None,
+        mimic: Mimic | tuple[str, Number, Number] | None = None,
+    ) -> None:
+        """Set numbers of a joint, which are those of `add_joint`; an infinite limit is no limit."""
+        joint = self._named("joints", name)
+        if joint is None:
+            return
+        limits = lower, upper, velocity_limit, effort_limit
+        numbers = armature, damping, friction, stiffness, rest
+        given: dict[str, Any] = dict(zip(NUMBERS_OF_JOINTS, (*limits, *numbers), strict=True))
+        given |= {"mimic": mimic, "axes": None if axis is None and axis2 is None else (axis, axis2)}
+        ready = self._joint_fields(joint.name, joint.type, {n: x for n, x in given.items() if x is not None})
+        if rotation is not None or rpy is not None:
+            ready["rotation"] = self._read.orientation(f"joint {joint.name!r}", rotation, rpy)
+        self._set("joints", name, {"translation": translation, "pitch": pitch}, ready)
+
+    def set_frame(
+        self,
+        name: str,
+        *,
+        body: str | None = None,
+        translation: _Vector | None = None,
+        rotation: ArrayLike | None = None,
+        rpy: ArrayLike | None = None,
+    ) -> None:
+        """Set the body or the pose of a frame; the arguments are those of `add_frame`."""
+        turned = rotation is not None or rpy is not None
+        ready = {"rotation": self._read.orientation(f"frame {shown(name)}", rotation, rpy)} if turned else {}
+        self._set("frames", name, {"body": body, "translation": translation}, ready)
+
+    def set_spring(
+        self,
+        name: str,
+        *,
+        point_a: _Vector | None = None,
+        point_b: _Vector | None = None,
+        stiffness: Number | None = None,
+        rest_length: Number | None = None,
+        damping: Number | None = None,
+    ) -> None:
+        """Set numbers of a spring between points; the arguments are those of `add_spring`."""
+        numbers = {"stiffness": stiffness, "rest_length": rest_length, "damping": damping}
+        self._set("springs", name, {"point_a": point_a, "point_b": point_b, **numbers})
+
+    def set_coupling(
+        self,
+        name: str,
+        *,
+        stiffness: Number | None = None,
+        rest_length: Number | None = None,
+        damping: Number | None = None,
+        armature: Number | None = None,
+    ) -> None:
+        """Set numbers of a coupling of joints; the arguments are those of `add_coupling`."""
+        numbers = {"stiffness": stiffness, "rest_length": rest_length, "damping": damping, "armature": armature}
+        self._set("couplings", name, numbers)
+
+    def set_loop(
+        self,
+        name: str,
+        *,
+        translation_a: _Vector | None = None,
+        rotation_a: ArrayLike | None = None,
+        translation_b: _Vector | None = None,
+        rotation_b: ArrayLike | None = None,
+        length: Number | None = None,
+    ) -> None:
+        """Set the places of a loop's ends, and the length of a rod; the arguments are those of `add_loop`."""
+        a = {"translation_a": translation_a, "rotation_a": rotation_a}
+        self._set("loops", name, a | {"translation_b": translation_b, "rotation_b": rotation_b, "length": length})
+
+    def set_coupler(
+        self, name: str, *, ratio: Number | None = None, offset: Number | None = None, curve: _Vector | None = None
+    ) -> None:
+        """Set the ratio, the offset or the curve of a coupler; the arguments are those of `add_coupler`."""
+        self._set("couplers", name, {"ratio": ratio, "offset": offset, "curve": curve})
+
+    # Add, remove, rename
+
+    def add_payload(
+        self,
+        name: str,
+        *,
+        at: str,
+        mass: Number,
+        com: _Vector = (0.0, 0.0, 0.0),
+        inertia: ArrayLike | Sequence[Any] | None = None,
+        translation: _Vector = (0.0, 0.0, 0.0),
+        rotation: ArrayLike | None = None,
+        rpy: ArrayLike | None = None,
+    ) -> None:
+        """Add a body that is fixed to a frame, such as a tool or what a gripper holds.
+
+        The joint that fixes it has the name ``"<name>_mount"``.
+
+        Parameters
+        ----------
+        name : str
+        at : str
+            A frame or a body.
+        mass : float
+            kg.
+        com : (3,) array_like
+            Centre of mass in the payload's axes, m.
+        inertia : (3, 3) or (3,) array_like, optional
+            About the centre of mass, in the payload's axes (or its diagonal), kg m²; without it a point mass.
+        translation : (3,) array_like
+            Origin of the payload's axes in the frame, m.
+        rotation, rpy : (3, 3) or (3,) array_like, optional
+            Orientation of the payload's axes in the frame; at most one.
+        """
+        item = f"payload {shown(name)}"
+        frame = self._frame(item, at)
+        if frame is None:
+            return
+        R = self._read.orientation(item, rotation, rpy)
+        place = self._read.place(f"{item}: translation", translation)
+        self.add_body(name, mass=mass, com=com, inertia=inertia)
+        self.add_joint(
+            f"{name}_mount",
+            "fixed",
+            parent=frame.body,
+            child=name,
+            translation=moved_by(frame.rotation, frame.translation, place),
+            rotation=frame.rotation @ R,
+        )
+        size = f" of {mass:g} kg" if isinstance(mass, (int, float)) else ""
+        self._notes.append(f"added payload {shown(name)}{size} at {at!r}")
+
+    def remove_joint(self, name: str) -> None:
+        """Remove a joint with all that it carries: bodies, joints, frames, and what acts on them.
+
+        Springs, loops, couplings and forces between the removed parts and others go too, which the notes name. A joint
+        that mimics a removed one is a fault.
+        """
+        joint = self._named("joints", name)
+        if joint is None:
+            return
+        bodies, joints = {joint.child}, {joint.name}
+        # Parts may stand in any order.
+        while more := [j for j in self._parts["joints"] if j.parent in bodies and j.name not in joints]:
+            bodies |= {j.child for j in more}
+            joints |= {j.name for j in more}
+        frames = {f.name for f in self._parts["frames"] if f.body in bodies}
+        lost = []
+        for kind, parts in self._parts.items():
+            for part in [*parts]:
+                own = part.name in joints if kind == "joints" else part.name in bodies and kind == "bodies"
+                refers = kind not in ("bodies", "joints") and _touches(part, kind, bodies, joints, frames)
+                if own or refers:
+                    parts.remove(part)
+                    self._bindings = [b for b in self._bindings if (b.where, b.part) != (kind, part.name)]
+                    lost += [] if own or kind == "frames" else [f"{called(kind)} {part.name!r}"]
+        also = f"; with it {', '.join(lost)}" if lost else ""
+        self._notes.append(f"removed joint {name!r} and the bodies {', '.join(sorted(bodies))}{also}")
+
+    def add_prefix(self, prefix: str) -> None:
+        """Put a prefix before the names of all bodies, joints, frames and other parts; parameters keep theirs."""
+        prefix = self._read.name("prefix", prefix)
+        self._parts, self._bindings = renamed(self._holding(), prefix)
+        self._odd = {prefix + body: why for body, why in self._odd.items()}
+        self._sources = [(prefix + start, source) for start, source in self._sources]
+        if prefix:
+            self._notes.append(f"all names begin with {prefix!r}")
+
+    # How
+
+    def _holding(self) -> Any:
+        """Return the parts as an unchecked description."""
+        raise NotImplementedError
+
+    def _set(self, kind: str, name: str, values: Mapping[str, Any], ready: Mapping[str, Any] | None = None) -> None:
+        part = self._named(kind, name)
+        if part is None:
+            return
+        given = {n: x for n, x in values.items() if x is not None}
+        fields = self._read_fields(f"{called(kind)} {part.name!r}", given) | dict(ready or {})
+        self._change(kind, part, fields)
+
+    def _change(self, kind: str, part: Any, fields: dict[str, Any]) -> None:
+        bound = {*fields}
+        if "mimic" in fields:
+            leader, ratio_and_offset = fields.pop("mimic")
+            numbers, new = split(kind, part.name, ratio_and_offset)
+            fields["mimic"], bound = Mimic(leader, **numbers), bound | {"ratio", "offset"}
+        else:
+            new = ()
+        numbers, more = split(kind, part.name, fields)
+        known = len(self._read.faults)
+        changed = [*_changes(part, numbers, self._bindings, {b.field for b in more})]
+        self._bindings = [
+            b for b in self._bindings if (b.where, b.part) != (kind, part.name) or b.field not in bound
+        ] + [*new, *more]
+        parts = self._parts[kind]
+        parts[next(i for i, x in enumerate(parts) if x is part)] = replace(part, **numbers)
+        if changed and len(self._read.faults) == known:
+            self._notes.append(f"changed {called(kind)} {part.name!r}: {', '.join(changed)}")
+
+    def _named(self, kind: str, name: Any) -> Any:
+        """Return a part by name; None after a fault."""
+        what = called(kind)
+        name = self._read.name(f"{what} name", name)
+        names = [x.name for x in self._parts[kind]]
+        if name in names:
+            return self._parts[kind][names.index(name)]
+        hint = ""
+        if kind == "bodies" and (frame := next((f for f in self._parts["frames"] if f.name == name), None)):
+            hint = (
+                f"; it is a frame on body {frame.body!r}, which holds its inertia: change that one, or hang something "
+                "on the frame with add_payload"
+            )
+        elif near := nearest(name, names):
+            hint = f"; did you mean {near[0]!r}?"
+        elif not names:
+            hint = "; the model has none"
+        self._read.faults.append(f"{what} {name!r}: there is none of this name{hint}")
+        return None
+
+    def _frame(self, item: str, at: Any) -> Frame | None:
+        """Return a frame, or that of a body; None after a fault."""
+        for frame in self._parts["frames"]:
+            if frame.name == at:
+                return frame  # type: ignore[no-any-return]  # parts of all kinds
+        bodies = [b.name for b in self._parts["bodies"]]
+        if at in bodies or at == "world":
+            return Frame(at, at, np.eye(3), np.zeros(3))
+        near = nearest(at, [f.name for f in self._parts["frames"]] + bodies) if isinstance(at, str) else []
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        self._read.faults.append(f"{item}: at: unknown frame {shown(at)}{hint}")
+        return None
+
+
+def _touches(part: Any, kind: str, bodies: set[str], joints: set[str], frames: set[str]) -> bool:
+    """Return whether a part that is no body and no joint hangs on removed ones."""
+    if kind in ("couplings", "couplers", "prescribed"):
+        return bool(names_in(part) & joints)
+    if hasattr(part, "joint"):
+        return part.joint in joints
+    if hasattr(part, "frame"):
+        return part.frame in frames | bodies
+    return bool({getattr(part, side, None) for side in ("body", "body_a", "body_b")} & bodies)
+
+
+def _changes(part: Body | Joint, numbers: Mapping[str, Any], bindings: list[Binding], free: set[str]) -> Iterator[str]:
+    """Yield what of a part becomes another number."""
+    for name, new in numbers.items():
+        old = getattr(part, name)
+        if name in free:
+            yield f"{name} is a parameter"
+        elif not np.array_equal(old, new) or any(b.part == part.name and b.field == name for b in bindings):
+            yield f"{name} {_short(old)} to {_short(new)}" if isinstance(new, (float, np.ndarray)) else name
+
+
+def _short(x: Any) -> str:
+    values = np.ravel(x)
+    if len(values) > 3:
+        return "as given" if len(values) > 6 else str(values.tolist())
+    texts = [f"{v:g}" for v in values.tolist()]
+    return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"

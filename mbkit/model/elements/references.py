@@ -1,0 +1,118 @@
+"""What parts of a description refer to: other names for it, and another place for what hangs on the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, replace
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.model.elements.forces import Force, coordinate_arguments
+from mbkit.model.elements.formula import Formula
+from mbkit.model.parameters import Binding, split
+
+#: A `mbkit.model.description.Description`, a floor above.
+_Model = Any
+#: Kinds of parts, as a description names them.
+KINDS_OF_PARTS: Final = (
+    *("bodies", "joints", "frames"),
+    *("springs", "couplings", "loops", "couplers", "prescribed", "forces", "no_slip"),
+)
+#: Fields that name other parts.
+_OF_BODIES: Final = ("parent", "child", "body", "body_a", "body_b", "frame")
+_OF_JOINTS: Final = ("joint", "leader", "joints", "without")
+#: Bodies that a part hangs on, with the end of its fields' names.
+_SIDES: Final = {"parent": "", "body_a": "_a", "body_b": "_b"}
+
+
+def names_in(part: Any) -> set[str]:
+    """Return the names of the bodies, frames and joints that a part refers to."""
+    given = [getattr(part, n, ()) for n in (*_OF_BODIES, *_OF_JOINTS)]
+    own = {x for value in given for x in ((value,) if isinstance(value, str) else value)}
+    mimic = getattr(part, "mimic", None)
+    return own | ({mimic.joint} if mimic else set())
+
+
+def renamed(model: _Model, prefix: str) -> tuple[dict[str, list[Any]], list[Binding]]:
+    """Return the parts and bindings of a model with a prefix before the names of all parts; parameters keep theirs."""
+
+    def new(name: str) -> str:
+        return name if name == "world" else prefix + name
+
+    others = coordinate_arguments(model)
+    parts = {
+        kind: [_with_names(part, new, _arguments(part, model, others, new)) for part in getattr(model, kind)]
+        for kind in KINDS_OF_PARTS
+    }
+    return parts, [replace(b, part=new(b.part)) if b.part else b for b in model.bindings]
+
+
+def _arguments(part: Any, model: _Model, others: Iterable[str], new: Callable[[str], str]) -> dict[str, str]:
+    """Return the new names of the coordinates and velocities in a force's formulas."""
+    if not isinstance(part, Force):
+        return {}
+    own = {*part.own(model), *part.symbols}
+    return {name: new(name) for name in part.arguments if name in others and name not in own}
+
+
+def _with_names(part: Any, new: Callable[[str], str], arguments: Mapping[str, str]) -> Any:
+    changes: dict[str, Any] = {}
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if field.name == "name" or field.name in (*_OF_BODIES, *_OF_JOINTS):
+            changes[field.name] = new(value) if isinstance(value, str) else tuple(map(new, value))
+        elif field.name == "mimic" and value is not None:
+            changes["mimic"] = replace(value, joint=new(value.joint))
+        elif isinstance(value, Formula) and arguments:
+            changes[field.name] = replace(value, arguments=tuple(arguments.get(x, x) for x in value.arguments))
+    return replace(part, **changes)
+
+
+def entries(part: Any, where: str, field: str, bindings: Iterable[Binding]) -> Any:
+    """Return a field with its expressions in the place of their nominal numbers."""
+    own = [b for b in bindings if (b.where, b.part, b.field) == (where, part.name, field)]
+    if not own:
+        return getattr(part, field)
+    value = np.array(getattr(part, field), dtype=object)
+    for b in own:
+        value[b.index] = b.expression
+    return value.item() if value.ndim == 0 else value
+
+
+def with_fields(part: Any, where: str, values: Mapping[str, Any], bindings: list[Binding]) -> Any:
+    """Return a part with other fields, numbers or expressions, and put the bindings of these into the list."""
+    numbers, new = split(where, part.name, dict(values))
+    bindings[:] = [b for b in bindings if (b.where, b.part) != (where, part.name) or b.field not in values]
+    bindings += new
+    return replace(part, **numbers)
+
+
+def moved_by(R: Array, p: Array, x: Any) -> Any:
+    """Return p + R x of three numbers or expressions; what a zero or a one multiplies stays as it is."""
+    if np.array_equal(R, np.eye(3)) and not p.any():
+        return x
+    if np.asarray(x).dtype != object:
+        return p + R @ x
+    out = np.empty(3, dtype=object)
+    for i in range(3):
+        terms = [x[k] if R[i, k] == 1.0 else R[i, k] * x[k] for k in range(3) if R[i, k]]
+        out[i] = sum(terms[1:], terms[0]) + p[i] if p[i] else sum(terms[1:], terms[0])
+    return out
+
+
+def hung_on(part: Any, where: str, body: str, R: Array, p: Array, bindings: list[Binding]) -> Any:
+    """Return a part with what hung on the ground hung on a body, where the ground has the pose R, p."""
+    for side, end in _SIDES.items():
+        if getattr(part, side, None) != "world":
+            continue
+        part = replace(part, **{side: body})
+        names = {f.name for f in fields(part)}
+        for name, of in ((f"rotation{end}", R), (f"axis{end}", R)):
+            if name in names:
+                part = replace(part, **{name: of @ getattr(part, name)})
+        for name in {f"translation{end}", f"point{end}"} & names:
+            point = moved_by(R, p, entries(part, where, name, bindings))
+            part = with_fields(part, where, {name: point}, bindings)
+    return part

@@ -1,0 +1,619 @@
+"""A description changed: edited, locked, joined, mounted, and with numbers that are free."""
+
+from __future__ import annotations
+
+import pickle
+
+import casadi as ca
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mbkit as mb
+from mbkit.errors import InputError, MbkitError, ModelError, UnknownNameError
+from mbkit.model import Model
+from tests.random_trees import SOUND, off, random_tree, states
+
+# Sums of a few hundred rounded terms.
+CLOSE = 1e-13
+SEEDS = st.integers(0, 10**6)
+TERMS = ("mass_matrix", "nle", "gravity", "passive")
+
+
+def own(model: Model) -> mb.Dynamics:
+    return mb.dynamics(model, "lagrangian")
+
+
+def pendulum(name: str = "arm", mass: float = 1.0) -> mb.ModelBuilder:
+    b = mb.ModelBuilder(name)
+    b.add_body("link", mass=mass, com=(0.1, 0.0, -0.5), inertia=(0.1, 0.1, 0.02))
+    b.add_joint("hinge", "revolute", parent="world", child="link", axis=(0, 1, 0), lower=-2.0, upper=2.0, damping=0.1)
+    b.add_frame("tip", body="link", translation=(0, 0, -1.0))
+    return b
+
+
+# Edit
+
+
+@settings(max_examples=15, deadline=None)
+@given(SEEDS)
+def test_a_builder_of_a_model_builds_the_same_model(seed):
+    model = random_tree(seed, 8, mimic=True)
+    again = mb.ModelBuilder.of(model).build()
+    assert again == model
+    assert again.notes == model.notes
+    assert again.nonphysical == model.nonphysical
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda", "anymal", "talos", "romeo_small"])
+def test_a_builder_of_a_robot_builds_the_same_robot(name):
+    robot = mb.load(name)
+    again = mb.ModelBuilder.of(robot).build()
+    assert again == robot
+    assert again.nonphysical == robot.nonphysical
+    # No file describes what a builder made, and its shapes are those of the file.
+    assert not again.source
+    assert again.drawn_from == (("", robot.source),)
+
+
+def test_what_is_set_is_what_a_new_description_would_have():
+    b = mb.ModelBuilder.of(pendulum().build())
+    b.set_body("link", mass=3.0, com=(0, 0, -0.2), inertia=(0.3, 0.3, 0.1))
+    b.set_joint(
+        "hinge", damping=0.5, armature=0.2, stiffness=4.0, rest=0.1, upper=np.inf, axis=(1, 0, 0), rpy=(0, 0, 1)
+    )
+    b.set_frame("tip", translation=(0, 0, -2.0))
+    b.set_gravity((0, 0, -1.62))
+    changed = b.build()
+    new = mb.ModelBuilder("arm", gravity=(0, 0, -1.62))
+    new.add_body("link", mass=3.0, com=(0, 0, -0.2), inertia=(0.3, 0.3, 0.1))
+    new.add_joint(
+        "hinge", "revolute", parent="world", child="link", axis=(1, 0, 0), rpy=(0, 0, 1), lower=-2.0, damping=0.5,
+        armature=0.2, stiffness=4.0, rest=0.1,
+    )  # fmt: skip
+    new.add_frame("tip", body="link", translation=(0, 0, -2.0))
+    assert changed == new.build()
+    told = " ".join(changed.notes)
+    assert "mass 1 to 3" in told
+    assert "damping 0.1 to 0.5" in told
+    assert "gravity from [0, 0, -9.81] to [0, 0, -1.62]" in told
+
+
+def test_springs_loops_couplings_and_couplers_are_set_too():
+    b = mb.ModelBuilder("two")
+    for k in (1, 2):
+        b.add_body(f"link{k}", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
+        b.add_joint(f"j{k}", "revolute", parent="world", child=f"link{k}", axis=(0, 1, 0), translation=(k, 0, 0))
+    b.add_spring("spring", body_a="link1", body_b="link2", stiffness=1.0)
+    b.add_coupling("tendon", {"j1": 1.0, "j2": -1.0}, stiffness=1.0)
+    b.add_coupler("gear", "j1", "j2", ratio=2.0)
+    b.add_loop("rod", "distance", body_a="link1", body_b="link2", length=1.0)
+    before = b.build()
+    b = mb.ModelBuilder.of(before)
+    b.set_spring("spring", stiffness=7.0, point_a=(0, 0, -1.0))
+    b.set_coupling("tendon", damping=2.0)
+    b.set_coupler("gear", offset=0.3)
+    b.set_loop("rod", translation_b=(0, 0, 0.1), length=1.5)
+    after = b.build()
+    assert (after.springs[0].stiffness, after.springs[0].point_a.tolist()) == (7.0, [0, 0, -1.0])
+    assert (after.couplings[0].stiffness, after.couplings[0].damping) == (1.0, 2.0)
+    assert (after.couplers[0].ratio, after.couplers[0].offset) == (2.0, 0.3)
+    assert (after.loops[0].length, after.loops[0].translation_b.tolist()) == (1.5, [0, 0, 0.1])
+    assert (before.springs[0].stiffness, before.loops[0].length) == (1.0, 1.0)
+
+
+def test_a_parameter_takes_the_place_of_a_number_and_a_number_that_of_a_parameter():
+    b = mb.ModelBuilder.of(pendulum(mass=mb.Parameter("m", 2.0)).build())
+    b.set_joint("hinge", damping=mb.Parameter("d", 0.3))
+    assert dict(b.build().parameters) == {"m": 2.0, "d": 0.3}
+    b.set_body("link", mass=5.0)
+    model = b.build()
+    assert dict(model.parameters) == {"d": 0.3}
+    assert model.mass == 5.0
+
+
+@settings(max_examples=15, deadline=None)
+@given(SEEDS)
+def test_a_payload_adds_its_inertia_by_the_jacobian_of_its_frame(seed):
+    tree = random_tree(seed, 6, kinds=SOUND)
+    b = mb.ModelBuilder.of(tree)
+    inertia = np.array([[0.3, 0.02, 0.01], [0.02, 0.25, -0.03], [0.01, -0.03, 0.2]])
+    b.add_payload(
+        "load", at="tip", mass=0.7, com=(0.1, -0.2, 0.3), inertia=inertia, translation=(0.2, 0, 0), rpy=(1, 2, 3)
+    )
+    b.add_frame("center", body="load", translation=(0.1, -0.2, 0.3))
+    loaded = b.build()
+    (q,), (v,), *_ = states(tree, 1, seed)
+    before, after = own(tree), own(loaded)
+    J = np.asarray(after.jacobian(q, "center", axes="local"))
+    spatial = np.block([[0.7 * np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), inertia]])
+    assert off(after.mass_matrix(q), before.mass_matrix(q) + J.T @ spatial @ J) < CLOSE
+    pull = J[:3].T @ np.asarray(after.pose(q, "center"))[:3, :3].T @ (0.7 * loaded.gravity)
+    assert off(after.gravity(q), before.gravity(q) - pull) < CLOSE
+    assert off(after.passive(q, v), before.passive(q, v)) < CLOSE
+
+
+def test_a_removed_joint_takes_all_that_it_carries():
+    b = pendulum()
+    for k, parent in enumerate(("link", "more0", "world")):
+        b.add_body(f"more{k}", mass=1.0, com=(0, 0, 0.1), inertia=(0.1, 0.1, 0.1))
+        b.add_joint(f"j{k}", "revolute", parent=parent, child=f"more{k}", axis=(1, 0, 0))
+    b.add_frame("far", body="more1")
+    b.add_spring("spring", body_a="more1", body_b="more2", stiffness=1.0, point_a=(1, 0, 0))
+    b.add_coupling("tendon", {"j1": 1.0, "hinge": 1.0}, stiffness=1.0)
+    q, v = ca.SX.sym("q"), ca.SX.sym("v")
+    b.add_joint_force("motor", "j1", -q - v)
+    whole = b.build()
+    b = mb.ModelBuilder.of(whole)
+    b.remove_joint("j0")
+    left = b.build()
+    assert [x.name for x in left.bodies] == ["link", "more2"]
+    assert left.joint_names == ("hinge", "j2")
+    assert not (left.springs)
+    assert not (left.couplings)
+    assert not (left.forces)
+    assert [f.name for f in left.frames] == ["tip"]
+    assert all(x in left.notes[-1] for x in ("more0", "more1", "spring 'spring'", "coupling 'tendon'", "force 'motor'"))
+
+
+@settings(max_examples=10, deadline=None)
+@given(SEEDS)
+def test_a_prefix_changes_names_alone(seed):
+    tree = random_tree(seed, 6, mimic=True)
+    b = mb.ModelBuilder.of(tree)
+    b.add_prefix("left_")
+    named = b.build()
+    assert named.coordinate_names == tuple(f"left_{x}" for x in tree.coordinate_names)
+    (q,), (v,), _, (tau,) = states(tree, 1, seed)
+    for term in TERMS:
+        arguments = (q,) if term in ("mass_matrix", "gravity") else (q, v)
+        assert np.array_equal(getattr(own(named), term)(*arguments), getattr(own(tree), term)(*arguments))
+    assert np.array_equal(own(named).forward_dynamics(q, v, tau), own(tree).forward_dynamics(q, v, tau))
+
+
+def test_formulas_follow_a_prefix():
+    b = pendulum()
+    b.add_body("second", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("elbow", "revolute", parent="link", child="second", axis=(0, 1, 0))
+    elbow, rate, k, q = (ca.SX.sym(x) for x in ("elbow", "elbow_dot", "k", "q"))
+    b.add_joint_force("servo", "hinge", k * (elbow - q) - 0.3 * rate, parameters={"k": 2.0})
+    plain = b.build()
+    changed = mb.ModelBuilder.of(plain)
+    changed.add_prefix("a_")
+    q, v = [0.3, -0.4], [1.0, 2.0]
+    assert np.array_equal(own(changed.build()).passive(q, v), own(plain).passive(q, v))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda b: b.set_body("lnk", mass=1.0), ["body 'lnk'", "did you mean 'link'"]),
+        (lambda b: b.set_body("tip", mass=1.0), ["'tip'", "frame on body 'link'", "add_payload"]),
+        (lambda b: b.set_joint("hing", damping=1.0), ["joint 'hing'", "did you mean 'hinge'"]),
+        (lambda b: b.set_joint("hinge", damping="soft"), ["joint 'hinge': damping", "soft"]),
+        (lambda b: b.set_joint("hinge", lower=3.0), ["joint 'hinge'", "lower"]),
+        (lambda b: b.set_body("link", mass=-1.0), ["link", "-1"]),
+        (lambda b: b.set_spring("spring", stiffness=1.0), ["spring 'spring'", "none"]),
+        (lambda b: b.set_frame("tip", rotation=np.ones((3, 3))), ["tip", "not a rotation matrix"]),
+        (lambda b: b.add_payload("load", at="tipp", mass=1.0), ["payload 'load'", "'tipp'", "did you mean 'tip'"]),
+        (
+            lambda b: b.add_payload("load", at="tip", mass=1.0, inertia=(1, 1, 5)),
+            ["body 'load'", "violates A + B >= C"],
+        ),
+        (lambda b: b.add_payload("link", at="tip", mass=1.0), ["body 'link'", "2 times"]),
+        (lambda b: b.remove_joint("knee"), ["joint 'knee'"]),
+        (lambda b: b.add_prefix(7), ["prefix", "7"]),
+    ],
+)
+def test_a_faulty_change_is_told_at_build(change, words):
+    model = pendulum().build()
+    b = mb.ModelBuilder.of(model)
+    change(b)
+    with pytest.raises(ModelError) as caught:
+        b.build()
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+    assert model == pendulum().build()
+
+
+def test_a_robot_with_odd_inertias_is_edited_and_a_new_fault_is_told():
+    with pytest.warns(mb.errors.NonPhysicalWarning):
+        robot = mb.load("romeo_small")
+    odd = dict(robot.nonphysical)
+    b = mb.ModelBuilder.of(robot)
+    sound = next(j.child for j in robot.joints if j.type.nv and j.child not in odd)
+    b.set_body(sound, mass=2.0)
+    assert dict(b.build().nonphysical) == odd
+    b.set_body(sound, inertia=(1.0, 1.0, 5.0))
+    with pytest.raises(ModelError, match=sound):
+        b.build()
+
+
+# Lock
+
+
+def free_entries(full: Model, reduced: Model) -> list[int]:
+    return [i for i, name in enumerate(full.velocity_names) if name in reduced.velocity_names]
+
+
+def in_pinocchio(
+    model: Model, raw: pin.Model, q: np.ndarray, v: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Return a state in the order of a model of Pinocchio, and where our velocities are in it."""
+    joints = [(raw.joints[raw.getJointId(j)], model.joint(j).type) for j in model.joint_names]
+    at = [x.idx_q + k for x, kind in joints for k in range(kind.nq)]
+    order = [x.idx_v + k for x, kind in joints for k in range(kind.nv)]
+    pin_q, pin_v = np.empty(raw.nq), np.empty(raw.nv)
+    pin_q[at] = q
+    if len(v):
+        pin_v[order] = v
+    return pin_q, pin_v, order
+
+
+def assert_same_as(raw: pin.Model, dyn: mb.Dynamics, q: np.ndarray, v: np.ndarray) -> None:
+    pin_q, pin_v, order = in_pinocchio(dyn.model, raw, q, v)
+    data = raw.createData()
+    M = np.triu(pin.crba(raw, data, pin_q))
+    M = M + np.triu(M, 1).T
+    assert off(dyn.mass_matrix(q), M[np.ix_(order, order)]) < CLOSE
+    assert off(dyn.nle(q, v), pin.nonLinearEffects(raw, data, pin_q, pin_v)[order]) < CLOSE
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.data())
+def test_a_locked_model_has_the_rows_and_columns_that_are_left(seed, data):
+    tree = random_tree(seed, 8, mimic=True)
+    names = data.draw(st.lists(st.sampled_from(tree.joint_names), min_size=1, unique=True))
+    q0, _ = tree.random_state(seed + 1)
+    reduced = tree.lock(names, q0) if len(names) < len(tree.joint_names) else tree.lock(names[1:], q0)
+    (q,), (v,), (a,), (tau,) = states(reduced, 1, seed)
+    whole_q, whole_v = reduced.full_state(q, v)
+    kept = free_entries(tree, reduced)
+    assert all(np.array_equal(x, y) for x, y in zip(reduced.reduced_state(whole_q, whole_v), (q, v), strict=True))
+    full, small = own(tree), own(reduced)
+    assert off(small.mass_matrix(q), full.mass_matrix(whole_q)[np.ix_(kept, kept)]) < CLOSE
+    for term in ("nle", "passive"):
+        assert off(getattr(small, term)(q, v), getattr(full, term)(whole_q, whole_v)[kept]) < CLOSE
+    assert off(small.gravity(q), full.gravity(whole_q)[kept]) < CLOSE
+    assert off(small.pose(q, "tip"), full.pose(whole_q, "tip")) < CLOSE
+    rates = small.mass_matrix(q) @ small.forward_dynamics(q, v, tau) - tau
+    assert off(rates, small.passive(q, v) - small.nle(q, v)) < 1e-10
+    assert a.shape == v.shape
+
+
+@pytest.mark.parametrize("name", ["ur5", "anymal", "talos", "g1", "solo8"])
+def test_a_locked_robot_is_that_of_pinocchio(name):
+    robot = mb.load(name)
+    rng = np.random.default_rng(3)
+    q0, _ = robot.random_state(rng)
+    names = [
+        robot.joint_names[k] for k in sorted(rng.permutation(len(robot.joint_names))[: len(robot.joint_names) // 2])
+    ]
+    reduced = robot.lock(names, q0)
+    raw = pin.buildModelFromUrdf(robot.source)
+    raw = pin.buildReducedModel(raw, [raw.getJointId(x) for x in names], in_pinocchio(robot, raw, q0, q0[:0])[0])
+    q, v = reduced.random_state(rng)
+    for engine in ("lagrangian", "pinocchio"):
+        assert_same_as(raw, mb.dynamics(reduced, engine), q, v)
+
+
+def test_a_locked_gripper_is_one_line():
+    robot = mb.load("panda")
+    arm = robot.lock({"panda_finger_joint1": 0.02})
+    assert arm.nv == 7
+    assert not arm.needs.mimic
+    # The finger that mimics is locked with it, and frames stay.
+    assert arm.joint("panda_finger_joint2").kind == "fixed"
+    assert {f.name for f in robot.frames} <= {f.name for f in arm.frames}
+    assert "panda_finger_joint1 at 0.02; with them panda_finger_joint2" in arm.notes[-1]
+    again = arm.lock({"panda_joint1": 0.5})
+    q, v = again.full_state(again.neutral())
+    assert (q[0], q[-1], v.tolist()) == (0.5, 0.02, [0.0] * 8)
+    assert pickle.loads(pickle.dumps(again)).full_state(again.neutral())[0].tolist() == q.tolist()
+
+
+def test_couplings_couplers_and_formulas_hold_the_locked_numbers():
+    b = mb.ModelBuilder("three")
+    for k in range(3):
+        b.add_body(f"b{k}", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
+        b.add_joint(f"j{k}", "revolute", parent="world", child=f"b{k}", axis=(0, 1, 0), translation=(k, 0, 0))
+    b.add_coupling("tendon", {"j0": 2.0, "j1": -1.0}, stiffness=3.0, rest_length=0.2, damping=0.5)
+    b.add_coupling("alone", {"j0": 1.0}, stiffness=3.0)
+    q, j0, rate = ca.SX.sym("q"), ca.SX.sym("j0"), ca.SX.sym("j0_dot")
+    b.add_joint_force("servo", "j2", 5.0 * (j0 - q) - rate)
+    b.add_joint_force("lost", "j0", -q)
+    full = b.build()
+    reduced = full.lock({"j0": 0.7})
+    q, v = np.array([0.3, -0.2]), np.array([1.0, 2.0])
+    assert off(own(reduced).passive(q, v), own(full).passive([0.7, *q], [0.0, *v])[1:]) < 1e-15
+    assert [x.name for x in reduced.couplings] == ["tendon"]
+    assert [x.name for x in reduced.forces] == ["servo"]
+    told = " ".join(reduced.notes)
+    assert "coupling 'alone'" in told
+    assert "force 'lost'" in told
+
+
+def geared(ratio: float = -2.0, curve: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Model:
+    b = mb.ModelBuilder("geared")
+    for k in range(3):
+        b.add_body(f"b{k}", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
+        b.add_joint(f"j{k}", "revolute", parent="world", child=f"b{k}", axis=(0, 1, 0), translation=(k, 0, 0))
+    b.add_coupler("gear", "j0", "j1", ratio=ratio, offset=0.1, curve=curve)
+    return b.build()
+
+
+@pytest.mark.parametrize("given", [{"j1": 0.3}, {"j0": -0.5}, {"j0": -0.5, "j1": 0.3}])
+def test_what_a_coupler_ties_is_locked_with_it(given):
+    reduced = geared().lock(given)
+    assert reduced.joint_names == ("j2",)
+    assert not reduced.couplers
+    assert np.allclose(reduced.full_state([0.2])[0], [-0.5, 0.3, 0.2], rtol=0, atol=1e-15)
+
+
+def test_a_loop_stays_and_one_that_nothing_moves_is_gone():
+    crank = mb.catalog.four_bar()
+    dyn = own(crank)
+    q, _ = dyn.project([0.5, 0.0, 1.0], [0.0] * 3)
+    locked = crank.lock({name: q[k] for k, name in enumerate(crank.joint_names)})
+    assert not locked.loops
+    assert "is closed by the locked joints" in " ".join(locked.notes)
+    with pytest.raises(InputError, match="is open by"):
+        crank.lock(dict.fromkeys(crank.joint_names, 0.3))
+    one = crank.lock({crank.joint_names[0]: q[0]})
+    assert len(one.loops) == 1
+    assert np.abs(own(one).constraint_residual(q[1:])).max() < 1e-14
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda m: m.lock({"hing": 0.0}), ["'hing'", "hinge"]),
+        (lambda m: m.lock({"hinge": 2.5}), ["'hinge' at 2.5", "-2 to 2"]),
+        (lambda m: m.lock({"hinge": [0.1, 0.2]}), ["'hinge'", "(1,)"]),
+        (lambda m: m.lock({"hinge": float("nan")}), ["'hinge'"]),
+        (lambda m: m.lock("hinge"), ["joints", "list of names"]),
+        (lambda m: m.lock({"hinge": 0.1}, m.neutral()), ["q:"]),
+        (lambda m: m.lock(["hinge"], [0.1, 0.2]), ["q", "2"]),
+        (lambda m: m.full_state([0.0]), ["no locked joints"]),
+        (lambda m: m.lock({"hinge": 0.1}).lock({"hinge": 0.2}), ["'hinge'"]),
+        (lambda _: mb.load("panda").lock({"panda_finger_joint2": 0.0}), ["follows 'panda_finger_joint1'"]),
+        (lambda _: geared(curve=(1.0, 0, 0)).lock({"j0": 0.2}), ["gear", "lock 'j1'"]),
+        (lambda _: geared().lock({"j0": 0.4, "j1": 0.4}), ["gear", "locked at"]),
+        (lambda _: mb.catalog.rolling_disc().lock({"move": [0, 0, 0, 0, 0, 0, 2.0]}), ["move"]),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_locked_is_refused(ask, words):
+    with pytest.raises(MbkitError) as caught:
+        ask(pendulum().build())
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+# Join and mount
+
+
+@settings(max_examples=15, deadline=None)
+@given(SEEDS)
+def test_two_trees_joined_have_the_arm_s_terms_in_their_block(seed):
+    base, arm = random_tree(seed, 5, kinds=SOUND), random_tree(seed + 1, 5, kinds=SOUND)
+    if any(j.parent == "world" and j.type.floating for j in arm.joints):
+        with pytest.raises(InputError, match="floats"):
+            mb.join(base, arm, at="tip", prefix="arm_")
+        return
+    whole = mb.join(base, arm, at="tip", pose=mb.spatial.pose((0.1, 0.2, 0.3), rpy=(1, 2, 3)), prefix="arm_")
+    assert whole.joint_names == (*base.joint_names, *(f"arm_{x}" for x in arm.joint_names))
+    q1, v1 = base.random_state(seed)
+    q2, v2 = arm.random_state(seed)
+    q, v = np.concatenate([q1, q2]), np.concatenate([v1, v2])
+    M = own(whole).mass_matrix(q)
+    # The arm's own block is that of the arm alone, wherever it stands, and the base's block is its own and more.
+    n = base.nv
+    assert off(M[n:, n:], own(arm).mass_matrix(q2)) < CLOSE
+    assert np.linalg.eigvalsh(M[:n, :n] - own(base).mass_matrix(q1))[0] > -1e-9 * np.abs(M).max()
+    assert off(M, mb.dynamics(whole, "pinocchio").mass_matrix(q)) < CLOSE
+    assert off(own(whole).nle(q, v), mb.dynamics(whole, "pinocchio").nle(q, v)) < CLOSE
+    assert off(own(whole).passive(q, v), mb.dynamics(whole, "pinocchio").passive(q, v)) < CLOSE
+
+
+def test_a_joined_robot_is_that_of_pinocchio_and_of_mujoco():
+    base, arm = mb.load("anymal", floating_base=True), mb.load("ur5")
+    place = mb.spatial.pose((0.1, 0.0, 0.2), rpy=(0.1, 0.2, 0.3))
+    whole = mb.join(base, arm, at="base", pose=place, prefix="arm_")
+    a = pin.buildModelFromUrdf(base.source, pin.JointModelFreeFlyer(), "root_joint")
+    b = pin.buildModelFromUrdf(arm.source)
+    for k in range(1, b.njoints):
+        b.names[k] = "arm_" + b.names[k]
+    for f in list(b.frames)[1:]:
+        f.name = "arm_" + f.name
+    raw = pin.appendModel(a, b, a.getFrameId("base"), pin.SE3(place))
+    q, v = whole.random_state(np.random.default_rng(1))
+    for engine in ("lagrangian", "pinocchio", "mujoco"):
+        assert_same_as(raw, mb.dynamics(whole, engine), q, v)
+
+
+def test_what_hangs_on_the_ground_hangs_on_the_frame():
+    arm = pendulum("arm")
+    arm.add_spring("spring", body_a="world", body_b="link", point_a=(1.0, 0, 0), point_b=(0, 0, -1), stiffness=9.0)
+    arm = arm.build()
+    pose = mb.spatial.pose((0.3, 0.2, 0.1), rpy=(0.4, 0.5, 0.6))
+    alone = mb.ModelBuilder("block")
+    alone.add_body("block", mass=1.0, inertia=(1, 1, 1))
+    alone.add_joint("weld", "fixed", parent="world", child="block")
+    joined = mb.join(alone.build(), arm, at="block", pose=pose)
+    # Its springs see the same distances; its weight hangs another way.
+    for q in ([0.3], [-1.1]):
+        assert off(own(joined).passive(q, [0.7]), own(arm).passive(q, [0.7])) < 1e-14
+    tilted = mb.join(alone.build(), arm, at="world", pose=pose)
+    assert off(own(tilted).gravity([0.3]), own(joined).gravity([0.3])) < 1e-14
+
+
+def test_a_mount_turns_gravity_the_other_way_round():
+    R = mb.spatial.matrix_from_rpy(0.3, -0.4, 0.5)
+    X = np.eye(4)
+    X[:3, :3], X[:3, 3] = R, (1, 2, 3)
+    mounted = mb.load("ur5", mount=X)
+    turned = mb.load("ur5", gravity=R.T @ [0, 0, -9.81])
+    q, v = turned.random_state(4)
+    for term in TERMS[1:3]:
+        arguments = (q,) if term == "gravity" else (q, v)
+        assert off(getattr(own(mounted), term)(*arguments), getattr(own(turned), term)(*arguments)) < CLOSE
+    assert off(own(mounted).pose(q, "tool0"), X @ own(turned).pose(q, "tool0")) < 1e-14
+    assert "mounted at [1.0, 2.0, 3.0] m" in mounted.notes[-1] or any("mounted" in x for x in mounted.notes)
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda a: mb.join(a, a, at="tip"), ["prefix", "bodies", "'link'"]),
+        (lambda a: mb.join(a, a, at="top", prefix="b_"), ["'top'", "tip"]),
+        (lambda a: mb.join(a, a, at="tip", prefix=3), ["prefix", "3"]),
+        (lambda a: mb.join(a, a, at="tip", prefix="b_", pose=np.eye(3)), ["pose", "(4, 4)"]),
+        (lambda a: mb.join(a, a, at="tip", prefix="b_", pose=2 * np.eye(4)), ["pose", "homogeneous"]),
+        (lambda a: mb.join(a, "ur5", at="tip"), ["arm", "Model"]),
+        (lambda _: mb.load("ur5", floating_base=True, mount=np.eye(4)), ["mount", "root_joint"]),
+        (lambda a: mb.join(a, mb.load("ur5", floating_base=True), at="tip"), ["floats", "root_joint"]),
+    ],
+)
+def test_what_cannot_be_joined_is_refused(ask, words):
+    with pytest.raises(MbkitError) as caught:
+        ask(pendulum().build())
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+# Free numbers and variants
+
+
+@settings(max_examples=10, deadline=None)
+@given(SEEDS)
+def test_free_numbers_have_their_values_until_others_are_given(seed):
+    tree = random_tree(seed, 5, mimic=True)
+    free = tree.with_free("*.mass", "*.com", "*.inertia", "*.damping", "*.stiffness", "*.translation", "gravity")
+    (q,), (v,), (a,), _ = states(tree, 1, seed)
+    assert off(own(free).inverse_dynamics(q, v, a), own(tree).inverse_dynamics(q, v, a)) < CLOSE
+    rng = np.random.default_rng(seed)
+    mass = {name: float(rng.uniform(1, 2)) for name in free.parameters if name.endswith(".mass")}
+    b = mb.ModelBuilder.of(tree)
+    for name, x in mass.items():
+        b.set_body(name.removesuffix(".mass"), mass=x)
+    assert off(own(free).at(**mass).inverse_dynamics(q, v, a), own(b.build()).inverse_dynamics(q, v, a)) < CLOSE
+    assert free.with_parameters(**free.parameters) == tree
+
+
+def test_a_scale_is_one_factor_beside_free_numbers():
+    tree = random_tree(2, 4)
+    free = tree.with_free("b0.mass", mb.scale("*.mass", "*.inertia", name="size"))
+    assert dict(free.parameters) == {"b0.mass": tree.body("b0").mass, "size": 1.0}
+    other = free.with_parameters(size=2.0, **{"b0.mass": 3.0})
+    assert other.body("b0").mass == 6.0
+    assert other.body("b1").mass == 2 * tree.body("b1").mass
+    assert np.allclose(other.body("b2").inertia, 2 * tree.body("b2").inertia, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("lnk.mass", ["'lnk.mass'", "did you mean 'link.mass'"]),
+        ("tip.mass", ["'tip' is a frame on body 'link'", "link.mass"]),
+        ("hinge.friction", ["friction is data"]),
+        ("*.armature", ["'*.armature'", "did you mean 'hinge.armature'"]),
+        ("link.masss", ["link.mass"]),
+        (7, ["paths", "7"]),
+    ],
+)
+def test_a_path_that_fits_nothing_is_refused(path, words):
+    with pytest.raises(InputError) as caught:
+        pendulum().build().with_free(path)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+def test_variants_are_robots_of_their_own():
+    robot = mb.load("ur5")
+    spread = {"*.mass": 0.2, "forearm_link.inertia": 0.3, "wrist_1_link.com": 0.01, mb.scale("gravity"): (0.9, 1.1)}
+    many = mb.variants(robot, spread, size=20, seed=3)
+    q, v = robot.random_state(0, 20)
+    tau = np.ones((20, 6))
+    together = many.dynamics().forward_dynamics(q, v, tau)
+    for k in (0, 7, 19):
+        for engine in ("pinocchio", "mujoco"):
+            one = mb.dynamics(many[k], engine).forward_dynamics(q[k], v[k], tau[k])
+            assert off(one, together[k]) < 1e-12
+    assert len({float(x) for x in many.values["forearm_link.mass"]}) == 20
+    assert repr(many) == "<Variants of 'ur5': 20 of 16 numbers, seed 3>"
+    assert "forearm_link.mass" in str(many)
+
+
+def test_the_same_seed_draws_the_same_whatever_else_varies(tmp_path):
+    robot = mb.load("ur5")
+    one = mb.variants(robot, {"*.mass": 0.1}, size=5, seed=1)
+    two = mb.variants(robot, {"forearm_link.inertia": 0.1, "*.mass": 0.1}, size=5, seed=1)
+    assert all(np.array_equal(x, two.values[name]) for name, x in one.values.items())
+    assert not np.array_equal(
+        one.values["forearm_link.mass"], mb.variants(robot, {"*.mass": 0.1}, size=5).values["forearm_link.mass"]
+    )
+    one.to_csv(tmp_path / "drawn.csv")
+    rows = (tmp_path / "drawn.csv").read_text().splitlines()
+    assert len(rows) == 6
+    assert float(rows[1].split(",")[1]) == next(iter(one.values.values()))[0]
+    assert pickle.loads(pickle.dumps(two))[3] == two[3]
+
+
+@settings(max_examples=20, deadline=None)
+@given(SEEDS, st.floats(0.01, 2.0))
+def test_every_drawn_body_can_be(seed, spread):
+    tree = random_tree(seed, 3)
+    many = mb.variants(tree, {"*.inertial": spread}, size=50, seed=seed)
+    for k in range(0, 50, 7):
+        # The builder refuses any other.
+        for body in many[k].bodies:
+            second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
+            assert body.mass > 0
+            assert np.linalg.eigvalsh(second)[0] > 0
+    small = mb.variants(tree, {"*.inertial": 1e-9}, size=3, seed=seed)
+    (q,), (v,), (a,), _ = states(tree, 1, seed)
+    assert off(own(small[1]).inverse_dynamics(q, v, a), own(tree).inverse_dynamics(q, v, a)) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("spread", "words"),
+    [
+        ({"link.mass": (-1.0, 1.0)}, ["'link.mass' is negative", "variants"]),
+        ({"link.inertia.zz": (0.5, 0.6)}, ["'link' has an inertia that no matter has", "link.inertia"]),
+        ({"hinge.damping": (1.0, 0.0)}, ["hinge.damping", "lower end first"]),
+        ({"link.mass": lambda rng, n: rng.random(n - 1)}, ["link.mass", "(10,)"]),
+        ({"link.mass": "much"}, ["link.mass"]),
+        ({"link.mass": -0.1}, ["link.mass"]),
+        ({"link.mass": 0.1, "*.mass": 0.2}, ["link.mass", "two entries"]),
+        ({}, ["spread"]),
+        ({"link.inertial": (0, 1)}, ["link.inertial", "one number"]),
+        ({"arm.mass": 1.0}, ["arm.mass"]),
+    ],
+)
+def test_a_spread_that_is_none_is_refused(spread, words):
+    with pytest.raises(InputError) as caught:
+        mb.variants(pendulum().build(), spread, size=10)
+    assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+# Pictures
+
+
+def test_an_edited_and_a_joined_robot_are_drawn_with_their_shapes():
+    from mbkit.show.scene import shapes_of
+
+    robot = mb.load("ur5")
+    b = mb.ModelBuilder.of(robot)
+    b.add_payload("load", at="tool0", mass=2.0, inertia=(0.01, 0.01, 0.01))
+    whole = mb.join(b.build(), robot, at="load", prefix="second_")
+    shapes = shapes_of(whole)
+    plain = [x.name for x in shapes_of(robot)]
+    assert [x.name for x in shapes][: 2 * len(plain)] == [*plain, *(f"second_{x}" for x in plain)]
+    assert {"load"} <= {x.body for x in shapes}
+    assert mujoco.mj_name2id(
+        mb.dynamics(whole, "mujoco").mj_model, mujoco.mjtObj.mjOBJ_BODY, "second_forearm_link"
+    ) > 0  # fmt: skip
+
+
+def test_a_name_that_is_unknown_is_told_of_every_change():
+    with pytest.raises(UnknownNameError, match="hinge"):
+        pendulum().build().lock({"hinges": 0.0})
