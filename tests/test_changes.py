@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 
 import casadi as ca
 import mujoco
@@ -593,6 +594,45 @@ def test_a_spread_that_is_none_is_refused(spread, words):
     with pytest.raises(InputError) as caught:
         mb.variants(pendulum().build(), spread, size=10)
     assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+# Texts and macros
+
+
+def test_the_text_of_a_file_is_the_robot_of_the_file():
+    robot = mb.load("ur5")
+    text = Path(robot.source).read_text()
+    assert mb.load(text) == robot
+    assert not mb.load(text).source
+    arm = "<mujoco><worldbody><body><joint name='j'/><geom size='0.1'/></body></worldbody></mujoco>"
+    assert mb.load(f"\n{arm}").joint_names == ("j",)
+    with pytest.raises(mb.errors.LoadError, match="the text given"):
+        mb.load("<robot name='x'><link></robot>")
+
+
+MACRO = """<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="arm">
+  <xacro:arg name="prefix" default=""/><xacro:arg name="mass" default="2"/>
+  <link name="base"/>
+  <link name="$(arg prefix)link"><inertial><origin xyz="0 0 0.1"/><mass value="${2 * $(arg mass)}"/>
+    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="$(arg prefix)hinge" type="continuous"><parent link="base"/><child link="$(arg prefix)link"/></joint>
+</robot>"""
+
+
+def test_a_xacro_file_is_expanded_with_its_arguments(tmp_path):
+    file = tmp_path / "arm.urdf.xacro"
+    file.write_text(MACRO)
+    robot = mb.load(file, xacro={"prefix": "left_", "mass": "3"})
+    assert robot.joint_names == ("left_hinge",)
+    assert robot.mass == 6.0
+    assert mb.load(str(file)).mass == 4.0
+    file.write_text(MACRO.replace("$(arg prefix)link", "$(find nowhere)"))
+    with pytest.raises(mb.errors.LoadError, match="xacro cannot expand it"):
+        mb.load(file)
+    with pytest.raises(InputError, match="xacro: expected a mapping"):
+        mb.load(file, xacro={"mass": 3})
+    with pytest.raises(InputError, match="which is no"):
+        mb.load("ur5", xacro={"mass": "3"})
 
 
 # Pictures

@@ -7,7 +7,7 @@ import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -30,12 +30,13 @@ from mbkit.model.validation import scale_doubts
 # `Path` drops one of the two slashes.
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
 _PACKAGE: Final = "example-robot-data"
+#: What stands for a path in messages on a text.
+_TEXT: Final = "the text given"
 _USD: Final = "this is OpenUSD; export it as one of them"
 #: What is said of files of other formats.
 _OTHERS: Final = {
     ".sdf": "this is SDF; export it as one of them",
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
-    ".xacro": "this is a xacro file; run xacro, and load the URDF that it writes",
     ".mjb": "this is a compiled MuJoCo model; save it as XML (mujoco.mj_saveLastXML)",
 }
 
@@ -79,8 +80,9 @@ def load(
     loops: bool | Loops = True,
     actuators: bool = False,
     mount: ArrayLike | None = None,
+    xacro: Mapping[str, str] | None = None,
 ) -> Model:
-    """Load a robot by name, or a URDF or MJCF file.
+    """Load a robot by name, or a URDF or MJCF: a file, its text, or a xacro file of a URDF.
 
     No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF its
     inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers where their forces
@@ -90,7 +92,7 @@ def load(
     ----------
     source : str or path
         A robot of example-robot-data, such as ``"panda"`` or ``"ur_description/ur5_gripper"`` (`robots` lists them),
-        or a path.
+        or a path, or the text of a URDF or MJCF, such as ROS's ``robot_description``. A text has no meshes to draw.
     floating_base : bool
         Whether the base link moves freely, on a joint named ``"root_joint"``.
     mimic : {"reduce", "free"}
@@ -118,6 +120,9 @@ def load(
     mount : (4, 4) array_like, optional
         Where the robot's ground stands in the world, as a homogeneous matrix: a ceiling, a wall or a tilted base.
         `mbkit.spatial.pose` makes one. For a fixed base; q places a floating one.
+    xacro : mapping of str to str, optional
+        Arguments of a xacro file, as ``{"prefix": "left_"}``. The package xacro expands it, ``mbkit[xacro]``; such a
+        file is a program that may read others, and its meshes are not drawn.
 
     Returns
     -------
@@ -162,9 +167,18 @@ def load(
         if not isinstance(value, (str, bool, np.bool_, NoneType)) or value not in allowed:
             raise InputError(f"{name}: expected {expected}, got {shown(value)}")
     added = None if isinstance(loops, (bool, np.bool_)) else loops
-    path, by_name = _locate(source)
+    if isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
+        path, by_name, file = Path(_TEXT), False, ""
+        root = xml_reader.parse(source.encode("utf-8", "replace"), _TEXT)
+    else:
+        path, by_name = _locate(source)
+        expands = path.suffix.lower() == ".xacro"
+        # What xacro makes is no file that others could read again.
+        file = "" if expands else str(path.absolute())
+        root = xml_reader.expanded(path, {} if xacro is None else xacro) if expands else xml_reader.read(path)
+    if xacro is not None and path.suffix.lower() != ".xacro":
+        raise InputError(f"xacro: arguments {shown(xacro)} for {path}, which is no .xacro file")
     policy = nonphysical or ("warn" if by_name else "error")
-    root = xml_reader.read(path)
     if root.tag == "robot":
         # Pinocchio is imported only for a URDF.
         from mbkit.load.urdf import model_of
@@ -188,7 +202,7 @@ def load(
     doubts = scale_doubts(model)
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)
-    return replace(model, notes=(*root.notes, *model.notes, *_friction(model)), source=str(path.absolute()))
+    return replace(model, notes=(*root.notes, *model.notes, *_friction(model)), source=file)
 
 
 def _friction(model: Model) -> Iterator[str]:
@@ -208,15 +222,13 @@ def _locate(source: str | os.PathLike[str]) -> tuple[Path, bool]:
         raise InputError(f"source: expected a path of characters, got bytes {shown(text)}")
     if not text:
         raise InputError("source: expected a robot's name or a path, got an empty text")
-    if text.lstrip().startswith("<"):
-        raise InputError("source: expected a robot's name or a path, got the text of a file; write it to a file")
     text = os.path.expanduser(text)
     if _URL.match(text) and not os.path.exists(text):
         raise LoadError(f"{text}: this is a URL, and mbkit reads local files; download it and give its path")
     if (other := _OTHERS.get(Path(text).suffix.lower())) is not None:
         raise LoadError(f"{text}: expected a URDF or MJCF file, {other}")
     if isinstance(source, str):
-        looks_like_path = text.lower().endswith((".urdf", ".xml", ".mjcf"))
+        looks_like_path = text.lower().endswith((".urdf", ".xml", ".mjcf", ".xacro"))
         robot = None if looks_like_path else find(text)
         if robot is not None:
             return robot.path, True

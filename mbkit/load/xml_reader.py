@@ -16,7 +16,8 @@ from typing import Final, NoReturn
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-from mbkit.errors import LoadError
+from mbkit._check import shown
+from mbkit.errors import InputError, LoadError
 
 #: Far above any robot, far below what would exhaust memory or the stack.
 MOST_BYTES: Final = 64 * 2**20
@@ -87,6 +88,28 @@ def read(path: Path) -> Element:
     if size > MOST_BYTES:
         raise LoadError(f"{path}: expected a description of up to {MOST_BYTES} bytes, got {size} bytes")
     return parse(content, str(path))
+
+
+def expanded(path: Path, arguments: Mapping[str, str]) -> Element:
+    """Return the root element of what xacro makes of a file with arguments; `LoadError` in xacro's words."""
+    if not isinstance(arguments, Mapping) or not all(isinstance(x, str) for pair in arguments.items() for x in pair):
+        raise InputError(
+            f"xacro: expected a mapping of names to text, as {{'prefix': 'left_'}}, got {shown(arguments)}"
+        )
+    # What is missing or too large is said as of every file.
+    read(path)
+    try:
+        # Only such a file needs it.
+        import xacro
+    except ImportError:
+        raise LoadError(f"{path}: a xacro file is expanded by the package xacro; pip install 'mbkit[xacro]'") from None
+    try:
+        text = xacro.process_file(str(path), mappings=dict(arguments)).toxml()
+    except Exception as error:
+        # Any: its macros are Python's expressions.
+        why = " ".join(f"{type(error).__name__}: {error}".split())
+        raise LoadError(f"{path}: xacro cannot expand it: {why[:500]}") from None
+    return parse(text.encode(), str(path))
 
 
 def unknown_root(path: Path, root: Element) -> LoadError:

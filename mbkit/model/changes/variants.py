@@ -1,10 +1,10 @@
 """Many variants of one model: numbers drawn at random, reproducibly, and always of bodies that can be.
 
 The inertia of a body is drawn by the Cholesky factor of its pseudo-inertia J, which is positive definite for every
-distribution of mass: J' = L T Tᵀ Lᵀ with J = L Lᵀ and T lower triangular, its diagonal log-normal and the entries below
-it normal. The spread is that of T, whatever units and axes (Wensing, Kim and Slotine 2018, Linear matrix inequalities
-for physically consistent inertial parameter identification; Rucker and Wensing 2022, Smooth parameterization of
-rigid-body inertia).
+distribution of mass: J' = L T Tᵀ Lᵀ with J = L Lᵀ and T lower triangular. T has a log-normal diagonal and normal
+entries below it, and the spread is that of T Tᵀ, whatever units and axes (Wensing, Kim and Slotine 2018, Linear matrix
+inequalities for physically consistent inertial parameter identification; Rucker and Wensing 2022, Smooth
+parameterization of rigid-body inertia).
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Variants:
             Those of ``mbkit.dynamics(model, "lagrangian", ...)``.
         """
         # By name: a description knows no engine.
-        dyn = import_module("mbkit.engines").dynamics(self.model, "lagrangian", **options)
+        dyn = import_module("mbkit.engines.lagrangian").LagrangianDynamics(self.model, **options)
         return dyn.at(**self.values)
 
     def to_dict(self) -> dict[str, Any]:
@@ -237,15 +237,16 @@ def _bodies_drawn(
             f"spread: body {name!r} has an inertia that no matter has, so that none is drawn about it; correct it"
         ) from None
     T = np.zeros((size, 3, 3))
-    T[:, *_LOWER] = spread * rng.standard_normal((size, 6))
+    # Half of it, since the inertia has the factor's square.
+    T[:, *_LOWER] = 0.5 * spread * rng.standard_normal((size, 6))
     diagonal = np.arange(3)
     T[:, diagonal, diagonal] = np.exp(T[:, diagonal, diagonal])
     factor = L @ T
     moments = factor @ factor.swapaxes(1, 2)
     out: dict[str, Array] = {}
     if not about_com:
-        # The whole factor: the mass's own entry, and below it the centre of mass, in lengths of the body.
-        out[f"{name}.mass"] = body.mass * np.exp(2 * spread * rng.standard_normal(size))
+        # The rest of the whole factor: the mass, and below it the centre of mass, in the body's radii of gyration.
+        out[f"{name}.mass"] = body.mass * np.exp(spread * rng.standard_normal(size))
         away = spread * rng.standard_normal((size, 3)) @ L.T / np.sqrt(body.mass)
         out |= {f"{name}.com.{axis}": body.com[k] + away[:, k] for k, axis in enumerate("xyz")}
         moments = moments * (out[f"{name}.mass"] / body.mass)[:, None, None]
