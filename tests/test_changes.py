@@ -417,17 +417,19 @@ def test_two_trees_joined_have_the_arm_s_terms_in_their_block(seed):
     assert off(own(whole).passive(q, v), mb.dynamics(whole, "pinocchio").passive(q, v)) < CLOSE
 
 
-def test_a_joined_robot_is_that_of_pinocchio_and_of_mujoco():
-    base, arm = mb.load("anymal", floating_base=True), mb.load("ur5")
+@pytest.mark.parametrize(("name", "floating", "at"), [("anymal", True, "base"), ("ur5", False, "tool0")])
+def test_a_joined_robot_is_that_of_pinocchio_and_of_mujoco(name, floating, at):
+    base, arm = mb.load(name, floating_base=floating), mb.load("ur5")
     place = mb.spatial.pose((0.1, 0.0, 0.2), rpy=(0.1, 0.2, 0.3))
-    whole = mb.join(base, arm, at="base", pose=place, prefix="arm_")
-    a = pin.buildModelFromUrdf(base.source, pin.JointModelFreeFlyer(), "root_joint")
+    whole = mb.join(base, arm, at=at, pose=place, prefix="arm_")
+    free = (pin.JointModelFreeFlyer(), "root_joint") if floating else ()
+    a = pin.buildModelFromUrdf(base.source, *free)
     b = pin.buildModelFromUrdf(arm.source)
     for k in range(1, b.njoints):
         b.names[k] = "arm_" + b.names[k]
     for f in list(b.frames)[1:]:
         f.name = "arm_" + f.name
-    raw = pin.appendModel(a, b, a.getFrameId("base"), pin.SE3(place))
+    raw = pin.appendModel(a, b, a.getFrameId(at), pin.SE3(place))
     q, v = whole.random_state(np.random.default_rng(1))
     for engine in ("lagrangian", "pinocchio", "mujoco"):
         assert_same_as(raw, mb.dynamics(whole, engine), q, v)
