@@ -62,7 +62,7 @@ class TrigRing:
                     base, exponent = (factor, 1) if factor in self._generator else factor.as_base_exp()
                     exponents[self._generator[base]] += int(exponent)
             if number:
-                _gather(terms, (0, self.still, tuple(exponents)), Fraction(int(number.p), int(number.q)))
+                gather(terms, (0, self.still, tuple(exponents)), Fraction(int(number.p), int(number.q)))
         return TrigPolynomial(self, terms)
 
     def power(self, generator: sp.Expr, exponent: int) -> TrigPolynomial:
@@ -117,7 +117,7 @@ class TrigPolynomial:
         other = self._other(x)
         out = dict(self.terms)
         for key, value in other.terms.items():
-            _gather(out, key, value)
+            gather(out, key, value)
         return TrigPolynomial(self.space, out)
 
     __radd__ = __add__
@@ -143,9 +143,9 @@ class TrigPolynomial:
                 value = x1 * x2
                 powers = tuple(i + j for i, j in zip(m, n, strict=True))
                 if k == still:
-                    _gather(out, (t, l, powers), value)
+                    gather(out, (t, l, powers), value)
                 elif l == still:
-                    _gather(out, (s, k, powers), value)
+                    gather(out, (s, k, powers), value)
                 else:
                     half = value / 2
                     total = tuple(i + j for i, j in zip(k, l, strict=True))
@@ -166,7 +166,8 @@ class TrigPolynomial:
         return sp.Mul(*(g**e for g, e in zip(self.space.generators, exponents, strict=True) if e))
 
 
-def _gather(out: dict[Key, Fraction], key: Key, value: Fraction) -> None:
+def gather(out: dict[Any, Fraction], key: Any, value: Fraction) -> None:
+    """Add a term."""
     total = out.get(key)
     if total is None:
         out[key] = value
@@ -183,12 +184,12 @@ def _put(
     first = next((k for k in multiples if k), 0)
     if not first:
         if kind == 0:
-            _gather(out, (0, multiples, powers), value)
+            gather(out, (0, multiples, powers), value)
         return
     if first < 0:
         multiples = tuple(-k for k in multiples)
         value = -value if kind else value
-    _gather(out, (kind, multiples, powers), value)
+    gather(out, (kind, multiples, powers), value)
 
 
 def _rational(x: Fraction) -> sp.Rational:

@@ -48,8 +48,6 @@ def tidy_matrix(x: Any) -> sp.ImmutableMatrix:
     return sp.ImmutableMatrix(x).applyfunc(tidy)
 
 
-#: Operations up to which the derivative is multiplied out too.
-_SMALL: Final = 60
 #: Operations up to which the contents of brackets are tidied.
 _LONG: Final = 150
 
@@ -63,13 +61,7 @@ def slope(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
     broken = [f for f in x.atoms(sp.Pow) if f.base.has(q) and (not f.exp.is_Integer or f.exp.is_negative)]
     if all(f.base.is_Symbol for f in broken):
         return tidy(sp.diff(x, q))
-    product = _product(x, q)
-    # Multiplied out, what has roots gets shorter in rare cases only.
-    if x.count_ops() > _SMALL or not all(f.exp.is_Integer for f in broken):
-        return product
-    plain = tidy(sp.diff(x, q))
-    # A sum that was written as products stays one, unless it gets much shorter.
-    return plain if complexity(plain) < (_WORTH if x.is_Add else 1.0) * complexity(product) else product
+    return _product(x, q)
 
 
 def gradient(x: sp.Expr, coordinates: Any) -> list[sp.Expr]:
