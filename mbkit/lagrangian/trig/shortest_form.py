@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from fractions import Fraction
 from itertools import combinations
-from math import comb, gcd, lcm, prod
+from math import comb, prod
 from typing import Any, Final
 
 import sympy as sp
@@ -224,11 +224,9 @@ def content(poly: Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, Poly]:
     shared = {a: min(es) for a, es in powers.items() if min(es) > 0 or min(es) == max(es)}
     values = list(poly.values())
     scale = min(map(abs, values))
-    if any(v.denominator > 1 or abs(v) > 100 for v in (x / scale for x in values)):
-        scale = Fraction(gcd(*(v.numerator for v in values)), lcm(*(v.denominator for v in values)))
-        # Decimals share many numbers by accident; a common factor is useful where it is small.
-        if scale.numerator > 100 or scale.denominator > 100:
-            scale = Fraction(1)
+    # Decimals share many numbers by accident; a common factor is useful where it leaves small whole numbers.
+    if any((x / scale).denominator > 1 or abs(x / scale) > 100 for x in values):
+        scale = Fraction(1)
     if sum(v > 0 for v in values) == 0:
         scale = -scale
     left = {

@@ -111,13 +111,10 @@ def forms(x: sp.Expr) -> list[sp.Expr]:
     """Return short forms of an expression: as it stands, and over one denominator; none of a long one."""
     out: list[sp.Expr] = []
     with suppress(UnsupportedError):
+        for f, put in _QUOTIENTS.items():
+            x = x.replace(f, put)
         reading = _Reading(x)
         out.append(reading.as_it_stands())
-        if x.has(*_QUOTIENTS):
-            for f, put in _QUOTIENTS.items():
-                x = x.replace(f, put)
-            reading = _Reading(x)
-            out.append(reading.as_it_stands())
         out += reading.over_one_denominator()
     return out
 
@@ -207,11 +204,7 @@ class _Reading:
         written = root if root in self._powers else 1 / x.base
         generator = self._powers[written]
         if generator not in self._known:
-            power = _Power(x.base, written == root, self._read(x.base))
-            # The same may be written in several ways.
-            twins = (g for g, p in self._known.items() if p.root == power.root and p.sum.terms == power.sum.terms)
-            generator = self._powers[written] = next(twins, generator)
-            self._known.setdefault(generator, power)
+            self._known[generator] = _Power(x.base, written == root, self._read(x.base))
         return self._space.power(generator, int(2 * x.exp) if written == root else -int(x.exp))
 
     # Writing
@@ -237,8 +230,7 @@ class _Reading:
         if not self._known or len(self.sum.terms) > _SHORT:
             return []
         # What was read last may stand on what was read before.
-        total = self._over_one(self.sum, list(reversed(self._known)))
-        return [total, sp.factor_terms(total)]
+        return [self._over_one(self.sum, list(reversed(self._known)))]
 
     def _over_one(self, x: TrigPolynomial, left: list[sp.Dummy]) -> sp.Expr:
         """Return a sum as a numerator and powers of what the generators stand for, for each set of roots one."""
