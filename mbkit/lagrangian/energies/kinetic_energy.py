@@ -187,27 +187,8 @@ def blocks(A: sp.Matrix) -> list[list[int]]:
 _LONG: Final = 250
 
 
-class Squares:
-    """The inverse of a symmetric matrix, each set of coupled coordinates by itself; InputError names a singular one."""
-
-    def __init__(self, M: Any, what: str) -> None:
-        self._blocks = [(block, _solver(M.extract(block, block), what)) for block in blocks(M)]
-
-    def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
-        """Return xᵀ M⁻¹ y."""
-        parts = (a.form([x[i] for i in block], [y[i] for i in block]) for block, a in self._blocks)
-        return sum(parts, sp.Integer(0))
-
-    def solve(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
-        """Return M⁻¹ x."""
-        out = list(x)
-        for block, a in self._blocks:
-            for i, value in zip(block, a.solve([x[i] for i in block]), strict=True):
-                out[i] = value
-        return out
-
-
-def _solver(M: sp.ImmutableMatrix, what: str) -> _Eliminated | _Inverted:
+def completed_squares(M: sp.ImmutableMatrix, what: str) -> _Eliminated | _Inverted:
+    """Return the inverse of a symmetric matrix; InputError names a singular one."""
     try:
         return _Eliminated(M)
     except _NoPivotError:
@@ -253,10 +234,12 @@ class _Eliminated:
         return out
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
+        """Return xᵀ M⁻¹ y."""
         a, b = self._lowered(x), self._lowered(y)
         return sum((a[k] * b[k] / pivot for k, pivot, _ in self._steps), sp.Integer(0))
 
     def solve(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
+        """Return M⁻¹ x."""
         out = self._lowered(x)
         for k, pivot, factors in reversed(self._steps):
             out[k] = out[k] / pivot - sum((factor * out[i] for i, factor in factors.items()), sp.Integer(0))
@@ -270,7 +253,9 @@ class _Inverted:
         self._inverse = inverse(M, what)
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:
+        """Return xᵀ M⁻¹ y."""
         return sum((a * b for a, b in zip(x, self.solve(y), strict=True)), sp.Integer(0))
 
     def solve(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
+        """Return M⁻¹ x."""
         return list(self._inverse * sp.Matrix(list(x)))

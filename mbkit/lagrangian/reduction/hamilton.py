@@ -32,7 +32,7 @@ from mbkit.lagrangian.energies.energy_form import (
     timed_parameters,
     vanish,
 )
-from mbkit.lagrangian.energies.kinetic_energy import Squares
+from mbkit.lagrangian.energies.kinetic_energy import completed_squares
 from mbkit.lagrangian.energies.symbols import free_name, velocity_of
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
@@ -350,7 +350,7 @@ def hamiltonian(system: EnergyForm) -> Hamiltonian:
     k = system.kinetic
     momenta = momentum_symbols(system, system.coordinates)
     p = [symbol - x for symbol, x in zip(momenta, k.b, strict=True)]
-    squares = Squares(k.M, "T: its mass matrix")
+    squares = completed_squares(k.M, "T: its mass matrix")
     return Hamiltonian(
         system=system,
         H=squares.form(p, p) / 2 - k.T0 + system.V,

@@ -28,7 +28,7 @@ from mbkit.engines.base import at_times
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import EnergyForm, parameter_values, timed_parameters
-from mbkit.lagrangian.energies.kinetic_energy import Squares
+from mbkit.lagrangian.energies.kinetic_energy import completed_squares
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.energy_model import EnergyModel
@@ -177,7 +177,7 @@ def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
     k = system.kinetic
     symbols = momentum_symbols(system, ignored)
     excess = [symbol - k.b[i] for symbol, i in zip(symbols, c, strict=True)]
-    squares = Squares(k.M.extract(c, c), "T: the ignored coordinates' mass matrix")
+    squares = completed_squares(k.M.extract(c, c), "T: the ignored coordinates' mass matrix")
     columns = [list(k.M.extract(c, [j])) for j in r]
     v = [system.velocities[j] for j in r]
     M = sp.Matrix(len(r), len(r), lambda i, j: tidy(k.M[r[i], r[j]] - squares.form(columns[i], columns[j])))
