@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections import Counter
 from fractions import Fraction
 from itertools import combinations
-from math import comb, prod
+from math import comb, gcd, lcm, prod
+from random import Random
 from typing import Any, Final
 
 import sympy as sp
@@ -188,8 +189,9 @@ def _power(k: int, kept: int) -> dict[tuple[int, int], int]:
 
 # Sums of products of atoms: what their terms share, and whether they are products of sums.
 
-#: Possible terms up to which a product of sums is looked for.
+#: Possible terms up to which a product of sums is looked for, and places at which it is ruled out first.
 _DENSE: Final = 50_000
+_PROBES: Final = 4
 
 #: A product of powers of atoms -> its coefficient.
 Poly = dict[tuple[tuple[sp.Expr, int], ...], Fraction]
@@ -203,7 +205,7 @@ def product(poly: Poly, x: sp.Expr) -> list[sp.Expr]:
     # SymPy's polynomials are as large as all powers together.
     large = prod(e + 1 for e in highest.values()) > _DENSE
     # The factors of a sum with decimals would have others.
-    if large or x.has(sp.Float) or any(e < 0 for atoms in poly for _, e in atoms):
+    if large or x.has(sp.Float) or any(e < 0 for atoms in poly for _, e in atoms) or _irreducible(poly):
         return []
     symbols = {a: sp.Dummy(f"x{i}") for i, a in enumerate(dict.fromkeys(a for atoms in poly for a, _ in atoms))}
     named = sp.Add(
@@ -214,6 +216,28 @@ def product(poly: Poly, x: sp.Expr) -> list[sp.Expr]:
     )
     factored = sp.factor(named)
     return [] if factored.is_Add else [factored.xreplace({symbol: a for a, symbol in symbols.items()})]
+
+
+def _irreducible(poly: Poly) -> bool:
+    """Return whether a sum surely has no factors: those of Q a + R are shared by Q and R, tested at random numbers."""
+    atoms = list(dict.fromkeys(a for powers in poly for a, _ in powers))
+    rows = [tuple(dict(powers).get(a, 0) for a in atoms) for powers in poly]
+    # Without what all terms share, which is no factor that is looked for.
+    least = [min(es) for es in zip(*rows, strict=True)]
+    rows = [tuple(e - f for e, f in zip(row, least, strict=True)) for row in rows]
+    scale = lcm(*(v.denominator for v in poly.values()))
+    numbers = [int(v * scale) for v in poly.values()]
+    shared, rng = gcd(*numbers), Random(0)
+    for i, highest in enumerate(max(es) for es in zip(*rows, strict=True)):
+        for _ in range(_PROBES if highest == 1 else 0):
+            at = [rng.randrange(1_000, 1_000_000) for _ in atoms]
+            parts = [0, 0]
+            for row, x in zip(rows, numbers, strict=True):
+                others = (at[j] ** e for j, e in enumerate(row) if j != i)
+                parts[row[i]] += x // shared * prod(others)
+            if gcd(*parts) == 1:
+                return True
+    return False
 
 
 def content(poly: Poly) -> tuple[list[tuple[sp.Expr, int]], Fraction, Poly]:
