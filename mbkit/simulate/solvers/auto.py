@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -39,68 +39,47 @@ _RECENT: Final = 8
 #: h|λ| from which on stability holds rk853's steps: its region reaches to 6 on the negative and 5 on the imaginary
 #: axis; steps that follow an oscillation at a tolerance of 1e-6 or less have 2 at most.
 _EDGE: Final = 3.0
-#: h|λ| that rk853 would have at most, where rodas5 is compared with it.
-_KEPT: Final = 5.0
-#: Time of an attempt of rodas5 over that of one of rk853, and how much faster rodas5 must be.
-_DEARER: Final = 1.2
-_FASTER: Final = 1.5
-#: First step of rodas5, of what remains: one too long is soon rejected, while growing takes a step for each decade.
-_BEGIN: Final = 1e-3
-#: Fastest rate times duration from which on the tolerance follows the number of steps.
-_MANY: Final = 1000.0
 #: Errors of n steps, in a mean over 2 nv numbers, add up to n √(2 nv) tolerances at most: the limit, in the user's
 #: tolerances. Measured is a third to a three-hundredth of it for rk853, a tenth to a thirtieth for rodas5.
 _SUM: Final = {EXPLICIT: 300.0, IMPLICIT: 1000.0}
-#: Steps to come that count at most, for each step so far.
+#: Steps to come that count at most, for each step so far: the first ones may be short.
 _BELIEVED: Final = 64
-#: Where rounding keeps steps short: by how much the tolerance is loosened, and up to what.
+#: By how much a tolerance is loosened where rounding keeps steps short.
 _LOOSER: Final = 10.0
-_LOOSEST: Final = 1e-5
 #: Rounding of accelerations is the residual of a cubic through points within this part of a step.
 _NEAR: Final = 0.03
 _AHEAD: Final = np.linspace(0.0, 1.0, 12)[:, None]
 _CUBIC: Final = np.linalg.qr(_AHEAD ** np.arange(4))[0]
 _RESIDUAL: Final = np.eye(len(_AHEAD)) - _CUBIC @ _CUBIC.T
 _LEFT: Final = len(_AHEAD) - 4
-#: Rounding in a step's estimated error: the length of rk853's weights, and the part that is too much.
-_WEIGHT: Final = 2.0
-_ROUNDED: Final = 0.03
-#: Sequences of methods in a batch that are described.
-_DESCRIBED: Final = 3
-
-
-class Costs(NamedTuple):
-    """When to check for stiffness."""
-
-    # Steps before the first check, and the factor to each next one.
-    first: int
-    later: int
-    # Steps to come that are worth a check, and those that are worth a trial of rodas5 in any case.
-    worth: int
-    guess: int
-    # Steps of a trial.
-    pilot: int
-
-
-# Measured by validation/auto.py in processor time, in steps of rk853. In machine code a check takes 50 to 100, a trial
-# 60, a step of rodas5 0.5 to 1.2; in Python 2 to 5, 15 and 1.2 to 1.6. All checks take a tenth of a run at most.
-_COMPILED: Final = Costs(first=64, later=4, worth=1500, guess=3000, pilot=24)
-_IN_PYTHON: Final = Costs(first=5, later=2, worth=100, guess=300, pilot=8)
+#: Rounding times a step, beside the tolerance, that is too much: of that, rk853's weights make an error twice as large.
+_ROUNDED: Final = 0.015
+#: What a check takes, in steps of rk853: so many come before the first. Measured by validation/auto.py in processor
+#: time: 50 to 100 in machine code, 2 to 5 in Python; a trial takes 60 and 15, a step of rodas5 0.5 to 1.6.
+_COMPILED: Final = 64
+_IN_PYTHON: Final = 5
+#: By how many times as many steps a check comes later than the one before.
+_LATER: Final = 3
+#: Checks whose time is to come where one is worth it, and where a trial of rodas5 is in any case.
+_WORTH: Final = 20
+_GUESS: Final = 60
+#: Steps of a trial.
+_PILOT: Final = 12
 
 
 class AutoContext:
-    """What all trajectories of a run share: the problem, the costs of checks, and all attempts."""
+    """What all trajectories of a run share: the problem, what a check takes, and all attempts."""
 
     def __init__(self, problem: IntegrationProblem) -> None:
         self.problem, self.space, self.stops = problem, Space(problem.dyn.model), problem.stops
         self.attempts: list[StepAttempts] = []
-        self.costs = _IN_PYTHON
+        self.check = _IN_PYTHON
 
     def make(self, method: str, tolerances: Tolerances) -> StepAttempts:
         """Return the step attempts of a method, whose evaluations are counted with all others."""
         attempts = make_attempts(self.problem, method, self.space, tolerances)
         self.attempts.append(attempts)
-        self.costs = _COMPILED if attempts.rounds > 1 else _IN_PYTHON
+        self.check = _COMPILED if attempts.rounds > 1 else _IN_PYTHON
         return attempts
 
 
@@ -116,8 +95,8 @@ def loosest(method: str, base: Tolerances) -> Tolerances:
 class StepRateMonitor:
     """How fast a method goes, judged by the later half of its attempts."""
 
-    def __init__(self, t: float, first: int, later: int) -> None:
-        self._next, self._later = first, later
+    def __init__(self, t: float, first: int) -> None:
+        self._next = first
         # Attempts and time; the ends of the last steps.
         self._begin = t
         self._marks = [(0, t)]
@@ -140,7 +119,7 @@ class StepRateMonitor:
         """Return whether a check is due."""
         due = self.missing <= 0
         if due:
-            self._next = self._later * self._marks[-1][0]
+            self._next = _LATER * self._marks[-1][0]
         return due
 
     def rate(self) -> float:
@@ -182,14 +161,14 @@ class SwitchingController:
 
     def __init__(self, context: AutoContext, index: int) -> None:
         problem = context.problem
-        self._context, self._index, self._user, self._duration = context, index, problem.tolerances, problem.duration
+        self._context, self._index, self._user = context, index, problem.tolerances
         self.record = TrajectoryRecord(problem, index, context.space)
         self.doubt = ""
         # The first is the user's or loosened, the second for the number of steps.
         self._base, self._tolerances = self._user, loosest(EXPLICIT, self._user)
         self._least, self._tightest = LEAST, math.inf
         # rk853's h|λ| when it was left: where accuracy kept its steps short, it would do so again.
-        self._kept = _KEPT
+        self._kept = 0.0
         self._segments = [Segment(EXPLICIT, problem.start)]
         self._monitor: StepRateMonitor | None = None
         self._at: tuple[float, Array, Array] = problem.start, np.empty(0), np.empty(0)
@@ -209,7 +188,7 @@ class SwitchingController:
     @property
     def _first(self) -> int:
         # Later after each return, so that the methods do not take turns for ever.
-        return self._context.costs.first << 2 * (self._returns if self._method == EXPLICIT else 0)
+        return self._context.check << 2 * (self._returns if self._method == EXPLICIT else 0)
 
     @property
     def _rest(self) -> float:
@@ -226,7 +205,7 @@ class SwitchingController:
     def leaves(self, attempts: StepAttempts, place: int, steps: AcceptedSteps) -> bool:
         """Add accepted steps; return whether another method goes on from their end."""
         if self._monitor is None:
-            self._monitor = StepRateMonitor(float(steps.t[0]), self._first, self._context.costs.later)
+            self._monitor = StepRateMonitor(float(steps.t[0]), self._first)
         self._monitor.saw(steps)
         self._tries += steps.attempts
         self._at = float(steps.t[-1]), steps.q[-1], steps.w[-1]
@@ -253,7 +232,7 @@ class SwitchingController:
         """Return step attempts of a method that begin here."""
         t, q, w = self._at
         attempts = self._context.make(method, loosest(method, self._base))
-        attempts.start([self._index], q[None], w[None], t, _BEGIN * self._rest if method == IMPLICIT else 0.0)
+        attempts.start([self._index], q[None], w[None], t, 0.0)
         return attempts
 
     def _switch(self, method: str, attempts: StepAttempts, why: str) -> None:
@@ -262,33 +241,32 @@ class SwitchingController:
 
     def _check_stiff(self, attempts: StepAttempts, place: int, monitor: StepRateMonitor) -> None:
         """Check whether rodas5 shall take over."""
-        rate, step, costs = monitor.rate(), monitor.step(), self._context.costs
+        rate, step, check = monitor.rate(), monitor.step(), self._context.check
         to_come = rate * self._rest
-        if to_come >= costs.worth and step:
-            rates = self._spectrum(attempts, place, min(_EDGE / step, _MANY / self._duration))
+        if to_come >= _WORTH * check and step:
+            rates = self._spectrum(attempts, place)
             if self._rounding_limited(attempts, place, step):
                 return
             held = rates is not None and step * rates.stable >= _EDGE
-            # Where steps are short now, and not only on the average.
-            if (held or to_come >= costs.guess) and (trial := self._faster_trial(min(rate, 1 / step))):
+            # Compared with the steps as they are now, which may be short in passing only.
+            if (held or to_come >= _GUESS * check) and (trial := self._faster_trial(1 / step)):
                 why = "stability held its steps" if held else "rodas5 got further with a trial"
                 size = "" if rates is None else f" (h|λ| = {step * rates.stable:.1f}; {rates})"
                 self._switch(IMPLICIT, trial, why + size)
-                if rates is not None:
-                    self._kept = min(_KEPT, step * rates.stable) or _KEPT
+                self._kept = 0.0 if rates is None else step * rates.stable
                 return
         # By the mean rate, which passing changes hardly touch.
         self._adapt_tolerance(attempts, place, monitor.overall() * self._rest)
 
     def _faster_trial(self, rate: float) -> StepAttempts | None:
         """Let rodas5 try some steps, which are the next ones if it is faster than this rate."""
-        costs, trial = self._context.costs, self._started(IMPLICIT)
-        monitor, ahead, count = StepRateMonitor(self._at[0], costs.pilot, costs.later), list[AcceptedSteps](), 0
+        trial, ahead, count = self._started(IMPLICIT), list[AcceptedSteps](), 0
+        monitor = StepRateMonitor(self._at[0], _PILOT)
         if trial.rounds > 1:
-            trial.rounds = costs.pilot
+            trial.rounds = _PILOT
         try:
             trial.hold(self._interval, self._context.stops[self._interval])
-            while count < costs.pilot and (accepted := trial.advance()):
+            while count < _PILOT and (accepted := trial.advance()):
                 ahead.append(accepted[0][1])
                 monitor.saw(ahead[-1])
                 count += ahead[-1].attempts
@@ -297,7 +275,7 @@ class SwitchingController:
             return None
         # With the tolerance for so many steps.
         tighter = self._factor(IMPLICIT, monitor.rate() * self._rest) ** (-1 / 5)
-        if not _DEARER * _FASTER * tighter * monitor.rate() < rate:
+        if not tighter * monitor.rate() < rate:
             return None
         self._ahead = ahead
         return trial
@@ -306,20 +284,20 @@ class SwitchingController:
         """Check whether rk853 shall take over again."""
         rate = monitor.rate()
         to_come = rate * self._rest
-        if _DEARER * to_come >= self._context.costs.worth:
-            rates = self._spectrum(attempts, place, 0.0)
-            if rates is not None and rates.stable / self._kept < _DEARER * rate:
+        if to_come >= _WORTH * self._context.check:
+            rates = self._spectrum(attempts, place)
+            if rates is not None and rates.stable < self._kept * rate:
                 self._returns += 1
                 self._switch(EXPLICIT, self._started(EXPLICIT), f"stability no longer held rk853's steps ({rates})")
                 return
         self._adapt_tolerance(attempts, place, to_come)
 
-    def _spectrum(self, attempts: StepAttempts, place: int, enough: float) -> Stiffness | None:
+    def _spectrum(self, attempts: StepAttempts, place: int) -> Stiffness | None:
         """Return the rates of the linearized motion; None where they are not finite."""
         _, q, w = self._at
         try:
             J = linearized(self._context.space, q, w, partial(attempts.rates, place))
-            return stiffness_of(J, enough, exact=False)
+            return stiffness_of(J, 0.0, exact=False)
         except (NumericalError, FunctionError):
             return None
 
@@ -372,7 +350,7 @@ class SwitchingController:
             return 0.0, 0.0
         rtol, atol = self._tolerances
         scatter = np.sqrt(np.sum((_RESIDUAL @ rates) ** 2, axis=0) / _LEFT)
-        share = _WEIGHT * step * float(np.sqrt(np.mean((scatter / (atol + rtol * np.abs(w))) ** 2)))
+        share = step * float(np.sqrt(np.mean((scatter / (atol + rtol * np.abs(w))) ** 2)))
         return share, float(scatter.max() / max(np.abs(k).max(), np.finfo(float).tiny))
 
     def _loosen(self, noise: float) -> None:
@@ -381,7 +359,7 @@ class SwitchingController:
             # The user's own may still be possible.
             self._least = math.inf
             return
-        self._base = Tolerances(*(min(_LOOSER * x, max(x, _LOOSEST)) for x in self._base))
+        self._base = _scaled(self._base, _LOOSER)
         self.doubt = (
             f"near t = {self._at[0]:.6g} s accelerations are known to {noise:.0e} of themselves, which is not enough "
             f"for rtol = {self._user.rtol:g}; there it took {self._base.rtol:.0e}. Leave out what has next to no mass, "
@@ -438,11 +416,9 @@ def _chosen(controllers: Sequence[SwitchingController], batch: int | None) -> st
         return controllers[0].describe()
     sequences = [controller.method_sequence() for controller in controllers]
     kinds, parts = Counter(sequences), list[str]()
-    for kind, count in kinds.most_common(_DESCRIBED):
+    for kind, count in kinds.most_common():
         example = sequences.index(kind)
         text = controllers[example].describe()
         such = "" if text == kind else f", such as trajectory {example}"
         parts.append(f"{count} of {batch}{such}: {text}")
-    if len(kinds) > _DESCRIBED:
-        parts.append(f"and {len(kinds) - _DESCRIBED} more kinds")
     return "; ".join(parts)
