@@ -25,15 +25,14 @@ from mbkit.model.manifold import unit_quaternions
 from mbkit.model.model import unchecked
 from mbkit.model.validation import idle_joints, sample_mass_matrix
 from tests.random_trees import off, random_tree, states
+from tests.scenes import chain, hinge
 
 I3 = (1.0, 1.0, 1.0)
 
 
 def pendulum(**joint):
-    b = mb.ModelBuilder("pendulum")
-    b.add_body("bob", mass=1.0, com=(0, 0, -1))
-    b.add_joint("hinge", "revolute", parent="world", child="bob", axis=(0, 1, 0), **joint)
-    return b
+    bob = {"body": "bob", "joint": "hinge", "mass": 1.0, "com": (0, 0, -1), "axis": (0, 1, 0)}
+    return chain(bob | joint, name="pendulum")
 
 
 # Arguments
@@ -118,8 +117,7 @@ def test_each_argument_of_a_builder_is_built_or_refused_by_name(method):
 @pytest.mark.parametrize("value", [np.complex128(1 + 1j), np.complex64(2), np.array(1 + 1j)])
 def test_a_complex_number_is_not_cut_to_its_real_part(value):
     b = pendulum()
-    b.add_body("c", mass=value)
-    b.add_joint("k", "fixed", parent="bob", child="c")
+    body_c(mass=value)(b)
     with pytest.raises(ModelError, match="body 'c': mass"):
         b.build()
 
@@ -157,43 +155,33 @@ def test_difference_undoes_integrate(seed):
 
 
 def test_integrate_is_the_flow_of_constant_velocity():
-    """Steps along one twist add up: exp((s + t) ξ) = exp(s ξ) exp(t ξ)."""
-    model = random_tree(1, 4, ("free", "ball", "planar", "revolute"))
+    """Steps along one twist add up: exp((s + t) ξ) = exp(s ξ) exp(t ξ); it starts off along D v."""
+    model = random_tree(1, 6, ("free", "ball", "planar", "revolute", "universal"))
     q, v, _, _ = states(model, 5)
-    once = model.integrate(q, v)
     twice = model.integrate(model.integrate(q, 0.3 * v), 0.7 * v)
-    assert off(model.difference(once, twice), 0 * v) < 1e-14
-
-
-def test_integrate_starts_off_along_d_times_v():
-    model = random_tree(2, 6, ("free", "ball", "universal", "planar"))
-    (q, v), h = (x[0] for x in states(model, 1)[:2]), 1e-6
+    assert off(model.difference(model.integrate(q, v), twice), 0 * v) < 1e-14
+    h = 1e-6
     rate = (model.integrate(q, h * v) - model.integrate(q, -h * v)) / (2 * h)
     for joint in model.independent_joints:
         iq, iv = model.layout.q[joint.name], model.layout.v[joint.name]
-        assert np.allclose(rate[iq], joint.type.qdot(list(q[iq]), list(v[iv])), atol=1e-9)
+        for one, at, along in zip(rate, q, v, strict=True):
+            assert np.allclose(one[iq], joint.type.qdot(list(at[iq]), list(along[iv])), atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-300, 1e-160, 1e-12, 1e-8, 9.99e-3, 1.001e-2, 0.0999, 0.1001, 1.0, 3.1415])
 def test_exponentials_keep_their_digits_at_every_size(angle):
-    b = mb.ModelBuilder("free")
-    b.add_body("a", mass=1.0, inertia=I3)
-    b.add_joint("j", "free", parent="world", child="a")
-    model = b.build()
-    axis = np.array([0.6, -0.48, 0.64])
-    dq = np.concatenate([[0.3, -0.2, 0.5], angle * axis])
+    model = chain({"kind": "free", "mass": 1.0, "inertia": I3}).build()
+    dq = np.array([0.3, -0.2, 0.5, *(angle * np.array([0.6, -0.48, 0.64]))])
     back = model.difference(model.neutral(), model.integrate(model.neutral(), dq))
     assert np.allclose(back, dq, rtol=3e-15, atol=3e-16)
     assert np.allclose(back[3:], dq[3:], rtol=3e-14, atol=0)
 
 
 def test_random_states_keep_to_the_limits_and_fill_them():
-    b = pendulum(lower=-0.5, upper=7.0)
-    b.add_body("slider", mass=1.0)
-    b.add_joint("slide", "prismatic", parent="bob", child="slider", axis=(1, 0, 0))
-    b.add_body("far", mass=1.0, com=(0, 1, 0))
-    b.add_joint("wound", "revolute", parent="slider", child="far", axis=(1, 0, 0), lower=4.0, upper=9.0)
-    q, v = b.build().random_state(np.random.default_rng(0), 4000)
+    swing = {"mass": 1.0, "com": (0, 0, -1), "axis": (0, 1, 0), "lower": -0.5, "upper": 7.0}
+    slide = {"mass": 1.0, "kind": "prismatic", "axis": (1, 0, 0)}
+    wound = {"mass": 1.0, "com": (0, 1, 0), "axis": (1, 0, 0), "lower": 4.0, "upper": 9.0}
+    q, v = chain(swing, slide, wound).build().random_state(np.random.default_rng(0), 4000)
     assert -0.5 <= q[:, 0].min() < -0.49
     assert np.pi - 0.01 < q[:, 0].max() <= np.pi
     assert -1 <= q[:, 1].min() < -0.99
@@ -210,10 +198,7 @@ def test_random_states_keep_to_the_limits_and_fill_them():
     [(5.0, None), (None, -5.0), (5.0, 30.0), (-30.0, -5.0), (7.0, 1e308), (-1e308, -9.0), (1e300, 1e301), (2.0, 2.0)],
 )
 def test_limits_far_from_zero_are_kept(kind, lower, upper):
-    b = mb.ModelBuilder("far")
-    b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("j", kind, parent="world", child="a", axis=(0, 1, 0), lower=lower, upper=upper)
-    model = b.build()
+    model = hinge(kind=kind, lower=lower, upper=upper).build()
     q, _ = model.random_state(np.random.default_rng(0), 100)
     assert (q >= model.lower).all()
     assert (q <= model.upper).all()
@@ -223,9 +208,7 @@ def test_limits_far_from_zero_are_kept(kind, lower, upper):
 
 def test_limits_of_a_follower_bound_its_leader():
     b = pendulum(lower=-1.0, upper=1.0)
-    b.add_body("c", mass=1.0, com=(0, 0, -1))
-    follower = {"mimic": ("hinge", -2.0, 0.5), "lower": 0.1, "upper": 0.9}
-    b.add_joint("m", "revolute", parent="bob", child="c", axis=(0, 1, 0), **follower)
+    joint_k(mimic=("hinge", -2.0, 0.5), lower=0.1, upper=0.9)(b)
     model = b.build()
     q, _ = model.random_state(np.random.default_rng(0), 500)
     y = model.layout.expand_q(q)[:, 1]
@@ -341,19 +324,15 @@ def test_needs_are_read_off_the_description():
     assert timed.build().needs.time
 
 
-def test_names_address_coordinates():
+def test_names_address_coordinates_and_models_show_themselves():
     model = random_tree(3, 10)
-    assert len(model.coordinate_names) == model.nq
+    assert len(model.coordinate_names) == len(set(model.coordinate_names)) == model.nq
     assert len(model.velocity_names) == model.nv
-    assert len(set(model.coordinate_names)) == model.nq
     for joint in model.independent_joints:
         part = model.layout.q[joint.name]
         assert all(n.startswith(joint.name) for n in model.coordinate_names[part])
     with pytest.raises(UnknownNameError, match="j3"):
         model.joint("j33")
-
-
-def test_models_show_themselves():
     model = random_tree(3, 4, ("revolute", "prismatic"), mimic=True)
     assert f"nv={model.nv}" in repr(model)
     page = replace(model, name="<script>")._repr_html_()
@@ -390,14 +369,6 @@ def test_reduced_mass_matrix_is_that_of_the_constrained_motion():
 # The builder's checks
 
 
-def bad_axis(b):
-    b.add_joint("k", "revolute", parent="bob", child="c", axis=(0, 0, 0))
-
-
-def two_parents(b):
-    b.add_joint("k", "ball", parent="world", child="bob")
-
-
 def cycle(b):
     b.add_body("c", mass=1.0, inertia=I3)
     b.add_body("d", mass=1.0, inertia=I3)
@@ -413,14 +384,22 @@ def body_c(**kwargs):
     return change
 
 
-def joint_k(kind="revolute", **kwargs):
+def joint_k(kind="revolute", parent="bob", **kwargs):
     def change(b):
         b.add_body("c", mass=1.0, com=(0, 1, 1), inertia=I3)
         if KINDS.get(kind) and KINDS[kind].n_axes and "axis" not in kwargs:
             kwargs["axis"] = (1, 0, 0)
-        b.add_joint("k", kind, parent="bob", child="c", **kwargs)
+        b.add_joint("k", kind, parent=parent, child="c", **kwargs)
 
     return change
+
+
+def call(method, *args, **kwargs):
+    return lambda b: getattr(b, method)(*args, **kwargs)
+
+
+def joined(name, kind, parent, child):
+    return call("add_joint", name, kind, parent=parent, child=child)
 
 
 FAULTS = {
@@ -434,28 +413,19 @@ FAULTS = {
     "inertia of a wrong shape": (body_c(mass=1.0, inertia=np.ones(6)), r"body 'c': inertia: expected shape \(3, 3\)"),
     "massless end": (body_c(), "body 'c': no mass moves with joint 'k'"),
     "point on its axis": (body_c(mass=1.0, com=(1, 0, 0)), "body 'c': no mass moves with joint 'k'"),
-    "two bodies of a name": (lambda b: b.add_body("bob", mass=1.0), "body 'bob': declared 2 times"),
-    "body called world": (lambda b: b.add_body("world", mass=1.0), "body 'world'"),
-    "body without joint": (lambda b: b.add_body("c", mass=1.0), "body 'c': no joint carries it"),
-    "two parents": (two_parents, "body 'bob': carried by 2 joints \\('hinge', 'k'\\)"),
+    "two bodies of a name": (call("add_body", "bob", mass=1.0), "body 'bob': declared 2 times"),
+    "body called world": (call("add_body", "world", mass=1.0), "body 'world'"),
+    "body without joint": (call("add_body", "c", mass=1.0), "body 'c': no joint carries it"),
+    "two parents": (joined("k", "ball", "world", "bob"), r"'bob': carried by 2 joints \('hinge', 'k'\)"),
     "cycle": (cycle, "body 'c': not connected to the world"),
-    "world as child": (lambda b: b.add_joint("k", "ball", parent="bob", child="world"), "the world cannot be a child"),
+    "world as child": (joined("k", "ball", "bob", "world"), "the world cannot be a child"),
     "unknown kind": (joint_k("revolut"), "joint 'k': unknown kind 'revolut'; use one of revolute"),
-    "unknown parent": (
-        lambda b: b.add_joint("k", "ball", parent="bib", child="bob"),
-        "joint 'k': unknown body 'bib'; did you mean 'bob'",
-    ),
-    "zero axis": (bad_axis, "joint 'k': axis is zero"),
-    "missing axis": (
-        lambda b: b.add_joint("k", "revolute", parent="bob", child="c"),
-        "revolute joint takes axis, got 0",
-    ),
+    "unknown parent": (joint_k(parent="bib"), "joint 'k': unknown body 'bib'; did you mean 'bob'"),
+    "zero axis": (joint_k(axis=(0, 0, 0)), "joint 'k': axis is zero"),
+    "missing axis": (joint_k(axis=None), "revolute joint takes axis, got 0"),
     "axis too many": (joint_k("ball", axis=(1, 0, 0)), "ball joint takes no axis, got 1"),
     "NaN axis": (joint_k(axis=(np.nan, 0, 0)), "joint 'k': axis: nan at index"),
-    "two joints of a name": (
-        lambda b: b.add_joint("hinge", "ball", parent="bob", child="c"),
-        "joint 'hinge': declared 2 times",
-    ),
+    "two joints of a name": (joined("hinge", "ball", "bob", "c"), "joint 'hinge': declared 2 times"),
     "crossed limits": (joint_k(lower=1.0, upper=-1.0), "joint 'k': lower limit .* above upper"),
     "NaN limit": (joint_k(lower=np.nan), "joint 'k': lower: expected 1 numbers"),
     "negative damping": (joint_k(damping=-1.0), "joint 'k': damping .* is negative"),
@@ -468,28 +438,22 @@ FAULTS = {
     "ragged limit": (joint_k(lower=[1, [2]]), "joint 'k': lower: expected 1 numbers"),
     "ragged damping": (joint_k(damping=[1, [2]]), "joint 'k': damping: expected an array of numbers"),
     "ragged inertia": (body_c(mass=1.0, inertia=[[1, 2], [3]]), "body 'c': inertia: expected an array of numbers"),
-    "kind as list": (lambda b: b.add_joint("k", ["a"], parent="bob", child="c"), "joint 'k': unknown kind"),
+    "kind as list": (joined("k", ["a"], "bob", "c"), "joint 'k': unknown kind"),
     "limits on a quaternion": (joint_k("ball", lower=-1.0), "joint 'k': limits on the quaternion"),
-    "frame of the ground": (lambda b: b.add_frame("world", body="bob"), "frame 'world'"),
+    "frame of the ground": (call("add_frame", "world", body="bob"), "frame 'world'"),
     "skewed rotation": (joint_k(rotation=2 * np.eye(3)), "joint 'k': rotation is not a rotation matrix"),
     "reflection": (joint_k(rotation=np.diag([1, 1, -1])), "joint 'k': rotation is not a rotation matrix"),
     "rotation twice": (joint_k(rotation=np.eye(3), rpy=(0, 0, 0)), "rotation or rpy"),
     "mimics nobody": (joint_k(mimic=("hinje", 1.0, 0.0)), "joint 'k': mimics unknown joint 'hinje'; near: 'hinge'"),
     "mimics itself": (joint_k(mimic=("k", 1.0, 0.0)), "joint 'k': mimics in a circle"),
-    "mimic on a ball": (
-        joint_k("ball", mimic=("hinge", 1.0, 0.0)),
-        "joint 'k': mimics 'hinge', but both must have one",
-    ),
+    "mimic on a ball": (joint_k("ball", mimic=("hinge", 1.0, 0.0)), "'k': mimics 'hinge', but both must have one"),
     "mimic in parts": (joint_k(mimic=("hinge",)), "joint 'k': mimic: expected"),
-    "spring to nowhere": (lambda b: b.add_spring("s", body_a="bob", body_b="bb"), "spring 's': unknown body 'bb'"),
-    "spring to itself": (lambda b: b.add_spring("s", body_a="bob", body_b="bob"), "spring 's': both ends on 'bob'"),
-    "soft spring": (
-        lambda b: b.add_spring("s", body_a="bob", body_b="world", stiffness=-1.0),
-        "spring 's': stiffness -1 is negative",
-    ),
-    "frame nowhere": (lambda b: b.add_frame("f", body="bub"), "frame 'f': unknown body 'bub'"),
-    "loop kind": (lambda b: b.add_loop("l", "line", body_a="bob", body_b="world"), "loop 'l': unknown kind 'line'"),
-    "prescribed nothing": (lambda b: b.prescribe("hing"), "prescribed 'hing': expected a joint of one velocity"),
+    "spring to nowhere": (call("add_spring", "s", body_a="bob", body_b="bb"), "spring 's': unknown body 'bb'"),
+    "spring to itself": (call("add_spring", "s", body_a="bob", body_b="bob"), "spring 's': both ends on 'bob'"),
+    "soft spring": (call("add_spring", "s", body_a="bob", body_b="world", stiffness=-1.0), "stiffness -1 is negative"),
+    "frame nowhere": (call("add_frame", "f", body="bub"), "frame 'f': unknown body 'bub'"),
+    "loop kind": (call("add_loop", "l", "line", body_a="bob", body_b="world"), "loop 'l': unknown kind 'line'"),
+    "prescribed nothing": (call("prescribe", "hing"), "prescribed 'hing': expected a joint of one velocity"),
 }
 
 
@@ -527,9 +491,7 @@ def test_impossible_bodies_can_be_kept_with_a_warning_but_not_negative_masses():
     b.add_joint("l", "fixed", parent="c", child="d")
     with pytest.raises(ModelError, match="negative"):
         b.build(nonphysical="warn")
-
-
-def test_thin_rods_plates_and_points_are_matter():
+    # Thin rods, plates and points are matter.
     for inertia in ((1.0, 1.0, 0.0), (1.0, 1.0, 2.0), (0.1 + 0.2, 0.1, 0.2), None):
         b = pendulum()
         body_c(mass=1.0, com=(0, 1, 1), inertia=inertia)(b)
@@ -549,14 +511,14 @@ def test_wrong_configurations_are_explained(call):
     model = random_tree(1, 4, ("free", "revolute"))
     q, v, _, _ = (x[0] for x in states(model, 1))
     second = v if call == "integrate" else q
-    with pytest.raises(InputError, match="expected shape"):
-        getattr(model, call)(q[:-1], second)
-    with pytest.raises(InputError, match="finite"):
-        getattr(model, call)(q * np.nan, second)
-    with pytest.raises(InputError, match="norm"):
-        getattr(model, call)(2 * q, second)
-    with pytest.raises(InputError, match="different sizes"):
-        getattr(model, call)(np.stack([q] * 2), np.stack([second] * 3))
+    for wrong, other, words in (
+        (q[:-1], second, "expected shape"),
+        (q * np.nan, second, "finite"),
+        (2 * q, second, "norm"),
+        (np.stack([q] * 2), np.stack([second] * 3), "different sizes"),
+    ):
+        with pytest.raises(InputError, match=words):
+            getattr(model, call)(wrong, other)
 
 
 # How public names look in a shell.
@@ -583,16 +545,12 @@ def test_a_package_that_is_called_looks_like_its_function(package, function):
         called(nonsense=1)
 
 
-def test_every_engine_is_in_the_documentation_of_dynamics():
+def test_parts_of_a_model_are_short_to_look_at_and_every_engine_is_documented():
     assert all(f'"{name}"' in mb.dynamics.__doc__ for name in ENGINES)
-
-
-def test_parts_of_a_model_are_short_to_look_at():
     model = mb.load("panda")
-    for parts in (model.joints, model.bodies, model.frames):
-        for part in parts:
-            assert part.name in repr(part)
-            assert len(repr(part)) < 160
+    for part in (*model.joints, *model.bodies, *model.frames):
+        assert part.name in repr(part)
+        assert len(repr(part)) < 160
     assert "\n" not in repr(model.layout)
     assert len(repr(model.layout)) < 160
 
@@ -622,56 +580,53 @@ def test_a_single_number_is_no_vector(x: Any) -> None:
 
 
 def test_a_single_number_stands_for_each_velocity_of_a_joint() -> None:
-    b = mb.ModelBuilder("ball")
-    b.add_body("a", mass=1.0, inertia=(1, 1, 1))
-    b.add_joint("cross", "universal", parent="world", child="a", axis=(1, 0, 0), axis2=(0, 1, 0), damping=0.5)
-    assert b.build().joints[0].damping.tolist() == [0.5, 0.5]
+    model = hinge(kind="universal", axis2=(0, 0, 1), damping=0.5).build()
+    assert model.joints[0].damping.tolist() == [0.5, 0.5]
 
 
 # A description cannot come into being unchecked
 
 
+ARM, ELBOW = "upper_arm_link", "elbow_joint"
+
+
 @pytest.mark.parametrize(
-    ("fields_", "says"),
+    ("part", "changed", "says"),
     [
-        ({"mass": -5.0}, "body 'upper_arm_link': mass -5 is negative"),
-        ({"mass": 0.0}, "body 'upper_arm_link': no mass but inertia"),
-        ({"mass": "heavy"}, "body 'upper_arm_link': mass: expected numbers, got 'heavy'"),
-        ({"com": 1.0}, r"body 'upper_arm_link': com: expected shape \(3,\), got \(\)"),
-        ({"com": [1.0, 2.0]}, r"com: expected shape \(3,\), got \(2,\)"),
-        ({"inertia": -np.eye(3)}, "body 'upper_arm_link': inertia is not positive"),
-        ({"inertia": np.diag([1.0, 1.0, 5.0])}, r"inertia violates A \+ B >= C"),
-        ({"inertia": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "inertia is not symmetric"),
+        (ARM, {"mass": -5.0}, "body 'upper_arm_link': mass -5 is negative"),
+        (ARM, {"mass": 0.0}, "body 'upper_arm_link': no mass but inertia"),
+        (ARM, {"mass": "heavy"}, "body 'upper_arm_link': mass: expected numbers, got 'heavy'"),
+        (ARM, {"com": 1.0}, r"body 'upper_arm_link': com: expected shape \(3,\), got \(\)"),
+        (ARM, {"com": [1.0, 2.0]}, r"com: expected shape \(3,\), got \(2,\)"),
+        (ARM, {"inertia": -np.eye(3)}, "body 'upper_arm_link': inertia is not positive"),
+        (ARM, {"inertia": np.diag([1.0, 1.0, 5.0])}, r"inertia violates A \+ B >= C"),
+        (ARM, {"inertia": [[1, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "inertia is not symmetric"),
+        (ELBOW, {"parent": "nowhere"}, "joint 'elbow_joint': unknown body 'nowhere'"),
+        (ELBOW, {"damping": [-1.0]}, "damping .* is negative"),
+        (ELBOW, {"lower": [2.0], "upper": [1.0]}, "lower limit .* above upper limit"),
+        ("", {"bodies": ()}, "bodies"),
+        *(
+            ("", {"gravity": g}, "gravity: expected three finite numbers")
+            for g in (-9.81, (0, -9.81), (0, 0, np.nan), (0, 0, np.inf))
+        ),
     ],
 )
-def test_a_body_that_cannot_be_is_refused_by_replace_too(fields_: dict[str, Any], says: str) -> None:
+def test_what_cannot_be_is_refused_by_replace_too(part: str, changed: dict[str, Any], says: str) -> None:
     model = mb.load("ur5")
+
+    def parts(of: str) -> tuple[Any, ...]:
+        return tuple(replace(x, **changed) if x.name == part else x for x in getattr(model, of))
+
     with pytest.raises(ModelError, match=says):
-        replace(
-            model,
-            bodies=tuple(replace(x, **fields_) if x.name == "upper_arm_link" else x for x in model.bodies),
-        )
+        replace(model, **({"bodies": parts("bodies"), "joints": parts("joints")} if part else changed))
 
 
-def test_structure_is_checked_by_replace_too() -> None:
+def test_shapes_are_checked_by_replace_too() -> None:
     model = mb.load("ur5")
-    joint = model.joint("elbow_joint")
-    for changed, says in (
-        (replace(joint, parent="nowhere"), "joint 'elbow_joint': unknown body 'nowhere'"),
-        (replace(joint, damping=[-1.0]), "damping .* is negative"),
-        (replace(joint, lower=[2.0], upper=[1.0]), "lower limit .* above upper limit"),
-    ):
-        with pytest.raises(ModelError, match=says):
-            replace(model, joints=tuple(changed if x.name == joint.name else x for x in model.joints))
     with pytest.raises(ModelError, match="rotation is not a rotation matrix"):
-        replace(joint, rotation=2 * np.eye(3))
+        replace(model.joint(ELBOW), rotation=2 * np.eye(3))
     with pytest.raises(ModelError, match=r"damping: expected shape \(1,\), got \(2,\)"):
-        replace(joint, damping=[1.0, 2.0])
-    with pytest.raises(ModelError, match="bodies"):
-        replace(model, bodies=())
-    for gravity in (-9.81, (0, -9.81), (0, 0, np.nan), (0, 0, np.inf)):
-        with pytest.raises(ModelError, match="gravity: expected three finite numbers"):
-            replace(model, gravity=gravity)
+        replace(model.joint(ELBOW), damping=[1.0, 2.0])
     # What a list gives is numbers as well.
     assert replace(model.bodies[0], com=[1, 2, 3]).com.tolist() == [1.0, 2.0, 3.0]
 

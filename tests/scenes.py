@@ -1,0 +1,43 @@
+"""Small mechanisms of a few calls: one body on a joint, and bodies one after the other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mbkit.model import Model, ModelBuilder
+
+BODY = ("mass", "com", "inertia")
+
+
+def chain(*links: dict[str, Any], name: str = "chain", **options: Any) -> ModelBuilder:
+    """Return bodies b0, b1, … on hinges j0, j1, …, each on the one before it, where a link does not say otherwise.
+
+    A link holds the arguments of `add_body` and `add_joint`, its names as "body" and "joint".
+    """
+    b, before = ModelBuilder(name, **options), "world"
+    for k, link in enumerate(links):
+        given = {"body": f"b{k}", "joint": f"j{k}", "kind": "revolute", "parent": before} | link
+        before, joint, kind = (given.pop(x) for x in ("body", "joint", "kind"))
+        b.add_body(before, **{x: given.pop(x) for x in BODY if x in given})
+        b.add_joint(joint, kind, child=before, **given)
+    return b
+
+
+def slider(name: str = "slider", gravity: Any = (0, 0, -9.81), **given: Any) -> ModelBuilder:
+    """Return a point of 1 kg that slides along x."""
+    own = {"body": "mass", "joint": "x", "kind": "prismatic", "mass": 1.0, "axis": (1, 0, 0)}
+    return chain(own | given, name=name, gravity=gravity)
+
+
+def hinge(name: str = "hinge", gravity: Any = (0, 0, -9.81), **given: Any) -> ModelBuilder:
+    """Return a body a that hangs on a hinge j, turning about y."""
+    own = {"body": "a", "joint": "j", "mass": 1.0, "com": (0, 0, -1), "inertia": (0.1, 0.1, 0.1), "axis": (0, 1, 0)}
+    return chain(own | given, name=name, gravity=gravity)
+
+
+def damped_arm() -> Model:
+    """Return two rods on hinges across each other, with dampers and a spring."""
+    upper = {"mass": 1.0, "com": (0, 0, -0.5), "inertia": (0.1, 0.1, 0.01), "axis": (0, 1, 0)}
+    lower = {"mass": 0.5, "com": (0, 0, -0.3), "inertia": (0.03, 0.03, 0.01), "axis": (1, 0, 0)}
+    upper |= {"damping": 0.7, "stiffness": 3.0, "rest": 0.2}
+    return chain(upper, lower | {"translation": (0, 0, -1), "damping": 0.1}, name="damped").build()
