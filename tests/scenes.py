@@ -41,3 +41,24 @@ def damped_arm() -> Model:
     lower = {"mass": 0.5, "com": (0, 0, -0.3), "inertia": (0.03, 0.03, 0.01), "axis": (1, 0, 0)}
     upper |= {"damping": 0.7, "stiffness": 3.0, "rest": 0.2}
     return chain(upper, lower | {"translation": (0, 0, -1), "damping": 0.1}, name="damped").build()
+
+
+def linkage(
+    lengths: tuple[float, float, float] = (0.3, 0.9, 0.7),
+    ground: float = 1.0,
+    density: float = 2.0,
+    name: str = "four_bar",
+    **loop: Any,
+) -> ModelBuilder:
+    """Return crank, coupler and rocker in the plane of x and z, thin rods, with a pin or another loop; kg/m."""
+    crank, coupler, rocker = lengths
+    links = []
+    places = ("crank", "world", 0.0, crank), ("coupler", "crank", crank, coupler), ("rocker", "world", ground, rocker)
+    for body, parent, at, length in places:
+        thin = density * length**3 / 12
+        rod = {"mass": density * length, "com": (length / 2, 0, 0), "inertia": (0.0, thin, thin), "axis": (0, -1, 0)}
+        links.append(rod | {"body": body, "joint": f"at_{body}", "parent": parent, "translation": (at, 0, 0)})
+    b = chain(*links, name=name)
+    ends = {"body_a": "coupler", "translation_a": (coupler, 0, 0), "body_b": "rocker", "translation_b": (rocker, 0, 0)}
+    b.add_loop("pin", **({"kind": "point"} | ends | loop))
+    return b

@@ -7,15 +7,18 @@ import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
 import mbkit as mb
 from mbkit import spatial
+from mbkit.engines import Dynamics
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
+from mbkit.load.shapes import MassProperties, together
 from mbkit.model import Body, Joint, Loop, Mimic, Model
 from mbkit.studies.baseline.description import SECTIONS, changes, described
 from mbkit.studies.explain import hypotheses
@@ -23,6 +26,7 @@ from mbkit.studies.explain.merged_model import merge
 from mbkit.studies.importers.study import written
 from mbkit.testing import assert_same_dynamics
 from tests.random_trees import random_tree
+from tests.scenes import chain, hinge
 
 ROBOTS = ("panda", "ur5", "solo8", "so100", "kinova")
 
@@ -131,18 +135,17 @@ def fused_unturned(m: Model) -> Planted:
     mount, tool = m.joint("mount"), m.body("tool")
     b = m.body(mount.parent)
     p = mount.translation + mount.rotation @ tool.com
-    mass = b.mass + tool.mass
-    com = (b.mass * b.com + tool.mass * p) / mass
-    I = np.zeros((3, 3))
-    for kg, at, own in ((b.mass, b.com, b.inertia), (tool.mass, p, tool.inertia)):
-        d = at - com
-        I += own + kg * (d @ d * np.eye(3) - np.outer(d, d))
-    m = replace(m, joints=m.joints[:-1], bodies=m.bodies[:-1])
-    return with_body(m, b.name, mass=mass, com=com, inertia=I), "fused with a rotated frame", b.name
+    one = together([MassProperties(b.mass, b.com, b.inertia), MassProperties(tool.mass, p, tool.inertia)])
+    changed = with_body(without_tool(m), b.name, mass=one.mass, com=one.com, inertia=one.inertia)
+    return changed, "fused with a rotated frame", b.name
+
+
+def without_tool(m: Model) -> Model:
+    return replace(m, joints=m.joints[:-1], bodies=m.bodies[:-1])
 
 
 def lost_tool(m: Model) -> Planted:
-    return replace(m, joints=m.joints[:-1], bodies=m.bodies[:-1]), "lost body", "tool"
+    return without_tool(m), "lost body", "tool"
 
 
 def gravity(m: Model) -> Planted:
@@ -177,10 +180,9 @@ def test_a_planted_difference_is_named(plant: str, name: str) -> None:
     b, kind, where = PLANTS[plant](a)
     found = mb.explain(a, b, samples=1)
     assert [c.kind for c in found.causes] == [kind], found.to_markdown()
-    (cause,) = found.causes
-    assert where in str(cause)
+    assert where in str(found.causes[0])
     assert found.explained
-    assert cause.acts == (kind not in SILENT)
+    assert found.causes[0].acts == (kind not in SILENT)
     assert found.agree == (kind in SILENT)
 
 
@@ -391,47 +393,29 @@ def test_joints_that_only_one_side_has() -> None:
 # Engines, of which nothing is known but their answers.
 
 
-def other_engine(change: Callable[[Model], Model]) -> type[PinocchioDynamics]:
+def engine(name: str, base: type[Dynamics] = PinocchioDynamics, **methods: Callable[..., Any]) -> type[Dynamics]:
+    """An engine with some methods of its own."""
+    return type(name.title(), (base,), {"engine": name, **methods})
+
+
+def other_engine(change: Callable[[Model], Model]) -> type[Dynamics]:
     """Pinocchio, told something else than it says."""
+    inner = cache(lambda model: PinocchioDynamics(change(model)))
 
-    class Other(PinocchioDynamics):
-        engine = "other"
+    def told(name: str) -> Callable[..., np.ndarray]:
+        return lambda self, *x: getattr(inner(self.model), name)(*x)
 
-        def __init__(self, model: Model) -> None:
-            super().__init__(model)
-            self._told = PinocchioDynamics(change(model))
-
-        def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
-            return self._told._mass_matrix(q)
-
-        def _gravity(self, q: np.ndarray) -> np.ndarray:
-            return self._told._gravity(q)
-
-        def _nle(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-            return self._told._nle(q, v)
-
-        def _passive(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-            return self._told._passive(q, v)
-
-    return Other
+    return engine("other", **{x: told(x) for x in ("_mass_matrix", "_gravity", "_nle", "_passive")})
 
 
 @cache
 def arm() -> Model:
-    rng = np.random.default_rng(1)
-    b = mb.ModelBuilder("arm")
-    parent = "world"
+    rng, links = np.random.default_rng(1), []
     for k, ax in enumerate(np.eye(3)[[2, 1, 0]]):
-        d = rng.uniform(0.01, 0.02, 3)
-        b.add_body(
-            f"b{k}", mass=1.0 + k, com=rng.uniform(-0.1, 0.1, 3), inertia=[d[0] + d[1], d[1] + d[2], d[2] + d[0]]
-        )
-        at = rng.uniform(0.1, 0.3, 3)
-        b.add_joint(
-            f"j{k}", "revolute", parent=parent, child=f"b{k}", translation=at, rpy=(0.1, 0.2, k), axis=ax, damping=0.2
-        )
-        parent = f"b{k}"
-    return b.build()
+        d, com, at = rng.uniform(0.01, 0.02, 3), rng.uniform(-0.1, 0.1, 3), rng.uniform(0.1, 0.3, 3)
+        body = {"mass": 1.0 + k, "com": com, "inertia": [d[0] + d[1], d[1] + d[2], d[2] + d[0]]}
+        links.append(body | {"translation": at, "rpy": (0.1, 0.2, k), "axis": ax, "damping": 0.2})
+    return chain(*links, name="arm").build()
 
 
 @pytest.mark.parametrize("plant", ["armature", "damping", "gravity", "axis sign", "centre of mass"])
@@ -446,63 +430,48 @@ def test_an_engine_that_was_told_something_else(plant: str) -> None:
 def test_engines_that_are_asked_in_another_convention() -> None:
     free = random_tree(2, 3, kinds=("free", "revolute", "revolute"), springs=False, damping=False, armature=False)
 
-    class Raw(MujocoDynamics):
-        """MuJoCo as it is: linear velocity in the world's axes."""
+    def raw_nle(self: MujocoDynamics, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        self._set(q, v)
+        self._velocities()
+        return self._force(self._d.qfrc_bias)
 
-        engine = "raw"
+    def w_first(self: PinocchioDynamics, q: np.ndarray) -> np.ndarray:
+        q = q.copy()
+        start = self.model.quaternions[0][0]
+        q[..., start : start + 4] = np.roll(q[..., start : start + 4], -1, axis=-1)
+        return PinocchioDynamics._full_q(self, q)
 
-        def _rotation(self, start_q: int) -> np.ndarray:  # noqa: ARG002
-            return np.eye(3)
+    # MuJoCo as it is, with linear velocity in the world's axes; and with forces turned and ω × v forgotten.
+    raw = engine("raw", MujocoDynamics, _rotation=lambda *_: np.eye(3), _nle=raw_nle)
+    unturned = engine("unturned", MujocoDynamics, _nle=raw_nle)
+    base = next(j for j in free.joints if j.kind == "free")
+    world = with_joint(free, base.name, rotation=np.eye(3), translation=np.zeros(3))
+    for other in (raw, unturned):
+        (cause,) = mb.explain(mb.dynamics(world), other(world)).causes
+        assert cause.kind == "velocity frame"
+    assert "ω × v" in str(cause)
+    shuffled = engine("shuffled", _full_q=w_first)
+    assert [c.kind for c in mb.explain(mb.dynamics(free), shuffled(free)).causes] == ["quaternion order"]
 
-        def _nle(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-            self._set(q, v)
-            self._velocities()
-            return self._force(self._d.qfrc_bias)
 
-    class Unturned(Raw):
-        """MuJoCo with forces turned and ω × v forgotten."""
+def scaled_entry(M: np.ndarray, i: int, k: int) -> np.ndarray:
+    M = M.copy()
+    M[..., i, k] *= 1.1
+    if i != k:
+        M[..., k, i] *= 1.1
+    return M
 
-        engine = "unturned"
-        _rotation = MujocoDynamics._rotation
 
-    class Shuffled(PinocchioDynamics):
-        """Quaternions read w first."""
-
-        engine = "shuffled"
-
-        def _full_q(self, q: np.ndarray) -> np.ndarray:
-            q = q.copy()
-            start = self.model.quaternions[0][0]
-            q[..., start : start + 4] = np.roll(q[..., start : start + 4], -1, axis=-1)
-            return super()._full_q(q)
-
-    plain = mb.dynamics(free)
-    world = replace(
-        free,
-        joints=tuple(
-            replace(j, rotation=np.eye(3), translation=np.zeros(3)) if j.kind == "free" else j for j in free.joints
-        ),
-    )
-    assert [c.kind for c in mb.explain(mb.dynamics(world), Raw(world)).causes] == ["velocity frame"]
-    told = mb.explain(mb.dynamics(world), Unturned(world)).causes
-    assert [c.kind for c in told] == ["velocity frame"]
-    assert "ω × v" in str(told[0])
-    assert [c.kind for c in mb.explain(plain, Shuffled(free)).causes] == ["quaternion order"]
+def differing(gaps: Any, tolerance: float) -> list[str]:
+    return [g.term for g in gaps if g.relative > tolerance]
 
 
 def test_a_term_that_is_not_always_there_is_compared_too() -> None:
-    class Odd(PinocchioDynamics):
-        """Wrong in C v alone."""
-
-        engine = "odd"
-
-        def _coriolis_force(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-            return 1.1 * (self._nle(q, v) - self._gravity(q))
-
-    found = mb.explain(mb.dynamics(arm()), Odd(arm()))
+    odd = engine("odd", _coriolis_force=lambda self, q, v: 1.1 * (self._nle(q, v) - self._gravity(q)))
+    found = mb.explain(mb.dynamics(arm()), odd(arm()))
     assert not found.agree
     assert not found.explained
-    assert [g.term for g in found.left if g.relative > found.tolerance] == ["C v"]
+    assert differing(found.left, found.tolerance) == ["C v"]
 
 
 def test_a_known_defect_is_the_cause_and_no_defect_is_none() -> None:
@@ -516,54 +485,38 @@ def test_a_known_defect_is_the_cause_and_no_defect_is_none() -> None:
 
 
 def test_what_nothing_explains_is_narrowed_to_its_joints() -> None:
-    class Odd(PinocchioDynamics):
-        """Wrong in one entry of M, of two joints."""
+    def odd(self: PinocchioDynamics, q: np.ndarray) -> np.ndarray:
+        M, own = PinocchioDynamics._mass_matrix(self, q), self.model.joint_names
+        return scaled_entry(M, own.index("j1"), own.index("j2")) if {"j1", "j2"} <= set(own) else M
 
-        engine = "odd"
-
-        def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
-            M = super()._mass_matrix(q).copy()
-            if {"j1", "j2"} <= set(self.model.joint_names):
-                i, k = (self.model.joint_names.index(n) for n in ("j1", "j2"))
-                M[..., i, k] *= 1.1
-                M[..., k, i] *= 1.1
-            return M
-
-    found = mb.explain(mb.dynamics(arm()), Odd(arm()))
+    found = mb.explain(mb.dynamics(arm()), engine("odd", _mass_matrix=odd)(arm()))
     assert not found.explained
     assert found.subtree == ("j1", "j2")
     assert "no usual cause" in found.verdict
-    assert [g.term for g in found.left if g.relative > found.tolerance] == ["M"]
+    assert differing(found.left, found.tolerance) == ["M"]
 
 
 def test_an_engine_without_a_mass_matrix_is_refused_by_name() -> None:
-    class Forces(PinocchioDynamics):
-        engine = "forces"
+    def none(*_: Any) -> np.ndarray:
+        raise UnsupportedError("forces: no mass matrix")
 
-        def _mass_matrix(self, _q: np.ndarray) -> np.ndarray:
-            raise UnsupportedError("forces: no mass matrix")
-
-    for pair in ((mb.dynamics(arm()), Forces(arm())), (Forces(arm()), mb.dynamics(arm()))):
+    forces = engine("forces", _mass_matrix=none)(arm())
+    for pair in ((mb.dynamics(arm()), forces), (forces, mb.dynamics(arm()))):
         with pytest.raises(UnsupportedError, match=r"explain: forces: expected the mass matrix of arm.* g, nle"):
             mb.explain(*pair)
 
 
 def test_an_engine_that_refuses_bodies_without_mass_is_explained_as_far_as_it_goes() -> None:
-    class Picky(PinocchioDynamics):
-        """Wrong in one entry of M, and without an answer where nothing has mass."""
+    """It is wrong in one entry of M, and has no answer where nothing has mass."""
 
-        engine = "picky"
+    def picky(self: PinocchioDynamics, q: np.ndarray) -> np.ndarray:
+        if not all(b.mass for b in self.model.bodies):
+            raise UnsupportedError("picky: a body has no mass")
+        return scaled_entry(PinocchioDynamics._mass_matrix(self, q), 0, 0)
 
-        def _mass_matrix(self, q: np.ndarray) -> np.ndarray:
-            if not all(b.mass for b in self.model.bodies):
-                raise UnsupportedError("picky: a body has no mass")
-            M = super()._mass_matrix(q).copy()
-            M[..., 0, 0] *= 1.1
-            return M
-
-    found = mb.explain(Picky(arm()), mb.dynamics(arm()))
+    found = mb.explain(engine("picky", _mass_matrix=picky)(arm()), mb.dynamics(arm()))
     assert not found.agree
-    assert [g.term for g in found.gaps if g.relative > found.tolerance] == ["M"]
+    assert differing(found.gaps, found.tolerance) == ["M"]
 
 
 def test_bad_input_is_refused() -> None:
@@ -582,11 +535,11 @@ def test_bad_input_is_refused() -> None:
 SAYS = {"name", "frames", "notes", "nonphysical", "bindings", "source", "time", "layout"}
 
 
+ROD = {"mass": 1.0, "com": (0, 0, -0.5), "inertia": (0.1, 0.1, 0.01), "axis": (0, 1, 0)}
+
+
 def coupled(ratio: float, offset: float = 0.0) -> Model:
-    b = mb.ModelBuilder("pair")
-    for k, mass in enumerate((1.0, 2.0)):
-        b.add_body(f"rod{k}", mass=mass, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
-        b.add_joint(f"j{k}", "revolute", parent="world", child=f"rod{k}", axis=(0, 1, 0), translation=(k, 0, 0))
+    b = chain(ROD, ROD | {"mass": 2.0, "parent": "world", "translation": (1, 0, 0)}, name="pair")
     b.add_coupler("gear", "j0", "j1", ratio=ratio, offset=offset)
     return b.build()
 
@@ -632,12 +585,8 @@ def test_every_part_that_moves_something_is_compared() -> None:
 
 def test_one_motion_by_two_formulas_is_no_difference() -> None:
     def driven(amplitude: float, phase: float) -> Model:
-        b = mb.ModelBuilder("driven")
-        b.add_body("rod", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
-        b.add_body("bob", mass=1.0)
-        b.add_joint("crank", "revolute", parent="world", child="rod", axis=(0, 1, 0))
-        b.add_joint("slide", "prismatic", parent="rod", child="bob", axis=(0, 0, 1))
-        b.prescribe("crank", amplitude=amplitude, frequency=3.0, phase=phase)
+        b = chain(ROD, {"mass": 1.0, "kind": "prismatic", "axis": (0, 0, 1)})
+        b.prescribe("j0", amplitude=amplitude, frequency=3.0, phase=phase)
         return b.build()
 
     assert mb.explain(driven(1.0, 0.0), driven(-1.0, np.pi)).agree
@@ -647,33 +596,22 @@ def test_one_motion_by_two_formulas_is_no_difference() -> None:
 def test_an_inertia_along_another_axis_is_no_misread_quaternion() -> None:
     """A capsule that lies along y and not along z: no file has a quaternion for that."""
     for moments in ((0.3, 0.3, 0.1), (0.3, 0.25, 0.1)):
-        b = mb.ModelBuilder("capsule")
-        b.add_body("limb", mass=2.0, com=(0.1, 0, 0), inertia=moments)
-        b.add_joint("hinge", "revolute", parent="world", child="limb", axis=(1, 1, 1))
-        model = b.build()
-        (limb,) = model.bodies
-        turned = replace(limb, inertia=np.diag([limb.inertia[0, 0], limb.inertia[2, 2], limb.inertia[1, 1]]))
-        (cause,) = mb.explain(model, replace(model, bodies=(turned,))).causes
+        model = hinge(mass=2.0, com=(0.1, 0, 0), inertia=moments, axis=(1, 1, 1)).build()
+        x, y, z = moments
+        (cause,) = mb.explain(model, with_body(model, "a", inertia=np.diag([x, z, y]))).causes
         assert cause.kind == "inertia axes"
         assert "->" in cause.says
 
 
 def test_a_joint_that_the_other_side_has_not_is_not_held_still() -> None:
-    def arm(fingers: int) -> Model:
-        b = mb.ModelBuilder("arm")
-        for k, name in enumerate(("upper", "lower", "finger")[: 2 + fingers]):
-            b.add_body(name, mass=1.0 - 0.3 * k, com=(0, 0, -0.2), inertia=(1e-2, 1e-2, 1e-3))
-            parent = ("world", "upper", "lower")[k]
-            b.add_joint(
-                f"to {name}", "revolute", parent=parent, child=name, axis=(0, 1, 0), translation=(0, 0, -0.4 * k)
-            )
-        return b.build()
-
+    link = {"com": (0, 0, -0.2), "inertia": (1e-2, 1e-2, 1e-3), "axis": (0, 1, 0)}
+    links = [link | {"mass": 1.0 - 0.3 * k, "translation": (0, 0, -0.4 * k)} for k in range(3)]
+    whole, short = (chain(*links[:n], name="arm").build() for n in (3, 2))
     for a, c, kind, says in (
-        (arm(1), arm(0), "lost joint", "lacks it"),
-        (arm(0), arm(1), "added joint", "has it besides"),
+        (whole, short, "lost joint", "lacks it"),
+        (short, whole, "added joint", "has it besides"),
     ):
-        (cause,) = (x for x in mb.explain(a, c).causes if x.subject == "joint 'to finger'")
+        (cause,) = (x for x in mb.explain(a, c).causes if x.subject == "joint 'j2'")
         assert (cause.kind, says in cause.says) == (kind, True)
 
 
@@ -695,14 +633,9 @@ def test_slides_that_follow_each_other_in_another_order_are_an_order_and_no_exch
     """Translations commute: gymnasium's and dm_control's walkers differ so."""
 
     def cart(names: str, mass: float) -> Model:
-        b, parent = mb.ModelBuilder("cart"), "world"
-        for k, name in enumerate(names):
-            b.add_joint(name, "prismatic", parent=parent, child=f"b{k}", axis=np.eye(3)["xyz".index(name)])
-            b.add_body(f"b{k}")
-            parent = f"b{k}"
-        b.add_joint("turn", "revolute", parent=parent, child="body", axis=(0, 1, 0))
-        b.add_body("body", mass=mass, com=(0.1, 0, 0.2), inertia=np.eye(3))
-        return b.build()
+        slides = ({"joint": x, "kind": "prismatic", "axis": np.eye(3)["xyz".index(x)]} for x in names)
+        turn = {"axis": (0, 1, 0), "mass": mass, "com": (0.1, 0, 0.2), "inertia": np.eye(3)}
+        return chain(*slides, turn, name="cart").build()
 
     why = mb.explain(cart("xyz", 1.0), cart(order, heavier))
     assert why.agree == (heavier == 1.0)

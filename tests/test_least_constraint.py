@@ -18,6 +18,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import NonPhysicalWarning, NumericalError
 from mbkit.studies.stress import cases
 from tests.random_trees import SOUND, off, random_tree, rotation, states
+from tests.scenes import chain
 
 EPS = np.finfo(float).eps
 
@@ -195,13 +196,9 @@ def test_how_much_would_be_lost():
 
 
 def test_a_joint_that_moves_nothing_is_told_as_before():
-    b = mb.ModelBuilder("idle")
-    b.add_body("rod", mass=1.0, com=(0, 0, -0.5), inertia=(1.0, 1.0, 0.0))
-    b.add_body("point", mass=1.0)
-    b.add_joint("swing", "continuous", parent="world", child="rod", axis=(0, -1, 0))
-    b.add_joint("spin", "continuous", parent="rod", child="point", axis=(0, 0, 1))
+    rod = {"mass": 1.0, "com": (0, 0, -0.5), "inertia": (1.0, 1.0, 0.0), "axis": (0, -1, 0)}
     with pytest.warns(NonPhysicalWarning):
-        model = b.build(nonphysical="warn")
+        model = chain(rod, {"mass": 1.0, "axis": (0, 0, 1)}).build(nonphysical="warn")
     dyn = mb.dynamics(model, "lagrangian")
     assert dyn.elimination == "links"
     with pytest.raises(NumericalError):
@@ -223,11 +220,9 @@ def test_parameters_are_decided_at_their_nominal_values():
 
 
 def test_an_inertia_that_is_a_parameter_may_become_a_rods():
-    b = mb.ModelBuilder("suspended")
     moments = (mb.Parameter("A", 0.1), mb.Parameter("B", 0.2), mb.Parameter("C", 0.25))
-    b.add_body("body", mass=1.0, com=(0.1, 0.2, 0.3), inertia=moments)
-    b.add_joint("turn", "spherical_zyx", parent="world", child="body")
-    dyn = mb.dynamics(b.build(), "lagrangian")
+    body = {"kind": "spherical_zyx", "mass": 1.0, "com": (0.1, 0.2, 0.3), "inertia": moments}
+    dyn = mb.dynamics(chain(body).build(), "lagrangian")
     assert dyn.elimination == "least constraint"
     q, v, _, tau = states(dyn.model, 5)
     for values in ({}, {"A": 0.0, "B": 0.2, "C": 0.2}):
@@ -246,13 +241,9 @@ def test_symbols_and_written_systems_keep_the_mass_matrix():
 def test_fewer_squares_than_velocities_are_a_singular_mass_matrix_and_no_fault():
     """Two virtual links and a point: whether its mass is a number or a parameter."""
     for mass in (1.0, mb.Parameter("m", 1.0)):
-        b = mb.ModelBuilder("few")
-        for name, own in (("a", 0.0), ("b", 0.0), ("c", mass)):
-            b.add_body(name, mass=own, com=(0.3, 0.1, 0.2))
-        b.add_joint("x", "planar", parent="world", child="a")
-        b.add_joint("y", "continuous", parent="a", child="b", axis=(0, 1, 0))
-        b.add_joint("z", "continuous", parent="b", child="c", axis=(1, 0, 0))
-        model = b.build(nonphysical="warn")
+        light = {"mass": 0.0, "com": (0.3, 0.1, 0.2)}
+        links = light | {"kind": "planar"}, light | {"axis": (0, 1, 0)}, light | {"mass": mass, "axis": (1, 0, 0)}
+        model = chain(*links).build(nonphysical="warn")
         dyn = mb.dynamics(model, "lagrangian", compile=False)
         assert dyn.elimination == "links"
         q, _ = model.random_state(np.random.default_rng(0))
@@ -262,14 +253,12 @@ def test_fewer_squares_than_velocities_are_a_singular_mass_matrix_and_no_fault()
 @pytest.mark.parametrize("inertia", [(0, 0, 1.0), (0, 1.0, 1.0)], ids=["flat", "rod"])
 def test_planar_descriptions_keep_their_digits(inertia):
     """Two light links and a point of 1 kg at their end; a flat inertia is no body's, and common in planar models."""
-    b = mb.ModelBuilder("arm", gravity=(0, -9.81, 0))
-    for k, (parent, mass) in enumerate((("world", 1e-9), ("l0", 1e-9), ("l1", 1.0))):
-        own = np.multiply(inertia, 1e-9 / 12 if k < 2 else 0.0)
-        b.add_body(f"l{k}", mass=mass, com=(0.5 if k < 2 else 1.0, 0, 0), inertia=own)
-        place = (float(k > 0), 0, 0)
-        b.add_joint(f"j{k}", "continuous", parent=parent, child=f"l{k}", axis=(0, 0, 1), translation=place)
+    light = {"mass": 1e-9, "com": (0.5, 0, 0), "inertia": np.multiply(inertia, 1e-9 / 12), "axis": (0, 0, 1)}
+    further = {"translation": (1.0, 0, 0)}
+    point = {"mass": 1.0, "com": (1.0, 0, 0), "inertia": (0, 0, 0), "axis": (0, 0, 1)}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NonPhysicalWarning)
+        b = chain(light, light | further, point | further, gravity=(0, -9.81, 0))
         model = b.build(nonphysical="warn")
     dyn, oracle = mb.dynamics(model, "lagrangian", compile=False), OracleDynamics(model)
     assert dyn.elimination == "least constraint"
@@ -282,16 +271,8 @@ def test_planar_descriptions_keep_their_digits(inertia):
 def test_poses_are_found_one_coordinate_after_the_other():
     """Three poles of any zeros on one light cart; a ball on a rod that is turned into its own axis."""
     rng = np.random.default_rng(3)
-    b = mb.ModelBuilder("cart", gravity=(0, 0, -9.81))
-    b.add_body("cart", mass=1e-9)
-    b.add_joint("slide", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
-    for k, turned in enumerate(rng.uniform(-3, 3, 3)):
-        b.add_body(f"p{k}", mass=1.0, com=(np.sin(turned), 0, np.cos(turned)))
-        b.add_joint(f"h{k}", "continuous", parent="cart", child=f"p{k}", axis=(0, 1, 0))
-    assert cancellation(b.build()) > 1e8
-    b = mb.ModelBuilder("rod")
-    b.add_body("rod", mass=1e-3, inertia=(1, 1, 1e-9))
-    b.add_body("ball", mass=1.0, inertia=(1, 1, 1))
-    b.add_joint("u", "universal", parent="world", child="rod", axis=(1, 0, 0), axis2=(0, 1, 0))
-    b.add_joint("s", "ball", parent="rod", child="ball")
-    assert cancellation(b.build()) > 1e6
+    coms = [(np.sin(turned), 0, np.cos(turned)) for turned in rng.uniform(-3, 3, 3)]
+    poles = [{"mass": 1.0, "com": com, "parent": "b0", "axis": (0, 1, 0)} for com in coms]
+    assert cancellation(chain({"kind": "prismatic", "mass": 1e-9, "axis": (1, 0, 0)}, *poles).build()) > 1e8
+    rod = {"kind": "universal", "mass": 1e-3, "inertia": (1, 1, 1e-9), "axis": (1, 0, 0), "axis2": (0, 1, 0)}
+    assert cancellation(chain(rod, {"kind": "ball", "mass": 1.0, "inertia": (1, 1, 1)}).build()) > 1e6

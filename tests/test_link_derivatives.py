@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from mbkit.derivation.link_equations import LinkEquations
 from mbkit.derivation.mass_matrix_solve import Factors, implicit
 from tests.joint_of_ones_own import OWN
 from tests.random_trees import ALL, off, random_tree, rotation, states
+from tests.scenes import chain
 
 EPS = np.finfo(float).eps
 #: Roundings of a matrix of derivatives, on a scale of the whole matrix: two ways of computing it.
@@ -25,34 +28,28 @@ DERIVATIVES = {"inverse_dynamics_derivatives": "a", "forward_dynamics_derivative
 
 def own_types(*kinds: str) -> mb.Model:
     """Return a chain with joint types of one's own between hinges on skew axes."""
-    rng = np.random.default_rng(4)
-    b = mb.ModelBuilder("own types", gravity=(1.0, 2.0, -9.0))
+    rng, links = np.random.default_rng(4), []
     for i, kind in enumerate(("revolute", *kinds, "revolute")):
-        inertia = np.diag([0.2, 0.3, 0.4])
-        b.add_body(f"b{i}", mass=1.0 + i, com=rng.standard_normal(3), inertia=inertia)
-        place = {"rotation": rotation(rng), "translation": rng.standard_normal(3)}
-        parent = f"b{i - 1}" if i else "world"
-        axis = {} if kind == "ball" else {"axis": rng.standard_normal(3)}
-        b.add_joint(f"j{i}", kind, parent=parent, child=f"b{i}", damping=0.3, **place, **axis)
-    return b.build()
+        body = {"kind": kind, "mass": 1.0 + i, "com": rng.standard_normal(3), "inertia": np.diag([0.2, 0.3, 0.4])}
+        place = {"rotation": rotation(rng), "translation": rng.standard_normal(3), "damping": 0.3}
+        links.append(body | place | ({} if kind == "ball" else {"axis": rng.standard_normal(3)}))
+    return chain(*links, gravity=(1.0, 2.0, -9.0)).build()
 
 
 def coupled_branches() -> mb.Model:
     """Return two fingers on a floating palm, with a rotor, spring and damper that couple them, and a mimic joint."""
-    b = mb.ModelBuilder("fingers", gravity=(0.0, 1.0, -9.0))
-    b.add_body("palm", mass=1.0, com=(0.1, 0.0, 0.2), inertia=(0.1, 0.2, 0.25))
-    b.add_joint("base", "free", parent="world", child="palm")
+    palm = {"kind": "free", "mass": 1.0, "com": (0.1, 0.0, 0.2), "inertia": (0.1, 0.2, 0.25)}
+    links = [palm]
     for side in (-1.0, 1.0):
-        parent = "palm"
-        for k in range(3):
-            name = f"{'left' if side < 0 else 'right'}{k}"
-            b.add_body(name, mass=0.3, com=(0.1, 0.05 * side, 0.02), inertia=(0.01, 0.02, 0.015))
-            mimic = {"mimic": ("j_left1", 0.7, 0.1)} if name == "right2" else {}
-            place = {"translation": (0.2, side * 0.1 * (k == 0), 0.03)}
-            b.add_joint(f"j_{name}", "revolute", parent=parent, child=name, axis=(0.1 * k, side, 0.2), **place, **mimic)
-            parent = name
-    factors = {"j_left0": 1.0, "j_right1": -2.0, "j_right2": 0.5}
-    b.add_coupling("tendon", factors, stiffness=3.0, rest_length=0.2, damping=0.4, armature=0.6)
+        finger = {"mass": 0.3, "com": (0.1, 0.05 * side, 0.02), "inertia": (0.01, 0.02, 0.015)}
+        places = [{"axis": (0.1 * k, side, 0.2), "translation": (0.2, side * 0.1 * (k == 0), 0.03)} for k in range(3)]
+        links += [finger | places[0] | {"parent": "b0"}, finger | places[1], finger | places[2]]
+    # b1 to b3 are the left finger, b4 to b6 the right one.
+    links[6] |= {"mimic": ("j2", 0.7, 0.1)}
+    b = chain(*links, gravity=(0.0, 1.0, -9.0))
+    b.add_coupling(
+        "tendon", {"j1": 1.0, "j5": -2.0, "j6": 0.5}, stiffness=3.0, rest_length=0.2, damping=0.4, armature=0.6
+    )
     return b.build()
 
 
@@ -136,17 +133,11 @@ def test_the_inverse_of_the_mass_matrix_is_exactly_symmetric():
 def test_a_uniform_motion_changes_nothing_that_hangs_below():
     """Galileo: to the last digit, since no velocity of an origin enters."""
     model = random_tree(31, 8, ("revolute", "prismatic", "ball"), nearest=2, springs=False, damping=False)
-    floating = mb.ModelBuilder("ship", gravity=model.gravity)
-    floating.add_body("hull", mass=3.0, com=(0.1, 0.2, 0.3), inertia=(1.0, 1.1, 1.2))
-    floating.add_joint("sea", "free", parent="world", child="hull")
-    for body in model.bodies:
-        floating.add_body(body.name, mass=body.mass, com=body.com, inertia=body.inertia)
-    for j in model.joints:
-        axis = {"axis": j.axes[0]} if len(j.axes) else {}
-        parent = "hull" if j.parent == "world" else j.parent
-        place = {"rotation": j.rotation, "translation": j.translation}
-        floating.add_joint(j.name, j.kind, parent=parent, child=j.child, **place, **axis)
-    ship = floating.build()
+    matter = {"mass": 3.0, "com": (0.1, 0.2, 0.3), "inertia": (1.0, 1.1, 1.2)}
+    hull = chain(matter | {"body": "hull", "joint": "sea", "kind": "free"}).build()
+    hung = (replace(j, parent="hull") if j.parent == "world" else j for j in model.joints)
+    bodies, joints = (*hull.bodies, *model.bodies), (*hull.joints, *hung)
+    ship = replace(hull, gravity=model.gravity, bodies=bodies, joints=joints)
     equations = LinkEquations(ship)
     q, v, a, _ = (x[0] for x in states(ship, 1))
     part = ship.layout.v["sea"]
@@ -182,28 +173,17 @@ def test_their_number_grows_with_the_pairs_of_joints_on_a_branch():
         counts.append(operations(equations, equations.inverse_dynamics_derivatives))
     # A chain's pairs; of a star each joint takes as many.
     assert counts[2] - counts[1] < 4 * (counts[1] - counts[0])
-    star = mb.ModelBuilder("star", gravity=(1.0, 2.0, 3.0))
-    for i in range(16):
-        star.add_body(f"b{i}", mass=1.0, com=(0.1, 0.2, 0.3), inertia=(0.1, 0.2, 0.25))
-        star.add_joint(f"j{i}", "revolute", parent="world", child=f"b{i}", axis=(0, 1, 0))
-    equations = LinkEquations(star.build())
+    ray = {"parent": "world", "mass": 1.0, "com": (0.1, 0.2, 0.3), "inertia": (0.1, 0.2, 0.25), "axis": (0, 1, 0)}
+    equations = LinkEquations(chain(*[ray] * 16, gravity=(1.0, 2.0, 3.0)).build())
     assert operations(equations, equations.inverse_dynamics_derivatives) < 16 * 40
 
 
 def hands() -> mb.Model:
     """Return two hands of six links on one wrist."""
-    b = mb.ModelBuilder("hands", gravity=(1.0, 2.0, 3.0))
-    b.add_body("wrist", mass=1.0, com=(0.1, 0.2, 0.3), inertia=(0.1, 0.2, 0.25))
-    b.add_joint("w", "revolute", parent="world", child="wrist", axis=(0, 0, 1))
-    for hand in range(2):
-        parent = "wrist"
-        for k in range(6):
-            name = f"h{hand}_{k}"
-            b.add_body(name, mass=1.0, com=(0.1, 0.2, 0.3), inertia=(0.1, 0.2, 0.25))
-            axis = np.eye(3)[k % 3]
-            b.add_joint(f"j_{name}", "revolute", parent=parent, child=name, axis=axis, translation=(0.1, 0.3, 0.2))
-            parent = name
-    return b.build()
+    link = {"mass": 1.0, "com": (0.1, 0.2, 0.3), "inertia": (0.1, 0.2, 0.25)}
+    fingers = [link | {"axis": np.eye(3)[k % 3], "translation": (0.1, 0.3, 0.2)} for k in range(6)]
+    hand = [fingers[0] | {"parent": "b0"}, *fingers[1:]]
+    return chain(link | {"axis": (0, 0, 1)}, *hand, *hand, gravity=(1.0, 2.0, 3.0)).build()
 
 
 def test_branches_share_only_what_they_hang_on():

@@ -17,6 +17,7 @@ from mbkit.derivation.rotations import SYMMETRIC, Matrix, Permutation, PlaneRota
 from mbkit.model.joint_types import KINDS
 from mbkit.spatial import matrix_from_quaternion, normalized
 from tests.random_trees import off, random_tree, rotation, states
+from tests.scenes import chain
 
 EPS = np.finfo(float).eps
 TERMS = {
@@ -119,13 +120,11 @@ def test_moved_matter_keeps_the_kinetic_energy(seed, short):
 
 
 def arm(masses: tuple[float, ...]) -> mb.model.Model:
-    b, parent = mb.ModelBuilder("arm"), "world"
+    links = []
     for i, m in enumerate(masses):
-        b.add_body(f"b{i}", mass=m, com=(0.5, 0, 0.1), inertia=tuple(0.01 * m * x for x in (1, 2, 2.5)))
-        axis, place = np.eye(3)[(2, 1, 2)[i]], (float(i > 0), 0, 0)
-        b.add_joint(f"j{i}", "revolute", parent=parent, child=f"b{i}", axis=axis, translation=place)
-        parent = f"b{i}"
-    return b.build()
+        body = {"mass": m, "com": (0.5, 0, 0.1), "inertia": tuple(0.01 * m * x for x in (1, 2, 2.5))}
+        links.append(body | {"axis": np.eye(3)[(2, 1, 2)[i]], "translation": (float(i > 0), 0, 0)})
+    return chain(*links, name="arm").build()
 
 
 def error(equations: Equations, model: mb.model.Model, name: str) -> float:

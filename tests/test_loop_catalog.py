@@ -559,14 +559,6 @@ def test_andrews_squeezer_starts_as_published() -> None:
         assert centre(k) == pytest.approx(place, abs=1e-16)
 
 
-def test_andrews_squeezer_has_the_published_accelerations() -> None:
-    told = published()["andrews_squeezing_mechanism"]
-    tau = [told["drive_torque_on_beta"], *np.zeros(6)]
-    dyn = from_model(catalog.andrews_squeezer()).dynamics(options=OWN)
-    a = dyn.forward_dynamics(np.zeros(7), np.zeros(7), tau)
-    assert np.abs(a - [float(x) for x in told["qdd0"]]).max() < 1e-12 * 14222
-
-
 # In space
 
 

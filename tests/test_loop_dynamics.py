@@ -18,23 +18,13 @@ from mbkit.lagrangian import from_model
 from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop, Prescribed
 from tests.random_trees import random_tree
+from tests.scenes import chain, hinge, linkage
 
 EPS = float(np.finfo(float).eps)
 
 
 def four_bar(**loop: object) -> mb.Model:
-    b = mb.ModelBuilder("four_bar")
-    for name, parent, at, length in (
-        ("crank", "world", 0.0, 0.3),
-        ("coupler", "crank", 0.3, 0.9),
-        ("rocker", "world", 1.0, 0.7),
-    ):
-        inertia = (0.0, 2 * length**3 / 12, 2 * length**3 / 12)
-        b.add_body(name, mass=2 * length, com=(length / 2, 0, 0), inertia=inertia)
-        b.add_joint(f"at_{name}", "revolute", parent=parent, child=name, translation=(at, 0, 0), axis=(0, -1, 0))
-    ends = {"body_a": "coupler", "translation_a": (0.9, 0, 0), "body_b": "rocker", "translation_b": (0.7, 0, 0)}
-    b.add_loop("pin", **({"kind": "point"} | ends | loop))  # type: ignore[arg-type]  # by name
-    return b.build()
+    return linkage(**loop).build()  # type: ignore[arg-type]  # by name
 
 
 def closed_tree(seed: int, kind: str = "point", *, drive: bool = False) -> tuple[mb.Model, np.ndarray]:
@@ -135,50 +125,33 @@ def test_catalog_system_moves_as_it_does_on_paper() -> None:
     assert np.allclose(runs[0].q, runs[1].q, atol=1e-8)
 
 
-def test_planar_rows_that_say_nothing_are_left_out_in_any_plane() -> None:
-    assert mb.dynamics(four_bar(), "lagrangian").constraint_names == ("loop 'pin' x", "loop 'pin' z")
-    turned = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
-    model = four_bar()
+def in_a_tilted_plane(model: mb.Model) -> mb.Model:
+    R = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
     joints = tuple(
-        replace(j, rotation=turned @ j.rotation, translation=turned @ j.translation) if j.parent == "world" else j
+        replace(j, rotation=R @ j.rotation, translation=R @ j.translation) if j.parent == "world" else j
         for j in model.joints
     )
-    tilted = replace(model, joints=joints, gravity=turned @ model.gravity)
-    dyns = [mb.dynamics(x, "lagrangian") for x in (model, tilted)]
+    return replace(model, joints=joints, gravity=R @ model.gravity)
+
+
+def test_planar_rows_that_say_nothing_are_left_out_in_any_plane() -> None:
+    assert mb.dynamics(four_bar(), "lagrangian").constraint_names == ("loop 'pin' x", "loop 'pin' z")
+    model = four_bar()
+    dyns = [mb.dynamics(x, "lagrangian") for x in (model, in_a_tilted_plane(model))]
     assert all(len(d.constraint_names) == 2 and d.mobility().degrees_of_freedom == 1 for d in dyns)
     q, v = model.random_state(0)
     a, b = (d.forward_dynamics(q, v, np.zeros(3)) for d in dyns)
     assert np.allclose(a, b, rtol=1e-11)
 
 
-def bricard() -> mb.Model:
-    """Bricard's six equal bars of 1 m at right angles (IFToMM A04), its neutral pose in the edges of a cube."""
-    b = mb.ModelBuilder("bricard")
-    path = np.array([(1, 0, 0), (0, -1, 0), (0, 0, 1), (-1, 0, 0), (0, 1, 0)], dtype=float)
-    axes = np.array([(0, 1, 0), (0, 0, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)], dtype=float)
-    before, at = "world", np.zeros(3)
-    for k, (bar, axis) in enumerate(zip(path, axes, strict=True), 1):
-        inertia = (np.eye(3) - np.outer(bar, bar)) / 12
-        b.add_body(f"bar{k}", mass=1.0, com=bar / 2, inertia=inertia)
-        b.add_joint(f"hinge{k}", "revolute", parent=before, child=f"bar{k}", translation=at, axis=axis)
-        before, at = f"bar{k}", bar
-    align = Rotation.from_euler("y", 90, degrees=True).as_matrix()
-    end = path.sum(axis=0)
-    b.add_loop(
-        "last", "revolute", body_a="bar5", translation_a=path[-1], rotation_a=align, body_b="world",
-        translation_b=end, rotation_b=align,
-    )  # fmt: skip
-    return b.build()
-
-
 def test_bricard_is_redundant_and_moves() -> None:
-    model = bricard()
+    model = mb.catalog.bricard()
     dyn = mb.dynamics(model, "lagrangian")
     mobility = dyn.mobility()
     assert mobility.degrees_of_freedom == 1
-    assert len(mobility.rows) == 5
+    assert len(mobility.rows) == 6
     assert len(mobility.redundant) == 1
-    assert "of 5 rows 1 is redundant" in str(mobility)
+    assert "of 6 rows 1 is redundant" in str(mobility)
     q = model.neutral()
     assert np.abs(dyn.constraint_residual(q)).max() < 1e-15
     tau = np.zeros(model.nv)
@@ -198,12 +171,10 @@ def test_bricard_is_redundant_and_moves() -> None:
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_prescribed_motion_is_followed_and_its_drive_pays_for_the_energy(compiled: bool) -> None:
-    b = mb.ModelBuilder("driven")
-    b.add_body("arm", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
-    b.add_joint("drive", "revolute", parent="world", child="arm", axis=(0, 1, 0))
-    b.add_body("bob", mass=0.5, com=(0, 0, -0.4), inertia=(0.02, 0.02, 0.01))
-    b.add_joint("swing", "revolute", parent="arm", child="bob", translation=(0, 0, -1), axis=(0, 1, 0))
-    b.prescribe("drive", offset=0.2, rate=0.3, amplitude=0.4, frequency=3.0, phase=0.1)
+    arm = {"mass": 1.0, "com": (0, 0, -0.5), "inertia": (0.1, 0.1, 0.01), "axis": (0, 1, 0)}
+    bob = {"mass": 0.5, "com": (0, 0, -0.4), "inertia": (0.02, 0.02, 0.01), "axis": (0, 1, 0)}
+    b = chain(arm, bob | {"translation": (0, 0, -1)})
+    b.prescribe("j0", offset=0.2, rate=0.3, amplitude=0.4, frequency=3.0, phase=0.1)
     model = b.build()
     dyn = mb.dynamics(model, "lagrangian", compile=compiled)
     q, v = dyn.project([0.2, 0.3], [0.0, 0.5])
@@ -282,16 +253,10 @@ def test_derivatives_of_forward_dynamics_are_those_of_differences() -> None:
 
 
 def test_links_without_mass_in_a_loop() -> None:
-    b = mb.ModelBuilder("light_coupler")
-    for name, parent, at, mass in (
-        ("crank", "world", 0.0, 1.0),
-        ("coupler", "crank", 0.3, 0.0),
-        ("rocker", "world", 1.0, 2.0),
-    ):
-        b.add_body(name, mass=mass, com=(0.2, 0, 0) if mass else (0, 0, 0), inertia=(mass / 100,) * 3)
-        b.add_joint(f"at_{name}", "revolute", parent=parent, child=name, translation=(at, 0, 0), axis=(0, -1, 0))
-    b.add_loop("pin", "point", body_a="coupler", translation_a=(0.9, 0, 0), body_b="rocker", translation_b=(0.7, 0, 0))
-    model = b.build()
+    model = four_bar()
+    crank, coupler, rocker = model.bodies
+    light = replace(coupler, mass=0.0, com=np.zeros(3), inertia=np.zeros((3, 3)))
+    model = replace(model, bodies=(crank, light, rocker))
     dyn, oracle = (mb.dynamics(model, name) for name in ("lagrangian", "oracle"))
     q, v = model.random_state(2)
     tau = np.array([1.0, 0.0, 0.5])
@@ -309,6 +274,11 @@ def test_pickle_time_and_names() -> None:
     assert model.time_parameter == "t"
     assert dict(dyn.model.parameters) == {"t": 0.25}
     assert isinstance(dyn.function("constraint_residual"), ca.Function)
+    # The time is a parameter that stays.
+    later = model.with_parameters(t=0.5)
+    assert later.time == 0.5
+    assert later.time_parameter == "t"
+    assert np.array_equal(mb.dynamics(later, "lagrangian").constraint_residual(q), dyn.at(t=0.5).constraint_residual(q))
 
 
 def test_without_constraints_there_are_no_such_quantities() -> None:
@@ -324,38 +294,35 @@ def test_without_constraints_there_are_no_such_quantities() -> None:
 
 
 def test_loops_that_cannot_be_are_refused_with_the_reason() -> None:
-    far = four_bar(translation_b=(5.0, 0, 0))
-    with pytest.raises(InputError, match=r"no configuration satisfies them all.*loop 'pin'"):
-        mb.dynamics(far, "lagrangian").project(np.zeros(3), np.zeros(3))
-    with pytest.raises(InputError, match=r"the ends never meet.*0.2"):
-        mb.dynamics(four_bar(translation_b=(0.7, 0.2, 0)), "lagrangian").constraint_residual(np.zeros(3))
-    with pytest.raises(InputError, match="closes nothing"):
-        mb.dynamics(four_bar(body_b="world", body_a="crank", translation_a=(0, 0, 0), translation_b=(0, 0, 0)),
-                    "lagrangian").constraint_residual(np.zeros(3))  # fmt: skip
-    with pytest.raises(ModelError, match="both ends on 'rocker'"):
-        four_bar(body_a="rocker")
-    with pytest.raises(ModelError, match="expected a rod with a length above 0"):
-        four_bar(kind="distance")
-    with pytest.raises(ModelError, match="only a rod has one"):
-        four_bar(length=1.0)
-    with pytest.raises(ModelError, match="unknown kind 'weld'"):
-        four_bar(kind="weld")
+    zero = np.zeros(3)
+    shut = {"body_a": "crank", "translation_a": zero, "body_b": "world", "translation_b": zero}
+    for loop, call, words in (
+        ({"translation_b": (5.0, 0, 0)}, "project", r"no configuration satisfies them all.*loop 'pin'"),
+        ({"translation_b": (0.7, 0.2, 0)}, "constraint_residual", r"the ends never meet.*0.2"),
+        (shut, "constraint_residual", "closes nothing"),
+    ):
+        with pytest.raises(InputError, match=words):
+            getattr(mb.dynamics(four_bar(**loop), "lagrangian"), call)(*[zero] * (1 + (call == "project")))
+    for loop, words in (
+        ({"body_a": "rocker"}, "both ends on 'rocker'"),
+        ({"kind": "distance"}, "expected a rod with a length above 0"),
+        ({"length": 1.0}, "only a rod has one"),
+        ({"kind": "weld"}, "unknown kind 'weld'"),
+    ):
+        with pytest.raises(ModelError, match=words):
+            four_bar(**loop)
     with pytest.raises(InputError, match=r"q0: the constraints of four_bar ask for f = 0"):
-        mb.simulate(mb.dynamics(four_bar(), "lagrangian"), np.zeros(3), np.zeros(3), 0.1, "rk4", dt=1e-3)
+        mb.simulate(mb.dynamics(four_bar(), "lagrangian"), zero, zero, 0.1, "rk4", dt=1e-3)
+    # Loops that never close have no mobility.
+    b = hinge(com=(0.5, 0, 0))
+    b.add_loop("pin", "point", body_a="a", translation_a=(1, 0, 0), translation_b=(5, 0, 0), body_b="world")
+    with pytest.raises(InputError, match="no configuration satisfies them all"):
+        mb.dynamics(b.build(), "lagrangian", compile=False).mobility()
 
 
 def test_a_singular_pose_is_passed_by_projected_stages_and_told() -> None:
     # All links of a parallelogram in one line: its Jacobian loses a row there.
-    b = mb.ModelBuilder("parallelogram")
-    for name, parent, at, length in (
-        ("crank", "world", 0.0, 1.0),
-        ("coupler", "crank", 1.0, 2.0),
-        ("rocker", "world", 2.0, 1.0),
-    ):
-        b.add_body(name, mass=length, com=(length / 2, 0, 0), inertia=(0.0, length**3 / 12, length**3 / 12))
-        b.add_joint(f"at_{name}", "revolute", parent=parent, child=name, translation=(at, 0, 0), axis=(0, -1, 0))
-    b.add_loop("pin", "point", body_a="coupler", translation_a=(2, 0, 0), body_b="rocker", translation_b=(1, 0, 0))
-    dyn = mb.dynamics(b.build(), "lagrangian")
+    dyn = mb.dynamics(linkage((1.0, 2.0, 1.0), ground=2.0, density=1.0).build(), "lagrangian")
     q, v = dyn.project([1.0, -1.0, 1.0], [-2.0, 2.0, -2.0])
     with pytest.warns(mb.errors.MbkitWarning, match="singular pose"):
         run = mb.simulate(dyn, q, v, 1.5, "rk4", dt=1e-3)
@@ -378,13 +345,9 @@ def test_all_rows_are_closed_and_no_frame_is_half_a_turn_off(seed: int) -> None:
 
 
 def test_a_start_half_a_turn_off_is_refused() -> None:
-    b = mb.ModelBuilder("welded")
-    for k, parent in enumerate(("world", "arm0", "arm1", "arm2")):
-        b.add_body(f"arm{k}", mass=1.0, com=(0.1, 0, 0), inertia=(0.1, 0.1, 0.1))
-        b.add_joint(
-            f"j{k}", "revolute", parent=parent, child=f"arm{k}", translation=(0.5 if k else 0, 0, 0), axis=(0, 0, 1)
-        )
-    b.add_loop("weld", "frame", body_a="arm3", body_b="world", translation_b=(0.5, 0, 0))
+    first = {"mass": 1.0, "com": (0.1, 0, 0), "inertia": (0.1, 0.1, 0.1), "axis": (0, 0, 1)}
+    b = chain(first, *[first | {"translation": (0.5, 0, 0)}] * 3)
+    b.add_loop("weld", "frame", body_a="b3", body_b="world", translation_b=(0.5, 0, 0))
     dyn = mb.dynamics(b.build(), "lagrangian")
     closed, _ = dyn.project([1.0, 1.0, 2.0, 2.0], np.zeros(4))
     turned = np.array([*closed[:3], closed[3] + np.pi])
@@ -392,15 +355,6 @@ def test_a_start_half_a_turn_off_is_refused() -> None:
     mb.simulate(dyn, closed, np.zeros(4), 0.01, "rk4", dt=1e-3)
     with pytest.raises(InputError, match="loop 'weld' half a turn off"):
         mb.simulate(dyn, turned, np.zeros(4), 0.01, "rk4", dt=1e-3)
-
-
-def test_the_time_is_a_parameter_that_stays() -> None:
-    model, q = closed_tree(2, "point", drive=True)
-    later = model.with_parameters(t=0.5)
-    assert later.time == 0.5
-    assert later.time_parameter == "t"
-    own = mb.dynamics(model, "lagrangian")
-    assert np.array_equal(mb.dynamics(later, "lagrangian").constraint_residual(q), own.at(t=0.5).constraint_residual(q))
 
 
 @pytest.mark.parametrize("name", ["four_bar", "bricard", "andrews_squeezer", "flyball_governor"])
@@ -453,12 +407,3 @@ def test_a_whole_comparison_of_a_mechanism_passes_with_its_loops_on(monkeypatch:
     assert loops.present
     assert "needed" in loops.what
     assert type(result).from_json(result.to_json()).softness == result.softness
-
-
-def test_loops_that_never_close_have_no_mobility() -> None:
-    b = mb.ModelBuilder("short_arm")
-    b.add_body("arm", mass=1.0, com=(0.5, 0, 0), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("shoulder", "revolute", parent="world", child="arm", axis=(0, 1, 0))
-    b.add_loop("pin", "point", body_a="arm", translation_a=(1, 0, 0), translation_b=(5, 0, 0), body_b="world")
-    with pytest.raises(InputError, match="no configuration satisfies them all"):
-        mb.dynamics(b.build(), "lagrangian", compile=False).mobility()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, NumericalError, UnknownNameError, UnsupportedError
-from tests.test_loop_dynamics import closed_tree, four_bar
+from tests.scenes import chain
+from tests.test_loop_dynamics import closed_tree, four_bar, in_a_tilted_plane
 from validation.four_bar import COUPLER, CRANK, GRAVITY, GROUND, LINE, ROCKER, geometry
 
 OWN = {"compile": False}
@@ -203,14 +205,7 @@ def test_four_bar_at_rest_has_the_torque_and_the_pin_forces_of_statics() -> None
 
 def test_loads_of_a_planar_mechanism_are_in_its_plane_in_any_plane() -> None:
     """A tilted plane keeps two of the three rows of its pin; the load is carried by all three."""
-    from scipy.spatial.transform import Rotation
-
-    flat, R = four_bar(), Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
-    joints = tuple(
-        replace(j, rotation=R @ j.rotation, translation=R @ j.translation) if j.parent == "world" else j
-        for j in flat.joints
-    )
-    tilted = replace(flat, joints=joints, gravity=R @ flat.gravity)
+    flat, tilted = four_bar(), in_a_tilted_plane(four_bar())
     q, v = flat.random_state(0)
     tau = np.array([1.0, 0.0, 0.0])
     for engine in RIGID:
@@ -361,14 +356,11 @@ CRANK_RADIUS, ROD, INERTIA, SLIDER = 0.3, 0.8, 0.05, 2.0
 
 def crank_with_rod() -> mb.Model:
     """A crank, and a slider along x on a rod without mass."""
-    b = mb.ModelBuilder("crank_with_rod", gravity=(0, 0, 0))
-    b.add_body("wheel", mass=1.0, inertia=(INERTIA,) * 3)
-    b.add_joint("crank", "revolute", parent="world", child="wheel", axis=(0, 0, 1))
-    b.add_body("block", mass=SLIDER, inertia=(0.01,) * 3)
-    b.add_joint("slider", "prismatic", parent="world", child="block", axis=(1, 0, 0))
-    b.add_loop(
-        "rod", "distance", body_a="wheel", translation_a=(CRANK_RADIUS, 0, 0), body_b="block", length=ROD
-    )  # fmt: skip
+    wheel = {"body": "wheel", "joint": "crank", "mass": 1.0, "inertia": (INERTIA,) * 3, "axis": (0, 0, 1)}
+    block = {"body": "block", "joint": "slider", "mass": SLIDER, "inertia": (0.01,) * 3, "axis": (1, 0, 0)}
+    slide = {"kind": "prismatic", "parent": "world"}
+    b = chain(wheel, block | slide, name="crank_with_rod", gravity=(0, 0, 0))
+    b.add_loop("rod", "distance", body_a="wheel", translation_a=(CRANK_RADIUS, 0, 0), body_b="block", length=ROD)
     return b.build()
 
 
@@ -458,23 +450,21 @@ def test_coordinates_that_are_not_independent_are_refused() -> None:
 # Couplers
 
 
-def geared(*, mimic: bool = False, **values: object) -> mb.Model:
+def geared(*, mimic: bool = False, ratio: Any = -2.0, offset: Any = 0.3) -> mb.Model:
     """A pendulum whose second link and a rack follow the first by gears: as constraints, or as mimic joints."""
-    ratio, offset = ({"ratio": -2.0, "offset": 0.3} | values).values()
-    b = mb.ModelBuilder("geared")
-    follow = {"b": ("a", ratio, offset), "c": ("a", 0.25, 0.0)} if mimic else {"b": None, "c": None}
-    b.add_body("one", mass=1.0, com=(0.1, 0, -0.2), inertia=(0.1, 0.12, 0.05))
-    b.add_joint("a", "revolute", parent="world", child="one", axis=(0, 1, 0))
-    b.add_body("two", mass=0.5, com=(0, 0.05, -0.1), inertia=(0.01, 0.02, 0.015))
-    b.add_joint(
-        "b", "revolute", parent="one", child="two", translation=(0, 0, -0.4), axis=(0, 1, 0), mimic=follow["b"]
-    )  # fmt: skip
-    b.add_body("rack", mass=0.3, com=(0, 0.02, -0.1), inertia=(0.01, 0.02, 0.015))
-    b.add_joint(
-        "c", "prismatic", parent="world", child="rack", translation=(1, 0, 0), axis=(0, 0, 1), mimic=follow["c"]
-    )
+    one = {"joint": "a", "mass": 1.0, "com": (0.1, 0, -0.2), "inertia": (0.1, 0.12, 0.05), "axis": (0, 1, 0)}
+    two = {"joint": "b", "mass": 0.5, "com": (0, 0.05, -0.1), "inertia": (0.01, 0.02, 0.015), "axis": (0, 1, 0)}
+    rack = {"joint": "c", "mass": 0.3, "com": (0, 0.02, -0.1), "inertia": (0.01, 0.02, 0.015), "axis": (0, 0, 1)}
+    two |= {"translation": (0, 0, -0.4), "mimic": ("a", ratio, offset) if mimic else None}
+    rack |= {
+        "kind": "prismatic",
+        "parent": "world",
+        "translation": (1, 0, 0),
+        "mimic": ("a", 0.25, 0.0) if mimic else None,
+    }
+    b = chain(one, two, rack, name="geared")
     if not mimic:
-        b.add_coupler("gear", "b", "a", ratio=ratio, offset=offset)  # type: ignore[arg-type]  # by name
+        b.add_coupler("gear", "b", "a", ratio=ratio, offset=offset)
         b.add_coupler("pinion", "c", "a", ratio=0.25)
     return b.build()
 
@@ -568,11 +558,9 @@ def test_couplers_in_mujoco_follow_its_written_law_and_survive_mjcf(tmp_path: Pa
     ],
 )
 def test_faulty_couplers_are_refused(joint: str, leader: str, words: str) -> None:
-    b = mb.ModelBuilder("bad")
-    for name, kind in (("a", "revolute"), ("b", "revolute"), ("e", "ball")):
-        b.add_body(f"of {name}", mass=1.0, com=(0.1, 0.1, 0), inertia=(0.1,) * 3)
-        axis = (0, 1, 0) if kind == "revolute" else None
-        b.add_joint(name, kind, parent="world", child=f"of {name}", axis=axis)
+    body = {"mass": 1.0, "com": (0.1, 0.1, 0), "inertia": (0.1,) * 3, "parent": "world"}
+    turning = [body | {"joint": name, "axis": (0, 1, 0)} for name in "ab"]
+    b = chain(*turning, body | {"joint": "e", "kind": "ball"})
     b.add_coupler("gear", joint, leader)
     with pytest.raises(ModelError, match=words):
         b.build()
@@ -582,11 +570,8 @@ def test_faulty_couplers_are_refused(joint: str, leader: str, words: str) -> Non
 
 
 def test_forces_by_functions_enter_the_forces_of_actuators_and_have_no_load_on_single_bodies() -> None:
-    b = mb.ModelBuilder("closer", gravity=(0, 0, -9.81))
-    for name in ("one", "two"):
-        b.add_body(name, mass=1.0, com=(0.1, 0, -0.2), inertia=(0.1, 0.12, 0.05))
-    b.add_joint("a", "revolute", parent="world", child="one", axis=(0, 1, 0))
-    b.add_joint("b", "revolute", parent="one", child="two", translation=(0, 0, -0.4), axis=(0, 1, 0))
+    rod = {"mass": 1.0, "com": (0.1, 0, -0.2), "inertia": (0.1, 0.12, 0.05), "axis": (0, 1, 0)}
+    b = chain(rod | {"joint": "a"}, rod | {"joint": "b", "translation": (0, 0, -0.4)}, name="closer")
     b.add_joint_force("drag", "b", lambda t, q, v: -2.0 * v**3 - q)  # noqa: ARG005
     b.add_coupler("gear", "b", "a", ratio=0.5)
     model = b.build()

@@ -16,6 +16,7 @@ from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop, Prescribed
 from tests.random_trees import SOUND, off, random_tree, rotation
+from tests.scenes import chain, linkage
 
 EPS = float(np.finfo(float).eps)
 #: At which motions in time are taken, s.
@@ -151,15 +152,13 @@ def test_stacked_and_mimic_joints_in_loops(kinds):
 
 def planar(n: int, seed: int) -> tuple[mb.Model, np.ndarray]:
     """Return two chains in a plane, and a configuration."""
-    rng = np.random.default_rng(seed)
-    b = mb.ModelBuilder(f"planar{seed}", gravity=(0, -9.81, 0))
+    rng, links = np.random.default_rng(seed), []
     for k in range(n):
-        b.add_body(f"b{k}", mass=rng.uniform(0.5, 2), com=(*(0.2 * rng.standard_normal(2)), 0), inertia=(0.1, 0.2, 0.2))
-        parent = f"b{k - 2}" if k > 1 else "world"
-        kind = "prismatic" if k == 3 else "continuous"
-        place = {"axis": (1, 0, 0) if k == 3 else (0, 0, 1), "translation": (*rng.uniform(0.2, 0.6, 2), 0)}
-        b.add_joint(f"j{k}", kind, parent=parent, child=f"b{k}", damping=0.1, **place)
-    return b.build(), rng.uniform(-1, 1, n)
+        mass, com, at = rng.uniform(0.5, 2), 0.2 * rng.standard_normal(2), rng.uniform(0.2, 0.6, 2)
+        body = {"mass": mass, "com": (*com, 0), "inertia": (0.1, 0.2, 0.2), "damping": 0.1, "translation": (*at, 0)}
+        kind = {"kind": "prismatic", "axis": (1, 0, 0)} if k == 3 else {"axis": (0, 0, 1)}
+        links.append(body | kind | {"parent": f"b{k - 2}" if k > 1 else "world"})
+    return chain(*links, gravity=(0, -9.81, 0)).build(), rng.uniform(-1, 1, n)
 
 
 @pytest.mark.parametrize(
@@ -261,23 +260,15 @@ def test_pinocchio_s_derivative_under_a_loop_is_not_that_of_its_acceleration(fou
         dyn.linearize(q, v, tau)
 
 
-def parallelogram() -> mb.Model:
-    b = mb.ModelBuilder("parallelogram", gravity=(0, -9.81, 0))
-    for name, parent, x, length in (("a", "world", 0.0, 1.0), ("b", "a", 1.0, 2.0), ("c", "world", 2.0, 1.0)):
-        b.add_body(name, mass=1.0, com=(length / 2, 0, 0), inertia=(0, length**2 / 12, length**2 / 12))
-        b.add_joint(name, "continuous", parent=parent, child=name, axis=(0, 0, 1), translation=(x, 0, 0))
-    b.add_loop("pin", "point", body_a="b", translation_a=(2, 0, 0), body_b="c", translation_b=(1, 0, 0))
-    return b.build()
-
-
 def test_a_singular_pose_is_refused():
-    dyn = mb.dynamics(parallelogram())
+    dyn = mb.dynamics(linkage((1.0, 2.0, 1.0), ground=2.0, density=1.0).build())
     assert dyn.constraint_solver == "constraintDynamics"
+    zero = np.zeros(3)
     for v in ([0.0, 0, 0], [1.0, -1, 1]):
         with pytest.raises(NumericalError, match="singular pose, where rows of loop 'pin' depend"):
-            dyn.forward_dynamics([0.0, 0, 0], v, [0.0, 0, 0])
+            dyn.forward_dynamics(zero, v, zero)
         with pytest.raises(NumericalError, match="singular pose"):
-            dyn.constraint_forces([0.0, 0, 0], v, [0.0, 0, 0])
+            dyn.constraint_forces(zero, v, zero)
     # Beside it one freedom is left.
     q = np.array([0.3, -0.3, 0.3])
     exact = mb.dynamics(dyn.model, "oracle")
@@ -285,11 +276,12 @@ def test_a_singular_pose_is_refused():
 
 
 def of_masses(b: float, c: float) -> mb.Model:
-    out = mb.ModelBuilder("masses", gravity=(0, -9.81, 0))
-    for name, parent, x, m in (("a", "world", 0.0, 1.0), ("b", "a", 0.3, b), ("c", "world", 1.0, c)):
-        out.add_body(name, mass=m, com=(0.2, 0, 0), inertia=(0, m / 50, m / 50))
-        out.add_joint(name, "continuous", parent=parent, child=name, axis=(0, 0, 1), translation=(x, 0, 0))
-    out.add_loop("pin", "point", body_a="b", translation_a=(0.9, 0, 0), body_b="c", translation_b=(0.7, 0, 0))
+    links = []
+    for parent, x, m in (("world", 0.0, 1.0), ("b0", 0.3, b), ("world", 1.0, c)):
+        body = {"mass": m, "com": (0.2, 0, 0), "inertia": (0, m / 50, m / 50), "axis": (0, 0, 1)}
+        links.append(body | {"parent": parent, "translation": (x, 0, 0)})
+    out = chain(*links, gravity=(0, -9.81, 0))
+    out.add_loop("pin", "point", body_a="b1", translation_a=(0.9, 0, 0), body_b="b2", translation_b=(0.7, 0, 0))
     return out.build()
 
 

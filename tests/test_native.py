@@ -14,38 +14,23 @@ from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.mujoco.rollout import INTEGRATORS
 from mbkit.errors import MbkitWarning
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Model
 from mbkit.simulate import METHODS, simulate
+from tests import orders
+from tests.scenes import chain, damped_arm, slider
 
 NATIVE = tuple(m.name for m in METHODS.values() if m.kind == "native" and "mujoco" in m.engines)
 IMPLICIT = ("mujoco_implicit", "mujoco_implicitfast", "mujoco_discrete")
 
 
-def damped() -> Model:
-    b = ModelBuilder("damped")
-    b.add_body("a", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
-    b.add_body("b", mass=0.5, com=(0, 0, -0.3), inertia=(0.03, 0.03, 0.01))
-    b.add_joint("j1", "revolute", parent="world", child="a", axis=(0, 1, 0), damping=0.7, stiffness=3.0, rest=0.2)
-    b.add_joint("j2", "revolute", parent="a", child="b", axis=(1, 0, 0), translation=(0, 0, -1), damping=0.1)
-    return b.build()
-
-
-def slider(**joint: float) -> Dynamics:
-    b = ModelBuilder("slider")
-    b.add_body("mass", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), **joint)
-    return dynamics(b.build(), "mujoco")
+def sliding(**joint: float) -> Dynamics:
+    return dynamics(slider(**joint).build(), "mujoco")
 
 
 def cases() -> dict[str, tuple[Model, np.ndarray, np.ndarray, float]]:
-    rng = np.random.default_rng(2)
-    top, box = catalog.heavy_top(), catalog.free_body()
-    return {
-        "double pendulum": (catalog.double_pendulum(), np.array([0.6, 0.3]), np.array([0.5, -0.5]), 1.0),
-        "damped, on a spring": (damped(), np.array([1.0, -0.5]), np.array([2.0, 1.0]), 1.0),
-        "heavy top": (top, top.random_state(rng)[0], np.array([1.0, 20.0, -4.0]), 0.5),
-        "free body": (box, box.random_state(rng)[0], np.array([1.0, 2.0, 3.0, 0.1, 5.0, 0.1]), 1.0),
-    }
+    sprung = damped_arm(), np.array([1.0, -0.5]), np.array([2.0, 1.0]), 1.0
+    known = ("double pendulum", "heavy top", "Dzhanibekov box")
+    return {"damped, on a spring": sprung} | {name: orders.cases()[name] for name in known}
 
 
 def test_there_are_all_of_mujocos() -> None:
@@ -58,28 +43,17 @@ def test_there_are_all_of_mujocos() -> None:
 @pytest.mark.parametrize("case", cases())
 @pytest.mark.parametrize("method", NATIVE)
 def test_observed_order(case: str, method: str) -> None:
-    model, q, v, duration = cases()[case]
-    dyn = dynamics(model, "mujoco")
-    truth = simulate(dynamics(model), q, v, duration, "dop853", rtol=3e-14, save=[0.0, duration])
     counts = (60, 90, 140, 200) if METHODS[method].order == 4 else (300, 450, 700, 1000)
-    errors = []
-    for n in counts:
-        run = simulate(dyn, q, v, duration, method, dt=duration / n)
-        apart = [model.difference(truth.q[-1], run.q[-1]), run.v[-1] - truth.v[-1]]
-        errors.append(float(np.linalg.norm(np.concatenate(apart))))
-    order = np.polyfit(np.log(1 / np.array(counts)), np.log(errors), 1)[0]
+    order = orders.observed(cases()[case], method, counts, "mujoco")
     assert order == pytest.approx(METHODS[method].order, abs=0.2)
 
 
 @pytest.mark.parametrize(("native", "own"), [("mujoco_euler", "semi_implicit_euler"), ("mujoco_rk4", "rk4")])
 def test_a_tumbling_base_runs_as_with_the_own_method(native: str, own: str) -> None:
     """The same model, step and formula in the limit of small steps: q and v, all along, for one state and a batch."""
-    b = ModelBuilder("tumbling")
-    b.add_body("base", mass=2.0, com=(0.1, -0.2, 0.05), inertia=(0.3, 0.4, 0.6))
-    b.add_joint("float", "free", parent="world", child="base", translation=(0, 0, 1), rpy=(0.3, -0.2, 1.0))
-    b.add_body("arm", mass=0.7, com=(0.2, 0.1, 0.0), inertia=(0.02, 0.03, 0.04))
-    b.add_joint("shoulder", "ball", parent="base", child="arm", translation=(0.3, 0.0, 0.1), damping=0.1)
-    model = b.build()
+    base = {"kind": "free", "mass": 2.0, "com": (0.1, -0.2, 0.05), "inertia": (0.3, 0.4, 0.6), "rpy": (0.3, -0.2, 1.0)}
+    arm = {"kind": "ball", "mass": 0.7, "com": (0.2, 0.1, 0.0), "inertia": (0.02, 0.03, 0.04), "damping": 0.1}
+    model = chain(base | {"translation": (0, 0, 1)}, arm | {"translation": (0.3, 0.0, 0.1)}).build()
     q, v = model.random_state(np.random.default_rng(4), 2)
     v[:, :6] += [1.0, 2.0, -1.5, 2.0, -1.0, 3.0]
     order, apart = METHODS[native].order, []
@@ -177,7 +151,7 @@ def test_batches_are_their_states_one_by_one_and_may_be_empty(method: str) -> No
 
 @pytest.mark.parametrize("method", NATIVE)
 def test_the_same_inputs_give_the_same_bits(method: str) -> None:
-    model, q, v, _ = cases()["free body"]
+    model, q, v, _ = cases()["Dzhanibekov box"]
     runs = [simulate(dynamics(model, "mujoco"), q, v, 0.05, method).q for _ in range(2)]
     assert np.array_equal(*runs)
 

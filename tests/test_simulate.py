@@ -1,6 +1,6 @@
 # Torques and stub engines have the signature they are called with.
 # ruff: noqa: ARG002, ARG005
-"""Integrators: their order, MuJoCo's own steps, published figures, and runs that go wrong."""
+"""Integrators: their order, MuJoCo's own steps, and runs that go wrong."""
 
 from __future__ import annotations
 
@@ -46,6 +46,7 @@ from mbkit.model import Model, quaternions
 from mbkit.model.integration_space import Space
 from mbkit.simulate import METHODS, RK4, Tableau, Trajectory, simulate
 from mbkit.simulate.time_grid import Grid
+from tests import orders
 from tests.scenes import chain, damped_arm, hinge, slider
 from validation import closed_forms
 
@@ -67,10 +68,6 @@ def tumbling() -> tuple[Model, np.ndarray, np.ndarray]:
 
 def stiff(stiffness: float = 1e9) -> Dynamics:
     return dynamics(slider(stiffness=stiffness).build())
-
-
-def slope(steps: list[float], errors: list[float]) -> float:
-    return float(np.polyfit(np.log(steps), np.log(errors), 1)[0])
 
 
 # Tableaus
@@ -227,33 +224,11 @@ def test_space_round_trip_and_parent_axes() -> None:
 # Order of convergence
 
 
-def order_cases() -> dict[str, tuple[Model, np.ndarray, np.ndarray, float]]:
-    rng = np.random.default_rng(2)
-    top = catalog.heavy_top()
-    box = catalog.free_body()
-    model, q, v = tumbling()
-    return {
-        "double pendulum": (catalog.double_pendulum(), np.array([0.6, 0.3]), np.array([0.5, -0.5]), 1.0),
-        "heavy top": (top, top.random_state(rng)[0], np.array([1.0, 20.0, -4.0]), 0.5),
-        "free body": (box, box.random_state(rng)[0], np.array([1.0, 2.0, 3.0, 0.1, 5.0, 0.1]), 1.0),
-        "tumbling arm": (model, q, 3 * v, 0.5),
-    }
-
-
-@pytest.mark.parametrize("case", order_cases())
+@pytest.mark.parametrize("case", orders.cases())
 @pytest.mark.parametrize("method", FIXED)
 def test_observed_order(case: str, method: str) -> None:
-    model, q, v, duration = order_cases()[case]
-    dyn = dynamics(model)
-    truth = simulate(dyn, q, v, duration, "dop853", rtol=3e-14, save=[0.0, duration])
     counts = (60, 90, 140, 200) if method == "rk4" else (300, 450, 700, 1000)
-    steps, errors = [], []
-    for n in counts:
-        run = simulate(dyn, q, v, duration, method, dt=duration / n)
-        steps.append(duration / n)
-        apart = [model.difference(truth.q[-1], run.q[-1]), run.v[-1] - truth.v[-1]]
-        errors.append(float(np.linalg.norm(np.concatenate(apart))))
-    assert slope(steps, errors) == pytest.approx(METHODS[method].order, abs=0.2)
+    assert orders.observed(case, method, counts) == pytest.approx(METHODS[method].order, abs=0.2)
 
 
 # MuJoCo's own integrators
@@ -366,7 +341,7 @@ def test_nothing_is_loaded_that_a_run_does_not_need(engine: str, method: str) ->
     assert made.stdout == f"[{engine!r}]\n", made.stderr
 
 
-# Conservation and published figures
+# Conservation; published figures are reached in tests/test_published.py
 
 
 def test_energy_and_momentum_are_kept() -> None:
@@ -387,55 +362,6 @@ def test_energy_and_momentum_are_kept() -> None:
     world = Space(box).to_integrator_velocity(flight.q, flight.v)
     assert np.abs(world[:, :3] - v[:3]).max() < 1e-12
     assert flight.q[-1, :3] == pytest.approx(2 * v[:3], abs=1e-12)
-
-
-def test_pendulum_follows_the_elliptic_functions() -> None:
-    dyn = dynamics(catalog.pendulum())
-    t = np.linspace(0, 10, 21)
-    theta, speed = closed_forms.pendulum_solution(t, -np.pi / 2)
-    tight = simulate(dyn, [-np.pi / 2], [0.0], 10.0, "dop853", rtol=3e-14, save=t)
-    assert tight.q[:, 0] == pytest.approx(theta, abs=1e-11)
-    assert tight.v[:, 0] == pytest.approx(speed, abs=1e-11)
-    fixed = simulate(dyn, [-np.pi / 2], [0.0], 10.0, "rk4", dt=1e-3, save=t)
-    assert fixed.q[:, 0] == pytest.approx(theta, abs=1e-9)
-    figures = closed_forms.published()["iftomm_A01_pendulum"]["exact"]["t=10 x,y"]
-    assert [np.sin(tight.q[-1, 0]), -np.cos(tight.q[-1, 0])] == pytest.approx([float(x) for x in figures], abs=1e-11)
-
-
-def test_heavy_top_reaches_the_published_attitude() -> None:
-    top = closed_forms.published()["heavy_top"]
-    model = catalog.heavy_top()
-    w, x, y, z = top["published_quaternion_wxyz_t0p2_rk4"]
-    for options in ({"method": "dop853", "rtol": 1e-12}, {"method": "rk4", "dt": 1e-4}):
-        run = simulate(dynamics(model), model.neutral(), top["w0_body"], 0.2, **options)
-        got = run.q[-1]
-        got = got * np.sign(got @ [x, y, z, w])
-        assert got == pytest.approx([x, y, z, w], abs=1.5e-5)
-
-
-def test_dzhanibekov_box_follows_the_jacobi_functions() -> None:
-    box = closed_forms.published()["dzhanibekov_box"]
-    model = catalog.free_body(mass=box["m"], sides=box["dims"])
-    w0 = np.array(box["w0"], dtype=float)
-    period = float(box["exact_period"])
-    t = np.linspace(0, period, 13)
-    exact, _ = closed_forms.free_spin(t, np.array(box["I"]), w0)
-    v0 = np.concatenate([np.zeros(3), w0])
-    run = simulate(dynamics(model), model.neutral(), v0, period, "dop853", rtol=3e-14, save=t)
-    assert run.v[:, 3:] == pytest.approx(exact, abs=1e-10)
-    fixed = simulate(dynamics(model), model.neutral(), v0, period, "rk4", dt=period / 3000)
-    assert fixed.v[::250, 3:] == pytest.approx(exact, abs=1e-8)
-
-
-def test_light_cart_pole_is_the_published_one() -> None:
-    figures = closed_forms.published()["light_cart_pole"]
-    model = catalog.cart_pole(cart_mass=figures["M"], pole_mass=figures["m"], length=figures["l"])
-    times = [0.0, *(float(k) for k in figures["published"])]
-    run = simulate(dynamics(model), [0.0, np.pi / 2], [0.0, 0.0], 8.0, "dop853", rtol=1e-12, atol=1e-14, save=times)
-    wanted = np.array(list(figures["published"].values()))
-    assert run.q[1:] == pytest.approx(wanted, abs=1e-7)
-    cart = closed_forms.light_cart_pole_cart(run.q[:, 1], np.pi / 2, figures["M"], figures["m"], figures["l"])
-    assert run.q[:, 0] == pytest.approx(cart, abs=1e-8)
 
 
 # DOP853

@@ -30,6 +30,7 @@ from mbkit.studies import InterruptedSweepError, Reference, work_precision
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
 from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.sweep import Problem, _without_heyoka_cache, first_run, plans, repetitions
+from tests.scenes import chain, hinge, slider
 
 FIXED = [m.name for m in METHODS.values() if m.kind != "adaptive"]
 STEPS = [0.1 / 2**k for k in range(6)]
@@ -97,18 +98,7 @@ def test_orders_on_the_manifold_by_a_reference_of_our_own():
     assert [round(c.order, 1) for c in result.curves] == pytest.approx([4.0, 4.0, 2.0, 4.0], abs=0.2)
 
 
-def test_a_tolerance_is_reached_in_proportion(few):
-    for curve in few.curves:
-        if curve.method == "dop853":
-            assert math.isnan(curve.order)
-            assert math.isnan(curve.expected)
-            loose, tight = curve.points
-            assert tight.error < 0.1 * loose.error
-            assert tight.error < 1e-11
-            assert tight.evaluations > loose.evaluations > 0
-
-
-def test_points_tell_what_they_cost(few):
+def test_points_tell_what_they_cost_and_a_tolerance_is_reached_in_proportion(few):
     for curve, point in few.rows():
         assert point.seconds > 0
         assert point.repeats == 1
@@ -119,6 +109,12 @@ def test_points_tell_what_they_cost(few):
             assert point.steps == round(1.0 / point.value)
         # The energy's error is of the size of the motion's.
         assert point.energy < 10 * point.error + 1e-13
+    for curve in (c for c in few.curves if c.method == "dop853"):
+        assert math.isnan(curve.order)
+        assert math.isnan(curve.expected)
+        loose, tight = curve.points
+        assert tight.error < min(0.1 * loose.error, 1e-11)
+        assert tight.evaluations > loose.evaluations > 0
     assert few.reference == "an exact function, to rounding"
     assert few.q0 == (1.0,)
     assert few.settings["timing"] == "interleaved in one process"
@@ -154,17 +150,8 @@ def test_a_grid_ends_where_an_engines_own_law_keeps_the_error():
 def test_coarse_tolerances_that_bind_no_step_do_not_end_a_grid():
     # Steps end on the saved times, 0.1 s apart: of a gentle motion the first tolerances ask for no shorter ones.
     gentle = [(0.3 * math.cos(4 * t), -1.2 * math.sin(4 * t)) for t in np.linspace(0, 1, 11)]
-    spring = mb.ModelBuilder("spring", gravity=(0, 0, 0))
-    spring.add_body("mass", mass=1.0)
-    spring.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=16.0)
-    result = work_precision(
-        spring.build(),
-        ["pinocchio"],
-        ["dop853"],
-        reference=lambda t: tuple([x] for x in gentle[round(10 * t)]),
-        repeats=1,
-        seconds=60.0,
-    )
+    model, exact = slider(stiffness=16.0).build(), lambda t: tuple([x] for x in gentle[round(10 * t)])
+    result = work_precision(model, ["pinocchio"], ["dop853"], reference=exact, repeats=1, seconds=60.0)
     (curve,) = result.curves
     # Tolerances that take the same steps are one point.
     first, second = curve.points[:2]
@@ -190,16 +177,11 @@ def test_a_slow_machine_measures_the_same_points(monkeypatch):
     assert 2000 < max(p.evaluations for c, p in quick.rows() if c.method == "mujoco_rk4") <= 4000
 
 
-@pytest.mark.parametrize("name", ["pinocchio", "lagrangian", "mujoco"])
-def test_the_same_seed_gives_the_same_errors_to_the_bit(name):
-    one, two = (study([name], ["rk4", "rk853"], steps=[0.05, 0.025], seed=3) for _ in range(2))
-    assert errors(one) == errors(two)
-
-
-def test_a_seed_starts_elsewhere():
-    a, b = (
-        work_precision(mb.catalog.pendulum(), ["pinocchio"], ["rk4"], steps=[0.1], repeats=1, seed=s) for s in (0, 1)
-    )
+def test_the_same_seed_gives_the_same_errors_to_the_bit_and_another_starts_elsewhere():
+    for name in ("pinocchio", "lagrangian", "mujoco"):
+        one, two = (study([name], ["rk4", "rk853"], steps=[0.05, 0.025], seed=3) for _ in range(2))
+        assert errors(one) == errors(two)
+    a, b = (study(["pinocchio"], ["rk4"], reference=None, steps=[0.1], seed=s) for s in (0, 1))
     assert a.q0 != b.q0
     assert a.floor < 1e-15
 
@@ -258,13 +240,8 @@ def test_nothing_that_is_kept_shortens_a_first_run(method, compiled):
 
 
 def test_a_step_too_large_is_noted_and_does_not_end_the_sweep():
-    b = mb.ModelBuilder("stiff")
-    b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), stiffness=4e3)
-    result = work_precision(
-        b.build(), ["pinocchio"], ["rk4"], q0=[0.1], v0=[0.0], duration=2.0, steps=[0.2, 1e-2, 5e-3, 2.5e-3], repeats=1
-    )
-    (curve,) = result.curves
+    given = {"q0": [0.1], "v0": [0.0], "duration": 2.0, "steps": [0.2, 1e-2, 5e-3, 2.5e-3], "repeats": 1}
+    (curve,) = work_precision(hinge(stiffness=4e3).build(), ["pinocchio"], ["rk4"], **given).curves
     assert [p.value for p in curve.points] == pytest.approx([0.2, 1e-2, 5e-3, 2.5e-3])
     assert math.isnan(curve.points[0].error) or curve.points[0].error > 1
     assert all(p.error < 0.1 for p in curve.points[1:])
@@ -276,20 +253,14 @@ def test_steps_are_shortened_to_end_on_saved_times():
 
 
 def test_the_energy_of_a_damped_scene_is_not_made_up():
-    b = mb.ModelBuilder("damped")
-    b.add_body("a", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), damping=0.3)
-    result = work_precision(b.build(), ["pinocchio"], ["rk4"], q0=[1.0], v0=[0.0], steps=[0.05, 0.025], repeats=1)
+    given = {"q0": [1.0], "v0": [0.0], "steps": [0.05, 0.025], "repeats": 1}
+    result = work_precision(hinge(damping=0.3).build(), ["pinocchio"], ["rk4"], **given)
     assert all(math.isnan(p.energy) and p.error < 1e-3 for _, p in result.rows())
 
 
 def test_mimic_joints_are_free_where_mujocos_own_integrators_run():
-    b = mb.ModelBuilder("twin")
-    for k in range(2):
-        b.add_body(f"b{k}", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
-        mimic = mb.Mimic("j0", 1.0, 0.0) if k else None
-        b.add_joint(f"j{k}", "revolute", parent="world", child=f"b{k}", axis=(0, 1, 0), mimic=mimic)
-    model = b.build()
+    rod = {"mass": 1.0, "com": (0, 0, -0.5), "inertia": (0.1, 0.1, 0.1), "parent": "world", "axis": (0, 1, 0)}
+    model = chain(rod, rod | {"mimic": mb.Mimic("j0", 1.0, 0.0)}).build()
     native = work_precision(model, ["mujoco"], ["mujoco_rk4"], steps=[0.05], repeats=1)
     assert native.facts["nq"] == 2
     assert "mimic joints free" in native.facts["notes"]
@@ -316,23 +287,19 @@ def test_a_reference_gives_start_times_and_horizon():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (lambda _t: [1.0, 2.0], "reference's q"),
-        (lambda _t: ([1.0, 2.0], [0.0]), "reference's q"),
-        (lambda _t: ([math.nan], [0.0]), "reference's q"),
-        (lambda _t: 1.0, r"expected the function to return \(q, v\)"),
-        (lambda t: 1 / t, "reference: the function raised ZeroDivisionError at t = 0 s"),
-        (3.0, "expected a Reference or a function"),
+        ({"reference": lambda _t: [1.0, 2.0]}, "reference's q"),
+        ({"reference": lambda _t: ([1.0, 2.0], [0.0])}, "reference's q"),
+        ({"reference": lambda _t: ([math.nan], [0.0])}, "reference's q"),
+        ({"reference": lambda _t: 1.0}, r"expected the function to return \(q, v\)"),
+        ({"reference": lambda t: 1 / t}, "reference: the function raised ZeroDivisionError at t = 0 s"),
+        ({"reference": 3.0}, "expected a Reference or a function"),
+        ({"q0": [0.5]}, "does not start"),
+        ({"v0": [0.5]}, "does not start"),
     ],
 )
-def test_a_reference_that_is_none_is_refused(wrong, message):
+def test_a_reference_that_is_none_or_of_another_motion_is_refused(wrong, message):
     with pytest.raises(InputError, match=message):
-        study(["pinocchio"], ["rk4"], reference=wrong)
-
-
-@pytest.mark.parametrize("start", [{"q0": [0.5]}, {"v0": [0.5]}])
-def test_a_reference_of_another_motion_is_refused(start):
-    with pytest.raises(InputError, match="does not start"):
-        study(["pinocchio"], ["rk4"], **start)
+        study(["pinocchio"], ["rk4"], **wrong)
 
 
 # What cannot be done
@@ -343,24 +310,14 @@ def push(t, _q, _v):
 
 
 def test_methods_that_cannot_call_back_are_refused_by_name():
-    result = work_precision(
-        mb.catalog.pendulum(),
-        ("lagrangian", "mujoco"),
-        ("rk4", "taylor", "cvodes", "mujoco_rk4", "rk853"),
-        torque=push,
-        steps=[0.05],
-        tolerances=[1e-6],
-        repeats=1,
-    )
-    assert {(r.engine, r.term) for r in result.refusals} == {
-        ("lagrangian", "taylor"),
-        ("lagrangian", "cvodes"),
-        ("mujoco", "mujoco_rk4"),
-    }
+    methods = ("rk4", "taylor", "cvodes", "mujoco_rk4", "rk853")
+    given = {"torque": push, "reference": None, "steps": [0.05], "tolerances": [1e-6]}
+    result = study(("lagrangian", "mujoco"), methods, **given)
+    refused = {("lagrangian", "taylor"), ("lagrangian", "cvodes"), ("mujoco", "mujoco_rk4")}
+    assert {(r.engine, r.term) for r in result.refusals} == refused
     assert all("torque" in r.reason for r in result.refusals)
-    assert {(c.engine, c.method) for c in result.curves} == {
-        (e, m) for e in ("lagrangian", "mujoco") for m in ("rk4", "rk853")
-    }
+    found = {(e, m) for e in ("lagrangian", "mujoco") for m in ("rk4", "rk853")}
+    assert {(c.engine, c.method) for c in result.curves} == found
     assert all(math.isnan(p.energy) for _, p in result.rows())
 
 
@@ -435,21 +392,13 @@ def test_a_tolerance_that_no_run_takes_is_said():
         ({"progress": 1}, InputError, "progress"),
         ({"checkpoint": 7}, InputError, "checkpoint: expected a path or a function"),
         ({"checkpoint": "/nowhere/at/all/x.json"}, InputError, "checkpoint: there is no folder"),
+        ({"model": "pendulum"}, InputError, "expected a Model"),
+        ({"model": hinge("rock", kind="fixed", axis=None).build()}, InputError, "nothing moves in rock"),
     ],
 )
 def test_misuse_is_explained(more, error, message):
     with pytest.raises(error, match=message):
-        work_precision(mb.catalog.pendulum(), **{"repeats": 1, "seconds": 1.0, **more})
-
-
-def test_what_is_no_model_or_does_not_move_is_refused():
-    with pytest.raises(InputError, match="expected a Model"):
-        work_precision("pendulum")
-    b = mb.ModelBuilder("rock")
-    b.add_body("a", mass=1.0)
-    b.add_joint("f", "fixed", parent="world", child="a")
-    with pytest.raises(InputError, match="nothing moves in rock"):
-        work_precision(b.build())
+        work_precision(**{"model": mb.catalog.pendulum(), "repeats": 1, "seconds": 1.0, **more})
 
 
 # Interruptions
@@ -494,20 +443,14 @@ def test_a_checkpoint_gets_results_on_the_way_and_the_last(monkeypatch):
     assert set(counts) == set(range(len(STEPS) + 1))
 
 
-def test_a_checkpoint_that_cannot_be_written_loses_no_result(tmp_path):
+def test_a_checkpoint_that_fails_loses_no_result(tmp_path):
     folder = tmp_path / "taken.json"
     folder.mkdir()
-    with pytest.warns(MbkitWarning, match=r"cannot write .*the study goes on"):
-        result = study(["pinocchio"], ["rk4"], checkpoint=folder)
-    assert result.complete
+    for checkpoint, said in ((folder, "cannot write"), (lambda _: {}["x"], "checkpoint: the function raised KeyError")):
+        with pytest.warns(MbkitWarning, match=f"{said}.*the study goes on"):
+            assert study(["pinocchio"], ["rk4"], checkpoint=checkpoint).complete
     assert list(tmp_path.iterdir()) == [folder]
     assert not list(folder.iterdir())
-
-
-def test_a_checkpoint_function_that_fails_loses_no_result():
-    with pytest.warns(MbkitWarning, match=r"checkpoint: the function raised KeyError.*the study goes on"):
-        result = study(["pinocchio"], ["rk4"], checkpoint=lambda _: {}["x"])
-    assert result.complete
 
 
 def test_what_was_finished_is_kept_where_progress_fails():
@@ -599,14 +542,11 @@ def test_a_worker_that_dies_is_told():
     assert "ended without an answer" in result.refusals[0].reason
 
 
-def test_an_executor_that_is_shut_down_is_told():
+def test_an_executor_that_is_shut_down_and_a_torque_that_cannot_be_sent_are_told():
     executor = ThreadPoolExecutor(1)
     executor.shutdown()
     result = study(["pinocchio"], ["rk4"], executor=executor)
     assert "takes no more calls" in result.refusals[0].reason
-
-
-def test_a_torque_that_cannot_be_sent_is_refused_before_anything_runs():
     with spawning(1) as executor, pytest.raises(InputError, match="cannot be sent to the executor's processes"):
         study(["pinocchio"], ["rk4"], torque=lambda *_: [0.0], executor=executor)
 
@@ -662,9 +602,7 @@ def results(draw):
     curves = []
     for k in range(draw(st.integers(0, 4))):
         points = tuple(
-            PrecisionPoint(
-                "dt", 0.1 / (i + 1), draw(NUMBERS), draw(NUMBERS), draw(NUMBERS), math.nan, i, 4 * i, 1, "é\n,"
-            )
+            PrecisionPoint("dt", 0.1 / (i + 1), *draw(THREE), math.nan, i, 4 * i, 1, "é\n,")
             for i in range(draw(st.integers(0, 5)))
         )
         curves.append(Curve("mujoco", f"mujoco_{k}", points, draw(NUMBERS), 3, 4.0, draw(NUMBERS)))
@@ -687,12 +625,9 @@ def test_the_front_is_a_pareto_front(result):
         # Something on the front is at least as good in both.
         assert any(f.seconds <= p.seconds and max(f.error, floor) <= max(p.error, floor) for _, f in front)
     for _, f in front:
-        assert not any(
-            p.seconds <= f.seconds
-            and max(p.error, floor) <= max(f.error, floor)
-            and (p.seconds < f.seconds or max(p.error, floor) < max(f.error, floor))
-            for _, p in known
-        )
+        own = f.seconds, max(f.error, floor)
+        others = [(p.seconds, max(p.error, floor)) for _, p in known]
+        assert not any(a <= own[0] and b <= own[1] and (a, b) != own for a, b in others)
 
 
 @given(results())
@@ -704,9 +639,8 @@ def test_results_survive_json_and_csv(result):
     rows = list(csv.DictReader(io.StringIO(result.to_csv())))
     assert len(rows) == len(list(result.rows()))
     for row, (curve, point) in zip(rows, result.rows(), strict=True):
-        assert (row["engine"], row["method"], row["note"]) == tuple(
-            csv_text(x) for x in (curve.engine, curve.method, point.note)
-        )
+        said = tuple(map(csv_text, (curve.engine, curve.method, point.note)))
+        assert (row["engine"], row["method"], row["note"]) == said
         assert row["error"] == ("" if math.isnan(point.error) else repr(point.error))
     assert sum(int(r["front"]) for r in rows) == len(result.front)
 
