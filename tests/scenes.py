@@ -62,3 +62,10 @@ def linkage(
     ends = {"body_a": "coupler", "translation_a": (coupler, 0, 0), "body_b": "rocker", "translation_b": (rocker, 0, 0)}
     b.add_loop("pin", **({"kind": "point"} | ends | loop))
     return b
+
+
+def mounted(
+    name: str, body: str, joint: str, kind: str = "revolute", gravity: Any = (0, 0, -9.81), **given: Any
+) -> ModelBuilder:
+    """Return one body on a joint that stands on the ground."""
+    return chain({"body": body, "joint": joint, "kind": kind} | given, name=name, gravity=gravity)

@@ -19,6 +19,7 @@ from mbkit.model.base_parameters import BaseParameters, energy_regressor
 from mbkit.model.model import unchecked
 from tests.joint_of_ones_own import OWN
 from tests.random_trees import ALL, random_tree, rotation, states
+from tests.scenes import mounted
 
 
 def tree_of(seed: int, n: int = 9, kinds: tuple[str, ...] = ALL, **options) -> Model:
@@ -448,9 +449,7 @@ def test_names_from_files_are_shown_as_text():
 
 
 def test_what_does_not_move_has_none():
-    b = mb.ModelBuilder("still")
-    b.add_body("rock", mass=1.0, com=(0.1, 0.2, 0.3), inertia=(2.0, 3.0, 4.0))
-    b.add_joint("foot", "fixed", parent="world", child="rock")
+    b = mounted("still", "rock", "foot", "fixed", mass=1.0, com=(0.1, 0.2, 0.3), inertia=(2.0, 3.0, 4.0))
     base = b.build().base_parameters()
     assert (base.count, base.matrix.shape, base.values.shape) == (0, (0, 10), (0,))
     assert "0 base parameters of 10" in str(base)

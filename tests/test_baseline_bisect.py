@@ -20,6 +20,7 @@ from mbkit.studies import results
 from mbkit.studies.baseline import BisectResult, bisection, study
 from mbkit.studies.baseline.history import Commit, History
 from mbkit.studies.versions.result import AWAY, TOWARDS
+from tests.scenes import mounted
 from tests.test_baseline import ARM
 from tests.test_engine_versions import script
 from tests.test_versions import made, wrong
@@ -412,9 +413,7 @@ def test_a_real_version_is_found(monkeypatch, tmp_path):
     if not kept:
         pytest.skip("set MBKIT_TEST_ENVIRONMENTS to a folder for environments")
     monkeypatch.setenv("MBKIT_ENVIRONMENTS", kept)
-    b = mb.ModelBuilder("top")
-    b.add_body("rotor", mass=1.0, com=(0.0, 0.0, 0.1), inertia=(0.3, 0.4, 0.5))
-    b.add_joint("ball", "ball", parent="world", child="rotor")
+    b = mounted("top", "rotor", "ball", "ball", mass=1.0, com=(0.0, 0.0, 0.1), inertia=(0.3, 0.4, 0.5))
     model, path, now, old = b.build(), tmp_path / "top.toml", results.versions(), "3.3.7"
     with monkeypatch.context() as m:
         m.setattr(results, "versions", lambda: now | {"mujoco": old})

@@ -19,6 +19,7 @@ from mbkit.errors import KnownDefectWarning, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import simulate
 from tests.random_trees import ALL, IN_MUJOCO, SOUND, off, random_tree, states
+from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
 #: Normwise, of trees of ten bodies: what large terms leave of their rounding where they cancel.
@@ -284,9 +285,7 @@ def test_a_pendulums_pivot_carries_weight_and_centripetal_force():
 
 def test_nothing_outside_means_no_change_of_momentum():
     model = random_tree(21, 5, ("revolute", "ball", "prismatic"), **NOTHING, gravity=False)
-    b = mb.ModelBuilder("adrift", gravity=(0, 0, 0))
-    b.add_body("base", mass=1.0, inertia=(0.2, 0.3, 0.4))
-    b.add_joint("float", "free", parent="world", child="base")
+    b = mounted("adrift", "base", "float", "free", gravity=(0, 0, 0), mass=1.0, inertia=(0.2, 0.3, 0.4))
     for body in model.bodies:
         b.add_body(body.name, mass=body.mass, com=body.com, inertia=body.inertia)
     for joint in model.joints:
@@ -306,9 +305,7 @@ def test_nothing_outside_means_no_change_of_momentum():
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_model_without_velocities_has_a_mass_and_loads(engine):
-    b = mb.ModelBuilder("rock")
-    b.add_body("a", mass=2.0, com=(1, 2, 3), inertia=(1, 1, 1))
-    b.add_joint("f", "fixed", parent="world", child="a")
+    b = mounted("rock", "a", "f", "fixed", mass=2.0, com=(1, 2, 3), inertia=(1, 1, 1))
     dyn, none = mb.dynamics(b.build(), engine), np.zeros(0)
     for quantity in dyn.supports & {*QUANTITIES}:
         if quantity.endswith(("jacobian", "matrix", "inverse", "force")):

@@ -34,6 +34,7 @@ from mbkit.codegen.program import Program, program
 from mbkit.codegen.python_call import python_call
 from mbkit.errors import InputError
 from tests.random_trees import random_tree, states
+from tests.scenes import mounted
 from validation.memory import allocated
 
 EPS = np.finfo(float).eps
@@ -392,9 +393,7 @@ def test_one_function_serves_all_who_ask_in_a_process(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["prismatic", "continuous"])
 def test_a_spring_in_one_dimension_is_compiled_too(kind):
     """CasADi turns √(x²) into |x|, whose derivative is a sign."""
-    b = mb.ModelBuilder("line")
-    b.add_body("b", mass=1.0, com=(0.1, 0, 0), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("j", kind, parent="world", child="b", axis=(1, 0, 0))
+    b = mounted("line", "b", "j", kind, mass=1.0, com=(0.1, 0, 0), inertia=(0.1, 0.1, 0.1), axis=(1, 0, 0))
     b.add_spring("s", body_a="world", body_b="b", stiffness=3.0, rest_length=0.5, damping=0.2, point_b=(0.2, 0, 0))
     model = b.build()
     code, plain = (mb.dynamics(model, "lagrangian", compile=c) for c in (True, False))

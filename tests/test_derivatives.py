@@ -12,6 +12,7 @@ from mbkit.codegen.extended_precision import Extended, arithmetic
 from mbkit.codegen.program import program
 from mbkit.errors import InputError, NumericalError
 from tests.random_trees import off, random_tree, states
+from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
 # A central difference is good to h² and to 2⁻¹¹³ / h: 22 digits.
@@ -220,9 +221,7 @@ def test_parameters_are_arguments_of_derivatives_too():
 
 
 def test_a_model_that_cannot_move_has_empty_derivatives():
-    b = mb.ModelBuilder("block")
-    b.add_body("a", mass=1.0)
-    b.add_joint("j", "fixed", parent="world", child="a")
+    b = mounted("block", "a", "j", "fixed", mass=1.0)
     dyn = mb.dynamics(b.build(), "lagrangian")
     nothing = np.zeros(0)
     for result in (
@@ -236,9 +235,7 @@ def test_bad_input_and_singular_poses_are_named():
     dyn = mb.dynamics(mb.load("ur5"), "lagrangian")
     with pytest.raises(InputError, match="expected shape"):
         dyn.inverse_dynamics_derivatives(np.zeros(6), np.zeros(6), np.zeros(5))
-    b = mb.ModelBuilder("massless")
-    b.add_body("a", mass=1.0, com=(0.0, 0.0, 0.0))
-    b.add_joint("spin", "revolute", parent="world", child="a", axis=(0, 0, 1))
+    b = mounted("massless", "a", "spin", "revolute", mass=1.0, com=(0.0, 0.0, 0.0), axis=(0, 0, 1))
     with pytest.warns(UserWarning, match="no mass moves"):
         model = b.build(nonphysical="warn")
     with pytest.raises(NumericalError, match="forward_dynamics_derivatives"):

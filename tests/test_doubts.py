@@ -19,6 +19,7 @@ from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord
 from mbkit.simulate.torque import Torque
 from mbkit.studies.stress.cases.exact_motions import pendulum
+from tests.scenes import mounted
 
 # Drake's own runs have tests of their own.
 LINEAR = sorted(name for name, method in METHODS.items() if method.stability and method.name != "drake_sap")
@@ -140,9 +141,7 @@ def test_coordinates_without_digits_are_told():
 
 
 def test_a_step_over_gimbal_lock_is_told():
-    b = mb.ModelBuilder("ball", gravity=(0, 0, 0))
-    b.add_body("a", mass=1.0, com=(0, 0, 0), inertia=np.eye(3))
-    b.add_joint("j", "spherical_zyx", parent="world", child="a")
+    b = mounted("ball", "a", "j", "spherical_zyx", gravity=(0, 0, 0), mass=1.0, com=(0, 0, 0), inertia=np.eye(3))
     told = doubts(b.build(), "rk4", [0.0, 1.5, 0.0], [0.0, 1.0, 0.0], dt=1e-2, duration=0.2)[1]
     assert any("gimbal lock" in x for x in told)
     assert not doubts(b.build(), "rk4", [0.0, 1.5, 0.0], [0.0, -1.0, 0.0], dt=1e-2, duration=0.2)[1]
@@ -265,9 +264,7 @@ def test_what_rings_where_it_should_be_gone_is_told():
 
 def test_taylor_s_tolerance_is_not_relative_to_the_largest_rate():
     """Of a ball at 1e5 rad/s the quaternion was off by 6 percent at rtol = 1e-8, and nothing said so."""
-    b = mb.ModelBuilder("ball", gravity=(0.0, 0.0, 0.0))
-    b.add_body("ball", mass=1.0, inertia=(0.4, 0.4, 0.4))
-    b.add_joint("turn", "ball", parent="world", child="ball")
+    b = mounted("ball", "ball", "turn", "ball", gravity=(0.0, 0.0, 0.0), mass=1.0, inertia=(0.4, 0.4, 0.4))
     run, told = doubts(b.build(), "taylor", [0, 0, 0, 1], [0, 0, 1e5], duration=0.1, rtol=1e-8, save=[0.0, 0.1])
     half = 0.5e5 * 0.1
     assert np.abs(run.q[-1] - [0, 0, np.sin(half), np.cos(half)]).max() < 1e-6
@@ -310,9 +307,7 @@ def test_errors_that_add_up_over_many_steps_are_told():
 
 def test_a_joint_that_moves_no_mass_in_a_pose_is_named():
     # A point on a massless rod: where the second axis has turned the rod along the first one, nothing turns about it.
-    b = mb.ModelBuilder("rod")
-    b.add_body("rod", mass=1.0, com=(0, 0, -1))
-    b.add_joint("hook", "universal", parent="world", child="rod", axis=(1, 0, 0), axis2=(0, 1, 0))
+    b = mounted("rod", "rod", "hook", "universal", mass=1.0, com=(0, 0, -1), axis=(1, 0, 0), axis2=(0, 1, 0))
     dyn = mb.dynamics(b.build(), "lagrangian")
     told = massless_joints(dyn, np.array([0.3, np.pi / 2 - 1e-6]))
     assert "'hook'" in told

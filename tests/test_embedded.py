@@ -28,6 +28,7 @@ from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
+from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
 
@@ -285,9 +286,7 @@ def test_a_batch_is_its_states_one_by_one(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["lanes", "stages"])
 def test_held_torques_jump_where_they_should(kind: str) -> None:
-    b = ModelBuilder("cart")
-    b.add_body("cart", mass=2.0)
-    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+    b = mounted("cart", "cart", "x", "prismatic", mass=2.0, axis=(1, 0, 0))
     dyn = both(b.build())[kind]
     grid = np.array([0.0, 0.3, 0.35, 1.0])
     run = simulate(dyn, [0.0], [0.0], 1.0, "rk853", rtol=1e-12, save=grid, torque=[[2.0], [-40.0], [0.0]])
@@ -376,9 +375,7 @@ def test_of_a_batch_each_stops_at_its_own_event(kind: str) -> None:
 
 
 def test_a_state_beyond_all_bounds_is_none() -> None:
-    b = ModelBuilder("runaway")
-    b.add_body("x", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="x", axis=(1, 0, 0))
+    b = mounted("runaway", "x", "x", "prismatic", mass=1.0, axis=(1, 0, 0))
     dyn = dynamics(b.build(), "lagrangian", compile=True)
     # 1e100 m are passed with 1e300 N after a while.
     rows = np.full((2, 1), 1e302)
@@ -463,9 +460,7 @@ def test_bad_input_is_named() -> None:
 
 
 def test_a_model_without_joints_stands_still() -> None:
-    b = ModelBuilder("stone")
-    b.add_body("stone", mass=1.0)
-    b.add_joint("glue", "fixed", parent="world", child="stone")
+    b = mounted("stone", "stone", "glue", "fixed", mass=1.0)
     for dyn in (dynamics(b.build(), "pinocchio"), dynamics(b.build(), "lagrangian", compile=True)):
         run = simulate(dyn, [], [], 1.0, "rk853", save=[0.0, 1.0])
         assert run.q.shape == (2, 0)

@@ -21,6 +21,7 @@ from mbkit.errors import InputError, MbkitError, MbkitWarning, NumericalError, U
 from mbkit.model import kind_of
 from mbkit.model.joint_types import KINDS
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
+from tests.scenes import mounted
 
 VECTORS = {
     "gravity": "q",
@@ -226,9 +227,7 @@ def test_shapes_are_as_documented_for_one_velocity_too(engine, n):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_model_without_velocities_has_empty_terms_and_poses(way):
-    b = mb.ModelBuilder("rock")
-    b.add_body("a", mass=1.0, com=(0, 0, 0.3))
-    b.add_joint("f", "fixed", parent="world", child="a", translation=(1, 0, 0))
+    b = mounted("rock", "a", "f", "fixed", mass=1.0, com=(0, 0, 0.3), translation=(1, 0, 0))
     b.add_frame("top", body="a", translation=(0, 0, 1))
     dyn, none = made_by(b.build(), way), np.zeros(0)
     assert dyn.mass_matrix(none).shape == (0, 0)
@@ -465,9 +464,7 @@ class Odd(type(KINDS["revolute"])):
 
 def test_a_joint_type_that_an_engine_does_not_have_is_named(monkeypatch):
     monkeypatch.setitem(KINDS, "odd", Odd())
-    b = mb.ModelBuilder("arm")
-    b.add_body("a", mass=1.0, com=(0, 0, 1))
-    b.add_joint("hinge", "odd", parent="world", child="a", axis=(0, 1, 0))
+    b = mounted("arm", "a", "hinge", "odd", mass=1.0, com=(0, 0, 1), axis=(0, 1, 0))
     model = b.build()
     others = [name for name in ENGINES if name not in ("lagrangian", "oracle")]
     for engine in others:
@@ -482,9 +479,7 @@ def test_a_joint_type_that_an_engine_does_not_have_is_named(monkeypatch):
 
 @pytest.mark.parametrize("engine", list(ENGINES))
 def test_a_loop_that_no_joint_can_open_is_refused_and_not_ignored(engine):
-    b = mb.ModelBuilder("loop")
-    b.add_body("a", mass=1.0, com=(0, 0, 1))
-    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0))
+    b = mounted("loop", "a", "j", "revolute", mass=1.0, com=(0, 0, 1), axis=(0, 1, 0))
     b.add_loop("closed", "point", body_a="a", body_b="world")
     model = b.build()
     with pytest.raises((InputError, UnsupportedError), match=r"loop|constraints between bodies"):
@@ -559,9 +554,7 @@ def test_a_singular_mass_matrix_is_named_and_never_nan():
 
 
 def test_a_point_spring_of_no_length_pulls_and_does_not_divide_by_zero():
-    b = mb.ModelBuilder("tether", gravity=(0, 0, 0))
-    b.add_body("a", mass=1.0)
-    b.add_joint("j", "prismatic", parent="world", child="a", axis=(1, 0, 0))
+    b = mounted("tether", "a", "j", "prismatic", gravity=(0, 0, 0), mass=1.0, axis=(1, 0, 0))
     b.add_spring("s", body_a="world", body_b="a", stiffness=7.0)
     model = b.build()
     for engine in ENGINES:

@@ -24,6 +24,7 @@ from mbkit.derivation import FUNCTIONS
 from mbkit.derivation.body_motion import OF_FRAME
 from mbkit.errors import InputError, MbkitError, OutputError, UnknownNameError, UnsupportedError
 from tests.random_trees import off, random_tree, states
+from tests.scenes import mounted
 
 CC, CXX = shutil.which("cc"), shutil.which("c++")
 EPS = float(np.finfo(float).eps)
@@ -284,9 +285,7 @@ def test_what_no_tree_holds_is_refused():
     b.prescribe("j", rate=1.0)
     with pytest.raises(UnsupportedError, match=r"without\('prescribed'\)"):
         export_c(b.build())
-    b = mb.ModelBuilder("statue")
-    b.add_body("stone", mass=2.0)
-    b.add_joint("foot", "fixed", parent="world", child="stone")
+    b = mounted("statue", "stone", "foot", "fixed", mass=2.0)
     with pytest.raises(UnsupportedError, match="no joint of it moves"):
         export_c(b.build())
 

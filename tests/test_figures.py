@@ -14,12 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 import mbkit as mb
-from mbkit import ModelBuilder, catalog, dynamics, simulate
+from mbkit import catalog, dynamics, simulate
 from mbkit.errors import InputError
 from mbkit.simulate import Event, Trajectory
 from mbkit.simulate.plotting.style import PLAIN
 from mbkit.simulate.plotting.time_series import plot_csv
 from mbkit.studies.compare.result import Comparison
+from tests.scenes import mounted
 from tests.test_report import AGREEING, DIFFERING, STUDY
 from tests.test_stress_report import NASTY, RESULT
 
@@ -76,9 +77,7 @@ def events() -> Trajectory:
 
 
 def diverged() -> Trajectory:
-    b = ModelBuilder("stiff")
-    b.add_body("mass", mass=1.0)
-    b.add_joint("a_joint_with_a_long_name", "prismatic", parent="world", child="mass", stiffness=1e8, axis=(0, 0, 1))
+    b = mounted("stiff", "mass", "a_joint_with_a_long_name", "prismatic", mass=1.0, stiffness=1e8, axis=(0, 0, 1))
     with pytest.warns(mb.errors.MbkitWarning):
         return simulate(dynamics(b.build()), [0.1], [0.0], 1.0)
 

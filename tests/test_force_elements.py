@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.simulate import METHODS
+from tests.scenes import mounted
 
 RNG = np.random.default_rng
 #: A symmetric positive matrix without any zero.
@@ -216,9 +217,7 @@ def test_a_body_on_a_bushing_has_the_frequencies_of_the_closed_form() -> None:
     """A bushing h below the centre of mass couples sliding and rocking, with K = [[k, k h], [k h, k h² + c]]."""
     m, inertia, h = 2.0, (0.3, 0.4, 0.5), 0.2
     k, c = np.array([1000.0, 1500.0, 800.0]), np.array([30.0, 40.0, 50.0])
-    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
-    b.add_body("block", mass=m, inertia=inertia)
-    b.add_joint("free", "free", parent="world", child="block")
+    b = mounted("block", "block", "free", "free", gravity=(0, 0, 0), mass=m, inertia=inertia)
     ends = {"body_a": "world", "body_b": "block", "translation_a": (0, 0, -h), "translation_b": (0, 0, -h)}
     b.add_bushing("rubber", **ends, stiffness=[*k, *c])
 
@@ -249,9 +248,7 @@ def test_expressions_of_either_library_and_functions_say_the_same() -> None:
 
 
 def test_a_joint_of_several_velocities_takes_one_force_each() -> None:
-    b = mb.ModelBuilder("disc")
-    b.add_body("disc", mass=1.0, inertia=(1.0, 1.0, 1.0))
-    b.add_joint("plane", "planar", parent="world", child="disc")
+    b = mounted("disc", "disc", "plane", "planar", mass=1.0, inertia=(1.0, 1.0, 1.0))
     q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
     b.add_joint_force("f", "plane", -q - 0.1 * v**3, potential=ca.dot(q, q))
     dyn = mb.dynamics(b.build())
@@ -310,9 +307,7 @@ def test_a_run_whose_damper_takes_energy_away_is_no_doubt() -> None:
 
 def slider() -> mb.Model:
     """Return 2 kg on a rail under the force 3 cos 5 t."""
-    b = mb.ModelBuilder("slider", gravity=(0, 0, 0))
-    b.add_body("car", mass=2.0)
-    b.add_joint("rail", "prismatic", parent="world", child="car", axis=(1, 0, 0))
+    b = mounted("slider", "car", "rail", "prismatic", gravity=(0, 0, 0), mass=2.0, axis=(1, 0, 0))
     b.add_joint_force("drive", "rail", lambda t, _q, _v: 3 * ca.cos(5 * t))
     return b.build()
 
@@ -498,9 +493,7 @@ def test_a_symbol_with_two_meanings_is_refused() -> None:
     b.add_force("f", "cart", force=(-ca.SX.sym("x"), 0, 0))
     with pytest.raises(ModelError, match="'x' stands for one of its own arguments and a coordinate"):
         b.build()
-    b = mb.ModelBuilder("cart")
-    b.add_body("cart", mass=1.0)
-    b.add_joint("q", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+    b = mounted("cart", "cart", "q", "prismatic", mass=1.0, axis=(1, 0, 0))
     b.add_joint_force("f", "q", -2 * q_)
     assert mb.dynamics(b.build()).passive([1.0], [0.0]) == -2.0
 

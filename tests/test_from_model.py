@@ -16,6 +16,7 @@ from mbkit.lagrangian.trig.shortest_form import number
 from mbkit.lagrangian.trig.simplify import forms, tidy
 from mbkit.model.parts import Loop, Prescribed
 from tests.random_trees import off, random_tree, states
+from tests.scenes import mounted
 
 ONE = ("revolute", "continuous", "prismatic", "helical")
 # Sums of some hundred rounded terms, in another order than the derivation's.
@@ -116,9 +117,7 @@ def test_numbers_are_the_description_s():
 
 
 def test_a_system_of_other_form_keeps_its_numbers():
-    b = mb.ModelBuilder("pendulum")
-    b.add_body("bob", mass=1.0, com=(0.1, 0, -1.0))
-    b.add_joint("theta", "continuous", parent="world", child="bob", axis=(0, -1, 0))
+    b = mounted("pendulum", "bob", "theta", "continuous", mass=1.0, com=(0.1, 0, -1.0), axis=(0, -1, 0))
     assert in_symbols(b.build()) is None
     with pytest.raises(InputError, match="no system of the catalog"):
         from_model(b.build(), symbols=True)

@@ -25,6 +25,7 @@ import mbkit as mb
 from mbkit import _escape
 from mbkit.cli import cli
 from mbkit.lagrangian.printing.summary import SystemSummary, python_code
+from tests.scenes import mounted
 
 #: Code for every reader of an output, and what a terminal obeys. XML can hold the first of them.
 SEEN = (
@@ -305,9 +306,7 @@ def test_errors_and_warnings_are_seen_as_they_are():
         assert "\\x1b[31m" in str(made)
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
-        b = mb.ModelBuilder(named("robot"))
-        b.add_body(named("body"), mass=1.0, inertia=(1.0, 1.0, 5.0))
-        b.add_joint("j", "revolute", axis=(0, 0, 1), parent="world", child=named("body"))
+        b = mounted(named("robot"), named("body"), "j", "revolute", mass=1.0, inertia=(1.0, 1.0, 5.0), axis=(0, 0, 1))
         b.build(nonphysical="warn")
     assert heard
     assert all(is_seen(str(w.message)) for w in heard)

@@ -13,6 +13,7 @@ from mbkit.engines.linearization import DIFFERENTIABLE, tangent_rate
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.spatial import skew
 from tests.random_trees import SOUND, random_tree, states
+from tests.scenes import chain, slider
 
 EPS = np.finfo(float).eps
 TREES = {
@@ -55,9 +56,6 @@ def quasi():
 def test_the_tangent_moves_as_model_integrate_and_difference_say(tree):
     dyn, (q, v, _, _) = tree
     check_rate(dyn.model, q, v)
-
-
-def test_so_does_that_of_quasi_velocities():
     check_rate(quasi().model, np.array([0.7, 0.3]), np.array([0.4, -0.9]))
 
 
@@ -153,11 +151,8 @@ def test_a_large_batch_is_computed_in_slices():
 
 
 def test_a_held_force_moves_a_mass_by_parabolas():
-    b = mb.ModelBuilder("mass")
-    b.add_body("mass", mass=2.0)
-    b.add_joint("z", "prismatic", parent="world", child="mass", axis=(0, 0, 1))
-    h = 0.3
-    A, B, f = mb.dynamics(b.build(), "lagrangian").linearize([1.0], [3.0], [0.5]).discretize(h)
+    model, h = slider(mass=2.0, axis=(0, 0, 1)).build(), 0.3
+    A, B, f = mb.dynamics(model, "lagrangian").linearize([1.0], [3.0], [0.5]).discretize(h)
     a = 0.25 - 9.81
     np.testing.assert_allclose(A, [[1, h], [0, 1]], atol=4 * EPS)
     np.testing.assert_allclose(B, [[h**2 / 4], [h / 2]], atol=4 * EPS)
@@ -183,6 +178,11 @@ def test_an_unknown_hold_is_refused():
             linear.discretize(*arguments)
     with pytest.raises(NumericalError, match="overflows"), np.errstate(all="ignore"):
         mb.dynamics(mb.catalog.pendulum(), "lagrangian").linearize([np.pi], [0.0], [0.0]).discretize(1e4)
+    # A step that ends nowhere.
+    dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
+    for method in ("rk4", "gauss4", "implicit_midpoint"):
+        with pytest.raises(NumericalError):
+            dyn.discretize([0.1, 0.2], [1e160, 1e160], [0, 0], 10.0, method)
 
 
 # Steps
@@ -213,10 +213,7 @@ def test_the_derivative_of_a_step_is_its_differences(tree, method):
 
 
 def test_of_a_linear_system_it_is_the_methods_stability_function():
-    b = mb.ModelBuilder("oscillator", gravity=(0, 0, 0))
-    b.add_body("mass", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=4.0, damping=0.3)
-    dyn, h = mb.dynamics(b.build(), "lagrangian"), 0.1
+    dyn, h = mb.dynamics(slider(stiffness=4.0, damping=0.3).build(), "lagrangian"), 0.1
     Z, one = h * dyn.linearize([0.3], [0.2], [0.0]).A, np.eye(2)
     rk4 = one + Z @ (one + Z / 2 @ (one + Z / 3 @ (one + Z / 4)))
     gauss4 = np.linalg.solve(one - Z / 2 + Z @ Z / 12, one + Z / 2 + Z @ Z / 12)
@@ -255,37 +252,25 @@ def test_the_midpoint_rule_is_symplectic_in_canonical_coordinates(kinds):
     close(Phi.T @ J @ Phi, J, 1e3 * EPS * np.linalg.cond(dyn.mass_matrix(q)))
 
 
-def test_methods_that_have_no_derivative_are_refused():
-    q, v = [0.1], [0.2]
+def test_methods_engines_and_models_without_derivatives_say_why():
+    pendulum, q, v = mb.catalog.pendulum(), [0.1], [0.2]
     for method in ("rk853", "dop853", "mujoco_rk4", "implicit_midpoint"):
         with pytest.raises(UnsupportedError, match=rf"{method}.*'rk4'"):
-            mb.dynamics(mb.catalog.pendulum()).discretize(q, v, v, 0.1, method)
+            mb.dynamics(pendulum).discretize(q, v, v, 0.1, method)
     with pytest.raises(UnknownNameError):
-        mb.dynamics(mb.catalog.pendulum()).discretize(q, v, v, 0.1, "rk5")
-
-
-def test_engines_and_models_without_derivatives_say_why():
-    pendulum = mb.catalog.pendulum()
-    for f in (lambda d: d.linearize([0], [0], [0]), lambda d: d.discretize([0], [0], [0], 0.1)):
-        with pytest.raises(UnsupportedError, match="finite differences"):
-            f(mb.dynamics(pendulum, "mujoco"))
-    for call in (
-        lambda d: d.inverse_dynamics_second_derivatives([0], [0], [0]),
-        lambda d: d.parameter_derivatives("mass_matrix", [0]),
+        mb.dynamics(pendulum).discretize(q, v, v, 0.1, "rk5")
+    for engine, call, words in (
+        ("mujoco", lambda d: d.linearize([0], [0], [0]), "finite differences"),
+        ("mujoco", lambda d: d.discretize([0], [0], [0], 0.1), "finite differences"),
+        ("pinocchio", lambda d: d.inverse_dynamics_second_derivatives([0], [0], [0]), "lagrangian"),
+        ("pinocchio", lambda d: d.parameter_derivatives("mass_matrix", [0]), "lagrangian"),
     ):
-        with pytest.raises(UnsupportedError, match="lagrangian"):
-            call(mb.dynamics(pendulum))
+        with pytest.raises(UnsupportedError, match=words):
+            call(mb.dynamics(pendulum, engine))
     dyn = quasi()
     with pytest.raises(UnsupportedError, match="quasi-velocities"):
         dyn.discretize([1.0, 0.2], [0.1, 0.2], [0, 0], 0.1)
     assert dyn.linearize([1.0, 0.2], [0.1, 0.2], [0, 0]).A.shape == (4, 4)
-
-
-def test_a_step_that_ends_nowhere_is_an_error():
-    dyn = mb.dynamics(mb.catalog.double_pendulum(), "lagrangian")
-    for method in ("rk4", "gauss4", "implicit_midpoint"):
-        with pytest.raises(NumericalError):
-            dyn.discretize([0.1, 0.2], [1e160, 1e160], [0, 0], 10.0, method)
 
 
 # Second derivatives and parameters
@@ -321,13 +306,12 @@ def test_second_derivatives_have_the_oracles_digits():
 
 
 def parametric():
-    b = mb.ModelBuilder("arm")
-    for i, name in enumerate("ab"):
-        mass = mb.Parameter(f"m{name}", 1.0 + i)
-        b.add_body(name, mass=mass, com=(0.3, 0.1, mb.Parameter("c", 0.2)), inertia=np.diag([0.1, 0.2, 0.25]))
-    b.add_joint("j", "ball", parent="world", child="a", damping=mb.Parameter("d", 0.3))
-    b.add_joint("k", "revolute", parent="a", child="b", axis=(1, 2, 0), stiffness=mb.Parameter("s", 4.0))
-    return b.build()
+    links = []
+    for i in range(2):
+        com = (0.3, 0.1, mb.Parameter("c", 0.2))
+        links.append({"mass": mb.Parameter(f"m{i}", 1.0 + i), "com": com, "inertia": np.diag([0.1, 0.2, 0.25])})
+    ball = {"kind": "ball", "damping": mb.Parameter("d", 0.3)}
+    return chain(links[0] | ball, links[1] | {"axis": (1, 2, 0), "stiffness": mb.Parameter("s", 4.0)}).build()
 
 
 def test_derivatives_by_parameters_are_the_oracles_and_differences():

@@ -22,6 +22,7 @@ from validation import four_bar as bare
 pytest.importorskip("pydrake")
 
 from mbkit.engines.drake.rollout import DiscreteRun
+from tests.scenes import slider
 
 #: Kinds of loops that Drake has.
 HELD = ("point", "frame", "distance")
@@ -184,9 +185,7 @@ def test_a_batch_a_torque_and_a_shortened_last_step() -> None:
 
 def test_a_step_of_a_tree_is_semi_implicit_with_damping_at_its_end() -> None:
     """x⁺ = x + h v⁺ and (m + h d) v⁺ = m v - h k x, in closed form."""
-    b = mb.ModelBuilder("slider", gravity=(0, 0, 0))
-    b.add_body("mass", mass=2.0)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), damping=3.0, stiffness=50.0)
+    b = slider("slider", gravity=(0, 0, 0), mass=2.0, damping=3.0, stiffness=50.0)
     dyn, x, v, h = mb.dynamics(b.build(), "drake"), 0.3, -1.0, 0.01
     run = mb.simulate(dyn, [x], [v], 0.1, "drake_sap", dt=h)
     for k in range(10):

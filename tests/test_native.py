@@ -96,14 +96,14 @@ def test_dampers_are_implicit_in_three_and_springs_in_one(tmp_path: Path, monkey
     h, damping, stiffness = 1e-3, 1e6, 1e9
     for method in NATIVE:
         if method in IMPLICIT:
-            run = simulate(slider(damping=damping), [1.0], [1.0], 0.01, method, dt=h)
+            run = simulate(sliding(damping=damping), [1.0], [1.0], 0.01, method, dt=h)
             factor = 1 / (1 + h * damping)
             assert run.v[:, 0] == pytest.approx(factor ** np.arange(11), rel=1e-9)
         else:
             with pytest.warns(MbkitWarning, match="diverged"):
-                simulate(slider(damping=damping), [1.0], [1.0], 0.1, method, dt=h)
+                simulate(sliding(damping=damping), [1.0], [1.0], 0.1, method, dt=h)
         if method == "mujoco_discrete":
-            run = simulate(slider(stiffness=stiffness), [1.0], [0.0], 0.1, method, dt=h)
+            run = simulate(sliding(stiffness=stiffness), [1.0], [0.0], 0.1, method, dt=h)
             # v⁺ = v - h K (q + h v⁺), q⁺ = q + h v⁺: implicit Euler.
             step = np.linalg.inv([[1.0, -h], [h * stiffness, 1.0]])
             exact = [np.linalg.matrix_power(step, k) @ [1.0, 0.0] for k in range(6)]
@@ -111,7 +111,7 @@ def test_dampers_are_implicit_in_three_and_springs_in_one(tmp_path: Path, monkey
             assert abs(run.q[-1, 0]) < 1e-100
         else:
             with pytest.warns(MbkitWarning, match="diverged"):
-                simulate(slider(stiffness=stiffness), [1.0], [0.0], 0.1, method, dt=h)
+                simulate(sliding(stiffness=stiffness), [1.0], [0.0], 0.1, method, dt=h)
     # MuJoCo writes MUJOCO_LOG.TXT where it stands, if it is let.
     assert not list(tmp_path.iterdir())
 

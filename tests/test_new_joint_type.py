@@ -17,6 +17,7 @@ from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import KINDS, JointType, kind_of, register_joint_type
 from mbkit.testing import assert_engines_agree
 from tests.joint_of_ones_own import OWN, Cylindrical
+from tests.scenes import mounted
 
 MASS, RADIUS, INERTIA, G, STIFFNESS = 2.0, 0.3, 0.05, 9.81, 7.0
 
@@ -86,9 +87,7 @@ def test_studies_take_it():
 @pytest.mark.parametrize("kind", OWN)
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco", "drake"])
 def test_other_engines_refuse_it_by_name(engine, kind):
-    b = mb.ModelBuilder("m")
-    b.add_body("body", mass=1.0, inertia=(1.0, 1.0, 1.0))
-    b.add_joint("j", kind, parent="world", child="body", axis=(0, 0, 1))
+    b = mounted("m", "body", "j", kind, mass=1.0, inertia=(1.0, 1.0, 1.0), axis=(0, 0, 1))
     with pytest.raises(UnsupportedError, match=rf"{engine}: joint 'j' is {kind}.*lagrangian engine"):
         mb.dynamics(b.build(), engine)
 

@@ -17,6 +17,7 @@ from mbkit.methods.tableaus import EmbeddedTableau, dormand_prince_853, rodas5p
 from mbkit.simulate import METHODS, RK4, ImplicitTableau, Method, Tableau, register_method, simulate
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.solvers import compiled_fixed_step
+from tests.scenes import slider
 
 HEUN = Tableau("heun", [[0, 0], [1, 0]], [1 / 2, 1 / 2], order=2)
 TRAPEZOID = ImplicitTableau("trapezoid", [[0, 0], [1 / 2, 1 / 2]], [1 / 2, 1 / 2], 2)
@@ -135,9 +136,7 @@ def test_its_stability_is_computed_from_its_tableau() -> None:
 
 def spring() -> mb.Model:
     """A mass with ω = 10 rad/s and ζ = 1."""
-    b = mb.ModelBuilder("spring")
-    b.add_body("mass", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=100.0, damping=20.0)
+    b = slider("spring", stiffness=100.0, damping=20.0)
     return b.build()
 
 

@@ -17,6 +17,7 @@ from mbkit.codegen.program import program
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from tests.random_trees import ALL, random_tree, states
+from tests.scenes import chain, hinge
 from validation import newton_euler
 from validation.plain_model import plain
 
@@ -72,11 +73,8 @@ def witnessed(model, seed=0):
     q, v, a, _ = (x[0] for x in states(model, 1, seed))
     yield "M", oracle.digits("mass_matrix", q), newton_euler.mass_matrix(reading, q)
     yield "nle", oracle.digits("nle", q, v), newton_euler.nle(reading, q, v)
-    yield (
-        "inverse dynamics",
-        oracle.digits("inverse_dynamics", q, v, a),
-        newton_euler.inverse_dynamics(reading, q, v, a),
-    )
+    inverse = newton_euler.inverse_dynamics(reading, q, v, a)
+    yield "inverse dynamics", oracle.digits("inverse_dynamics", q, v, a), inverse
 
 
 def off(x, y):
@@ -242,10 +240,7 @@ def test_one_state_is_a_row_of_a_batch_and_batches_have_no_seams():
 
 
 def test_a_model_in_which_nothing_moves():
-    b = mb.ModelBuilder("rock")
-    b.add_body("a", mass=1.0, com=(0, 0, 1))
-    b.add_joint("f", "fixed", parent="world", child="a")
-    oracle = mb.dynamics(b.build(), "oracle")
+    oracle = mb.dynamics(chain({"kind": "fixed", "mass": 1.0, "com": (0, 0, 1)}).build(), "oracle")
     assert oracle.mass_matrix([]).shape == (0, 0)
     assert oracle.forward_dynamics([], [], []).shape == (0,)
     assert oracle.potential_energy([]) == pytest.approx(9.81)
@@ -266,10 +261,7 @@ def test_a_quaternion_stands_for_its_rotation():
 
 def test_an_unfavourable_angle_keeps_its_digits():
     """1e5 turns: the double's own sine is off by 1e-11, the sine of the double is not."""
-    b = mb.ModelBuilder("pendulum", gravity=(0, 0, -1))
-    b.add_body("a", mass=1.0, com=(0, 0, -1))
-    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0))
-    oracle = mb.dynamics(b.build(), "oracle")
+    oracle = mb.dynamics(hinge(gravity=(0, 0, -1)).build(), "oracle")
     angle = 2e5 * math.pi
     with mpmath.workdps(50):
         assert abs(oracle.digits("gravity", [angle])[0] - mpmath.sin(mpmath.mpf(angle))) < 1e-34
@@ -304,22 +296,9 @@ def test_without_heyoka_mpmath_computes(monkeypatch):
 def test_every_operation_of_a_program(backend):
     x, c = ca.SX.sym("x", 2), ca.SX.sym("c", 1)
     a, b = x[0], x[1]
-    outs = ca.vertcat(
-        a + b,
-        a - b,
-        a * b,
-        a / b,
-        -a,
-        a**2,
-        2 * a,
-        1 / a,
-        ca.sqrt(a),
-        ca.sin(a),
-        ca.cos(a),
-        a < b,
-        ca.if_else(a < b, c, 0),
-    )
-    made = program(ca.Function("f", [x, c], [ca.densify(outs)]))
+    outs = [a + b, a - b, a * b, a / b, -a, a**2, 2 * a, 1 / a]
+    outs += [ca.sqrt(a), ca.sin(a), ca.cos(a), a < b, ca.if_else(a < b, c, 0)]
+    made = program(ca.Function("f", [x, c], [ca.densify(ca.vertcat(*outs))]))
     own = arithmetic(backend)
     states = np.array([[0.3, 0.7], [0.7, 0.3]])
     high, low = own.pair(Extended(made, own)(states, np.array([[0.1]]))[0][:, :, 0])
@@ -336,11 +315,8 @@ def test_it_survives_pickling_with_what_it_was_given():
     model = random_tree(2, 5)
     q, v, _, _ = states(model, 2)
     values = mb.dynamics(model, "oracle").equations.constant_values
-    for oracle in (
-        mb.dynamics(model, "oracle"),
-        OracleDynamics(model, 2 * values),
-        OracleDynamics(model, backend="mpmath"),
-    ):
+    others = OracleDynamics(model, 2 * values), OracleDynamics(model, backend="mpmath")
+    for oracle in (mb.dynamics(model, "oracle"), *others):
         again = pickle.loads(pickle.dumps(oracle))
         assert type(again) is OracleDynamics
         for ours, theirs in zip(oracle.extended("nle", q, v), again.extended("nle", q, v), strict=True):
@@ -358,19 +334,17 @@ def test_parameters_are_taken_at_their_values():
 def test_misuse_is_explained():
     model = mb.load("ur5")
     oracle = mb.dynamics(model, "oracle")
-    q = np.zeros(6)
-    with pytest.raises(UnknownNameError, match="'mass_matrix'"):
-        oracle.extended("mas_matrix", q)
-    with pytest.raises(InputError, match="expected q, v, got 1"):
-        oracle.digits("nle", q)
-    with pytest.raises(InputError, match="expected q, got 2"):
-        oracle.digits("mass_matrix", q, q)
-    with pytest.raises(InputError, match=r"expected shape \(6,\)"):
-        oracle.extended("nle", q, np.zeros(5))
-    with pytest.raises(InputError, match="different sizes"):
-        oracle.extended("nle", np.zeros((2, 6)), np.zeros((3, 6)))
-    with pytest.raises(UnsupportedError, match="lagrangian engine"):
-        oracle.function("nle")
+    q, two = np.zeros(6), np.zeros((2, 6))
+    for method, arguments, error, words in (
+        ("extended", ("mas_matrix", q), UnknownNameError, "'mass_matrix'"),
+        ("digits", ("nle", q), InputError, "expected q, v, got 1"),
+        ("digits", ("mass_matrix", q, q), InputError, "expected q, got 2"),
+        ("extended", ("nle", q, np.zeros(5)), InputError, r"expected shape \(6,\)"),
+        ("extended", ("nle", two, np.zeros((3, 6))), InputError, "different sizes"),
+        ("function", ("nle",), UnsupportedError, "lagrangian engine"),
+    ):
+        with pytest.raises(error, match=words):
+            getattr(oracle, method)(*arguments)
     with pytest.raises(InputError, match="constants: expected shape"):
         OracleDynamics(model, [1.0, 2.0])
     with pytest.raises(InputError, match="'real128' or 'mpmath'"):
@@ -380,13 +354,9 @@ def test_misuse_is_explained():
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_singular_mass_matrix_is_named(backend):
-    b = mb.ModelBuilder("empty")
-    b.add_body("a", mass=1.0, inertia=(1, 1, 1))
-    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 0, 1))
-    b.add_body("b")
-    b.add_joint("k", "revolute", parent="a", child="b", axis=(0, 0, 1))
+    empty = {"axis": (0, 0, 1)}
     with pytest.warns(mb.errors.NonPhysicalWarning):
-        model = b.build(nonphysical="warn")
+        model = chain(empty | {"mass": 1.0, "inertia": (1, 1, 1)}, empty, name="empty").build(nonphysical="warn")
     oracle = OracleDynamics(model, backend=backend)
     z = np.zeros(2)
     assert oracle.mass_matrix(z)[1, 1] == 0

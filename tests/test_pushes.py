@@ -16,6 +16,7 @@ from mbkit.lagrangian import systems
 from mbkit.model import Model
 from mbkit.simulate import METHODS
 from tests.random_trees import random_tree
+from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake")
@@ -24,17 +25,13 @@ WRENCH = np.array([3.0, -1.0, 2.0, 0.4, 0.3, -0.2])
 
 
 def brick(gravity: Any = (0, 0, 0)) -> Model:
-    b = mb.ModelBuilder("brick", gravity=gravity)
-    b.add_body("brick", mass=2.0, inertia=(0.1, 0.2, 0.3))
-    b.add_joint("float", "free", parent="world", child="brick")
+    b = mounted("brick", "brick", "float", "free", gravity=gravity, mass=2.0, inertia=(0.1, 0.2, 0.3))
     b.add_frame("corner", body="brick", translation=(0.3, 0.0, 0.1), rpy=(0.2, -0.3, 0.5))
     return b.build()
 
 
 def damped() -> Model:
-    b = mb.ModelBuilder("damped")
-    b.add_body("rod", mass=2.0, com=(0.5, 0, 0))
-    b.add_joint("hinge", "revolute", parent="world", child="rod", axis=(0, 1, 0), damping=0.3)
+    b = mounted("damped", "rod", "hinge", "revolute", mass=2.0, com=(0.5, 0, 0), axis=(0, 1, 0), damping=0.3)
     b.add_frame("tip", body="rod", translation=(1.0, 0, 0))
     return b.build()
 
@@ -92,9 +89,7 @@ def test_a_constant_force_makes_a_parabola_and_a_constant_moment_a_spin() -> Non
 
 def test_what_is_held_is_the_wrench_and_not_its_generalized_force() -> None:
     # A force tangential to a pendulum's rod stays so as it turns: θ̈ = F / (m l) without gravity.
-    b = mb.ModelBuilder("spoke", gravity=(0, 0, 0))
-    b.add_body("rod", mass=2.0, com=(0.5, 0, 0))
-    b.add_joint("hinge", "revolute", parent="world", child="rod", axis=(0, 0, 1))
+    b = mounted("spoke", "rod", "hinge", "revolute", gravity=(0, 0, 0), mass=2.0, com=(0.5, 0, 0), axis=(0, 0, 1))
     b.add_frame("end", body="rod", translation=(0.5, 0, 0))
     dyn = mb.dynamics(b.build(), "lagrangian")
     for method in ("rk4", "rk853"):
@@ -320,9 +315,7 @@ def test_a_batch_of_none_and_a_model_without_velocities() -> None:
     given: dict[str, Any] = {"dt": 0.01, "wrenches": {"tip": np.empty((0, 6))}}
     run = mb.simulate(mb.dynamics(model), np.empty((0, 1)), np.empty((0, 1)), 0.1, **given)
     assert run.work().shape == (0, 11)
-    b = mb.ModelBuilder("welded")
-    b.add_body("block", mass=1.0, inertia=(1, 1, 1))
-    b.add_joint("weld", "fixed", parent="world", child="block")
+    b = mounted("welded", "block", "weld", "fixed", mass=1.0, inertia=(1, 1, 1))
     for engine in ENGINES:
         run = mb.simulate(mb.dynamics(b.build(), engine), [], [], 0.02, dt=0.01, wrenches={"block": WRENCH})
         assert not run.work().any()

@@ -19,7 +19,7 @@ import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Model
 from mbkit.simulate import simulate
 from mbkit.studies.work_precision import reference as module
 from mbkit.studies.work_precision.reference import (
@@ -32,6 +32,7 @@ from mbkit.studies.work_precision.reference import (
     taylor_pair,
     two_engines,
 )
+from tests.scenes import mounted
 
 hy = pytest.importorskip("heyoka")
 # No test reads what an earlier run left, or leaves anything.
@@ -213,9 +214,7 @@ def test_a_way_that_is_too_slow_leaves_time_for_the_next(monkeypatch: pytest.Mon
 
 
 def test_a_motion_that_ends_in_a_singularity_is_known_up_to_it() -> None:
-    b = ModelBuilder("bead", gravity=(0, 0, 0))
-    b.add_body("bead", mass=1.0)
-    b.add_joint("slide", "prismatic", parent="world", child="bead", axis=(1, 0, 0))
+    b = mounted("bead", "bead", "slide", "prismatic", gravity=(0, 0, 0), mass=1.0, axis=(1, 0, 0))
     b.add_spring("rubber", body_a="world", body_b="bead", stiffness=1.0, rest_length=0.5)
     found = reference(b.build(), [1.0], [-10.0], 1.0, np.linspace(0, 1.0, 101))
     assert found.horizon < 0.11
@@ -340,9 +339,7 @@ def test_bad_input_is_named(change: dict[str, Any], message: str) -> None:
 
 
 def test_a_model_without_joints_rests() -> None:
-    b = ModelBuilder("rock")
-    b.add_body("rock", mass=1.0)
-    b.add_joint("glue", "fixed", parent="world", child="rock")
+    b = mounted("rock", "rock", "glue", "fixed", mass=1.0)
     model: Model = b.build()
     found = reference(model, [], [], 1.0, [0, 1.0])
     assert isinstance(found, Reference)

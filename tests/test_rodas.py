@@ -27,6 +27,7 @@ from mbkit.simulate.solvers.step_attempts import RosenbrockAttempts
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.simulate.torque import Torque
 from tests.random_trees import SOUND, random_tree
+from tests.scenes import slider
 from validation import closed_forms
 
 # The tableau
@@ -153,9 +154,7 @@ def test_tolerance_rules_the_error() -> None:
 
 def test_a_stiff_oscillator_follows_its_closed_form_with_few_steps() -> None:
     k, c = 1e12, 1e9
-    b = ModelBuilder("slider", gravity=(0, 0, 0))
-    b.add_body("mass", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=k, damping=c)
+    b = slider("slider", gravity=(0, 0, 0), stiffness=k, damping=c)
     root = np.sqrt(c * c / 4 - k)
     fast = -(c / 2 + root)
     slow = k / fast

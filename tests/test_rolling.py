@@ -14,6 +14,7 @@ import mbkit as mb
 from mbkit.errors import InputError, ModelError, NumericalError, UnsupportedError
 from mbkit.lagrangian import from_model
 from mbkit.model import Model, Parameter
+from tests.scenes import mounted
 from validation import bicycle as paper
 
 EPS = float(np.finfo(float).eps)
@@ -367,9 +368,7 @@ def test_projection_leaves_a_configuration_that_velocities_alone_bind() -> None:
 
 
 def cart(*, axles: int = 2, **blade: Any) -> Model:
-    b = mb.ModelBuilder("cart", gravity=(0, 0, 0))
-    b.add_body("cart", mass=2.0, inertia=(0.1, 0.2, 0.3))
-    b.add_joint("move", "planar", parent="world", child="cart")
+    b = mounted("cart", "cart", "move", "planar", gravity=(0, 0, 0), mass=2.0, inertia=(0.1, 0.2, 0.3))
     for k in range(axles):
         b.add_blade(f"axle{k}", body_a="cart", translation_a=(0.0, 0.2 * k - 0.1, 0.0), axis_a=(0, 1, 0), **blade)
     return b.build()
@@ -493,9 +492,7 @@ def test_wheels_carry_the_weight() -> None:
 
 
 def test_every_fault_is_in_the_one_error() -> None:
-    b = mb.ModelBuilder("faults")
-    b.add_body("a", mass=1.0, inertia=(1, 1, 1))
-    b.add_joint("j", "free", parent="world", child="a")
+    b = mounted("faults", "a", "j", "free", mass=1.0, inertia=(1, 1, 1))
     b.add_blade("neither", body_a="a")
     b.add_blade("both", body_a="a", axis_a=(1, 0, 0), axis_b=(1, 0, 0))
     b.add_blade("zero", body_a="a", axis_a=(0, 0, 0))
@@ -522,17 +519,13 @@ def test_a_disc_that_lies_flat_is_named() -> None:
     q = np.array([0, 0, -0.5, 0, pi / 2, 0])
     for name in ("lagrangian", "pinocchio", "oracle"):
         # cos(π/2) is 6e-17 in double: exactly flat it lies where the angle is turned by the joint's frame.
-        b = mb.ModelBuilder("coin")
-        b.add_body("coin", mass=1.0, inertia=(1, 1, 1))
-        b.add_joint("move", "free", parent="world", child="coin")
+        b = mounted("coin", "coin", "move", "free", mass=1.0, inertia=(1, 1, 1))
         b.add_rolling("floor", "disc", body_a="coin", radius=0.5, axis_a=(0, 0, 1))
         coin = mb.dynamics(b.build(), name)
         with pytest.raises(NumericalError, match="floor"):
             coin.constraint_jacobian(coin.model.neutral())
         assert np.isfinite(mb.dynamics(model, name).constraint_jacobian(q)).all()
-    b = mb.ModelBuilder("record")
-    b.add_body("record", mass=1.0, inertia=(1, 1, 1))
-    b.add_joint("turn", "planar", parent="world", child="record")
+    b = mounted("record", "record", "turn", "planar", mass=1.0, inertia=(1, 1, 1))
     b.add_rolling("floor", "disc", body_a="record", radius=0.5, axis_a=(0, 0, 1))
     with pytest.raises(InputError, match=r"'floor'.*lies flat"):
         mb.dynamics(b.build(), "lagrangian").constraint_names  # noqa: B018  # derived there
@@ -545,9 +538,7 @@ def test_rows_that_cannot_hold_are_refused_with_what_is_left() -> None:
     b.add_blade("wind", body_a="cart", axis_a=(0, 1, 0), speed=0.5)
     with pytest.raises(InputError, match="no velocity has this speed"):
         mb.dynamics(b.build(), "lagrangian").constraint_names  # noqa: B018  # derived there
-    b = mb.ModelBuilder("hovering")
-    b.add_body("wheel", mass=1.0, inertia=(1, 1, 1))
-    b.add_joint("x", "planar", parent="world", child="wheel", translation=(0, 0, 0.6))
+    b = mounted("hovering", "wheel", "x", "planar", mass=1.0, inertia=(1, 1, 1), translation=(0, 0, 0.6))
     b.add_rolling("ground", "disc", body_a="wheel", radius=0.5, axis_a=(0, 1, 0))
     with pytest.raises(InputError, match=r"height: the ends never meet.*0\.1 is left"):
         mb.dynamics(b.build(), "pinocchio").constraint_jacobian(np.zeros(3))

@@ -31,6 +31,7 @@ from mbkit.simulate.solvers import compiled_fixed_step
 from mbkit.simulate.time_grid import Grid
 from mbkit.simulate.torque import Torque
 from tests.random_trees import ALL, random_tree
+from tests.scenes import mounted, slider
 
 EPS = np.finfo(float).eps
 FIXED = ("rk4", "semi_implicit_euler")
@@ -146,9 +147,7 @@ def test_a_step_in_parts_is_the_whole_one(method: str) -> None:
 
 def test_kuttas_method_has_the_weights_of_its_tableau() -> None:
     """On v̇ = τ with one mass, a stage's weights show in the step of a force that is linear in v."""
-    b = ModelBuilder("damped")
-    b.add_body("mass", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), damping=1.0)
+    b = slider("damped", damping=1.0)
     h = 0.3
     _, v1 = Machine(step(Equations(b.build()), "rk4"))(np.zeros(1), np.ones(1), np.zeros(1), np.array([h]))
     z = h * -1.0
@@ -334,9 +333,7 @@ def test_divergence_is_told_as_the_stepwise_run_tells_it(method: str, save: Any)
 
 
 def test_a_state_that_comes_back_from_beyond_all_bounds_is_lost_too() -> None:
-    b = ModelBuilder("mass")
-    b.add_body("mass", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0))
+    b = slider("mass")
     dyn = dynamics(b.build().without("gravity"), "lagrangian", compile=True)
     tau = np.zeros((2, 30, 1))
     tau[1, 4], tau[1, 5] = 1e105, -1e105
@@ -347,9 +344,7 @@ def test_a_state_that_comes_back_from_beyond_all_bounds_is_lost_too() -> None:
 
 
 def test_a_model_that_cannot_move_says_who_is_to_blame() -> None:
-    b = ModelBuilder("string")
-    b.add_body("mass", mass=1.0, inertia=(0.1, 0.1, 0.1))
-    b.add_joint("plane", "planar", parent="world", child="mass")
+    b = mounted("string", "mass", "plane", "planar", mass=1.0, inertia=(0.1, 0.1, 0.1))
     b.add_spring("string", body_a="world", body_b="mass", stiffness=1.0, rest_length=0.5)
     dyn = dynamics(b.build(), "lagrangian", compile=True)
     with pytest.warns(MbkitWarning, match=r"point spring.*direction.*'string'"):

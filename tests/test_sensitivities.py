@@ -11,6 +11,7 @@ import pytest
 import mbkit as mb
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from tests.random_trees import random_tree, states
+from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
 
@@ -120,9 +121,7 @@ def test_without_parameters_and_without_duration(arm):
 
 
 def test_of_a_model_that_cannot_move():
-    b = mb.ModelBuilder("wall")
-    b.add_body("brick", mass=1.0)
-    b.add_joint("mortar", "fixed", parent="world", child="brick")
+    b = mounted("wall", "brick", "mortar", "fixed", mass=1.0)
     dyn = mb.dynamics(b.build(), "lagrangian")
     assert mb.sensitivities(dyn, [], [], 0.1, dt=0.05).state.shape == (3, 0, 0)
     assert dyn.linearize([], [], []).discretize(0.1).A.shape == (0, 0)

@@ -14,9 +14,9 @@ import pytest
 from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError
-from mbkit.model import ModelBuilder
 from mbkit.simulate import METHODS, Event, simulate
 from mbkit.simulate.time_grid import Grid
+from tests.scenes import slider
 
 EPS = float(np.finfo(float).eps)
 ADAPTIVE = [m.name for m in METHODS.values() if m.kind == "adaptive"]
@@ -338,10 +338,7 @@ def test_a_run_away_keeps_what_it_has_and_says_when(
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log where it stands
     if not METHODS[method].callables:
         pytest.skip("no torque function, so nothing to run away with")
-    b = ModelBuilder("pushed_away")
-    b.add_body("mass", mass=1.0)
-    # A damper that pushes: exp(1e4 t) passes all bounds after 23 ms, and each method's own growth before the end.
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0))
+    b = slider("pushed_away")
     model = b.build()
     with pytest.warns(MbkitWarning, match="pushed_away: .* after t = ") as told:
         run = simulate(

@@ -20,6 +20,7 @@ from mbkit.lagrangian import systems
 from mbkit.model import Model
 from mbkit.simulate import METHODS, Tableau, register_method, simulate
 from tests.random_trees import ALL, SOUND, random_tree
+from tests.scenes import mounted
 from tests.test_rollouts import tumbling, unstable
 
 FIXED = ("rk4", "semi_implicit_euler")
@@ -156,9 +157,7 @@ def test_one_state_beside_a_batch_is_repeated_and_an_empty_batch_stays_empty() -
 
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_model_that_cannot_move_stays(compiled: bool) -> None:
-    b = mb.ModelBuilder("block")
-    b.add_body("block", mass=1.0, inertia=(1, 1, 1))
-    b.add_joint("weld", "fixed", parent="world", child="block")
+    b = mounted("block", "block", "weld", "fixed", mass=1.0, inertia=(1, 1, 1))
     q, v = own(b.build(), compiled=compiled).step([], [], [], H)
     assert q.shape == v.shape == (0,)
 
@@ -324,9 +323,7 @@ def test_a_state_beyond_all_bounds_is_an_error(compiled: bool, batch: bool) -> N
 
 @pytest.mark.parametrize("options", [{"compile": True}, {"compile": False}])
 def test_a_stage_beyond_all_bounds_is_an_error(options: dict[str, bool]) -> None:
-    b = mb.ModelBuilder("slide", gravity=(0, 0, 0))
-    b.add_body("block", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0))
+    b = mounted("slide", "block", "x", "prismatic", gravity=(0, 0, 0), mass=1.0, axis=(1, 0, 0))
     dyn = mb.dynamics(b.build(point_masses=True), "lagrangian", **options)
     for shape in ((1,), (3, 1)):
         state = np.zeros(shape), np.full(shape, 1e307), np.zeros(shape)
@@ -336,9 +333,7 @@ def test_a_stage_beyond_all_bounds_is_an_error(options: dict[str, bool]) -> None
 
 
 def test_an_acceleration_that_is_not_finite_names_the_suspect() -> None:
-    b = mb.ModelBuilder("massless")
-    b.add_body("rod", mass=0.0)
-    b.add_joint("hinge", "revolute", parent="world", child="rod", axis=(0, 1, 0))
+    b = mounted("massless", "rod", "hinge", "revolute", mass=0.0, axis=(0, 1, 0))
     for compiled in (True, False):
         dyn = own(b.build(nonphysical="warn"), compiled=compiled)
         with pytest.raises(NumericalError, match="no mass moves"):

@@ -19,6 +19,7 @@ from mbkit.simulate import simulate
 from mbkit.simulate.diagnostics.stiffness import RateJacobian
 from mbkit.simulate.solvers.vector_field import Rates
 from tests.random_trees import ALL, random_tree
+from tests.scenes import slider
 from validation import closed_forms
 
 IMPLICIT = ("radau", "bdf", "lsoda")
@@ -224,9 +225,7 @@ def test_an_explicit_method_needs_far_more() -> None:
 
 def test_a_stiff_linear_oscillator_follows_its_closed_form() -> None:
     k, c, m = 1e9, 1e6, 1.0
-    b = ModelBuilder("slider")
-    b.add_body("mass", mass=m)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), stiffness=k, damping=c)
+    b = slider("slider", mass=m, stiffness=k, damping=c)
     dyn = dynamics(b.build(), "lagrangian")
     root = np.sqrt(c * c / 4 - k * m)
     slow, fast = -k / (c / 2 + root), -(c / 2 + root)

@@ -14,10 +14,11 @@ from mbkit.derivation.steps.midpoint import Midpoint, _MomentumSpace
 from mbkit.derivation.steps.rosenbrock import Factors
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError, UnsupportedError
-from mbkit.model import Model, ModelBuilder, quaternions
+from mbkit.model import Model, quaternions
 from mbkit.simulate import simulate
 from mbkit.spatial import rotate
 from tests.random_trees import random_tree
+from tests.scenes import mounted, slider
 
 EPS = np.finfo(float).eps
 METHOD = "implicit_midpoint"
@@ -204,9 +205,7 @@ def test_time_can_be_turned_back(case: str) -> None:
 
 
 def test_damping_takes_energy() -> None:
-    b = ModelBuilder("slider")
-    b.add_body("mass", mass=2.0)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0), damping=0.5)
+    b = slider("slider", mass=2.0, damping=0.5)
     run = simulate(engine(b.build()), [0.0], [1.0], 4.0, METHOD, dt=1e-2)
     # Linear: each step divides by the same number.
     ratio = (1 - 0.5e-2 / 4) / (1 + 0.5e-2 / 4)
@@ -298,9 +297,7 @@ def test_the_last_step_may_be_shorter_and_saved_states_are_those_of_the_whole_ru
 
 
 def test_a_model_that_does_not_move_may_be_run() -> None:
-    b = ModelBuilder("statue")
-    b.add_body("stone", mass=1.0)
-    b.add_joint("weld", "fixed", parent="world", child="stone")
+    b = mounted("statue", "stone", "weld", "fixed", mass=1.0)
     run = simulate(engine(b.build()), [], [], 1.0, METHOD, dt=0.1)
     assert run.q.shape == (11, 0)
 
@@ -334,9 +331,7 @@ def test_a_step_that_is_too_long_is_told_and_what_was_good_is_kept(compile: bool
 
 @pytest.mark.parametrize("compile", [True, False])
 def test_a_state_that_grows_beyond_all_bounds_is_told(compile: bool) -> None:  # noqa: A002
-    b = ModelBuilder("pushed away")
-    b.add_body("mass", mass=1.0)
-    b.add_joint("x", "prismatic", parent="world", child="mass", axis=(1, 0, 0))
+    b = slider("pushed away")
     with pytest.warns(MbkitWarning, match="beyond all bounds"):
         run = simulate(engine(b.build(), compile=compile), [0.0], [1.0], 10.0, METHOD, dt=0.5, torque=[1e99])
     # Half of 1e99 N for 4.5 s on 1 kg is beyond 1e100 m.

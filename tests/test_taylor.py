@@ -23,10 +23,11 @@ from mbkit.codegen.taylor import TaylorSystem, _functions, order_of, precision, 
 from mbkit.derivation import Equations
 from mbkit.engines import dynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Model
 from mbkit.simulate import Event, Trajectory, at_section, simulate
 from mbkit.simulate.solvers.taylor import rounded
 from tests.random_trees import random_tree
+from tests.scenes import mounted
 
 hy = pytest.importorskip("heyoka")
 # No test reads what an earlier run left, or leaves anything.
@@ -49,9 +50,7 @@ def taylor(dyn: Any, q: Any, v: Any, duration: float = 3.0, rtol: float = EPS, *
 
 
 def slider() -> Model:
-    b = ModelBuilder("slider", gravity=(0, 0, 0))
-    b.add_body("block", mass=1.0)
-    b.add_joint("slide", "prismatic", parent="world", child="block", axis=(1, 0, 0))
+    b = mounted("slider", "block", "slide", "prismatic", gravity=(0, 0, 0), mass=1.0, axis=(1, 0, 0))
     return b.build()
 
 
@@ -305,9 +304,7 @@ def test_a_diverging_run_keeps_what_it_has(engine: str) -> None:
 
 def test_a_singular_point_ends_the_run() -> None:
     """A spring's direction turns round where its length is zero; a series would go on as it was."""
-    b = ModelBuilder("bead", gravity=(0, 0, 0))
-    b.add_body("bead", mass=1.0)
-    b.add_joint("slide", "prismatic", parent="world", child="bead", axis=(1, 0, 0))
+    b = mounted("bead", "bead", "slide", "prismatic", gravity=(0, 0, 0), mass=1.0, axis=(1, 0, 0))
     b.add_spring("rubber", body_a="world", body_b="bead", stiffness=1.0, rest_length=0.5)
     dyn = dynamics(b.build(), "lagrangian")
     with pytest.warns(

@@ -16,6 +16,7 @@ import mbkit as mb
 from mbkit.errors import MbkitWarning, ModelError, UnsupportedError
 from mbkit.spatial import matrix_from_quaternion
 from tests.random_trees import off, random_tree, states
+from tests.scenes import mounted
 
 FREE_URDF = """<robot name="box"><link name="base"><inertial><origin xyz="0.1 0.2 0.3"/><mass value="2"/>
 <inertia ixx="0.3" iyy="0.4" izz="0.5" ixy="0.01" ixz="0.02" iyz="0.03"/></inertial></link>
@@ -70,9 +71,7 @@ def test_continuous_joints_are_one_plain_angle_everywhere():
 
 
 def test_planar_velocities_are_the_derivatives_of_the_coordinates():
-    b = mb.ModelBuilder("puck")
-    b.add_body("puck", mass=2.0, com=(0.3, 0, 0), inertia=(0.1, 0.1, 0.2))
-    b.add_joint("slide", "planar", parent="world", child="puck")
+    b = mounted("puck", "puck", "slide", "planar", mass=2.0, com=(0.3, 0, 0), inertia=(0.1, 0.1, 0.2))
     model = b.build()
     q, v = np.array([1.0, 2.0, 0.7]), np.array([0.1, -0.2, 0.3])
     # T by hand: the centre of mass moves with (ẋ, ẏ) + θ̇ ẑ × R c.
@@ -84,9 +83,7 @@ def test_planar_velocities_are_the_derivatives_of_the_coordinates():
 
 
 def test_helical_pitch_is_metres_per_radian():
-    b = mb.ModelBuilder("screw")
-    b.add_body("nut", mass=2.0, inertia=(1, 1, 1))
-    b.add_joint("thread", "helical", parent="world", child="nut", axis=(0, 0, 1), pitch=0.5)
+    b = mounted("screw", "nut", "thread", "helical", mass=2.0, inertia=(1, 1, 1), axis=(0, 0, 1), pitch=0.5)
     model = b.build()
     for engine in ("pinocchio", "lagrangian"):
         dyn = mb.dynamics(model, engine)
@@ -123,9 +120,7 @@ def test_siblings_are_addressed_by_name_whatever_their_order(tmp_path):
 
 
 def test_armature_counts_once_in_every_engine():
-    b = mb.ModelBuilder("geared")
-    b.add_body("a", mass=1.0, com=(0, 0, -1))
-    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), armature=0.25)
+    b = mounted("geared", "a", "j", "revolute", mass=1.0, com=(0, 0, -1), axis=(0, 1, 0), armature=0.25)
     model = b.build()
     for engine in ("pinocchio", "lagrangian", "mujoco"):
         dyn = mb.dynamics(model, engine)
@@ -155,9 +150,7 @@ def test_parallel_slides_of_one_body_are_coupled_in_every_engine():
 
 
 def test_damping_acts_in_forward_dynamics_of_every_engine_and_not_in_nle():
-    b = mb.ModelBuilder("damped")
-    b.add_body("a", mass=1.0, com=(0, 0, -1))
-    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), damping=0.5)
+    b = mounted("damped", "a", "j", "revolute", mass=1.0, com=(0, 0, -1), axis=(0, 1, 0), damping=0.5)
     model = b.build()
     for engine in ("pinocchio", "lagrangian", "mujoco"):
         dyn = mb.dynamics(model, engine)
