@@ -484,7 +484,7 @@ def spawning(workers):
 @pytest.mark.parametrize("make", [lambda: ThreadPoolExecutor(2), lambda: spawning(2)], ids=["threads", "processes"])
 def test_executors_find_the_same_errors(make, few):
     with make() as executor:
-        result = study(("pinocchio", "mujoco"), ("rk4", "dop853"), executor=executor)
+        result = study(("pinocchio", "mujoco"), ("rk4", "dop853"), executor=executor, seconds=1e4)
     assert errors(result) == errors(few)
     assert [c.order for c in result.curves] == pytest.approx([c.order for c in few.curves], nan_ok=True)
     assert result.settings["executor"] == type(executor).__name__
@@ -502,7 +502,7 @@ def test_dasks_executor_finds_the_same_errors(few, tmp_path):
         distributed.Client(cluster) as client,
         client.get_executor() as executor,
     ):
-        result = study(("pinocchio", "mujoco"), ("rk4", "dop853"), executor=executor)
+        result = study(("pinocchio", "mujoco"), ("rk4", "dop853"), executor=executor, seconds=1e4)
     assert errors(result) == errors(few)
 
 
