@@ -7,6 +7,7 @@ from __future__ import annotations
 import pickle
 import re
 import warnings
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, TorqueError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import Trajectory, at_section, simulate, stiffness
-from mbkit.simulate.solvers.auto import StepRateMonitor
+from mbkit.simulate.solvers.auto import StepRateMonitor, _chosen
 from mbkit.simulate.solvers.trajectory_record import AcceptedSteps
 from mbkit.studies.stress import cases
 from mbkit.studies.stress.cases.exact_motions import cart_pole as light_cart_pole
@@ -454,3 +455,10 @@ def test_nothing_is_said_where_all_is_well() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         simulate(COMPILED, *START, "auto", rtol=1e-8)
+
+
+def test_a_batch_tells_its_three_commonest_sequences_of_methods():
+    ways = ["rk853"] * 4 + ["rodas5"] * 3 + ["rk853, rodas5"] * 2 + ["rodas5, rk853", "rodas5, rk853, rodas5"]
+    batch: Any = [SimpleNamespace(method_sequence=lambda way=way: way, describe=lambda way=way: way) for way in ways]
+    told = _chosen(batch, len(batch))
+    assert told == "4 of 11: rk853; 3 of 11: rodas5; 2 of 11: rk853, rodas5; and 2 more kinds"

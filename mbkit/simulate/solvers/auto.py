@@ -52,6 +52,8 @@ _AHEAD: Final = np.linspace(0.0, 1.0, 12)[:, None]
 _CUBIC: Final = np.linalg.qr(_AHEAD ** np.arange(4))[0]
 _RESIDUAL: Final = np.eye(len(_AHEAD)) - _CUBIC @ _CUBIC.T
 _LEFT: Final = len(_AHEAD) - 4
+#: Sequences of methods in a batch that are described.
+_DESCRIBED: Final = 3
 #: Rounding times a step, beside the tolerance, that is too much: of that, rk853's weights make an error twice as large.
 _ROUNDED: Final = 0.015
 #: What a check takes, in steps of rk853: so many come before the first. Measured by validation/auto.py in processor
@@ -416,9 +418,11 @@ def _chosen(controllers: Sequence[SwitchingController], batch: int | None) -> st
         return controllers[0].describe()
     sequences = [controller.method_sequence() for controller in controllers]
     kinds, parts = Counter(sequences), list[str]()
-    for kind, count in kinds.most_common():
+    for kind, count in kinds.most_common(_DESCRIBED):
         example = sequences.index(kind)
         text = controllers[example].describe()
         such = "" if text == kind else f", such as trajectory {example}"
         parts.append(f"{count} of {batch}{such}: {text}")
+    if len(kinds) > _DESCRIBED:
+        parts.append(f"and {len(kinds) - _DESCRIBED} more kinds")
     return "; ".join(parts)
