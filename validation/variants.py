@@ -123,6 +123,27 @@ def joined(model, raw, _):
     return mb.join(model, arm, at=name, pose=X, prefix="second_"), reference
 
 
+def written():
+    """Return how far terms are off after each robot, changed in three ways, was written and read back."""
+    rows = []
+    for name, floating, model in robots():
+        b = mb.ModelBuilder.of(model)
+        at = (model.frames or model.bodies)[-1].name
+        b.add_payload("the load", at=at, mass=LOAD.mass, com=LOAD.lever, inertia=LOAD.inertia)
+        b.add_prefix("my_")
+        changed = b.build()
+        q, _ = changed.random_state(0)
+        if changed.nv > 2:
+            changed = changed.lock(changed.joint_names[1:3], q)
+        for form in ("urdf", "mjcf"):
+            row = {"robot": name, "free": floating, "format": form}
+            try:
+                rows.append(row | {"apart": mb.convert(changed, form).worst})
+            except mb.errors.MbkitError as error:
+                rows.append(row | {"why": f"{error}"[:200]})
+    return rows
+
+
 def worst(row):
     return max(x for x in row["apart"].values() if not isinstance(x, str))
 
@@ -196,7 +217,8 @@ def main():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mb.errors.MbkitWarning)
         rows, refused = judged()
-    out = {**stamp(), "judged": rows, "refused": refused, "rates": rates()}
+        files = written()
+    out = {**stamp(), "judged": rows, "refused": refused, "written": files, "rates": rates()}
     with open("validation/variants.json", "w", encoding="utf-8") as file:
         json.dump(out, file, indent=1)
         file.write("\n")
