@@ -532,7 +532,7 @@ def test_bad_input_is_refused() -> None:
 # Nothing is said to move as another thing that does not
 
 #: Fields of a description that move nothing: names, where things are drawn, and what the loader says.
-SAYS = {"name", "frames", "notes", "nonphysical", "bindings", "source", "time", "layout"}
+SAYS = {"name", "frames", "notes", "nonphysical", "bindings", "source", "drawn_from", "locked", "time", "layout"}
 
 
 ROD = {"mass": 1.0, "com": (0, 0, -0.5), "inertia": (0.1, 0.1, 0.01), "axis": (0, 1, 0)}

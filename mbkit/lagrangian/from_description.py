@@ -85,7 +85,7 @@ def from_model(
 
     >>> for row in mb.lagrangian.from_model(mb.catalog.slider_crank()).constraints:
     ...     print(row)
-    L1*(cos(theta) - 1) + L2*(cos(phi + theta) - 1) - x
+    L1*cos(theta) - L1 + L2*cos(phi + theta) - L2 - x
     L1*sin(theta) + L2*sin(phi + theta)
     """
     if not isinstance(model, Model):

@@ -88,7 +88,7 @@ def scale(*patterns: str, name: str | None = None) -> Scale:
     --------
     >>> import mbkit as mb
     >>> heavier = mb.load("ur5").with_free(mb.scale("*.mass", "*.inertia", name="size"))
-    >>> round(heavier.with_parameters(size=2.0).mass / mb.load("ur5").mass, 12)
+    >>> heavier.with_parameters(size=2.0).body("forearm_link").mass / heavier.body("forearm_link").mass
     2.0
     """
     if not patterns:

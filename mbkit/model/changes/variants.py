@@ -154,7 +154,7 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
     >>> import mbkit as mb
     >>> many = mb.variants(mb.load("ur5"), {"*.mass": 0.1, "forearm_link.inertia": 0.2}, size=100, seed=1)
     >>> many
-    <Variants of 'ur5': 100 of 14 numbers, seed 1>
+    <Variants of 'ur5': 100 of 12 numbers, seed 1>
     >>> many.dynamics().mass_matrix([0.0] * 6).shape, many[7].nv
     ((100, 6, 6), 6)
     """
