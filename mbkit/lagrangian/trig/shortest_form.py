@@ -6,6 +6,7 @@ A form has powers of the cosines and sines of single angles in place of multiple
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from fractions import Fraction
 from itertools import combinations
 from math import comb, gcd, lcm, prod
@@ -54,17 +55,29 @@ def shortest_form(x: TrigPolynomial, *, whole: bool = True, decimals: bool = Tru
     by_monomial: dict[tuple[int, ...], dict[Key, Fraction]] = {}
     for key, value in x.terms.items():
         by_monomial.setdefault(key[2], {})[key] = value
-    form: Form = {}
-    for terms in by_monomial.values():
-        form |= _fewest_terms(TrigPolynomial(x.space, terms))
-    return _Writer(x.space, whole, decimals).expression(form)
+    parts = [TrigPolynomial(x.space, terms) for terms in by_monomial.values()]
+    forms = [_joined(map(_fewest_terms, parts))]
+    if whole and len(parts) > 1 and (angles := _split_off(x)):
+        # A factor such as sin θ shows in all parts only where sin 2θ is written by it.
+        forms += [_joined(power_form(part, tuple(angles), kept) for part in parts) for kept in (0, 1)]
+    write = _Writer(x.space, whole, decimals).expression
+    return min((write(form) for form in forms), key=complexity)
+
+
+def _joined(forms: Iterable[Form]) -> Form:
+    return {key: value for form in forms for key, value in form.items()}
+
+
+def _split_off(x: TrigPolynomial) -> list[int]:
+    """Return the angles that powers are tried of; none of a large sum."""
+    angles = [i for i in range(len(x.space.angles)) if any(key[1][i] for key in x.terms)]
+    return angles if len(angles) <= _ANGLES and len(x.terms) <= _SMALL else []
 
 
 def _fewest_terms(x: TrigPolynomial) -> Form:
     """Return the shortest form with the angles of one subset split off as powers of their own cosines and sines."""
-    angles = [i for i in range(len(x.space.angles)) if any(key[1][i] for key in x.terms)]
-    most = len(angles) if len(angles) <= _ANGLES and len(x.terms) <= _SMALL else 0
-    subsets = (subset for n in range(most + 1) for subset in combinations(angles, n))
+    angles = _split_off(x)
+    subsets = (subset for n in range(len(angles) + 1) for subset in combinations(angles, n))
     # The square that stays, of cosines (0) or sines (1); neither is shorter always.
     return min((power_form(x, subset, kept) for subset in subsets for kept in (0, 1)), key=len)
 
