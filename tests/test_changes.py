@@ -57,7 +57,7 @@ def test_a_builder_of_a_robot_builds_the_same_robot(name):
     assert again.nonphysical == robot.nonphysical
     # No file describes what a builder made, and its shapes are those of the file.
     assert not again.source
-    assert again.drawn_from == (("", robot.source),)
+    assert [tuple(x)[:3] for x in again.drawn_from] == [("", robot.source, "world")]
 
 
 def test_what_is_set_is_what_a_new_description_would_have():
@@ -78,6 +78,7 @@ def test_what_is_set_is_what_a_new_description_would_have():
     new.add_frame("tip", body="link", translation=(0, 0, -2.0))
     assert changed == new.build()
     told = " ".join(changed.notes)
+    assert "inertia;" not in told
     assert "mass 1 to 3" in told
     assert "damping 0.1 to 0.5" in told
     assert "gravity from [0, 0, -9.81] to [0, 0, -1.62]" in told
@@ -580,7 +581,7 @@ def test_every_drawn_body_can_be(seed, spread):
 @pytest.mark.parametrize(
     ("spread", "words"),
     [
-        ({"link.mass": (-1.0, 1.0)}, ["'link.mass' is negative", "variants"]),
+        ({"link.mass": (-1.0, 1.0)}, ["'link.mass' is zero or negative", "variants"]),
         ({"link.inertia.zz": (0.5, 0.6)}, ["'link' has an inertia that no matter has", "link.inertia"]),
         ({"hinge.damping": (1.0, 0.0)}, ["hinge.damping", "lower end first"]),
         ({"link.mass": lambda rng, n: rng.random(n - 1)}, ["link.mass", "(10,)"]),
@@ -596,6 +597,155 @@ def test_a_spread_that_is_none_is_refused(spread, words):
     with pytest.raises(InputError) as caught:
         mb.variants(pendulum().build(), spread, size=10)
     assert all(word in str(caught.value) for word in words), str(caught.value)
+
+
+def test_one_name_is_one_number():
+    shared = pendulum(mass=mb.Parameter("m", 2.0)).build()
+    with pytest.raises(InputError, match=r"'link\.mass' is a parameter already, m"):
+        shared.with_free("link.mass")
+    with pytest.raises(InputError, match="parameter 'm', which stands elsewhere"):
+        shared.with_free(mb.scale("*.damping", name="m"))
+    with pytest.raises(InputError, match="is the path of a number"):
+        shared.with_free(mb.scale("*.damping", name="hinge.damping"))
+    # A scale multiplies what is a parameter already.
+    scaled = shared.with_free("*.mass", mb.scale("*.mass", name="s"))
+    assert scaled.with_parameters(m=3.0, s=2.0).mass == 6.0
+    # The name stands for the arm's mass already, in another part.
+    arm = pendulum().build().with_free("link.mass")
+    joined = mb.join(pendulum("base", mass=2.0).build(), arm, at="tip", prefix="a_")
+    with pytest.raises(InputError, match="which stands elsewhere"):
+        joined.with_free("link.mass")
+    with pytest.raises(InputError, match="which stands elsewhere"):
+        mb.variants(joined, {"link.mass": 0.1}, size=2)
+    with pytest.raises(InputError, match="is a parameter already"):
+        mb.variants(shared, {"link.mass": 0.1}, size=2)
+
+
+def test_a_rotor_of_a_ball_is_one_number():
+    b = mb.ModelBuilder("ball")
+    b.add_body("link", mass=1.0, com=(0.1, 0.0, -0.5), inertia=(0.1, 0.1, 0.02))
+    b.add_joint("ball", "ball", parent="world", child="link", armature=0.2)
+    many = mb.variants(b.build(), {"*.armature": 0.3}, size=2)
+    assert [*many.values] == ["ball.armature"]
+    q, v = many[0].random_state(0)
+    assert off(many.dynamics().nle(np.tile(q, (2, 1)), np.tile(v, (2, 1)))[1], own(many[1]).nle(q, v)) < CLOSE
+    assert len([*many]) == 2
+
+
+def test_a_frame_with_a_parameter_carries_what_hangs_on_it():
+    b = pendulum("base")
+    b.add_frame("far", body="link", translation=(mb.Parameter("L", 1.0), 0, 0), rpy=(0.1, 0.2, 0.3))
+    base = b.build()
+    arm = mb.ModelBuilder("arm")
+    arm.add_body("second", mass=1.0, inertia=(0.1, 0.1, 0.1))
+    arm.add_joint("elbow", "revolute", parent="world", child="second", axis=(0, 1, 0))
+    whole = mb.join(base, arm.build(), at="far", pose=mb.spatial.pose((0.1, 0.2, 0.3)))
+    b = mb.ModelBuilder.of(whole)
+    b.add_payload("load", at="far", mass=1.0, translation=(0.1, 0.2, 0.3))
+    dyn = own(b.build()).at(L=3.0)
+    q = [0.3, 0.0]
+    assert np.allclose(dyn.pose(q, "second")[:3, 3], dyn.pose(q, "load")[:3, 3], rtol=0, atol=1e-14)
+    assert np.allclose(np.linalg.norm(dyn.pose(q, "far")[:3, 3]), 3.0, rtol=1e-15)
+    assert off(dyn.pose(q, "load"), dyn.pose(q, "far") @ mb.spatial.pose((0.1, 0.2, 0.3))) < 1e-14
+
+
+def test_a_prefix_keeps_the_parameter_of_a_gravity_compensation():
+    b = pendulum()
+    b.add_gravity_compensation("link", mb.Parameter("f", 0.5))
+    plain = b.build()
+    b = mb.ModelBuilder.of(plain)
+    b.add_prefix("a_")
+    assert np.array_equal(own(b.build()).at(f=1.0).passive([0.3], [0.0]), own(plain).at(f=1.0).passive([0.3], [0.0]))
+
+
+def test_what_locked_places_depend_on_is_a_number():
+    b = mb.ModelBuilder.of(geared())
+    b.set_coupler("gear", ratio=mb.Parameter("r", -2.0))
+    free = b.build()
+    with pytest.raises(InputError, match="coupler 'gear' has a parameter, r"):
+        free.lock({"j1": 0.3})
+    assert free.with_parameters(r=3.0).lock({"j1": 0.3}).full_state([0.0])[0] == pytest.approx(
+        [1.0, 0.3, 0.0], rel=1e-15
+    )
+
+
+def test_a_builder_keeps_what_is_locked_the_time_and_what_was_used_as_written():
+    b = pendulum()
+    b.add_body("empty")
+    b.add_joint("idle", "revolute", parent="link", child="empty", axis=(0, 1, 0))
+    with pytest.warns(mb.errors.NonPhysicalWarning):
+        odd = b.build(nonphysical="warn")
+    b = mb.ModelBuilder.of(odd)
+    b.add_prefix("a_")
+    assert [name for name, _ in b.build().nonphysical] == ["a_empty"]
+    assert mb.join(pendulum("base").build(), odd, at="tip", prefix="a_").nv == 3
+    arm = mb.load("panda").lock({"panda_finger_joint1": 0.02})
+    b = mb.ModelBuilder.of(arm)
+    b.add_prefix("a_")
+    assert b.build().full_state(arm.neutral())[0][-1] == 0.02
+    b = mb.ModelBuilder.of(pendulum().build())
+    b.prescribe("hinge", rate=1.0)
+    assert mb.ModelBuilder.of(b.build().with_nominal({"t": 2.0})).build().time == 2.0
+
+
+def test_forces_that_read_a_removed_joint_go_with_it():
+    b = pendulum()
+    b.add_body("second", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("elbow", "revolute", parent="link", child="second", axis=(0, 1, 0))
+    elbow, q = ca.SX.sym("elbow"), ca.SX.sym("q")
+    b.add_joint_force("servo", "hinge", elbow - q)
+    b.add_gravity_compensation("link", 0.5, without=["elbow"])
+    b = mb.ModelBuilder.of(b.build())
+    b.remove_joint("elbow")
+    left = b.build()
+    assert [x.name for x in left.forces] == ["gravity compensation of link"]
+    assert left.forces[0].without == ()
+    assert "force 'servo'" in left.notes[-1]
+
+
+def test_shapes_on_the_ground_move_with_it(tmp_path):
+    from mbkit.show.scene import shapes_of
+
+    file = tmp_path / "arm.xml"
+    file.write_text(
+        "<mujoco><worldbody><geom name='table' type='box' size='1 1 1' pos='0 0 -1'/>"
+        "<body name='link'><joint name='j'/><geom name='rod' size='0.1'/></body></worldbody></mujoco>"
+    )
+    X = mb.spatial.pose((0, 0, 2.0), rpy=(np.pi / 2, 0, 0))
+    (table,) = (x for x in shapes_of(mb.load(file, mount=X)) if x.name == "table")
+    assert table.body == "world"
+    assert np.allclose(table.translation, (0, 1, 2), atol=1e-15)
+    whole = mb.join(pendulum("base").build(), mb.load(file), at="tip", pose=X, prefix="a_")
+    (table,) = (x for x in shapes_of(whole) if x.name == "a_table")
+    assert table.body == "link"
+    assert np.allclose(table.translation, (0, 1, 1), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda _: mb.ModelBuilder.of("ur5"),
+        lambda m: m.lock({3: 1.0}),
+        lambda m: m.lock([["hinge"]]),
+        lambda m: m.lock({"hinge": [[1], [1, 2]]}),
+        lambda m: m.lock([]),
+        lambda m: mb.variants(m, {"*.mass": [[1], [1, 2]]}),
+        lambda m: mb.variants(m, {"*.mass": lambda _: 1.0}),
+        lambda m: mb.variants(m, {"*.mass": 0.1}, size=0),
+        lambda m: mb.variants(m, {"*.mass": 0.1}, size=2).to_csv(5),
+        lambda m: mb.variants(m, {"*.mass": 0.1}, size=2)[2],
+        lambda m: mb.variants(m, {"*.mass": 0.1}, size=2).dynamics(foo=1),
+        lambda m: mb.variants(m, {"hinge.armature": 0.3}, size=2),
+        lambda m: mb.variants(m, {mb.scale("*.mass"): (-1.0, -0.5)}, size=3),
+        lambda m: mb.variants(m, {mb.scale("link.inertia.zz"): (30, 40)}, size=3),
+        lambda m: mb.variants(m, {"link.mass": lambda _, n: np.zeros(n)}, size=3),
+        lambda m: mb.join(m, m, at="tip", prefix="\ud800"),
+        lambda _: mb.load("ur5", mount=mb.spatial.pose((1e200, 0, 0))),
+    ],
+)
+def test_bad_input_is_told_by_an_error_of_ours(ask):
+    with pytest.raises(MbkitError):
+        ask(pendulum().build())
 
 
 # Texts and macros

@@ -197,12 +197,11 @@ def load(
         raise xml_reader.unknown_root(path, root)
     if added is not None:
         model = add_loops(model, added)
-    if mount is not None:
-        model = mounted(model, mount)
     doubts = scale_doubts(model)
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)
-    return replace(model, notes=(*root.notes, *model.notes, *_friction(model)), source=file)
+    model = replace(model, notes=(*root.notes, *model.notes, *_friction(model)), source=file)
+    return model if mount is None else mounted(model, mount)
 
 
 def _friction(model: Model) -> Iterator[str]:

@@ -280,8 +280,10 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         self._parts: dict[str, list[Any]] = {kind: [] for kind in KINDS_OF_PARTS}
         self._notes: list[str] = []
         #: Of a model that is edited: bodies that were used as written, and where its shapes are.
-        self._odd: dict[str, str] = {}
-        self._sources: list[tuple[str, str]] = []
+        self._odd: set[str] = set()
+        self._sources: list[Any] = []
+        self._locked: list[tuple[Any, ...]] = []
+        self._time = 0.0
 
     def add_body(
         self,
@@ -675,7 +677,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
             model = self._assemble(*_resolve(joints, self._bindings))
             inconsistent = suspects(model, point_masses=point_masses)
         # What a model was used with already stays used.
-        known = {n for n, why in inconsistent if self._odd.get(n) == why}
+        known = {n for n, _ in inconsistent} & self._odd
         negative = {b.name for b in bodies if b.mass < 0}
         static = static_bodies(joints) - negative
         idle = fault_sentences([(n, why) for n, why in inconsistent if n in static], parts)
@@ -693,7 +695,9 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         notes = dict.fromkeys((*model.notes, *(f"never moves, so this cannot act: {text}" for text in idle)))
         # Tables of motions need not begin at time 0.
         with unchecked():
-            return replace(model, notes=(*notes,), nonphysical=inconsistent, time=float(np.clip(0.0, *model.interval)))
+            return replace(
+                model, notes=(*notes,), nonphysical=inconsistent, time=float(np.clip(self._time, *model.interval))
+            )
 
     def _add(
         self,
@@ -739,6 +743,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
                 notes=tuple(self._notes),
                 bindings=tuple(bindings),
                 drawn_from=tuple(self._sources),
+                locked=tuple(self._locked),
                 **parts,
             )
 

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import chain, count, pairwise
 from types import MappingProxyType
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -222,6 +222,28 @@ class Layout:
         return np.asarray(v @ self.G.T) if self.reduced else v
 
 
+class ShapeFile(NamedTuple):
+    """A file with shapes: the prefix of its bodies' names, its path, and the body and pose of its ground."""
+
+    prefix: str
+    path: str
+    body: str = "world"
+    rotation: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    translation: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def renamed(self, prefix: str) -> ShapeFile:
+        """Return the same with a prefix before all names."""
+        body = self.body if self.body == "world" else prefix + self.body
+        return self._replace(prefix=prefix + self.prefix, body=body)
+
+    def hung_on(self, body: str, R: Array, p: Array) -> ShapeFile:
+        """Return the same where the world has the pose R, p on a body."""
+        if self.body != "world":
+            return self
+        turned, moved = R @ np.array(self.rotation), p + R @ np.array(self.translation)
+        return self._replace(body=body, rotation=tuple(map(tuple, turned.tolist())), translation=tuple(moved.tolist()))
+
+
 @dataclass(frozen=True, eq=False)
 class Description:
     """The parts of a multibody system: a tree of bodies and what acts on it.
@@ -256,9 +278,9 @@ class Description:
         At which motions prescribed in time are taken, s; neither does it count.
     forces : tuple of JointForce, FrameForce, Bushing or GravityCompensation
         Given by functions of the time and the state, and what holds the weight of bodies.
-    drawn_from : tuple of (str, str)
-        Of a model that was edited, locked or joined: files with shapes to draw, each with the prefix of the names of
-        its bodies. No file describes such a model, and its `source` is empty.
+    drawn_from : tuple of ShapeFile
+        Of a model that was edited, locked, mounted or joined: files with shapes to draw. No file describes such a
+        model, and its `source` is empty.
     locked : tuple of (str, tuple of float, int)
         Joints that `lock` fixed, their coordinates, and how many velocities each had. Neither of both counts for
         equality.
@@ -281,7 +303,7 @@ class Description:
     couplers: tuple[Coupler, ...] = ()
     forces: tuple[Force, ...] = ()
     no_slip: tuple[NoSlip, ...] = ()
-    drawn_from: tuple[tuple[str, str], ...] = ()
+    drawn_from: tuple[ShapeFile, ...] = ()
     locked: tuple[tuple[str, tuple[float, ...], int], ...] = ()
     layout: Layout = field(init=False, repr=False)
 
@@ -303,9 +325,9 @@ class Description:
         return hash(self.digest)
 
     @property
-    def sources(self) -> tuple[tuple[str, str], ...]:
-        """Files with shapes to draw, each with the prefix of the names of its bodies."""
-        return (("", self.source),) if self.source else self.drawn_from
+    def sources(self) -> tuple[ShapeFile, ...]:
+        """Files with shapes to draw."""
+        return (ShapeFile("", self.source),) if self.source else self.drawn_from
 
     # Sizes and names
 

@@ -354,7 +354,8 @@ class Model(Description):
         ----------
         *paths : str or Scale
             ``"body.mass"``, ``"body.com"``, ``"body.inertia"``, ``"joint.damping"``, ``"joint.armature"`` and other
-            numbers that `set_body`, `set_joint` and the like change; ``"gravity"``; wildcards such as ``"*.damping"``.
+            numbers of bodies, joints, springs, couplings, loops, couplers and motions; ``"gravity"``; wildcards such as
+            ``"*.damping"``.
             Each number becomes a parameter of its path's name with its present value; of a vector each component, as
             ``"body.com.x"``. A wildcard leaves out what is zero, and bodies that never move. `mbkit.scale` makes one
             factor of many numbers.

@@ -21,6 +21,7 @@ from mbkit.load.mjcf_reader import write_out_attached
 from mbkit.load.shapes import SIZES
 from mbkit.load.xml_reader import Element, Reader, element_text
 from mbkit.model import Frame, Model
+from mbkit.model.description import ShapeFile
 from mbkit.show.mesh_files import file_of, read_surfaces
 from mbkit.show.surfaces import Color, Surface, cleaned, solid
 
@@ -78,18 +79,20 @@ class _Bodies:
     """The bodies of a model whose names begin with a prefix, such as those of one of several joined files."""
 
     model: Model
-    prefix: str
+    file: ShapeFile
 
     def frame(self, name: str) -> Frame:
         """Return a frame by its name in the file."""
-        return self.model.frame(name if name == "world" else self.prefix + name)
+        if name != "world":
+            return self.model.frame(self.file.prefix + name)
+        return Frame(name, self.file.body, np.array(self.file.rotation), np.array(self.file.translation))
 
 
 def read_visuals(model: Model, kind: str) -> Visuals:
     """Return the "visual" or "collision" shapes of the files of a model; `LoadError` if one is unreadable."""
     out = Visuals()
-    for prefix, source in model.sources:
-        bodies, path = _Bodies(model, prefix), Path(source)
+    for file in model.sources:
+        bodies, path, prefix = _Bodies(model, file), Path(file.path), file.prefix
         root = xml_reader.read(path)
         if root.tag == "robot":
             own = _Urdf(bodies, path, root).visuals(kind)

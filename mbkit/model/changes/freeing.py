@@ -128,8 +128,13 @@ def _of_part(where: str, part: Any, field: str) -> Iterator[Number]:
             yield Number(f"{path}.{end}", path, where, part.name, field, both, float(value[i, k]))
     else:
         of_joint = where == "joints" and field != "translation"
-        if of_joint and part.type.quaternion is not None and field in ("stiffness", "rest"):
-            return
+        if of_joint and part.type.quaternion is not None:
+            if field == "armature" and part.type.nv:
+                # A rotor has the same inertia about every axis there.
+                every = tuple((i,) for i in range(part.type.nv))
+                yield Number(path, path, where, part.name, field, every, float(value[0]))
+            if field in ("armature", "stiffness", "rest"):
+                return
         yield from _entries(path, where, part.name, field, value, part.type.velocity_suffixes if of_joint else _AXES)
 
 
@@ -167,7 +172,7 @@ def _nothing(model: Model, every: list[Number], pattern: str) -> str:
     if field in _DATA:
         return f"{item}: {field} is data, and acts in no engine"
     frame = next((f for f in model.frames if pattern.startswith(f"{f.name}.")), None)
-    if frame is not None:
+    if frame is not None and field.split(".")[0] in _FIELDS["bodies"]:
         end = pattern.removeprefix(f"{frame.name}.")
         return f"{item}: {frame.name!r} is a frame on body {frame.body!r}, which holds its inertia: {frame.body}.{end}"
     near = nearest(pattern, [x.path for x in every] + [x.whole for x in every])
@@ -176,24 +181,42 @@ def _nothing(model: Model, every: list[Number], pattern: str) -> str:
     zero = [x.whole for x in every if fnmatchcase(x.path, pattern) or fnmatchcase(x.whole, pattern)]
     if zero:
         return f"{item} that acts; without a wildcard, as in {zero[0]!r}, a zero becomes a parameter too"
-    fields = ", ".join(dict.fromkeys(x.field for x in every if fnmatchcase(x.part, name)))
+    fields = ", ".join(dict.fromkeys(x.field for x in every if name and fnmatchcase(x.part, name)))
     return f"{item}; " + (f"{name} has {fields}" if fields else "no part has this name")
 
 
 def with_free(model: Model, paths: Iterable[Any]) -> Model:
     """Return a model with free numbers, as `Model.with_free` says."""
     model.require_bodies("with_free")
-    there = {(b.where, b.part, b.field, b.index) for b in model.bindings}
+    bound = {(b.where, b.part, b.field, b.index): b.expression for b in model.bindings}
     new: dict[_Entry, Any] = {}
     paths = tuple(paths)
-    scales = [x for x in paths if isinstance(x, Scale)]
     for path in (x for x in paths if not isinstance(x, Scale)):
         for number in chosen(model, path):
+            if (there := bound.get(number.entries[0])) is not None:
+                if path in (number.path, number.whole):
+                    raise InputError(f"paths: {number.path!r} is a parameter already, {there}; give that one a value")
+                continue
+            _require_other_name(model, number.path)
             new |= dict.fromkeys(number.entries, Parameter(number.path, number.value))
-    for one in scales:
-        for number in {x.path: x for pattern in one.patterns for x in chosen(model, pattern)}.values():
+    for one in (x for x in paths if isinstance(x, Scale)):
+        if one.name in {x.path for x in numbers_of(model)}:
+            raise InputError(f"scale: {one.name!r} is the path of a number; give another name=")
+        _require_other_name(model, one.name)
+        for number in _scaled(model, one):
             factor = Parameter(one.name, 1.0)
-            new |= {key: new.get(key, number.value) * factor for key in number.entries}
-    bindings = (*model.bindings, *(Binding(*key, x) for key, x in new.items() if key not in there))
-    out = replace(model, bindings=bindings)
-    return replace(out, notes=(*out.notes, f"free numbers: {', '.join(out.parameters)}"))
+            new |= {key: new.get(key, bound.get(key, number.value)) * factor for key in number.entries}
+    kept = [b for b in model.bindings if (b.where, b.part, b.field, b.index) not in new]
+    out = replace(model, bindings=(*kept, *(Binding(*key, x) for key, x in new.items())))
+    if not (free := [name for name in out.parameters if name not in model.parameters]):
+        return model
+    return replace(out, notes=(*out.notes, f"free numbers: {', '.join(free)}"))
+
+
+def _scaled(model: Model, one: Scale) -> list[Number]:
+    return [*{x.path: x for pattern in one.patterns for x in chosen(model, pattern)}.values()]
+
+
+def _require_other_name(model: Model, name: str) -> None:
+    if name in model.parameters:
+        raise InputError(f"paths: {model.name} has a parameter {name!r}, which stands elsewhere; a name is one number")

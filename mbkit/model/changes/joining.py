@@ -12,11 +12,13 @@ from mbkit import spatial
 from mbkit._check import Array, shown
 from mbkit.errors import InputError
 from mbkit.model.builder import ModelBuilder, expect_model
-from mbkit.model.elements.references import KINDS_OF_PARTS, hung_on, renamed
+from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on, renamed
 from mbkit.model.model import Model
 
 #: Kinds of parts that share one set of names each.
 _NAMED: Final = (("bodies", "frames"), *((kind,) for kind in KINDS_OF_PARTS if kind not in ("bodies", "frames")))
+_LONGEST: Final = 1e150
+_LONGEST_PREFIX: Final = 1000
 #: Parts that may hang on the ground.
 _PLACED: Final = ("joints", "springs", "loops", "forces", "no_slip")
 
@@ -26,6 +28,8 @@ def read_pose(name: str, pose: ArrayLike | None) -> tuple[Array, Array]:
     if pose is None:
         return np.eye(3), np.zeros(3)
     X = spatial.checked_pose(name, pose)
+    if np.abs(X[:3, 3]).max() > _LONGEST:
+        raise InputError(f"{name}: expected lengths up to {_LONGEST:g} m, got {np.abs(X[:3, 3]).max():g}")
     return X[:3, :3], X[:3, 3]
 
 
@@ -49,7 +53,9 @@ def mounted(model: Model, pose: ArrayLike) -> Model:
         kind: tuple(hung_on(x, kind, "world", R, p, bindings) for x in getattr(model, kind)) for kind in _PLACED
     }
     note = f"mounted at {np.round(p, 6).tolist()} m, roll, pitch, yaw {_degrees(R)} degrees"
-    return replace(model, **parts, bindings=tuple(bindings), notes=(*model.notes, note))
+    drawn_from = tuple(x.hung_on("world", R, p) for x in model.sources)
+    notes = (*model.notes, note)
+    return replace(model, **parts, bindings=tuple(bindings), notes=notes, source="", drawn_from=drawn_from)
 
 
 def _degrees(R: Array) -> list[float]:
@@ -110,29 +116,32 @@ def join(
     (18, 'left_shoulder_pan_joint', 'right_shoulder_pan_joint')
     """
     base, arm = expect_model(base, "base"), expect_model(arm, "arm")
-    if not isinstance(prefix, str):
-        raise InputError(f"prefix: expected text, got {shown(prefix)}")
+    if not isinstance(prefix, str) or len(prefix) > _LONGEST_PREFIX or any("\ud800" <= c <= "\udfff" for c in prefix):
+        raise InputError(f"prefix: expected a text of up to {_LONGEST_PREFIX} characters, got {shown(prefix)}")
     for model in (base, arm):
         model.require_bodies("join")
     frame = base.frame(at)
     R, p = read_pose("pose", pose)
     if at != "world" and (floating := [j.name for j in arm.joints if j.parent == "world" and j.type.floating]):
         raise InputError(
-            f"arm: {arm.name} floats on joint {floating[0]!r}, so that nothing would hold it at {at!r}; load it with "
-            "floating_base=False, or remove that joint"
+            f"arm: {arm.name} floats on joint {floating[0]!r}, so that nothing would hold it at {at!r}; load it with a "
+            "fixed base, or lock that joint"
         )
     parts, bindings = renamed(arm, prefix)
     _require_other_names(base, parts, prefix)
-    R, p = frame.rotation @ R, frame.translation + frame.rotation @ p
+    place = entries(frame, "frames", "translation", base.bindings)
+    drawn = frame.rotation @ R, frame.translation + frame.rotation @ p
+    R, p = frame.rotation @ R, place + frame.rotation @ p
     b = ModelBuilder.of(base)
     for kind in KINDS_OF_PARTS:
         b._parts[kind] += [hung_on(x, kind, frame.body, R, p, bindings) for x in parts[kind]]
     b._bindings += [x for x in bindings if x.where != "gravity"]
-    b._odd |= {prefix + body: why for body, why in arm.nonphysical}
+    b._odd |= {prefix + body for body, _ in arm.nonphysical}
+    b._locked += [(prefix + joint, *rest) for joint, *rest in arm.locked]
     b._name = base.name if name is None else b._read.name("name", name)
     b._notes += [f"{prefix or arm.name}: {text}" for text in arm.notes]
     b.note(f"joined: {arm.name} at {at!r}" + (f" with the prefix {prefix!r}" if prefix else ""))
-    b._sources += [(prefix + start, source) for start, source in arm.sources]
+    b._sources += [x.renamed(prefix).hung_on(frame.body, *drawn) for x in arm.sources]
     return b.build()
 
 

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, finite_array, rows, shown
 from mbkit.errors import InputError, UnknownNameError
+from mbkit.model.builder import shape_of
+from mbkit.model.description import expect_name
 from mbkit.model.elements.forces import RATE, Force, GravityCompensation, JointForce, coordinate_arguments
 from mbkit.model.elements.formula import Formula, Operation
 from mbkit.model.elements.references import entries, moved_by, with_fields
@@ -39,6 +41,7 @@ def lock(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike |
     model.require_bodies("lock")
     given = _given(model, joints, q)
     values = _with_followers(model, given)
+    _require_limits(model, values)
     _refuse_driven(model, values)
     bindings, notes = list(model.bindings), []
     parts: dict[str, Any] = {"joints": tuple(_fixed(j, values, bindings) for j in model.joints)}
@@ -83,12 +86,13 @@ def _free(model: Model, name: str) -> bool:
 
 def _given(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike | None) -> Values:
     """Return the coordinates of the joints that the caller locks."""
-    if isinstance(joints, str) or not isinstance(joints, (Mapping, Sequence)):
+    if isinstance(joints, (str, bytes)) or not isinstance(joints, (Mapping, Sequence)) or not len(joints):
         raise InputError(f"joints: expected a mapping from names to values or a list of names, got {shown(joints)}")
     if isinstance(joints, Mapping) and q is not None:
         raise InputError("q: values stand in the mapping; give names alone with a whole configuration")
     for name in joints:
-        if not isinstance(name, str) or name not in {j.name for j in model.joints}:
+        expect_name("joint", name)
+        if name not in {j.name for j in model.joints}:
             raise UnknownNameError("joint", name, model.joint_names)
         joint = model.joint(name)
         if joint.mimic:
@@ -102,19 +106,22 @@ def _given(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike
         if whole.ndim > 1:
             raise InputError(f"q: expected one configuration, got shape {whole.shape}")
         given = {name: whole[model.layout.q[name]] for name in joints}
-    for name, x in given.items():
+    return given
+
+
+def _require_limits(model: Model, values: Values) -> None:
+    for name, x in values.items():
         joint = model.joint(name)
         room = _TYPED * np.maximum(1.0, np.abs(x))
         if (x < joint.lower - room).any() or (x > joint.upper + room).any():
             raise InputError(
                 f"joints: {name!r} at {_short(x)} is beyond its limits, {_short(joint.lower)} to {_short(joint.upper)}"
             )
-    return given
 
 
 def _coordinates(joint: Joint, value: Any) -> Array:
     item, n = f"joints: {joint.name!r}", joint.type.nq
-    if n == 1 and np.shape(value) == ():
+    if n == 1 and shape_of(value) == ():
         value = [value]
     x = finite_array(item, value, (n,))
     k = joint.type.quaternion
@@ -133,6 +140,7 @@ def _with_followers(model: Model, given: Values) -> Values:
             break
         ties.remove(tied)
         item = f"joints: coupler {tied.name!r}"
+        _require_numbers(model, "couplers", tied.name, item)
         if tied.leader in values:
             follows = np.array([float(tied.polynomial(values[tied.leader][0]))])
             name = tied.joint
@@ -140,8 +148,6 @@ def _with_followers(model: Model, given: Values) -> Values:
             raise InputError(f"{item} does not tell {tied.leader!r} from {tied.joint!r}; lock {tied.leader!r} instead")
         else:
             follows, name = (values[tied.joint] - tied.offset) / tied.ratio, tied.leader
-        if not np.isfinite(follows).all():
-            raise InputError(f"{item} has a parameter without a value; give it first")
         there = values.setdefault(name, follows)
         if abs(there[0] - follows[0]) > _TYPED * max(1.0, abs(follows[0])):
             raise InputError(f"{item} asks for {name!r} at {follows[0]:g}, and it is locked at {there[0]:g}")
@@ -149,6 +155,15 @@ def _with_followers(model: Model, given: Values) -> Values:
         if joint.mimic and joint.mimic.joint in values:
             values[joint.name] = joint.mimic.ratio * values[joint.mimic.joint] + joint.mimic.offset
     return values
+
+
+def _require_numbers(model: Model, where: str, name: str, item: str) -> None:
+    """Refuse a part with parameters, on whose values locked places or a closed loop would depend (InputError)."""
+    if free := [b for b in model.bindings if (b.where, b.part) == (where, name)]:
+        raise InputError(
+            f"{item} has a parameter, {free[0].expression}, on which the locked places would depend; give it with "
+            "with_parameters first"
+        )
 
 
 def _refuse_driven(model: Model, values: Values) -> None:
@@ -260,6 +275,7 @@ def _closed_for_good(model: Model) -> tuple[list[Loop], list[str]]:
                 f"joints: locked there, loop {loop.name!r} is open by {size:.3g} and nothing moves it; take the values "
                 "of a state that project returns"
             )
+        _require_numbers(model, "loops", loop.name, f"joints: loop {loop.name!r}, which nothing moves then,")
         closed.append(loop)
         notes.append(f"loop {loop.name!r} is closed by the locked joints, and is gone")
     for part in model.no_slip:

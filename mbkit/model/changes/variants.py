@@ -12,7 +12,7 @@ from __future__ import annotations
 import csv
 import os
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -23,8 +23,8 @@ import numpy as np
 from mbkit._check import Array, count, finite_array, real, shown
 from mbkit._escape import csv_text, html
 from mbkit.errors import InputError, OutputError
-from mbkit.model.builder import expect_model
-from mbkit.model.changes.freeing import SYMMETRIC, Number, Scale, chosen, numbers_of, with_free
+from mbkit.model.builder import expect_model, shape_of
+from mbkit.model.changes.freeing import SYMMETRIC, Scale, chosen, numbers_of, with_free
 from mbkit.model.model import Model
 
 #: What a spread says of a path: a size, the ends of a uniform range, or a function of a generator and how many to draw.
@@ -34,7 +34,8 @@ _PLACES: Final = ("com", "translation", "translation_a", "translation_b", "point
 _ADDED: Final = (*_PLACES, "gravity", "rate", "phase")
 #: All ten numbers of a body together.
 _INERTIAL: Final = ".inertial"
-_NOT_NEGATIVE: Final = ("mass", "armature", "damping", "stiffness", "length", "radius")
+_NOT_NEGATIVE: Final = ("mass", "armature", "damping", "stiffness", "rest_length", "length", "radius")
+_POSITIVE: Final = ("mass", "length", "radius")
 #: Of a moment of inertia: rounding.
 _ROUNDED: Final = 1e-12
 _SHOWN: Final = 12
@@ -64,8 +65,12 @@ class Variants:
     def __getitem__(self, k: int) -> Model:
         """Return variant k as a model of plain numbers, for every engine."""
         if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not -len(self) <= k < len(self):
-            raise InputError(f"variant: expected a whole number below {len(self)}, got {shown(k)}")
+            last = len(self) - 1
+            raise InputError(f"variant: expected a whole number from 0 to {last}, or from the end, got {shown(k)}")
         return self.model.with_parameters(**{name: float(x[k]) for name, x in self.values.items()})
+
+    def __iter__(self) -> Iterator[Model]:
+        return (self[k] for k in range(len(self)))
 
     def dynamics(self, **options: Any) -> Any:
         """Return the own derivation's dynamics of all variants, one a member of each batch; derived once.
@@ -76,8 +81,8 @@ class Variants:
             Those of ``mbkit.dynamics(model, "lagrangian", ...)``.
         """
         # By name: a description knows no engine.
-        dyn = import_module("mbkit.engines.lagrangian").LagrangianDynamics(self.model, **options)
-        return dyn.at(**self.values)
+        registry = import_module("mbkit.engines.registry")
+        return registry.dynamics(self.model, registry.DERIVED, **options).at(**self.values)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the seed and the values by name, as JSON takes them."""
@@ -86,6 +91,8 @@ class Variants:
 
     def to_csv(self, path: str | os.PathLike[str]) -> None:
         """Write a table of what was drawn, a row a variant."""
+        if not isinstance(path, (str, os.PathLike)):
+            raise InputError(f"path: expected a path, got {shown(path)}")
         try:
             with Path(path).open("w", newline="", encoding="utf-8") as file:
                 write = csv.writer(file)
@@ -129,9 +136,10 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
     robot : Model
     spread : mapping
         From paths, as `Model.with_free` takes them, or a `scale`, to how far their numbers spread. One number is the
-        standard deviation of the logarithm, so that masses, dampers and the like keep their sign (0.1 is about 10 %);
-        of places, ``com``, ``rest`` and gravity it is that of the number itself, in m, rad or m/s². Two numbers are the
-        ends of a uniform range; a function gets a `numpy.random.Generator` and how many numbers to return.
+        standard deviation of the logarithm, so that masses, dampers and the like keep their sign (0.1 is about 10 %).
+        Of places, ``com``, ``rest``, gravity, and ``offset``, ``rate`` and ``phase`` of motions it is that of the
+        number itself, in its units. Two numbers are the ends of a uniform range; a function gets a
+        `numpy.random.Generator` and how many numbers to return.
 
         ``"link.inertia"`` draws the six numbers about the centre of mass, and ``"link.inertial"`` all ten numbers of a
         body together, by their pseudo-inertia: every draw is a body that can be.
@@ -160,8 +168,7 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
     """
     model = expect_model(robot, "robot")
     model.require_bodies("variants")
-    count("size", size)
-    count("seed", seed, least=0)
+    size, seed = count("size", size, least=1), count("seed", seed)
     if not isinstance(spread, Mapping) or not spread:
         raise InputError(f"spread: expected a mapping from paths to spreads, got {shown(spread)}")
     values: dict[str, Array] = {}
@@ -174,7 +181,7 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
         values |= drawn
         paths += [path] if isinstance(path, Scale) else [*drawn]
     free = with_free(model, paths)
-    _require_bodies_that_can_be(model, values, size)
+    _require_bodies_that_can_be(model, values, [x for x in spread if isinstance(x, Scale)], size)
     return Variants(free, values, seed)
 
 
@@ -190,7 +197,7 @@ def _drawn(model: Model, path: Any, how: Spread, rng: np.random.Generator, size:
         return {k: x for name in bodies for k, x in _bodies_drawn(model, name, _size(item, how), rng, size).items()}
     numbers = chosen(model, path)
     out: dict[str, Array] = {}
-    if not callable(how) and np.ndim(how) == 0:
+    if not callable(how) and shape_of(how) == ():
         for name in dict.fromkeys(x.part for x in numbers if x.field == "inertia"):
             six = [x for x in numbers if (x.part, x.field) == (name, "inertia")]
             # A single moment is a number like others.
@@ -198,20 +205,30 @@ def _drawn(model: Model, path: Any, how: Spread, rng: np.random.Generator, size:
                 out |= _bodies_drawn(model, name, _size(item, how), rng, size, about_com=True)
                 numbers = [x for x in numbers if x not in six]
     for x in numbers:
-        out[x.path] = _numbers(f"{item}: {x.path}", x.value, how, rng, size, added=x.field in _ADDED)
+        added = x.field in _ADDED
+        if path != x.path and not (x.value or added or callable(how)) and shape_of(how) == ():
+            # A factor leaves the zeros of a vector as they are.
+            continue
+        out[x.path] = _numbers(f"{item}: {x.path}", x.value, how, rng, size, added=added)
     return out
 
 
 def _size(item: str, how: Spread) -> float:
-    if callable(how) or np.ndim(how):
+    if callable(how) or shape_of(how) != ():
         raise InputError(f"{item}: expected one number for a whole inertia, got {shown(how)}")
     return real(item, how, positive=True)
 
 
 def _numbers(item: str, nominal: float, how: Spread, rng: np.random.Generator, size: int, *, added: bool) -> Array:
     if callable(how):
-        return finite_array(item, how(rng, size), (size,))
-    if np.ndim(how) == 0:
+        try:
+            drawn = how(rng, size)
+        except TypeError as error:
+            raise InputError(f"{item}: expected a function of a generator and a number of draws: {error}") from None
+        return finite_array(item, drawn, (size,))
+    if shape_of(how) == ():
+        if not nominal and not added:
+            raise InputError(f"{item} is zero, which a spread by a factor leaves; give a range, such as (0, 1)")
         away = real(item, how, positive=True) * rng.standard_normal(size)
         return np.asarray(nominal + away if added else nominal * np.exp(away))
     low, high = finite_array(item, how, (2,))
@@ -249,32 +266,36 @@ def _bodies_drawn(
         out[f"{name}.mass"] = body.mass * np.exp(spread * rng.standard_normal(size))
         away = spread * rng.standard_normal((size, 3)) @ L.T / np.sqrt(body.mass)
         out |= {f"{name}.com.{axis}": body.com[k] + away[:, k] for k, axis in enumerate("xyz")}
-        moments = moments * (out[f"{name}.mass"] / body.mass)[:, None, None]
     inertias = np.trace(moments, axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments
     wanted = [x for x in numbers_of(model) if (x.where, x.part, x.field) == ("bodies", name, "inertia")]
     return out | {x.path: inertias[:, x.indices[0][0], x.indices[0][1]] for x in wanted}
 
 
-def _require_bodies_that_can_be(model: Model, values: Mapping[str, Array], size: int) -> None:
+def _require_bodies_that_can_be(model: Model, values: Mapping[str, Array], scales: Sequence[Scale], size: int) -> None:
     """Refuse draws that no body, damper or spring can have (InputError)."""
-    free: dict[str, list[Number]] = {}
-    for x in numbers_of(model):
-        if x.path in values:
-            free.setdefault(x.part, []).append(x)
-            bad = np.flatnonzero(values[x.path] < 0)
-            if x.field in _NOT_NEGATIVE and x.value >= 0 and len(bad):
-                raise InputError(
-                    f"spread: {x.path!r} is negative in {len(bad)} of {size} variants, such as "
-                    f"{values[x.path][bad[0]]:.3g} in {bad[0]}; a number instead of a range keeps its sign"
-                )
+    drawn: dict[str, Array] = {}
+    numbers = {x.path: x for x in numbers_of(model)}
+    drawn |= {path: values[path] for path in numbers if path in values}
+    for one in scales:
+        for x in {x.path: x for pattern in one.patterns for x in chosen(model, pattern)}.values():
+            drawn[x.path] = drawn.get(x.path, x.value) * values[one.name]
+    for path, value in drawn.items():
+        x, never = numbers[path], np.zeros(size, dtype=bool)
+        if x.field in _NOT_NEGATIVE and x.value >= 0:
+            never = value <= 0 if x.field in _POSITIVE and x.value > 0 else value < 0
+        if len(bad := np.flatnonzero(never)):
+            raise InputError(
+                f"spread: {path!r} is {'zero or ' * (x.field in _POSITIVE)}negative in {len(bad)} of {size} variants, "
+                f"such as {value[bad[0]]:.3g} in {bad[0]}; a number instead of a range keeps its sign"
+            )
     for body in model.bodies:
-        own = [x for x in free.get(body.name, ()) if x.field == "inertia"]
+        own = [x for path in drawn if (x := numbers[path]).part == body.name and x.field == "inertia"]
         if not own:
             continue
         inertias = np.tile(body.inertia, (size, 1, 1))
         for x in own:
             for index in x.indices:
-                inertias[:, index[0], index[1]] = values[x.path]
+                inertias[:, index[0], index[1]] = drawn[x.path]
         trace = np.trace(inertias, axis1=1, axis2=2)
         least = np.linalg.eigvalsh(0.5 * trace[:, None, None] * np.eye(3) - inertias)[:, 0]
         if len(bad := np.flatnonzero(least < -_ROUNDED * np.abs(trace))):

@@ -10,15 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, shown
-from mbkit.errors import nearest
-from mbkit.model.elements.references import KINDS_OF_PARTS, moved_by, names_in, renamed
+from mbkit.errors import InputError, nearest
+from mbkit.model.elements.forces import RATE
+from mbkit.model.elements.references import KINDS_OF_PARTS, entries, moved_by, names_in, renamed
 from mbkit.model.parameters import Binding, Number, split
-from mbkit.model.parts import Body, Frame, Joint, Mimic
+from mbkit.model.parts import Frame, Mimic
 
 _Vector = ArrayLike | Sequence[Number]
 _Numbers = ArrayLike | Sequence[Number] | Number
 #: What a kind of part is called, where it is not the plural's singular.
 _CALLED: Final = {"bodies": "body", "prescribed": "prescribed", "forces": "force", "no_slip": "no slip"}
+#: Numbers up to which a note says them all.
+_FEW: Final = 3
 #: Arguments of joints that are limits or one number for each velocity.
 NUMBERS_OF_JOINTS: Final = (
     *("lower", "upper", "velocity_limit", "effort_limit"),
@@ -44,8 +47,10 @@ class EditingBuilder:
     _bindings: list[Binding]
     _parts: dict[str, list[Any]]
     _notes: list[str]
-    _odd: dict[str, str]
-    _sources: list[tuple[str, str]]
+    _odd: set[str]
+    _sources: list[Any]
+    _locked: list[tuple[Any, ...]]
+    _time: float
     _read_fields: Callable[..., dict[str, Any]]
     _joint_fields: Callable[..., dict[str, Any]]
     add_body: Callable[..., None]
@@ -73,12 +78,19 @@ class EditingBuilder:
         >>> robot.notes[-1]
         "added payload 'load' of 2 kg at 'tool0'"
         """
+        if not callable(getattr(model, "require_bodies", None)):
+            raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
         model.require_bodies("ModelBuilder.of")
         out = cls(model.name)  # type: ignore[call-arg]  # the whole builder's
         out._gravity = model.gravity
         out._bindings = list(model.bindings)
         out._parts = {kind: list(getattr(model, kind)) for kind in KINDS_OF_PARTS}
-        out._notes, out._odd, out._sources = list(model.notes), dict(model.nonphysical), list(model.sources)
+        out._notes, out._odd, out._sources = (
+            list(model.notes),
+            {name for name, _ in model.nonphysical},
+            [*model.sources],
+        )
+        out._locked, out._time = [*model.locked], model.time
         return out
 
     # Change
@@ -255,7 +267,7 @@ class EditingBuilder:
             "fixed",
             parent=frame.body,
             child=name,
-            translation=moved_by(frame.rotation, frame.translation, place),
+            translation=moved_by(frame.rotation, entries(frame, "frames", "translation", self._bindings), place),
             rotation=frame.rotation @ R,
         )
         size = f" of {mass:g} kg" if isinstance(mass, (int, float)) else ""
@@ -276,15 +288,19 @@ class EditingBuilder:
             bodies |= {j.child for j in more}
             joints |= {j.name for j in more}
         frames = {f.name for f in self._parts["frames"] if f.body in bodies}
+        self._locked = [x for x in self._locked if x[0] not in joints]
+        gone = self._arguments_of(joints)
         lost = []
         for kind, parts in self._parts.items():
             for part in [*parts]:
                 own = part.name in joints if kind == "joints" else part.name in bodies and kind == "bodies"
                 refers = kind not in ("bodies", "joints") and _touches(part, kind, bodies, joints, frames)
+                refers = refers or bool(gone & {*getattr(part, "arguments", ())} - {*getattr(part, "symbols", ())})
                 if own or refers:
                     parts.remove(part)
                     self._bindings = [b for b in self._bindings if (b.where, b.part) != (kind, part.name)]
                     lost += [] if own or kind == "frames" else [f"{called(kind)} {part.name!r}"]
+        self._parts["forces"] = [_without(x, joints) for x in self._parts["forces"]]
         also = f"; with it {', '.join(lost)}" if lost else ""
         self._notes.append(f"removed joint {name!r} and the bodies {', '.join(sorted(bodies))}{also}")
 
@@ -292,12 +308,19 @@ class EditingBuilder:
         """Put a prefix before the names of all bodies, joints, frames and other parts; parameters keep theirs."""
         prefix = self._read.name("prefix", prefix)
         self._parts, self._bindings = renamed(self._holding(), prefix)
-        self._odd = {prefix + body: why for body, why in self._odd.items()}
-        self._sources = [(prefix + start, source) for start, source in self._sources]
+        self._odd = {prefix + body for body in self._odd}
+        self._sources = [x.renamed(prefix) for x in self._sources]
+        self._locked = [(prefix + joint, *rest) for joint, *rest in self._locked]
         if prefix:
             self._notes.append(f"all names begin with {prefix!r}")
 
     # How
+
+    def _arguments_of(self, joints: set[str]) -> set[str]:
+        """Return the names of coordinates and velocities of joints in formulas."""
+        model = self._holding()
+        names = {n for j in joints for n in model.coordinate_names[model.layout.q[j]]}
+        return names | {n + RATE for j in joints for n in model.velocity_names[model.layout.v[j]]}
 
     def _holding(self) -> Any:
         """Return the parts as an unchecked description."""
@@ -321,7 +344,11 @@ class EditingBuilder:
             new = ()
         numbers, more = split(kind, part.name, fields)
         known = len(self._read.faults)
-        changed = [*_changes(part, numbers, self._bindings, {b.field for b in more})]
+        old = {b.field for b in self._bindings if (b.where, b.part) == (kind, part.name)}
+        changed = [*_changes(part, numbers, old, {b.field for b in (*new, *more)})]
+        if kind == "bodies":
+            # What was used as written is judged again.
+            self._odd.discard(part.name)
         self._bindings = [
             b for b in self._bindings if (b.where, b.part) != (kind, part.name) or b.field not in bound
         ] + [*new, *more]
@@ -352,16 +379,23 @@ class EditingBuilder:
 
     def _frame(self, item: str, at: Any) -> Frame | None:
         """Return a frame, or that of a body; None after a fault."""
-        for frame in self._parts["frames"]:
+        for frame in self._parts["frames"] if isinstance(at, str) else ():
             if frame.name == at:
                 return frame  # type: ignore[no-any-return]  # parts of all kinds
         bodies = [b.name for b in self._parts["bodies"]]
-        if at in bodies or at == "world":
+        if isinstance(at, str) and at in (*bodies, "world"):
             return Frame(at, at, np.eye(3), np.zeros(3))
         near = nearest(at, [f.name for f in self._parts["frames"]] + bodies) if isinstance(at, str) else []
         hint = f"; did you mean {near[0]!r}?" if near else ""
         self._read.faults.append(f"{item}: at: unknown frame {shown(at)}{hint}")
         return None
+
+
+def _without(force: Any, joints: set[str]) -> Any:
+    """Return a gravity compensation that does not name removed joints; other forces as they are."""
+    if not joints & {*getattr(force, "without", ())}:
+        return force
+    return replace(force, without=tuple(name for name in force.without if name not in joints))
 
 
 def _touches(part: Any, kind: str, bodies: set[str], joints: set[str], frames: set[str]) -> bool:
@@ -375,19 +409,21 @@ def _touches(part: Any, kind: str, bodies: set[str], joints: set[str], frames: s
     return bool({getattr(part, side, None) for side in ("body", "body_a", "body_b")} & bodies)
 
 
-def _changes(part: Body | Joint, numbers: Mapping[str, Any], bindings: list[Binding], free: set[str]) -> Iterator[str]:
+def _changes(part: Any, numbers: Mapping[str, Any], were_free: set[str], free: set[str]) -> Iterator[str]:
     """Yield what of a part becomes another number."""
     for name, new in numbers.items():
         old = getattr(part, name)
-        if name in free:
-            yield f"{name} is a parameter"
-        elif not np.array_equal(old, new) or any(b.part == part.name and b.field == name for b in bindings):
+        if name in free or (name == "mimic" and free & {"ratio", "offset"}):
+            yield f"{name} has a parameter"
+        elif name in were_free or (name == "mimic" and were_free & {"ratio", "offset"}):
+            yield f"{name} has no parameter any more"
+        elif isinstance(old, Mimic) or isinstance(new, Mimic) or np.size(new) > _FEW:
+            yield from () if np.array_equal(old, new) else (name,)
+        elif not np.array_equal(old, new):
             yield f"{name} {_short(old)} to {_short(new)}" if isinstance(new, (float, np.ndarray)) else name
 
 
 def _short(x: Any) -> str:
-    values = np.ravel(x)
-    if len(values) > 3:
-        return "as given" if len(values) > 6 else str(values.tolist())
-    texts = [f"{v:g}" for v in values.tolist()]
+    # The shortest text that is the number.
+    texts = [f"{v:g}" if float(f"{v:g}") == v else repr(v) for v in np.ravel(x).tolist()]
     return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"

@@ -9,9 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.errors import UnknownNameError
 from mbkit.model.elements.forces import Force, coordinate_arguments
 from mbkit.model.elements.formula import Formula
-from mbkit.model.parameters import Binding, split
+from mbkit.model.parameters import Binding, Expression, split
 
 #: A `mbkit.model.description.Description`, a floor above.
 _Model = Any
@@ -46,14 +47,24 @@ def renamed(model: _Model, prefix: str) -> tuple[dict[str, list[Any]], list[Bind
         kind: [_with_names(part, new, _arguments(part, model, others, new)) for part in getattr(model, kind)]
         for kind in KINDS_OF_PARTS
     }
-    return parts, [replace(b, part=new(b.part)) if b.part else b for b in model.bindings]
+    # Some names follow from others, as that of a gravity compensation from its body's.
+    names = {
+        (kind, old.name): part.name
+        for kind, made in parts.items()
+        for old, part in zip(getattr(model, kind), made, strict=True)
+    }
+    return parts, [replace(b, part=names.get((b.where, b.part), b.part)) for b in model.bindings]
 
 
 def _arguments(part: Any, model: _Model, others: Iterable[str], new: Callable[[str], str]) -> dict[str, str]:
     """Return the new names of the coordinates and velocities in a force's formulas."""
     if not isinstance(part, Force):
         return {}
-    own = {*part.own(model), *part.symbols}
+    try:
+        own = {*part.own(model), *part.symbols}
+    except UnknownNameError:
+        # A force on a joint that is not there, which is told where the model is built.
+        return {}
     return {name: new(name) for name in part.arguments if name in others and name not in own}
 
 
@@ -89,20 +100,21 @@ def with_fields(part: Any, where: str, values: Mapping[str, Any], bindings: list
     return replace(part, **numbers)
 
 
-def moved_by(R: Array, p: Array, x: Any) -> Any:
+def moved_by(R: Array, p: Any, x: Any) -> Any:
     """Return p + R x of three numbers or expressions; what a zero or a one multiplies stays as it is."""
     if np.array_equal(R, np.eye(3)) and not p.any():
         return x
-    if np.asarray(x).dtype != object:
+    if p.dtype != object and np.asarray(x).dtype != object:
         return p + R @ x
     out = np.empty(3, dtype=object)
     for i in range(3):
         terms = [x[k] if R[i, k] == 1.0 else R[i, k] * x[k] for k in range(3) if R[i, k]]
-        out[i] = sum(terms[1:], terms[0]) + p[i] if p[i] else sum(terms[1:], terms[0])
+        terms += [p[i]] if isinstance(p[i], Expression) or p[i] else []
+        out[i] = sum(terms[1:], terms[0])
     return out
 
 
-def hung_on(part: Any, where: str, body: str, R: Array, p: Array, bindings: list[Binding]) -> Any:
+def hung_on(part: Any, where: str, body: str, R: Array, p: Any, bindings: list[Binding]) -> Any:
     """Return a part with what hung on the ground hung on a body, where the ground has the pose R, p."""
     for side, end in _SIDES.items():
         if getattr(part, side, None) != "world":
