@@ -715,10 +715,14 @@ def test_shapes_on_the_ground_move_with_it(tmp_path):
     (table,) = (x for x in shapes_of(mb.load(file, mount=X)) if x.name == "table")
     assert table.body == "world"
     assert np.allclose(table.translation, (0, 1, 2), atol=1e-15)
-    whole = mb.join(pendulum("base").build(), mb.load(file), at="tip", pose=X, prefix="a_")
+    base = pendulum("base")
+    base.add_frame("turned", body="link", translation=(0.1, 0.2, 0.3), rpy=(0.3, 0.4, 0.5))
+    whole = mb.join(base.build(), mb.load(file, mount=X), at="turned", pose=X, prefix="a_")
     (table,) = (x for x in shapes_of(whole) if x.name == "a_table")
+    pose = mb.spatial.pose((0.1, 0.2, 0.3), rpy=(0.3, 0.4, 0.5)) @ X @ X @ mb.spatial.pose((0, 0, -1))
     assert table.body == "link"
-    assert np.allclose(table.translation, (0, 1, 1), atol=1e-15)
+    assert np.allclose(table.translation, pose[:3, 3], atol=1e-15)
+    assert np.allclose(table.rotation, pose[:3, :3], atol=1e-15)
 
 
 @pytest.mark.parametrize(
