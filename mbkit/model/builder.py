@@ -27,7 +27,7 @@ from mbkit.model.rolling import ROLLING_KINDS, RollingKind
 from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
 # The squares of sums of such lengths still fit a double.
-_LONGEST: Final = 1e150
+LONGEST: Final = 1e150
 _LONGEST_NAME: Final = 1000
 #: What the builder takes for a vector, and for one number or several.
 _Vector = ArrayLike | Sequence[Number]
@@ -104,8 +104,8 @@ class ArgumentReader:
         """Return three lengths, or expressions, whose squares do not overflow."""
         lengths = self.quantities(name, value, 3)
         largest = max(abs(nominal(x)) for x in lengths)
-        if largest > _LONGEST:
-            self.faults.append(f"{name}: expected lengths up to {_LONGEST:g} m, got {largest:g}")
+        if largest > LONGEST:
+            self.faults.append(f"{name}: expected lengths up to {LONGEST:g} m, got {largest:g}")
             return np.zeros(3)
         return lengths
 

@@ -11,14 +11,12 @@ from numpy.typing import ArrayLike
 from mbkit import spatial
 from mbkit._check import Array, shown
 from mbkit.errors import InputError
-from mbkit.model.builder import ModelBuilder, expect_model
-from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on, renamed
+from mbkit.model.builder import LONGEST, ModelBuilder, expect_model
+from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on
 from mbkit.model.model import Model
 
 #: Kinds of parts that share one set of names each.
 _NAMED: Final = (("bodies", "frames"), *((kind,) for kind in KINDS_OF_PARTS if kind not in ("bodies", "frames")))
-_LONGEST: Final = 1e150
-_LONGEST_PREFIX: Final = 1000
 #: Parts that may hang on the ground.
 _PLACED: Final = ("joints", "springs", "loops", "forces", "no_slip")
 
@@ -28,8 +26,8 @@ def read_pose(name: str, pose: ArrayLike | None) -> tuple[Array, Array]:
     if pose is None:
         return np.eye(3), np.zeros(3)
     X = spatial.checked_pose(name, pose)
-    if np.abs(X[:3, 3]).max() > _LONGEST:
-        raise InputError(f"{name}: expected lengths up to {_LONGEST:g} m, got {np.abs(X[:3, 3]).max():g}")
+    if np.abs(X[:3, 3]).max() > LONGEST:
+        raise InputError(f"{name}: expected lengths up to {LONGEST:g} m, got {np.abs(X[:3, 3]).max():g}")
     return X[:3, :3], X[:3, 3]
 
 
@@ -41,7 +39,7 @@ def mounted(model: Model, pose: ArrayLike) -> Model:
     Raises
     ------
     InputError
-        A pose that is none, and a free joint on the ground, which has no mount.
+        Another matrix than a pose, and a free joint on the ground, which has no mount.
     """
     R, p = read_pose("mount", pose)
     if floating := [j.name for j in model.joints if j.parent == "world" and j.type.floating]:
@@ -74,7 +72,7 @@ def join(
     """Put one model on a frame of another: an arm on a cart, a hand on an arm, two arms on one body.
 
     What hangs on the ground of `arm` hangs on the body of the frame instead. The world, gravity and the file of shapes
-    are those of `base`. Coordinates of `base` come first.
+    are those of `base`, and forces in world axes stay in these. Coordinates of `base` come first.
 
     Parameters
     ----------
@@ -96,11 +94,11 @@ def join(
     Raises
     ------
     InputError
-        Names that both have, an arm that floats, and a pose that is none.
+        Names that both have, an arm that floats, and another matrix than a pose.
     UnknownNameError
         No frame of this name.
     ModelError
-        Parameters of the same name with two values.
+        Parameters of the same name with two values, or a prefix that no name can have.
 
     Examples
     --------
@@ -116,8 +114,8 @@ def join(
     (18, 'left_shoulder_pan_joint', 'right_shoulder_pan_joint')
     """
     base, arm = expect_model(base, "base"), expect_model(arm, "arm")
-    if not isinstance(prefix, str) or len(prefix) > _LONGEST_PREFIX or any("\ud800" <= c <= "\udfff" for c in prefix):
-        raise InputError(f"prefix: expected a text of up to {_LONGEST_PREFIX} characters, got {shown(prefix)}")
+    if not isinstance(prefix, str):
+        raise InputError(f"prefix: expected text, got {shown(prefix)}")
     for model in (base, arm):
         model.require_bodies("join")
     frame = base.frame(at)
@@ -127,21 +125,17 @@ def join(
             f"arm: {arm.name} floats on joint {floating[0]!r}, so that nothing would hold it at {at!r}; load it with a "
             "fixed base, or lock that joint"
         )
-    parts, bindings = renamed(arm, prefix)
-    _require_other_names(base, parts, prefix)
-    place = entries(frame, "frames", "translation", base.bindings)
-    drawn = frame.rotation @ R, frame.translation + frame.rotation @ p
-    R, p = frame.rotation @ R, place + frame.rotation @ p
-    b = ModelBuilder.of(base)
-    for kind in KINDS_OF_PARTS:
-        b._parts[kind] += [hung_on(x, kind, frame.body, R, p, bindings) for x in parts[kind]]
-    b._bindings += [x for x in bindings if x.where != "gravity"]
-    b._odd |= {prefix + body for body, _ in arm.nonphysical}
-    b._locked += [(prefix + joint, *rest) for joint, *rest in arm.locked]
+    b, added = ModelBuilder.of(base), ModelBuilder.of(arm)
+    if prefix:
+        added.add_prefix(prefix)
+    added._notes = [f"{prefix or arm.name}: {text}" for text in arm.notes]
+    _require_other_names(base, added._parts, prefix)
+    place = entries(frame, "frames", "translation", base.bindings) + frame.rotation @ p
+    b._take(added, frame.body, frame.rotation @ R, place, frame.translation + frame.rotation @ p)
     b._name = base.name if name is None else b._read.name("name", name)
-    b._notes += [f"{prefix or arm.name}: {text}" for text in arm.notes]
     b.note(f"joined: {arm.name} at {at!r}" + (f" with the prefix {prefix!r}" if prefix else ""))
-    b._sources += [x.renamed(prefix).hung_on(frame.body, *drawn) for x in arm.sources]
+    if not np.array_equal(base.gravity, arm.gravity, equal_nan=True):
+        b.note(f"gravity is that of {base.name}, {base.gravity.tolist()}; {arm.name} had {arm.gravity.tolist()}")
     return b.build()
 
 

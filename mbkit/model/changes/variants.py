@@ -155,7 +155,7 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
     Raises
     ------
     InputError
-        A path that fits nothing, a spread that is none, and draws that no body can have, by name.
+        A path that fits nothing, another spread than these, and draws that no body can have, by name.
 
     Examples
     --------
@@ -175,9 +175,13 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
     paths: list[Any] = []
     for path, how in spread.items():
         rng = np.random.default_rng([seed, zlib.crc32(str(path).encode())])
-        drawn = _drawn(model, path, how, rng, size)
+        # What leaves a double's range is told by name.
+        with np.errstate(over="ignore", invalid="ignore"):
+            drawn = _drawn(model, path, how, rng, size)
         if twice := [name for name in drawn if name in values]:
             raise InputError(f"spread: {twice[0]!r} is in two entries of the spread; draw it by one")
+        if wide := [name for name, x in drawn.items() if not np.isfinite(x).all()]:
+            raise InputError(f"spread: {str(path)!r}: {wide[0]!r} leaves a double's range; give a smaller spread")
         values |= drawn
         paths += [path] if isinstance(path, Scale) else [*drawn]
     free = with_free(model, paths)
@@ -257,10 +261,10 @@ def _bodies_drawn(
     # Half of it, since the inertia has the factor's square.
     T[:, *_LOWER] = 0.5 * spread * rng.standard_normal((size, 6))
     diagonal = np.arange(3)
+    out: dict[str, Array] = {}
     T[:, diagonal, diagonal] = np.exp(T[:, diagonal, diagonal])
     factor = L @ T
     moments = factor @ factor.swapaxes(1, 2)
-    out: dict[str, Array] = {}
     if not about_com:
         # The rest of the whole factor: the mass, and below it the centre of mass, in the body's radii of gyration.
         out[f"{name}.mass"] = body.mass * np.exp(spread * rng.standard_normal(size))
@@ -286,7 +290,7 @@ def _require_bodies_that_can_be(model: Model, values: Mapping[str, Array], scale
         if len(bad := np.flatnonzero(never)):
             raise InputError(
                 f"spread: {path!r} is {'zero or ' * (x.field in _POSITIVE)}negative in {len(bad)} of {size} variants, "
-                f"such as {value[bad[0]]:.3g} in {bad[0]}; a number instead of a range keeps its sign"
+                f"such as {value[bad[0]]:.3g} in {bad[0]}; give a smaller spread, or a range that it can have"
             )
     for body in model.bodies:
         own = [x for path in drawn if (x := numbers[path]).part == body.name and x.field == "inertia"]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, nearest
 from mbkit.model.elements.forces import RATE
-from mbkit.model.elements.references import KINDS_OF_PARTS, entries, moved_by, names_in, renamed
+from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on, moved_by, names_in, renamed
 from mbkit.model.parameters import Binding, Number, split
 from mbkit.model.parts import Frame, Mimic
 
@@ -315,6 +315,19 @@ class EditingBuilder:
             self._notes.append(f"all names begin with {prefix!r}")
 
     # How
+
+    def _take(self, other: EditingBuilder, body: str, R: Array, p: Any, nominal: Array) -> None:
+        """Take the parts of another builder, with its ground at R, p on a body; `nominal` is p without parameters."""
+        bindings = other._bindings
+        for kind, parts in other._parts.items():
+            self._parts[kind] += [hung_on(x, kind, body, R, p, bindings) for x in parts]
+        # There is one gravity.
+        self._bindings += [b for b in bindings if b.where != "gravity"]
+        self._odd |= other._odd
+        self._locked += other._locked
+        self._notes += other._notes
+        self._sources += [x.hung_on(body, R, nominal) for x in other._sources]
+        self._read.faults += other._read.faults
 
     def _arguments_of(self, joints: set[str]) -> set[str]:
         """Return the names of coordinates and velocities of joints in formulas."""
