@@ -523,6 +523,34 @@ def test_shorter_forms_are_equal():
             assert abs((form - long).subs(at).evalf(25)) < 1e-20 * scale, long
 
 
+def test_angles_that_depend_on_each_other_lose_no_term():
+    """θ + 1 and θ + 2 · ½ are one angle, and so are θ and 2 · θ/2: their terms add."""
+    half, pick = sp.Rational(1, 2), random.Random(5)
+    assert tidy(5 * x * sp.cos(th + 1) + x * sp.cos(th + half) * sp.cos(half)).coeff(x).subs(th, 0).evalf() == (
+        pytest.approx(5 * np.cos(1) + np.cos(0.5) ** 2)
+    )
+    angles = [
+        th,
+        th / 2,
+        2 * th,
+        c / 3,
+        c,
+        th + 1,
+        th - half,
+        1 - th,
+        c + sp.pi / 3,
+        c - sp.pi / 6,
+        half,
+        sp.Integer(1),
+    ]
+    at = {th: sp.Float(0.3, 40), c: sp.Float(0.7, 40)}
+    for _ in range(60):
+        factors = [pick.choice([sp.sin, sp.cos])(pick.choice(angles)) ** pick.randint(1, 2) for _ in range(9)]
+        long = sum(pick.randint(-3, 3) * sp.Mul(*factors[k : k + 3]) for k in (0, 3, 6)) + pick.choice(factors)
+        for form in [*forms(long), tidy(long)]:
+            assert abs((form - long).subs(at).evalf(25)) < 1e-20, long
+
+
 def test_what_cancels_is_found_without_a_search():
     s, co, rho = sp.sin(th), sp.cos(th), sp.sqrt(l**2 - a**2 * sp.sin(th) ** 2)
     long = co * (1 + a * co / rho) + s * sp.diff(a * co / rho, th)

@@ -89,7 +89,10 @@ class _Writer:
         self._sums: dict[frozenset[Any], sp.Expr] = {}
 
     def expression(self, form: Form) -> sp.Expr:
-        poly = dict(_term(self._space, key, value) for key, value in form.items())
+        poly: Poly = {}
+        for key, value in form.items():
+            # Angles that are numbers are not independent: 2 · ½ and 1 are one sum.
+            gather(poly, *_term(self._space, key, value))
         by_angle: dict[tuple[tuple[sp.Expr, int], ...], Poly] = {}
         for atoms, value in poly.items():
             turned = tuple(a for a in atoms if isinstance(a[0], (sp.sin, sp.cos)))
@@ -144,17 +147,25 @@ class _Writer:
 
 def _term(space: TrigRing, key: FormKey, value: Fraction) -> tuple[tuple[tuple[sp.Expr, int], ...], Fraction]:
     done, kind, rest, powers = key
-    out = [(g, e) for g, e in zip(space.generators, powers, strict=True) if e]
+    out = Counter({g: e for g, e in zip(space.generators, powers, strict=True) if e})
     for i, c, s in done:
-        out += [(f(space.angles[i]), e) for f, e in ((sp.sin, s), (sp.cos, c)) if e]
+        for f, e in ((sp.sin, s), (sp.cos, c)):
+            if e:
+                turned, sign = _turned(f(space.angles[i]))
+                out[turned] += e
+                value *= sign**e
     if any(rest):
         angle = sp.Add(*(k * a for k, a in zip(rest, space.angles, strict=True) if k))
-        turned = sp.sin(angle) if kind else sp.cos(angle)
-        if turned.is_Mul:
-            # SymPy writes sin(b - a) as -sin(a - b).
-            turned, value = -turned, -value
-        out.append((turned, 1))
-    return tuple(out), value
+        turned, sign = _turned(sp.sin(angle) if kind else sp.cos(angle))
+        # It may be one of those already there: 2 · ½ is 1.
+        out[turned] += 1
+        value *= sign
+    return tuple(out.items()), value
+
+
+def _turned(x: sp.Expr) -> tuple[sp.Expr, int]:
+    """Return a sine or cosine and its sign: SymPy writes sin(b - a) as -sin(a - b)."""
+    return (-x, -1) if x.is_Mul else (x, 1)
 
 
 # Powers of the cosines and sines of single angles
