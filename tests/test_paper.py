@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import random
+import warnings
 from functools import cache
 from itertools import pairwise
 
@@ -14,8 +15,9 @@ from scipy.integrate import solve_ivp
 from sympy.physics.mechanics import dynamicsymbols
 
 import mbkit as mb
-from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.lagrangian import Lagrangian
+from mbkit.lagrangian.systems import one_degree
 from mbkit.lagrangian.trig.simplify import forms, is_zero, tidy
 from mbkit.simulate import METHODS as METHODS_OF
 
@@ -608,3 +610,53 @@ def test_models_of_bodies_and_of_energies_answer_the_same_questions():
         assert (model.clock, model.rates, model.written is None) == (*expected[1:3], expected[0])
     assert robot.energy_equations is None
     assert energies.energy_equations("literal").form is lag
+
+
+def test_functions_that_are_not_given_stand_in_the_equation():
+    J, h = sp.Function("J"), sp.Function("h")
+    system = one_degree(J(th), m * g * h(th), coordinate=th, parameters={m: 1.0, g: 9.81}, name="cam")
+    (equation,) = system.equations().equations()
+    thdot, thddot = sp.symbols("thetadot thetaddot")
+    slope = sp.diff(J(th), th)
+    assert sp.expand(equation.lhs - (J(th) * thddot + slope * thdot**2 / 2 + m * g * sp.diff(h(th), th))) == 0
+    assert r"J\left(\theta\right)" in system.equations().latex()
+    assert pickle.loads(pickle.dumps(system)).equations() == system.equations()
+    with pytest.raises(UnsupportedError, match=r"J\(theta\): an undefined function .*substituted"):
+        system.dynamics().forward_dynamics([0.1], [0.0], [0.0])
+    given = system.substituted({J: 1 + sp.sin(th) ** 2 / 2, h(th): -sp.cos(th)})
+    direct = one_degree(1 + sp.sin(th) ** 2 / 2, -m * g * sp.cos(th), coordinate=th, parameters={m: 1.0, g: 9.81})
+    at = [0.3], [0.7], [0.2]
+    assert given.dynamics().forward_dynamics(*at) == pytest.approx(direct.dynamics().forward_dynamics(*at), rel=1e-15)
+    with pytest.raises(InputError, match=r"J\(c\) is no coordinate"):
+        Lagrangian(J(c) * thdot**2, 0, [th])
+    with pytest.raises(InputError, match="F is no parameter or function"):
+        system.substituted({sp.Function("F"): th})
+
+
+def test_mass_that_changes_with_time_is_told():
+    v, gas = sp.symbols("xdot u_e")
+    rocket = {"coordinates": [x], "time": t, "parameters": [m, k, gas]}
+    with pytest.warns(MbkitWarning, match="Meshchersky"):
+        Lagrangian((m - k * t) * v**2 / 2, 0, **rocket)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # With the force of what leaves it is Meshchersky's equation, (m - k t) x'' = k u.
+        right = Lagrangian((m - k * t) * v**2 / 2, 0, forces={x: -k * (v - gas)}, **rocket)
+        # A length that is driven leaves its own rate in T.
+        length = l + sp.sin(t)
+        Lagrangian(m * (length**2 * w**2 + sp.diff(length, t) ** 2) / 2, 0, [th], time=t, parameters=[m, l])
+    (equation,) = right.equations().equations()
+    xddot = sp.Symbol("xddot")
+    assert sp.expand(equation.lhs - equation.rhs - ((m - k * t) * xddot - k * gas)) == 0
+
+
+@pytest.mark.parametrize("numbers", [{m: -1.0, k: 1.0}, {m: 1.0, k: -0.5}])
+def test_negative_masses_are_told(numbers):
+    T = m * u**2 / 2 + k * (w + u * sp.cos(th)) ** 2 / 2
+    with pytest.warns(MbkitWarning, match="has negative kinetic energy"):
+        Lagrangian(T, 0, [x, th], parameters=numbers)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # Without numbers nothing is known, and a light mass is no negative one.
+        Lagrangian(T, 0, [x, th], parameters=[m, k])
+        Lagrangian(T, 0, [x, th], parameters={m: 1.0, k: 1e-9})

@@ -346,7 +346,7 @@ def test_bad_input_says_what_is_wrong():
         with pytest.raises(InputError, match=told):
             whole.quasi_velocities(sp.eye(3), names)
     bound = Lagrangian(m * (xdot**2 + ydot**2), 0, [x, y], parameters=[m], constraints=[x - y])
-    with pytest.raises(UnsupportedError, match="has constraints"):
+    with pytest.raises(UnsupportedError, match="has holonomic constraints"):
         bound.quasi_velocities(sp.eye(2))
     moving = Lagrangian(m * xdot**2, t * x, [x], time=t, parameters=[m])
     with pytest.raises(InputError, match="got the time t"):

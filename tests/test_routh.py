@@ -134,6 +134,26 @@ def test_routhian_of_the_heavy_top_is_the_textbooks():
     assert "p_{\\phi}" in routhian.latex()
 
 
+def test_the_effective_potential_has_the_part_of_axes_that_turn():
+    """In axes that turn at Ω a mass on a spring rests at the same radius, where Vₑ is least: T0 belongs to it."""
+    r, angle, k, W = sp.symbols("r phi k Omega", positive=True)
+    rdot, turn = sp.symbols("rdot phidot")
+    T = m * (rdot**2 + r**2 * (turn + W) ** 2) / 2
+    reduced = Lagrangian(T, k * r**2 / 2, [r, angle], [rdot, turn], parameters=[m, k, W]).routhian()
+    p = sp.Symbol("p_phi")
+    assert sp.simplify(reduced.effective_potential - (k * r**2 / 2 + p**2 / (2 * m * r**2) - W * p)) == 0
+    slope = sp.diff(reduced.effective_potential, r).subs({m: 1, k: 4, W: 1, p: 2})
+    assert slope.subs(r, 1) == 0
+
+
+def test_momenta_of_numbered_angles_are_set_below_the_line():
+    first, second = sp.symbols("theta1 theta2")
+    rates = sp.symbols("thetadot1 thetadot2")
+    free = Lagrangian(m * (rates[0] ** 2 + rates[1] ** 2) / 2, 0, [first, second], rates, parameters=[m])
+    assert r"p_{\theta_{1}} = " in free.conserved_quantities()[0].latex()
+    assert r"\dot{p}_{\theta_{2}}" in free.hamiltonian().equations().latex()
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_reduced_motion_is_the_whole_one(case):
     make, q, v = CASES[case]

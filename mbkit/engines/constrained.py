@@ -79,7 +79,7 @@ class Constrained:
     @property
     def velocity_constraint_names(self) -> tuple[str, ...]:
         """Names of the rows that hold velocities alone, the last ones of `constraint_names`."""
-        return self._states_held.names_of(self, moving=True) if self.model.no_slip else ()
+        return self._states_held.names_of(self, moving=True) if self.model.holds_velocities else ()
 
     def _warn_of_open_states(self, q: ArrayLike) -> None:
         """Warn where configurations do not satisfy the constraints, whose accelerations are those of no motion."""

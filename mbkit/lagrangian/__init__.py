@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.reduction.hamilton import CanonicalEquations as CanonicalEquations
     from mbkit.lagrangian.reduction.hamilton import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.reduction.hamilton import Hamiltonian as Hamiltonian
+    from mbkit.lagrangian.reduction.nonholonomic import Integrability as Integrability
+    from mbkit.lagrangian.reduction.nonholonomic import NonholonomicEquations as NonholonomicEquations
     from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion as QuasiEquationsOfMotion
     from mbkit.lagrangian.reduction.routh import Routhian as Routhian
     from mbkit.lagrangian.statics.equilibrium import Equilibrium as Equilibrium
@@ -36,7 +38,9 @@ _HOME = {
     "EquationsOfMotion": "mbkit.lagrangian.energies.equations_of_motion",
     "Equilibrium": "mbkit.lagrangian.statics.equilibrium",
     "Hamiltonian": "mbkit.lagrangian.reduction.hamilton",
+    "Integrability": "mbkit.lagrangian.reduction.nonholonomic",
     "Lagrangian": "mbkit.lagrangian.system",
+    "NonholonomicEquations": "mbkit.lagrangian.reduction.nonholonomic",
     "QuasiEquationsOfMotion": "mbkit.lagrangian.reduction.quasi_equations",
     "QuasiLagrangian": "mbkit.lagrangian.system",
     "Routhian": "mbkit.lagrangian.reduction.routh",

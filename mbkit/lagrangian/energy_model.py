@@ -87,7 +87,17 @@ class EnergyModel(Model):
     @property
     def constrained(self) -> bool:
         """Whether constraints bind the coordinates to each other."""
-        return bool(self.form.constraints)
+        return bool(self.form.multiplier_symbols)
+
+    @property
+    def holds_velocities(self) -> bool:
+        """Whether some constraints hold velocities alone."""
+        return bool(self.form.velocity_constraints)
+
+    @property
+    def constraints_do_work(self) -> bool:
+        """Whether constraints may feed energy: those that depend on the time or prescribe a speed."""
+        return self.time_parameter is not None or any(self.form.velocity_rows[1])
 
     @cached_property
     def velocity_map(self) -> VelocityMap | None:
@@ -133,6 +143,7 @@ class EnergyModel(Model):
         s = self.form
         parts = [s.T, s.V, s.dissipation, s.forces, s.constraints, s.coordinates, s.velocities, s.time]
         parts += [] if s.quasi is None else [s.quasi.D]
+        parts += [s.velocity_constraints] if s.velocity_constraints else []
         return "\n".join((s.name, *(sp.srepr(sp.sympify(x)) for x in parts)))
 
     def with_nominal(self, values: Mapping[str, Any]) -> EnergyModel:

@@ -23,7 +23,7 @@ from mbkit._reproducible import pivoted
 from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.engines.constraint_manifold import Manifold, require_few
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, NumericalError, UnknownNameError
+from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.energy_model import abstract_parts
 from mbkit.model import Model
 
@@ -221,6 +221,11 @@ class Embedded:
         self.manifold, self.dynamics, self.independent = manifold, manifold.dyn, independent
         self.model = manifold.dyn.model
         form = manifold.equations.form
+        if form.velocity_constraints:
+            raise UnsupportedError(
+                f"embedded: {self.model.name} has velocity constraints, which bind no coordinates; "
+                "mbkit.simulate(lag.dynamics(), ...) holds them by multipliers, and maggi() has equations without these"
+            )
         rows = len(form.constraints)
         require_few(manifold)
         self.degrees = self.model.nv - rows

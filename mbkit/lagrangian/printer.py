@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import sympy as sp
+from sympy.core.function import AppliedUndef
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.pretty.pretty_symbology import pretty_symbol
 
@@ -156,6 +157,8 @@ class ExpressionPrinter:
             return f"{self._atom(x.base) if x.base.is_Symbol or x.base.is_Add else f'({self.text(x.base)})'}{high}"
         if isinstance(x, sp.Abs):
             return f"|{self.text(x.args[0])}|"
+        if isinstance(x, sp.Derivative) and len(x.expr.args) == 1 and x.variables[0] == x.expr.args[0]:
+            return f"{x.expr.func.__name__}{'′' * x.derivative_count}({self.text(x.expr.args[0])})"
         if isinstance(x, sp.Function) and len(x.args) == 1:
             space = " " if isinstance(x, (sp.sin, sp.cos, sp.tan)) else ""
             text = self._argument(x.args[0]) if space else f"({self.text(x.args[0])})"
@@ -194,11 +197,27 @@ class ExpressionPrinter:
         return x
 
 
+#: p_theta1, which SymPy leaves as it is: it knows a letter's name alone below the line.
+_NUMBERED: Final = re.compile(r"(.+)_([A-Za-z]+)(\d+)")
+
+
 class _Latex(LatexPrinter):  # type: ignore[misc]
     """SymPy's printer, with ½ in front of a product, and with names that are not TeX escaped."""
 
     def _print_Symbol(self, expr: sp.Symbol, style: str = "plain") -> str:
+        numbered = _NUMBERED.fullmatch(expr.name)
+        if numbered and pretty_symbol(numbered[2]) != numbered[2]:
+            stem, letter, digits = (self._print_Symbol(sp.Symbol(part), style) for part in numbered.groups())
+            return f"{stem}_{{{letter}_{{{digits}}}}}"
         return latex(expr.name, lambda name: str(super(_Latex, self)._print_Symbol(sp.Symbol(name), style)))
+
+    def _print_Function(self, expr: sp.Function, exp: str | None = None) -> str:
+        if not isinstance(expr, AppliedUndef):
+            return str(super()._print_Function(expr, exp))
+        # Without its bracket J(θ) is a product.
+        power = "" if exp is None else f"^{{{exp}}}"
+        arguments = ", ".join(map(self._print, expr.args))
+        return rf"{self._print(sp.Symbol(expr.func.__name__))}{power}\left({arguments}\right)"
 
     def _print_Mul(self, expr: sp.Expr) -> str:
         number = expr.args[0]

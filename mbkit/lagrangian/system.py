@@ -23,6 +23,13 @@ from mbkit.lagrangian.energy_model import EnergyModel, energies_latex
 from mbkit.lagrangian.independent_coordinates import Embedded
 from mbkit.lagrangian.reduction import hamilton
 from mbkit.lagrangian.reduction.hamilton import ConservedQuantity, Hamiltonian, hamiltonian
+from mbkit.lagrangian.reduction.nonholonomic import (
+    Integrability,
+    NonholonomicEquations,
+    integrability,
+    nonholonomic_equations,
+    symmetry_momenta,
+)
 from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
 from mbkit.lagrangian.reduction.routh import Routhian, routhian
 from mbkit.lagrangian.trig.simplify import tidy
@@ -53,19 +60,25 @@ class Lagrangian(EnergyForm):
         Every other symbol, with its value where it has one.
     constraints : sequence of sympy.Expr or sympy.Eq, optional
         Holonomic: f(q, t) = 0 each.
+    velocity_constraints : sequence of sympy.Expr or sympy.Eq, optional
+        Linear in the velocities: A(q, t) v + a(q, t) = 0 each, such as rolling (Neimark and Fufaev 1972, ch. I).
+        They need not be integrable. T, V and forces are those of the free system: to put a row that is not
+        integrable into T before Lagrange's equations are formed gives other, wrong equations.
     name : str
         A name stands for one thing: ``Symbol("m", positive=True)`` and ``Symbol("m")`` are the same parameter.
 
     Attributes
     ----------
-    T, V, dissipation, coordinates, velocities, accelerations, time, parameters, constraints
+    T, V, dissipation, coordinates, velocities, accelerations, time, parameters
         The arguments in plain symbols; `time` is None where nothing depends on it.
+    constraints, velocity_constraints
+        The arguments in plain symbols.
     forces : (n, 1) sympy.Matrix
         Without the dissipation.
     inputs : mapping of coordinate to sympy.Symbol
         The symbols that stand for ``tau``.
     multiplier_symbols : tuple of sympy.Symbol
-        λ of each constraint.
+        λ of each constraint, those of the velocity constraints last.
 
     Raises
     ------
@@ -110,10 +123,14 @@ class Lagrangian(EnergyForm):
         return hamilton.conserved_momenta(self)
 
     def conserved_quantities(self) -> tuple[ConservedQuantity, ...]:
-        """Return the constants of every motion: those momenta, and the energy or Jacobi's integral."""
-        return hamilton.conserved_quantities(
+        """Return the constants of every motion: those momenta, and the energy or Jacobi's integral.
+
+        Of constraints' reactions on cyclic coordinates, momenta along sums of these on which none acts are added.
+        """
+        found = hamilton.conserved_quantities(
             self._in_rates, self.conserved_momenta(), self.energy_function, self.velocities
         )
+        return found if self.quasi is not None or not self.multiplier_symbols else (*found, *symmetry_momenta(self))
 
     @property
     def energy_function(self) -> sp.Expr:
@@ -162,6 +179,44 @@ class Lagrangian(EnergyForm):
             Constraints act on the system.
         """
         return QuasiLagrangian(self, D, names)
+
+    # Velocity constraints, eliminated
+
+    def maggi(self, quasi_velocities: Any = None) -> NonholonomicEquations:
+        """Return Maggi's equations: velocity constraints eliminated by independent quasi-velocities.
+
+        Parameters
+        ----------
+        quasi_velocities : sequence of coordinates, or mapping of name to sympy.Expr, optional
+            Coordinates whose rates stay, or w by its definition in the velocities: one for each degree of freedom.
+            By default the coordinates whose choice leaves the simplest determinant.
+
+        Raises
+        ------
+        InputError
+            Too many or too few, or some that do not determine every velocity with the constraints.
+        UnsupportedError
+            No velocity constraints, or holonomic ones beside them.
+        """
+        return nonholonomic_equations(self._in_rates, quasi_velocities, "Maggi")
+
+    def boltzmann_hamel(self, quasi_velocities: Any = None) -> NonholonomicEquations:
+        """Return the same equations by Boltzmann and Hamel, from T in n quasi-velocities; arguments as of `maggi`."""
+        return nonholonomic_equations(self._in_rates, quasi_velocities, "Hamel")
+
+    def appell(self, quasi_velocities: Any = None) -> NonholonomicEquations:
+        """Return the same equations by Gibbs and Appell, with `S`; arguments as of `maggi`."""
+        return nonholonomic_equations(self._in_rates, quasi_velocities, "Appell")
+
+    def integrability(self) -> Integrability:
+        """Return which velocity constraints are integrable, by Frobenius' theorem.
+
+        Raises
+        ------
+        UnsupportedError
+            No velocity constraints.
+        """
+        return integrability(self._in_rates)
 
     # Running it
 
@@ -262,7 +317,7 @@ class Lagrangian(EnergyForm):
         return self._consistent(self._interpreted.at(**values) if values else self._interpreted).at(real("t", t))
 
     def _consistent(self, dyn: Dynamics) -> Manifold:
-        if not self.constraints:
+        if not self.multiplier_symbols:
             raise UnsupportedError(f"{self.name}: has no constraints; give them as constraints=[...]")
         return manifold_of(dyn)
 

@@ -82,6 +82,11 @@ class Model(Description):
         return any(getattr(self, feature) for feature in CONSTRAINT_FEATURES)
 
     @property
+    def holds_velocities(self) -> bool:
+        """Whether some constraints hold velocities alone, as contacts without slip do."""
+        return bool(self.no_slip)
+
+    @property
     def constraints_do_work(self) -> bool:
         """Whether constraints may feed energy, as motions prescribed in time and blades with a speed do."""
         return self.time_parameter is not None or any(x.speed for x in self.no_slip)

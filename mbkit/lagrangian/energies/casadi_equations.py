@@ -46,8 +46,6 @@ class EnergyEquations(ConstraintQuantities, Equations):
         read = Conversion(names, values.number)
         self._T, self._V, self._R = ca.SX(read(form.T)), ca.SX(read(form.V)), ca.SX(read(form.dissipation))
         self._Q = read.matrix(form.forces)
-        rows = tuple(f"constraints[{k}] ({_short(x)})" for k, x in enumerate(form.constraints))
-        self.constraints = ConstraintTerms(read.matrix(form.constraints), self.q, self.v, self.time, rows)
         #: Of each momentum k, (γ^k v)_i = Σ_j γ^k_ij v_j; none where velocities are rates.
         self._turns: list[Any] = []
         qdot, pullback = self.v, lambda x: x
@@ -58,6 +56,10 @@ class EnergyEquations(ConstraintQuantities, Equations):
             turns = (read.matrix([gamma[k, i, j] for j in range(n) for i in range(n)]) for k in range(n))
             self._turns = [ca.mtimes(ca.reshape(turn, n, n), self.v) for turn in turns]
         self.kin = SimpleNamespace(qdot=qdot, pullback=pullback)  # type: ignore[assignment]
+        kinds = ("constraints", form.constraints), ("velocity_constraints", form.velocity_constraints)
+        rows = tuple(f"{what}[{k}] ({_short(x)})" for what, found in kinds for k, x in enumerate(found))
+        f, speeds = (read.matrix(found) for _, found in kinds)
+        self.constraints = ConstraintTerms(f, self.q, self.v, self.time, rows, qdot, speeds)
         self.parameters = values.parameters
         self.constants, self.constant_values = values.constants, values.constant_values
 
@@ -152,14 +154,14 @@ class EnergyEquations(ConstraintQuantities, Equations):
     @cached_property
     def forward_dynamics(self) -> Any:
         """M⁻¹ (τ + τ_passive - nle + Jᵀ λ); every other term of the equation is the one without constraints."""
-        if not self.form.constraints:
+        if not self.model.constrained:
             return super().forward_dynamics
         return self._constrained[0]
 
     @cached_property
     def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
         """∂FD/∂q, ∂FD/∂v and ∂FD/∂τ; under constraints the last is M⁻¹ on what they leave free."""
-        if not self.form.constraints:
+        if not self.model.constrained:
             return super().forward_dynamics_derivatives
         q, v, tau = (ca.jacobian(self.forward_dynamics, x) for x in (self.q, self.v, self.tau))
         return q, v, tau

@@ -14,8 +14,9 @@ import sympy as sp
 from sympy.core.function import AppliedUndef
 
 from mbkit._check import Array, real
-from mbkit.errors import InputError, UnknownNameError
-from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, require_inertia, split
+from mbkit._warn import warn
+from mbkit.errors import InputError, MbkitWarning, UnknownNameError
+from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, require_inertia, split, warn_of_negative
 from mbkit.lagrangian.energies.symbols import (
     PlainSymbols,
     acceleration_of,
@@ -25,6 +26,7 @@ from mbkit.lagrangian.energies.symbols import (
     listed,
     name_of,
     plain,
+    undefined,
     velocity_of,
 )
 from mbkit.lagrangian.trig.simplify import is_zero, tidy, tidy_matrix
@@ -73,15 +75,17 @@ class EnergyForm:
         dissipation: Any = 0,
         parameters: Mapping[sp.Symbol, float | None] | Iterable[sp.Symbol] | None = None,
         constraints: Sequence[Any] = (),
+        velocity_constraints: Sequence[Any] = (),
         name: str = "system on paper",
     ) -> None:
         self.parameters = _parameters(parameters)
         into = PlainSymbols(coordinates, velocities, time, among=getattr(T, "free_symbols", ()), named=self.parameters)
         self.T, self.V, self.dissipation = into("T", T), into("V", V), into("dissipation", dissipation)
         acting = _forces(into, forces or {})
-        self.constraints = tuple(_row(into, f"constraints[{k}]", c) for k, c in enumerate(_rows(constraints)))
+        self.constraints = _rows(into, "constraints", constraints)
+        self.velocity_constraints = _rows(into, "velocity_constraints", velocity_constraints)
         self.coordinates, self.velocities = into.coordinates, into.velocities
-        others = (self.T, self.V, self.dissipation, *self.constraints)
+        others = (self.T, self.V, self.dissipation, *self.constraints, *self.velocity_constraints)
         # The time of dynamicsymbols need not enter by itself.
         self.time = into.time if any(into.time in x.free_symbols for x in (*others, *acting.values())) else None
         moving = {*self.coordinates, *self.velocities, *([self.time] if self.time else [])}
@@ -94,7 +98,8 @@ class EnergyForm:
         )
         used = {s.name for s in (*moving, *self.parameters, *self.inputs.values(), *self.accelerations)}
         self.multiplier_symbols = tuple(
-            sp.Symbol(free_name(f"lambda{k + 1}", used)) for k in range(len(self.constraints))
+            sp.Symbol(free_name(f"lambda{k + 1}", used))
+            for k in range(len(self.constraints) + len(self.velocity_constraints))
         )
         _check_names(self)
         _check_declared(self)
@@ -102,7 +107,9 @@ class EnergyForm:
         if not isinstance(name, str) or not name.strip():
             raise InputError(f"name: expected a text, got {name!r}")
         self.name = name
-        require_inertia(self.kinetic.M, self.coordinates, self.velocities, self.constraints)
+        require_inertia(self.kinetic.M, self.velocities, self.constraint_matrix)
+        warn_of_negative(self.kinetic.M, self.velocities, self.parameters)
+        _warn_of_mass_in_time(self)
 
     # Parts
 
@@ -121,16 +128,32 @@ class EnergyForm:
         """T - V."""
         return self.T - self.V
 
+    # Constraints
+
+    @cached_property
+    def velocity_rows(self) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix]:
+        """A (k, n) and a (k, 1) of the velocity constraints A v + a = 0."""
+        rows = sp.Matrix(len(self.velocity_constraints), 1, self.velocity_constraints)
+        if not rows:
+            return sp.ImmutableMatrix(0, len(self.velocities), []), sp.ImmutableMatrix(0, 1, [])
+        A, at_rest = rows.jacobian(self.velocities), rows.subs(dict.fromkeys(self.velocities, 0))
+        return tidy_matrix(A), tidy_matrix(at_rest)
+
+    @cached_property
+    def constraint_matrix(self) -> sp.ImmutableMatrix:
+        """J (m, n) of the holonomic constraints, with A of the velocity constraints below it."""
+        f = sp.Matrix(len(self.constraints), 1, self.constraints)
+        J = f.jacobian(self.coordinates) if f else sp.zeros(0, len(self.coordinates))
+        return sp.ImmutableMatrix(J.col_join(self.velocity_rows[0]))
+
     # Cyclic coordinates
 
     @cached_property
     def _ignorable(self) -> dict[sp.Symbol, sp.Expr]:
         """Each coordinate that L does not hold -> the force along it beside V's, constraints with their λ included."""
-        multipliers = list(zip(self.multiplier_symbols, self.constraints, strict=True))
-        forces = {
-            q: tidy(x + sum((sp.diff(f, q) * symbol for symbol, f in multipliers), sp.Integer(0)))
-            for q, x in zip(self.coordinates, acting_forces(self), strict=True)
-        }
+        reactions = self.constraint_matrix.T * sp.Matrix(len(self.multiplier_symbols), 1, self.multiplier_symbols)
+        acting = zip(self.coordinates, acting_forces(self), reactions, strict=True)
+        forces = {q: tidy(x + reaction) for q, x, reaction in acting}
         # Term by term in the velocities, so that each is short.
         parts = (*self.kinetic.M, *self.kinetic.b, self.kinetic.T0, self.V)
         return {q: forces[q] for q in self.coordinates if vanish(sp.diff(x, q) for x in parts)}
@@ -149,23 +172,31 @@ class EnergyForm:
         return partial(type(self), **self._arguments()), ()
 
     def _arguments(self) -> dict[str, Any]:
-        names = ("T", "V", "coordinates", "velocities", "time", "dissipation", "constraints", "name")
+        energies = ("T", "V", "coordinates", "velocities", "time", "dissipation", "name")
+        names = (*energies, "constraints", "velocity_constraints")
         forces = {q: self.inputs.get(q, x) for q, x in zip(self.coordinates, self.forces, strict=True)}
         return {n: getattr(self, n) for n in names} | {"forces": forces, "parameters": dict(self.parameters)}
 
     def substituted(self, values: Mapping[sp.Symbol, Any]) -> Self:
-        """Return the same system with numbers for some parameters."""
+        """Return the same system with numbers for some parameters, and expressions for functions such as J(theta)."""
         own = {s.name: s for s in self.parameters}
+        functions = {f.func.__name__: f for x in _parts(self).values() for f in x.atoms(AppliedUndef)}
         put = {}
         for key, x in values.items():
-            symbol = own.get(str(key))
-            if symbol is None:
-                raise InputError(f"values: {key} is no parameter; they are {plain(self.parameters) or 'none'}")
-            put[symbol] = sp.sympify(x)
+            name = name_of(key)
+            if name not in own and name not in functions:
+                known = plain(self.parameters) or "none"
+                raise InputError(f"values: {key} is no parameter or function; the parameters are {known}")
+            put[own[name] if name in own else functions[name]] = sp.sympify(x)
+
+        def replaced(x: Any) -> Any:
+            # Of a function that is now known, the derivatives are too.
+            return by_name(x.subs(put).doit(), {s.name: s for s in (*self.coordinates, *self.parameters)})
+
         out = self._arguments()
-        out |= {name: out[name].subs(put) for name in ("T", "V", "dissipation")}
-        out["forces"] = {q: x if q in self.inputs else x.subs(put) for q, x in out["forces"].items()}
-        out["constraints"] = [c.subs(put) for c in self.constraints]
+        out |= {name: replaced(out[name]) for name in ("T", "V", "dissipation")}
+        out["forces"] = {q: x if q in self.inputs else replaced(x) for q, x in out["forces"].items()}
+        out |= {name: [replaced(c) for c in out[name]] for name in ("constraints", "velocity_constraints")}
         out["parameters"] = {s: x for s, x in self.parameters.items() if s not in put}
         return type(self)(**out)
 
@@ -233,7 +264,7 @@ def read_expression(
             out = out.subs(d, rates[name])
     out = out.subs({f: known[name_of(f)] for f in out.atoms(AppliedUndef) if name_of(f) in rates})
     out = by_name(out, known)
-    unknown = [str(x) for x in (*out.atoms(sp.Derivative), *out.atoms(AppliedUndef), *(out.free_symbols - set(own)))]
+    unknown = [str(x) for x in (*undefined(out, own), *(out.free_symbols - set(own)))]
     if unknown and not others:
         raise InputError(f"{what}: {', '.join(sorted(unknown))} is no symbol of {form.name}: {', '.join(known)}")
     return out
@@ -275,13 +306,14 @@ def _forces(into: PlainSymbols, source: Any) -> dict[sp.Symbol, sp.Expr]:
     return out
 
 
-def _rows(source: Any) -> Sequence[Any]:
+def _rows(into: PlainSymbols, what: str, source: Any) -> tuple[sp.Expr, ...]:
     if isinstance(source, (sp.Basic, str)) and not isinstance(source, sp.Tuple):
         source = [source]
     try:
-        return list(source)
+        rows = list(source)
     except TypeError:
-        raise InputError(f"constraints: expected a list of expressions, got {source!r}") from None
+        raise InputError(f"{what}: expected a list of expressions, got {source!r}") from None
+    return tuple(_row(into, f"{what}[{k}]", c) for k, c in enumerate(rows))
 
 
 def _row(into: PlainSymbols, what: str, source: Any) -> sp.Expr:
@@ -304,7 +336,8 @@ def _parts(d: EnergyForm) -> dict[str, sp.Expr]:
     """Return every expression by its name in messages."""
     out = {"T": d.T, "V": d.V, "dissipation": d.dissipation}
     out |= {f"forces[{q}]": x for q, x in zip(d.coordinates, d.forces, strict=True)}
-    return out | {f"constraints[{k}]": x for k, x in enumerate(d.constraints)}
+    out |= {f"constraints[{k}]": x for k, x in enumerate(d.constraints)}
+    return out | {f"velocity_constraints[{k}]": x for k, x in enumerate(d.velocity_constraints)}
 
 
 def _check_names(d: EnergyForm) -> None:
@@ -338,6 +371,22 @@ def _check_declared(d: EnergyForm) -> None:
     raise InputError(message)
 
 
+def _warn_of_mass_in_time(d: EnergyForm) -> None:
+    """Warn of T = ½ m(t) v²: the rocket's equation is another one. A length that is driven leaves terms of ṫ in T."""
+    k, t = d.kinetic, d.time
+    if t is None or any(k.b) or k.T0 != 0:
+        return
+    held = [w.name for i, w in enumerate(d.velocities) if t in k.M[i, i].free_symbols and d.forces[i] == 0]
+    if not held:
+        return
+    warn(
+        f"T: the mass matrix of {', '.join(held)} depends on the time {t}, which adds dM/dt v to the equation. That is "
+        "right where something drives a length. Where mass leaves or joins with the relative velocity u, the force "
+        "dm/dt (v + u) is missing; add it to forces (Meshchersky's equation)",
+        MbkitWarning,
+    )
+
+
 def _check_velocities(d: EnergyForm) -> None:
     """Refuse velocities in V and constraints, and expressions that hold no coordinate or velocity."""
     moving = set(d.velocities)
@@ -353,3 +402,15 @@ def _check_velocities(d: EnergyForm) -> None:
     for k, x in enumerate(d.constraints):
         if not x.free_symbols & set(d.coordinates):
             raise InputError(f"constraints[{k}]: {x} holds no coordinate, so that it binds none")
+    for k, x in enumerate(d.velocity_constraints):
+        slopes = [sp.diff(x, w) for w in d.velocities]
+        if not any(slopes):
+            raise InputError(
+                f"velocity_constraints[{k}]: {x} holds none of the velocities {', '.join(map(str, d.velocities))}; "
+                "f(q, t) = 0 belongs in constraints"
+            )
+        if not vanish(sp.diff(slope, w) for slope in slopes for w in d.velocities):
+            raise InputError(
+                f"velocity_constraints[{k}]: expected a row A(q, t) v + a(q, t) that is linear in the velocities, "
+                f"got {x}; mechanics has no reaction force for others that all agree on"
+            )

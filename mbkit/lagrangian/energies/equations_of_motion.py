@@ -35,7 +35,8 @@ class EquationsOfMotion(Printable):
     constraint_jacobian : (m, n) sympy.Matrix
         J; no rows without constraints.
     constraint_acceleration, constraints : (m, 1) sympy.Matrix
-        γ, the terms of J̇ v and of the time, so that J v̇ + γ = 0; and f(q, t), which is zero.
+        γ, the terms of J̇ v and of the time, so that J v̇ + γ = 0; and f(q, t), then A v + a of the velocity
+        constraints, which are zero.
     """
 
     coordinates: tuple[sp.Symbol, ...]
@@ -81,7 +82,7 @@ class EquationsOfMotion(Printable):
     def equations(self) -> tuple[sp.Eq, ...]:
         """Return one equation per coordinate: M v̇ + C v + d + ∂V/∂q on the left, Q on the right.
 
-        Constraints follow, f = 0 each.
+        Constraints follow, f = 0 or A v + a = 0 each.
         """
         return tuple(sp.Eq(sp.Add(*terms), force, evaluate=False) for terms, force in self._rows())
 
@@ -169,7 +170,7 @@ def _by_speeds(x: sp.Expr, velocities: tuple[sp.Symbol, ...]) -> sp.Expr:
 def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> EquationsOfMotion:
     """Return Lagrange's equations of a system: d/dt ∂L/∂v - ∂L/∂q = Q + Jᵀ λ; C is zero without `coriolis`."""
     q, v, k, t = system.coordinates, sp.Matrix(system.velocities), system.kinetic, system.time
-    n, m = len(q), len(system.constraints)
+    n = len(q)
     drift = sp.zeros(n, 1)
     if any(k.b) or k.T0 != 0:
         curl = k.b.jacobian(q)
@@ -179,10 +180,6 @@ def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> Equatio
     friction = [sp.diff(system.dissipation, w) for w in system.velocities]
     inputs = [system.inputs.get(x, sp.Integer(0)) for x in q]
     forces = sp.Matrix(system.forces) + sp.Matrix(inputs) - sp.Matrix(friction)
-    f = sp.Matrix(m, 1, system.constraints)
-    jacobian = f.jacobian(q) if m else sp.zeros(0, n)
-    rate = jacobian * v + (sp.zeros(m, 1) if t is None else sp.diff(f, t))
-    gamma = rate.jacobian(q) * v + (sp.zeros(m, 1) if t is None else sp.diff(rate, t)) if m else rate
     return EquationsOfMotion(
         coordinates=q,
         velocities=system.velocities,
@@ -192,11 +189,22 @@ def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> Equatio
         drift=tidy_matrix(drift),
         potential_gradient=sp.ImmutableMatrix(gradient(system.V, q)),
         forces=tidy_matrix(forces),
-        constraint_jacobian=sp.ImmutableMatrix(jacobian),
-        constraint_acceleration=tidy_matrix(gamma),
-        constraints=sp.ImmutableMatrix(f),
-        multipliers=system.multiplier_symbols,
+        **constraint_fields(system, v),
     )
+
+
+def constraint_fields(system: EnergyForm, qdot: sp.Matrix) -> dict[str, Any]:
+    """Return the fields of `EquationsOfMotion` that constraints fill, with the coordinates' rates in velocities."""
+    m, t = len(system.multiplier_symbols), system.time
+    by_time = sp.Matrix(len(system.constraints), 1, [0 if t is None else sp.diff(f, t) for f in system.constraints])
+    rate = system.constraint_matrix * sp.Matrix(system.velocities) + by_time.col_join(system.velocity_rows[1])
+    gamma = rate.jacobian(system.coordinates) * qdot if m else rate
+    return {
+        "constraint_jacobian": system.constraint_matrix,
+        "constraint_acceleration": tidy_matrix(gamma if t is None or not m else gamma + sp.diff(rate, t)),
+        "constraints": sp.ImmutableMatrix(m, 1, [*system.constraints, *system.velocity_constraints]),
+        "multipliers": system.multiplier_symbols,
+    }
 
 
 def christoffel(M: Any, coordinates: Any, velocities: Any) -> sp.ImmutableMatrix:

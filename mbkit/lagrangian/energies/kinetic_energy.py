@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, Final
@@ -11,7 +11,8 @@ import mpmath
 import numpy as np
 import sympy as sp
 
-from mbkit.errors import InputError
+from mbkit._warn import warn
+from mbkit.errors import InputError, MbkitWarning
 from mbkit.lagrangian.trig.simplify import DIGITS, LARGE, RandomEvaluation, tidy
 
 #: Lines through the velocities, and places on each.
@@ -90,22 +91,21 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
 # Whether every motion has kinetic energy, or is bound by a constraint.
 
 _PLACES: Final = 3
+#: Of its largest eigenvalue, what rounding leaves of one that is zero.
+_NEGATIVE: Final = 1e-12
 #: Letters of a matrix that a message shows.
 _SHOWN: Final = 200
 
 
-def require_inertia(
-    M: sp.ImmutableMatrix, coordinates: Sequence[sp.Symbol], velocities: Sequence[sp.Symbol], constraints: Sequence[Any]
-) -> None:
+def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: sp.ImmutableMatrix) -> None:
     """Refuse a mass matrix that is singular everywhere, unless constraints bind its massless directions (InputError).
 
     M + Jᵀ J has an inverse exactly where M v̇ - Jᵀ λ = f, J v̇ = -γ determines v̇.
     """
     n = len(velocities)
-    J = sp.Matrix(len(constraints), 1, list(constraints)).jacobian(coordinates) if constraints else sp.zeros(0, n)
     idle = [w for i, w in enumerate(velocities) if not any(M[i, :]) and not any(J[:, i])]
     if idle:
-        bound = " and no constraint holds its coordinate" if constraints else ""
+        bound = " and no constraint holds its coordinate" if J else ""
         names = ", ".join(w.name for w in idle)
         raise InputError(f"T: the mass matrix is singular everywhere: no kinetic energy has {names}{bound}")
     probe = RandomEvaluation([*M, *J])
@@ -139,6 +139,29 @@ def _unmoved(A: Any, velocities: Sequence[sp.Symbol]) -> str:
     _, _, V = np.linalg.svd(np.array(A.tolist(), dtype=complex))
     names = [w.name for w, x in zip(velocities, V[-1], strict=True) if abs(x) > 1e-6]
     return names[0] if len(names) == 1 else f"{', '.join(names)} together"
+
+
+def warn_of_negative(
+    M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], values: Mapping[sp.Symbol, float | None]
+) -> None:
+    """Warn of a mass matrix that is negative along some velocity wherever it is looked at.
+
+    Where a parameter in it has no value, nothing is known.
+    """
+    held = {s: values[s] for s in M.free_symbols if s in values}
+    if None in held.values():
+        return
+    probe, n, way = RandomEvaluation([*M]), len(velocities), None
+    for seed in range(2 * _PLACES):
+        found = probe({**probe.place(seed), **{s: mpmath.mpf(x) for s, x in held.items()}})
+        if found is None or any(mpmath.im(x) for x in found):
+            return
+        sizes, ways = np.linalg.eigh(np.array(found, dtype=float).reshape(n, n))
+        if sizes[0] >= -_NEGATIVE * abs(sizes[-1]):
+            return
+        way = ways[:, 0]
+    names = [w.name for w, x in zip(velocities, way, strict=True) if abs(x) > 1e-6]  # type: ignore[arg-type]
+    warn(f"T: a motion of {', '.join(names)} has negative kinetic energy; no mass or inertia does that", MbkitWarning)
 
 
 # The inverse of a matrix in symbols, block by block.

@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import sympy as sp
-from sympy.core.function import AppliedUndef
+from sympy.core.function import AppliedUndef, UndefinedFunction
 
 from mbkit.errors import InputError
 
@@ -111,7 +111,7 @@ class PlainSymbols:
         # A derivative before the function in it.
         order = sorted(self._map, key=lambda x: not isinstance(x, sp.Derivative))
         out = by_name(out.subs([(x, self._map[x]) for x in order]), self._named)
-        left = [*out.atoms(sp.Derivative), *out.atoms(AppliedUndef)]
+        left = undefined(out, [*self._named.values()])
         if left:
             raise InputError(
                 f"{what}: {left[0]} is no coordinate or velocity here; the coordinates are "
@@ -120,13 +120,22 @@ class PlainSymbols:
         return out
 
 
+def undefined(x: sp.Expr, known: Iterable[sp.Symbol]) -> list[sp.Expr]:
+    """Return derivatives and undefined functions in an expression but those of known symbols, such as J(theta)."""
+    symbols = set(known)
+    found = [*x.atoms(sp.Derivative), *x.atoms(AppliedUndef)]
+    return [f for f in found if not (f.free_symbols and f.free_symbols <= symbols)]
+
+
 def plain(names: Iterable[sp.Symbol]) -> str:
     """Return names as a list to read."""
     return ", ".join(sorted(s.name for s in names))
 
 
 def name_of(value: Any) -> str:
-    """Return the name of a coordinate: of a symbol, a dynamicsymbol, or the name itself."""
+    """Return the name of a coordinate or function: of a symbol, a dynamicsymbol, or the name itself."""
+    if isinstance(value, UndefinedFunction):
+        return str(value.__name__)
     return (
         value if isinstance(value, str) else str(getattr(value, "func", value) if getattr(value, "args", ()) else value)
     )

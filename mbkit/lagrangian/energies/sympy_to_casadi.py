@@ -8,10 +8,12 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 import sympy as sp
+from sympy.core.function import AppliedUndef
 
 from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
 from mbkit.errors import UnsupportedError
+from mbkit.lagrangian.energies.symbols import name_of
 
 _SAME_NAME: Final = "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log sign"
 _UNARY: Final[dict[Any, Callable[[Any], Any]]] = {
@@ -70,6 +72,10 @@ class Conversion:
             return out
         if x.func is sp.Piecewise:
             return self._pieces(x)
+        if isinstance(x, (AppliedUndef, sp.Derivative)):
+            raise UnsupportedError(
+                f"{x}: an undefined function has no value; give it one with substituted({{{name_of(x)}: ...}})"
+            )
         raise UnsupportedError(
             f"{x.func}: no engine computes this function; there are powers, sin, cos, tan, their inverses, "
             "sinh, cosh, tanh and theirs, exp, log, Abs, sign, Min, Max and Piecewise"

@@ -191,7 +191,7 @@ class SystemSummary:
         out["gravity"] = [text(x) for x in e.potential_gradient]
         out["drift"] = [text(x) for x in e.drift]
         out["forces"] = [text(x) for x in e.forces]
-        out["constraints"] = [text(x) for x in s.constraints]
+        out |= {n: [text(x) for x in getattr(s, n)] for n in ("constraints", "velocity_constraints")}
         # Each equation alone: no letter is explained elsewhere.
         rows = self._equations(Abbreviations((), ()), latex=True)
         out["equations"] = [] if self.long else [f"{text(x.lhs)} = {text(x.rhs)}" for x in e.equations()]
@@ -230,7 +230,7 @@ def python_code(system: Lagrangian) -> str:
 
     Its functions take one state, and parameters by keyword. Constraints are refused (UnsupportedError).
     """
-    if system.constraints:
+    if system.multiplier_symbols:
         raise UnsupportedError(f"{system.name}: a system with constraints cannot be written as a Python module yet")
     e = system.equations()
     n = len(e.coordinates)

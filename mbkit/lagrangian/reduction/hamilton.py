@@ -94,11 +94,13 @@ def is_energy(system: EnergyForm) -> bool:
 
 
 def keeps_energy(system: EnergyForm) -> bool:
-    """Return whether h is constant: dh/dt = Qᵀ v - ∂L/∂t, and moving constraints do work too."""
+    """Return whether h is constant: dh/dt = Qᵀ v - ∂L/∂t + λᵀ J v, where J v = -a of constraints that move."""
     if system.time is not None:
         k, t = system.kinetic, system.time
         if not vanish(sp.diff(x, t) for x in (*k.M, *k.b, k.T0, system.V, *system.constraints)):
             return False
+    if not vanish(system.velocity_rows[1]):
+        return False
     power = sum((x * w for x, w in zip(acting_forces(system), system.velocities, strict=True)), sp.Integer(0))
     return vanish([power])
 
@@ -343,7 +345,7 @@ class Hamiltonian(Printable):
 
 def hamiltonian(system: EnergyForm) -> Hamiltonian:
     """Return H of a system; constraints are refused (UnsupportedError), as no H holds their forces."""
-    if system.constraints:
+    if system.multiplier_symbols:
         raise UnsupportedError(
             f"hamiltonian: {system.name} has constraints, whose forces no H holds; embed them first, or leave them out"
         )

@@ -22,7 +22,7 @@ from sympy.core.function import AppliedUndef
 
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities, read_expression, symbols_of
-from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion
+from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, constraint_fields
 from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, inverse
 from mbkit.lagrangian.energies.symbols import fits
 from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
@@ -75,6 +75,7 @@ def quasi_equations(system: EnergyForm, quasi: QuasiVelocities) -> QuasiEquation
         drift=tidy_matrix(drift),
         potential_gradient=tidy_matrix(_along(quasi, system.V)),
         forces=tidy_matrix(sp.Matrix(system.forces) + quasi.input_forces - friction),
+        **constraint_fields(system, quasi.D * v),
         D=quasi.D,
         rates=quasi.rates,
         hamel_coefficients=gamma,
@@ -112,7 +113,8 @@ def in_quasi_velocities(system: EnergyForm, D: Any, names: Any) -> tuple[dict[st
     """Return the arguments of the system in velocities w with q̇ = D w, the parts of its T, and D with its inverse."""
     if system.constraints:
         raise UnsupportedError(
-            f"quasi_velocities: {system.name} has constraints, whose multipliers act on coordinates; embed them first"
+            f"quasi_velocities: {system.name} has holonomic constraints; embed them first, or write their rates as "
+            "velocity_constraints"
         )
     D = tidy_matrix(_checked(system, D))
     W, w, k = inverse(D, "D"), _named(system, names), system.kinetic
@@ -131,6 +133,7 @@ def in_quasi_velocities(system: EnergyForm, D: Any, names: Any) -> tuple[dict[st
         "forces": dict(zip(system.coordinates, forces, strict=True)),
         "dissipation": tidy(system.dissipation.subs(rates, simultaneous=True)),
         "parameters": system.parameters,
+        "velocity_constraints": [tidy(x.subs(rates, simultaneous=True)) for x in system.velocity_constraints],
         "name": system.name,
     }
     quasi = QuasiVelocities(D, W, system.coordinates, system.velocities, tidy_matrix(D.T * sp.Matrix(inputs)))

@@ -4,10 +4,11 @@ With the cyclic coordinates' velocities u, those of the others v, and M, b of T 
 constant where nothing acts, and R = L - pᵀ u with u eliminated is the Lagrangian of the others (Goldstein, Poole, Safko
 2002, ch. 8.3, where it has the other sign; Lanczos 1970, ch. V.4)::
 
-    R = ½ vᵀ (Mᵥᵥ - Mᵥᵤ Mᵤᵤ⁻¹ Mᵤᵥ) v  +  vᵀ (bᵥ + Mᵥᵤ Mᵤᵤ⁻¹ (p - bᵤ))  +  T0  -  Vₑ
-    Vₑ = V + ½ (p - bᵤ)ᵀ Mᵤᵤ⁻¹ (p - bᵤ)
+    R = ½ vᵀ (Mᵥᵥ - Mᵥᵤ Mᵤᵤ⁻¹ Mᵤᵥ) v  +  vᵀ (bᵥ + Mᵥᵤ Mᵤᵤ⁻¹ (p - bᵤ))  -  Vₑ
+    Vₑ = V + ½ (p - bᵤ)ᵀ Mᵤᵤ⁻¹ (p - bᵤ) - T0
 
-The term linear in v makes gyroscopic forces, and Vₑ is the effective potential.
+The term linear in v makes gyroscopic forces, and Vₑ is the effective potential. T0, of axes that turn at a given rate,
+is part of it; the reduced Lagrangian keeps it in its T.
 """
 
 from __future__ import annotations
@@ -89,8 +90,9 @@ class Routhian(Printable, Generic[FormT]):
 
     @property
     def effective_potential(self) -> sp.Expr:
-        """Vₑ, which is V and the part of the constant momenta."""
-        return self.lagrangian.V
+        """Vₑ = V + ½ (p - bᵤ)ᵀ Mᵤᵤ⁻¹ (p - bᵤ) - T0, whose stationary points are the steady motions."""
+        V, T0 = self.lagrangian.V, self.lagrangian.kinetic.T0
+        return V if T0 == 0 else tidy(V - T0)
 
     @cached_property
     def _places(self) -> tuple[list[int], list[int]]:
@@ -196,6 +198,7 @@ def routhian(system: FormT, cyclic: Any = None) -> Routhian[FormT]:
         dissipation=tidy(system.dissipation),
         parameters={**system.parameters, **dict.fromkeys(symbols)},
         constraints=system.constraints,
+        velocity_constraints=system.velocity_constraints,
         name=f"{system.name} less {', '.join(q.name for q in ignored)}",
     )
     definitions = dict(zip(symbols, (system.momenta[i] for i in c), strict=True))

@@ -17,6 +17,7 @@ import mpmath
 import sympy as sp
 from mpmath.libmp import NoConvergence
 from numpy.random import default_rng
+from sympy.core.function import AppliedUndef
 from sympy.functions.elementary.trigonometric import TrigonometricFunction
 
 from mbkit.errors import UnsupportedError
@@ -318,6 +319,11 @@ class RandomEvaluation:
     """Expressions as numbers at random places, of their symbols and of further ones."""
 
     def __init__(self, expressions: Sequence[sp.Expr], symbols: Iterable[sp.Symbol] = ()) -> None:
+        # A function that is not given, and each of its derivatives, may have any value.
+        unknown = {f for x in expressions for f in (*x.atoms(sp.Derivative), *x.atoms(AppliedUndef))}
+        values = {f: sp.Dummy(str(f)) for f in sorted(unknown, key=lambda f: (not f.is_Derivative, str(f)))}
+        for f, value in values.items():
+            expressions = [x.xreplace({f: value}) for x in expressions]
         held: set[Any] = set(symbols).union(*(x.free_symbols for x in expressions))
         self.symbols = sorted(held, key=lambda s: (s.name, str(s)))
         dummies = {s: sp.Dummy() for s in self.symbols}

@@ -88,10 +88,10 @@ def _poses(problem: IntegrationProblem, record: GridRecord) -> tuple[str, ...]:
 
 def midpoint_of(dyn: LagrangianDynamics) -> Midpoint:
     """Return the parts of a step of these dynamics; `UnsupportedError` for rows that hold velocities alone."""
-    if dyn.model.no_slip:
+    if dyn.model.holds_velocities:
         raise UnsupportedError(
-            f"implicit_midpoint: {dyn.model.name} has contacts without slip, {dyn.model.no_slip[0].name!r} first, "
-            f"whose motion keeps no symplectic form; {IMPLICIT_METHODS} are the implicit methods for it"
+            f"implicit_midpoint: {dyn.model.name} has constraints of velocities, {dyn.velocity_constraint_names[0]} "
+            f"first, whose motion keeps no symplectic form; {IMPLICIT_METHODS} are the implicit methods for it"
         )
     return (ConstrainedMidpoint if dyn.model.constrained else Midpoint)(dyn.equations)
 

@@ -1,0 +1,376 @@
+"""Velocity constraints on paper: rolling and blades against closed forms, and three eliminations against each other."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.integrate import solve_ivp
+
+import mbkit as mb
+from mbkit.errors import InputError, UnsupportedError
+from mbkit.lagrangian import Lagrangian, NonholonomicEquations
+
+EPS = float(np.finfo(float).eps)
+# A run of some hundred adaptive steps at 1e-13.
+CLOSE = 1e-11
+x, y, phi, theta, psi, t = sp.symbols("x y phi theta psi t")
+xdot, ydot, u, w, s = sp.symbols("xdot ydot phidot thetadot psidot")
+m, J, a, r, g, I1, I3, slope, Omega = sp.symbols("m J a r g I1 I3 alpha Omega")
+WAYS = ("maggi", "boltzmann_hamel", "appell")
+HEADING = {"v": xdot * sp.cos(theta) + ydot * sp.sin(theta), "omega": w}
+
+
+def sleigh() -> Lagrangian:
+    """Chaplygin's sleigh: a blade at (x, y), its centre of mass at `a` before it."""
+    speed = (xdot - a * sp.sin(theta) * w) ** 2 + (ydot + a * sp.cos(theta) * w) ** 2
+    return Lagrangian(
+        m * speed / 2 + J * w**2 / 2,
+        0,
+        [x, y, theta],
+        parameters={m: 1.3, J: 0.4, a: 0.3},
+        velocity_constraints=[ydot * sp.cos(theta) - xdot * sp.sin(theta)],
+        name="sleigh",
+    )
+
+
+def disc(i1: float = 0.25, i3: float = 0.5) -> Lagrangian:
+    """A disc of mass 1 and radius 1 with the contact (x, y), heading phi, tilt theta and spin psi."""
+    centre = sp.Matrix([x - r * sp.sin(theta) * sp.sin(phi), y + r * sp.sin(theta) * sp.cos(phi), r * sp.cos(theta)])
+    speed = centre.jacobian([x, y, phi, theta]) * sp.Matrix([xdot, ydot, u, w])
+    T = m * speed.dot(speed) / 2 + I1 * (w**2 + (u * sp.cos(theta)) ** 2) / 2 + I3 * (s + u * sp.sin(theta)) ** 2 / 2
+    return Lagrangian(
+        T,
+        m * g * centre[2],
+        [x, y, phi, theta, psi],
+        parameters={m: 1.0, r: 1.0, g: 9.81, I1: i1, I3: i3},
+        velocity_constraints=[xdot + r * s * sp.cos(phi), sp.Eq(ydot, -r * s * sp.sin(phi))],
+        name="disc",
+    )
+
+
+def knife() -> Lagrangian:
+    """A knife edge on a slope, down which x points."""
+    T, V = m * (xdot**2 + ydot**2) / 2 + J * w**2 / 2, -m * g * sp.sin(slope) * x
+    return Lagrangian(
+        T,
+        V,
+        [x, y, theta],
+        parameters={m: 0.7, J: 0.2, g: 9.81, slope: 0.4},
+        velocity_constraints=[xdot * sp.sin(theta) - ydot * sp.cos(theta)],
+        name="knife edge",
+    )
+
+
+def ball() -> Lagrangian:
+    """A homogeneous ball on a table that turns; its axes by three angles about z, x, z."""
+    rates = sp.Matrix(
+        [
+            w * sp.cos(phi) + s * sp.sin(phi) * sp.sin(theta),
+            w * sp.sin(phi) - s * sp.cos(phi) * sp.sin(theta),
+            u + s * sp.cos(theta),
+        ]
+    )
+    T = m * (xdot**2 + ydot**2) / 2 + m * r**2 * rates.dot(rates) / 5
+    return Lagrangian(
+        T,
+        0,
+        [x, y, phi, theta, psi],
+        parameters={m: 0.5, r: 0.2, Omega: 1.5},
+        velocity_constraints=[xdot - r * rates[1] + Omega * y, ydot + r * rates[0] - Omega * x],
+        name="ball",
+    )
+
+
+def run(lag: Lagrangian, q, v, duration: float, **options):
+    method = {"method": "rk853", "rtol": 1e-13, "atol": 1e-13} | options
+    return mb.simulate(lag.dynamics(), q, v, duration=duration, **method)
+
+
+# Closed forms
+
+
+@pytest.mark.parametrize("method", ["rk853", "rodas5", "dop853"])
+def test_the_sleigh_follows_its_closed_form(method) -> None:
+    lag, q = sleigh(), np.array([0.1, 0.2, 0.3])
+    q, v = lag.project(q, [1.0, 0.2, 0.5])
+    along, turn, I = float(v[0] * np.cos(q[2]) + v[1] * np.sin(q[2])), float(v[2]), 0.4 + 1.3 * 0.3**2
+    end = run(lag, q, v, 3.0, method=method, **({"rtol": 1e-12, "atol": 1e-12} if method != "rk853" else {}))
+    # v' = a omega², (J + m a²) omega' = -m a v omega: on v² + I/m omega² = E², as tanh and sech.
+    E = np.hypot(along, np.sqrt(I / 1.3) * turn)
+    at = np.arctanh(along / E) + 0.3 * E * 1.3 / I * 3.0
+    got = end.v[-1, 0] * np.cos(end.q[-1, 2]) + end.v[-1, 1] * np.sin(end.q[-1, 2])
+    # At its own tolerance rodas5 leaves some 1e-11 of each second.
+    assert [got, end.v[-1, 2]] == pytest.approx([E * np.tanh(at), E * np.sqrt(1.3 / I) / np.cosh(at)], abs=1e-10)
+    assert lag.constraint(end.q[-1]).shape == (0,)
+
+
+def test_a_knife_edge_on_a_slope_draws_a_cycloid() -> None:
+    rate, force = 2.0, 9.81 * np.sin(0.4)
+    out = run(knife(), [0.0, 0.0, 0.0], [0.0, 0.0, rate], 4.0)
+    turned = rate * out.t
+    expected = force / (2 * rate**2) * np.stack([np.sin(turned) ** 2, turned - np.sin(2 * turned) / 2], axis=1)
+    assert out.q[:, :2] == pytest.approx(expected, abs=CLOSE)
+
+
+def test_a_ball_on_a_turning_table_goes_in_circles_at_two_sevenths_of_its_rate() -> None:
+    lag = ball()
+    q, v = lag.project([1.0, 0.3, 0.2, 1.4, 0.1], [0.4, -0.1, 0.3, 0.2, 0.5])
+    out = run(lag, q, v, 2.0)
+    turn = 2 / 7 * 1.5
+    # v' = (2/7) Omega z × v.
+    c, d = np.cos(turn * out.t), np.sin(turn * out.t)
+    expected = np.stack([v[0] * c - v[1] * d, v[0] * d + v[1] * c], axis=1)
+    assert out.v[:, :2] == pytest.approx(expected, abs=CLOSE)
+    middle = q[:2] + np.array([-v[1], v[0]]) / turn
+    assert np.linalg.norm(out.q[:, :2] - middle, axis=1) == pytest.approx(np.linalg.norm(v[:2]) / turn, abs=CLOSE)
+
+
+def test_a_disc_keeps_its_steady_motion() -> None:
+    lag, tilt, heading = disc(), 0.3, 1.7
+    # phi' cos θ (phi' (I1 - I3 - m r²) sin θ - psi' (I3 + m r²)) = m g r sin θ (Neimark and Fufaev 1972, ch. VI).
+    spin = ((0.25 - 1.5) * heading * np.sin(tilt) - 9.81 * np.tan(tilt) / heading) / 1.5
+    q = np.array([0.0, 0.0, 0.4, tilt, 0.0])
+    v = np.array([-spin * np.cos(0.4), -spin * np.sin(0.4), heading, 0.0, spin])
+    assert lag.dynamics().forward_dynamics(q, v, np.zeros(5))[2:] == pytest.approx(np.zeros(3), abs=100 * EPS)
+    out = run(lag, q, v, 2.0)
+    assert out.q[:, 3] == pytest.approx(tilt, abs=CLOSE)
+    middle = q[:2] + spin / heading * np.array([np.sin(0.4), -np.cos(0.4)])
+    assert np.linalg.norm(out.q[:, :2] - middle, axis=1) == pytest.approx(abs(spin / heading), abs=CLOSE)
+
+
+@pytest.mark.parametrize(("i1", "i3"), [(0.25, 0.5), (0.5, 1.0)])
+def test_a_disc_rolls_upright_above_its_limit_only(i1, i3) -> None:
+    # Ω² > I1 m g r / (I3 (I3 + m r²)), g/(3 r) of a thin disc (Routh 1905, Advanced Rigid Dynamics, art. 244).
+    limit = np.sqrt(i1 * 9.81 / (i3 * (i3 + 1.0)))
+    e = disc(i1, i3).maggi()
+    for factor, stable in ((0.999, False), (1.001, True)):
+        rate = factor * limit
+        f, at = e.field(), np.zeros(8)
+        at[7] = rate
+        # ∂f/∂(θ, φ', θ') by central differences; θ is the fourth coordinate.
+        places, h = (3, 5, 6), 1e-5
+        A = np.array([(f(0.0, at + h * np.eye(8)[k]) - f(0.0, at - h * np.eye(8)[k]))[[3, 5, 6]] for k in places]).T
+        A /= 2 * h
+        # At the limit the square of the eigenvalue is zero; a thousandth beside it leaves some 0.1.
+        assert bool(np.linalg.eigvals(A).real.max() < 1e-3) is stable
+
+
+# Three eliminations, the multipliers and the oracle
+
+
+def made(seed: int, moving: bool) -> Lagrangian:
+    """Return a system of four coordinates with one or two rows, of random numbers."""
+    rng = np.random.default_rng(seed)
+    q, v = sp.symbols("q1:5"), sp.symbols("q1dot q2dot q3dot q4dot")
+    v = sp.symbols("qdot1:5")
+
+    def number() -> sp.Rational:
+        return sp.Rational(int(rng.integers(-9, 10)), 10)
+
+    def wave() -> sp.Expr:
+        return number() * sp.sin(q[rng.integers(4)] + number()) + number() * q[rng.integers(4)]
+
+    shifts = [wave() for _ in range(3)]
+    T = sum((3 + number()) * x**2 for x in v) / 2 + sum((v[k] * shifts[k] + v[3]) ** 2 for k in range(3)) / 4
+    if moving:
+        T += v[0] * wave() + wave() ** 2 * (1 + t / 5)
+    V = sum(wave() ** 2 for _ in range(2))
+    rows = [v[k] + sum(wave() * v[j] for j in (2, 3)) for k in range(1 + seed % 2)]
+    if moving:
+        rows = [row + wave() + number() * t for row in rows]
+    return Lagrangian(
+        T, V, q, v, time=t if moving else None, dissipation=sum(x**2 for x in v) / 9, velocity_constraints=rows
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("moving", [False, True])
+def test_each_elimination_is_the_motion_with_multipliers(seed, way, moving) -> None:
+    lag, rng = made(seed, moving), np.random.default_rng(seed)
+    if moving and way == "boltzmann_hamel":
+        with pytest.raises(UnsupportedError, match="that move"):
+            lag.boltzmann_hamel()
+        return
+    e, now = getattr(lag, way)(), 0.3 if moving else 0.0
+    q, v = lag.project(rng.uniform(-1, 1, 4), rng.uniform(-1, 1, 4), t=now)
+    w = e.to_quasi_velocity(q, v, t=now)
+    assert e.to_velocity(q, w, t=now) == pytest.approx(v, abs=20 * EPS)
+    tau = rng.uniform(-1, 1, 4)
+    rate = e.field(tau)(now, np.concatenate([q, w]))
+    dyn = lag.dynamics().at(t=now) if moving else lag.dynamics()
+    exact = lag.dynamics("oracle").at(t=now) if moving else lag.dynamics("oracle")
+    vdot = exact.forward_dynamics(q, v, tau)
+    # Coordinates' rates stay in w, so that ẇ is part of v̇.
+    kept = [lag.velocities.index(x) for x in e.velocities]
+    assert rate[:4] == pytest.approx(v, abs=20 * EPS)
+    scale = np.abs(vdot).max()
+    assert rate[4:] == pytest.approx(vdot[kept], abs=1e3 * EPS * scale)
+    assert dyn.forward_dynamics(q, v, tau) == pytest.approx(vdot, abs=1e3 * EPS * scale)
+    symbols = [*lag.coordinates, *e.velocities, *e.accelerations, *([t] if moving else [])]
+    place = dict(zip(symbols, [*q, *w, *(exact.forward_dynamics(q, v, 0 * tau)[kept]), now], strict=False))
+    reactions = [float(row.subs(place)) for row in e.reactions]
+    assert reactions == pytest.approx(lag.multipliers(q, v, t=now), abs=1e3 * EPS * max(1, scale))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_without_motion_of_the_rows_the_mass_matrix_rate_less_2_c_is_skew(seed) -> None:
+    e = made(seed, False).maggi()
+    rng, h = np.random.default_rng(seed), 1e-6
+    state = rng.uniform(-1, 1, 4 + len(e.velocities))
+    M, C = (sp.lambdify([*e.coordinates, *e.velocities], A) for A in (e.mass_matrix, e.coriolis_matrix))
+    rate = e.field()(0.0, state)[:4]
+    by = np.concatenate([rate, np.zeros(len(e.velocities))])
+    Mdot = (M(*(state + h * by)) - M(*(state - h * by))) / (2 * h)
+    skew = Mdot - 2 * C(*state)
+    assert skew + skew.T == pytest.approx(np.zeros_like(skew), abs=1e-8)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_quasi_velocities_by_definition_give_the_textbook_sleigh(way) -> None:
+    e = getattr(sleigh(), way)(HEADING)
+    v, omega, vdot, omegadot = (*e.velocities, *e.accelerations)
+    rows = [m * vdot - m * a * omega**2, (J + m * a**2) * omegadot + m * a * v * omega]
+    assert [sp.expand(eq.lhs - eq.rhs - row) for eq, row in zip(e.equations(), rows, strict=True)] == [0, 0]
+    assert [sp.simplify(eq.rhs) for eq in e.kinematics()] == [v * sp.cos(theta), v * sp.sin(theta), omega]
+    assert sp.expand(e.reactions[0] - m * (a * omegadot + v * omega)) == 0
+    assert e.determinant.free_symbols == set()
+    assert pickle.loads(pickle.dumps(e)).equations() == e.equations()
+    assert r"\dot{\omega}" in e.latex()
+
+
+def test_the_reduced_form_runs_to_the_same_end() -> None:
+    lag = disc()
+    e, q = lag.maggi(), [0.1, 0.2, 0.3, 0.2, 0.4]
+    q, v = lag.project(q, [0.0, 0.0, 1.0, 0.3, 4.0])
+    out = run(lag, q, v, 1.0)
+    y0 = np.concatenate([q, e.to_quasi_velocity(q, v)])
+    end = solve_ivp(e.field(), (0, 1), y0, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    assert end[:5] == pytest.approx(out.q[-1], abs=1e-9)
+    assert e.to_velocity(end[:5], end[5:]) == pytest.approx(out.v[-1], abs=1e-9)
+
+
+def test_rows_put_into_t_before_give_other_equations() -> None:
+    lag = sleigh()
+    e = lag.maggi(HEADING)
+    v, omega = e.velocities
+    # Naive: T with the blade's row in it has no term in v omega, and the sleigh goes straight on for ever.
+    naive = sp.expand(lag.T.subs({xdot: v * sp.cos(theta), ydot: v * sp.sin(theta), w: omega}))
+    naive = sp.simplify(naive)
+    assert sp.simplify(naive - (m * v**2 + (J + m * a**2) * omega**2) / 2) == 0
+    assert e.coriolis_force != sp.zeros(2, 1)
+
+
+# What is constant, and what is integrable
+
+
+def test_integrability_tells_rolling_on_a_line_from_rolling_in_a_plane() -> None:
+    assert not disc().integrability().holonomic
+    assert disc().integrability().growth == (3, 4, 5)
+    assert sleigh().integrability().integrable == (False,)
+    T = m * xdot**2 / 2 + m * ydot**2 / 2 + J * w**2 / 2
+    line = Lagrangian(T, 0, [x, y, theta], parameters=[m, J, r], velocity_constraints=[xdot - r * w])
+    assert line.integrability().holonomic
+    # sin θ (y ẋ - x ẏ) is integrable by the factor 1/y².
+    factor = Lagrangian(
+        T, 0, [x, y, theta], parameters=[m, J], velocity_constraints=[sp.sin(theta) * (y * xdot - x * ydot)]
+    )
+    assert factor.integrability().integrable == (True,)
+    assert "1 function of the coordinates is constant" in str(factor.integrability())
+    # Two rows: the first is integrable with the second, which holds dθ, and the pair leaves one.
+    pair = Lagrangian(
+        T, 0, [x, y, theta], parameters=[m, J], velocity_constraints=[ydot - theta * xdot, w - sp.Integer(2) * xdot]
+    )
+    assert pair.integrability().holonomic
+    moving = Lagrangian(T, 0, [x, y, theta], time=t, parameters=[m, J], velocity_constraints=[ydot - t * xdot])
+    assert not moving.integrability().holonomic
+
+
+def test_momenta_along_symmetries_that_the_rows_allow_are_constant() -> None:
+    T = m * (xdot**2 + ydot**2) / 2 + J * w**2 / 2
+    lag = Lagrangian(
+        T,
+        m * g * y,
+        [x, y, theta],
+        parameters={m: 1.0, J: 0.5, r: 0.3, g: 9.81},
+        velocity_constraints=[xdot - r * w + ydot * sp.sin(y)],
+    )
+    (energy, momentum) = lag.conserved_quantities()
+    assert energy.name == "E"
+    assert sp.expand(momentum.expression - (r * m * xdot + J * w)) == 0
+    q, v = lag.project([0.1, 0.4, 0.2], [1.0, -0.5, 2.0])
+    out = run(lag, q, v, 1.0)
+    values = 0.3 * out.v[:, 0] + 0.5 * out.v[:, 2]
+    assert values == pytest.approx(values[0], abs=CLOSE)
+    assert [k.name for k in sleigh().conserved_quantities()] == ["E"]
+    # Rows that move feed energy; the spin about the vertical is constant.
+    assert [k.name for k in ball().conserved_quantities()] == ["p_phi"]
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([xdot * ydot], "linear in the velocities"),
+        ([x - y], "holds none of the velocities"),
+        ([xdot - ydot, 2 * ydot - 2 * xdot], "follow from each other"),
+        (5, "expected a list of expressions"),
+        ([xdot - sp.Symbol("k") * ydot], "is not declared"),
+    ],
+)
+def test_bad_rows_are_refused(rows, message) -> None:
+    T = m * (xdot**2 + ydot**2 + w**2) / 2
+    with pytest.raises(InputError, match=message):
+        Lagrangian(T, 0, [x, y, theta], parameters=[m], velocity_constraints=rows).maggi()
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ([x, y, theta], "expected 2, one for each degree of freedom, got 3"),
+        (["z", "x"], "z is no coordinate"),
+        ({"v": xdot * w, "omega": w}, "a sum of velocities"),
+        ({"x": xdot, "omega": w}, "stands for something else"),
+        ({"v": ydot * sp.cos(theta) - xdot * sp.sin(theta), "omega": w}, "singular everywhere"),
+    ],
+)
+def test_bad_choices_are_refused(choice, message) -> None:
+    with pytest.raises(InputError, match=message):
+        sleigh().maggi(choice)
+
+
+def test_what_velocity_constraints_cannot_have_is_refused() -> None:
+    lag = sleigh()
+    with pytest.raises(UnsupportedError, match="whose forces no H holds"):
+        lag.hamiltonian()
+    with pytest.raises(UnsupportedError, match="velocity constraints, which bind no coordinates"):
+        lag.embedded()
+    q, v = lag.project([0, 0, 0], [1, 0, 0.2])
+    with pytest.raises(UnsupportedError, match=r"velocity_constraints\[0\]"):
+        mb.simulate(lag.dynamics(), q, v, dt=0.1, duration=1, method="implicit_midpoint")
+    with pytest.raises(UnsupportedError, match="no velocity constraints"):
+        Lagrangian(m * xdot**2, 0, [x], parameters=[m]).maggi()
+    with pytest.raises(InputError, match="nearest consistent state"):
+        mb.simulate(lag.dynamics(), [0, 0, 0], [0, 1, 0], dt=0.1, duration=1)
+
+
+def test_a_system_with_velocity_constraints_keeps_them_in_its_variants() -> None:
+    lag = sleigh()
+    again = pickle.loads(pickle.dumps(lag))
+    assert again.velocity_constraints == lag.velocity_constraints
+    assert again.model.digest == lag.model.digest != knife().model.digest
+    less = lag.substituted({a: 0.25})
+    assert isinstance(less.maggi(), NonholonomicEquations)
+    w1, w2, w3 = sp.symbols("w1 w2 w3")
+    D = sp.Matrix([[sp.cos(theta), -sp.sin(theta), 0], [sp.sin(theta), sp.cos(theta), 0], [0, 0, 1]])
+    turned = lag.quasi_velocities(D, [w1, w2, w3])
+    assert turned.velocity_constraints == (w2,)
+    q, v = np.array([0.1, 0.2, 0.3]), np.array([1.0, 0.0, 0.5])
+    vdot = turned.dynamics().forward_dynamics(q, v, np.zeros(3))
+    assert vdot == pytest.approx([0.3 * 0.25, 0.0, -1.3 * 0.3 * 0.5 / (0.4 + 1.3 * 0.09)], abs=20 * EPS)
+    assert turned.maggi().equations() == lag.maggi().equations()
