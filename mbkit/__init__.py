@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
     from mbkit.engines import engine as engine
+    from mbkit.engines.consistent.impacts import Impact as Impact
+    from mbkit.engines.consistent.impacts import impact as impact
     from mbkit.engines.operational_space import OperationalSpace as OperationalSpace
     from mbkit.engines.operational_space import operational_space as operational_space
     from mbkit.errors import MbkitError as MbkitError
@@ -61,6 +63,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "Dynamics": "mbkit.engines",
+    "Impact": "mbkit.engines.consistent.impacts",
     "MbkitError": "mbkit.errors",
     "Mimic": "mbkit.model",
     "Model": "mbkit.model",
@@ -77,6 +80,7 @@ _HOME = {
     "excitation": "mbkit.identify",
     "explain": "mbkit.studies.explain",
     "identify": "mbkit.identify",
+    "impact": "mbkit.engines.consistent.impacts",
     "join": "mbkit.model.changes.joining",
     "load": "mbkit.load",
     "operational_space": "mbkit.engines.operational_space",

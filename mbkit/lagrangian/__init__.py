@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.reduction.hamilton import CanonicalEquations as CanonicalEquations
     from mbkit.lagrangian.reduction.hamilton import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.reduction.hamilton import Hamiltonian as Hamiltonian
+    from mbkit.lagrangian.reduction.impulses import ImpulseEquations as ImpulseEquations
     from mbkit.lagrangian.reduction.nonholonomic import Integrability as Integrability
     from mbkit.lagrangian.reduction.nonholonomic import NonholonomicEquations as NonholonomicEquations
     from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion as QuasiEquationsOfMotion
@@ -38,6 +39,7 @@ _HOME = {
     "EquationsOfMotion": "mbkit.lagrangian.energies.equations_of_motion",
     "Equilibrium": "mbkit.lagrangian.statics.equilibrium",
     "Hamiltonian": "mbkit.lagrangian.reduction.hamilton",
+    "ImpulseEquations": "mbkit.lagrangian.reduction.impulses",
     "Integrability": "mbkit.lagrangian.reduction.nonholonomic",
     "Lagrangian": "mbkit.lagrangian.system",
     "NonholonomicEquations": "mbkit.lagrangian.reduction.nonholonomic",

@@ -23,6 +23,7 @@ from mbkit.lagrangian.energy_model import EnergyModel, energies_latex
 from mbkit.lagrangian.independent_coordinates import Embedded
 from mbkit.lagrangian.reduction import hamilton
 from mbkit.lagrangian.reduction.hamilton import ConservedQuantity, Hamiltonian, hamiltonian
+from mbkit.lagrangian.reduction.impulses import ImpulseEquations, impulse_equations
 from mbkit.lagrangian.reduction.nonholonomic import (
     Integrability,
     NonholonomicEquations,
@@ -217,6 +218,33 @@ class Lagrangian(EnergyForm):
             No velocity constraints.
         """
         return integrability(self._in_rates)
+
+    # Impacts
+
+    def impulse(
+        self,
+        impulses: Mapping[Any, Any] | None = None,
+        *,
+        rows: Any = (),
+        restitution: Any = 0,
+    ) -> ImpulseEquations:
+        """Return the equations of an impact, which changes velocities at once: M (v⁺ - v⁻) = Ŝ + Jᵀ P.
+
+        Parameters
+        ----------
+        impulses : mapping of coordinate to sympy.Expr, optional
+            Ŝ, generalized impulses.
+        rows : sequence of sympy.Expr or sympy.Eq, optional
+            Linear in the velocities: a constraint that is imposed at once, or the approach of a contact.
+        restitution : sympy.Expr or float
+            e of Newton's law for `rows`: they are -e times what they were before.
+
+        Raises
+        ------
+        InputError
+            Neither impulses nor rows, rows that are not linear, e beyond 0 to 1.
+        """
+        return impulse_equations(self._in_rates, impulses, rows, restitution)
 
     # Running it
 

@@ -1,1 +1,1 @@
-"""States that constraints allow."""
+"""States and jumps of the velocity that constraints allow."""
