@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from mbkit.identify import excitation as excitation
     from mbkit.identify import identify as identify
     from mbkit.lagrangian.statics.equilibrium import equilibrium as equilibrium
+    from mbkit.lagrangian.statics.steady_motion import SteadyMotion as SteadyMotion
+    from mbkit.lagrangian.statics.steady_motion import steady_motion as steady_motion
     from mbkit.load import load as load
     from mbkit.load import robots as robots
     from mbkit.model import Mimic as Mimic
@@ -70,6 +72,7 @@ _HOME = {
     "ModelBuilder": "mbkit.model",
     "OperationalSpace": "mbkit.engines.operational_space",
     "Parameter": "mbkit.model",
+    "SteadyMotion": "mbkit.lagrangian.statics.steady_motion",
     "Trajectory": "mbkit.simulate",
     "compare": "mbkit.studies",
     "compare_parsers": "mbkit.studies.importers",
@@ -87,6 +90,7 @@ _HOME = {
     "robots": "mbkit.load",
     "scale": "mbkit.model.changes.freeing",
     "sensitivities": "mbkit.simulate",
+    "steady_motion": "mbkit.lagrangian.statics.steady_motion",
     "stress": "mbkit.studies",
     "variants": "mbkit.model.changes.variants",
     "versions": "mbkit.studies.versions",
