@@ -74,7 +74,7 @@ TEXTS = {
     "less_than": (b'<robot name="<"/>', "line 1, column 14: .*&lt;"),
     "broken_utf8": (b'<robot name="\xff\xfe"/>', "line 1, column 14: .*0xff.*UTF-8"),
     "null_character": (b'<robot name="r\x00"/>', "line 1, column 15: .*0x00"),
-    "sdf": (b'<sdf version="1.6"/>', "root element is <sdf>; expected <robot>"),
+    "sdf": (b'<sdf version="1.6"/>', r"this is SDF; give its file a name that ends in \.sdf"),
     "html": (b"<html><body/></html>", "root element is <html>"),
     "nested": (b"<robot>" + b"<link>" * 100_000, "nested more than 250 deep"),
     "nested_a_little": (b"<robot>" + b"<link>" * 251, "nested more than 250 deep"),
@@ -648,7 +648,6 @@ def test_damaged_values_never_crash(tmp_path, data):
     ("source", "words"),
     [
         ("~/no_such_file_here.urdf", str(Path.home() / "no_such_file_here.urdf")),
-        ("robot.sdf", "this is SDF; export it"),
         (Path("scene.usda"), "this is OpenUSD"),
         ("arm.urdf.xacro", "no such file"),
         (" <robot name='x'/>", "the text given"),

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from mbkit._check import Array
-from mbkit.errors import UnsupportedError
+from mbkit._check import Array, finite_array
+from mbkit.errors import LoadError, ModelError, UnsupportedError
+from mbkit.load.xml_reader import Element
 from mbkit.load.xml_reader import unused as unused
-from mbkit.model import Body, Coupler, Joint, Loop, Model
+from mbkit.model import Body, Coupler, Joint, Loop, Model, ModelBuilder
 from mbkit.model.joint_types import kind_of
 
 
@@ -43,6 +44,8 @@ IMPORTERS = {
     "mujoco": Importer("mbkit.engines.mujoco.importer", "mujoco", "mujoco", "mujoco"),
     "drake": Importer("mbkit.engines.drake.importer", "pydrake", "drake", "mbkit[drake]"),
 }
+#: Whose importer reads SDF.
+_OF_SDF: Final = "drake"
 #: The largest number that mbkit's own loaders take.
 _MAX_NUMBER: Final = 1e30
 
@@ -145,6 +148,25 @@ def check_installed(engine: str) -> None:
         installed = False
     if not installed:
         raise UnsupportedError(f"{engine} is not installed (no module {library!r}); pip install {package}")
+
+
+def model_of_sdf(
+    root: Element, source: str, path: str, floating_base: bool, nonphysical: Literal["error", "warn"], gravity: Any
+) -> Model:
+    """Return the model of an <sdf> element; for the arguments see `mbkit.load`, `source` is a file or a text."""
+    models = root.all("model")
+    if len(models) != 1 or len(root.children) != 1:
+        there = ", ".join(f"<{x.tag[:60]}>" for x in root.children[:10]) or "nothing"
+        raise LoadError(f"{path}: expected an SDF of one <model> and nothing beside it, got {there}")
+    try:
+        check_installed(_OF_SDF)
+        g = finite_array("gravity", (0.0, 0.0, -9.81) if gravity is None else gravity, (3,))
+        b: ModelBuilder = import_module(IMPORTERS[_OF_SDF].module).read_sdf(root, source, floating_base, g)
+        return b.build(nonphysical=nonphysical, point_masses=False)
+    except UnsupportedError as error:
+        raise LoadError(f"{path}: an SDF is read by Drake's parser: {error}") from None
+    except ModelError as error:
+        raise ModelError(path, error.faults) from None
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from importlib import import_module
 from pathlib import Path
 from types import NoneType
 from typing import Final, Literal
@@ -35,7 +36,6 @@ _TEXT: Final = "the text given"
 _USD: Final = "this is OpenUSD; export it as one of them"
 #: What is said of files of other formats.
 _OTHERS: Final = {
-    ".sdf": "this is SDF; export it as one of them",
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
     ".mjb": "this is a compiled MuJoCo model; save it as XML (mujoco.mj_saveLastXML)",
 }
@@ -82,19 +82,22 @@ def load(
     mount: ArrayLike | None = None,
     xacro: Mapping[str, str] | None = None,
 ) -> Model:
-    """Load a robot by name, or a URDF or MJCF: a file, its text, or a xacro file of a URDF.
+    """Load a robot by name, or a URDF, MJCF or SDF: a file, its text, or a xacro file of a URDF.
 
-    No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF its
-    inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers where their forces
-    are linear, and the rotors of its actuators as armature. Dry friction and limits are data: no engine applies them.
+    No other files are opened, except those that an MJCF or SDF includes, and the meshes that give a body of an MJCF
+    its inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers where their
+    forces are linear, and the rotors of its actuators as armature. Dry friction and limits are data: no engine applies
+    them.
 
     Parameters
     ----------
     source : str or path
         A robot of example-robot-data, such as ``"panda"`` or ``"ur_description/ur5_gripper"`` (`robots` lists them),
-        or a path, or the text of a URDF or MJCF, such as ROS's ``robot_description``. A text has no meshes to draw.
+        or a path, or the text of a URDF, MJCF or SDF, such as ROS's ``robot_description``. A text has no meshes to
+        draw. Drake's parser reads an SDF of one model that is a tree, ``mbkit[drake]``; its meshes are not drawn.
     floating_base : bool
-        Whether the base link moves freely, on a joint named ``"root_joint"``.
+        Whether the base link moves freely, on a joint named ``"root_joint"``. The base of an SDF is held at its pose
+        otherwise.
     mimic : {"reduce", "free"}
         What a URDF's mimic joints become: functions of the joints they follow, without coordinates of their own, or
         independent joints. An MJCF's equalities of joints are couplers, with the loops.
@@ -135,7 +138,7 @@ def load(
     UnknownNameError
         No robot has this name.
     LoadError
-        The file, or one that it includes, is missing, or is not readable as a URDF or MJCF.
+        The file, or one that it includes, is missing, or is not readable as a URDF, MJCF or SDF.
     ModelError
         The file or the added loops have faults; all of them are listed.
 
@@ -193,6 +196,13 @@ def load(
         whole = xml_reader.with_includes(root, path)
         wanted = added is not None or bool(loops)
         model = model_of_mjcf(whole, path, floating_base, policy, gravity, meshes, wanted, bool(actuators))
+    elif root.tag == "sdf":
+        if str(path) != _TEXT and path.suffix.lower() != ".sdf":
+            raise LoadError(f"{path}: this is SDF; give its file a name that ends in .sdf")
+        # By name: files know no engine.
+        read = import_module("mbkit.engines.imported").model_of_sdf
+        given = file or str(source).lstrip("\ufeff \t\r\n")
+        model, file = read(root, given, str(path), floating_base, policy, gravity), ""
     else:
         raise xml_reader.unknown_root(path, root)
     if added is not None:
@@ -227,7 +237,7 @@ def _locate(source: str | os.PathLike[str]) -> tuple[Path, bool]:
     if (other := _OTHERS.get(Path(text).suffix.lower())) is not None:
         raise LoadError(f"{text}: expected a URDF or MJCF file, {other}")
     if isinstance(source, str):
-        looks_like_path = text.lower().endswith((".urdf", ".xml", ".mjcf", ".xacro"))
+        looks_like_path = text.lower().endswith((".urdf", ".xml", ".mjcf", ".xacro", ".sdf"))
         robot = None if looks_like_path else find(text)
         if robot is not None:
             return robot.path, True

@@ -1,8 +1,8 @@
-"""Drake's own importers of URDF and MJCF, and the plants that they read, described.
+"""Drake's own importers of URDF, MJCF and SDF, and the plants that they read, described.
 
 The only place that knows the content of a parsed plant: a joint's frames stand off its bodies' frames, inertias are
-about a body's origin, a rotor's inertia belongs to an actuator, a pitch is metres per turn, and a base that nothing
-holds floats.
+about a body's origin, a rotor's inertia belongs to an actuator, and a base that nothing holds floats. pydrake does not
+give the axis of a screw.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from logging.handlers import BufferingHandler
 from typing import Any, Final
 
@@ -17,15 +18,16 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import MultibodyForces
+from pydrake.multibody.tree import ForceElementIndex, FrameIndex, MultibodyForces, UniformGravityFieldElement
 
 from mbkit._check import Array
 from mbkit.engines.drake.engine import DrakeDynamics
 from mbkit.engines.drake.model import DrakeModel, mapped
 from mbkit.engines.imported import Imported, Parts, checked, written
 from mbkit.errors import UnsupportedError
-from mbkit.load.urdf_reader import BASE_JOINT
-from mbkit.model import Model
+from mbkit.load.urdf_reader import BASE_JOINT, Snapper
+from mbkit.load.xml_reader import Element
+from mbkit.model import Model, ModelBuilder
 from mbkit.model.joint_types import kind_of
 from mbkit.spatial import skew
 
@@ -33,12 +35,17 @@ _KINDS: Final = {
     "weld": "fixed",
     "revolute": "revolute",
     "prismatic": "prismatic",
-    "screw": "helical",
     "planar": "planar",
     "ball_rpy": "ball",
     "quaternion_floating": "free",
 }
-_TURN: Final = 2 * np.pi
+#: What Drake passes over without a word, though it acts.
+_UNREAD: Final = ("mimic", "fluid_added_mass")
+#: Force elements that are a joint's own spring, with the names of its stiffness and rest.
+_SPRINGS: Final = {
+    "RevoluteSpring": ("default_stiffness", "default_nominal_angle"),
+    "PrismaticSpring": ("stiffness", "nominal_position"),
+}
 #: Parts of messages that Drake gives for every file, or that are not for it.
 _IDLE: Final = ("safety_controller", "calibration")
 
@@ -52,22 +59,82 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
                 models = Parser(plant).AddModels(str(path))
             else:
                 models = Parser(plant).AddModelsFromString(text, "urdf" if format_ == "urdf" else "xml")
-            welded = _weld(plant, models) if format_ == "urdf" and not floating_base else ""
+            welded = _weld(plant, _loose(plant, models)) if format_ == "urdf" and not floating_base else ""
             plant.Finalize()
         except (Exception, SystemExit) as error:
             # A demand of Drake's that fails comes as SystemExit.
-            raise UnsupportedError(f"drake: {' '.join(str(error).replace(f'{path.parent}/', '').split())}") from None
-    model, maps = _described(plant, floating_base)
+            raise UnsupportedError(f"drake: {_text(str(error).replace(f'{path.parent}/', ''))}") from None
+    model, maps, _ = _described(plant, floating_base)
     dyn = _Read.holding(model, maps)
     notes = [f"the base {welded!r} floats by itself; welded to the world here"] if welded else []
-    messages = [" ".join(record.getMessage().split("warning: ")[-1].split()) for record in records]
-    notes += [text for text in dict.fromkeys(messages) if not any(x in text for x in _IDLE)]
+    notes += _told(records)
     held = "by constraints" if plant.num_constraints() else ""
     if held:
         notes.append(f"{plant.num_constraints()} constraints, outside M and nle")
     # A plant counts its constraints.
     loops = "pydrake does not give the bodies and points of constraints" if plant.num_constraints() else ()
     return Imported(model, dyn.terms, tuple(notes), loops=loops, holds_mimics=held)
+
+
+def read_sdf(root: Element, source: str, floating_base: bool, gravity: Array) -> ModelBuilder:
+    """Return a builder that holds the one model of an SDF, as Drake reads it with sdformat, and notes.
+
+    `source` is the file or its text. The base floats in SDF; it is held at its pose unless it is to float.
+    """
+    for element in root.walk():
+        weightless = element.tag == "gravity" and element.text.strip().lower() in ("false", "0")
+        if element.tag in _UNREAD or weightless:
+            raise UnsupportedError(f"<{element.tag}> ({element.place}) has no counterpart here")
+    plant = MultibodyPlant(0.0)
+    plant.mutable_gravity_field().set_gravity_vector(gravity)
+    with _log() as records:
+        try:
+            parser, is_text = Parser(plant), source.startswith("<")
+            models = parser.AddModelsFromString(source, "sdf") if is_text else parser.AddModels(source)
+            loose = _loose(plant, models)
+            base = "" if floating_base or len(loose) != 1 else _weld(plant, loose)
+            plant.Finalize()
+        except (Exception, SystemExit) as error:
+            raise UnsupportedError(_text(str(error).replace(source, "").replace("<literal-string>.sdf", ""))) from None
+    told = _told(records)
+    # Drake goes on with other numbers, and does not give them.
+    if impossible := [x for x in told if "inertia" in x]:
+        raise UnsupportedError(impossible[0])
+    names = ", ".join(repr(_name(plant, x)) for x in loose) or "none"
+    if len(loose) > 1 or (floating_base and not loose):
+        raise UnsupportedError(f"expected one link that no joint carries, the base; there are: {names}")
+    if n := plant.num_constraints():
+        raise UnsupportedError(f"{n} constraints, such as those of closed loops or mimic joints; pydrake tells none")
+    model, maps, at = _described(plant, floating_base)
+    snap = Snapper()
+    joints = (replace(j, rotation=snap(j.rotation), axes=snap(j.axes) if j.axes.size else j.axes) for j in model.joints)
+    b = ModelBuilder.of(replace(model, name=root.children[0].attributes["name"], joints=tuple(joints)))
+    bodies = {int(body.index()): name for name, body in maps.bodies.items()}
+    frames = {x.attributes.get("name") for x in root.walk() if x.tag == "frame"}
+    for frame in map(plant.get_frame, map(FrameIndex, range(1, plant.num_frames()))):
+        body = int(frame.body().index())
+        X = at[body] if frame.is_body_frame() else at[body] @ frame.GetFixedPoseInBodyFrame()
+        # A joint may hold a link elsewhere than at its origin.
+        if frame.name() in frames if not frame.is_body_frame() else not X.IsNearlyEqualTo(RigidTransform(), 0.0):
+            name = bodies[body] if frame.is_body_frame() else _name(plant, frame)
+            b.add_frame(name, body=bodies[body], translation=X.translation(), rotation=snap(X.rotation().matrix()))
+    held = f"the base {base!r} floats in SDF, and is held here at its pose; floating_base=True lets it move"
+    dry = [x for e in root.walk() if e.tag == "friction" for x in [e.text.strip()] if x.strip("0.")]
+    ignored = "dry friction of joints is not read; it acts in no engine" if dry else ""
+    for note in (held if base else "", ignored, *told, snap.note):
+        if note:
+            b.note(note)
+    return b
+
+
+def _text(message: object) -> str:
+    return " ".join(str(message).split())
+
+
+def _told(records: list[logging.LogRecord]) -> list[str]:
+    """Return what Drake logged, but what it says of every file."""
+    messages = dict.fromkeys(_text(record.getMessage().split("warning: ")[-1]) for record in records)
+    return [text for text in messages if not any(x in text for x in _IDLE)]
 
 
 @contextmanager
@@ -86,13 +153,24 @@ def _log() -> Iterator[list[logging.LogRecord]]:
         logger.propagate = propagate
 
 
-def _weld(plant: Any, models: Any) -> str:
-    """Hold the bodies that no joint carries, and return the first one's name."""
+def _loose(plant: Any, models: Any) -> list[Any]:
+    """Return the bodies that no joint carries."""
     carried = {int(plant.get_joint(j).child_body().index()) for j in plant.GetJointIndices()}
-    loose = [b for model in models for b in plant.GetBodyIndices(model) if int(b) not in carried]
-    for b in loose:
-        plant.WeldFrames(plant.world_frame(), plant.get_body(b).body_frame())
-    return str(plant.get_body(loose[0]).name()) if loose else ""
+    return [plant.get_body(b) for model in models for b in plant.GetBodyIndices(model) if int(b) not in carried]
+
+
+def _weld(plant: Any, loose: list[Any]) -> str:
+    """Hold bodies where they are, and return the first one's name."""
+    for body in loose:
+        X = plant.GetDefaultFloatingBaseBodyPose(body)
+        plant.WeldFrames(plant.world_frame(), body.body_frame(), X)
+    return _name(plant, loose[0]) if loose else ""
+
+
+def _name(plant: Any, thing: Any) -> str:
+    """Return the name of a body, joint or frame, with the names of the nested models that hold it."""
+    scope = str(plant.GetModelInstanceName(thing.model_instance()))
+    return "::".join([*scope.split("::")[1:], str(thing.name())])
 
 
 class _Read(DrakeDynamics):
@@ -111,9 +189,9 @@ class _Read(DrakeDynamics):
         return self._force(plant.CalcGeneralizedForces(context, forces) - weight)
 
 
-def _described(plant: Any, floating_base: bool) -> tuple[Model, DrakeModel]:
-    """Read a finalized plant joint by joint."""
-    rotors, parts = _rotors(plant), Parts()
+def _described(plant: Any, floating_base: bool) -> tuple[Model, DrakeModel, dict[int, Any]]:
+    """Read a finalized plant joint by joint; with the poses of Drake's bodies in ours, by index."""
+    rotors, springs, parts = _rotors(plant), _springs(plant), Parts()
     #: Drake's body frame in ours, which is the joint's moving one.
     at = {0: RigidTransform()}
     names = {0: "world"}
@@ -124,9 +202,9 @@ def _described(plant: Any, floating_base: bool) -> tuple[Model, DrakeModel]:
             raise UnsupportedError(
                 f"drake: built a {joint.type_name()} joint from {joint.name()!r}, which has no counterpart here"
             )
-        parent, child, name = int(joint.parent_body().index()), joint.child_body(), str(joint.name())
+        parent, child, name = int(joint.parent_body().index()), joint.child_body(), _name(plant, joint)
         index = int(child.index())
-        names[index] = parts.name("body", str(child.name()))
+        names[index] = parts.name("body", _name(plant, child))
         at[index] = joint.frame_on_child().GetFixedPoseInBodyFrame().inverse()
         X = at[parent] @ joint.frame_on_parent().GetFixedPoseInBodyFrame()
         if kind == "fixed":
@@ -136,6 +214,7 @@ def _described(plant: Any, floating_base: bool) -> tuple[Model, DrakeModel]:
             # Called after its body by itself.
             name = BASE_JOINT
         kind, numbers = _numbers(joint, kind, *rotors.get(int(joint.index()), (np.inf, 0.0)))
+        numbers |= springs.get(int(joint.index()), {})
         R, p = np.array(X.rotation().matrix()), np.array(X.translation())
         parts.joint(name, kind, names[parent], names[index], R, p, **numbers)
         _add_body(parts, names[index], child, at[index])
@@ -144,7 +223,7 @@ def _described(plant: Any, floating_base: bool) -> tuple[Model, DrakeModel]:
     parts.joints.sort(key=lambda own: _first_velocity(*theirs[own.name]))
     model = parts.model("drake", np.array(plant.gravity_field().gravity_vector()))
     bodies = {name: plant.get_body(type(plant.world_body().index())(k)) for k, name in names.items()}
-    return checked("drake", model), mapped(plant, model, theirs, bodies)
+    return checked("drake", model), mapped(plant, model, theirs, bodies), at
 
 
 def _first_velocity(joint: Any) -> int:
@@ -177,6 +256,19 @@ def _rotors(plant: Any) -> dict[int, tuple[float, float]]:
     return out
 
 
+def _springs(plant: Any) -> dict[int, dict[str, Array]]:
+    """Return stiffness and rest of each joint that has a spring; other forces than weight are refused."""
+    out = {}
+    for element in map(plant.get_force_element, map(ForceElementIndex, range(plant.num_force_elements()))):
+        kind = type(element).__name__
+        if kind in _SPRINGS:
+            stiffness, rest = (np.full(1, getattr(element, name)()) for name in _SPRINGS[kind])
+            out[int(element.joint().index())] = {"stiffness": stiffness, "rest": rest}
+        elif not isinstance(element, UniformGravityFieldElement):
+            raise UnsupportedError(f"drake: built a {kind}, which has no counterpart here")
+    return out
+
+
 def _add_body(parts: Parts, name: str, body: Any, X: Any) -> None:
     """Add a body's matter, in our axes; Drake's inertia is about its frame's origin."""
     M = body.default_spatial_inertia()
@@ -198,12 +290,10 @@ def _numbers(joint: Any, kind: str, effort: float, armature: float) -> tuple[str
         damping = np.r_[damping[3:], damping[:3]]
     numbers: dict[str, Any] = {"damping": damping, "effort_limit": np.full(nv, effort)}
     if nv == 1:
-        axis = {"revolute": "revolute_axis", "prismatic": "translation_axis", "helical": "screw_axis"}[kind]
+        axis = {"revolute": "revolute_axis", "prismatic": "translation_axis"}[kind]
         lower, upper = np.array(joint.position_lower_limits()), np.array(joint.position_upper_limits())
         numbers |= {"axes": np.array([getattr(joint, axis)()]), "lower": lower, "upper": upper}
         numbers |= {"velocity_limit": np.array(joint.velocity_upper_limits()), "armature": np.full(1, armature)}
-        if kind == "helical":
-            numbers["pitch"] = float(joint.screw_pitch()) / _TURN
         if kind == "revolute" and not np.isfinite([lower, upper]).any():
             kind = "continuous"
     return kind, numbers
