@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import importlib.metadata
 import os
 import re
@@ -11,9 +12,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
-from types import NoneType
-from typing import Final, Literal
+from types import NoneType, SimpleNamespace
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,6 +33,8 @@ from mbkit.model.validation import scale_doubts
 # `Path` drops one of the two slashes.
 _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
 _PACKAGE: Final = "example-robot-data"
+#: A package of modules, one a robot, that clone its repository into a cache.
+_DESCRIPTIONS: Final = "robot_descriptions"
 #: What stands for a path in messages on a text.
 _TEXT: Final = "the text given"
 _USD: Final = "this is OpenUSD; export it as one of them"
@@ -93,8 +97,9 @@ def load(
     ----------
     source : str or path
         A robot of example-robot-data, such as ``"panda"`` or ``"ur_description/ur5_gripper"`` (`robots` lists them),
-        or a path, or the text of a URDF, MJCF or SDF, such as ROS's ``robot_description``. A text has no meshes to
-        draw. Drake's parser reads an SDF of one model that is a tree, ``mbkit[drake]``; its meshes are not drawn.
+        or of robot_descriptions, such as ``"upkie_description"``, if that package has it in its cache; or a path, or
+        the text of a URDF, MJCF or SDF, such as ROS's ``robot_description``. A text has no meshes to draw. Drake's
+        parser reads an SDF of one model that is a tree, ``mbkit[drake]``; its meshes are not drawn.
     floating_base : bool
         Whether the base link moves freely, on a joint named ``"root_joint"``. The base of an SDF is held at its pose
         otherwise.
@@ -242,7 +247,7 @@ def _locate(source: str | os.PathLike[str]) -> tuple[Path, bool]:
         if robot is not None:
             return robot.path, True
         if not looks_like_path and not os.path.exists(text):
-            raise unknown(text)
+            return described(text), True
     return Path(text), False
 
 
@@ -337,13 +342,57 @@ def canonical(name: str) -> str | None:
 
 def unknown(name: str) -> UnknownNameError:
     """Return the error for a name that is neither a robot nor a path."""
-    known = sorted({x for r in robots() for x in (r.name, r._spellings[0])} | _SHORT.keys())
+    modules = _modules()
+    known = sorted({x for r in robots() for x in (r.name, r._spellings[0])} | _SHORT.keys() | modules.keys())
     # Packages of descriptions call a robot's folder so.
     if (meant := find(re.sub("(_mj|_moveit)?_description$", "", name))) is not None:
         known = [meant.name]
+    other = "" if modules or not name.endswith("_description") else f"; names of {_DESCRIPTIONS} need that package"
     return UnknownNameError(
-        "robot", name, known, "(a path to a file ends in .urdf or .xml; mbkit robots lists all names)"
+        "robot", name, known, f"(a path to a file ends in .urdf or .xml; mbkit robots lists all names{other})"
     )
+
+
+def _modules() -> dict[str, Path]:
+    """Return the modules of robot_descriptions by name; none where it is not installed."""
+    spec = find_spec(_DESCRIPTIONS)
+    folders = spec.submodule_search_locations or () if spec else ()
+    return {p.stem: p for folder in folders for p in Path(folder).glob("[!_]*_description.py")}
+
+
+def described(name: str) -> Path:
+    """Return a robot's file in the cache of robot_descriptions; `UnknownNameError` where that has no such robot.
+
+    Nothing is fetched: its module runs with a function that looks into the cache, in the place of the one that clones.
+    """
+    module = _key(name)
+    if (file := _modules().get(module)) is None:
+        raise unknown(name)
+    repositories = import_module(f"{_DESCRIPTIONS}._repositories").REPOSITORIES
+    cache = os.path.expanduser(os.environ.get("ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions"))
+
+    def cached(repository: str, commit: str | None = None) -> str:
+        place = repositories[repository].cache_path
+        return os.path.join(cache, f"{place}-{commit}/{place}" if commit else place)
+
+    def importing(what: str, *others: Any) -> Any:
+        return SimpleNamespace(clone_to_cache=cached) if what == "_cache" else builtins.__import__(what, *others)
+
+    there: dict[str, Any] = {"__builtins__": vars(builtins) | {"__import__": importing}, "__package__": _DESCRIPTIONS}
+    pull = f"python -m {_DESCRIPTIONS} pull {module}"
+    try:
+        exec(compile(file.read_text("utf-8"), str(file), "exec"), there)
+    except OSError:
+        # A module that mends its file opens it.
+        there = {}
+    path = Path(there.get("URDF_PATH") or there.get("MJCF_PATH") or there.get("XACRO_PATH") or "")
+    if not path.is_file():
+        raise LoadError(f"{name}: its files are not in the cache of {_DESCRIPTIONS}, {cache}; `{pull}` fetches them")
+    if path.suffix == ".xacro":
+        raise LoadError(
+            f"{name}: {_DESCRIPTIONS} makes its URDF by xacro; `{pull}` prints the path, which mb.load takes"
+        )
+    return path
 
 
 def _key(name: str) -> str:

@@ -493,7 +493,7 @@ def _path(source: str | os.PathLike[str]) -> Path:
         if robot is not None:
             return robot.path
         if not os.path.exists(source) and os.sep not in source:
-            raise loader.unknown(source)
+            return loader.described(source)
     if not isinstance(source, (str, os.PathLike)):
         raise InputError(f"source: expected a path or a robot's name, got {source!r}")
     return Path(os.fspath(source))
