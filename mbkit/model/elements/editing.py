@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import EllipsisType
 from typing import Any, Final, Self
 
 import numpy as np
@@ -38,7 +39,7 @@ class EditingBuilder:
     """Changes parts by name; `ModelBuilder` inherits it.
 
     Like the methods that add parts, these remember a fault, and `build` reports all of them. None stands for "as it
-    is".
+    is", but of `mimic`.
     """
 
     _read: Any
@@ -145,17 +146,23 @@ class EditingBuilder:
         friction: ArrayLike | None = None,
         stiffness: _Numbers | None = None,
         rest: _Numbers | None = None,
-        mimic: Mimic | tuple[str, Number, Number] | None = None,
+        mimic: Mimic | tuple[str, Number, Number] | EllipsisType | None = ...,
     ) -> None:
-        """Set numbers of a joint, which are those of `add_joint`; an infinite limit is no limit."""
+        """Set numbers of a joint, which are those of `add_joint`; an infinite limit is no limit.
+
+        With ``mimic=None`` a mimic joint has its own coordinate again. Joints that a file let follow it follow its
+        leader, as before.
+        """
         joint = self._named("joints", name)
         if joint is None:
             return
         limits = lower, upper, velocity_limit, effort_limit
         numbers = armature, damping, friction, stiffness, rest
         given: dict[str, Any] = dict(zip(NUMBERS_OF_JOINTS, (*limits, *numbers), strict=True))
-        given |= {"mimic": mimic, "axes": None if axis is None and axis2 is None else (axis, axis2)}
+        given |= {"axes": None if axis is None and axis2 is None else (axis, axis2)}
+        given |= {} if mimic is ... else {"mimic": mimic}
         ready = self._joint_fields(joint.name, joint.type, {n: x for n, x in given.items() if x is not None})
+        ready |= {"mimic": None} if mimic is None else {}
         if rotation is not None or rpy is not None:
             ready["rotation"] = self._read.orientation(f"joint {joint.name!r}", rotation, rpy)
         self._set("joints", name, {"translation": translation, "pitch": pitch}, ready)
@@ -304,6 +311,44 @@ class EditingBuilder:
         also = f"; with it {', '.join(lost)}" if lost else ""
         self._notes.append(f"removed joint {name!r} and the bodies {', '.join(sorted(bodies))}{also}")
 
+    def remove(self, name: str, kind: str | None = None) -> None:
+        """Remove a frame, or what acts: a spring, coupling, loop, coupler, prescribed motion, force or no-slip row.
+
+        A joint goes with `remove_joint`, and a body with the joint that carries it.
+
+        Parameters
+        ----------
+        name : str
+            A prescribed motion has the name of its joint.
+        kind : {"frame", "spring", "coupling", "loop", "coupler", "prescribed", "force", "no slip"}, optional
+            Needed where parts of several kinds have the name.
+        """
+        name, kinds = self._read.name("remove: name", name), {called(k): k for k in KINDS_OF_PARTS[2:]}
+        if kind is not None and (not isinstance(kind, str) or kind not in kinds):
+            self._read.faults.append(f"remove: unknown kind {shown(kind)}; there are {', '.join(map(repr, kinds))}")
+            return
+        having = {k: [x.name for x in self._parts[k]] for word, k in kinds.items() if kind in (None, word)}
+        found = [k for k, names in having.items() if name in names]
+        if len(found) != 1:
+            hint = f"there is none of this name{self._remedy(name, {n for names in having.values() for n in names})}"
+            if found:
+                hint = f"expected kind= one of {', '.join(repr(called(k)) for k in found)}, which all have this name"
+            self._read.faults.append(f"remove: {name!r}: {hint}")
+            return
+        (where,) = found
+        if where == "frames" and (users := [x.name for x in self._parts["forces"] if getattr(x, "frame", "") == name]):
+            self._read.faults.append(f"remove: frame {name!r}: force {users[0]!r} acts there; remove that one first")
+            return
+        self._parts[where] = [x for x in self._parts[where] if x.name != name]
+        self._bindings = [b for b in self._bindings if (b.where, b.part) != (where, name)]
+        self._notes.append(f"removed {called(where)} {name!r}")
+
+    def _remedy(self, name: str, names: Iterable[str]) -> str:
+        for joint in self._parts["joints"]:
+            if name in (joint.name, joint.child):
+                return f"; remove_joint({joint.name!r}) removes a joint and what it carries"
+        return f"; did you mean {near[0]!r}?" if (near := nearest(name, names)) else ""
+
     def add_prefix(self, prefix: str) -> None:
         """Put a prefix before the names of all bodies, joints, frames and other parts; parameters keep theirs."""
         prefix = self._read.name("prefix", prefix)
@@ -349,12 +394,13 @@ class EditingBuilder:
 
     def _change(self, kind: str, part: Any, fields: dict[str, Any]) -> None:
         bound = {*fields}
+        new: Sequence[Binding] = ()
         if "mimic" in fields:
-            leader, ratio_and_offset = fields.pop("mimic")
-            numbers, new = split(kind, part.name, ratio_and_offset)
-            fields["mimic"], bound = Mimic(leader, **numbers), bound | {"ratio", "offset"}
-        else:
-            new = ()
+            bound |= {"ratio", "offset"}
+            if fields["mimic"] is not None:
+                leader, ratio_and_offset = fields["mimic"]
+                numbers, new = split(kind, part.name, ratio_and_offset)
+                fields["mimic"] = Mimic(leader, **numbers)
         numbers, more = split(kind, part.name, fields)
         known = len(self._read.faults)
         old = {b.field for b in self._bindings if (b.where, b.part) == (kind, part.name)}
