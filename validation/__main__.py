@@ -52,7 +52,9 @@ PARTS = {
     "mechanisms": Part(5, ("mechanisms.json",), "mechanisms with loops: errors, softness, time of a step"),
     "bicycle": Part(1, ("bicycle.json",), "the benchmark bicycle's eigenvalues beside its paper's formulas and print"),
     "iftomm": Part(15, ("iftomm.json",), "published problems with loops: Andrews' squeezer, IFToMM's A01 to A05"),
-    "variants": Part(6, ("variants.json",), "changed robots beside Pinocchio's own changes, and a thousand variants"),
+    "variants": Part(
+        6, ("variants.json",), "changed robots beside Pinocchio's and MuJoCo's own changes, and a thousand variants"
+    ),
     "bench_rollouts": Part(5, ("rollouts.json",), "batches of rollouts, beside mujoco.rollout"),
     "bench_trajectory": Part(5, ("trajectory.json",), "one trajectory to an error of 1e-9"),
     "bench_derivation": Part(1, ("derivation.json",), "equations to read, beside sympy.physics.mechanics"),
