@@ -365,10 +365,16 @@ class Model(Description):
             ``"body.com.x"``. A wildcard leaves out what is zero, and bodies that never move. `mbkit.scale` makes one
             factor of many numbers.
 
+            ``"body.log_cholesky"`` makes ten parameters ``"body.log_cholesky.alpha"``, ``d1``, ``d2``, ``d3``, ``s12``,
+            ``s23``, ``s13``, ``t1``, ``t2``, ``t3`` of mass, centre of mass and inertia. All their values are bodies
+            that can be (Rucker and Wensing 2022): with V upper triangular of the s and the diagonal exp(d), the mass is
+            exp(2 alpha), the centre of mass t, and the second moments about it are exp(2 alpha) V Vᵀ.
+
         Raises
         ------
         InputError
-            A path that fits nothing, or a link that was merged with a body, which the message names.
+            A path that fits nothing, a link that was merged with a body, which the message names, or the factor of a
+            body without mass or extent.
 
         Examples
         --------

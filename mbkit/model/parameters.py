@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -13,6 +14,12 @@ from mbkit._check import real, shown
 from mbkit.errors import InputError
 from mbkit.model.parts import Joint
 
+
+def _exp(x: Any) -> Any:
+    """Return e to a number of any kind: a float, an expression, or a scalar of CasADi or SymPy."""
+    return math.exp(x) if isinstance(x, float) else x.exp() if hasattr(x, "exp") else math.e**x
+
+
 #: Operation and sign by name.
 _OPERATIONS: Final[dict[str, tuple[Callable[..., Any], str]]] = {
     "add": (operator.add, "+"),
@@ -20,6 +27,7 @@ _OPERATIONS: Final[dict[str, tuple[Callable[..., Any], str]]] = {
     "mul": (operator.mul, "*"),
     "div": (operator.truediv, "/"),
     "neg": (operator.neg, "-"),
+    "exp": (_exp, "exp"),
 }
 _Operator = Callable[["Expression", Any], "Expression"]
 
@@ -32,7 +40,7 @@ def _operators(name: str) -> tuple[_Operator, _Operator]:
 class Expression:
     """A number that depends on named parameters.
 
-    Sums, differences, products, quotients and powers of expressions and numbers are expressions; so a catalog's
+    Sums, differences, products, quotients, powers and `exp` of expressions and numbers are expressions; so a catalog's
     formulas take them like floats. The exponent of a power is a whole number or one half.
     """
 
@@ -54,6 +62,10 @@ class Expression:
 
     def __pos__(self) -> Expression:
         return self
+
+    def exp(self) -> Expression:
+        """Return e to this number, which `numpy.exp` calls too."""
+        return _Operation("exp", (self,))
 
     def __pow__(self, exponent: float) -> Expression:
         if not _is_number(exponent) or abs(exponent) > 100 or not (float(exponent).is_integer() or exponent == 0.5):
@@ -133,6 +145,8 @@ class _Operation(Expression):
     def __str__(self) -> str:
         texts = [str(x) if isinstance(x, Expression) else f"{x:g}" for x in self.operands]
         sign = _OPERATIONS[self.name][1]
+        if self.name == "exp":
+            return f"exp({texts[0]})"
         return f"({sign}{texts[0]})" if self.name == "neg" else f"({texts[0]} {sign} {texts[1]})"
 
 

@@ -1,8 +1,13 @@
-"""Numbers of a model that become parameters, by path: ``"link.mass"``, ``"*.damping"``, ``"gravity"``."""
+"""Numbers of a model that become parameters, by path: ``"link.mass"``, ``"*.damping"``, ``"gravity"``.
+
+``"link.log_cholesky"`` stands for ten numbers of which all values are bodies that can be (Rucker and Wensing 2022,
+Smooth parameterization of rigid-body inertia, IEEE Robotics and Automation Letters 7(2)).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple
@@ -13,6 +18,7 @@ from mbkit._check import shown
 from mbkit.errors import InputError, nearest
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Parameter
+from mbkit.model.parts import Body
 from mbkit.model.validation import static_bodies
 
 _AXES: Final = ("x", "y", "z")
@@ -34,6 +40,9 @@ _FIELDS: Final = {
 #: What no engine applies.
 _DATA: Final = ("friction", "lower", "upper", "velocity_limit", "effort_limit")
 _Entry = tuple[str, str, str, tuple[int, ...]]
+#: The ten numbers of a log-Cholesky factor, and the end of their path.
+TEN: Final = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
+LOG_CHOLESKY: Final = ".log_cholesky"
 #: Of loops, the length that a rod alone has.
 _ROD: Final = "distance"
 
@@ -185,13 +194,58 @@ def _nothing(model: Model, every: list[Number], pattern: str) -> str:
     return f"{item}; " + (f"{name} has {fields}" if fields else "no part has this name")
 
 
+def body_of_log_cholesky(ten: Sequence[Any]) -> dict[str, Any]:
+    """Return mass, centre of mass and inertia about it, of the numbers `TEN` of any kind that `numpy.exp` takes.
+
+    The pseudo-inertia is U Uᵀ with U = exp(alpha) [[V, t], [0, 1]] and V upper triangular with the diagonal exp(d): the
+    mass is exp(2 alpha), the centre of mass t, and the second moments about it are exp(2 alpha) V Vᵀ.
+    """
+    alpha, d1, d2, d3, s12, s23, s13, *t = ten
+    mass = np.exp(2.0 * alpha)
+    V = [[np.exp(d1), s12, s13], [np.exp(d2), s23], [np.exp(d3)]]
+    # Rows begin at the diagonal.
+    second = {(i, k): sum(x * y for x, y in zip(V[i][k - i :], V[k], strict=True)) for _, (i, k) in SYMMETRIC}
+    trace = sum(second[i, i] for i in range(3))
+    inertia = {index: mass * (trace - x if index[0] == index[1] else -x) for index, x in second.items()}
+    return {"mass": mass, "com": t, "inertia": inertia}
+
+
+def log_cholesky(body: Body) -> dict[str, float]:
+    """Return the log-Cholesky numbers of a body by their paths; `InputError` for one without extent."""
+    second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
+    try:
+        # Upper triangular: the lower factor of the axes in the other order.
+        V = np.linalg.cholesky(second[::-1, ::-1] / body.mass)[::-1, ::-1] if body.mass > 0 else np.zeros((3, 3))
+        d = [math.log(x) for x in np.diag(V)]
+    except (np.linalg.LinAlgError, ValueError):
+        raise InputError(
+            f"paths: body {body.name!r} has no log-Cholesky factor, which needs mass and extent along three axes"
+        ) from None
+    ten = (0.5 * math.log(body.mass), *d, V[0, 1], V[1, 2], V[0, 2], *body.com)
+    return {f"{body.name}{LOG_CHOLESKY}.{name}": float(x) for name, x in zip(TEN, ten, strict=True)}
+
+
+def _factored(model: Model, path: str, bound: Container[_Entry]) -> dict[_Entry, Any]:
+    """Return the expressions of the bodies that a path of log-Cholesky factors fits."""
+    new: dict[_Entry, Any] = {}
+    for name in dict.fromkeys(x.part for x in chosen(model, f"{path.removesuffix(LOG_CHOLESKY)}.mass")):
+        own = body_of_log_cholesky([Parameter(*pair) for pair in log_cholesky(model.body(name)).items()])
+        new["bodies", name, "mass", ()] = own["mass"]
+        new |= {("bodies", name, "com", (i,)): x for i, x in enumerate(own["com"])}
+        new |= {("bodies", name, "inertia", at): x for (i, k), x in own["inertia"].items() for at in ((i, k), (k, i))}
+        if any(key in bound for key in new):
+            raise InputError(f"paths: {path!r}: numbers of {name!r} are parameters already")
+    return new
+
+
 def with_free(model: Model, paths: Iterable[Any]) -> Model:
     """Return a model with free numbers, as `Model.with_free` says."""
     model.require_bodies("with_free")
     bound = {(b.where, b.part, b.field, b.index): b.expression for b in model.bindings}
     new: dict[_Entry, Any] = {}
     paths = tuple(paths)
-    for path in (x for x in paths if not isinstance(x, Scale)):
+    factors = [x for x in paths if isinstance(x, str) and x.endswith(LOG_CHOLESKY)]
+    for path in (x for x in paths if not isinstance(x, Scale) and x not in factors):
         for number in chosen(model, path):
             if (there := bound.get(number.entries[0])) is not None:
                 if path in (number.path, number.whole):
@@ -199,6 +253,8 @@ def with_free(model: Model, paths: Iterable[Any]) -> Model:
                 continue
             _require_other_name(model, number.path)
             new |= dict.fromkeys(number.entries, Parameter(number.path, number.value))
+    for path in factors:
+        new |= _factored(model, path, {*bound, *new})
     for one in (x for x in paths if isinstance(x, Scale)):
         if one.name in {x.path for x in numbers_of(model)}:
             raise InputError(f"scale: {one.name!r} is the path of a number; give another name=")
@@ -208,6 +264,9 @@ def with_free(model: Model, paths: Iterable[Any]) -> Model:
             new |= {key: new.get(key, bound.get(key, number.value)) * factor for key in number.entries}
     kept = [b for b in model.bindings if (b.where, b.part, b.field, b.index) not in new]
     out = replace(model, bindings=(*kept, *(Binding(*key, x) for key, x in new.items())))
+    if factors:
+        # The numbers of the factors, to rounding.
+        out = out._substituted(lambda p: p)
     if not (free := [name for name in out.parameters if name not in model.parameters]):
         return model
     return replace(out, notes=(*out.notes, f"free numbers: {', '.join(free)}"))

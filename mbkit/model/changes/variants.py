@@ -24,7 +24,7 @@ from mbkit._check import Array, count, finite_array, real, shown
 from mbkit._escape import csv_text, html
 from mbkit.errors import InputError, OutputError
 from mbkit.model.builder import expect_model, shape_of
-from mbkit.model.changes.freeing import SYMMETRIC, Scale, chosen, numbers_of, with_free
+from mbkit.model.changes.freeing import LOG_CHOLESKY, SYMMETRIC, Scale, chosen, log_cholesky, numbers_of, with_free
 from mbkit.model.model import Model
 
 #: What a spread says of a path: a size, the ends of a uniform range, or a function of a generator and how many to draw.
@@ -142,7 +142,8 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
         `numpy.random.Generator` and how many numbers to return.
 
         ``"link.inertia"`` draws the six numbers about the centre of mass, and ``"link.inertial"`` all ten numbers of a
-        body together, by their pseudo-inertia: every draw is a body that can be.
+        body together, by their pseudo-inertia: every draw is a body that can be. ``"link.log_cholesky"`` draws the
+        ten parameters of `Model.with_free` themselves, each with the same spread.
     size : int
         How many variants.
     seed : int
@@ -183,7 +184,8 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
         if wide := [name for name, x in drawn.items() if not np.isfinite(x).all()]:
             raise InputError(f"spread: {str(path)!r}: {wide[0]!r} leaves a double's range; give a smaller spread")
         values |= drawn
-        paths += [path] if isinstance(path, Scale) else [*drawn]
+        whole = isinstance(path, Scale) or path.endswith(LOG_CHOLESKY)
+        paths += [path] if whole else [*drawn]
     free = with_free(model, paths)
     _require_bodies_that_can_be(model, values, [x for x in spread if isinstance(x, Scale)], size)
     return Variants(free, values, seed)
@@ -196,6 +198,10 @@ def _drawn(model: Model, path: Any, how: Spread, rng: np.random.Generator, size:
         return {path.name: _numbers(item, 1.0, how, rng, size, added=False)}
     if not isinstance(path, str):
         raise InputError(f"spread: expected paths such as '*.mass' or a scale, got {shown(path)}")
+    if path.endswith(LOG_CHOLESKY):
+        bodies = dict.fromkeys(x.part for x in chosen(model, f"{path.removesuffix(LOG_CHOLESKY)}.mass"))
+        ten = {k: x for name in bodies for k, x in log_cholesky(model.body(name)).items()}
+        return {k: _numbers(f"{item}: {k}", x, how, rng, size, added=True) for k, x in ten.items()}
     if path.endswith(_INERTIAL):
         bodies = dict.fromkeys(x.part for x in chosen(model, f"{path.removesuffix(_INERTIAL)}.mass"))
         return {k: x for name in bodies for k, x in _bodies_drawn(model, name, _size(item, how), rng, size).items()}
