@@ -151,9 +151,9 @@ def check_installed(engine: str) -> None:
 
 
 def model_of_sdf(
-    root: Element, source: str, path: str, floating_base: bool, nonphysical: Literal["error", "warn"], gravity: Any
+    root: Element, text: str, path: str, floating_base: bool, nonphysical: Literal["error", "warn"], gravity: Any
 ) -> Model:
-    """Return the model of an <sdf> element; for the arguments see `mbkit.load`, `source` is a file or a text."""
+    """Return the model of an <sdf> element; for the arguments see `mbkit.load`."""
     models = root.all("model")
     if len(models) != 1 or len(root.children) != 1:
         there = ", ".join(f"<{x.tag[:60]}>" for x in root.children[:10]) or "nothing"
@@ -161,7 +161,7 @@ def model_of_sdf(
     try:
         check_installed(_OF_SDF)
         g = finite_array("gravity", (0.0, 0.0, -9.81) if gravity is None else gravity, (3,))
-        b: ModelBuilder = import_module(IMPORTERS[_OF_SDF].module).read_sdf(root, source, floating_base, g)
+        b: ModelBuilder = import_module(IMPORTERS[_OF_SDF].module).read_sdf(root, text, floating_base, g)
         return b.build(nonphysical=nonphysical, point_masses=False)
     except UnsupportedError as error:
         raise LoadError(f"{path}: an SDF is read by Drake's parser: {error}") from None

@@ -88,7 +88,7 @@ def load(
 ) -> Model:
     """Load a robot by name, or a URDF, MJCF or SDF: a file, its text, or a xacro file of a URDF.
 
-    No other files are opened, except those that an MJCF or SDF includes, and the meshes that give a body of an MJCF
+    No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF
     its inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers where their
     forces are linear, and the rotors of its actuators as armature. Dry friction and limits are data: no engine applies
     them.
@@ -206,8 +206,9 @@ def load(
             raise LoadError(f"{path}: this is SDF; give its file a name that ends in .sdf")
         # By name: files know no engine.
         read = import_module("mbkit.engines.imported").model_of_sdf
-        given = file or str(source).lstrip("\ufeff \t\r\n")
-        model, file = read(root, given, str(path), floating_base, policy, gravity), ""
+        text = path.read_text("utf-8", "replace") if file else str(source)
+        text = text.lstrip("\ufeff \t\r\n")
+        model, file = read(root, text, str(path), floating_base, policy, gravity), ""
     else:
         raise xml_reader.unknown_root(path, root)
     if added is not None:

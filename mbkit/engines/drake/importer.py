@@ -1,8 +1,8 @@
 """Drake's own importers of URDF, MJCF and SDF, and the plants that they read, described.
 
 The only place that knows the content of a parsed plant: a joint's frames stand off its bodies' frames, inertias are
-about a body's origin, a rotor's inertia belongs to an actuator, and a base that nothing holds floats. pydrake does not
-give the axis of a screw.
+about a body's origin, a rotor's inertia belongs to an actuator, a pitch is metres per turn, and a base that nothing
+holds floats.
 """
 
 from __future__ import annotations
@@ -35,10 +35,13 @@ _KINDS: Final = {
     "weld": "fixed",
     "revolute": "revolute",
     "prismatic": "prismatic",
+    "screw": "helical",
+    "universal": "universal",
     "planar": "planar",
     "ball_rpy": "ball",
     "quaternion_floating": "free",
 }
+_TURN: Final = 2 * np.pi
 #: What Drake passes over without a word, though it acts.
 _UNREAD: Final = ("mimic", "fluid_added_mass")
 #: Force elements that are a joint's own spring, with the names of its stiffness and rest.
@@ -76,12 +79,14 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     return Imported(model, dyn.terms, tuple(notes), loops=loops, holds_mimics=held)
 
 
-def read_sdf(root: Element, source: str, floating_base: bool, gravity: Array) -> ModelBuilder:
-    """Return a builder that holds the one model of an SDF, as Drake reads it with sdformat, and notes.
+def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> ModelBuilder:
+    """Return a builder that holds the one model of an SDF's text, as Drake reads it with sdformat, and notes.
 
-    `source` is the file or its text. The base floats in SDF; it is held at its pose unless it is to float.
+    The base floats in SDF; it is held at its pose unless it is to float.
     """
     for element in root.walk():
+        if element.tag == "include":
+            raise UnsupportedError(f"<include> ({element.place}) is not followed; `gz sdf -p` writes out what it names")
         weightless = element.tag == "gravity" and element.text.strip().lower() in ("false", "0")
         if element.tag in _UNREAD or weightless:
             raise UnsupportedError(f"<{element.tag}> ({element.place}) has no counterpart here")
@@ -89,13 +94,14 @@ def read_sdf(root: Element, source: str, floating_base: bool, gravity: Array) ->
     plant.mutable_gravity_field().set_gravity_vector(gravity)
     with _log() as records:
         try:
-            parser, is_text = Parser(plant), source.startswith("<")
-            models = parser.AddModelsFromString(source, "sdf") if is_text else parser.AddModels(source)
+            models = Parser(plant).AddModelsFromString(text, "sdf")
             loose = _loose(plant, models)
             base = "" if floating_base or len(loose) != 1 else _weld(plant, loose)
             plant.Finalize()
         except (Exception, SystemExit) as error:
-            raise UnsupportedError(_text(str(error).replace(source, "").replace("<literal-string>.sdf", ""))) from None
+            raise UnsupportedError(
+                _text(str(error).replace(text, "").replace("<literal-string>.sdf:", "line "))
+            ) from None
     told = _told(records)
     # Drake goes on with other numbers, and does not give them.
     if impossible := [x for x in told if "inertia" in x]:
@@ -289,11 +295,27 @@ def _numbers(joint: Any, kind: str, effort: float, armature: float) -> tuple[str
         # Drake's order is angular, linear.
         damping = np.r_[damping[3:], damping[:3]]
     numbers: dict[str, Any] = {"damping": damping, "effort_limit": np.full(nv, effort)}
+    if kind == "universal":
+        numbers["axes"] = np.eye(3)[:2]
     if nv == 1:
-        axis = {"revolute": "revolute_axis", "prismatic": "translation_axis"}[kind]
+        ways = {"revolute": "revolute_axis", "prismatic": "translation_axis"}
+        axis = getattr(joint, ways[kind])() if kind in ways else _screw_axis(joint)
         lower, upper = np.array(joint.position_lower_limits()), np.array(joint.position_upper_limits())
-        numbers |= {"axes": np.array([getattr(joint, axis)()]), "lower": lower, "upper": upper}
+        numbers |= {"axes": np.array([axis]), "lower": lower, "upper": upper}
         numbers |= {"velocity_limit": np.array(joint.velocity_upper_limits()), "armature": np.full(1, armature)}
+        if kind == "helical":
+            numbers["pitch"] = float(joint.screw_pitch()) / _TURN
         if kind == "revolute" and not np.isfinite([lower, upper]).any():
             kind = "continuous"
     return kind, numbers
+
+
+def _screw_axis(joint: Any) -> Array:
+    """Return a screw's axis, which pydrake gives by its pose alone."""
+    plant = joint.GetParentPlant()
+    context = plant.CreateDefaultContext()
+    q = plant.GetPositions(context)
+    q[joint.position_start()] = 1.0
+    plant.SetPositions(context, q)
+    turn = joint.frame_on_child().CalcPose(context, joint.frame_on_parent()).rotation()
+    return np.array(turn.ToAngleAxis().axis())
