@@ -186,6 +186,10 @@ def changed(old, new):
         ('<sdf version="1.7"><world name="w"/></sdf>', "one <model> and nothing beside it, got <world>"),
         (changed("</sdf>", '<model name="b"/></sdf>'), "got <model>, <model>"),
         (changed("<mass>2", "<mass>-2"), "invalid inertia"),
+        (changed("<mass>2", "<mass>1 2"), r"mass text: expected a number, got '1 2' \(line 5\)"),
+        (changed("<mass>2", "<mass>"), "mass text: expected a number, got ''"),
+        (changed("0.1 0 0 0 0 0", "0.1 0 0"), "pose text: expected 6 numbers"),
+        (changed("<spring_reference>0.2", "<spring_reference>nan"), "'nan' is not a finite number"),
         (changed("<ixx>0.01", "<ixx>9"), "invalid inertia"),
         (changed("<parent>inside::base", "<parent>bose"), "bose"),
         (changed('type="revolute"', 'type="revolute2"'), "revolute2"),
@@ -203,8 +207,19 @@ def changed(old, new):
     ],
 )
 def test_what_is_no_tree_of_one_model_is_refused_by_name(given, words):
-    with pytest.raises(LoadError, match=words):
+    with pytest.raises(MbkitError, match=words):
         mb.load(given)
+
+
+@drake
+def test_a_pose_may_be_empty_or_a_quaternion():
+    quaternion = changed(
+        "<pose>0.2 0 0 0 0 1.5707963267948966</pose>", '<pose rotation_format="quat_xyzw">0.2 0 0 0 0 {0} {0}</pose>'
+    )
+    turned = mb.load(quaternion.format(0.5**0.5))
+    assert np.abs(turned.body("arm").inertia - np.diag([0.04, 0.01, 0.03])).max() < CLOSE
+    place = '<pose relative_to="__model__">0 0.3 0 0 0 0</pose>'
+    assert not mb.load(changed(place, '<pose relative_to="__model__"/>')).joint("hinge").translation.any()
 
 
 @drake

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 
 from mbkit._check import Array, finite_array
 from mbkit.errors import LoadError, ModelError, UnsupportedError
-from mbkit.load.xml_reader import Element
+from mbkit.load.xml_reader import Element, Reader
 from mbkit.load.xml_reader import unused as unused
 from mbkit.model import Body, Coupler, Joint, Loop, Model, ModelBuilder
 from mbkit.model.joint_types import kind_of
@@ -46,6 +46,15 @@ IMPORTERS = {
 }
 #: Whose importer reads SDF.
 _OF_SDF: Final = "drake"
+_POSE: Final = 6
+#: How many numbers elements of SDF hold; sdformat takes the first of more, and a default for none. A pose may be empty.
+_IN_SDF: Final = {"pose": _POSE, "xyz": 3} | dict.fromkeys(
+    (
+        *("mass", "ixx", "iyy", "izz", "ixy", "ixz", "iyz", "damping", "spring_stiffness", "spring_reference"),
+        *("thread_pitch", "screw_thread_pitch"),
+    ),
+    1,
+)
 #: The largest number that mbkit's own loaders take.
 _MAX_NUMBER: Final = 1e30
 
@@ -125,7 +134,7 @@ def checked(engine: str, model: Model) -> Model:
     """Return an importer's model; raise `UnsupportedError` where nothing moves in it or a number is not sound."""
     if not model.nv:
         raise UnsupportedError(f"{engine}: nothing moves in the model that it built from the file (nv = 0)")
-    joint_numbers = ("rotation", "translation", "axes", "pitch", "armature", "damping", "stiffness")
+    joint_numbers = ("rotation", "translation", "axes", "pitch", "armature", "damping", "stiffness", "rest")
     for what, part, names in (
         *((f"body {x.name!r} with a", x, ("mass", "com", "inertia")) for x in model.bodies),
         *((f"joint {x.name!r} with a", x, joint_numbers) for x in model.joints),
@@ -158,6 +167,13 @@ def model_of_sdf(
     if len(models) != 1 or len(root.children) != 1:
         there = ", ".join(f"<{x.tag[:60]}>" for x in root.children[:10]) or "nothing"
         raise LoadError(f"{path}: expected an SDF of one <model> and nothing beside it, got {there}")
+    numbers = Reader()
+    for element in models[0].walk():
+        if (n := _IN_SDF.get(element.tag)) and (element.text or n != _POSE):
+            n += element.attributes.get("rotation_format") == "quat_xyzw"
+            numbers.numbers(replace(element, attributes={"text": element.text}), "text", "model", count=n)
+    if numbers.faults:
+        raise ModelError(path, numbers.faults)
     try:
         check_installed(_OF_SDF)
         g = finite_array("gravity", (0.0, 0.0, -9.81) if gravity is None else gravity, (3,))
