@@ -8,6 +8,7 @@ holds floats.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -42,6 +43,8 @@ _KINDS: Final = {
     "quaternion_floating": "free",
 }
 _TURN: Final = 2 * np.pi
+#: What Drake and sdformat call a text.
+_PLACE: Final = re.compile(r"<(?:literal|data)-string>(?:\.sdf)?:")
 #: What Drake passes over without a word, though it acts.
 _UNREAD: Final = ("mimic", "fluid_added_mass")
 #: Force elements that are a joint's own spring, with the names of its stiffness and rest.
@@ -99,9 +102,7 @@ def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> M
             base = "" if floating_base or len(loose) != 1 else _weld(plant, loose)
             plant.Finalize()
         except (Exception, SystemExit) as error:
-            raise UnsupportedError(
-                _text(str(error).replace(text, "").replace("<literal-string>.sdf:", "line "))
-            ) from None
+            raise UnsupportedError(_text(_PLACE.sub("line ", str(error).replace(text, "")))) from None
     told = _told(records)
     # Drake goes on with other numbers, and does not give them.
     if impossible := [x for x in told if "inertia" in x]:
