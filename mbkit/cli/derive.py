@@ -34,6 +34,12 @@ _C_FOLDER: Final = "mbkit-export"
 @click.option("--latex", "form", flag_value="latex", help="Print LaTeX.")
 @click.option("--python", "form", flag_value="python", help="Print a Python module that needs NumPy only.")
 @click.option("--c", "form", flag_value="c", help="Write C99, as mbkit export does.")
+@click.option(
+    "--program",
+    "quantity",
+    metavar="QUANTITY",
+    help="Print one quantity, such as inverse_dynamics, as named terms: s1, c2, x7, ... Takes robots of any size.",
+)
 @shared.load_options
 @click.option(
     "--snap",
@@ -46,7 +52,14 @@ _C_FOLDER: Final = "mbkit-export"
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to write to, instead of printing.")
 @shared.force_option
 def derive(
-    system: str, form: str | None, options: dict[str, Any], snap: float, as_json: bool, out: Path | None, force: bool
+    system: str,
+    form: str | None,
+    quantity: str | None,
+    options: dict[str, Any],
+    snap: float,
+    as_json: bool,
+    out: Path | None,
+    force: bool,
 ) -> None:
     """Print T, V, M, C, g and the equation of motion of SYSTEM, and what it conserves.
 
@@ -55,6 +68,8 @@ def derive(
     have the same name, NAME is the catalog's, or paper's where the catalog's has a quaternion or a loop;
     mbkit.catalog:NAME and mbkit.lagrangian.systems:NAME are always the one and the other.
     """
+    if as_json and quantity:
+        raise click.UsageError("--json and --program exclude each other; --program has --python, --latex and --c")
     if as_json and form:
         raise click.UsageError(f"--json and --{form} exclude each other: the JSON holds the equations in both forms")
     from mbkit.report.output_folder import check_writable, file_stem, write
@@ -68,6 +83,10 @@ def derive(
     from mbkit.simulate.progress import Bar
 
     on_paper = isinstance(target, EnergyModel)
+    if quantity is not None:
+        text, ending = _program(target, quantity, form, snap)
+        tell(text if out is None else str(write(out, f"{file_stem(target.name)}{ending}", text + "\n", force=force)))
+        return
     if form == "c":
         model = target if on_paper else in_symbols(target) or target
         _tell_functions(*_write_c(model, system, out or Path(_C_FOLDER), force))
@@ -127,6 +146,25 @@ def _about(system: Callable[..., Lagrangian]) -> str:
     about = (getdoc(system) or "").split("\n\nReferences\n")[0].split("\n\nParameters\n")[0]
     first, *rest = " ".join(about.replace("`", "").split()).split(". ")
     return ". ".join([first.replace("Return ", f"{system.__name__}: ", 1), *rest])
+
+
+def _program(model: Model, quantity: str, form: str | None, snap: float) -> tuple[str, str]:
+    """Return one quantity as named terms, and the ending of its file."""
+    from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
+    from mbkit.lagrangian.printing.program_text import ProgramText, program_text
+
+    if form in (None, "latex"):
+        model, note = with_plain_turns(model, snap)
+        if note:
+            say("note", f"{note}. The terms to read differ from the model by that; --snap 0 leaves it as it is")
+    text = program_text(model, quantity)
+    forms: dict[str | None, tuple[Callable[[ProgramText], str], str]] = {
+        None: (str, ".txt"),
+        "latex": (ProgramText.latex, ".tex"),
+    }
+    forms |= {"python": (ProgramText.python, ".py"), "c": (ProgramText.c, ".c")}
+    written, ending = forms[form]
+    return written(text).rstrip(), ending
 
 
 def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion as EquationsOfMotion
     from mbkit.lagrangian.from_description import from_model as from_model
     from mbkit.lagrangian.independent_coordinates import Embedded as Embedded
+    from mbkit.lagrangian.printing.program_text import ProgramText as ProgramText
+    from mbkit.lagrangian.printing.program_text import program_text as program
     from mbkit.lagrangian.reduction.hamilton import CanonicalEquations as CanonicalEquations
     from mbkit.lagrangian.reduction.hamilton import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.reduction.hamilton import Hamiltonian as Hamiltonian
@@ -43,6 +45,7 @@ _HOME = {
     "Integrability": "mbkit.lagrangian.reduction.nonholonomic",
     "Lagrangian": "mbkit.lagrangian.system",
     "NonholonomicEquations": "mbkit.lagrangian.reduction.nonholonomic",
+    "ProgramText": "mbkit.lagrangian.printing.program_text",
     "QuasiEquationsOfMotion": "mbkit.lagrangian.reduction.quasi_equations",
     "QuasiLagrangian": "mbkit.lagrangian.system",
     "Routhian": "mbkit.lagrangian.reduction.routh",
@@ -52,13 +55,15 @@ _HOME = {
 }
 
 __all__ = ["FUNCTIONS", "CSource", "Equations", "ForwardDynamicsDerivatives", "InverseDynamicsDerivatives", "export_c"]
-__all__ += ["systems", *_HOME]
+__all__ += ["program", "systems", *_HOME]
 
 
 def __getattr__(name: str) -> Any:
     with needed("sympy", "mechanics on paper"):
         if name == "systems":
             return importlib.import_module("mbkit.lagrangian.systems")
+        if name == "program":
+            return importlib.import_module("mbkit.lagrangian.printing.program_text").program_text
         if name in _HOME:
             return getattr(importlib.import_module(_HOME[name]), name)
     raise AttributeError(f"module 'mbkit.lagrangian' has no attribute {name!r}; it has: {', '.join(__all__)}")
