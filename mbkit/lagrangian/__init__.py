@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion as QuasiEquationsOfMotion
     from mbkit.lagrangian.reduction.routh import Routhian as Routhian
     from mbkit.lagrangian.statics.equilibrium import Equilibrium as Equilibrium
+    from mbkit.lagrangian.statics.newton_euler import FreeBodies as FreeBodies
+    from mbkit.lagrangian.statics.newton_euler import newton_euler as newton_euler
     from mbkit.lagrangian.statics.virtual_work import from_particles as from_particles
     from mbkit.lagrangian.statics.virtual_work import generalized_force as generalized_force
     from mbkit.lagrangian.system import Lagrangian as Lagrangian
@@ -40,6 +42,7 @@ _HOME = {
     "Embedded": "mbkit.lagrangian.independent_coordinates",
     "EquationsOfMotion": "mbkit.lagrangian.energies.equations_of_motion",
     "Equilibrium": "mbkit.lagrangian.statics.equilibrium",
+    "FreeBodies": "mbkit.lagrangian.statics.newton_euler",
     "Hamiltonian": "mbkit.lagrangian.reduction.hamilton",
     "ImpulseEquations": "mbkit.lagrangian.reduction.impulses",
     "Integrability": "mbkit.lagrangian.reduction.nonholonomic",
@@ -51,6 +54,7 @@ _HOME = {
     "Routhian": "mbkit.lagrangian.reduction.routh",
     "from_model": "mbkit.lagrangian.from_description",
     "from_particles": "mbkit.lagrangian.statics.virtual_work",
+    "newton_euler": "mbkit.lagrangian.statics.newton_euler",
     "generalized_force": "mbkit.lagrangian.statics.virtual_work",
 }
 

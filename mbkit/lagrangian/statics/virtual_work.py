@@ -130,18 +130,26 @@ def from_particles(
     time: sp.Symbol | None = None,
     parameters: Mapping[sp.Symbol, float | None] | Iterable[sp.Symbol] | None = None,
     constraints: Sequence[Any] = (),
+    velocity_constraints: Sequence[Any] = (),
+    inertias: Sequence[Any] | None = None,
+    angular_velocities: Sequence[Any] | None = None,
     name: str = "particles",
 ) -> Lagrangian:
-    """Return the system of particles at R_i(q, t): Σ (m_i R̈_i - f_i) · δR_i = 0.
+    """Return the system of particles or rigid bodies at R_i(q, t): Σ (m_i R̈_i - f_i) · δR_i = 0 and what turns.
 
     Parameters
     ----------
     masses : sequence of sympy.Expr
         m_i, kg.
     positions : sequence of vectors
-        R_i(q, t): 1, 2 or 3 components along fixed axes, m.
+        R_i(q, t): 1, 2 or 3 components along fixed axes, m; of a body its centre of mass.
     coordinates, velocities
         As of `Lagrangian`.
+    inertias : sequence of sympy.Expr, of 3 of them, or of (3, 3) matrices, optional
+        About the centre of mass, kg m²: one number in a plane, else principal ones or a matrix in the body's axes; None
+        for a particle.
+    angular_velocities : sequence of vectors, optional
+        ω_i(q, v, t) in the axes of the inertia: 1 component in a plane, else 3; None for a particle.
     gravity : vector, optional
         Its acceleration along the same axes, m/s²: V = -Σ m_i gravity · R_i.
     potential : sympy.Expr, optional
@@ -150,7 +158,7 @@ def from_particles(
         f_i on each particle beside gravity, N; None for a particle without.
     generalized : mapping of coordinate to sympy.Expr, optional
         Further generalized forces.
-    dissipation, time, parameters, constraints, name
+    dissipation, time, parameters, constraints, velocity_constraints, name
         As of `Lagrangian`.
 
     Examples
@@ -170,6 +178,9 @@ def from_particles(
     m = [into("masses", x) for x in ([masses] if isinstance(masses, (sp.Basic, int, float)) else masses)]
     _pairs("masses", m, "positions", R)
     T = [mass * sp.Add(*(_rate(x, into) ** 2 for x in place)) / 2 for mass, place in zip(m, R, strict=True)]
+    T += [
+        (w.T * A * w)[0] / 2 for turn in turning(into, len(m), inertias, angular_velocities) if turn for A, w in [turn]
+    ]
     V = [into("potential", potential)]
     if gravity is not None:
         (down,) = vectors("gravity", [gravity], into)
@@ -195,8 +206,40 @@ def from_particles(
         dissipation=into("dissipation", dissipation),
         parameters=parameters,
         constraints=[into(f"constraints[{k}]", c) for k, c in enumerate(constraints)],
+        velocity_constraints=velocity_constraints,
         name=name,
     )
+
+
+def turning(
+    into: PlainSymbols, count: int, inertias: Sequence[Any] | None, angular_velocities: Sequence[Any] | None
+) -> list[tuple[sp.Matrix, sp.Matrix] | None]:
+    """Return inertia and angular velocity of each body, as matrices of 1 or 3 rows; None for a particle."""
+    if inertias is None and angular_velocities is None:
+        return [None] * count
+    A, w = list(inertias or [None] * count), list(angular_velocities or [None] * count)
+    for what, rows in (("inertias", A), ("angular_velocities", w)):
+        if len(rows) != count:
+            raise InputError(f"{what}: {len(rows)} of them for {count} positions; give one for each, or None")
+    out: list[tuple[sp.Matrix, sp.Matrix] | None] = []
+    for k, (inertia, rate) in enumerate(zip(A, w, strict=True)):
+        if (inertia is None) != (rate is None):
+            raise InputError(f"inertias[{k}]: expected an inertia and an angular velocity, or None for both")
+        if inertia is None:
+            out.append(None)
+            continue
+        (turn,) = vectors(f"angular_velocities[{k}]", [rate if hasattr(rate, "__len__") else [rate]], into)
+        shown = sp.Matrix(inertia) if hasattr(inertia, "__len__") else sp.Matrix([inertia])
+        matrix = shown if shown.is_square else sp.diag(*shown)
+        if matrix.rows != len(turn) or len(turn) == 2:
+            raise InputError(
+                f"inertias[{k}]: expected 1 number with 1 angular velocity, or 3 or a (3, 3) matrix with 3, got "
+                f"{shown.shape} with {len(turn)}"
+            )
+        if matrix != matrix.T:
+            raise InputError(f"inertias[{k}]: expected a symmetric matrix, got {matrix.tolist()}")
+        out.append((matrix.applyfunc(lambda x, k=k: into(f"inertias[{k}]", x)), sp.Matrix(turn)))
+    return out
 
 
 def _rate(x: sp.Expr, into: PlainSymbols) -> sp.Expr:
