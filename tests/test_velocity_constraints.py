@@ -374,3 +374,43 @@ def test_a_system_with_velocity_constraints_keeps_them_in_its_variants() -> None
     vdot = turned.dynamics().forward_dynamics(q, v, np.zeros(3))
     assert vdot == pytest.approx([0.3 * 0.25, 0.0, -1.3 * 0.3 * 0.5 / (0.4 + 1.3 * 0.09)], abs=20 * EPS)
     assert turned.maggi().equations() == lag.maggi().equations()
+
+
+# Descriptions
+
+
+def sphere() -> mb.Model:
+    """A ball that rolls on a plane that slopes, by three angles."""
+    b = mb.ModelBuilder("sphere")
+    b.add_body("ball", mass=0.4, inertia=(2e-3, 2e-3, 2e-3))
+    b.add_body("slide", mass=0.0)
+    b.add_body("shift", mass=0.0)
+    b.add_body("lift", mass=0.0)
+    for name, parent, child, axis in (
+        ("x", "world", "slide", (1, 0, 0)),
+        ("y", "slide", "shift", (0, 1, 0)),
+        ("z", "shift", "lift", (0, 0, 1)),
+    ):
+        b.add_joint(name, "prismatic", parent=parent, child=child, axis=axis)
+    b.add_joint("turn", "spherical_zyx", parent="lift", child="ball")
+    b.add_rolling("contact", "sphere", body_a="ball", radius=0.1, axis_b=(0.1, 0.0, 1.0))
+    return b.build()
+
+
+@pytest.mark.parametrize("make", [mb.catalog.rolling_disc, mb.catalog.chaplygin_sleigh, sphere])
+def test_what_rolls_in_a_description_rolls_on_paper(make) -> None:
+    model = make()
+    lag, own = mb.lagrangian.from_model(model), mb.dynamics(model, "lagrangian")
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        q, v = own.project(*model.random_state(rng))
+        expected = own.forward_dynamics(q, v, np.zeros(model.nv))
+        scale = max(1.0, np.abs(expected).max())
+        # The rows are closed to 1e-13, and a disc near its side turns that into more.
+        assert lag.dynamics().forward_dynamics(q, v, np.zeros(model.nv)) == pytest.approx(expected, abs=1e-10 * scale)
+    assert len(lag.velocity_constraints) == len(own.velocity_constraint_names)
+
+
+def test_a_bicycle_is_too_long_to_be_written_out() -> None:
+    with pytest.raises(UnsupportedError, match="at most 7 coordinates"):
+        mb.lagrangian.from_model(mb.catalog.bicycle())

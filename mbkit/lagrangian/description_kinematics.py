@@ -19,11 +19,13 @@ from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 from mbkit.lagrangian.trig.shortest_form import number, shortest_form
-from mbkit.model import Joint, Model
+from mbkit.lagrangian.trig.simplify import tidy
+from mbkit.model import Joint, Model, NoSlip
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.joint_types import cross3
 from mbkit.model.parts import Coupler, Loop, PointSpring, Prescribed
+from mbkit.model.rolling import contact
 
 Vector = list[Any]
 #: The joints from a body down to one that carries it.
@@ -294,6 +296,45 @@ def angle(x: float) -> sp.Expr:
 
 def _read(x: sp.Expr) -> sp.Expr:
     return angle(float(x)) if x.is_Number else x
+
+
+# Blades, and discs and spheres that roll.
+
+
+def rolling(kin: SymbolicKinematics, part: NoSlip) -> tuple[list[sp.Expr], list[sp.Expr]]:
+    """Return the rows of a part without slip that hold positions, and those that hold velocities, in world axes."""
+    exact, x = kin.values.no_slip[part.name], kin.written.values.no_slip[part.name]
+    ways = kin.way(part.body_a), kin.way(part.body_b)
+
+    def vector(way: _Way, entries: Any, weight: int) -> Vector:
+        sums = [kin.zero + e for e in kin.carried(way, list(entries), weight)]
+        kin.drop_dust(sums)
+        return [kin.shown(e) for e in sums]
+
+    def rate(u: Vector) -> Vector:
+        pairs = list(zip(kin.symbols, kin.rates, strict=True))
+        return [sum((sp.diff(e, q) * v for q, v in pairs), sp.Integer(0)) for e in u]
+
+    def material(way: _Way, point: Vector, at: Vector) -> Vector:
+        """Return the velocity of what a body carries at a place, from one of its own points."""
+        turned = [sp.Integer(0)] * 3
+        for axis in np.eye(3):
+            e = vector(way, axis, 0)
+            turned = [a + b / 2 for a, b in zip(turned, cross3(e, rate(e)), strict=True)]
+        arm = [a - b for a, b in zip(at, point, strict=True)]
+        return [a + b for a, b in zip(rate(point), cross3([tidy(w) for w in turned], arm), strict=True)]
+
+    a, b = (vector(way, axis, 0) for way, axis in zip(ways, (exact.axis_a, exact.axis_b), strict=True))
+    along = [vector(ways[1], row, 0) for row in exact.tangents]
+    place = contact(part.kind, a, b, along, x.radius, lambda square: sp.sqrt(tidy(square)))
+    centre, ground = (
+        vector(way, e, 1) for way, e in zip(ways, (exact.translation_a, exact.translation_b), strict=True)
+    )
+    at = [c + o for c, o in zip(centre, place.offset, strict=True)]
+    speeds = [material(way, point, at) for way, point in zip(ways, (centre, ground), strict=True)]
+    gap, velocity = ([c - d for c, d in zip(*two, strict=True)] for two in ((centre, ground), speeds))
+    held, moving = place.rows(gap, velocity, x.speed)
+    return [tidy(row) for row in held], [tidy(row) for row in moving]
 
 
 # Loop closures of a model as holonomic constraints, in SymPy.

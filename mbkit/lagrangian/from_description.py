@@ -10,7 +10,13 @@ import sympy as sp
 
 from mbkit.derivation.kinematics import dissipation, spring_energy
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.lagrangian.description_kinematics import SymbolicKinematics, closure, coupled, instead_of_writing
+from mbkit.lagrangian.description_kinematics import (
+    SymbolicKinematics,
+    closure,
+    coupled,
+    instead_of_writing,
+    rolling,
+)
 from mbkit.lagrangian.elements import acting, law
 from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.energy_model import EnergyModel
@@ -22,6 +28,8 @@ from mbkit.model import Model
 _MOST: Final = 24
 #: The same with loops or motions in time. A row of 40 four-bars has 81 coordinates.
 _MOST_BOUND: Final = 100
+#: The same with what rolls. A bicycle's nine coordinates take half a minute and rows that nobody reads.
+_MOST_ROLLING: Final = 7
 
 
 def from_model(
@@ -41,6 +49,7 @@ def from_model(
     Loop closures become holonomic constraints, in the order of `model.loops`, in the axes of the body that carries
     both ends. A point closure has three rows, two in a plane, and its multipliers are the force on body a; a frame
     closure has three more, one where all axes in the loop are parallel (`mbkit.lagrangian.description_kinematics`).
+    Blades and what rolls become velocity constraints, in world axes; the height of what rolls is a holonomic one.
     Prescribed coordinates become functions of the time, and T has terms of first and zeroth degree then.
 
     Parameters
@@ -61,7 +70,7 @@ def from_model(
     Raises
     ------
     UnsupportedError
-        Ball or free joints, blades or rolling contacts, forces by functions elsewhere than at joints, too many terms
+        Ball or free joints, forces by functions elsewhere than at joints, too many terms
         to read, or no coordinate that is left to move.
     InputError
         `symbols` of a model that is not in the catalog, names that do not fit, or a loop whose ends never meet or do
@@ -112,18 +121,21 @@ def from_model(
     moved = {model.coordinate_names.index(p.joint): law(kin, p, t) for p in model.prescribed}
     rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]
     rows += [(x.name, coupled(kin, x)) for x in model.couplers]
+    touching = [(x.name, *rolling(kin, x)) for x in model.no_slip]
+    rows += [(name, row) for name, held, _ in touching for row in held]
+    moving = [row for _, _, found in touching for row in found]
     if drives:
         rows += [(model.coordinate_names[i], q[i] - x) for i, x in moved.items()]
         moved = {}
     put = {q[i]: x for i, x in moved.items()} | {v[i]: sp.diff(x, t) for i, x in moved.items()}
     stored, pushed = acting(kin, t)
     T, V, R, *constraints = (x.xreplace(put) for x in (T, V + stored, R, *(row for _, row in rows)))
-    pushed = [x.xreplace(put) for x in pushed]
+    pushed, moving = ([x.xreplace(put) for x in found] for found in (pushed, moving))
     kept = [i for i in range(len(q)) if i not in moved]
     # Dampers on prescribed joints alone act on no coordinate that is left.
     R = R if R.free_symbols & {v[i] for i in kept} else sp.Integer(0)
     _check_kept(model, {q[i] for i in kept}, zip((name for name, _ in rows), constraints, strict=True))
-    used = set().union(*(x.free_symbols for x in (T, V, R, *constraints, *pushed)))
+    used = set().union(*(x.free_symbols for x in (T, V, R, *constraints, *moving, *pushed)))
     return Lagrangian(
         T,
         V,
@@ -133,6 +145,7 @@ def from_model(
         forces={q[i]: pushed[i] for i in kept if pushed[i] != 0},
         dissipation=R,
         constraints=constraints,
+        velocity_constraints=moving,
         # What only a frame needs is no part of the equation; a name of the user's own is kept all the same.
         parameters={s: source.parameters[n] for n, s in parameters.items() if named is None or s in used},
         name=model.name,
@@ -140,12 +153,6 @@ def from_model(
 
 
 def _check(model: Model) -> None:
-    if model.no_slip:
-        names = ", ".join(repr(x.name) for x in model.no_slip)
-        raise UnsupportedError(
-            f"{model.name}: no slip {names} holds velocities, and a Lagrangian's constraints hold positions alone; "
-            'mbkit.dynamics(model, "lagrangian") solves it, and model.without("no_slip") is the system that slips'
-        )
     turning = [j.name for j in model.independent_joints if not j.type.coordinate_velocities]
     if turning:
         raise UnsupportedError(
@@ -156,7 +163,7 @@ def _check(model: Model) -> None:
         raise UnsupportedError(f"{model.name}: no joint of it moves, so there is no equation")
     # Engines take trees of any size. What they refuse is solved here alone.
     bound = model.loops or model.prescribed
-    most = _MOST_BOUND if bound else _MOST
+    most = _MOST_ROLLING if model.no_slip else _MOST_BOUND if bound else _MOST
     if model.nv > most:
         raise UnsupportedError(
             f"model: expected at most {most} coordinates to be written out, got {model.nv} coordinates of "
