@@ -55,8 +55,8 @@ def _limits(model: Model) -> Finding | None:
     return Finding(LIMITS, f"no engine applies them: {'; '.join(parts)}", every)
 
 
-def stiff_joints(model: Model, M: Array, J: Array | None = None) -> list[Finding]:
-    """Return the joints whose own damper or spring is faster than a step of 1 ms, the fastest first.
+def stiff_joints(model: Model, M: Array, J: Array | None = None, step: float = STEP) -> list[Finding]:
+    """Return the joints whose own damper or spring is faster than a step, s, the fastest first.
 
     With all others free, a joint's velocity decays by its damper at the rate d (M⁻¹)ⱼⱼ, and swings by its spring at
     √(k (M⁻¹)ⱼⱼ). Constraints take the place of M⁻¹ by the mobility that they leave.
@@ -68,7 +68,7 @@ def stiff_joints(model: Model, M: Array, J: Array | None = None) -> list[Finding
     out = []
     for what, rates in (("damping", damping * mobility), ("stiffness", np.sqrt(stiffness * mobility))):
         for j, (joint, rate) in enumerate(zip(owners(model), rates, strict=True)):
-            if rate * STEP > 1.0:
+            if rate * step > 1.0:
                 of = f"{what} over inertia is {rate:.2g} 1/s" if what == "damping" else f"it swings at {rate:.2g} rad/s"
                 value = (damping if what == "damping" else stiffness)[j]
                 says = (

@@ -1,0 +1,364 @@
+"""The checks of `lint`: one function each, and one row of `CHECKS`, which its decorator makes.
+
+A check yields findings. How sure one is follows from how many times its number is beyond what is allowed: from
+`LIKELY_FROM` and `SURE_FROM` times on it is likely and sure. Limits are of matter and geometry where there are any.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations, permutations, product
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.model import Body, Model
+from mbkit.model.joint_numbers import owners
+from mbkit.model.validation import body_fault, listing
+from mbkit.studies.compare.findings import stiff_joints
+from mbkit.studies.lint.geometry import Geometry
+from mbkit.studies.lint.result import LIKELY, LOOK, SURE, LintFinding
+
+#: From so many times beyond a limit on a finding is likely, and sure.
+LIKELY_FROM: Final = 3.0
+SURE_FROM: Final = 30.0
+#: kg/m³: a light foam, and lead.
+FOAM: Final = 10.0
+LEAD: Final = 11_340.0
+#: A centre of mass may be outside of the shapes by this part of their size: motors are drawn with the next link.
+OUTSIDE: Final = 0.1
+#: The mean square radius of gyration may be less than that of the hull by this factor.
+COMPACT: Final = 30.0
+#: Inertias over their traces differ by less where they are alike, and by more where they are not.
+ALIKE: Final = 0.1
+UNLIKE: Final = 0.25
+#: Masses, and distances between joints, of neighbours.
+APART: Final = 1e3
+FAR: Final = 100.0
+#: Links with one inertia, and the ratio of moments from which their shapes differ.
+COPIES: Final = 3
+OTHER_SHAPE: Final = 1.5
+#: Of mirrored links: masses and inertias by themselves, and centres of mass by the radius of gyration.
+MIRRORED: Final = 0.05
+#: Coordinates beyond this say that there is no limit.
+NO_LIMIT: Final = 1e3
+#: Random poses.
+POSES: Final = 256
+
+_TURNS: Final = [
+    R
+    for order in permutations(range(3))
+    for signs in product((1.0, -1.0), repeat=3)
+    if np.linalg.det(R := np.diag(signs)[:, order]) > 0
+]
+_REFLECTIONS: Final = [np.array(signs) for signs in product((1.0, -1.0), repeat=3)]
+_UPPER: Final = np.triu_indices(3)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A model, its links as the file has them, their shapes, and an engine, where one takes the model."""
+
+    model: Model
+    links: Model
+    shapes: Mapping[str, Geometry]
+    control_period: float
+    engine: Dynamics | None
+
+    @cached_property
+    def bodies(self) -> tuple[Body, ...]:
+        """The links with mass."""
+        return tuple(body for body in self.links.bodies if body.mass > 0)
+
+    def shaped(self) -> Iterator[tuple[Body, Geometry]]:
+        """Yield the links with mass and shapes."""
+        yield from ((body, self.shapes[body.name]) for body in self.bodies if body.name in self.shapes)
+
+    @cached_property
+    def reach(self) -> float:
+        """The sum of the distances between joints, m."""
+        return float(sum(np.linalg.norm(joint.translation) for joint in self.links.joints))
+
+    @cached_property
+    def poses(self) -> Array:
+        """Random configurations, the same for the same model."""
+        return self.model.random_state(0, POSES)[0]
+
+
+class Check(NamedTuple):
+    """A check: what it looks at, and the function."""
+
+    name: str
+    about: str
+    run: Callable[[Judged], Iterator[LintFinding]]
+
+
+CHECKS: Final[dict[str, Check]] = {}
+_Run = Callable[[Judged], Iterator[LintFinding]]
+
+
+def check(about: str) -> Callable[[_Run], _Run]:
+    """Register a check under the name of its function."""
+
+    def register(run: _Run) -> _Run:
+        name = run.__name__.replace("_", " ")
+        CHECKS[name] = Check(name, about, run)
+        return run
+
+    return register
+
+
+def _confidence(times: float) -> str:
+    return SURE if times >= SURE_FROM else LIKELY if times >= LIKELY_FROM else LOOK
+
+
+# Links and their shapes
+
+
+@check("mass over the volume of the link's shapes")
+def density(at: Judged) -> Iterator[LintFinding]:
+    expected = f"{FOAM:g} to {LEAD:g} kg/m³, from foam to lead"
+    for body, shape in at.shaped():
+        # The hull is the most that shapes can hold.
+        heavy, light = body.mass / shape.hull.mass, body.mass / shape.least
+        if (times := max(heavy / LEAD, FOAM / light)) > 1:
+            rho, volume = (heavy, shape.hull.mass) if heavy > LEAD else (light, shape.least)
+            says = f"{body.mass:.3g} kg in the {1e3 * volume:.3g} l of its shapes are {rho:.3g} kg/m³"
+            yield LintFinding(body.name, "density", rho, expected, _confidence(times), says)
+
+
+@check("distance of the centre of mass from the hull of the link's shapes, or from the joint")
+def centre_of_mass(at: Judged) -> Iterator[LintFinding]:
+    for body in at.bodies:
+        shape = at.shapes.get(body.name)
+        off = float(np.linalg.norm(body.com)) if shape is None else shape.outside(body.com)
+        allowed = at.reach if shape is None else OUTSIDE * shape.size
+        if allowed and off > allowed:
+            what = "its joint; all joints together reach" if shape is None else "the hull of its shapes, which measures"
+            says = f"centre of mass {off:.3g} m from {what} {at.reach if shape is None else shape.size:.3g} m"
+            expected = f"up to {allowed:.3g} m"
+            yield LintFinding(body.name, "centre of mass", off, expected, _confidence(off / allowed), says)
+
+
+@check("radius of gyration against the size of the link")
+def radius_of_gyration(at: Judged) -> Iterator[LintFinding]:
+    for body in at.bodies:
+        shape, largest = at.shapes.get(body.name), float(np.linalg.eigvalsh(body.inertia)[-1])
+        if largest <= 0 or not (shape or at.reach):
+            continue
+        most = at.reach if shape is None else shape.farthest(body.com)
+        mean = np.sqrt(np.trace(shape.hull.inertia) / shape.hull.mass / 2 / COMPACT) if shape else 0.0
+        wide, own = np.sqrt(largest / body.mass), np.sqrt(np.trace(body.inertia) / body.mass / 2)
+        if (times := max(wide / most, mean / own)) > 1:
+            value = float(wide if wide > most else own)
+            where = "its shapes" if shape else "the whole robot"
+            says = f"inertia and mass give a radius of gyration of {value:.3g} m, in {where} of {most:.3g} m"
+            expected = f"{mean:.3g} to {most:.3g} m"
+            yield LintFinding(body.name, "radius of gyration", value, expected, _confidence(times**2), says)
+
+
+@check("axes of the inertia against those of the link's shapes")
+def axes(at: Judged) -> Iterator[LintFinding]:
+    for body, shape in at.shaped():
+        own, hull = (I / np.trace(I) if np.trace(I) > 0 else None for I in (body.inertia, shape.hull.inertia))
+        if own is None or hull is None:
+            continue
+        apart = float(np.linalg.norm(own - hull))
+        if apart < UNLIKE:
+            continue
+        turned = min(float(np.linalg.norm(R @ own @ R.T - hull)) for R in _TURNS)
+        best = float(np.linalg.norm(np.linalg.eigvalsh(own) - np.linalg.eigvalsh(hull)))
+        if min(turned, best) < ALIKE:
+            how = "with two axes exchanged" if turned < ALIKE else "in a turned frame"
+            says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, and {how} by {min(turned, best):.2g}"
+            expected = f"below {UNLIKE:g}"
+            confidence = LIKELY if apart > 3 * min(turned, best) else LOOK
+            yield LintFinding(body.name, "axes", apart, expected, confidence, says)
+
+
+@check("signs of the products of inertia against the link's shapes")
+def sign_of_products(at: Judged) -> Iterator[LintFinding]:
+    for body, shape in at.shaped():
+        own, hull = (I / np.trace(I) if np.trace(I) > 0 else None for I in (body.inertia, shape.hull.inertia))
+        if own is None or hull is None:
+            continue
+        flipped = 2 * np.diag(np.diag(own)) - own
+        apart, other = (float(np.linalg.norm(I - hull)) for I in (own, flipped))
+        if apart > ALIKE and 3 * other < apart:
+            says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, with the products' other sign by {other:.2g}"
+            yield LintFinding(body.name, "sign of products", apart, f"below {ALIKE:g}", LIKELY, says)
+
+
+# Links alone
+
+
+@check("principal moments that no matter has")
+def matter(at: Judged) -> Iterator[LintFinding]:
+    for body in at.links.bodies:
+        if why := body_fault(body, point_masses=True):
+            moments = np.linalg.eigvalsh(body.inertia)
+            excess = float(moments[2] - moments[0] - moments[1])
+            yield LintFinding(body.name, "matter", excess, "A + B >= C, and mass", SURE, why)
+
+
+@check("numbers that stand for unknown ones: no inertia, or a power of ten about all axes")
+def placeholder(at: Judged) -> Iterator[LintFinding]:
+    for body in at.bodies:
+        moment = float(body.inertia[0, 0])
+        if not body.inertia.any():
+            says = f"{body.mass:g} kg without inertia"
+        elif np.array_equal(body.inertia, moment * np.eye(3)) and _power_of_ten(moment):
+            says = f"inertia {moment:g} kg m² about every axis, with {body.mass:g} kg"
+        else:
+            continue
+        confidence = SURE if moment and _power_of_ten(body.mass) else LIKELY
+        yield LintFinding(body.name, "placeholder", moment, "the link's own inertia", confidence, says)
+
+
+def _power_of_ten(x: float) -> bool:
+    return f"{x:.6e}".startswith("1.000000e")
+
+
+@check("one inertia on several links of different shape or mass")
+def copied_inertia(at: Judged) -> Iterator[LintFinding]:
+    groups: dict[tuple[str, ...], list[Body]] = defaultdict(list)
+    for body in at.bodies:
+        if body.inertia.any():
+            groups[tuple(f"{x + 0.0:.9g}" for x in body.inertia[_UPPER])].append(body)
+    for group in groups.values():
+        if len(group) >= COPIES and any(_differ(a, b, at) for a, b in combinations(group, 2)):
+            names = [body.name for body in group]
+            says = f"the same inertia on {len(group)} links of different shape or mass: {listing(names, 6)}"
+            expected = "an inertia for each shape"
+            yield LintFinding(names[0], "copied inertia", len(group), expected, LIKELY, says, tuple(names[1:]))
+
+
+def _differ(a: Body, b: Body, at: Judged) -> bool:
+    if not np.isclose(a.mass, b.mass, rtol=MIRRORED):
+        return True
+    if a.name not in at.shapes or b.name not in at.shapes:
+        return False
+    one, other = (np.linalg.eigvalsh(at.shapes[x.name].hull.inertia / at.shapes[x.name].hull.mass) for x in (a, b))
+    return bool(np.maximum(one / other, other / one).max() > OTHER_SHAPE)
+
+
+# Links and their neighbours
+
+
+@check("masses of links without shapes, and distances between joints, against their neighbours")
+def neighbours(at: Judged) -> Iterator[LintFinding]:
+    masses, near = {b.name: b.mass for b in at.bodies}, defaultdict(set)
+    for joint in at.links.joints:
+        if joint.parent in masses and joint.child in masses:
+            near[joint.child].add(masses[joint.parent])
+            near[joint.parent].add(masses[joint.child])
+    for name, others in near.items():
+        ratio = max(min(others) / masses[name], masses[name] / max(others))
+        if ratio > APART and name not in at.shapes:
+            says = f"{masses[name]:.3g} kg beside {min(others):.3g} kg"
+            yield LintFinding(name, "neighbours", ratio, f"ratios up to {APART:g}", _confidence(ratio / APART), says)
+    lengths = {j.name: float(np.linalg.norm(j.translation)) for j in at.links.joints}
+    usual = float(np.median([x for x in lengths.values() if x > 0] or [0]))
+    for name, length in lengths.items():
+        if usual and length > FAR * usual:
+            says = f"its joint stands {length:.3g} m away, the median one {usual:.3g} m"
+            times = length / usual / FAR
+            yield LintFinding(name, "neighbours", length, f"up to {FAR * usual:.3g} m", _confidence(times), says)
+
+
+_LEFT: Final = re.compile(
+    r"(?i:left|(?<![a-z])([frhb]?l|l[frhb])(?![a-z]))|(?<![A-Za-z])L(?=[A-Z][a-z])|(?<=[a-z])L(?![a-z])"
+)
+
+
+def other_side(name: str) -> str:
+    """Return the name of the right link for that of a left one; the name itself for every other one."""
+    sides = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
+    return _LEFT.sub(lambda m: sides.get(m[0]) or m[0].replace("l", "r").replace("L", "R"), name)
+
+
+@check("left and right links that mirror each other but for one number, or all but one pair")
+def mirror(at: Judged) -> Iterator[LintFinding]:
+    right = {body.name: body for body in at.bodies}
+    pairs = [(a, right[name]) for a in at.bodies if (name := other_side(a.name)) != a.name and name in right]
+    wrong = [(a, b, _unlike(a, b)) for a, b in pairs]
+    odd = [x for x in wrong if x[2]]
+    # Where nearly every pair mirrors, one that does not at all counts too.
+    rule = len(wrong) - len(odd) >= max(3, 3 * len(odd))
+    for a, b, names in odd:
+        if len(names) <= 2 or rule:
+            says = f"mirrors {a.name} but for {', '.join(names)}"
+            expected = f"a mirror image, to {MIRRORED:.0%}"
+            confidence = LIKELY if rule else LOOK
+            yield LintFinding(b.name, "mirror", len(names), expected, confidence, says, (a.name,))
+
+
+def _unlike(a: Body, b: Body) -> list[str]:
+    """Return the names of the numbers by which two links are no mirror images, by the best reflection of axes."""
+    trace = max(float(np.trace(x.inertia)) for x in (a, b))
+    radius = np.sqrt(trace / max(a.mass, b.mass))
+    names = ["mass", *(f"{x} of the centre of mass" for x in "xyz"), "ixx", "ixy", "ixz", "iyy", "iyz", "izz"]
+    best = None
+    for s in _REFLECTIONS:
+        com, inertia = s * a.com - b.com, (np.outer(s, s) * a.inertia - b.inertia)[_UPPER]
+        off = [abs(a.mass / b.mass - 1), *(np.abs(com) / (2 * radius or 1.0)), *(np.abs(inertia) / (trace or 1.0))]
+        these = [name for name, x in zip(names, off, strict=True) if x > MIRRORED]
+        best = these if best is None or len(these) < len(best) else best
+    return best or []
+
+
+# Joints
+
+
+@check("limits of angles beyond a turn, which may be degrees")
+def limits_in_degrees(at: Judged) -> Iterator[LintFinding]:
+    for joint in at.model.joints:
+        for k in joint.type.angular:
+            ends = [float(x) for x in (joint.lower[k], joint.upper[k]) if abs(x) < NO_LIMIT]
+            value = max(map(abs, ends), default=0.0)
+            if value > 2 * np.pi * (1 + 1e-3):
+                whole = all(x == round(x) for x in ends) and value <= 720
+                says = f"limits {', '.join(f'{x:g}' for x in ends)} rad" + (", whole numbers as of degrees" if whole else "")
+                confidence = SURE if whole and value > 20 else LIKELY if value > 20 else LOOK
+                yield LintFinding(joint.name, "limits in degrees", value, "up to 2π rad", confidence, says)
+
+
+@check("limits of no width, and actuators of no force or speed")
+def empty_limits(at: Judged) -> Iterator[LintFinding]:
+    for joint in at.model.joints:
+        if any(joint.lower[k] == joint.upper[k] for k in range(len(joint.lower))):
+            says = f"lower and upper limit are both {joint.lower[0]:g}"
+            yield LintFinding(joint.name, "empty limits", 0.0, "lower < upper", LIKELY, says)
+        zero = [x for x in ("effort", "velocity") if (getattr(joint, f"{x}_limit") == 0).any()]
+        if zero:
+            says = f"its limit of {' and '.join(zero)} is 0"
+            yield LintFinding(joint.name, "empty limits", 0.0, "above 0", LOOK, says)
+
+
+@check("force that holds the robot against gravity at the worst of random poses, against the limit of effort")
+def effort(at: Judged) -> Iterator[LintFinding]:
+    if at.engine is None or at.model.constrained or any(j.type.floating for j in at.model.joints):
+        return
+    rest = np.zeros((len(at.poses), at.model.nv))
+    needed = np.abs(at.engine.inverse_dynamics(at.poses, rest, rest)).max(axis=0)
+    for joint, force, limit in zip(owners(at.model), needed, at.model.effort_limits, strict=True):
+        if force > limit > 0:
+            says = f"holding it against gravity takes {force:.3g}, and its effort is limited to {limit:.3g}"
+            expected = f"an effort of {force:.3g} N or Nm"
+            yield LintFinding(joint, "effort", float(limit), expected, _confidence(float(force / limit)), says)
+
+
+@check("damping over inertia against the period of control")
+def damping(at: Judged) -> Iterator[LintFinding]:
+    if at.engine is None:
+        return
+    for found in stiff_joints(at.model.without("springs"), at.engine.mass_matrix(at.poses), step=at.control_period):
+        expected, times = f"a time constant above {1e3 * at.control_period:g} ms", at.control_period / found.size
+        says = found.says.partition(": ")[2].partition(";")[0]
+        yield LintFinding(found.joints[0], "damping", found.size, expected, _confidence(times), says)
