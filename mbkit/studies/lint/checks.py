@@ -35,9 +35,13 @@ LEAD: Final = 11_340.0
 OUTSIDE: Final = 0.1
 #: The mean square radius of gyration may be less than that of the hull by this factor.
 COMPACT: Final = 30.0
+#: Inertias are compared with that of the hull where the centres of mass are nearer than this part of its size.
+CENTRED: Final = 0.15
 #: Inertias over their traces differ by less where they are alike, and by more where they are not.
 ALIKE: Final = 0.1
 UNLIKE: Final = 0.25
+#: The products' other sign brings an inertia nearer by more than this.
+BETTER: Final = 3.0
 #: Masses, and distances between joints, of neighbours.
 APART: Final = 1e3
 FAR: Final = 100.0
@@ -48,6 +52,8 @@ OTHER_SHAPE: Final = 1.5
 MIRRORED: Final = 0.05
 #: Coordinates beyond this say that there is no limit.
 NO_LIMIT: Final = 1e3
+#: rad: two turns; joints beyond one are built.
+MOST_TURN: Final = 4 * np.pi
 #: Random poses.
 POSES: Final = 256
 
@@ -149,50 +155,69 @@ def centre_of_mass(at: Judged) -> Iterator[LintFinding]:
 @check("radius of gyration against the size of the link")
 def radius_of_gyration(at: Judged) -> Iterator[LintFinding]:
     for body in at.bodies:
-        shape, largest = at.shapes.get(body.name), float(np.linalg.eigvalsh(body.inertia)[-1])
-        if largest <= 0 or not (shape or at.reach):
+        if _placeholder(body):
             continue
-        most = at.reach if shape is None else shape.farthest(body.com)
-        mean = np.sqrt(np.trace(shape.hull.inertia) / shape.hull.mass / 2 / COMPACT) if shape else 0.0
-        wide, own = np.sqrt(largest / body.mass), np.sqrt(np.trace(body.inertia) / body.mass / 2)
-        if (times := max(wide / most, mean / own)) > 1:
-            value = float(wide if wide > most else own)
+        shape = at.shapes.get(body.name)
+        least, most = _radii(body, shape) if shape else (0.0, at.reach)
+        value, times = _radius(body, least, most)
+        if most and times > 1:
             where = "its shapes" if shape else "the whole robot"
             says = f"inertia and mass give a radius of gyration of {value:.3g} m, in {where} of {most:.3g} m"
-            expected = f"{mean:.3g} to {most:.3g} m"
+            expected = f"{least:.3g} to {most:.3g} m"
             yield LintFinding(body.name, "radius of gyration", value, expected, _confidence(times**2), says)
 
 
-@check("axes of the inertia against those of the link's shapes")
-def axes(at: Judged) -> Iterator[LintFinding]:
+def _radii(body: Body, shape: Geometry) -> tuple[float, float]:
+    """Return the least radius of gyration of a link, m, and the distance of its farthest corner, which none exceeds."""
+    mean = np.sqrt(np.trace(shape.hull.inertia) / shape.hull.mass / 2 / COMPACT)
+    return float(mean), shape.farthest(body.com)
+
+
+def _radius(body: Body, least: float, most: float) -> tuple[float, float]:
+    """Return the radius of gyration that is out of bounds, or a mean one, and by how many times it is out of them."""
+    moments = np.linalg.eigvalsh(body.inertia)
+    widest = float(np.sqrt(max(moments[-1], 0.0) / body.mass))
+    mean = float(np.sqrt(max(moments.sum(), 0.0) / body.mass / 2))
+    if not mean or not most:
+        return mean, 1.0
+    return max((widest, widest / most), (mean, least / mean), key=lambda x: x[1])
+
+
+def _comparable(at: Judged) -> Iterator[tuple[Body, Array, Array]]:
+    """Yield links with their own inertia and that of their hull, over their traces, where mass is spread as the hull."""
     for body, shape in at.shaped():
-        own, hull = (I / np.trace(I) if np.trace(I) > 0 else None for I in (body.inertia, shape.hull.inertia))
-        if own is None or hull is None:
-            continue
-        apart = float(np.linalg.norm(own - hull))
-        if apart < UNLIKE:
-            continue
-        turned = min(float(np.linalg.norm(R @ own @ R.T - hull)) for R in _TURNS)
-        best = float(np.linalg.norm(np.linalg.eigvalsh(own) - np.linalg.eigvalsh(hull)))
-        if min(turned, best) < ALIKE:
-            how = "with two axes exchanged" if turned < ALIKE else "in a turned frame"
-            says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, and {how} by {min(turned, best):.2g}"
-            expected = f"below {UNLIKE:g}"
-            confidence = LIKELY if apart > 3 * min(turned, best) else LOOK
-            yield LintFinding(body.name, "axes", apart, expected, confidence, says)
+        fits = _radius(body, *_radii(body, shape))[1] <= 1 and not _placeholder(body)
+        if fits and np.linalg.norm(body.com - shape.hull.com) < CENTRED * shape.size:
+            yield body, body.inertia / np.trace(body.inertia), shape.hull.inertia / np.trace(shape.hull.inertia)
+
+
+def _flipped(inertia: Array) -> Array:
+    return np.asarray(2 * np.diag(np.diag(inertia)) - inertia)
 
 
 @check("signs of the products of inertia against the link's shapes")
 def sign_of_products(at: Judged) -> Iterator[LintFinding]:
-    for body, shape in at.shaped():
-        own, hull = (I / np.trace(I) if np.trace(I) > 0 else None for I in (body.inertia, shape.hull.inertia))
-        if own is None or hull is None:
-            continue
-        flipped = 2 * np.diag(np.diag(own)) - own
-        apart, other = (float(np.linalg.norm(I - hull)) for I in (own, flipped))
-        if apart > ALIKE and 3 * other < apart:
-            says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, with the products' other sign by {other:.2g}"
+    for body, own, hull in _comparable(at):
+        apart, other = (float(np.linalg.norm(I - hull)) for I in (own, _flipped(own)))
+        if _sign_is_wrong(apart, other):
+            says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, with the products' other sign {other:.2g}"
             yield LintFinding(body.name, "sign of products", apart, f"below {ALIKE:g}", LIKELY, says)
+
+
+def _sign_is_wrong(apart: float, other: float) -> bool:
+    return apart > ALIKE and other * BETTER < apart
+
+
+@check("axes of the inertia against those of the link's shapes")
+def axes(at: Judged) -> Iterator[LintFinding]:
+    for body, own, hull in _comparable(at):
+        apart, other = (float(np.linalg.norm(I - hull)) for I in (own, _flipped(own)))
+        turned = min(float(np.linalg.norm(R @ own @ R.T - hull)) for R in _TURNS)
+        best = min(turned, float(np.linalg.norm(np.linalg.eigvalsh(own) - np.linalg.eigvalsh(hull))))
+        if apart > UNLIKE and best < ALIKE and not _sign_is_wrong(apart, other):
+            how = "with axes exchanged" if turned < ALIKE else "in a turned frame"
+            says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, {how} {min(turned, best):.2g}"
+            yield LintFinding(body.name, "axes", apart, f"below {UNLIKE:g}", LIKELY, says)
 
 
 # Links alone
@@ -210,15 +235,18 @@ def matter(at: Judged) -> Iterator[LintFinding]:
 @check("numbers that stand for unknown ones: no inertia, or a power of ten about all axes")
 def placeholder(at: Judged) -> Iterator[LintFinding]:
     for body in at.bodies:
-        moment = float(body.inertia[0, 0])
-        if not body.inertia.any():
-            says = f"{body.mass:g} kg without inertia"
-        elif np.array_equal(body.inertia, moment * np.eye(3)) and _power_of_ten(moment):
-            says = f"inertia {moment:g} kg m² about every axis, with {body.mass:g} kg"
-        else:
-            continue
-        confidence = SURE if moment and _power_of_ten(body.mass) else LIKELY
-        yield LintFinding(body.name, "placeholder", moment, "the link's own inertia", confidence, says)
+        if _placeholder(body):
+            moment = float(body.inertia[0, 0])
+            says = f"inertia {moment:g} kg m² about every axis" if moment else "no inertia"
+            confidence = SURE if moment and _power_of_ten(body.mass) else LIKELY
+            says += f", with {body.mass:g} kg"
+            yield LintFinding(body.name, "placeholder", moment, "the link's own inertia", confidence, says)
+
+
+def _placeholder(body: Body) -> bool:
+    moment = float(body.inertia[0, 0])
+    same = np.allclose(body.inertia, moment * np.eye(3), rtol=0, atol=1e-9 * abs(moment))
+    return bool(same and (not moment or _power_of_ten(moment)))
 
 
 def _power_of_ten(x: float) -> bool:
@@ -229,7 +257,7 @@ def _power_of_ten(x: float) -> bool:
 def copied_inertia(at: Judged) -> Iterator[LintFinding]:
     groups: dict[tuple[str, ...], list[Body]] = defaultdict(list)
     for body in at.bodies:
-        if body.inertia.any():
+        if not _placeholder(body):
             groups[tuple(f"{x + 0.0:.9g}" for x in body.inertia[_UPPER])].append(body)
     for group in groups.values():
         if len(group) >= COPIES and any(_differ(a, b, at) for a, b in combinations(group, 2)):
@@ -254,14 +282,16 @@ def _differ(a: Body, b: Body, at: Judged) -> bool:
 @check("masses of links without shapes, and distances between joints, against their neighbours")
 def neighbours(at: Judged) -> Iterator[LintFinding]:
     masses, near = {b.name: b.mass for b in at.bodies}, defaultdict(set)
+    usual = float(np.median([*masses.values()])) if masses else 0.0
     for joint in at.links.joints:
         if joint.parent in masses and joint.child in masses:
             near[joint.child].add(masses[joint.parent])
             near[joint.parent].add(masses[joint.child])
     for name, others in near.items():
-        ratio = max(min(others) / masses[name], masses[name] / max(others))
+        mass, some = masses[name], [*others, usual]
+        ratio = max(min(some) / mass, mass / max(some))
         if ratio > APART and name not in at.shapes:
-            says = f"{masses[name]:.3g} kg beside {min(others):.3g} kg"
+            says = f"{mass:.3g} kg beside {min(others):.3g} kg, and {usual:.3g} kg as the median link"
             yield LintFinding(name, "neighbours", ratio, f"ratios up to {APART:g}", _confidence(ratio / APART), says)
     lengths = {j.name: float(np.linalg.norm(j.translation)) for j in at.links.joints}
     usual = float(np.median([x for x in lengths.values() if x > 0] or [0]))
@@ -316,17 +346,17 @@ def _unlike(a: Body, b: Body) -> list[str]:
 # Joints
 
 
-@check("limits of angles beyond a turn, which may be degrees")
+@check("limits of angles beyond two turns, which may be degrees")
 def limits_in_degrees(at: Judged) -> Iterator[LintFinding]:
     for joint in at.model.joints:
         for k in joint.type.angular:
             ends = [float(x) for x in (joint.lower[k], joint.upper[k]) if abs(x) < NO_LIMIT]
             value = max(map(abs, ends), default=0.0)
-            if value > 2 * np.pi * (1 + 1e-3):
+            if value > MOST_TURN:
                 whole = all(x == round(x) for x in ends) and value <= 720
                 says = f"limits {', '.join(f'{x:g}' for x in ends)} rad" + (", whole numbers as of degrees" if whole else "")
                 confidence = SURE if whole and value > 20 else LIKELY if value > 20 else LOOK
-                yield LintFinding(joint.name, "limits in degrees", value, "up to 2π rad", confidence, says)
+                yield LintFinding(joint.name, "limits in degrees", value, "up to two turns", confidence, says)
 
 
 @check("limits of no width, and actuators of no force or speed")
@@ -336,14 +366,15 @@ def empty_limits(at: Judged) -> Iterator[LintFinding]:
             says = f"lower and upper limit are both {joint.lower[0]:g}"
             yield LintFinding(joint.name, "empty limits", 0.0, "lower < upper", LIKELY, says)
         zero = [x for x in ("effort", "velocity") if (getattr(joint, f"{x}_limit") == 0).any()]
-        if zero:
+        # A joint that follows has no actuator.
+        if zero and joint.mimic is None:
             says = f"its limit of {' and '.join(zero)} is 0"
             yield LintFinding(joint.name, "empty limits", 0.0, "above 0", LOOK, says)
 
 
 @check("force that holds the robot against gravity at the worst of random poses, against the limit of effort")
 def effort(at: Judged) -> Iterator[LintFinding]:
-    if at.engine is None or at.model.constrained or any(j.type.floating for j in at.model.joints):
+    if at.engine is None or any(j.type.floating for j in at.model.joints):
         return
     rest = np.zeros((len(at.poses), at.model.nv))
     needed = np.abs(at.engine.inverse_dynamics(at.poses, rest, rest)).max(axis=0)

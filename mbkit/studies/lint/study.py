@@ -107,6 +107,8 @@ def _geometry(links: Model, skipped: list[str]) -> dict[str, Geometry]:
 
 def _engine(model: Model, skipped: list[str]) -> Dynamics | None:
     try:
+        if model.constrained:
+            raise UnsupportedError("constraints share the forces")
         return dynamics(model, PINOCCHIO)
     except MbkitError as error:
         skipped.append(f"effort and damping: {error}")
