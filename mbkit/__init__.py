@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from mbkit.studies.convert import convert as convert
     from mbkit.studies.explain import explain as explain
     from mbkit.studies.importers import compare_parsers as compare_parsers
+    from mbkit.studies.lint import lint as lint
     from mbkit.studies.stress.study import stress as stress
     from mbkit.studies.versions import versions as versions
     from mbkit.studies.work_precision.study import work_precision as work_precision
@@ -85,6 +86,7 @@ _HOME = {
     "identify": "mbkit.identify",
     "impact": "mbkit.engines.consistent.impacts",
     "join": "mbkit.model.changes.joining",
+    "lint": "mbkit.studies.lint",
     "load": "mbkit.load",
     "operational_space": "mbkit.engines.operational_space",
     "robots": "mbkit.load",

@@ -8,17 +8,20 @@ from __future__ import annotations
 import os
 import unittest
 from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
 from mbkit.engines.registry import STANDARD, find_engine
+from mbkit.errors import InputError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
     from mbkit.studies.baseline import BaselineResult
     from mbkit.studies.compare.result import Comparison, Row
     from mbkit.studies.explain import Explanation
+    from mbkit.studies.lint import LintFinding, LintResult
 
-__all__ = ["STRICT", "assert_baseline", "assert_engines_agree", "assert_same_dynamics"]
+__all__ = ["STRICT", "assert_baseline", "assert_engines_agree", "assert_plausible", "assert_same_dynamics"]
 
 #: Set to 1, an engine that is not installed fails a test instead of being skipped.
 STRICT = "MBKIT_TEST_STRICT"
@@ -117,6 +120,49 @@ def assert_same_dynamics(
     result = explain(model_a, model_b, samples=samples, seed=seed, tolerance=rtol, names=names)
     if not result.agree:
         raise AssertionError(_explanation_text(result))
+    return result
+
+
+def assert_plausible(
+    model: Model | str | os.PathLike[str], *, ignore: Iterable[str] = (), control_period: float = 1e-3
+) -> LintResult:
+    """Assert that nothing in a description is wrong for sure or likely, by what it knows of itself (`mbkit.lint`).
+
+    Parameters
+    ----------
+    model : Model, str or path
+    ignore : iterable of str
+        Checks, links and joints, or ``"part: check"``, whose findings are known and accepted; with wildcards.
+    control_period : float
+        s.
+
+    Raises
+    ------
+    AssertionError
+        Some findings are sure or likely; with each one's link, number and what is expected.
+
+    Examples
+    --------
+    >>> from mbkit.testing import assert_plausible
+    >>> assert_plausible("ur5", ignore=["wrist_*: *"]).passed
+    False
+    """
+    __tracebackhide__ = True
+    from mbkit.studies.lint import lint
+    from mbkit.studies.lint.result import LOOK
+
+    if isinstance(ignore, str):
+        raise InputError(f"ignore: expected several names, got {ignore!r}; write [{ignore!r}]")
+    result, accepted = lint(model, control_period=control_period), [*ignore]
+
+    def known(row: LintFinding) -> bool:
+        names = row.part, row.check, f"{row.part}: {row.check}"
+        return any(fnmatchcase(name, pattern) for name in names for pattern in accepted)
+
+    wrong = [row for row in result.rows if row.confidence != LOOK and not known(row)]
+    if wrong:
+        lines = _first([f"{row}; expected {row.expected}" for row in wrong], "")
+        raise AssertionError("\n".join([f"{result.model}: {len(wrong)} findings that are sure or likely", *lines]))
     return result
 
 

@@ -1,8 +1,8 @@
 """The command `mbkit`: checks arguments, calls the library, prints, and says how it ended.
 
-Exit status: 0 done, and the engines agree (or are as a baseline has them), 1 they differ, or a run diverged or
-is doubtful, 2 misuse or
-bad input, 70 a fault of mbkit's own, 130 interrupted.
+Exit status: 0 done, and the engines agree (or are as a baseline has them), 1 they differ, a run diverged or is
+doubtful, or a file has findings that are sure or likely, 2 misuse or bad input,
+70 a fault of mbkit's own, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sys
 import click
 
 from mbkit._version import __version__
-from mbkit.cli import baseline, bench, check, convert, derive, diff, plot, simulate, stress, versions
+from mbkit.cli import baseline, bench, check, convert, derive, diff, lint, plot, simulate, stress, versions
 from mbkit.cli._shared import CommandGroup
 
 
@@ -33,7 +33,7 @@ def cli() -> None:
 
 
 for _command in (
-    *(check.check, diff.diff, baseline.baseline, derive.derive, derive.export, simulate.simulate, plot.plot),
+    *(check.check, lint.lint, diff.diff, baseline.baseline, derive.derive, derive.export, simulate.simulate, plot.plot),
     *(bench.bench, stress.stress, versions.versions, convert.convert, convert.robots),
 ):
     cli.add_command(_command)

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from mbkit import _interrupt
 from mbkit.cli import _shared as shared
 from mbkit.cli._shared import AGREE, DIFFER, INTERRUPTED, MISUSE, Report
+from mbkit.errors import MbkitError
+
+if TYPE_CHECKING:
+    from mbkit.model import Model
+    from mbkit.studies import Finding
 
 
 @shared.command(
@@ -87,11 +95,25 @@ def _check_one(report: Report, target: str, options: dict[str, Any], *, full: bo
     report.prepare(stem, "json", "html")
     with Bar(f"check {model.name}") as bar:
         result = compare(model, **settings, progress=bar)
+    result = replace(result, findings=(*result.findings, *_of_file(model, target)))
     written = report.write(compare_view.view(result, target, full=full), stem)
     if result.nothing:
         needed = "" if result.rows else "; two engines that hold the model are needed"
         shared.say("error", f"{result.verdict}{needed}")
     shared.leave(MISUSE if not written or result.nothing else AGREE if result.passed else DIFFER)
+
+
+def _of_file(model: Model, target: str) -> Iterator[Finding]:
+    """Yield what `lint` says of a model with a file, which engines do not judge."""
+    from mbkit.studies import Finding
+    from mbkit.studies.lint import lint
+
+    if model.sources:
+        with suppress(MbkitError):
+            found = lint(model)
+            parts = tuple(dict.fromkeys(row.part for row in found.rows))
+            says = f"no engine judges it: {found.verdict}" + (f"; mbkit lint {target}" if parts else "")
+            yield Finding("the file itself", says, parts, len(found.rows))
 
 
 def _check_parsers(report: Report, target: str, **settings: Any) -> None:

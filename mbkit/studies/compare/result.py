@@ -122,8 +122,9 @@ class Finding:
     """What the description has that no engine of the comparison uses, or that asks for other methods.
 
     `kind` is ``"dry friction"``, ``"limits"`` or ``"stiff joint"``; `says` tells it in words, and `joints` has its
-    joints. `size` of friction is its ratio to the other forces at that joint and the median state, the largest of all
-    joints; of a stiff joint its time constant, s; of limits NaN.
+    joints. `mbkit check` adds ``"the file itself"``, with the links and joints that `mbkit.lint` names.
+    `size` of friction is its ratio to the other forces at that joint and the median state, the largest of all joints;
+    of a stiff joint its time constant, s; of the file the number of findings; of limits NaN.
     """
 
     kind: str

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, permutations, product
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -97,27 +97,16 @@ class Judged:
         return self.model.random_state(0, POSES)[0]
 
 
-class Check(NamedTuple):
-    """A check: what it looks at, and the function."""
+Check = Callable[[Judged], Iterator[LintFinding]]
 
-    name: str
-    about: str
-    run: Callable[[Judged], Iterator[LintFinding]]
-
-
+#: All checks by name; the first line of a check's docstring says what it looks at.
 CHECKS: Final[dict[str, Check]] = {}
-_Run = Callable[[Judged], Iterator[LintFinding]]
 
 
-def check(about: str) -> Callable[[_Run], _Run]:
+def check(run: Check) -> Check:
     """Register a check under the name of its function."""
-
-    def register(run: _Run) -> _Run:
-        name = run.__name__.replace("_", " ")
-        CHECKS[name] = Check(name, about, run)
-        return run
-
-    return register
+    CHECKS[run.__name__.replace("_", " ")] = run
+    return run
 
 
 def _confidence(times: float) -> str:
@@ -127,8 +116,9 @@ def _confidence(times: float) -> str:
 # Links and their shapes
 
 
-@check("mass over the volume of the link's shapes")
+@check
 def density(at: Judged) -> Iterator[LintFinding]:
+    """Judge the mass over the volume of the link's shapes."""
     expected = f"{FOAM:g} to {LEAD:g} kg/m³, from foam to lead"
     for body, shape in at.shaped():
         # The hull is the most that shapes can hold.
@@ -139,8 +129,9 @@ def density(at: Judged) -> Iterator[LintFinding]:
             yield LintFinding(body.name, "density", rho, expected, _confidence(times), says)
 
 
-@check("distance of the centre of mass from the hull of the link's shapes, or from the joint")
+@check
 def centre_of_mass(at: Judged) -> Iterator[LintFinding]:
+    """Judge the distance of the centre of mass from the hull of the link's shapes, or from the joint."""
     for body in at.bodies:
         shape = at.shapes.get(body.name)
         off = float(np.linalg.norm(body.com)) if shape is None else shape.outside(body.com)
@@ -152,8 +143,9 @@ def centre_of_mass(at: Judged) -> Iterator[LintFinding]:
             yield LintFinding(body.name, "centre of mass", off, expected, _confidence(off / allowed), says)
 
 
-@check("radius of gyration against the size of the link")
+@check
 def radius_of_gyration(at: Judged) -> Iterator[LintFinding]:
+    """Judge the radius of gyration against the size of the link."""
     for body in at.bodies:
         if _placeholder(body):
             continue
@@ -184,7 +176,7 @@ def _radius(body: Body, least: float, most: float) -> tuple[float, float]:
 
 
 def _comparable(at: Judged) -> Iterator[tuple[Body, Array, Array]]:
-    """Yield links with their own inertia and that of their hull, over their traces, where mass is spread as the hull."""
+    """Yield links with their inertia and that of their hull, each over its trace, where mass is spread as the hull."""
     for body, shape in at.shaped():
         fits = _radius(body, *_radii(body, shape))[1] <= 1 and not _placeholder(body)
         if fits and np.linalg.norm(body.com - shape.hull.com) < CENTRED * shape.size:
@@ -195,12 +187,15 @@ def _flipped(inertia: Array) -> Array:
     return np.asarray(2 * np.diag(np.diag(inertia)) - inertia)
 
 
-@check("signs of the products of inertia against the link's shapes")
+@check
 def sign_of_products(at: Judged) -> Iterator[LintFinding]:
+    """Judge the signs of the products of inertia against the link's shapes."""
     for body, own, hull in _comparable(at):
         apart, other = (float(np.linalg.norm(I - hull)) for I in (own, _flipped(own)))
         if _sign_is_wrong(apart, other):
-            says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, with the products' other sign {other:.2g}"
+            says = (
+                f"its inertia is off that of its shapes by {apart:.2g} of its trace, with products negated {other:.2g}"
+            )
             yield LintFinding(body.name, "sign of products", apart, f"below {ALIKE:g}", LIKELY, says)
 
 
@@ -208,8 +203,9 @@ def _sign_is_wrong(apart: float, other: float) -> bool:
     return apart > ALIKE and other * BETTER < apart
 
 
-@check("axes of the inertia against those of the link's shapes")
+@check
 def axes(at: Judged) -> Iterator[LintFinding]:
+    """Judge the axes of the inertia against those of the link's shapes."""
     for body, own, hull in _comparable(at):
         apart, other = (float(np.linalg.norm(I - hull)) for I in (own, _flipped(own)))
         turned = min(float(np.linalg.norm(R @ own @ R.T - hull)) for R in _TURNS)
@@ -223,8 +219,9 @@ def axes(at: Judged) -> Iterator[LintFinding]:
 # Links alone
 
 
-@check("principal moments that no matter has")
+@check
 def matter(at: Judged) -> Iterator[LintFinding]:
+    """Find masses and principal moments that no matter has."""
     for body in at.links.bodies:
         if why := body_fault(body, point_masses=True):
             moments = np.linalg.eigvalsh(body.inertia)
@@ -232,8 +229,9 @@ def matter(at: Judged) -> Iterator[LintFinding]:
             yield LintFinding(body.name, "matter", excess, "A + B >= C, and mass", SURE, why)
 
 
-@check("numbers that stand for unknown ones: no inertia, or a power of ten about all axes")
+@check
 def placeholder(at: Judged) -> Iterator[LintFinding]:
+    """Find numbers that stand for unknown ones: no inertia, or a power of ten about all axes."""
     for body in at.bodies:
         if _placeholder(body):
             moment = float(body.inertia[0, 0])
@@ -253,8 +251,9 @@ def _power_of_ten(x: float) -> bool:
     return f"{x:.6e}".startswith("1.000000e")
 
 
-@check("one inertia on several links of different shape or mass")
+@check
 def copied_inertia(at: Judged) -> Iterator[LintFinding]:
+    """Find one inertia on several links of different shape or mass."""
     groups: dict[tuple[str, ...], list[Body]] = defaultdict(list)
     for body in at.bodies:
         if not _placeholder(body):
@@ -279,8 +278,9 @@ def _differ(a: Body, b: Body, at: Judged) -> bool:
 # Links and their neighbours
 
 
-@check("masses of links without shapes, and distances between joints, against their neighbours")
+@check
 def neighbours(at: Judged) -> Iterator[LintFinding]:
+    """Judge the masses of links without shapes, and distances between joints, against their neighbours."""
     masses, near = {b.name: b.mass for b in at.bodies}, defaultdict(set)
     usual = float(np.median([*masses.values()])) if masses else 0.0
     for joint in at.links.joints:
@@ -313,8 +313,9 @@ def other_side(name: str) -> str:
     return _LEFT.sub(lambda m: sides.get(m[0]) or m[0].replace("l", "r").replace("L", "R"), name)
 
 
-@check("left and right links that mirror each other but for one number, or all but one pair")
+@check
 def mirror(at: Judged) -> Iterator[LintFinding]:
+    """Find left and right links that mirror each other but for one number, or all but one pair."""
     right = {body.name: body for body in at.bodies}
     pairs = [(a, right[name]) for a in at.bodies if (name := other_side(a.name)) != a.name and name in right]
     wrong = [(a, b, _unlike(a, b)) for a, b in pairs]
@@ -346,21 +347,25 @@ def _unlike(a: Body, b: Body) -> list[str]:
 # Joints
 
 
-@check("limits of angles beyond two turns, which may be degrees")
+@check
 def limits_in_degrees(at: Judged) -> Iterator[LintFinding]:
+    """Find limits of angles beyond two turns, which may be degrees."""
     for joint in at.model.joints:
         for k in joint.type.angular:
             ends = [float(x) for x in (joint.lower[k], joint.upper[k]) if abs(x) < NO_LIMIT]
             value = max(map(abs, ends), default=0.0)
             if value > MOST_TURN:
                 whole = all(x == round(x) for x in ends) and value <= 720
-                says = f"limits {', '.join(f'{x:g}' for x in ends)} rad" + (", whole numbers as of degrees" if whole else "")
+                says = f"limits {', '.join(f'{x:g}' for x in ends)} rad" + (
+                    ", whole numbers as of degrees" if whole else ""
+                )
                 confidence = SURE if whole and value > 20 else LIKELY if value > 20 else LOOK
                 yield LintFinding(joint.name, "limits in degrees", value, "up to two turns", confidence, says)
 
 
-@check("limits of no width, and actuators of no force or speed")
+@check
 def empty_limits(at: Judged) -> Iterator[LintFinding]:
+    """Find limits of no width, and actuators of no force or speed."""
     for joint in at.model.joints:
         if any(joint.lower[k] == joint.upper[k] for k in range(len(joint.lower))):
             says = f"lower and upper limit are both {joint.lower[0]:g}"
@@ -372,8 +377,9 @@ def empty_limits(at: Judged) -> Iterator[LintFinding]:
             yield LintFinding(joint.name, "empty limits", 0.0, "above 0", LOOK, says)
 
 
-@check("force that holds the robot against gravity at the worst of random poses, against the limit of effort")
+@check
 def effort(at: Judged) -> Iterator[LintFinding]:
+    """Judge the limits of effort by the forces that hold the robot against gravity at random poses."""
     if at.engine is None or any(j.type.floating for j in at.model.joints):
         return
     rest = np.zeros((len(at.poses), at.model.nv))
@@ -385,8 +391,9 @@ def effort(at: Judged) -> Iterator[LintFinding]:
             yield LintFinding(joint, "effort", float(limit), expected, _confidence(float(force / limit)), says)
 
 
-@check("damping over inertia against the period of control")
+@check
 def damping(at: Judged) -> Iterator[LintFinding]:
+    """Judge the damping over inertia against the period of control."""
     if at.engine is None:
         return
     for found in stiff_joints(at.model.without("springs"), at.engine.mass_matrix(at.poses), step=at.control_period):

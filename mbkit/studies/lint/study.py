@@ -6,27 +6,35 @@ import os
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from mbkit._check import real, shown
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.registry import PINOCCHIO
-from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnsupportedError
+from mbkit.errors import (
+    InputError,
+    LoadError,
+    MbkitError,
+    MbkitWarning,
+    ModelError,
+    NonPhysicalWarning,
+    UnsupportedError,
+)
 from mbkit.load.shapes import MassProperties, together
 from mbkit.load.urdf_reader import read_links
 from mbkit.model import Body, Model
 from mbkit.model.validation import listing
 from mbkit.show.scene import SHAPES
-from mbkit.show.visuals import read_visuals
+from mbkit.show.visuals import Shape, read_visuals
 from mbkit.studies._targets import model_of, with_values
 from mbkit.studies.lint.checks import CHECKS, Judged
 from mbkit.studies.lint.geometry import Geometry, geometry_of
-from mbkit.studies.lint.result import SURENESS, LintFinding, LintResult
+from mbkit.studies.lint.result import SURENESS, LintResult
 from mbkit.studies.results import provenance
 
 #: What the links of a body may differ by, as a whole, from the body itself.
@@ -34,17 +42,58 @@ _SAME = 1e-6
 
 
 def lint(
-    model: Model | str | os.PathLike[str], *, control_period: float = 1e-3, shapes: bool = True
+    model: Model | str | os.PathLike[str], *, control_period: float = 1e-3, shapes: bool = True, **load: Any
 ) -> LintResult:
-    """Say what is not plausible in a description, by what it knows of itself.
+    r"""Say what is not plausible in a description, by what it knows of itself; engines agree on a file in grams too.
+
+    Judged are the links of a URDF as the file has them, also those that the model merges, and the bodies of every other
+    model: their masses, centres of mass and inertias against each other, their names and their shapes, and the limits,
+    actuators and dampers of joints. `mbkit.studies.lint.checks.CHECKS` has all checks with what each looks at. Nothing
+    is refused: links that no matter has are findings.
+
+    Parameters
+    ----------
+    model : Model, str or path
+        Or what `mbkit check` takes: a robot's name, a path, ``"package.module:function"``.
+    control_period : float
+        Of the controller or of the steps, s: a damper should not be faster.
+    shapes : bool
+        Whether the shapes and meshes of the file are read. What needs them is not judged without.
+    **load
+        Arguments of `mbkit.load` for a name or a path, such as ``floating_base=True``.
+
+    Returns
+    -------
+    LintResult
+
+    Raises
+    ------
+    UnsupportedError
+        A model written as energies.
+    LoadError, ModelError, UnknownNameError
+        The model cannot be read.
+    InputError
+        A parameter of the model has no value, or another argument is wrong.
+
+    Examples
+    --------
+    >>> import mbkit as mb
+    >>> b = mb.ModelBuilder("in_grams")
+    >>> b.add_body("arm", mass=1200.0, com=(0, 0, 0.2), inertia=(1.0, 1.0, 1.0))
+    >>> b.add_joint("shoulder", "revolute", parent="world", child="arm", axis=(0, 1, 0), upper=90, effort_limit=50)
+    >>> print(*mb.lint(b.build()).rows, sep="\n")
+    shoulder: limits 90 rad, whole numbers as of degrees (limits in degrees, sure)
+    shoulder: holding it against gravity takes 2.35e+03, and its effort is limited to 50 (effort, sure)
+    arm: inertia 1 kg m² about every axis, with 1200 kg (placeholder, likely)
     """
     begun = time.perf_counter()
-    real("control_period", control_period, positive=True)
+    control_period = real("control_period", control_period, positive=True)
+    if not isinstance(shapes, (bool, np.bool_)):
+        raise InputError(f"shapes: expected True or False, got {shown(shapes)}")
     if not isinstance(model, Model):
-        if not isinstance(model, (str, os.PathLike)):
-            raise InputError(f"model: expected a Model, a robot's name or a path, got {shown(model)}")
-        with warnings.catch_warnings(action="ignore", category=MbkitWarning):
-            model = model_of(os.fspath(model), {"nonphysical": "warn"})
+        model = _read(model, load)
+    elif load:
+        raise InputError(f"{', '.join(load)}: only for a name or a path; the model is loaded already")
     if not model.has_bodies:
         raise UnsupportedError(f"lint: {model.name} was written as energies and has no bodies to judge")
     model = with_values(model, "lint")
@@ -54,7 +103,7 @@ def lint(
     if not shapes:
         skipped.append("shapes were not read")
     at = Judged(model, links, geometry, control_period, _engine(model, skipped))
-    found = [finding for check in CHECKS.values() for finding in check.run(at)]
+    found = [finding for run in CHECKS.values() for finding in run(at)]
     return LintResult(
         model=model.name,
         rows=tuple(sorted(found, key=lambda row: SURENESS.index(row.confidence))),
@@ -65,6 +114,19 @@ def lint(
         control_period=control_period,
         **provenance(begun),
     )
+
+
+def _read(target: object, options: dict[str, Any]) -> Model:
+    if not isinstance(target, (str, os.PathLike)):
+        raise InputError(f"model: expected a Model, a robot's name or a path, got {shown(target)}")
+    path = os.fspath(target)
+    with warnings.catch_warnings(action="ignore", category=NonPhysicalWarning):
+        try:
+            return model_of(path, options)
+        except ModelError:
+            if "nonphysical" in options:
+                raise
+            return model_of(path, {**options, "nonphysical": "warn"})
 
 
 def _links(model: Model) -> Model:
@@ -90,7 +152,7 @@ def _is(body: Body, model: Model, links: Model) -> bool:
 
 
 def _geometry(links: Model, skipped: list[str]) -> dict[str, Geometry]:
-    kinds: dict[str, list[list[object]]] = defaultdict(list)
+    kinds: dict[str, list[list[Shape]]] = defaultdict(list)
     missing: dict[str, str] = {}
     try:
         for kind in SHAPES[:2]:
