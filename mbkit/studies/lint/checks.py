@@ -41,9 +41,9 @@ CENTRED: Final = 0.15
 ALIKE: Final = 0.1
 UNLIKE: Final = 0.25
 #: The products' other sign brings an inertia nearer by more than this.
-BETTER: Final = 3.0
-#: Masses, and distances between joints, of neighbours.
-APART: Final = 1e3
+BETTER: Final = 2.5
+#: Masses, and distances between joints, of neighbours: a wrong unit makes 1e3 of a ratio that may be a third.
+APART: Final = 300.0
 FAR: Final = 100.0
 #: Links with one inertia, and the ratio of moments from which their shapes differ.
 COPIES: Final = 3
@@ -54,6 +54,8 @@ MIRRORED: Final = 0.05
 NO_LIMIT: Final = 1e3
 #: rad: two turns; joints beyond one are built.
 MOST_TURN: Final = 4 * np.pi
+#: Degrees that were computed from radians are whole numbers to this.
+WHOLE: Final = 1e-3
 #: Random poses.
 POSES: Final = 256
 
@@ -355,7 +357,7 @@ def limits_in_degrees(at: Judged) -> Iterator[LintFinding]:
             ends = [float(x) for x in (joint.lower[k], joint.upper[k]) if abs(x) < NO_LIMIT]
             value = max(map(abs, ends), default=0.0)
             if value > MOST_TURN:
-                whole = all(x == round(x) for x in ends) and value <= 720
+                whole = all(abs(x - round(x)) < WHOLE for x in ends) and value <= 720
                 says = f"limits {', '.join(f'{x:g}' for x in ends)} rad" + (
                     ", whole numbers as of degrees" if whole else ""
                 )
