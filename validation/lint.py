@@ -1,4 +1,4 @@
-"""What `mbkit lint` finds on the robots of example-robot-data, each finding judged by a person, and on planted mistakes.
+"""What `mbkit lint` finds on the robots of example-robot-data, with a verdict on each finding, and on planted mistakes.
 
 Run ``python -m validation.lint`` (about three minutes). Every finding on a robot has its verdict, true or false with a
 reason, in ``lint_verdicts.toml``: a finding is true where the number in the file is not that of the robot, or where the
@@ -141,14 +141,14 @@ PLANTED = (
     Planted("panda", "panda_link4", "centre of mass in millimetres", "centre of mass", com(1e3)),
     Planted("kinova", "j2s6s200_link_2", "centre of mass in millimetres", "centre of mass", com(1e3)),
     Planted("laikago", "FR_thigh", "centre of mass in centimetres", "centre of mass", com(1e2)),
-    Planted("simple_humanoid", "LARM_LINK2", "centre of mass in millimetres, without shapes", "centre of mass", com(1e3)),
+    Planted("simple_humanoid", "LARM_LINK2", "com in millimetres, without shapes", "centre of mass", com(1e3)),
     Planted("hyq", "lf_upperleg", "centre of mass on the other side of the joint", "centre of mass", com(-1)),
     Planted("b1", "FL_calf", "centre of mass on the other side of the joint", "centre of mass", com(-1)),
     Planted("z1", "link02", "inertia in g mm²", "radius of gyration", inertia(1e9)),
     Planted("xarm7", "link5", "inertia in kg mm²", "radius of gyration", inertia(1e6)),
     Planted("go2", "RR_calf", "inertia in g cm²", "radius of gyration", inertia(1e7)),
     Planted("tiago_pro", "arm_left_3_link", "inertia in kg cm²", "radius of gyration", inertia(1e4)),
-    Planted("romeo_laas_small", "LHipYaw_link", "inertia in kg mm², without shapes", "radius of gyration", inertia(1e6)),
+    Planted("romeo_laas_small", "LHipYaw_link", "in kg mm², without shapes", "radius of gyration", inertia(1e6)),
     Planted("solo12", "HL_LOWER_LEG", "inertia for a thousandth of the mass", "radius of gyration", inertia(1e-3)),
     Planted("talos_full_v2", "arm_left_2_link", "products of the other sign", "sign of products", PRODUCTS),
     Planted("solo12", "FL_UPPER_LEG", "products of the other sign", "sign of products", PRODUCTS),

@@ -33,7 +33,9 @@ FOAM: Final = 10.0
 LEAD: Final = 11_340.0
 #: A centre of mass may be outside of the shapes by this part of their size: motors are drawn with the next link.
 OUTSIDE: Final = 0.1
-#: The mean square radius of gyration may be less than that of the hull by this factor.
+#: A radius of gyration may be longer than the farthest corner by this factor: shapes are drawn coarsely.
+COARSE: Final = 1.2
+#: Its square may be less than that of the hull by this factor.
 COMPACT: Final = 30.0
 #: Inertias are compared with that of the hull where the centres of mass are nearer than this part of its size.
 CENTRED: Final = 0.15
@@ -49,7 +51,7 @@ FAR: Final = 100.0
 COPIES: Final = 3
 OTHER_SHAPE: Final = 1.5
 #: Of mirrored links: masses and inertias by themselves, and centres of mass by the radius of gyration.
-MIRRORED: Final = 0.05
+MIRRORED: Final = 0.1
 #: Coordinates beyond this say that there is no limit.
 NO_LIMIT: Final = 1e3
 #: rad: two turns; joints beyond one are built.
@@ -155,16 +157,15 @@ def radius_of_gyration(at: Judged) -> Iterator[LintFinding]:
         least, most = _radii(body, shape) if shape else (0.0, at.reach)
         value, times = _radius(body, least, most)
         if most and times > 1:
-            where = "its shapes" if shape else "the whole robot"
-            says = f"inertia and mass give a radius of gyration of {value:.3g} m, in {where} of {most:.3g} m"
-            expected = f"{least:.3g} to {most:.3g} m"
+            expected = f"{least:.3g} to {most:.3g} m, by {'its shapes' if shape else 'the reach of all joints'}"
+            says = f"inertia over mass gives a radius of gyration of {value:.3g} m"
             yield LintFinding(body.name, "radius of gyration", value, expected, _confidence(times**2), says)
 
 
 def _radii(body: Body, shape: Geometry) -> tuple[float, float]:
-    """Return the least radius of gyration of a link, m, and the distance of its farthest corner, which none exceeds."""
+    """Return the least and the greatest radius of gyration of a link, m; no point is beyond the farthest corner."""
     mean = np.sqrt(np.trace(shape.hull.inertia) / shape.hull.mass / 2 / COMPACT)
-    return float(mean), shape.farthest(body.com)
+    return float(mean), COARSE * shape.farthest(body.com)
 
 
 def _radius(body: Body, least: float, most: float) -> tuple[float, float]:
@@ -305,7 +306,7 @@ def neighbours(at: Judged) -> Iterator[LintFinding]:
 
 
 _LEFT: Final = re.compile(
-    r"(?i:left|(?<![a-z])([frhb]?l|l[frhb])(?![a-z]))|(?<![A-Za-z])L(?=[A-Z][a-z])|(?<=[a-z])L(?![a-z])"
+    r"(?i:left|(?<![a-z])([frhb]?l|l[frhb])(?![a-z]))|(?<![A-Za-z])L(?=[A-Z])|(?<=[a-z])L(?![a-z])"
 )
 
 
@@ -357,11 +358,11 @@ def limits_in_degrees(at: Judged) -> Iterator[LintFinding]:
             ends = [float(x) for x in (joint.lower[k], joint.upper[k]) if abs(x) < NO_LIMIT]
             value = max(map(abs, ends), default=0.0)
             if value > MOST_TURN:
-                whole = all(abs(x - round(x)) < WHOLE for x in ends) and value <= 720
+                whole = all(abs(x - round(x)) < WHOLE for x in ends)
                 says = f"limits {', '.join(f'{x:g}' for x in ends)} rad" + (
                     ", whole numbers as of degrees" if whole else ""
                 )
-                confidence = SURE if whole and value > 20 else LIKELY if value > 20 else LOOK
+                confidence = _confidence(value / MOST_TURN)
                 yield LintFinding(joint.name, "limits in degrees", value, "up to two turns", confidence, says)
 
 
