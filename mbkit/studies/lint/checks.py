@@ -236,8 +236,9 @@ def matter(at: Judged) -> Iterator[LintFinding]:
 def placeholder(at: Judged) -> Iterator[LintFinding]:
     """Find numbers that stand for unknown ones: no inertia, or a power of ten about all axes."""
     for body in at.bodies:
-        if _placeholder(body):
-            moment = float(body.inertia[0, 0])
+        moment = float(body.inertia[0, 0])
+        # A point mass that somebody builds is meant.
+        if _placeholder(body) and (moment or at.links.sources):
             says = f"inertia {moment:g} kg m² about every axis" if moment else "no inertia"
             confidence = SURE if moment and _power_of_ten(body.mass) else LIKELY
             says += f", with {body.mass:g} kg"
@@ -306,7 +307,7 @@ def neighbours(at: Judged) -> Iterator[LintFinding]:
 
 
 _LEFT: Final = re.compile(
-    r"(?i:left|(?<![a-z])([frhb]?l|l[frhb])(?![a-z]))|(?<![A-Za-z])L(?=[A-Z])|(?<=[a-z])L(?![a-z])"
+    r"(?i:left|(?<![a-z])([frhb]?l|l[frhb])(?![a-z]))|(?<![A-Za-z])L(?=[A-Z])(?!INK)|(?<=[a-z])L(?![a-z])"
 )
 
 
