@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations, permutations, product
+from itertools import combinations, product
 from typing import Final
 
 import numpy as np
@@ -61,12 +61,6 @@ WHOLE: Final = 1e-3
 #: Random poses.
 POSES: Final = 256
 
-_TURNS: Final = [
-    R
-    for order in permutations(range(3))
-    for signs in product((1.0, -1.0), repeat=3)
-    if np.linalg.det(R := np.diag(signs)[:, order]) > 0
-]
 _REFLECTIONS: Final = [np.array(signs) for signs in product((1.0, -1.0), repeat=3)]
 _UPPER: Final = np.triu_indices(3)
 
@@ -194,12 +188,18 @@ def _flipped(inertia: Array) -> Array:
 def sign_of_products(at: Judged) -> Iterator[LintFinding]:
     """Judge the signs of the products of inertia against the link's shapes."""
     for body, own, hull in _comparable(at):
-        apart, other = (float(np.linalg.norm(I - hull)) for I in (own, _flipped(own)))
+        apart, other = _distances(own, hull)
         if _sign_is_wrong(apart, other):
             says = (
                 f"its inertia is off that of its shapes by {apart:.2g} of its trace, with products negated {other:.2g}"
             )
             yield LintFinding(body.name, "sign of products", apart, f"below {ALIKE:g}", LIKELY, says)
+
+
+def _distances(own: Array, hull: Array) -> tuple[float, float]:
+    """Return how far an inertia is from another one, as it is and with its products negated."""
+    negated = 2 * np.diag(np.diag(own)) - own
+    return float(np.linalg.norm(own - hull)), float(np.linalg.norm(negated - hull))
 
 
 def _sign_is_wrong(apart: float, other: float) -> bool:
@@ -210,12 +210,11 @@ def _sign_is_wrong(apart: float, other: float) -> bool:
 def axes(at: Judged) -> Iterator[LintFinding]:
     """Judge the axes of the inertia against those of the link's shapes."""
     for body, own, hull in _comparable(at):
-        apart, other = (float(np.linalg.norm(I - hull)) for I in (own, _flipped(own)))
-        turned = min(float(np.linalg.norm(R @ own @ R.T - hull)) for R in _TURNS)
-        best = min(turned, float(np.linalg.norm(np.linalg.eigvalsh(own) - np.linalg.eigvalsh(hull))))
+        apart, other = _distances(own, hull)
+        # The distance in the best axes is that of the principal moments (Hoffman and Wielandt 1953).
+        best = float(np.linalg.norm(np.linalg.eigvalsh(own) - np.linalg.eigvalsh(hull)))
         if apart > UNLIKE and best < ALIKE and not _sign_is_wrong(apart, other):
-            how = "with axes exchanged" if turned < ALIKE else "in a turned frame"
-            says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, {how} {min(turned, best):.2g}"
+            says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, in other axes {best:.2g}"
             yield LintFinding(body.name, "axes", apart, f"below {UNLIKE:g}", LIKELY, says)
 
 

@@ -56,9 +56,9 @@ def geometry_of(kinds: Iterable[list[Shape]]) -> Geometry | None:
         hull = _hull(np.concatenate([V for V, _ in part]))
         closed = all(_closed(V, T) for V, T in part)
         enclosed = sum(abs(solid_of(V, T).mass) for V, T in part) if closed else np.inf
-        volumes += [min(enclosed, _volume(hull))] if hull is not None else []
-    planes, corners = whole.equations, whole.points[whole.vertices]
-    return Geometry(_outward(whole), corners, planes, min(volumes, default=_volume(whole)))
+        volumes += [min(enclosed, float(hull.volume))] if hull is not None else []
+    least = min(volumes, default=float(whole.volume))
+    return Geometry(_outward(whole), whole.points[whole.vertices], whole.equations, least)
 
 
 def _placed(shape: Shape) -> tuple[Array, Indices]:
@@ -76,10 +76,6 @@ def _hull(V: Array) -> ConvexHull | None:
     except (QhullError, ValueError):
         return None
     return hull if hull.volume > _FLAT * extent**3 else None
-
-
-def _volume(hull: ConvexHull) -> float:
-    return float(hull.volume)
 
 
 def _outward(hull: ConvexHull) -> MassProperties:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
-from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of, counted
+from mbkit.studies.results import Block, Items, ResultTable, Table, Title, columns_of, counted
 
 #: How sure a finding is. Only the first two make `LintResult.passed` False.
 SURE: Final = "sure"
@@ -76,7 +76,5 @@ class LintResult(ResultTable):
     def _blocks(self) -> Iterator[Block]:
         yield Title(self.model, f": {self.verdict}")
         if self.rows:
-            heads = ("part", "check", "confidence", "message", "expected")
-            kept = {c.head: c for c in columns_of(LintFinding)}
-            yield Table([Column(h, kept[h].value) for h in heads], self.rows)
+            yield Table([c for c in columns_of(LintFinding) if c.head != "value"], self.rows)
         yield Items(self.skipped)

@@ -82,9 +82,9 @@ def lint(
     >>> b.add_body("arm", mass=1200.0, com=(0, 0, 0.2), inertia=(1.0, 1.0, 1.0))
     >>> b.add_joint("shoulder", "revolute", parent="world", child="arm", axis=(0, 1, 0), upper=90, effort_limit=50)
     >>> print(*mb.lint(b.build()).rows, sep="\n")
-    shoulder: limits 90 rad, whole numbers as of degrees (limits in degrees, sure)
     shoulder: holding it against gravity takes 2.35e+03, and its effort is limited to 50 (effort, sure)
     arm: inertia 1 kg m² about every axis, with 1200 kg (placeholder, likely)
+    shoulder: limits 90 rad, whole numbers as of degrees (limits in degrees, likely)
     """
     begun = time.perf_counter()
     control_period = real("control_period", control_period, positive=True)
@@ -134,18 +134,17 @@ def _links(model: Model) -> Model:
     if model.source.lower().endswith(".urdf"):
         with suppress(MbkitError), warnings.catch_warnings(action="ignore", category=MbkitWarning):
             links = replace(read_links(Path(model.source)), source=model.source)
-            if all(_is(body, model, links) for body in model.bodies):
+            parts: dict[str, list[MassProperties]] = defaultdict(list)
+            for link in links.bodies:
+                frame, own = model.frame(link.name), MassProperties(link.mass, link.com, link.inertia)
+                parts[frame.body] += [own.moved(frame.rotation, frame.translation)] if link.mass else []
+            if all(_is(body, parts[body.name]) for body in model.bodies):
                 return links
     return model
 
 
-def _is(body: Body, model: Model, links: Model) -> bool:
+def _is(body: Body, parts: list[MassProperties]) -> bool:
     """Return whether a body is its links together."""
-    parts = []
-    for link in links.bodies:
-        frame = model.frame(link.name)
-        if frame.body == body.name and link.mass:
-            parts.append(MassProperties(link.mass, link.com, link.inertia).moved(frame.rotation, frame.translation))
     whole = together(parts) if parts else MassProperties(0.0, body.com, np.zeros((3, 3)))
     pairs = (whole.mass, body.mass), (whole.com, body.com), (whole.inertia, body.inertia)
     return all(np.allclose(a, b, rtol=_SAME, atol=_SAME * np.abs(b).max()) for a, b in pairs)
