@@ -201,6 +201,9 @@ def test_the_radius_of_gyration_is_within_the_shapes(found, share):
     assert (("radius of gyration", "a") in found(replace(a, inertia=wide * np.eye(3)))) == (share > 1)
     compact = np.trace(own) / 3 / checks.COMPACT / share
     assert (("radius of gyration", "a") in found(replace(a, inertia=compact * np.eye(3)))) == (share > 1)
+    # From the centre of mass at one end the other end is farther.
+    end = mass * (share * checks.COARSE * float(np.hypot(0.4, np.hypot(0.05, 0.03)))) ** 2
+    assert (("radius of gyration", "a") in found(replace(a, com=(0, 0, 0.4), inertia=end * np.eye(3)))) == (share > 1)
     far = mass * (share * 0.4) ** 2 * np.eye(3)
     assert (("radius of gyration", "a") in found(replace(a, inertia=far, shapes=""))) == (share > 1)
 
@@ -300,13 +303,21 @@ def test_neighbours_without_shapes(found, share):
     assert not found(*bare("a b", b={"mass": 1e-2, "inertia": np.diag([1.1, 1.2, 1.3]) * 1e-4}))
 
 
+#: Of a left leg; its product has the other sign in a right one.
+LEG = np.array([[0.011, 0.002, 0], [0.002, 0.012, 0], [0, 0, 0.013]])
+
+
 def pairs(count: int, *wrong: tuple[str, np.ndarray]) -> list[Link]:
     """Return pairs of legs that mirror each other in y, and one more whose right one differs as given."""
     out = []
-    inertia, com, mirror = np.diag([0.011, 0.012, 0.013]), np.array([0.01, 0.02, 0.1]), np.array([1, -1, 1])
+    inertia, com, mirror = LEG, np.array([0.01, 0.02, 0.1]), np.array([1, -1, 1])
     for k in range(count + 1):
         own = {"mass": 1.0, "com": com, "inertia": inertia}
-        other = own | {"com": com * mirror} | (dict(wrong) if k == count else {})
+        other = (
+            own
+            | {"com": com * mirror, "inertia": np.outer(mirror, mirror) * inertia}
+            | (dict(wrong) if k == count else {})
+        )
         out += [
             replace(Link("x", shapes=""), name=f"{side}_leg{k}", **x) for side, x in (("left", own), ("right", other))
         ]
@@ -316,7 +327,7 @@ def pairs(count: int, *wrong: tuple[str, np.ndarray]) -> list[Link]:
 @pytest.mark.parametrize("share", [0.98, 1.02])
 def test_links_that_mirror_but_for_one_number(found, share):
     part = share * checks.MIRRORED
-    inertia, com = np.diag([0.011, 0.012, 0.013]), np.array([0.01, -0.02, 0.1])
+    inertia, com = flipped(LEG), np.array([0.01, -0.02, 0.1])
     radius = np.sqrt(0.036)
     for wrong in (
         ("mass", 1 / (1 + part)),

@@ -36,6 +36,7 @@ PARTS = {
     ),
     "energy_drift": Part(1, ("energy_drift.json",), "a million steps of a symplectic method"),
     "long_loops": Part(1, ("long_loops.json",), "a million steps of mechanisms with loops: gap and energy"),
+    "lint": Part(5, ("lint.json",), "what lint finds on the robots, with verdicts, and of planted mistakes"),
     "importers": Part(1, ("importers.json", "importers_floating.json"), "one file through three importers"),
     "versions": Part(
         35, ("versions.json",), "versions of MuJoCo, Pinocchio and Drake; makes some 18 GB of environments"
