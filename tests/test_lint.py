@@ -353,11 +353,15 @@ def test_pairs_that_do_not_mirror_at_all_count_beside_three_that_do(found):
         *(("left_hip", "right_hip"), ("LeftElbow", "RightElbow"), ("FL_calf", "FR_calf"), ("lf_foot", "rf_foot")),
         *(("LShoulder", "RShoulder"), ("l_gripper_l_finger", "r_gripper_r_finger"), ("hand_l", "hand_r")),
         *(("panda_leftfinger", "panda_rightfinger"), ("LARM_LINK3", "RARM_LINK3"), ("LH_THIGH", "RH_THIGH")),
-        *(("link", "link"), ("tool", "tool"), ("pelvis", "pelvis"), ("Lid", "Lid"), ("EL", "EL")),
+        *(("HL_UPPER_LEG", "HR_UPPER_LEG"), ("LLEG", "RLEG"), ("handL", "handR")),
     ],
 )
 def test_names_of_the_other_side(left, right):
-    assert checks.other_side(left) == right
+    known = {left, right, "r_gripper_l_finger"}
+    assert checks.other_side(left, known) == right
+    assert checks.other_side(right, known - {"r_gripper_l_finger"}) == ""
+    assert checks.other_side(left, known - {right} - {"r_gripper_l_finger"}) == ""
+    assert checks.other_side("pelvis", {"pelvis", "pervis"}) == ""
 
 
 def limited(**limit: float) -> Link:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, product
@@ -306,21 +306,28 @@ def neighbours(at: Judged) -> Iterator[LintFinding]:
 
 
 _LEFT: Final = re.compile(
-    r"(?i:left|(?<![a-z])([frhb]?l|l[frhb])(?![a-z]))|(?<![A-Za-z])L(?=[A-Z])(?!INK)|(?<=[a-z])L(?![a-z])"
+    r"(?i:left|(?<![a-z])([frhb]?l|l[frhb])(?![a-z]))|(?<![A-Za-z])L(?=[A-Z])|(?<=[a-z])L(?![a-z])"
 )
 
 
-def other_side(name: str) -> str:
-    """Return the name of the right link for that of a left one; the name itself for every other one."""
+def other_side(name: str, known: Container[str]) -> str:
+    """Return the name of the right link for that of a left one, if it is known: of all sides in it, or of one."""
     sides = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
-    return _LEFT.sub(lambda m: sides.get(m[0]) or m[0].replace("l", "r").replace("L", "R"), name)
+    found = [*_LEFT.finditer(name)]
+    for these in (found, *([one] for one in found)):
+        out = name
+        for m in reversed(these):
+            out = out[: m.start()] + (sides.get(m[0]) or m[0].replace("l", "r").replace("L", "R")) + out[m.end() :]
+        if out != name and out in known:
+            return out
+    return ""
 
 
 @check
 def mirror(at: Judged) -> Iterator[LintFinding]:
     """Find left and right links that mirror each other but for one number, or all but one pair."""
     right = {body.name: body for body in at.bodies}
-    pairs = [(a, right[name]) for a in at.bodies if (name := other_side(a.name)) != a.name and name in right]
+    pairs = [(a, right[name]) for a in at.bodies if (name := other_side(a.name, right))]
     wrong = [(a, b, _unlike(a, b)) for a, b in pairs]
     odd = [x for x in wrong if x[2]]
     # Where nearly every pair mirrors, one that does not at all counts too.
