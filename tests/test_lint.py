@@ -408,6 +408,16 @@ def test_damping_slower_than_the_period(found, share):
     assert row is None or row.value == pytest.approx(0.004 / share, rel=1e-9)
 
 
+def test_a_joint_of_several_velocities_has_one_finding():
+    b = mb.ModelBuilder("ball")
+    b.add_body("bob", mass=1.0, com=(0, 0, -0.5), inertia=(0.01, 0.02, 0.025))
+    b.add_joint("socket", "ball", parent="world", child="bob", damping=(300, 200, 100))
+    (row,) = mb.lint(b.build()).rows
+    assert (row.part, row.check) == ("socket", "damping")
+    # About x and y the bob swings, and about z it turns.
+    assert row.value == pytest.approx(min(0.26 / 300, 0.27 / 200, 0.025 / 100), rel=1e-9)
+
+
 # Shapes
 
 
