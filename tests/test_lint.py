@@ -456,7 +456,8 @@ def test_an_open_mesh_has_the_volume_of_its_hull(tmp_path):
 def test_shapes_that_cannot_be_read_or_span_nothing_are_not_judged(tmp_path):
     flat = '<visual><geometry><mesh filename="flat.obj"/></geometry></visual>'
     lost = '<visual><geometry><mesh filename="lost.obj"/></geometry></visual>'
-    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")
+    # Flat to rounding.
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1e-9\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 3 1 4")
     result = mb.lint(write(tmp_path, Link("a", shapes=flat), Link("b", "a", shapes=lost)))
     assert (result.shaped, result.rows) == (0, ())
     assert "b (no such file: lost.obj)" in result.skipped[0]
