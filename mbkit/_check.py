@@ -46,7 +46,7 @@ def all_finite(array: Array) -> bool:
     return bool(np.isfinite(array).all())
 
 
-def _as_float(name: str, value: ArrayLike) -> Array:
+def real_array(name: str, value: ArrayLike) -> Array:
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
@@ -66,7 +66,7 @@ def _as_float(name: str, value: ArrayLike) -> Array:
 
 def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Return `value` as a new float64 array of exactly this shape, all finite."""
-    array = _as_float(name, value)
+    array = real_array(name, value)
     if array.shape != shape:
         raise InputError(f"{name}: expected shape {shape}, got {array.shape}")
     require_finite(name, array)
@@ -82,7 +82,7 @@ def require_finite(name: str, array: Array) -> None:
 
 def rows(name: str, value: ArrayLike, n: int, owner: str, size: str) -> Array:
     """Return `value` as float64, ``(n,)`` or ``(N, n)``, all finite; `owner` and `size` serve the message alone."""
-    array = _as_float(name, value)
+    array = real_array(name, value)
     if array.ndim not in (1, 2) or array.shape[-1] != n:
         raise InputError(f"{name}: expected shape ({n},) or (N, {n}), got {array.shape}; {owner} has {size} = {n}")
     require_finite(name, array)

@@ -157,6 +157,13 @@ def test_bad_impacts_are_refused() -> None:
         mb.impact(dyn, *state, jacobian=[[1, 0], [2, 0]])
     with pytest.raises(InputError, match="impulse"):
         mb.impact(dyn, *state, 0.1)
+    for rows in ("ab", [[1, 0], [1]], [1, 1j]):
+        with pytest.raises(InputError, match="jacobian: expected"):
+            mb.impact(dyn, *state, jacobian=rows)
+    with pytest.raises(InputError, match="batches of different sizes"):
+        mb.impact(dyn, np.zeros((3, 2)), np.zeros((2, 2)), [1, 0])
+    with pytest.raises(InputError, match="batches of different sizes"):
+        mb.impact(dyn, *state, np.ones((2, 2)), jacobian=np.ones((3, 1, 2)))
     lag = systems.double_pendulum()
     with pytest.raises(InputError, match="neither"):
         lag.impulse()

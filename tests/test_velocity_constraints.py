@@ -289,6 +289,45 @@ def test_integrability_tells_rolling_on_a_line_from_rolling_in_a_plane() -> None
     assert not moving.integrability().holonomic
 
 
+def test_a_row_that_only_the_first_brackets_keep_is_not_integrable() -> None:
+    # Engel's two rows: dω1 ∧ ω1 ∧ ω2 = 0 holds, yet every configuration can be reached from every other.
+    z, zdot, wdot = sp.symbols("z zdot wdot")
+    W = sp.Symbol("w")
+    T = (xdot**2 + ydot**2 + zdot**2 + wdot**2) / 2
+    rows = [ydot - z * xdot, zdot - W * xdot]
+    told = Lagrangian(T, 0, [x, y, z, W], velocity_constraints=rows).integrability()
+    assert (told.growth, told.integrals, told.integrable) == ((2, 3, 4), 0, (False, False))
+
+
+def test_many_rows_of_the_last_of_many_coordinates_are_solved() -> None:
+    # The first 200 choices of five columns of twelve hold the first, which is zero.
+    q, v = sp.symbols("q1:13"), sp.symbols("qdot1:13")
+    rows = [v[7 + i] - sp.sin(q[3]) * v[2 + i] for i in range(5)]
+    lag = Lagrangian(sum(z**2 for z in v) / 2, 0, q, v, velocity_constraints=rows)
+    assert lag.maggi().velocities == v[:7]
+    # sin q4 dq4 is exact, and no other row is.
+    assert lag.integrability().integrable == (False, True, False, False, False)
+
+
+@pytest.mark.parametrize(
+    "rows", [[xdot - 1, xdot - 2], [xdot, ydot, w, xdot - w], [xdot * (sp.sin(x) ** 2 - 1 + sp.cos(x) ** 2)]]
+)
+def test_rows_that_depend_on_each_other_have_no_verdict(rows) -> None:
+    lag = Lagrangian(m * (xdot**2 + ydot**2 + w**2) / 2, 0, [x, y, theta], parameters=[m], velocity_constraints=rows)
+    with pytest.raises(InputError, match="follow from each other or contradict"):
+        lag.integrability()
+
+
+def test_a_knife_edge_on_a_slope_rests_across_it() -> None:
+    rest = mb.equilibrium(knife().dynamics(), [0.0, 0.0, 0.1])
+    assert rest.q[2] == pytest.approx(np.pi / 2, abs=CLOSE)
+    assert abs(rest.multipliers[0]) == pytest.approx(0.7 * 9.81 * np.sin(0.4), rel=CLOSE)
+
+
+def test_engines_are_compared_on_a_sleigh() -> None:
+    assert mb.compare(sleigh().model).digits > 14
+
+
 def test_momenta_along_symmetries_that_the_rows_allow_are_constant() -> None:
     T = m * (xdot**2 + ydot**2) / 2 + J * w**2 / 2
     lag = Lagrangian(
@@ -320,6 +359,7 @@ def test_momenta_along_symmetries_that_the_rows_allow_are_constant() -> None:
         ([x - y], "holds none of the velocities"),
         ([xdot - ydot, 2 * ydot - 2 * xdot], "follow from each other"),
         (5, "expected a list of expressions"),
+        ([sp.Derivative(xdot, t) - ydot], "no coordinate or velocity"),
         ([xdot - sp.Symbol("k") * ydot], "is not declared"),
     ],
 )
@@ -336,6 +376,8 @@ def test_bad_rows_are_refused(rows, message) -> None:
         (["z", "x"], "z is no coordinate"),
         ({"v": xdot * w, "omega": w}, "a sum of velocities"),
         ({"x": xdot, "omega": w}, "stands for something else"),
+        ({"v": HEADING["v"], "vdot": w}, "or its derivative stands for something else"),
+        ({"v": HEADING["v"], "xddot": w}, "or its derivative stands for something else"),
         ({"v": ydot * sp.cos(theta) - xdot * sp.sin(theta), "omega": w}, "singular everywhere"),
     ],
 )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import spatial
-from mbkit._check import Array, _as_float, finite_array, real, shown
+from mbkit._check import Array, real_array, finite_array, real, shown
 from mbkit._reproducible import length
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
 from mbkit.model.elements.declare import ElementBuilder
@@ -134,7 +134,7 @@ class ArgumentReader:
         if value is None:
             return np.full(n, default)
         try:
-            array = _as_float(name, value)
+            array = real_array(name, value)
         except InputError:
             array = np.full(n, np.nan)
         if array.ndim == 0:

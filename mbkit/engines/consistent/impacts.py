@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, arrays_shown, finite_array, real
+from mbkit._check import Array, arrays_shown, batch_of, real, real_array, require_finite
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.errors import InputError, NumericalError
 
@@ -39,7 +39,8 @@ class Impact:
     reactions : (m,) or (N, m) array
         Λ of the model's own constraints, in the order of `constraint_names`; m is 0 without any.
     energy_change : float or (N,) array
-        T⁺ - T⁻, J. Without Ŝ and with e = 0 it is -½ (v⁺ - v⁻)ᵀ M (v⁺ - v⁻), as Carnot's theorem has it.
+        T⁺ - T⁻, J. Without Ŝ, with e = 0 and constraints that do not move, it is -½ (v⁺ - v⁻)ᵀ M (v⁺ - v⁻), as
+        Carnot's theorem has it.
     """
 
     v: Array
@@ -73,7 +74,7 @@ def impact(
     jacobian : (k, nv) or (N, k, nv) array_like, optional
         G: the velocities G v are those of the contact, such as rows of `Dynamics.jacobian`.
     restitution : float
-        e from 0, where G v⁺ = 0, to 1, where no energy is lost in frictionless contacts.
+        e from 0, where G v⁺ = 0, to 1, where frictionless contacts lose no energy unless constraints move.
 
     Raises
     ------
@@ -110,7 +111,9 @@ def impact(
     q, v = model.check_q(q), model.check_v(v)
     given = np.zeros(model.nv) if impulse is None else model.check_v(impulse, "impulse")
     G = np.zeros((0, model.nv)) if jacobian is None else _rows(model.nv, jacobian)
-    lead = np.broadcast_shapes(q.shape[:-1], v.shape[:-1], given.shape[:-1], G.shape[:-2])
+    batches = {"q": q, "v": v, "impulse": given, "jacobian": G.sum(axis=-1)}
+    size = batch_of(**batches)
+    lead = () if size is None else (size,)
     q, v, given = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in (q, v, given))
     G = np.broadcast_to(G, (*lead, *G.shape[-2:]))
     M = dyn.mass_matrix(q)
@@ -126,13 +129,14 @@ def impact(
 
 
 def _rows(nv: int, jacobian: ArrayLike) -> Array:
-    G = np.asarray(jacobian, dtype=np.float64)
+    G = real_array("jacobian", jacobian)
     if G.ndim == 1:
         # One row.
         G = G[None]
     if G.ndim not in (2, 3) or G.shape[-1] != nv:
         raise InputError(f"jacobian: expected shape (k, {nv}) or (N, k, {nv}), got {G.shape}")
-    return finite_array("jacobian", G, G.shape)
+    require_finite("jacobian", G)
+    return G
 
 
 def _solved(name: str, M: Array, R: Array, force: Array, wanted: Array) -> tuple[Array, Array]:

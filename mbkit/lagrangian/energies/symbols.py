@@ -124,7 +124,8 @@ def undefined(x: sp.Expr, known: Iterable[sp.Symbol]) -> list[sp.Expr]:
     """Return derivatives and undefined functions in an expression but those of known symbols, such as J(theta)."""
     symbols = set(known)
     found = [*x.atoms(sp.Derivative), *x.atoms(AppliedUndef)]
-    return [f for f in found if not (f.free_symbols and f.free_symbols <= symbols)]
+    of_symbols = [d for d in found if isinstance(d, sp.Derivative) and not d.expr.has(AppliedUndef)]
+    return [f for f in found if f in of_symbols or not (f.free_symbols and f.free_symbols <= symbols)]
 
 
 def plain(names: Iterable[sp.Symbol]) -> str:

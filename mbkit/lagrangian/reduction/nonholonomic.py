@@ -199,16 +199,16 @@ class _Frame:
 
 
 def _defined(system: EnergyForm, choice: Mapping[Any, Any]) -> tuple[tuple[sp.Symbol, ...], sp.Matrix]:
-    used = {s.name for s in symbols_of(system)}
+    used = {s.name for s in (*symbols_of(system), *system.accelerations)}
     out = []
     for key, source in choice.items():
         if not isinstance(key, (str, sp.Symbol)) or not str(key):
             raise InputError(f"quasi_velocities: expected names or symbols, got {key!r}")
         symbol = sp.Symbol(key) if isinstance(key, str) else key
         fits("velocities", symbol)
-        if symbol.name in used:
-            raise InputError(f"quasi_velocities: {symbol.name!r} stands for something else already")
-        used.add(symbol.name)
+        if {symbol.name, velocity_of(symbol).name} & used:
+            raise InputError(f"quasi_velocities: {symbol.name!r} or its derivative stands for something else already")
+        used |= {symbol.name, velocity_of(symbol).name}
         w = read_expression(system, f"quasi_velocities[{key}]", source)
         slopes = [sp.diff(w, v) for v in system.velocities]
         at_rest = w.subs(dict.fromkeys(system.velocities, 0))
@@ -238,10 +238,25 @@ def _simplest(system: EnergyForm, A: sp.ImmutableMatrix) -> list[int]:
         det = tidy(A[:, list(dependent)].det(method="berkowitz"))
         return is_zero(det), bool(det.free_symbols & moving), det.count_ops(), dependent
 
-    best = min(islice(combinations(range(n), A.rows), _CHOICES), key=price)
-    if price(best)[0]:
-        raise InputError(f"{system.name}: its velocity constraints follow from each other or contradict each other")
+    best = min((_dependent(system, A), *islice(combinations(range(n), A.rows), _CHOICES)), key=price)
     return [i for i in range(n) if i not in best]
+
+
+def _places(A: sp.ImmutableMatrix) -> tuple[int, ...]:
+    """Return columns that are independent of each other, as many as there are, from the last on."""
+    found: list[int] = []
+    for i in reversed(range(A.cols)):
+        if len(found) < A.rows and _rank([sp.Matrix(A[:, [i, *found]])]) > len(found):
+            found.insert(0, i)
+    return tuple(found)
+
+
+def _dependent(system: EnergyForm, A: sp.ImmutableMatrix) -> tuple[int, ...]:
+    """Return velocities that the rows give by the others; refuse rows that depend on each other."""
+    found = _places(A)
+    if len(found) < A.rows:
+        raise InputError(f"{system.name}: its velocity constraints follow from each other or contradict each other")
+    return found
 
 
 def _along(x: Any, system: EnergyForm, qdot: sp.Matrix) -> Any:
@@ -375,7 +390,8 @@ class Integrability(Printable):
     constraints : tuple of sympy.Expr
         The rows A v + a.
     integrable : tuple of bool
-        Of each row whether, with the others, it is: dω ∧ ω1 ∧ ... ∧ ωm = 0.
+        Of each row whether it follows from functions that stay constant: whether the last velocities of `growth`
+        keep it too. That dω ∧ ω1 ∧ ... ∧ ωm = 0 is needed for it, and is not enough.
     growth : tuple of int
         Dimensions of the velocities that the rows allow, then with their Lie brackets, then with the brackets of these,
         until they grow no more (the growth vector); time counts as a coordinate where it enters.
@@ -417,6 +433,7 @@ def integrability(system: EnergyForm) -> Integrability:
     if not system.velocity_constraints:
         raise UnsupportedError(f"{system.name}: has no velocity constraints; give them as velocity_constraints=[...]")
     A, a = system.velocity_rows
+    _dependent(system, A)
     place = list(system.coordinates)
     if system.time is not None and (any(a) or system.time in A.free_symbols):
         # Velocities (q̇, ṫ) of a row A q̇ + a ṫ = 0.
@@ -434,7 +451,7 @@ def integrability(system: EnergyForm) -> Integrability:
         if not new:
             break
         growth.append(len(spread))
-    good = tuple(_row_integrable(A, k, frame, place) for k in range(A.rows))
+    good = tuple(all(is_zero((A[k, :] * x)[0]) for x in spread) for k in range(A.rows))
     integrals = len(place) - growth[-1]
     moving = (system.coordinates, system.velocities)
     return Integrability(system.velocity_constraints, good, tuple(growth), integrals, moving)
@@ -442,7 +459,7 @@ def integrability(system: EnergyForm) -> Integrability:
 
 def _kernel(A: sp.ImmutableMatrix) -> list[sp.Matrix]:
     n = A.cols
-    choices = islice(combinations(range(n), A.rows), _CHOICES)
+    choices = dict.fromkeys((_places(A), *islice(combinations(range(n), A.rows), _CHOICES)))
     priced = ((tidy(A[:, list(c)].det(method="berkowitz")), c) for c in choices)
     det, dependent = min(((d, c) for d, c in priced if not is_zero(d)), key=lambda x: (x[0].count_ops(), x[1]))
     block, out = A[:, list(dependent)], []
@@ -492,13 +509,6 @@ def _rank(columns: Sequence[sp.Matrix]) -> int:
             sizes = [abs(x) for x in mpmath.svd_c(B, compute_uv=False)]
             best = max(best, sum(x > _ROUNDED * max(sizes) for x in sizes))
     return best
-
-
-def _row_integrable(A: sp.ImmutableMatrix, k: int, frame: Sequence[sp.Matrix], place: Sequence[sp.Symbol]) -> bool:
-    """Return whether dω of a row is zero on the velocities that all rows allow."""
-    slopes = sp.Matrix(A[k, :]).T.jacobian(place) if A.cols > 1 else sp.zeros(1, 1)
-    curl = slopes - slopes.T
-    return all(is_zero((x.T * curl * y)[0]) for i, x in enumerate(frame) for y in frame[:i])
 
 
 # Momenta along symmetries that the constraints allow

@@ -331,7 +331,9 @@ class _Balance:
             K = self._whole_stiffness(q, multipliers)
             if self._manifold is not None:
                 J = self._manifold.jacobian(q)
-                K = np.block([[K, -J.T], [J, np.zeros((len(J), len(J)))]])
+                # Rows of velocities hold no configuration.
+                held = J[: len(r) - nv]
+                K = np.block([[K, -J.T], [held, np.zeros((len(held), len(J)))]])
             step = _damped(K, r, damping)
             ahead = self.model.integrate(q, step[:nv]), multipliers + step[nv:]
             new = self.residual(*ahead, tau)
@@ -398,8 +400,8 @@ def _damped(K: Array, r: Array, damping: float) -> Array:
     """Return Levenberg's and Marquardt's step; Newton's without damping."""
     if damping:
         square = K.T @ K
-        scale = max(float(np.trace(square)) / len(K), np.finfo(float).tiny)
-        return np.asarray(np.linalg.solve(square + damping * scale * np.eye(len(K)), -K.T @ r))
+        scale = max(float(np.trace(square)) / len(square), np.finfo(float).tiny)
+        return np.asarray(np.linalg.solve(square + damping * scale * np.eye(len(square)), -K.T @ r))
     try:
         step = np.linalg.solve(K, -r)
     except np.linalg.LinAlgError:

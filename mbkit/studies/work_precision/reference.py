@@ -142,7 +142,7 @@ class Motion:
         own = arithmetic()
         run = Extended(program(self.equations.function("constraint_residual")), own)
         f, _ = own.pair(run(own.from_pair(*q), *self._constants(t))[0][..., 0])
-        return np.asarray(np.abs(f).max(axis=1))
+        return np.asarray(np.abs(f).max(axis=1, initial=0.0))
 
     def values(self, t: Array) -> Array:
         """Return the values of the equations' numbers at these times, (K, k)."""
