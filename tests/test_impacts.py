@@ -74,6 +74,13 @@ def test_an_elastic_ball_on_a_rod_keeps_energy_and_an_inelastic_one_loses_carnot
     assert pickle.loads(pickle.dumps(hit)).equations() == hit.equations()
 
 
+def test_symbols_of_a_blow_are_no_unknowns() -> None:
+    theta, omega, P1, after = sp.symbols("theta thetadot P1 thetadot_after")
+    blow = Lagrangian(omega**2 / 2, 0, [theta]).impulse({theta: P1 + after}, rows=[omega])
+    assert not {P1, after} & {*blow.impulse_symbols, *blow.velocities_after}
+    assert sp.expand(next(iter(blow.reactions().values())) + P1 + after + omega) == 0
+
+
 # Engines
 
 
@@ -167,6 +174,10 @@ def test_bad_impacts_are_refused() -> None:
     lag = systems.double_pendulum()
     with pytest.raises(InputError, match="neither"):
         lag.impulse()
+    with pytest.raises(InputError, match="rows: expected a list"):
+        lag.impulse(rows=5)
+    with pytest.raises(InputError, match="stands twice"):
+        lag.impulse({lag.coordinates[0]: 1, lag.coordinates[0].name: 2})
     with pytest.raises(InputError, match="is no coordinate"):
         lag.impulse({"z": 1})
     with pytest.raises(InputError, match="linear in the velocities"):

@@ -627,10 +627,29 @@ def test_functions_that_are_not_given_stand_in_the_equation():
     direct = one_degree(1 + sp.sin(th) ** 2 / 2, -m * g * sp.cos(th), coordinate=th, parameters={m: 1.0, g: 9.81})
     at = [0.3], [0.7], [0.2]
     assert given.dynamics().forward_dynamics(*at) == pytest.approx(direct.dynamics().forward_dynamics(*at), rel=1e-15)
+    with pytest.raises(InputError, match=r"J\(thetadot\) is a function of a velocity"):
+        Lagrangian(J(thdot) * thdot**2, 0, [th])
     with pytest.raises(InputError, match=r"J\(c\) is no coordinate"):
         Lagrangian(J(c) * thdot**2, 0, [th])
     with pytest.raises(InputError, match="F is no parameter or function"):
         system.substituted({sp.Function("F"): th})
+
+
+def test_a_function_of_several_arguments_gets_one_value():
+    J, (a, b), (u, w) = sp.Function("J"), sp.symbols("theta1 theta2"), sp.symbols("thetadot1 thetadot2")
+    system = Lagrangian(J(a) * u**2 + J(2 * b) * w**2, 0, [a, b])
+    assert sp.expand(system.substituted({J(a): 1 + a**2}).T - (1 + a**2) * u**2 - (1 + 4 * b**2) * w**2) == 0
+    with pytest.raises(InputError, match=r"J stands as J\(2\*theta2\), J\(theta1\); give one of them"):
+        system.substituted({J: 1 + a**2})
+    with pytest.raises(InputError, match="expected J of a symbol"):
+        system.substituted({J(2 * b): b})
+    for bad in (None, [1, 2], sp.nan):
+        with pytest.raises(InputError, match=r"values\[J\(theta1\)\]"):
+            system.substituted({J(a): bad})
+    # A parameter may have the function's name.
+    both = Lagrangian(J(a) * u**2, sp.Symbol("J") * a, [a], parameters={sp.Symbol("J"): 2.0})
+    given = both.substituted({J(a): 3})
+    assert (3 * u**2, both.V) == (given.T, given.V)
 
 
 def test_mass_that_changes_with_time_is_told():

@@ -14,8 +14,8 @@ from click.testing import CliRunner
 
 import mbkit as mb
 from mbkit.cli import cli
-from mbkit.errors import UnknownNameError, UnsupportedError
-from mbkit.lagrangian import program
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.lagrangian import Lagrangian, program
 from tests.random_trees import random_tree
 from tests.scenes import mounted
 
@@ -97,7 +97,29 @@ def test_the_c_of_a_program_computes_the_same(tmp_path) -> None:
     assert np.array(printed.split(), dtype=float) == pytest.approx(expected, abs=1e3 * EPS * np.abs(expected).max())
 
 
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc here")
+@pytest.mark.parametrize("names", [("double", "static"), ("q_", "v_"), ("sin", "cos")])
+def test_names_of_parameters_that_c_has_for_itself_are_others(names, tmp_path) -> None:
+    x, xdot = sp.symbols("x xdot")
+    a, b = map(sp.Symbol, names)
+    model = Lagrangian(a * xdot**2 / 2, b * sp.sin(x) + a * sp.cos(2 * x), [x], parameters={a: 1.5, b: 0.5}).model
+    source = program(model, "inverse_dynamics").c() + (
+        "#include <stdio.h>\nint main(void) {\n"
+        "double q[] = {0.3}, v[] = {0.2}, a[] = {0.7}, p[] = {1.5, 0.5}, out[1];\n"
+        'inverse_dynamics(q, v, a, p, out);\nprintf("%.17g", out[0]);\nreturn 0;\n}\n'
+    )
+    (tmp_path / "main.c").write_text(source)
+    subprocess.run(["gcc", "-std=c99", "-o", "main", "main.c", "-lm"], cwd=tmp_path, check=True)
+    printed = subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert float(printed) == pytest.approx(1.5 * 0.7 + 0.5 * np.cos(0.3) - 3 * np.sin(0.6), rel=10 * EPS)
+
+
 def test_what_a_program_cannot_hold_is_refused() -> None:
+    for bad in (None, "ur5", mb.lagrangian.systems.kepler()):
+        with pytest.raises(InputError, match="model: expected a Model"):
+            program(bad)
+    with pytest.raises(UnknownNameError, match="quantity"):
+        program(mb.catalog.pendulum(), ["gravity"])
     with pytest.raises(UnknownNameError, match="inverse_dynamic"):
         program(mb.catalog.pendulum(), "inverse_dynamic")
     with pytest.raises(UnsupportedError, match="has constraints"):

@@ -9,7 +9,7 @@ import pytest
 import sympy as sp
 
 import mbkit as mb
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian import Lagrangian, systems
 
 
@@ -60,8 +60,39 @@ def test_axes_that_turn_change_nothing() -> None:
     assert steady.rates["phi"] == pytest.approx(1.0, rel=1e-12)
 
 
+def test_an_orbit_is_found_without_a_start() -> None:
+    # At r = 0, where the search begins, there is no equation.
+    orbit = mb.steady_motion(systems.kepler(), momenta={"p_phi": 1.7})
+    assert orbit.equilibrium.q == pytest.approx([1.7**2], rel=1e-9)
+
+
+def test_a_sleeping_top_has_no_verdict_in_eulers_angles() -> None:
+    # Of 1.2e-14 rad of tilt rounding made a stable top of one that falls: p² < 4 I1 m g l.
+    top = systems.heavy_top()
+    with pytest.raises(NumericalError, match="phi, psi turn about one axis"):
+        mb.steady_motion(top, [0.0, 0.3, 0.0], momenta={"p_phi": 0.05, "p_psi": 0.05})
+
+
+def test_constraints_hold_at_given_rates() -> None:
+    # A bead in the trough z = x², pushed along it: ω² = 2 g across.
+    x, y, z, xdot, ydot, zdot, g = sp.symbols("x y z xdot ydot zdot g")
+    T = (xdot**2 + ydot**2 + zdot**2) / 2
+    trough = Lagrangian(T, g * z, [x, y, z], parameters={g: 9.81}, constraints=[z - x**2])
+    found = mb.steady_motion(trough, [0.1, 0.0, 0.01], rates={"y": 1.0})
+    assert found.frequencies == pytest.approx([np.sqrt(2 * 9.81)], rel=1e-9)
+
+
 def test_bad_questions_are_refused() -> None:
     pendulum = systems.spherical_pendulum()
+    for bad in ("fast", None, [1, 2], np.nan):
+        with pytest.raises(InputError, match=r"rates\[phi\]: expected"):
+            mb.steady_motion(pendulum, [1.0], rates={"phi": bad})
+        with pytest.raises(InputError, match=r"momenta\[p_phi\]: expected"):
+            mb.steady_motion(pendulum, [1.0], momenta={"p_phi": bad})
+    with pytest.raises(InputError, match="q0: expected real numbers"):
+        mb.steady_motion(pendulum, "a", rates={"phi": 1.0})
+    with pytest.raises(InputError, match="seed"):
+        mb.steady_motion(pendulum, rates={"phi": 1.0}, seed="a")
     with pytest.raises(InputError, match="one of the two"):
         mb.steady_motion(pendulum, [1.0])
     with pytest.raises(InputError, match="one of the two"):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import spatial
-from mbkit._check import Array, real_array, finite_array, real, shown
+from mbkit._check import Array, finite_array, real, real_array, shown
 from mbkit._reproducible import length
 from mbkit.errors import InputError, ModelError, NonPhysicalWarning, nearest
 from mbkit.model.elements.declare import ElementBuilder

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 import sympy as sp
-from sympy.core.function import AppliedUndef
+from sympy.core.function import AppliedUndef, UndefinedFunction
 
 from mbkit._check import Array, real
 from mbkit._warn import warn
@@ -180,29 +180,52 @@ class EnergyForm:
     def substituted(self, values: Mapping[sp.Symbol, Any]) -> Self:
         """Return the same system with numbers for some parameters, and expressions for functions such as J(theta)."""
         own = {s.name: s for s in self.parameters}
-        functions = {f.func.__name__: f for x in _parts(self).values() for f in x.atoms(AppliedUndef)}
-        put = {}
+        functions = sorted({f for x in _parts(self).values() for f in x.atoms(AppliedUndef)}, key=str)
+        numbers, known = {}, {s.name: s for s in symbols_of(self)}
+        made: dict[Any, sp.Lambda] = {}
         for key, x in values.items():
-            name = name_of(key)
-            if name not in own and name not in functions:
-                known = plain(self.parameters) or "none"
-                raise InputError(f"values: {key} is no parameter or function; the parameters are {known}")
-            put[own[name] if name in own else functions[name]] = sp.sympify(x)
+            name, value = name_of(key), by_name(expression(f"values[{key}]", x, known), known)
+            forms = [f for f in functions if f.func.__name__ == name]
+            if name in own and not isinstance(key, (AppliedUndef, UndefinedFunction)):
+                numbers[own[name]] = value
+            elif forms:
+                made[forms[0].func] = _as_function(key, forms, value, known)
+            else:
+                parameters = plain(self.parameters) or "none"
+                raise InputError(f"values: {key} is no parameter or function; the parameters are {parameters}")
 
         def replaced(x: Any) -> Any:
             # Of a function that is now known, the derivatives are too.
-            return by_name(x.subs(put).doit(), {s.name: s for s in (*self.coordinates, *self.parameters)})
+            x = x.subs([*made.items()]).subs(numbers).doit()
+            return by_name(x, {s.name: s for s in (*self.coordinates, *self.parameters)})
 
         out = self._arguments()
         out |= {name: replaced(out[name]) for name in ("T", "V", "dissipation")}
         out["forces"] = {q: x if q in self.inputs else replaced(x) for q, x in out["forces"].items()}
         out |= {name: [replaced(c) for c in out[name]] for name in ("constraints", "velocity_constraints")}
-        out["parameters"] = {s: x for s, x in self.parameters.items() if s not in put}
+        out["parameters"] = {s: x for s, x in self.parameters.items() if s not in numbers}
         return type(self)(**out)
 
     def conservative(self) -> Self:
         """Return the same system without dissipation and forces; inputs stay."""
         return type(self)(**{**self._arguments(), "dissipation": 0, "forces": dict(self.inputs)})
+
+
+def _as_function(key: Any, forms: list[Any], value: sp.Expr, known: Mapping[str, sp.Symbol]) -> sp.Lambda:
+    """Return the function whose value at the key's arguments, or at its only ones, is given."""
+    if not isinstance(key, AppliedUndef) and len(forms) > 1:
+        raise InputError(f"values: {key} stands as {', '.join(map(str, forms))}; give one of them with its value")
+    arguments = key.args if isinstance(key, AppliedUndef) else forms[0].args
+    own = {x: sp.Symbol(name_of(x)) for x in arguments if isinstance(x, AppliedUndef)}
+    given = [by_name(own.get(x, x), known) for x in arguments]
+    if not all(isinstance(x, sp.Symbol) for x in given) or len({*given}) < len(given) or isinstance(value, sp.Lambda):
+        raise InputError(
+            f"values: expected {forms[0].func.__name__} of a symbol with an expression in it, such as "
+            f"{forms[0].func.__name__}(x): x**2, got {key}: {value}"
+        )
+    if any(len(f.args) != len(given) for f in forms):
+        raise InputError(f"values: {key} has {len(given)} arguments, but {', '.join(map(str, forms))} stands here")
+    return sp.Lambda(tuple(given), value.subs(own))
 
 
 def vanish(parts: Iterable[sp.Expr]) -> bool:
@@ -390,6 +413,9 @@ def _warn_of_mass_in_time(d: EnergyForm) -> None:
 def _check_velocities(d: EnergyForm) -> None:
     """Refuse velocities in V and constraints, and expressions that hold no coordinate or velocity."""
     moving = set(d.velocities)
+    unknown = [f for f in d.T.atoms(AppliedUndef) if f.free_symbols & moving]
+    if unknown:
+        raise InputError(f"T: {unknown[0]} is a function of a velocity; T is of second degree in the velocities")
     for name, x in _parts(d).items():
         held = x.free_symbols & moving
         if held and (name == "V" or name.startswith("constraints")):

@@ -19,7 +19,7 @@ from sympy.printing.numpy import NumPyPrinter
 from mbkit._escape import identifier, one_line, python_docstring, terminal
 from mbkit.codegen.program import Operation, program
 from mbkit.derivation import FUNCTIONS, equations_of
-from mbkit.errors import UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.energies.symbols import free_name
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned, folded
 from mbkit.model import Model
@@ -47,6 +47,70 @@ _FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {
     "fmax": sp.Max,
 }
 
+
+#: Keywords of C, and functions that its lines call.
+_C_WORDS: Final = frozenset(
+    [
+        "auto",
+        "break",
+        "case",
+        "char",
+        "const",
+        "continue",
+        "default",
+        "do",
+        "double",
+        "else",
+        "enum",
+        "extern",
+        "float",
+        "for",
+        "goto",
+        "if",
+        "inline",
+        "int",
+        "long",
+        "register",
+        "restrict",
+        "return",
+        "short",
+        "signed",
+        "sizeof",
+        "static",
+        "struct",
+        "switch",
+        "typedef",
+        "union",
+        "unsigned",
+        "void",
+        "volatile",
+        "while",
+        "_Bool",
+        "_Complex",
+        "_Imaginary",
+        "sqrt",
+        "sin",
+        "cos",
+        "tan",
+        "asin",
+        "acos",
+        "atan",
+        "atan2",
+        "exp",
+        "log",
+        "sinh",
+        "cosh",
+        "tanh",
+        "asinh",
+        "acosh",
+        "atanh",
+        "fabs",
+        "pow",
+        "fmin",
+        "fmax",
+        "hypot",
+    ]
+)
 
 _Inputs = tuple[tuple[str, tuple[sp.Symbol, ...]], ...]
 
@@ -155,7 +219,9 @@ def program_text(model: Model, quantity: str = "inverse_dynamics") -> ProgramTex
     >>> text.operations < 120, text.results.shape
     (True, (6, 1))
     """
-    if quantity not in FUNCTIONS:
+    if not isinstance(model, Model):
+        raise InputError(f"model: expected a Model, got {type(model).__name__}; one of T and V is its .model")
+    if not isinstance(quantity, str) or quantity not in FUNCTIONS:
         raise UnknownNameError("quantity", str(quantity), FUNCTIONS)
     if model.constrained:
         raise UnsupportedError(f"program: {model.name} has constraints, which the terms of its tree leave out")
@@ -193,7 +259,8 @@ def program_text(model: Model, quantity: str = "inverse_dynamics") -> ProgramTex
 
 def _inputs(function: Any, model: Model) -> tuple[_Inputs, set[str]]:
     """Return the symbols of each argument, and the names that are taken."""
-    out, used = list[tuple[str, tuple[sp.Symbol, ...]]](), {"out", "np"}
+    out, used = list[tuple[str, tuple[sp.Symbol, ...]]](), {"out", "np", *_C_WORDS}
+    used |= {f"{name}_" for name in function.name_in()}
     for i, name in enumerate(function.name_in()):
         numbered = [f"{name}{k + 1}" for k in range(function.size1_in(i))]
         taken = list(model.parameters) if name == "parameters" else numbered

@@ -19,7 +19,7 @@ from sympy.matrices.exceptions import NonInvertibleMatrixError
 from mbkit._escape import terminal
 from mbkit.errors import InputError
 from mbkit.lagrangian.energies.energy_form import EnergyForm, read_expression, symbols_of, vanish
-from mbkit.lagrangian.energies.symbols import free_name, name_of
+from mbkit.lagrangian.energies.symbols import free_name, listed, name_of
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.trig.simplify import tidy
 
@@ -102,7 +102,8 @@ def impulse_equations(
     system: EnergyForm, impulses: Mapping[Any, Any] | None, rows: Sequence[Any], restitution: Any
 ) -> ImpulseEquations:
     """Return the equations of an impact; arguments are those of `Lagrangian.impulse`."""
-    rows = [rows] if isinstance(rows, (sp.Basic, str)) else list(rows)
+    rows = () if rows is None else rows
+    rows = listed("rows", rows) if isinstance(rows, (sp.Basic, str)) or not hasattr(rows, "__len__") else list(rows)
     if not impulses and not rows:
         raise InputError("impulses: expected impulses on coordinates or rows that are imposed, got neither")
     n, given = len(system.coordinates), _given(system, impulses or {})
@@ -114,7 +115,9 @@ def impulse_equations(
     held = _moving(system)
     J = sp.Matrix(own).col_join(sp.Matrix(len(G), n, [x for row, _ in G for x in row]))
     rebound = [-e * (sp.Matrix([row]) * v)[0] - (1 + e) * rest for row, rest in G]
-    used = {s.name for s in symbols_of(system)}
+    # Symbols of the arguments keep their names.
+    shown = sp.Tuple(e, *given, *(x for row, rest in G for x in (*row, rest)))
+    used = {s.name for s in (*symbols_of(system), *shown.free_symbols)}
     after = tuple(sp.Symbol(free_name(f"{w.name}_after", used)) for w in system.velocities)
     names = tuple(sp.Symbol(free_name(f"P{k + 1}", used)) for k in range(J.rows))
     return ImpulseEquations(
@@ -142,6 +145,8 @@ def _given(system: EnergyForm, impulses: Mapping[Any, Any]) -> list[sp.Expr]:
     for key, value in impulses.items():
         if name_of(key) not in names:
             raise InputError(f"impulses: {key} is no coordinate; the coordinates are {', '.join(names)}")
+        if [name_of(x) for x in impulses].count(name_of(key)) > 1:
+            raise InputError(f"impulses: {key} stands twice; add the impulses along it")
         out[names.index(name_of(key))] = read_expression(system, f"impulses[{key}]", value, others=True)
     return out
 

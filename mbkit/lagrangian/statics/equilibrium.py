@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, finite_array
+from mbkit._check import Array, finite_array, generator
 from mbkit._escape import html, terminal
 from mbkit.engines.base import Dynamics, at_time
 from mbkit.engines.constraint_manifold import manifold_of, refuse_unreachable, require_independent
@@ -177,7 +177,7 @@ def equilibrium(
         if q0 is not None:
             starts = [balance.allowed(model.check_q(finite_array("q0", q0, (model.nq,)), "q0"))]
         else:
-            rng = np.random.default_rng(seed)
+            rng = generator("seed", seed)
             starts = [model.random_state(rng)[0] for _ in range(_STARTS)]
             # From the neutral configuration there need be no way to the constraints.
             starts[:0] = [] if model.constrained else [model.neutral()]
@@ -306,8 +306,14 @@ class _Balance:
     def at_rest(self, starts: list[Array], tau: Array) -> tuple[Array, Array]:
         """Return the first configuration at rest, and λ there; NumericalError names the least force."""
         ends: list[tuple[float, Array, Array]] = []
-        for start in starts:
-            q, multipliers, residual, left = self._solved(start, tau)
+        for k, start in enumerate(starts):
+            try:
+                q, multipliers, residual, left = self._solved(start, tau)
+            except NumericalError:
+                # Coordinates may be singular at the neutral configuration, as those of an orbit.
+                if k + 1 == len(starts) and not ends:
+                    raise
+                continue
             if left <= 1.0:
                 return q, multipliers
             ends.append((self.size(residual), q, residual))

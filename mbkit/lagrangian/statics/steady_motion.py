@@ -9,20 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, rows
+from mbkit._check import Array, real, real_array, rows
 from mbkit._escape import html, terminal
 from mbkit.engines.base import Dynamics
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian.energies.symbols import name_of
 from mbkit.lagrangian.reduction.routh import Routhian
 from mbkit.lagrangian.statics.equilibrium import Equilibrium, equilibrium
 from mbkit.lagrangian.system import Lagrangian
+
+#: Condition of the scaled mass matrix of cyclic coordinates; its square times eps is the error of the stiffness.
+_POLE: Final = 1e5
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +103,7 @@ def steady_motion(
         Both or neither of momenta and rates, one of them without a number, no cyclic coordinate, or a system that
         depends on the time.
     NumericalError
-        The search ends nowhere.
+        The search ends nowhere, or where coordinates are singular, as Euler's angles are where a top sleeps.
 
     Examples
     --------
@@ -125,12 +128,13 @@ def steady_motion(
         start, momenta = _of_rates(system, reduced, start, rates or {}, values, seed)
     names = [p.name for p in reduced.momenta]
     _complete("momenta", momenta, names)
-    numbers = {name: float(momenta[name]) for name in names}
+    numbers = {name: real(f"momenta[{name}]", momenta[name]) for name in names}
     rest = equilibrium(_at(reduced.lagrangian, {**values, **numbers}), start, seed=seed)
     still = np.zeros((1, len(kept)))
     turning = reduced._rates(np.zeros(1), rest.q[None], still, _numbers(reduced, {**values, **numbers}))[0]
     q, v = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     q[kept], v[cyclic] = rest.q, turning
+    _refuse_pole(_at(system, values).mass_matrix(q)[np.ix_(cyclic, cyclic)], reduced, rest.q)
     told = {s.name: float(x) for s, x in zip(reduced.cyclic, turning, strict=True)}
     return SteadyMotion(rest, told, numbers, q, v)
 
@@ -138,6 +142,17 @@ def steady_motion(
 def _at(system: Lagrangian, values: dict[str, float]) -> Dynamics:
     dyn = system.dynamics()
     return dyn.at(**values) if values else dyn
+
+
+def _refuse_pole(M: Array, reduced: Routhian[Any], q: Array) -> None:
+    """Refuse a place where cyclic coordinates turn about one axis (NumericalError)."""
+    scale = 1 / np.sqrt(np.diag(M))
+    if np.linalg.cond(scale[:, None] * M * scale) > _POLE:
+        names = ", ".join(x.name for x in reduced.cyclic)
+        raise NumericalError(
+            f"{reduced.system.name}: {names} turn about one axis at {np.array2string(q, precision=4)}, where terms of "
+            "their momenta cancel and stability has no digits left; take other coordinates, or another q0"
+        )
 
 
 def _numbers(reduced: Routhian[Any], values: Mapping[str, float]) -> dict[str, float]:
@@ -149,7 +164,7 @@ def _start(reduced: Routhian[Any], q0: ArrayLike | None) -> Array | None:
         return None
     kept, _ = reduced._places
     whole, name = len(reduced.system.coordinates), reduced.system.name
-    start = np.asarray(q0, dtype=np.float64)
+    start = real_array("q0", q0)
     if start.shape == (whole,):
         return start[kept]
     return rows("q0", start, len(kept), name, "coordinates that are not cyclic")
@@ -175,7 +190,9 @@ def _of_rates(
     seed: int,
 ) -> tuple[Array, dict[str, float]]:
     """Return where the other coordinates rest while the cyclic ones are driven at these rates, and their momenta."""
-    named = {name_of(key): float(x) for key, x in rates.items()} if isinstance(rates, Mapping) else rates
+    named = (
+        {name_of(key): real(f"rates[{key}]", x) for key, x in rates.items()} if isinstance(rates, Mapping) else rates
+    )
     _complete("rates", named, [q.name for q in reduced.cyclic])
     kept, cyclic = reduced._places
     put = {system.velocities[i]: sp.Float(named[q.name], 17) for i, q in zip(cyclic, reduced.cyclic, strict=True)}
@@ -187,6 +204,8 @@ def _of_rates(
         [system.velocities[i] for i in kept],
         forces={q: x for q, x in forces.items() if x != 0},
         parameters=system.parameters,
+        constraints=system.constraints,
+        velocity_constraints=[x.subs(put) for x in system.velocity_constraints],
         name=f"{system.name} at these rates",
     )
     rest = equilibrium(_at(driven, values), start, seed=seed)
