@@ -359,6 +359,7 @@ def test_momenta_along_symmetries_that_the_rows_allow_are_constant() -> None:
         ([x - y], "holds none of the velocities"),
         ([xdot - ydot, 2 * ydot - 2 * xdot], "follow from each other"),
         (5, "expected a list of expressions"),
+        ({xdot: 1}, "expected a list of expressions"),
         ([sp.Derivative(xdot, t) - ydot], "no coordinate or velocity"),
         ([xdot - sp.Symbol("k") * ydot], "is not declared"),
     ],
@@ -399,6 +400,15 @@ def test_what_velocity_constraints_cannot_have_is_refused() -> None:
         Lagrangian(m * xdot**2, 0, [x], parameters=[m]).maggi()
     with pytest.raises(InputError, match="nearest consistent state"):
         mb.simulate(lag.dynamics(), [0, 0, 0], [0, 1, 0], dt=0.1, duration=1)
+
+
+def test_a_coordinate_that_a_row_holds_cannot_be_ignored() -> None:
+    z, zdot = sp.symbols("z zdot")
+    T = (xdot**2 + ydot**2 + zdot**2) / 2
+    lag = Lagrangian(T, x**2, [x, y, z], velocity_constraints=[zdot - sp.sin(y) * xdot])
+    assert [k.name for k in lag.conserved_quantities()] == ["p_y", "E"]
+    with pytest.raises(InputError, match="holds y, which can therefore not be ignored"):
+        lag.routhian([y])
 
 
 def test_a_system_with_velocity_constraints_keeps_them_in_its_variants() -> None:

@@ -332,10 +332,9 @@ def _forces(into: PlainSymbols, source: Any) -> dict[sp.Symbol, sp.Expr]:
 def _rows(into: PlainSymbols, what: str, source: Any) -> tuple[sp.Expr, ...]:
     if isinstance(source, (sp.Basic, str)) and not isinstance(source, sp.Tuple):
         source = [source]
-    try:
-        rows = list(source)
-    except TypeError:
-        raise InputError(f"{what}: expected a list of expressions, got {source!r}") from None
+    if isinstance(source, (Mapping, set, frozenset)) or not isinstance(source, Iterable):
+        raise InputError(f"{what}: expected a list of expressions, got {source!r}")
+    rows = list(source)
     return tuple(_row(into, f"{what}[{k}]", c) for k, c in enumerate(rows))
 
 

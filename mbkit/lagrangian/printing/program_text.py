@@ -49,12 +49,7 @@ _FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {
 
 
 #: Keywords of C, and functions that its lines call.
-_C_WORDS: Final = frozenset(
-    "auto break case char const continue default do double else enum extern float for goto if "  # noqa: SIM905
-    "inline int long register restrict return short signed sizeof static struct switch typedef union unsigned void "
-    "volatile while _Bool _Complex _Imaginary sqrt sin cos tan asin acos atan atan2 exp log sinh cosh tanh asinh "
-    "acosh atanh fabs pow fmin fmax hypot".split()
-)
+_C_WORDS: Final = {*C99CodePrinter().reserved_words, *_FUNCTIONS, "fabs", "pow", "fmin", "fmax", "hypot"}
 
 _Inputs = tuple[tuple[str, tuple[sp.Symbol, ...]], ...]
 

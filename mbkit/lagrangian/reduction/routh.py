@@ -241,6 +241,8 @@ def _forces(
     out = {q: tidy(forces[q].subs(eliminated)) for q in kept if forces[q] != 0}
     for q, x in out.items():
         _need_not(ignored, x, f"the force {forces[q]} along {q}")
+    for row in system.velocity_constraints:
+        _need_not(ignored, row, f"the velocity constraint {row}")
     # Nothing acts along the ignored coordinates: R holds their velocities in form only.
     _need_not([*ignored, *eliminated], tidy(system.dissipation), f"the dissipation {system.dissipation}")
     return out
