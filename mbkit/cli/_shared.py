@@ -146,16 +146,17 @@ def in_options(message: str) -> str:
 def check_engines(names: tuple[str, ...], least: int) -> None:
     """Raise for names that are no engine's, before anything is read, loaded or computed."""
     from mbkit.engines.registry import REFERENCE, compared, find_engine
+    from mbkit.engines.versions.engine_version import names_version, remote_engines
 
     comparable = compared()
     for name in names:
         if name == REFERENCE:
             raise InputError("--engines: the oracle is what every engine is measured by; leave it out")
-        if "==" in name:
-            # Another version, by the form of its name.
+        if names_version(name):
+            # Another version, or an engine that always has an environment.
             find_engine(name)
         elif name not in comparable:
-            raise UnknownNameError("engine", name, comparable)
+            raise UnknownNameError("engine", name, (*comparable, *remote_engines()))
     if len(set(names)) < least:
         count = {1: "one", 2: "two"}[least]
         raise InputError(

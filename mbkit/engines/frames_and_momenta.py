@@ -39,13 +39,14 @@ QUANTITIES: Final = (
 def seen_from(R: Array, p: Array, linear: Array, angular: Array, axes: str) -> Array:
     """Return a six-vector, or the rows of a Jacobian, in these axes.
 
-    `linear` and `angular`, (3,) or (3, nv), are those of a frame's origin in world axes; R_WF and p_WF are its pose.
+    `linear` and `angular`, (3,), (3, nv) or (N, 3, nv), are those of a frame's origin in world axes; R_WF and p_WF are
+    its pose.
     """
     if axes == LOCAL:
-        linear, angular = R.T @ linear, R.T @ angular
+        linear, angular = R.mT @ linear, R.mT @ angular
     elif axes == WORLD:
         linear = linear + skew(p) @ angular
-    return np.concatenate([linear, angular])
+    return np.concatenate([linear, angular], axis=-2 if linear.ndim > 1 else 0)
 
 
 def accelerated(R: Array, p: Array, velocity: Array, classical: Array, axes: str, kind: str) -> Array:

@@ -15,7 +15,7 @@ from typing import Any, Final
 from mbkit.engines import closed_loops, loads
 from mbkit.engines.base import Dynamics
 from mbkit.engines.frames_and_momenta import Composed
-from mbkit.engines.versions.engine_version import EngineVersion
+from mbkit.engines.versions.engine_version import EngineVersion, names_version
 from mbkit.engines.versions.engine_version import engine as named_version
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
@@ -238,7 +238,7 @@ def load_entry_points() -> None:
 
 def find_engine(name: str) -> EngineInfo:
     """Return an engine's `EngineInfo`, of another version too; `UnknownNameError` for an unknown name."""
-    if isinstance(name, str) and "==" in name:
+    if names_version(name):
         own = "mbkit.engines.versions.dynamics", "VersionDynamics"
         return EngineInfo(named_version(name).name, None, *own, shown=())
     if name not in ENGINES:
@@ -282,7 +282,7 @@ def dynamics(model: Model, engine: str | EngineVersion = PINOCCHIO, **options: A
         The engine is not installed, or cannot hold this model; with the reason.
     """
     expect_model(model)
-    if isinstance(engine, str) and "==" in engine:
+    if isinstance(engine, str) and names_version(engine):
         engine = named_version(engine)
     if isinstance(engine, EngineVersion):
         # The import is for few.

@@ -16,7 +16,7 @@ from typing import Any, Final
 from mbkit import catalog
 from mbkit._check import real
 from mbkit.engines.registry import ENGINES, REFERENCE, compared, find_engine
-from mbkit.engines.versions.engine_version import EngineVersion
+from mbkit.engines.versions.engine_version import EngineVersion, names_version, remote_engines
 from mbkit.engines.versions.engine_version import engine as named_version
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import load
@@ -193,6 +193,8 @@ def numbers_of(what: str, values: object, **sign: bool) -> tuple[float, ...]:
 def engine_names(engines: object, least: int = 1) -> tuple[str, ...]:
     """Return the names of engines that can be compared and measured, each once; other versions too, as `dynamics`."""
     if isinstance(engines, Iterable) and not isinstance(engines, str):
+        # An engine that always has an environment is its newest tested version.
+        engines = [named_version(x) if names_version(x) else x for x in engines]
         engines = [x.name if isinstance(x, EngineVersion) else x for x in engines]
     names, known = names_of("engines", engines), compared()
     for name in names:
@@ -201,7 +203,7 @@ def engine_names(engines: object, least: int = 1) -> tuple[str, ...]:
         if "==" in name:
             find_engine(name)
         elif name not in known:
-            raise UnknownNameError("engine", name, known)
+            raise UnknownNameError("engine", name, (*known, *remote_engines()))
     if len(names) < least:
         raise InputError(f"engines: expected at least {least} of {list(known)}, got {list(names)}")
     return names
@@ -241,7 +243,7 @@ def not_installed(engines: Iterable[str]) -> dict[str, str]:
     """Return the engines that are not installed, each with how to get it; unknown names are left to others."""
     out = {}
     for name in engines:
-        if "==" in name:
+        if names_version(name):
             # Another version has an environment, or gets one.
             try:
                 named_version(name).interpreter()

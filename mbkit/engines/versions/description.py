@@ -18,6 +18,10 @@ from mbkit.model import Joint, Model
 from mbkit.model.validation import static_bodies
 
 
+#: Joint type -> the joints that an engine has in its place, one after the other.
+Steps = Mapping[str, Callable[[Joint], list[dict[str, Any]]]]
+
+
 class Convention(NamedTuple):
     """Coordinates of joints that rotate freely, in an engine.
 
@@ -38,13 +42,6 @@ class Convention(NamedTuple):
     linear: int = 0
 
 
-CONVENTIONS: Final[Mapping[str, Convention]] = {
-    "mujoco": Convention((0, 1, 2, 6, 3, 4, 5), ball_q=(3, 0, 1, 2), turned={"free": (0,)}),
-    "pinocchio": Convention(),
-    "drake": Convention((6, 3, 4, 5, 0, 1, 2), (3, 4, 5, 0, 1, 2), (), {"free": (0, 3), "ball": (0,)}, 3),
-}
-
-
 def _one(joint: Joint) -> list[dict[str, Any]]:
     return [{"type": joint.kind, "axes": joint.axes.tolist(), "pitch": joint.pitch}]
 
@@ -53,26 +50,28 @@ def _stacked(joint: Joint) -> list[dict[str, Any]]:
     return [{"type": kind, "axes": [axis.tolist()], "pitch": 0.0} for kind, axis in STACKS[joint.kind](joint)]
 
 
-#: Joint type -> the joints that an engine has in its place, one after the other.
-_OF_ALL: Final[dict[str, Callable[[Joint], list[dict[str, Any]]]]] = {
+_OF_ALL: Final[Steps] = {
     "fixed": lambda _: [],
     **dict.fromkeys(("revolute", "continuous", "prismatic", "planar"), _stacked),
     **dict.fromkeys(("helical", "ball", "free"), _one),
 }
-_STEPS: Final = {
-    "pinocchio": _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _one),
-    "drake": _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _stacked),
-}
+#: The same where joints of several rotations are one joint of the engine, or a stack of them.
+ONE_BY_ONE: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _one)
+STACKED: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _stacked)
 
 
-def travelling(engine: str, model: Model) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
+def travelling(
+    engine: str, steps: Steps | None, model: Model
+) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
     """Return a description as an engine's file in `remote` takes it, and the engine's joints of each joint.
+
+    `steps` are the engine's joints in the place of each joint type; without them the description travels as MJCF.
 
     Raises `UnsupportedError` for what the engine does not have, or what does not travel.
     """
-    if engine not in _STEPS:
+    if steps is None:
         return _mjcf(model)
-    static, steps = static_bodies(model.joints), _STEPS[engine]
+    static = static_bodies(model.joints)
     for joint in model.joints:
         if joint.kind not in steps:
             raise UnsupportedError(
@@ -129,9 +128,11 @@ class Places(NamedTuple):
     turning: tuple[tuple[Joint, list[int], list[int]], ...]
 
 
-def places(engine: str, model: Model, names: Mapping[str, Sequence[str]], joints: Mapping[str, Any]) -> Places:
+def places(
+    convention: Convention, model: Model, names: Mapping[str, Sequence[str]], joints: Mapping[str, Any]
+) -> Places:
     """Return the places of an engine's coordinates, from those of its joints, by name."""
-    convention, layout = CONVENTIONS[engine], model.layout
+    layout = model.layout
     own: dict[str, tuple[list[int], list[int]]] = {}
     for joint in model.joints:
         if joint.type.nv:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -11,8 +13,8 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.base import MappedDynamics, require_no_forces
 from mbkit.engines.elements.passive import JointPassive, pull
-from mbkit.engines.frames_and_momenta import ALIGNED
-from mbkit.engines.versions.description import CONVENTIONS, places, travelling
+from mbkit.engines.frames_and_momenta import ALIGNED, seen_from
+from mbkit.engines.versions.description import places, travelling
 from mbkit.engines.versions.engine_version import EngineVersion
 from mbkit.engines.versions.process import RemoteError, new_key, process_of
 from mbkit.errors import NumericalError, UnsupportedError
@@ -23,6 +25,25 @@ _REFUSED: Final = {
     "coriolis_matrix": "this engine forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
     "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
 }
+
+
+#: Methods below that take stacks of states too: one call of the process for all of them.
+_STACKED: Final = frozenset(
+    {
+        *("_mass_matrix", "_coriolis_matrix", "_coriolis_force", "_nle", "_gravity", "_passive", "_inverse_dynamics"),
+        *("_forward_dynamics", "_kinetic_energy", "_potential_energy", "_pose", "_jacobian"),
+    }
+)
+
+
+def _turn(R: Array, x: Array) -> Array:
+    """Return R x, of one state or a stack of them."""
+    return np.asarray((R @ x[..., None])[..., 0])
+
+
+def _each(function: Callable[..., Any], *states: Array) -> Any:
+    """Return a function of single states at one state or a stack of them."""
+    return np.array([function(*row) for row in zip(*states, strict=True)]) if states[0].ndim > 1 else function(*states)
 
 
 class VersionDynamics(MappedDynamics):
@@ -38,21 +59,25 @@ class VersionDynamics(MappedDynamics):
     -----
     A call takes some 0.1 ms more than the engine: the state goes to another process and the value comes back. Springs,
     dampers and couplings are mbkit's own, from the engine's poses and Jacobians, where the engine's algorithms know
-    none (Pinocchio) and where they are not sent (Drake); MuJoCo's are its own.
+    none (Pinocchio) and where they are not sent (Drake); MuJoCo's are its own. Energies are those of the engine's mass
+    matrix and centre of mass where it has no function for them. A stack of states is one call.
     """
 
     def __init__(self, model: Model, version: EngineVersion) -> None:
         self.version = version
         super().__init__(model)
-        self._data, self._names = travelling(version.engine, model)
+        self._convention = version.package.convention
+        self._data, self._names = travelling(version.engine, version.package.steps, model)
         self._process, self._key, self._held = process_of(version), new_key(), 0
         weakref.finalize(self, self._process.unneeded.append, self._key)
         self._build()
         gives = self._call("about")[0]["gives"]
         layout = self.model.layout
         orders = (np.arange(n) for n in layout.sizes[2:])
+        self._gives = frozenset(gives)
+        self._springs = JointPassive(self.model, *orders)
         #: What the engine does not know of.
-        self._beside = None if "passive" in gives else JointPassive(self.model, *orders)
+        self._beside = None if "passive" in gives else self._springs
         rotors = None if self._beside is None else self._beside.armature
         self._rotors = None if rotors is None else layout.G.T @ rotors @ layout.G
         self._ends = {
@@ -68,6 +93,11 @@ class VersionDynamics(MappedDynamics):
         """Name of the engine with its version."""
         return self.version.name
 
+    @property
+    def bits(self) -> int:  # type: ignore[override]  # of this object
+        """Of the significand with which it computes: 53, or 24 in single precision."""
+        return self.version.package.bits
+
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.model, self.version)
 
@@ -75,7 +105,12 @@ class VersionDynamics(MappedDynamics):
         return type(self)(self.model.with_nominal(values), self.version)
 
     def _call(self, name: str, *arrays: Array, **plain: Any) -> tuple[dict[str, Any], list[Array]]:
-        return self._process.call(name, arrays, self._key, self.version.seconds, **plain)
+        stacked = bool(arrays) and arrays[0].ndim > 1
+        return self._process.call(name, arrays, self._key, self.version.seconds, stacked, **plain)
+
+    def _value(self, method: Callable[..., Any], states: list[Array], more: tuple[Any, ...], size: int | None) -> Any:
+        together = size and getattr(method, "__name__", "") in _STACKED
+        return method(*states, *more) if together else super()._value(method, states, more, size)
 
     def _build(self) -> None:
         """Send the model, to a process that does not hold it yet."""
@@ -84,7 +119,7 @@ class VersionDynamics(MappedDynamics):
             head, _ = self._call("build", **self._data)
         except RemoteError as error:
             raise UnsupportedError(f"{self.engine}: refuses {self.model.name}: {error}") from None
-        self._places = places(self.version.engine, self.model, self._names, head["joints"])
+        self._places = places(self._convention, self.model, self._names, head["joints"])
         self._v_index = self._places.v_index
 
     def _ask(self, name: str, *arrays: Array, **plain: Any) -> list[Array]:
@@ -97,41 +132,58 @@ class VersionDynamics(MappedDynamics):
             raise NumericalError(f"{self.engine}: {name} of {self.model.name}: {error}") from None
 
     def _native(self, q: Array, v: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return the engine's q and v, and b of a_engine = T a + b."""
-        layout, convention = self.model.layout, CONVENTIONS[self.version.engine]
+        """Return the engine's q and v, and b of a_engine = T a + b; of one state or a stack of them."""
+        layout, convention = self.model.layout, self._convention
         full_q, index = layout.expand_q(q), self._places.v_index
-        x, b = full_q[self._places.q_index], np.zeros(len(index))
-        own = b if v is None else layout.expand_v(v)[index]
+        x, b = full_q[..., self._places.q_index], np.zeros((*np.shape(q)[:-1], len(index)))
+        own = b if v is None else layout.expand_v(v)[..., index]
         self._turned = []
         for joint, at_q, at_v in self._places.turning:
-            quaternion = full_q[layout.full_q[joint.name]][-4:]
+            quaternion = full_q[..., layout.full_q[joint.name]][..., -4:]
             R = spatial.matrix_from_quaternion(quaternion)
             first = at_v[0]
             self._turned += [(R, slice(first + k, first + k + 3)) for k in convention.turned[joint.kind]]
             if len(at_q) < 4:
-                x[at_q] = spatial.rpy_from_matrix(R)
+                angles = [spatial.rpy_from_matrix(one) for one in R.reshape(-1, 3, 3)]
+                x[..., at_q] = np.reshape(angles, (*R.shape[:-2], 3))
             if joint.type.nv > 3:
                 linear = slice(first + convention.linear, first + convention.linear + 3)
                 angular = slice(first + 3 - convention.linear, first + 6 - convention.linear)
-                b[linear] = R @ np.cross(own[angular], own[linear])
-        return x, np.zeros(len(index)) if v is None else self._to_engine(v), b
+                b[..., linear] = _turn(R, np.cross(own[..., angular], own[..., linear]))
+        return x, b if v is None else self._to_engine(v), b
+
+    def _to_engine(self, x: Array) -> Array:
+        out: Array = self.model.layout.expand_v(x)[..., self._v_index]
+        for R, part in self._turned:
+            out[..., part] = _turn(R, out[..., part])
+        return out
+
+    def _columns(self, J: Array) -> Array:
+        J, full = J.copy(), np.empty_like(J)
+        for R, part in self._turned:
+            J[..., part] = J[..., part] @ R
+        full[..., self._v_index] = J
+        return np.asarray(full @ self.model.layout.G) if self.model.layout.reduced else full
+
+    def _force(self, f: Array) -> Array:
+        return np.asarray(self._columns(f[..., None, :])[..., 0, :])
 
     # The protocol.
 
     def _mass_matrix(self, q: Array) -> Array:
         x, _, _ = self._native(q)
-        own = self._columns(self._columns(self._ask("mass_matrix", x)[0]).T)
+        own = self._columns(self._columns(self._ask("mass_matrix", x)[0]).mT)
         return own if self._rotors is None else own + self._rotors
 
     def _coriolis_matrix(self, q: Array, v: Array) -> Array:
         x, u, _ = self._native(q, v)
-        return self._columns(self._columns(self._ask("coriolis_matrix", x, u)[0]).T).T
+        return self._columns(self._columns(self._ask("coriolis_matrix", x, u)[0]).mT).mT
 
     def _with_rotation(self, name: str, q: Array, v: Array) -> Array:
         """Return a force of velocities, and M b of the change of velocities."""
         x, u, b = self._native(q, v)
         out = self._ask(name, x, u)[0]
-        return self._force(out + self._ask("mass_matrix", x)[0] @ b if b.any() else out)
+        return self._force(out + _turn(self._ask("mass_matrix", x)[0], b) if b.any() else out)
 
     def _coriolis_force(self, q: Array, v: Array) -> Array:
         return self._with_rotation("coriolis_force", q, v)
@@ -151,53 +203,68 @@ class VersionDynamics(MappedDynamics):
     def _passive_beside(self, q: Array, v: Array) -> Array:
         """Return the passive force that the engine does not know of."""
         if self._beside is None:
-            return np.zeros(self.model.nv)
+            return np.zeros(np.shape(v))
         layout = self.model.layout
-        out = np.asarray(layout.G.T @ self._beside.force(layout.expand_q(q), layout.expand_v(v)))
+        own = _each(self._beside.force, layout.expand_q(q), layout.expand_v(v))
+        out = np.asarray(own @ layout.G)
         for spring, ends in self._ends.items():
-            a, b = self._jacobian(q, ends, ALIGNED)[:, :3]
-            out -= (b - a).T @ pull(spring, self._gap(q, ends), (b - a) @ v)
+            rates = np.diff(self._jacobian(q, ends, ALIGNED)[..., :3, :], axis=-3)[..., 0, :, :]
+            pulls = _each(partial(pull, spring), self._gap(q, ends), _turn(rates, v))
+            out = out - _turn(rates.mT, pulls)
         return out
 
     def _gap(self, q: Array, ends: tuple[Frame, ...]) -> Array:
-        a, b = self._pose(q, ends)[:, :3, 3]
-        return np.asarray(b - a)
+        X = self._pose(q, ends)
+        return np.asarray(X[..., 1, :3, 3] - X[..., 0, :3, 3])
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         x, u, b = self._native(q, v)
         out = self._force(self._ask("inverse_dynamics", x, u, self._to_engine(a) + b)[0])
-        rotors = 0.0 if self._rotors is None else self._rotors @ a
+        rotors = 0.0 if self._rotors is None else a @ self._rotors
         return np.asarray(out + rotors - self._passive_beside(q, v))
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        if self.model.layout.reduced or self._rotors is not None:
-            return self._solved_motion(q, v, tau)
+        if self.model.layout.reduced or self._rotors is not None or "forward_dynamics" not in self._gives:
+            rest = self._inverse_dynamics(q, v, np.zeros_like(v))
+            return np.asarray(np.linalg.solve(self._mass_matrix(q), (tau - rest)[..., None])[..., 0])
         tau, (x, u, b) = tau + self._passive_beside(q, v), self._native(q, v)
         return self._force(self._ask("forward_dynamics", x, u, self._to_engine(tau))[0] - b)
 
     def _kinetic_energy(self, q: Array, v: Array) -> Any:
+        if "kinetic_energy" not in self._gives:
+            return 0.5 * np.einsum("...i,...ij,...j", v, self._mass_matrix(q), v)
         own = self._ask("kinetic_energy", *self._native(q, v)[:2])[0]
-        return own if self._rotors is None else own + 0.5 * v @ self._rotors @ v
+        return own if self._rotors is None else own + 0.5 * np.einsum("...i,ij,...j", v, self._rotors, v)
 
     def _potential_energy(self, q: Array) -> Any:
-        own = self._ask("potential_energy", self._native(q)[0])[0]
-        if self._beside is None:
+        if has := "potential_energy" in self._gives:
+            own = self._ask("potential_energy", self._native(q)[0])[0]
+        else:
+            mass, center = self._ask("matter", self._native(q)[0])
+            own = -mass * (center @ self.model.gravity)
+        if has and self._beside is None:
             return own
-        lengths = ((s, np.linalg.norm(self._gap(q, ends))) for s, ends in self._ends.items())
+        lengths = ((s, np.linalg.norm(self._gap(q, ends), axis=-1)) for s, ends in self._ends.items())
         between = sum(0.5 * s.stiffness * (length - s.rest_length) ** 2 for s, length in lengths)
-        return own + self._beside.energy(self.model.layout.expand_q(q)) + between
+        return own + _each(self._springs.energy, self.model.layout.expand_q(q)) + between
 
-    def _place(self, q: Array, v: Array | None = None) -> Array:
-        self._x, _, b = self._native(q, v)
-        return b
+    def _pose(self, q: Array, frames: tuple[Frame, ...]) -> Array:
+        out = np.broadcast_to(np.eye(4), (*np.shape(q)[:-1], len(frames), 4, 4)).copy()
+        for k, (R, p, _, _) in enumerate(self._placed_frames(q, frames)):
+            out[..., k, :3, :3], out[..., k, :3, 3] = R, p
+        return out
 
-    def _placed(self, frame: Frame) -> tuple[Array, Array, Any]:
-        R, p, linear, angular = self._ask("frame", self._x, body=frame.body)
-        arm = R @ frame.translation
-        return R @ frame.rotation, p + arm, (linear - spatial.skew(arm) @ angular, angular)
+    def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
+        seen = [seen_from(*placed, axes) for placed in self._placed_frames(q, frames)]
+        return self._columns(np.stack(seen, axis=-3))
 
-    def _point_jacobian(self, p: Array, at: Any) -> Any:  # noqa: ARG002  # the engine's answer has both
-        return at
+    def _placed_frames(self, q: Array, frames: tuple[Frame, ...]) -> Iterator[tuple[Array, Array, Array, Array]]:
+        """Yield R_WF, p_WF and the Jacobians of the origin and of turning in the engine's velocities."""
+        x = self._native(q)[0]
+        for frame in frames:
+            R, p, linear, angular = self._ask("frame", x, body=frame.body)
+            arm = R @ frame.translation
+            yield R @ frame.rotation, p + arm, linear - spatial.skew(arm) @ angular, angular
 
     # Beside the protocol.
 
@@ -216,12 +283,10 @@ class VersionDynamics(MappedDynamics):
         xs, us = self._ask("rollout", x, u, method=method, dt=dt, steps=steps)
         if not (np.isfinite(xs).all() and np.isfinite(us).all()):
             raise NumericalError(f"{self.engine}: its own run of {self.model.name} is not finite")
-        q, v = np.empty_like(xs), np.empty_like(us)
+        q = np.empty_like(xs)
         q[:, self._places.q_index] = xs
-        for k in range(len(q)):
-            self._native(q[k])
-            v[k] = self._force(us[k])
-        return q, v
+        self._native(q)
+        return q, self._force(us)
 
     def seconds(self, q: Array, v: Array, repeats: int = 200) -> float:
         """Return the shortest time of one forward dynamics in the engine's process, s, without the way there."""

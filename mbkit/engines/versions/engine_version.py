@@ -10,25 +10,80 @@ from typing import Final, NamedTuple
 
 from mbkit._check import real
 from mbkit.engines.versions import environment
+from mbkit.engines.versions.description import ONE_BY_ONE, STACKED, Convention, Steps
 from mbkit.errors import InputError, UnknownNameError
 
 _VERSION: Final = re.compile(r"\d+(\.[0-9A-Za-z]+)*")
 
 
 class Package(NamedTuple):
-    """What pip installs of an engine, the module that is there then, and what an environment takes, as measured."""
+    """What pip installs of an engine, how it takes a description, and in which precision it computes.
+
+    Attributes
+    ----------
+    distribution, module : str
+        What pip installs, and what can be imported then.
+    megabytes, seconds : float
+        What an environment takes, as measured.
+    convention : Convention
+    steps : mapping, optional
+        The engine's joints in the place of each joint type. None: it reads the MJCF that mbkit writes.
+    bits : int
+        Of the significand with which it computes: 53, or 24 in single precision.
+    tested : tuple of str
+        Versions that were judged, the newest last: that one is meant where none is named. Empty where the name alone
+        is an engine that needs no environment.
+    beside : tuple of str
+        Packages that the environment holds too.
+    file : str
+        The engine's file in `remote` without its ending, ``on_`` and the name by default; or the path of one.
+    variables : mapping
+        Environment variables of its process; ``{environment}`` in one stands for the environment's folder.
+    """
 
     distribution: str
     module: str
     megabytes: float
     seconds: float
+    convention: Convention
+    steps: Steps | None = None
+    bits: int = 53
+    tested: tuple[str, ...] = ()
+    beside: tuple[str, ...] = ()
+    file: str = ""
+    variables: Mapping[str, str] = {}
 
 
+_MUJOCO: Final = Convention((0, 1, 2, 6, 3, 4, 5), ball_q=(3, 0, 1, 2), turned={"free": (0,)})
+_JAX: Final = {
+    "JAX_PLATFORMS": "cpu",
+    "JAX_COMPILATION_CACHE_DIR": "{environment}/kernels",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    # With its newer fusion XLA computes the poses of a chain again for each body behind them: 2 s of a Panda in
+    # place of 0.4 ms (jaxlib 0.10.2).
+    "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
+}
+_MJX: Final = Package(
+    "mujoco-mjx",
+    "mujoco.mjx",
+    730,
+    25,
+    _MUJOCO,
+    tested=("3.17.0",),
+    file="on_mjx",
+    variables={**_JAX, "JAX_ENABLE_X64": "1"},
+)
 #: Engines with a file of their own in `remote`.
-PACKAGES: Final[Mapping[str, Package]] = {
-    "mujoco": Package("mujoco", "mujoco", 120, 11),
-    "pinocchio": Package("pin", "pinocchio", 430, 25),
-    "drake": Package("drake", "pydrake.multibody.plant", 440, 20),
+PACKAGES: Final[dict[str, Package]] = {
+    "mujoco": Package("mujoco", "mujoco", 120, 11, _MUJOCO),
+    "pinocchio": Package("pin", "pinocchio", 430, 25, Convention(), ONE_BY_ONE),
+    "drake": Package(
+        *("drake", "pydrake.multibody.plant", 440, 20),
+        Convention((6, 3, 4, 5, 0, 1, 2), (3, 4, 5, 0, 1, 2), (), {"free": (0, 3), "ball": (0,)}, 3),
+        STACKED,
+    ),
+    "mjx": _MJX,
+    "mjx-single": _MJX._replace(bits=24, variables=_JAX),
 }
 
 
@@ -64,7 +119,13 @@ class EngineVersion:
 
     def interpreter(self) -> Path:
         """Return the interpreter of its environment; make the environment first if it is missing."""
-        return environment.interpreter(self.package.distribution, self.version, self.package.module)
+        package = self.package
+        return environment.interpreter(package.distribution, self.version, package.module, beside=package.beside)
+
+    def variables(self) -> dict[str, str]:
+        """Return the environment variables of its process."""
+        place = environment.place(self.package.distribution, self.version)
+        return {key: value.format(environment=place) for key, value in self.package.variables.items()}
 
     def __str__(self) -> str:
         return self.name
@@ -103,6 +164,8 @@ def engine(name: str, *, seconds: float = 60.0) -> EngineVersion:
     EngineVersion(engine='mujoco', version='3.12.0', seconds=60.0)
     """
     form = "expected an engine and its version, such as 'mujoco==3.12.0'"
+    if isinstance(name, str) and name in PACKAGES and PACKAGES[name].tested:
+        name = f"{name}=={PACKAGES[name].tested[-1]}"
     if not isinstance(name, str) or "==" not in name:
         raise InputError(
             f"name: {form}, got {name!r}; without a version it is the installed one, which needs no engine()"
@@ -113,6 +176,16 @@ def engine(name: str, *, seconds: float = 60.0) -> EngineVersion:
     if not _VERSION.fullmatch(version):
         raise InputError(f"name: {form}, got {name!r}")
     return EngineVersion(head, version, real("seconds", seconds, positive=True))
+
+
+def names_version(name: object) -> bool:
+    """Return whether `engine` is to read a name: one with a version, or of an engine that has an environment always."""
+    return isinstance(name, str) and ("==" in name or (name in PACKAGES and bool(PACKAGES[name].tested)))
+
+
+def remote_engines() -> tuple[str, ...]:
+    """Return the engines that always have an environment of their own."""
+    return tuple(name for name, package in PACKAGES.items() if package.tested)
 
 
 def order_of(version: str) -> tuple[int, ...]:

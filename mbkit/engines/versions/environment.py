@@ -74,7 +74,9 @@ def exists(distribution: str, version: str) -> bool:
     return python_of(place(distribution, version)).exists()
 
 
-def interpreter(distribution: str, version: str, module: str, report: Report = _print) -> Path:
+def interpreter(
+    distribution: str, version: str, module: str, report: Report = _print, beside: Sequence[str] = ()
+) -> Path:
     """Return the interpreter of a version's environment, which is made where there is none.
 
     Parameters
@@ -85,6 +87,8 @@ def interpreter(distribution: str, version: str, module: str, report: Report = _
         That can be imported then.
     report : callable
         Gets a line when an environment is begun, and one when it is there.
+    beside : sequence of str
+        Packages that the environment holds too.
 
     Raises
     ------
@@ -103,7 +107,7 @@ def interpreter(distribution: str, version: str, module: str, report: Report = _
         with _lock(path.parent / f".{path.name}.lock"):
             # Another process may have made it in the meantime.
             if not python_of(path).exists():
-                _make(path, distribution, version, module, report)
+                _make(path, distribution, version, module, report, beside)
     except OSError as error:
         raise OutputError(
             f"cannot make an environment in {path.parent}: {error.strerror or error}; set MBKIT_ENVIRONMENTS to a "
@@ -133,13 +137,15 @@ def _lock(path: Path) -> Iterator[None]:
         yield
 
 
-def _make(path: Path, distribution: str, version: str, module: str, report: Report) -> None:
+def _make(
+    path: Path, distribution: str, version: str, module: str, report: Report, beside: Sequence[str]
+) -> None:
     half = path.with_name(f".{path.name}.part")
     shutil.rmtree(half, ignore_errors=True)
     name, start = f"{distribution} {version}", time.perf_counter()
     report(f"mbkit: making an environment of {name} in {path}")
     try:
-        pip, limits = _empty(half), ["numpy"]
+        pip, limits = _empty(half), ["numpy", *beside]
         _install(pip, distribution, version, limits)
         # Old versions do not say how new their dependencies may be.
         while reason := _import_failure(half, module):

@@ -42,9 +42,15 @@ class EngineProcess(Child):
         self.unneeded: list[int] = []
 
     def call(
-        self, name: str, arrays: Sequence[Array] = (), model: int = 0, seconds: float | None = None, **plain: Any
+        self,
+        name: str,
+        arrays: Sequence[Array] = (),
+        model: int = 0,
+        seconds: float | None = None,
+        stacked: bool = False,
+        **plain: Any,
     ) -> tuple[dict[str, Any], list[Array]]:
-        """Return the head and the arrays of the answer.
+        """Return the head and the arrays of the answer; `stacked` arrays hold a state in each row.
 
         Raises `RemoteError` where the engine refuses, and `EngineProcessError` where the process died or was ended
         after `seconds`; the next call starts another.
@@ -54,7 +60,8 @@ class EngineProcess(Child):
             self.start()
             while self.unneeded:
                 self._exchange(serve.packed({"call": "forget", "model": self.unneeded.pop()}), self.version.seconds)
-            head, out = self._exchange(serve.packed({"call": name, "model": model, "with": plain}, arrays), limit)
+            message = {"call": name, "model": model, "with": plain, "stacked": stacked}
+            head, out = self._exchange(serve.packed(message, arrays), limit)
         if "error" in head:
             raise RemoteError(head["error"])
         return head, out
@@ -67,8 +74,10 @@ class EngineProcess(Child):
 
     def _command(self, handle: int) -> tuple[Sequence[str], Mapping[str, str]]:
         self._python = self.version.interpreter()
-        command = [self._python, "-E", "-s", _SERVE, handle, self.version.engine, self._folder]
-        return [*map(str, command)], {k: x for k, x in os.environ.items() if not k.startswith("PYTHON")}
+        file = self.version.package.file or f"on_{self.version.engine}"
+        command = [self._python, "-E", "-s", _SERVE, handle, file, self._folder]
+        kept = {k: x for k, x in os.environ.items() if not k.startswith("PYTHON")}
+        return [*map(str, command)], kept | self.version.variables()
 
     def _exchange(self, message: bytes, seconds: float) -> tuple[dict[str, Any], list[Array]]:
         with self._told(seconds):

@@ -28,6 +28,33 @@ def parsed(text: str, format_: str) -> Any:  # noqa: ARG001  # MuJoCo sees it in
     return mujoco.MjModel.from_xml_string(text)
 
 
+def smooth(m: Any) -> Any:
+    """Return a model with all off that its smooth dynamics do not need."""
+    for name in _OFF:
+        m.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, "mjDSBL_" + name, 0))
+    m.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+    return m
+
+
+def places(m: Any) -> dict[str, Any]:
+    """Return the places of each joint's numbers in qpos and qvel."""
+    out = {}
+    for j in range(m.njnt):
+        nq, nv = {0: (7, 6), 1: (4, 3)}.get(_plain(m.jnt_type[j]), (1, 1))
+        q, v = _plain(m.jnt_qposadr[j]), _plain(m.jnt_dofadr[j])
+        name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j}"
+        out[name] = [[*range(q, q + nq)], [*range(v, v + nv)]]
+    return out
+
+
+def body_of(m: Any, name: str) -> int:
+    """Return the number of a body."""
+    k = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, name)
+    if k < 0:
+        raise ValueError(f"no body {name!r}")
+    return k
+
+
 def _plain(number: Any) -> int:
     return int(np.ravel(number)[0])
 
@@ -36,22 +63,12 @@ class Engine:
     """A compiled model, with all off that its smooth dynamics do not need."""
 
     def __init__(self, m: Any) -> None:
-        self._m, self._d = m, mujoco.MjData(m)
-        for name in _OFF:
-            m.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, "mjDSBL_" + name, 0))
-        m.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
+        self._m, self._d = smooth(m), mujoco.MjData(m)
         # Older ones compute no energy without it.
         m.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
 
     def joints(self) -> dict[str, Any]:
-        """Return the places of each joint's numbers in qpos and qvel."""
-        out, m = {}, self._m
-        for j in range(m.njnt):
-            nq, nv = {0: (7, 6), 1: (4, 3)}.get(_plain(m.jnt_type[j]), (1, 1))
-            q, v = _plain(m.jnt_qposadr[j]), _plain(m.jnt_dofadr[j])
-            name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint {j}"
-            out[name] = [[*range(q, q + nq)], [*range(v, v + nv)]]
-        return out
+        return places(self._m)
 
     def _set(self, q: Any, v: Any = None) -> Any:
         d = self._d
@@ -109,9 +126,7 @@ class Engine:
 
     def frame(self, q: Any, body: str) -> Any:
         """Return R_WB, p_WB, and the Jacobians of the body's origin and turning in world axes."""
-        d, k = self._set(q), mujoco.mj_name2id(self._m, mujoco.mjtObj.mjOBJ_BODY, body)
-        if k < 0:
-            raise ValueError(f"no body {body!r}")
+        d, k = self._set(q), body_of(self._m, body)
         linear, angular = np.zeros((3, self._m.nv)), np.zeros((3, self._m.nv))
         mujoco.mj_jacBody(self._m, d, linear, angular, k)
         return [np.array(d.xmat[k]).reshape(3, 3), np.array(d.xpos[k]), linear, angular]

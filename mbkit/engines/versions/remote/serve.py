@@ -2,7 +2,7 @@
 
 The loop answers any `mbkit._child_process.Child`. A message of arrays is a line of JSON, with their shapes, and the
 bytes of their numbers: no pickles, and from any version of NumPy. An engine's process is started as
-``python serve.py HANDLE ENGINE FOLDER``, with an inherited socket, in a folder of its own.
+``python serve.py HANDLE FILE FOLDER``, with an inherited socket, in a folder of its own.
 """
 
 from __future__ import annotations
@@ -111,15 +111,31 @@ def _answer(adapter: Any, held: dict[int, Any], head: dict[str, Any], arrays: li
         return packed({})
     if name == "about":
         return packed({"version": adapter.VERSION, "gives": [x for x in dir(adapter.Engine) if x[0] != "_"]})
-    out = getattr(held[key], name)(*arrays, **head["with"])
-    return packed({}, out if isinstance(out, (list, tuple)) else [out])
+    return packed({}, _called(held[key], name, arrays, head["with"], head.get("stacked", False)))
 
 
-def serve(handle: int, engine: str, folder: str) -> None:
-    """Answer calls of an engine."""
+def _called(engine: Any, name: str, arrays: list[Any], plain: dict[str, Any], stacked: bool) -> list[Any]:
+    """Return a quantity at one state, or at each of a stack; an engine with ``STACKED = True`` takes stacks alone."""
+
+    def values(*states: Any) -> list[Any]:
+        out = getattr(engine, name)(*states, **plain)
+        return [*out] if isinstance(out, (list, tuple)) else [out]
+
+    together = getattr(engine, "STACKED", False)
+    if together == stacked:
+        return values(*arrays)
+    if together:
+        return [x[0] for x in values(*(np.asarray(x)[None] for x in arrays))]
+    return [np.array(column) for column in zip(*(values(*states) for states in zip(*arrays)))]
+
+
+def serve(handle: int, file: str, folder: str) -> None:
+    """Answer calls of an engine, whose file is beside this one, or is a path."""
 
     def prepare(_: Connection) -> Callable[[bytes], bytes]:
-        adapter = importlib.import_module("on_" + engine)
+        place, name = os.path.split(os.path.splitext(file)[0] if file.endswith(".py") else file)
+        sys.path[:0] = [place] if place else []
+        adapter = importlib.import_module(name)
         held: dict[int, Any] = {}
 
         def answer(message: bytes) -> bytes:

@@ -1,0 +1,142 @@
+"""MJX, MuJoCo in JAX, of any version from 3.2: terms of a model of MJCF or URDF in MuJoCo's own coordinates.
+
+The parser and the compiler are MuJoCo's. JAX computes in double precision where its process has ``JAX_ENABLE_X64=1``.
+"""
+
+from __future__ import annotations
+
+import time
+from importlib.metadata import version
+
+import jax
+import mujoco
+import numpy as np
+from mujoco import mjx
+from on_mujoco import body_of, built, parsed, places, smooth
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
+
+__all__ = ["VERSION", "Engine", "built", "parsed"]
+VERSION = version("mujoco-mjx")
+#: The smallest stack that is compiled, beside one state alone; larger ones have twice as many, and so on.
+_LEAST = 16
+
+
+class Engine:
+    """A model on JAX, with all off that its smooth dynamics do not need. Each method takes a stack of states."""
+
+    STACKED = True
+
+    def __init__(self, m: Any) -> None:
+        self._m = smooth(m)
+        self._mx = mjx.put_model(m)
+        self._d = mjx.make_data(self._mx)
+        self._gravity = np.array(m.opt.gravity)
+        self._compiled: dict[Any, Any] = {}
+
+    def joints(self) -> dict[str, Any]:
+        """Return the places of each joint's numbers in qpos and qvel."""
+        return places(self._m)
+
+    def _at(self, mx: Any, q: Any, v: Any = None) -> Any:
+        d = mjx.fwd_position(mx, self._d.replace(qpos=q))
+        return d if v is None else mjx.fwd_velocity(mx, d.replace(qvel=v))
+
+    def _over(self, key: Any, function: Any, *states: Any, shared: tuple[Any, ...] = ()) -> Any:
+        """Return a function of one state at each of a stack, compiled once for each size of a stack."""
+        if key not in self._compiled:
+            axes = (0,) * len(states) + (None,) * len(shared)
+            self._compiled[key] = jax.jit(jax.vmap(function, in_axes=axes))
+        n = len(states[0])
+        size = n if n == 1 else max(_LEAST, 1 << (n - 1).bit_length())
+        # A stack of another size would be compiled again.
+        full = [np.concatenate([x, np.repeat(x[-1:], size - n, axis=0)]) for x in states]
+        out = self._compiled[key](*full, *shared)
+        return jax.tree.map(lambda x: np.asarray(x)[:n], out)
+
+    def _mass(self, q: Any) -> Any:
+        return mjx.full_m(self._mx, self._at(self._mx, q))
+
+    def mass_matrix(self, q: Any) -> Any:
+        return self._over("mass_matrix", self._mass, q)
+
+    def _bias(self, q: Any, v: Any, gravity: Any) -> Any:
+        def bias(q: Any, v: Any, gravity: Any) -> Any:
+            mx = self._mx.replace(opt=self._mx.opt.replace(gravity=gravity))
+            return self._at(mx, q, v).qfrc_bias
+
+        return self._over("bias", bias, q, v, shared=(gravity,))
+
+    def gravity(self, q: Any) -> Any:
+        return self._bias(q, np.zeros((len(q), self._m.nv)), self._gravity)
+
+    def nle(self, q: Any, v: Any) -> Any:
+        return self._bias(q, v, self._gravity)
+
+    def coriolis_force(self, q: Any, v: Any) -> Any:
+        # Without gravity, so that nothing cancels.
+        return self._bias(q, v, np.zeros(3))
+
+    def passive(self, q: Any, v: Any) -> Any:
+        return self._over("passive", lambda q, v: self._at(self._mx, q, v).qfrc_passive, q, v)
+
+    def inverse_dynamics(self, q: Any, v: Any, a: Any) -> Any:
+        def inverse(q: Any, v: Any, a: Any) -> Any:
+            return mjx.inverse(self._mx, self._d.replace(qpos=q, qvel=v, qacc=a)).qfrc_inverse
+
+        return self._over("inverse", inverse, q, v, a)
+
+    def _forward(self, q: Any, v: Any, tau: Any) -> Any:
+        return mjx.forward(self._mx, self._d.replace(qpos=q, qvel=v, qfrc_applied=tau)).qacc
+
+    def forward_dynamics(self, q: Any, v: Any, tau: Any) -> Any:
+        return self._over("forward", self._forward, q, v, tau)
+
+    def frame(self, q: Any, body: str) -> Any:
+        """Return R_WB, p_WB, and the Jacobians of the body's origin and turning in world axes."""
+
+        def frame(q: Any, k: Any) -> Any:
+            d = self._at(self._mx, q)
+            linear, angular = mjx.jac(self._mx, d, d.xpos[k], k)
+            return d.xmat[k], d.xpos[k], linear.T, angular.T
+
+        return self._over("frame", frame, q, shared=(body_of(self._m, body),))
+
+    def matter(self, q: Any) -> Any:
+        """Return the mass of what moves and stands, kg, and its centre of mass, m."""
+        masses = np.array(self._m.body_mass)
+        at = self._over("matter", lambda q: self._at(self._mx, q).xipos, q)
+        return [np.full(len(q), masses.sum()), np.einsum("b,nbi->ni", masses, at) / masses.sum()]
+
+    def rollout(self, q: Any, v: Any, method: str, dt: float, steps: int) -> Any:
+        """Return qpos and qvel after each of so many steps."""
+        kind = {"euler": "EULER", "rk4": "RK4", "implicitfast": "IMPLICITFAST"}.get(method)
+        if kind is None:
+            raise NotImplementedError(f"MJX has no integrator {method!r}; it has euler, rk4 and implicitfast")
+        integrator = int(getattr(mujoco.mjtIntegrator, "mjINT_" + kind))
+
+        def run(q: Any, v: Any, dt: Any) -> Any:
+            mx = self._mx.replace(opt=self._mx.opt.replace(timestep=dt, integrator=integrator))
+
+            def step(d: Any, _: Any) -> Any:
+                d = mjx.step(mx, d)
+                return d, (d.qpos, d.qvel)
+
+            return jax.lax.scan(step, self._d.replace(qpos=q, qvel=v), None, steps)[1]
+
+        out = self._over(("rollout", method, steps), run, q, v, shared=(dt,))
+        return [np.concatenate([x[:, None], y], axis=1) for x, y in zip((q, v), out)]
+
+    def seconds(self, q: Any, v: Any, repeats: int) -> Any:
+        """Return the shortest time of one forward dynamics of the stack, s, of rounds of so many calls."""
+        tau = np.zeros_like(v)
+        self.forward_dynamics(q, v, tau)
+        best = float("inf")
+        for _ in range(5):
+            start = time.perf_counter()
+            for _ in range(repeats):
+                self.forward_dynamics(q, v, tau)
+            best = min(best, (time.perf_counter() - start) / repeats)
+        return np.full(len(q), best)
