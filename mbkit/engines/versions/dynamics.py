@@ -255,8 +255,8 @@ class VersionDynamics(MappedDynamics):
         return out
 
     def _jacobian(self, q: Array, frames: tuple[Frame, ...], axes: str) -> Array:
-        seen = [seen_from(*placed, axes) for placed in self._placed_frames(q, frames)]
-        return self._columns(np.stack(seen, axis=-3))
+        seen = (seen_from(*placed, axes) for placed in self._placed_frames(q, frames))
+        return np.stack([self._columns(J) for J in seen], axis=-3)
 
     def _placed_frames(self, q: Array, frames: tuple[Frame, ...]) -> Iterator[tuple[Array, Array, Array, Array]]:
         """Yield R_WF, p_WF and the Jacobians of the origin and of turning in the engine's velocities."""

@@ -40,10 +40,6 @@ class Engine:
         """Return the places of each joint's numbers in qpos and qvel."""
         return places(self._m)
 
-    def _at(self, mx: Any, q: Any, v: Any = None) -> Any:
-        d = mjx.fwd_position(mx, self._d.replace(qpos=q))
-        return d if v is None else mjx.fwd_velocity(mx, d.replace(qvel=v))
-
     def _over(self, key: Any, function: Any, *states: Any, shared: tuple[Any, ...] = ()) -> Any:
         """Return a function of one state at each of a stack, compiled once for each size of a stack."""
         if key not in self._compiled:
@@ -56,31 +52,32 @@ class Engine:
         out = self._compiled[key](*full, *shared)
         return jax.tree.map(lambda x: np.asarray(x)[:n], out)
 
-    def _mass(self, q: Any) -> Any:
-        return mjx.full_m(self._mx, self._at(self._mx, q))
+    def _terms(self, q: Any, v: Any = None, gravity: Any = None) -> Any:
+        """Return all that position and velocity decide, since each function takes seconds to trace."""
+
+        def terms(q: Any, v: Any, gravity: Any) -> Any:
+            mx = self._mx.replace(opt=self._mx.opt.replace(gravity=gravity))
+            d = mjx.fwd_velocity(mx, mjx.fwd_position(mx, self._d.replace(qpos=q, qvel=v)))
+            return mjx.full_m(mx, d), d.qfrc_bias, d.qfrc_passive, d.xipos
+
+        v = np.zeros((len(q), self._m.nv)) if v is None else v
+        return self._over("terms", terms, q, v, shared=(self._gravity if gravity is None else gravity,))
 
     def mass_matrix(self, q: Any) -> Any:
-        return self._over("mass_matrix", self._mass, q)
-
-    def _bias(self, q: Any, v: Any, gravity: Any) -> Any:
-        def bias(q: Any, v: Any, gravity: Any) -> Any:
-            mx = self._mx.replace(opt=self._mx.opt.replace(gravity=gravity))
-            return self._at(mx, q, v).qfrc_bias
-
-        return self._over("bias", bias, q, v, shared=(gravity,))
+        return self._terms(q)[0]
 
     def gravity(self, q: Any) -> Any:
-        return self._bias(q, np.zeros((len(q), self._m.nv)), self._gravity)
+        return self._terms(q)[1]
 
     def nle(self, q: Any, v: Any) -> Any:
-        return self._bias(q, v, self._gravity)
+        return self._terms(q, v)[1]
 
     def coriolis_force(self, q: Any, v: Any) -> Any:
         # Without gravity, so that nothing cancels.
-        return self._bias(q, v, np.zeros(3))
+        return self._terms(q, v, np.zeros(3))[1]
 
     def passive(self, q: Any, v: Any) -> Any:
-        return self._over("passive", lambda q, v: self._at(self._mx, q, v).qfrc_passive, q, v)
+        return self._terms(q, v)[2]
 
     def inverse_dynamics(self, q: Any, v: Any, a: Any) -> Any:
         def inverse(q: Any, v: Any, a: Any) -> Any:
@@ -88,17 +85,17 @@ class Engine:
 
         return self._over("inverse", inverse, q, v, a)
 
-    def _forward(self, q: Any, v: Any, tau: Any) -> Any:
-        return mjx.forward(self._mx, self._d.replace(qpos=q, qvel=v, qfrc_applied=tau)).qacc
-
     def forward_dynamics(self, q: Any, v: Any, tau: Any) -> Any:
-        return self._over("forward", self._forward, q, v, tau)
+        def forward(q: Any, v: Any, tau: Any) -> Any:
+            return mjx.forward(self._mx, self._d.replace(qpos=q, qvel=v, qfrc_applied=tau)).qacc
+
+        return self._over("forward", forward, q, v, tau)
 
     def frame(self, q: Any, body: str) -> Any:
         """Return R_WB, p_WB, and the Jacobians of the body's origin and turning in world axes."""
 
         def frame(q: Any, k: Any) -> Any:
-            d = self._at(self._mx, q)
+            d = mjx.com_pos(self._mx, mjx.kinematics(self._mx, self._d.replace(qpos=q)))
             linear, angular = mjx.jac(self._mx, d, d.xpos[k], k)
             return d.xmat[k], d.xpos[k], linear.T, angular.T
 
@@ -107,8 +104,7 @@ class Engine:
     def matter(self, q: Any) -> Any:
         """Return the mass of what moves and stands, kg, and its centre of mass, m."""
         masses = np.array(self._m.body_mass)
-        at = self._over("matter", lambda q: self._at(self._mx, q).xipos, q)
-        return [np.full(len(q), masses.sum()), np.einsum("b,nbi->ni", masses, at) / masses.sum()]
+        return [np.full(len(q), masses.sum()), np.einsum("b,nbi->ni", masses, self._terms(q)[3]) / masses.sum()]
 
     def rollout(self, q: Any, v: Any, method: str, dt: float, steps: int) -> Any:
         """Return qpos and qvel after each of so many steps."""
