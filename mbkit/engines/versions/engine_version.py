@@ -63,6 +63,7 @@ _JAX: Final = {
     # place of 0.4 ms (jaxlib 0.10.2).
     "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
 }
+_WARP: Final = {"WARP_CACHE_PATH": "{environment}/kernels"}
 _MJX: Final = Package(
     "mujoco-mjx",
     "mujoco.mjx",
@@ -81,6 +82,13 @@ PACKAGES: Final[dict[str, Package]] = {
         *("drake", "pydrake.multibody.plant", 440, 20),
         Convention((6, 3, 4, 5, 0, 1, 2), (3, 4, 5, 0, 1, 2), (), {"free": (0, 3), "ball": (0,)}, 3),
         STACKED,
+    ),
+    "mujoco-warp": Package(
+        *("mujoco-warp", "mujoco_warp", 590, 20, _MUJOCO),
+        bits=24,
+        tested=("4.0.0",),
+        file="on_mujoco_warp",
+        variables=_WARP,
     ),
     "mjx": _MJX,
     "mjx-single": _MJX._replace(bits=24, variables=_JAX),
