@@ -83,6 +83,14 @@ PACKAGES: Final[dict[str, Package]] = {
         Convention((6, 3, 4, 5, 0, 1, 2), (3, 4, 5, 0, 1, 2), (), {"free": (0, 3), "ball": (0,)}, 3),
         STACKED,
     ),
+    "newton": Package(
+        *("newton", "newton", 560, 22),
+        Convention(turned={"free": (0, 3), "ball": (0,)}),
+        {kind: step for kind, step in STACKED.items() if kind != "helical"},
+        bits=24,
+        tested=("1.8.0",),
+        variables=_WARP,
+    ),
     "mujoco-warp": Package(
         *("mujoco-warp", "mujoco_warp", 590, 20, _MUJOCO),
         bits=24,
