@@ -14,6 +14,7 @@ import numpy as np
 
 from mbkit._check import Array, count, real
 from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import STANDARD, find_engine
 from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError
@@ -26,12 +27,14 @@ from mbkit.studies.compare.beyond_terms import omissions, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
 from mbkit.studies.compare.errors import EPS, ROUNDINGS, Errors, Scales, condition_under_constraints, interleaved
 from mbkit.studies.compare.findings import findings
+from mbkit.studies.compare.precision import Precision, digits_of, named_precision
 from mbkit.studies.compare.result import OWN_LAW, Comparison, Row
 from mbkit.studies.compare.terms import (
     CONSTRAINT_TERMS,
     FORWARD_DYNAMICS,
     JOINT_LOADS,
     OF_CONSTRAINED_MOTION,
+    POWER,
     TERMS,
     States,
     Term,
@@ -82,6 +85,12 @@ class Judge:
             self.terms += MECHANISM_TERMS if model.constrained else BODY_TERMS
             self.scales = BodyScales.around(self.scales, oracle, at)
         self.joint_of = owners(model)
+        #: Tolerances of engines that are not double, by their bits.
+        self._lower = {
+            dyn.bits: Precision(model, at, dyn.bits, self.scales, oracle)
+            for dyn in self.engines.values()
+            if dyn.bits < DOUBLE_BITS
+        }
 
     def rows(self, tell: Progress) -> tuple[list[Row], list[Refusal]]:
         """Return a row per term and engine."""
@@ -89,15 +98,17 @@ class Judge:
         for k, term in enumerate(self.terms):
             tell(k / (len(self.terms) + 1), term.name)
             rows += self._term(term)
-        tell(len(self.terms) / (len(self.terms) + 1), "power balance")
+        tell(len(self.terms) / (len(self.terms) + 1), POWER)
 
         for name, dyn in self.engines.items():
             try:
                 errors = power_errors(dyn, self.oracle, self.at, self.scales)
             except MbkitError as error:
-                self._refuse(name, "power balance", error)
+                self._refuse(name, POWER, error)
             else:
-                rows.append(self._row("power balance", name, errors, self.defects.get(name, "")))
+                lower = self._lower.get(self.engines[name].bits)
+                allowed = lower.allowed(POWER) if lower else None
+                rows.append(self._row(POWER, name, errors, self.defects.get(name, ""), allowed))
         return rows, self.refusals
 
     def _term(self, term: Term) -> list[Row]:
@@ -168,6 +179,8 @@ class Judge:
 
     def _allowed(self, term: Term, engine: str, errors: Errors) -> float:
         """Return the tolerance, or the engine's own bound where its formula cannot do better."""
+        if lower := self._lower.get(self.engines[engine].bits):
+            return max(self.tolerance, lower.allowed(term))
         # Accelerations are M's solution: they cannot be better than M.
         of_mass = term.quantity in ("mass_matrix", "mass_matrix_inverse", "forward_dynamics")
         if not of_mass or errors.relative.max() <= self.tolerance:
@@ -187,6 +200,9 @@ class Judge:
             bad = [n for n, e in zip(self.joint_of, per, strict=False) if e > self.tolerance]
             named = f" at {', '.join(dict.fromkeys(bad)) or 'no single joint'}" if per.size else ""
             reason = f"differs by {relative:.1e}{named}" + (f"; {defect}" if defect else "")
+        elif relative > self.tolerance and self.engines[engine].bits < DOUBLE_BITS:
+            bits = self.engines[engine].bits
+            reason = f"agrees to {named_precision(bits)} ({-np.log10(relative):.1f} of {digits_of(bits):.1f} digits)"
         elif relative > self.tolerance:
             reason = (
                 f"{relative:.1e} at {joint} is above {self.tolerance:.0e}, and within the rounding of {engine}'s own "

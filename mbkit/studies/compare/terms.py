@@ -152,6 +152,10 @@ CONSTRAINT_TERMS: Final = (
 )
 
 
+#: The name of the power balance, which is no quantity of an engine.
+POWER: Final = "power balance"
+
+
 def power_errors(dyn: Dynamics, oracle: OracleDynamics, at: States, scales: Scales) -> Errors:
     """Return the errors of the power balance, dE/dt = (τ + τ_damping + Jᵀ λ) · v, with the engine's own acceleration.
 
