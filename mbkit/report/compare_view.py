@@ -194,8 +194,7 @@ def _sentence(result: Comparison) -> str:
     measured = f"{terms} term{'s' * (terms != 1)} at {result.rows[0].samples} states"
     if not result.passed:
         return f"{headline(result)}; measured against {reference}, in {measured}"
-    engines = ", ".join(e for e in result.engines if e != result.reference)
-    return f"{engines} agree to {result.digits:.1f} digits with {reference}, in {measured}{brief(result.shortened)}"
+    return f"{result.agreement(f' with {reference}')}, in {measured}{brief(result.shortened)}"
 
 
 def failures(result: Comparison) -> list[doc.Bullet]:

@@ -39,6 +39,8 @@ class Package(NamedTuple):
         The engine's file in `remote` without its ending, ``on_`` and the name by default; or the path of one.
     variables : mapping
         Environment variables of its process; ``{environment}`` in one stands for the environment's folder.
+    limit : float
+        Seconds that one evaluation may take, compiling included.
     """
 
     distribution: str
@@ -52,6 +54,7 @@ class Package(NamedTuple):
     beside: tuple[str, ...] = ()
     file: str = ""
     variables: Mapping[str, str] = {}
+    limit: float = 60.0
 
 
 _MUJOCO: Final = Convention((0, 1, 2, 6, 3, 4, 5), ball_q=(3, 0, 1, 2), turned={"free": (0,)})
@@ -63,6 +66,8 @@ _JAX: Final = {
     # place of 0.4 ms (jaxlib 0.10.2).
     "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
 }
+#: Where the first call of each function compiles it, s.
+_COMPILING: Final = 600.0
 _WARP: Final = {"WARP_CACHE_PATH": "{environment}/kernels"}
 _MJX: Final = Package(
     "mujoco-mjx",
@@ -73,6 +78,7 @@ _MJX: Final = Package(
     tested=("3.17.0",),
     file="on_mjx",
     variables={**_JAX, "JAX_ENABLE_X64": "1"},
+    limit=_COMPILING,
 )
 #: Engines with a file of their own in `remote`.
 PACKAGES: Final[dict[str, Package]] = {
@@ -90,6 +96,7 @@ PACKAGES: Final[dict[str, Package]] = {
         bits=24,
         tested=("1.8.0",),
         variables=_WARP,
+        limit=_COMPILING,
     ),
     "mujoco-warp": Package(
         *("mujoco-warp", "mujoco_warp", 590, 20, _MUJOCO),
@@ -97,6 +104,7 @@ PACKAGES: Final[dict[str, Package]] = {
         tested=("4.0.0",),
         file="on_mujoco_warp",
         variables=_WARP,
+        limit=_COMPILING,
     ),
     "mjx": _MJX,
     "mjx-single": _MJX._replace(bits=24, variables=_JAX),
@@ -147,7 +155,7 @@ class EngineVersion:
         return self.name
 
 
-def engine(name: str, *, seconds: float = 60.0) -> EngineVersion:
+def engine(name: str, *, seconds: float | None = None) -> EngineVersion:
     """Return an engine of a version, for `mbkit.dynamics`, in an environment of its own.
 
     The first `mbkit.dynamics` makes the environment, with uv where it is on the path and else with pip: the engine and
@@ -159,8 +167,8 @@ def engine(name: str, *, seconds: float = 60.0) -> EngineVersion:
     ----------
     name : str
         Engine and version, such as ``"mujoco==3.12.0"``, ``"pinocchio==2.7.0"`` or ``"drake==1.35.0"``.
-    seconds : float
-        That one evaluation may take before its process is ended.
+    seconds : float, optional
+        That one evaluation may take before its process is ended: a minute, or ten where the engine compiles first.
 
     Returns
     -------
@@ -191,7 +199,8 @@ def engine(name: str, *, seconds: float = 60.0) -> EngineVersion:
         raise UnknownNameError("engine with versions", head, PACKAGES)
     if not _VERSION.fullmatch(version):
         raise InputError(f"name: {form}, got {name!r}")
-    return EngineVersion(head, version, real("seconds", seconds, positive=True))
+    limit = PACKAGES[head].limit if seconds is None else real("seconds", seconds, positive=True)
+    return EngineVersion(head, version, limit)
 
 
 def names_version(name: object) -> bool:

@@ -13,6 +13,7 @@ stands a figure per joint.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,21 @@ EPS: Final = float(np.finfo(float).eps)
 ROUNDINGS: Final = 4.0
 #: Singular values of redundant rows, in terms of the largest one.
 _REDUNDANT: Final = 1e-11
+
+
+def epsilon(bits: int) -> float:
+    """Return eps of a significand of so many bits: the distance from 1 to the next number."""
+    return 2.0 ** (1 - bits)
+
+
+def digits_of(bits: int) -> float:
+    """Return the decimal digits of a significand: 7.2 of single precision, 16.0 of double."""
+    return bits * math.log10(2.0)
+
+
+def named_precision(bits: int) -> str:
+    """Return the name of a precision."""
+    return {24: "single precision", 53: "double precision"}.get(bits, f"{bits} bits")
 
 
 @dataclass(frozen=True)

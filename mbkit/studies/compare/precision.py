@@ -8,7 +8,6 @@ distance from the world's origin, since engines hold places in the world, and ro
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cached_property
 from typing import Final
@@ -21,25 +20,10 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.registry import DERIVED, find_engine
 from mbkit.errors import MbkitError
 from mbkit.model import Model
-from mbkit.studies.compare.errors import ROUNDINGS, Scales
+from mbkit.studies.compare.errors import ROUNDINGS, Scales, epsilon
 from mbkit.studies.compare.terms import States, Term, power_errors
 
 _SEEDS: Final = (0, 1)
-
-
-def epsilon(bits: int) -> float:
-    """Return eps of a significand of so many bits: the distance from 1 to the next number."""
-    return 2.0 ** (1 - bits)
-
-
-def digits_of(bits: int) -> float:
-    """Return the decimal digits of a significand: 7.2 of single precision, 16.0 of double."""
-    return bits * math.log10(2.0)
-
-
-def named_precision(bits: int) -> str:
-    """Return the name of a precision."""
-    return {24: "single precision", 53: "double precision"}.get(bits, f"{bits} bits")
 
 
 class Precision:

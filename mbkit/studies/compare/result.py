@@ -9,6 +9,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from mbkit._escape import one_line
+from mbkit.engines.base import DOUBLE_BITS
 from mbkit.simulate.plotting.style import (
     CROSS,
     PLAIN,
@@ -20,6 +21,7 @@ from mbkit.simulate.plotting.style import (
     legend,
     name_points,
 )
+from mbkit.studies.compare.errors import digits_of, named_precision
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of
 from mbkit.studies.work_precision.result import WorkPrecision
 
@@ -52,7 +54,8 @@ class Row:
     where there is one; or why more than the comparison's tolerance was allowed. `allowed` is the error that passes:
     that tolerance, or more where the engine's own formula cannot do better. `defect` is the engine's known defect,
     where the row failed with one announced. `zero` says whether the reference is zero in every entry at every state,
-    so that the row is no evidence.
+    so that the row is no evidence. `bits` are those of the significand with which the engine computes: 53, or 24 in
+    single precision, where `allowed` is what that precision costs the term.
     """
 
     term: str
@@ -74,6 +77,12 @@ class Row:
     allowed: float = math.nan
     defect: str = ""
     zero: bool = False
+    bits: int = DOUBLE_BITS
+
+    @property
+    def digits(self) -> str:
+        """Digits of a row of an engine in another precision than double, as in ``6.4 of 7.2 digits``."""
+        return f"{-math.log10(max(self.relative, 1e-16)):.1f} of {digits_of(self.bits):.1f} digits"
 
 
 @dataclass(frozen=True)
@@ -168,7 +177,12 @@ class Omission:
 
 
 def _outcome(row: Row) -> str:
-    return row.reason if not row.passed else "zero in all states" if row.zero else "agree"
+    if not row.passed:
+        return row.reason
+    if row.zero:
+        return "zero in all states"
+    single = row.bits < DOUBLE_BITS and row.relative > 0
+    return f"agrees to {named_precision(row.bits)} ({row.digits})" if single else "agree"
 
 
 _COLUMNS: Final = (
@@ -235,8 +249,7 @@ class Comparison(ResultTable):
             return f"nothing compared: {self.nothing}"
         missing = "".join(f"; {x}" for x in self.shortened)
         if self.passed:
-            agree = "agree" if len(self.engines) > 1 else f"agrees with the {self.reference}"
-            return f"{', '.join(self.engines)} {agree} to {self.digits:.1f} digits{missing}"
+            return f"{self.agreement()}{missing}"
         known: dict[tuple[str, str], list[str]] = {}
         for r in self.rows:
             if r.defect:
@@ -314,10 +327,23 @@ class Comparison(ResultTable):
         known = {r.term for r in self.rows}
         return tuple(dict.fromkeys(r.term for r in self.refusals if r.engine and r.term and r.term not in known))
 
+    def agreement(self, reference: str = "") -> str:
+        """Return to how many digits engines agree: those in double precision together, each other one by itself."""
+        lower = {r.engine: r for r in sorted(self.rows, key=lambda r: r.relative) if r.bits < DOUBLE_BITS}
+        doubles = [name for name in self.engines if name not in lower and not (reference and name == self.reference)]
+        agree = "agree" if len(doubles) > 1 else "agrees" if reference else f"agrees with the {self.reference}"
+        parts = [f"{', '.join(doubles)} {agree} to {self.digits:.1f} digits{reference}"] if doubles else []
+        parts += [f"{name} agrees to {named_precision(r.bits)} ({r.digits})" for name, r in lower.items()]
+        return "; ".join(parts)
+
     @property
     def digits(self) -> float:
-        """Decimal digits on which all terms agree, known defects apart, at most 16; zeros are no evidence."""
-        errors = [r.relative for r in self.rows if not r.zero and not r.defect]
+        """Decimal digits on which all terms agree, known defects apart, at most 16; zeros are no evidence.
+
+        Of engines in double precision, where there are some.
+        """
+        evidence = [r for r in self.rows if not r.zero and not r.defect]
+        errors = [r.relative for r in evidence if r.bits >= DOUBLE_BITS] or [r.relative for r in evidence]
         if not errors or any(math.isnan(e) for e in errors):
             return math.nan
         return -math.log10(max(*errors, 1e-16))

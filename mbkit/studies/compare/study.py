@@ -27,7 +27,7 @@ from mbkit.studies.compare.beyond_terms import omissions, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
 from mbkit.studies.compare.errors import EPS, ROUNDINGS, Errors, Scales, condition_under_constraints, interleaved
 from mbkit.studies.compare.findings import findings
-from mbkit.studies.compare.precision import Precision, digits_of, named_precision
+from mbkit.studies.compare.precision import Precision
 from mbkit.studies.compare.result import OWN_LAW, Comparison, Row
 from mbkit.studies.compare.terms import (
     CONSTRAINT_TERMS,
@@ -200,10 +200,7 @@ class Judge:
             bad = [n for n, e in zip(self.joint_of, per, strict=False) if e > self.tolerance]
             named = f" at {', '.join(dict.fromkeys(bad)) or 'no single joint'}" if per.size else ""
             reason = f"differs by {relative:.1e}{named}" + (f"; {defect}" if defect else "")
-        elif relative > self.tolerance and self.engines[engine].bits < DOUBLE_BITS:
-            bits = self.engines[engine].bits
-            reason = f"agrees to {named_precision(bits)} ({-np.log10(relative):.1f} of {digits_of(bits):.1f} digits)"
-        elif relative > self.tolerance:
+        elif relative > self.tolerance and self.engines[engine].bits == DOUBLE_BITS:
             reason = (
                 f"{relative:.1e} at {joint} is above {self.tolerance:.0e}, and within the rounding of {engine}'s own "
                 f"formula ({allowed:.0e}): its terms are {allowed / (ROUNDINGS * EPS):.0e} times the result"
@@ -226,6 +223,7 @@ class Judge:
             passed=passed,
             reason=reason,
             allowed=allowed,
+            bits=self.engines[engine].bits,
             defect="" if passed else defect.split(_AS_IT_IS)[0],
         )
 
