@@ -134,7 +134,9 @@ class Engine:
         return model, state, S, change
 
     def _mass(self, model: Any, state: Any) -> Any:
-        return newton.eval_mass_matrix(model, state)
+        # By Jacobians of each body, as `eval_inverse_dynamics_passive` has it; without J it sums inertias about the
+        # root's origin, and a light finger loses two more digits (version 1.8).
+        return newton.eval_mass_matrix(model, state, J=newton.eval_jacobian(model, state))
 
     def mass_matrix(self, q: Any) -> Any:
         model, state, S, _ = self._set(q)
