@@ -64,7 +64,7 @@ def bench(
     report.prepare(stem, "json", "csv", "png", "html")
     if quick and not methods:
         # A method that none of the engines has would be refused.
-        methods = tuple(m for m in QUICK_METHODS if not METHODS[m].engines or set(engines) & set(METHODS[m].engines))
+        methods = tuple(m for m in QUICK_METHODS if any(map(METHODS[m].on, engines)))
     settings["repeats"] = repeats or (5 if full else 3)
     settings["work"] = None if full else _QUICK_WORK if quick else _WORK
     workers: AbstractContextManager[Executor | None] = nullcontext() if jobs is None else WorkerPool(jobs)

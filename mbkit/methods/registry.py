@@ -79,7 +79,7 @@ class Method:
     about, lacks : str
         One line, with the source; why other engines do not have it, empty for an engine's own method.
     engines : tuple of str
-        Those that have it; any engine with forward dynamics where empty.
+        Those that have it, of any version; any engine with forward dynamics where empty.
     events, callables : bool
         Whether a run can stop at an event; whether the torque may be a function.
     least : float
@@ -137,6 +137,10 @@ class Method:
         source = self.formula_source
         return source() if callable(source) else source
 
+    def on(self, engine: str) -> bool:
+        """Return whether an engine has it, by its name, with a version or without."""
+        return not self.engines or engine.partition("==")[0] in self.engines
+
     def runs_compiled(self, *, derived: bool) -> bool:
         """Return whether no evaluation is a call from Python, on an engine with mbkit's own derivation or without."""
         return bool(self.engines) or (self.compiled and derived)
@@ -185,6 +189,7 @@ _ABOUT: Final = {
     BDF_METHOD: "SUNDIALS' CVODES through CasADi: BDF, orders 1 to 5 (Hindmarsh and others 2005)",
     "mujoco_euler": "MuJoCo's own semi-implicit Euler",
     "mujoco_rk4": "MuJoCo's own RK4",
+    "newton_featherstone": "SolverFeatherstone of Newton, a semi-implicit Euler",
     "mujoco_implicit": "MuJoCo's own Euler, implicit in dampers and all velocity terms",
     "mujoco_implicitfast": "as mujoco_implicit, with the Coriolis derivatives of free bodies alone",
     "mujoco_discrete": "MuJoCo's own Euler, implicit in dampers and springs",
@@ -211,12 +216,22 @@ def _scipy(name: str, scheme: str, order: int | None, **more: Any) -> Method:
     return _adaptive(name, order, "scipy:run_scipy", scheme=scheme, least=100 * _EPS, **more)
 
 
+#: The programs that have MuJoCo's integrators, and which of these they all have.
+_OF_MUJOCO: Final = ("mujoco", "mujoco-warp", "mjx", "mjx-single", "newton")
+_ANYWHERE: Final = ("euler", "implicitfast", "rk4")
+
+
 def _mujoco(scheme: str, stability: Stability, own: str = "") -> Method:
     order, name = 4 if isinstance(stability, TableauStability) else 1, f"mujoco_{scheme}"
     more: dict[str, Any] = {"solver": "native:run_native", "scheme": scheme, "stability": stability, "own": own}
-    return Method(
-        name, "native", order, order, _ABOUT[name], engines=("mujoco",), callables=False, wrenches=False, **more
-    )
+    engines = _OF_MUJOCO if scheme in _ANYWHERE else _OF_MUJOCO[:1]
+    return Method(name, "native", order, order, _ABOUT[name], engines=engines, callables=False, wrenches=False, **more)
+
+
+def _newton(scheme: str) -> Method:
+    more: dict[str, Any] = {"solver": "native:run_native", "scheme": scheme, "stability": SYMPLECTIC_EULER}
+    name = f"newton_{scheme}"
+    return Method(name, "native", 1, 1, _ABOUT[name], engines=("newton",), callables=False, wrenches=False, **more)
 
 
 def _drake(scheme: str, order: int) -> Method:
@@ -288,6 +303,7 @@ METHODS: Final[dict[str, Method]] = {
         _mujoco("implicit", IMPLICIT_IN_VELOCITY),
         _mujoco("implicitfast", IMPLICIT_IN_VELOCITY),
         _mujoco("discrete", IMPLICIT_EULER),
+        _newton("featherstone"),
         _drake("runge_kutta3", 3),
         _drake("runge_kutta5", 5),
         _drake("bogacki_shampine3", 3),

@@ -225,7 +225,7 @@ def _held_time(dyn: Dynamics) -> float:
 
 
 def _require_engine(dyn: Dynamics, method: Method) -> None:
-    if method.engines and dyn.engine not in method.engines:
+    if not method.on(dyn.engine):
         has = " or ".join(f"mbkit.dynamics(model, {name!r})" for name in method.engines)
         why = f", which {method.lacks}" if method.lacks else ""
         raise UnsupportedError(

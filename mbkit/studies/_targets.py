@@ -223,13 +223,13 @@ def methods_by_engine(
             raise InputError("methods: expected the methods of at least one engine, got none")
         for engine, own in wanted.items():
             for method in map(method_of, own):
-                if method.engines and engine not in method.engines:
+                if not method.on(engine):
                     raise InputError(
                         f"methods[{engine!r}]: {method.name} is not on {engine}; it is on {', '.join(method.engines)}"
                     )
     else:
         wanted = dict.fromkeys(names, tuple(METHODS) if methods is None else names_of("methods", methods))
-    out = {e: tuple(m for m in ms if not method_of(m).engines or e in METHODS[m].engines) for e, ms in wanted.items()}
+    out = {e: tuple(m for m in ms if method_of(m).on(e)) for e, ms in wanted.items()}
     available = {name for ms in out.values() for name in ms}
     for name in dict.fromkeys(m for ms in wanted.values() for m in ms):
         if methods is not None and name not in available:

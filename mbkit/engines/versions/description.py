@@ -95,7 +95,7 @@ def travelling(
                 "child": joint.child,
                 "rotation": joint.rotation.tolist(),
                 "translation": joint.translation.tolist(),
-                "armature": joint.armature.tolist(),
+                **{name: getattr(joint, name).tolist() for name in ("armature", "damping", "stiffness", "rest")},
                 "steps": [{**step, "type": _plain_type(step["type"])} for step in steps[joint.kind](joint)],
             }
             for joint in model.tree

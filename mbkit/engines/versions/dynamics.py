@@ -11,7 +11,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.base import MappedDynamics, require_no_forces
+from mbkit.engines.base import MappedDynamics, first_names, require_no_forces
 from mbkit.engines.elements.passive import JointPassive, pull
 from mbkit.engines.frames_and_momenta import ALIGNED, seen_from
 from mbkit.engines.versions.description import places, travelling
@@ -271,20 +271,35 @@ class VersionDynamics(MappedDynamics):
     def rollout(self, q0: Array, v0: Array, dt: float, steps: int, method: str = "rk4") -> tuple[Array, Array]:
         """Return the states of a run by the engine's own integrator, (steps + 1, nq) and (steps + 1, nv).
 
-        Raises `UnsupportedError` for an engine without one, for forces by functions, and for mimic joints, which it
-        would not reduce.
+        Raises `UnsupportedError` for an engine without one, and for what its own run would leave out: forces by
+        functions, the reduction of mimic joints, and springs and dampers that only mbkit knows of. Raises
+        `NumericalError` for a run that is not finite.
         """
-        if self.model.layout.reduced:
+        q, v = self.own_run(self.model.check_q(q0), self.model.check_v(v0), dt, steps, method)
+        if not (np.isfinite(q).all() and np.isfinite(v).all()):
+            raise NumericalError(f"{self.engine}: its own run of {self.model.name} is not finite")
+        return q, v
+
+    def own_run(self, q0: Array, v0: Array, dt: float, steps: int, method: str) -> tuple[Array, Array]:
+        """Return the same of one checked state or a stack of them; what is not finite is as the engine has it."""
+        model = self.model
+        if model.layout.reduced:
             raise UnsupportedError(f"{self.engine}: its own runs do not reduce mimic joints")
-        require_no_forces(self.model, self.engine)
+        require_no_forces(model, self.engine)
         if not self.runs:
             raise UnsupportedError(f"{self.engine}: it has no rollout of its own here")
-        x, u, _ = self._native(self.model.check_q(q0), self.model.check_v(v0))
-        xs, us = self._ask("rollout", x, u, method=method, dt=dt, steps=steps)
-        if not (np.isfinite(xs).all() and np.isfinite(us).all()):
-            raise NumericalError(f"{self.engine}: its own run of {self.model.name} is not finite")
+        if self._beside is not None and (own := [*model.springs, *model.couplings]):
+            raise UnsupportedError(f"{self.engine}: its own runs leave out {first_names(repr(x.name) for x in own)}")
+        x, u, _ = self._native(q0, v0)
+        try:
+            xs, us = self._ask("rollout", x, u, method=method, dt=dt, steps=steps)
+        except NumericalError as error:
+            raise UnsupportedError(str(error)) from None
         q = np.empty_like(xs)
-        q[:, self._places.q_index] = xs
+        q[..., self._places.q_index] = xs
+        for start, _ in model.quaternions:
+            # Of unit length to the engine's precision alone.
+            q[..., start : start + 4] /= np.linalg.norm(q[..., start : start + 4], axis=-1, keepdims=True)
         self._native(q)
         return q, self._force(us)
 

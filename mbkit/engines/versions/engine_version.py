@@ -33,8 +33,8 @@ class Package(NamedTuple):
     tested : tuple of str
         Versions that were judged, the newest last: that one is meant where none is named. Empty where the name alone
         is an engine that needs no environment.
-    beside : tuple of str
-        Packages that the environment holds too.
+    extra : str
+        Of the distribution, such as ``"[sim]"``, which pip installs too.
     file : str
         The engine's file in `remote` without its ending, ``on_`` and the name by default; or the path of one.
     variables : mapping
@@ -51,7 +51,7 @@ class Package(NamedTuple):
     steps: Steps | None = None
     bits: int = 53
     tested: tuple[str, ...] = ()
-    beside: tuple[str, ...] = ()
+    extra: str = ""
     file: str = ""
     variables: Mapping[str, str] = {}
     limit: float = 60.0
@@ -95,6 +95,7 @@ PACKAGES: Final[dict[str, Package]] = {
         {kind: step for kind, step in STACKED.items() if kind != "helical"},
         bits=24,
         tested=("1.8.0",),
+        extra="[sim]",
         variables=_WARP,
         limit=_COMPILING,
     ),
@@ -144,7 +145,7 @@ class EngineVersion:
     def interpreter(self) -> Path:
         """Return the interpreter of its environment; make the environment first if it is missing."""
         package = self.package
-        return environment.interpreter(package.distribution, self.version, package.module, beside=package.beside)
+        return environment.interpreter(package.distribution, self.version, package.module, extra=package.extra)
 
     def variables(self) -> dict[str, str]:
         """Return the environment variables of its process."""

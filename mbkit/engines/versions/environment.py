@@ -75,7 +75,7 @@ def exists(distribution: str, version: str) -> bool:
 
 
 def interpreter(
-    distribution: str, version: str, module: str, report: Report = _print, beside: Sequence[str] = ()
+    distribution: str, version: str, module: str, report: Report = _print, extra: str = ""
 ) -> Path:
     """Return the interpreter of a version's environment, which is made where there is none.
 
@@ -87,8 +87,8 @@ def interpreter(
         That can be imported then.
     report : callable
         Gets a line when an environment is begun, and one when it is there.
-    beside : sequence of str
-        Packages that the environment holds too.
+    extra : str
+        Of the distribution, such as ``"[sim]"``.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def interpreter(
         with _lock(path.parent / f".{path.name}.lock"):
             # Another process may have made it in the meantime.
             if not python_of(path).exists():
-                _make(path, distribution, version, module, report, beside)
+                _make(path, distribution, version, module, report, extra)
     except OSError as error:
         raise OutputError(
             f"cannot make an environment in {path.parent}: {error.strerror or error}; set MBKIT_ENVIRONMENTS to a "
@@ -138,21 +138,21 @@ def _lock(path: Path) -> Iterator[None]:
 
 
 def _make(
-    path: Path, distribution: str, version: str, module: str, report: Report, beside: Sequence[str]
+    path: Path, distribution: str, version: str, module: str, report: Report, extra: str
 ) -> None:
     half = path.with_name(f".{path.name}.part")
     shutil.rmtree(half, ignore_errors=True)
     name, start = f"{distribution} {version}", time.perf_counter()
     report(f"mbkit: making an environment of {name} in {path}")
     try:
-        pip, limits = _empty(half), ["numpy", *beside]
-        _install(pip, distribution, version, limits)
+        pip, limits = _empty(half), ["numpy"]
+        _install(pip, distribution, version, limits, extra)
         # Old versions do not say how new their dependencies may be.
         while reason := _import_failure(half, module):
             if not (limit := _limit(half, reason, limits)):
                 raise UnsupportedError(f"{name}: installed, but {module} cannot be imported: {reason}")
             limits.append(limit)
-            _install(pip, distribution, version, limits)
+            _install(pip, distribution, version, limits, extra)
         os.replace(half, path)
     finally:
         shutil.rmtree(half, ignore_errors=True)
@@ -195,8 +195,8 @@ def _limit(path: Path, reason: str, limits: Sequence[str]) -> str:
     return ""
 
 
-def _install(pip: Sequence[str], distribution: str, version: str, limits: Sequence[str]) -> None:
-    wanted = f"{distribution}=={version}"
+def _install(pip: Sequence[str], distribution: str, version: str, limits: Sequence[str], extra: str) -> None:
+    wanted = f"{distribution}{extra}=={version}"
     # A compiler would take long, and versions without a wheel are rarely built by one.
     done = _finished([*pip, "--only-binary=:all:", wanted, *limits], _INSTALL)
     if done.returncode == 0:

@@ -1,14 +1,17 @@
-"""The engines' own integrators: MuJoCo's with a step, Drake's with a tolerance or a step."""
+"""The engines' own integrators: MuJoCo's and those of engines in a process with a step, Drake's with a tolerance too."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
+from mbkit.engines.versions.dynamics import VersionDynamics
+from mbkit.errors import UnsupportedError
 from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
@@ -21,23 +24,20 @@ from mbkit.simulate.torque import Force
 
 def run_native(problem: IntegrationProblem) -> SolverResult:
     """Run the engine's integrator; nothing is kept after a trajectory's last bounded state."""
-    dyn, method, grid, torque = problem.dyn, method_of(problem.method), problem.grid, problem.torque
-    # MuJoCo is an extra.
-    from mbkit.engines.mujoco.engine import MujocoDynamics
-
-    assert isinstance(dyn, MujocoDynamics)
-    q0, v0 = problem.q0, problem.v0
+    method, grid, torque = method_of(problem.method), problem.grid, problem.torque
+    dyn, q0, v0 = problem.dyn, problem.q0, problem.v0
+    rollout = _in_its_process(problem, dyn) if isinstance(dyn, VersionDynamics) else _in_mujoco(problem, dyn)
     check_room((grid.steps + 1) * len(problem.q), q0.shape[-1] + v0.shape[-1])
     # MuJoCo's step is fixed for a rollout, so a shortened last step is a rollout of its own.
     whole = grid.steps if grid.last == grid.dt else grid.steps - 1
     first: dict[str, Any] = {"q0": q0, "v0": v0, "dt": grid.dt, "tau": torque.over(0, whole), "steps": whole}
-    q, v = dyn.rollout(integrator=method.scheme, progress=problem.bar.update, **first)
+    q, v = rollout(integrator=method.scheme, **first)
     if whole < grid.steps:
         # A state that diverged stays void; it only must not stop the others.
         good = np.isfinite(q[..., -1, :]).all(-1, keepdims=True) & np.isfinite(v[..., -1, :]).all(-1, keepdims=True)
         q1, v1 = np.where(good, q[..., -1, :], q0), np.where(good, v[..., -1, :], v0)
         tail = torque.over(whole, grid.steps)
-        q1, v1 = dyn.rollout(integrator=method.scheme, q0=q1, v0=v1, dt=grid.last, tau=tail, steps=1)
+        q1, v1 = rollout(integrator=method.scheme, q0=q1, v0=v1, dt=grid.last, tau=tail, steps=1)
         q, v = np.concatenate([q, q1[..., 1:, :]], -2), np.concatenate([v, v1[..., 1:, :]], -2)
     q, v = (np.asarray(x)[None] if problem.batch is None else np.asarray(x) for x in (q, v))
     good = are_bounded(q, v)
@@ -48,6 +48,28 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
     record.q, record.v = q[:, record.kept], v[:, record.kept]
     problem.bar.update(1.0)
     return record.result(lambda _: "", int(record.steps.sum()) * method.stages)
+
+
+_Rollout = Callable[..., tuple[Array, Array]]
+
+
+def _in_mujoco(problem: IntegrationProblem, dyn: Dynamics) -> _Rollout:
+    # MuJoCo is an extra.
+    from mbkit.engines.mujoco.engine import MujocoDynamics
+
+    assert isinstance(dyn, MujocoDynamics)
+    return partial(dyn.rollout, progress=problem.bar.update)
+
+
+def _in_its_process(problem: IntegrationProblem, dyn: VersionDynamics) -> _Rollout:
+    """Return the rollouts of an engine in an environment of its own, which sends no torques there."""
+
+    def rollout(integrator: str, q0: Array, v0: Array, dt: float, tau: Any, steps: int) -> tuple[Array, Array]:
+        if tau is not None and np.any(tau):
+            raise UnsupportedError(f"{problem.method} on {dyn.engine}: takes no torque; use rk4, which any engine has")
+        return dyn.own_run(q0, v0, dt, steps, integrator)
+
+    return rollout
 
 
 # Drake's own integrators, with a tolerance.

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
+from common import best_time
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody import tree
 from pydrake.multibody.parsing import Parser
@@ -157,12 +156,10 @@ class Engine:
     def seconds(self, q: Any, v: Any, repeats: int) -> Any:
         """Return the shortest time of one forward dynamics, s, of rounds of so many calls."""
         self._applied.FixValue(self._context, np.zeros(self._plant.num_velocities()))
-        best = float("inf")
-        for _ in range(5):
-            start = time.perf_counter()
-            for _ in range(repeats):
-                # A state that is set again empties Drake's cache.
-                self._set(q, v)
-                self._accelerations.Eval(self._context)
-            best = min(best, (time.perf_counter() - start) / repeats)
-        return best
+
+        def call() -> None:
+            # A state that is set again empties Drake's cache.
+            self._set(q, v)
+            self._accelerations.Eval(self._context)
+
+        return best_time(call, repeats)

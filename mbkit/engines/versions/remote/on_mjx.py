@@ -5,12 +5,12 @@ The parser and the compiler are MuJoCo's. JAX computes in double precision where
 
 from __future__ import annotations
 
-import time
 from importlib.metadata import version
 
 import jax
 import mujoco
 import numpy as np
+from common import best_time, center_of
 from mujoco import mjx
 from on_mujoco import body_of, built, parsed, places, smooth
 
@@ -103,8 +103,7 @@ class Engine:
 
     def matter(self, q: Any) -> Any:
         """Return the mass of what moves and stands, kg, and its centre of mass, m."""
-        masses = np.array(self._m.body_mass)
-        return [np.full(len(q), masses.sum()), np.einsum("b,nbi->ni", masses, self._terms(q)[3]) / masses.sum()]
+        return center_of(np.array(self._m.body_mass), self._terms(q)[3])
 
     def rollout(self, q: Any, v: Any, method: str, dt: float, steps: int) -> Any:
         """Return qpos and qvel after each of so many steps."""
@@ -129,10 +128,4 @@ class Engine:
         """Return the shortest time of one forward dynamics of the stack, s, of rounds of so many calls."""
         tau = np.zeros_like(v)
         self.forward_dynamics(q, v, tau)
-        best = float("inf")
-        for _ in range(5):
-            start = time.perf_counter()
-            for _ in range(repeats):
-                self.forward_dynamics(q, v, tau)
-            best = min(best, (time.perf_counter() - start) / repeats)
-        return np.full(len(q), best)
+        return [np.full(len(q), best_time(lambda: self.forward_dynamics(q, v, tau), repeats))]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import time
-
 import mujoco
 import numpy as np
+from common import best_time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -155,10 +154,4 @@ class Engine:
         """Return the shortest time of one forward dynamics, s, of rounds of so many calls."""
         m, d = self._m, self._d
         d.qpos[:], d.qvel[:] = q, v
-        best = float("inf")
-        for _ in range(5):
-            start = time.perf_counter()
-            for _ in range(repeats):
-                mujoco.mj_forward(m, d)
-            best = min(best, (time.perf_counter() - start) / repeats)
-        return best
+        return best_time(lambda: mujoco.mj_forward(m, d), repeats)

@@ -5,12 +5,11 @@ The parser and the compiler are MuJoCo's; all that is evaluated is in single pre
 
 from __future__ import annotations
 
-import time
-
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
+from common import best_time, center_of
 from on_mujoco import body_of, built, parsed, places, smooth
 
 TYPE_CHECKING = False
@@ -122,9 +121,7 @@ class Engine:
 
     def matter(self, q: Any) -> Any:
         """Return the mass of what moves and stands, kg, and its centre of mass, m."""
-        masses = np.array(self._m.body_mass)
-        center = np.einsum("b,nbi->ni", masses, self._placed(q).xipos.numpy()) / masses.sum()
-        return [np.full(len(q), masses.sum()), center]
+        return center_of(np.array(self._m.body_mass), self._placed(q).xipos.numpy())
 
     def rollout(self, q: Any, v: Any, method: str, dt: float, steps: int) -> Any:
         """Return qpos and qvel after each of so many steps."""
@@ -145,11 +142,6 @@ class Engine:
 
     def seconds(self, q: Any, v: Any, repeats: int) -> Any:
         """Return the shortest time of one forward dynamics of the stack, s, of rounds of so many calls."""
-        d, best = self._at(q, v), float("inf")
+        d = self._at(q, v)
         mjw.forward(self._w, d)
-        for _ in range(5):
-            start = time.perf_counter()
-            for _ in range(repeats):
-                mjw.forward(self._w, d)
-            best = min(best, (time.perf_counter() - start) / repeats)
-        return np.full(len(q), best)
+        return [np.full(len(q), best_time(lambda: mjw.forward(self._w, d), repeats))]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import tempfile
-import time
 
 import numpy as np
 import pinocchio as pin
+from common import best_time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -151,10 +151,4 @@ class Engine:
     def seconds(self, q: Any, v: Any, repeats: int) -> Any:
         """Return the shortest time of one forward dynamics, s, of rounds of so many calls."""
         m, d, tau = self._m, self._d, np.zeros(self._m.nv)
-        best = float("inf")
-        for _ in range(5):
-            start = time.perf_counter()
-            for _ in range(repeats):
-                pin.aba(m, d, q, v, tau)
-            best = min(best, (time.perf_counter() - start) / repeats)
-        return best
+        return best_time(lambda: pin.aba(m, d, q, v, tau), repeats)

@@ -1,0 +1,51 @@
+"""A description as Newton's builder takes it."""
+
+from __future__ import annotations
+
+import newton
+import numpy as np
+import warp as wp
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
+
+#: Numbers of a joint with one velocity, as Newton calls them.
+_OF_ONE = {"armature": "armature", "damping": "damping", "stiffness": "stiffness", "rest": "rest_q"}
+
+
+def built(data: dict[str, Any]) -> Any:
+    """Return the builder of a description, the joints of each of its joints, and its bodies."""
+    builder = newton.ModelBuilder(gravity=tuple(data["gravity"]))
+    bodies, numbers = {"world": -1}, {}
+    for joint in data["joints"]:
+        parent, steps = bodies[joint["parent"]], joint["steps"] or [{"type": "fixed", "axes": []}]
+        if steps[0]["type"] == "free" and parent >= 0:
+            raise NotImplementedError(f"free joint {joint['name']!r} on a body; here it takes those on the world alone")
+        turn = wp.quat_from_matrix(wp.mat33(np.array(joint["rotation"])))
+        numbers[joint["name"]], at = [], wp.transform(joint["translation"], turn)
+        for k, step in enumerate(steps):
+            if k < len(steps) - 1:
+                child = builder.add_link()
+            else:
+                child = bodies[joint["child"]] = _link(builder, joint["child"], data["bodies"][joint["child"]])
+            own = {name: joint[name][k] for name in _OF_ONE if step["type"] in ("revolute", "prismatic")}
+            numbers[joint["name"]].append(_joint(builder, step, parent, child, at, own))
+            parent, at = child, wp.transform()
+    builder.add_articulation([*range(builder.joint_count)])
+    return builder, numbers, bodies
+
+
+def _link(builder: Any, name: str, body: dict[str, Any]) -> int:
+    inertia = wp.mat33(np.array(body["inertia"]))
+    return builder.add_link(mass=body["mass"], com=tuple(body["com"]), inertia=inertia, label=name)
+
+
+def _joint(builder: Any, step: dict[str, Any], parent: int, child: int, at: Any, own: dict[str, float]) -> int:
+    kind = step["type"]
+    if kind in ("revolute", "prismatic"):
+        own = {_OF_ONE[name]: value for name, value in own.items()}
+        own["axis"] = wp.vec3(step["axes"][0])
+    if kind == "free":
+        return builder.add_joint_free(child, parent=parent, parent_xform=at)
+    return getattr(builder, "add_joint_" + kind)(parent, child, parent_xform=at, **own)
