@@ -1,7 +1,7 @@
 """The engines that robots are trained in, term by term on every robot of example-robot-data: ``trained_engines.json``.
 
-``python -m validation.trained_engines [ENGINE ...]`` measures Newton, MuJoCo Warp, and MJX in both precisions, or those
-that are named, and keeps the rows of the others. Each engine takes the description itself, not a file through its own
+``python -m validation.trained_engines [ENGINE ...] [ROBOT ...]`` measures Newton, MuJoCo Warp, and MJX in both
+precisions on every robot, or those that are named, and keeps the rows of the others. Each engine takes the description itself, not a file through its own
 importer. The reference has 34 digits. An environment that is missing is made.
 """
 
@@ -47,10 +47,13 @@ def measured(model: mb.Model, name: str) -> dict[str, Any]:
 
 def main() -> None:
     """Measure the robots one after the other, and write after each."""
-    names = sys.argv[1:] or ENGINES
+    names = [x for x in sys.argv[1:] if x in ENGINES] or ENGINES
+    wanted = [x for x in sys.argv[1:] if x not in ENGINES]
     held = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
     robots = held.get("robots", {})
     for robot in mb.robots():
+        if wanted and not any(x in robot.name for x in wanted):
+            continue
         rows = robots.setdefault(robot.name, {})
         try:
             with warnings.catch_warnings(action="ignore"):

@@ -15,7 +15,7 @@ from typing import Any, Final
 from mbkit.engines import closed_loops, loads
 from mbkit.engines.base import Dynamics
 from mbkit.engines.frames_and_momenta import Composed
-from mbkit.engines.versions.engine_version import EngineVersion, names_version
+from mbkit.engines.versions.engine_version import EngineVersion, names_version, remote_engines
 from mbkit.engines.versions.engine_version import engine as named_version
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
@@ -238,14 +238,19 @@ def load_entry_points() -> None:
 
 def find_engine(name: str) -> EngineInfo:
     """Return an engine's `EngineInfo`, of another version too; `UnknownNameError` for an unknown name."""
+    _load_unknown(name)
     if names_version(name):
         own = "mbkit.engines.versions.dynamics", "VersionDynamics"
         return EngineInfo(named_version(name).name, None, *own, shown=())
     if name not in ENGINES:
-        load_entry_points()
-    if name not in ENGINES:
-        raise UnknownNameError("engine", str(name), ENGINES)
+        raise UnknownNameError("engine", str(name), (*ENGINES, *remote_engines()))
     return ENGINES[name]
+
+
+def _load_unknown(name: object) -> None:
+    """Register the engines that installed packages name, where a name is not known yet."""
+    if name not in ENGINES and not names_version(name):
+        load_entry_points()
 
 
 def compared() -> tuple[str, ...]:
@@ -263,8 +268,9 @@ def dynamics(model: Model, engine: str | EngineVersion = PINOCCHIO, **options: A
     engine : {"pinocchio", "lagrangian", "mujoco", "drake", "oracle"}
         Rigid-body algorithms of Pinocchio, mbkit's own derivation from energies,
         MuJoCo, Drake (``pip install mbkit[drake]``), or the own derivation at 34 digits, for
-        measuring the others; or an engine of `register_engine`; or another version of an engine, from
-        `mbkit.engine` or by its name, such as ``"mujoco==3.12.0"``.
+        measuring the others; or an engine of `register_engine`; or one in an environment of its own, from
+        `mbkit.engine` or by its name: another version, such as ``"mujoco==3.12.0"``, or ``"newton"``,
+        ``"mujoco-warp"``, ``"mjx"`` and ``"mjx-single"``.
     **options
         The lagrangian engine's ``compile=`` (True or False), ``threads=`` and ``device=`` ("cuda" for batches on an
         NVIDIA GPU); MuJoCo's ``solref=`` and ``solimp=`` of
@@ -282,6 +288,8 @@ def dynamics(model: Model, engine: str | EngineVersion = PINOCCHIO, **options: A
         The engine is not installed, or cannot hold this model; with the reason.
     """
     expect_model(model)
+    if isinstance(engine, str):
+        _load_unknown(engine)
     if isinstance(engine, str) and names_version(engine):
         engine = named_version(engine)
     if isinstance(engine, EngineVersion):

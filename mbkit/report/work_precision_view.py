@@ -231,6 +231,7 @@ def sections(result: WorkPrecision, whole: bool, on: doc.On = "both") -> list[do
             level=3,
         ),
         doc.Section("What could not be measured", [doc.Items(named(result.failed))], on, level=3),
+        doc.Section("Where rounding grows", [doc.Items([doc.Bullet("", x) for x in result.turns])], on, level=3),
         doc.Section("", [doc.Details("the motion", [doc.Facts(start)])], on="page", level=3),
     ]
 

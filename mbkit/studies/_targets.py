@@ -192,11 +192,12 @@ def numbers_of(what: str, values: object, **sign: bool) -> tuple[float, ...]:
 
 def engine_names(engines: object, least: int = 1) -> tuple[str, ...]:
     """Return the names of engines that can be compared and measured, each once; other versions too, as `dynamics`."""
+    known = compared()
     if isinstance(engines, Iterable) and not isinstance(engines, str):
         # An engine that always has an environment is its newest tested version.
         engines = [named_version(x) if names_version(x) else x for x in engines]
         engines = [x.name if isinstance(x, EngineVersion) else x for x in engines]
-    names, known = names_of("engines", engines), compared()
+    names = names_of("engines", engines)
     for name in names:
         if name == REFERENCE:
             raise InputError("engines: the oracle is the reference by which the others are measured; leave it out")

@@ -60,9 +60,7 @@ ONE_BY_ONE: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _one
 STACKED: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _stacked)
 
 
-def travelling(
-    engine: str, steps: Steps | None, model: Model
-) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
+def travelling(engine: str, steps: Steps | None, model: Model) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
     """Return a description as an engine's file in `remote` takes it, and the engine's joints of each joint.
 
     `steps` are the engine's joints in the place of each joint type; without them the description travels as MJCF.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any, Final
 
@@ -97,6 +97,11 @@ class VersionDynamics(MappedDynamics):
     def bits(self) -> int:  # type: ignore[override]  # of this object
         """Of the significand with which it computes: 53, or 24 in single precision."""
         return self.version.package.bits
+
+    @property
+    def inertias_about(self) -> Mapping[str, str]:  # type: ignore[override]  # of this object
+        """The point about which it writes composite inertias, by quantity."""
+        return self.version.package.inertias_about
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.model, self.version)

@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from mbkit._check import real
+from mbkit._check import WORLD, real
+from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.versions import environment
 from mbkit.engines.versions.description import ONE_BY_ONE, STACKED, Convention, Steps
 from mbkit.errors import InputError, UnknownNameError
 
+_NAME: Final = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _VERSION: Final = re.compile(r"\d+(\.[0-9A-Za-z]+)*")
 
 
@@ -30,6 +32,8 @@ class Package(NamedTuple):
         The engine's joints in the place of each joint type. None: it reads the MJCF that mbkit writes.
     bits : int
         Of the significand with which it computes: 53, or 24 in single precision.
+    inertias_about : mapping
+        The point about which it writes composite inertias, as `Dynamics.inertias_about`.
     tested : tuple of str
         Versions that were judged, the newest last: that one is meant where none is named. Empty where the name alone
         is an engine that needs no environment.
@@ -50,6 +54,7 @@ class Package(NamedTuple):
     convention: Convention
     steps: Steps | None = None
     bits: int = 53
+    inertias_about: Mapping[str, str] = {}
     tested: tuple[str, ...] = ()
     extra: str = ""
     file: str = ""
@@ -75,6 +80,7 @@ _MJX: Final = Package(
     730,
     25,
     _MUJOCO,
+    inertias_about={"": TREE},
     tested=("3.17.0",),
     file="on_mjx",
     variables={**_JAX, "JAX_ENABLE_X64": "1"},
@@ -94,6 +100,9 @@ PACKAGES: Final[dict[str, Package]] = {
         Convention(turned={"free": (0, 3), "ball": (0,)}),
         {kind: step for kind, step in STACKED.items() if kind != "helical"},
         bits=24,
+        # Those of its own mass matrix are about each centre of mass, by Jacobians; its solver's are about the world's
+        # origin.
+        inertias_about={"forward_dynamics": WORLD},
         tested=("1.8.0",),
         extra="[sim]",
         variables=_WARP,
@@ -102,6 +111,7 @@ PACKAGES: Final[dict[str, Package]] = {
     "mujoco-warp": Package(
         *("mujoco-warp", "mujoco_warp", 590, 20, _MUJOCO),
         bits=24,
+        inertias_about={"": TREE},
         tested=("4.0.0",),
         file="on_mujoco_warp",
         variables=_WARP,
@@ -160,14 +170,16 @@ def engine(name: str, *, seconds: float | None = None) -> EngineVersion:
     """Return an engine of a version, for `mbkit.dynamics`, in an environment of its own.
 
     The first `mbkit.dynamics` makes the environment, with uv where it is on the path and else with pip: the engine and
-    NumPy, some 100 to 450 MB, below the user's cache folder or ``MBKIT_ENVIRONMENTS``. Later ones need no network. It
+    NumPy, some 100 to 730 MB, below the user's cache folder or ``MBKIT_ENVIRONMENTS``. Later ones need no network. It
     also refuses a version that does not exist, with those that do, as far as pip knows: without a network the error is
     that there is none.
 
     Parameters
     ----------
     name : str
-        Engine and version, such as ``"mujoco==3.12.0"``, ``"pinocchio==2.7.0"`` or ``"drake==1.35.0"``.
+        Engine and version, such as ``"mujoco==3.12.0"``, ``"pinocchio==2.7.0"`` or ``"drake==1.35.0"``; or
+        ``"newton"``, ``"mujoco-warp"``, ``"mjx"`` (double precision) and ``"mjx-single"``, which are their newest tested
+        versions where none is named.
     seconds : float, optional
         That one evaluation may take before its process is ended: a minute, or ten where the engine compiles first.
 
@@ -202,6 +214,25 @@ def engine(name: str, *, seconds: float | None = None) -> EngineVersion:
         raise InputError(f"name: {form}, got {name!r}")
     limit = PACKAGES[head].limit if seconds is None else real("seconds", seconds, positive=True)
     return EngineVersion(head, version, limit)
+
+
+def register_remote_engine(name: str, package: Package) -> None:
+    """Make an engine known that has an environment of its own, by its file: `mbkit.dynamics` and studies take its name.
+
+    A worker process and the command know it where a package names a module that calls this function in the entry
+    point group ``"mbkit.engines"``.
+
+    Raises `InputError` for a name that another engine has, a file that is not there, or no tested version.
+    """
+    if not isinstance(package, Package):
+        raise InputError(f"package: expected a Package, got {type(package).__name__}")
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or name in PACKAGES:
+        raise InputError(f"name: expected a word of letters, digits and hyphens that is not in use, got {name!r}")
+    if not Path(package.file).is_file():
+        raise InputError(f"package.file: expected the path of the engine's file, got {package.file!r}")
+    if not package.tested:
+        raise InputError("package.tested: expected at least one version, got none")
+    PACKAGES[name] = package
 
 
 def names_version(name: object) -> bool:

@@ -74,9 +74,7 @@ def exists(distribution: str, version: str) -> bool:
     return python_of(place(distribution, version)).exists()
 
 
-def interpreter(
-    distribution: str, version: str, module: str, report: Report = _print, extra: str = ""
-) -> Path:
+def interpreter(distribution: str, version: str, module: str, report: Report = _print, extra: str = "") -> Path:
     """Return the interpreter of a version's environment, which is made where there is none.
 
     Parameters
@@ -137,9 +135,7 @@ def _lock(path: Path) -> Iterator[None]:
         yield
 
 
-def _make(
-    path: Path, distribution: str, version: str, module: str, report: Report, extra: str
-) -> None:
+def _make(path: Path, distribution: str, version: str, module: str, report: Report, extra: str) -> None:
     half = path.with_name(f".{path.name}.part")
     shutil.rmtree(half, ignore_errors=True)
     name, start = f"{distribution} {version}", time.perf_counter()

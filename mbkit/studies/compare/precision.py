@@ -20,10 +20,13 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.registry import DERIVED, find_engine
 from mbkit.errors import MbkitError
 from mbkit.model import Model
-from mbkit.studies.compare.errors import ROUNDINGS, Scales, epsilon
+from mbkit.studies.compare.errors import Scales, epsilon
 from mbkit.studies.compare.terms import States, Term, power_errors
 
 _SEEDS: Final = (0, 1)
+#: An engine rounds on the way too: its error was at most 5.4 times that of the rounded numbers, over the terms of 66
+#: robots in Newton (validation/trained_engines.json).
+_ON_THE_WAY: Final = 8.0
 
 
 class Precision:
@@ -47,7 +50,7 @@ class Precision:
     def allowed(self, term: Term | str) -> float:
         """Return the largest error that passes: of a term, or of the power balance by its name."""
         own = [self._error(term, *rounded) for rounded in self._rounded]
-        return ROUNDINGS * max(self._eps, *own)
+        return _ON_THE_WAY * max(self._eps, *own)
 
     def _error(self, term: Term | str, dyn: Dynamics, at: States) -> float:
         try:

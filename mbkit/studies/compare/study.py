@@ -25,7 +25,15 @@ from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.beyond_terms import omissions, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
-from mbkit.studies.compare.errors import EPS, ROUNDINGS, Errors, Scales, condition_under_constraints, interleaved
+from mbkit.studies.compare.errors import (
+    ROUNDINGS,
+    EPS,
+    Errors,
+    Scales,
+    condition_under_constraints,
+    epsilon,
+    interleaved,
+)
 from mbkit.studies.compare.findings import findings
 from mbkit.studies.compare.precision import Precision
 from mbkit.studies.compare.result import OWN_LAW, Comparison, Row
@@ -179,14 +187,15 @@ class Judge:
 
     def _allowed(self, term: Term, engine: str, errors: Errors) -> float:
         """Return the tolerance, or the engine's own bound where its formula cannot do better."""
-        if lower := self._lower.get(self.engines[engine].bits):
-            return max(self.tolerance, lower.allowed(term))
+        dyn, allowed = self.engines[engine], self.tolerance
+        if lower := self._lower.get(dyn.bits):
+            allowed = max(allowed, lower.allowed(term))
         # Accelerations are M's solution: they cannot be better than M.
         of_mass = term.quantity in ("mass_matrix", "mass_matrix_inverse", "forward_dynamics")
-        if not of_mass or errors.relative.max() <= self.tolerance:
-            return self.tolerance
-        amplified = self.engines[engine].mass_matrix_rounding(self.at.q[errors.worst], term.quantity)
-        return max(self.tolerance, ROUNDINGS * EPS * amplified)
+        if not of_mass or errors.relative.max() <= allowed:
+            return allowed
+        amplified = dyn.mass_matrix_rounding(self.at.q[errors.worst], term.quantity)
+        return max(allowed, ROUNDINGS * epsilon(dyn.bits) * amplified)
 
     def _row(self, term: str, engine: str, errors: Errors, defect: str, allowed: float | None = None) -> Row:
         """Return a row against the oracle, not timed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, TypeVar
@@ -18,6 +19,8 @@ _COARSE: Final = 0.03
 #: Largest spread of the slopes between neighbouring points in the regression.
 _SLOPE_SPREAD: Final = 0.3
 _MIN_POINTS: Final = 3
+#: An error that is so many times as large has turned.
+_WORSE: Final = 1.5
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,18 @@ class Curve:
         if self.method.startswith(own):
             return f"{self.engine}'s own {self.method.removeprefix(own)}"
         return f"{self.engine} {self.method}"
+
+    @property
+    def turn(self) -> PrecisionPoint | None:
+        """The point of least error of a fixed step, where each finer step is worse by a half: rounding grows there.
+
+        So it is of an engine in single precision, whose error in the sum of steps is some eps / dt.
+        """
+        known = [p for p in self.points if math.isfinite(p.error)]
+        best = min(known, key=lambda p: p.error, default=None)
+        finer = [] if best is None else [p for p in known if p.value < best.value]
+        worse = bool(finer) and all(p.setting == "dt" and p.error > _WORSE * best.error for p in finer if best)
+        return best if worse else None
 
     def reach(self, error: float) -> PrecisionPoint | None:
         """Return the fastest point with at most this error, if there is one."""

@@ -76,6 +76,15 @@ class WorkPrecision(ResultTable):
         )
 
     @property
+    def turns(self) -> tuple[str, ...]:
+        """Of each curve that rounding bends back: the best step, below which errors grow again."""
+        return tuple(
+            f"{c.name}: best at dt = {p.value:.2g} s, with an error of {p.error:.1e}; smaller steps are worse"
+            for c in self.curves
+            if (p := c.turn)
+        )
+
+    @property
     def bounded(self) -> str:
         """The limit of work of each run, where it is less than a study's own; else empty."""
         work, whole = self.settings.get("work", math.inf), self.settings.get("whole_work", 0)
@@ -139,7 +148,7 @@ class WorkPrecision(ResultTable):
         last = {id(x[1]): (f"1e{exponent}", *x) for exponent, x in fastest.items() if x}
         yield Table((Column("error ≤", itemgetter(0), right=True), *_run_columns("fastest", 1)), last.values())
         yield Table(_CURVE_COLUMNS, self.curves)
-        notes = [f"{r.engine} {r.term}: {r.reason}" for r in self.failed]
+        notes = [f"{r.engine} {r.term}: {r.reason}" for r in self.failed] + [*self.turns]
         yield Items([*notes, *([] if self.complete else ["Interrupted: this is what was finished."])])
 
     def plot(self, ax: Axes | None = None) -> Figure:
