@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import mbkit as mb
 from mbkit._child_process import end_all
-from mbkit.engines.registry import EngineInfo, register_engine
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
+from mbkit.engines.registry import EngineInfo, register_engine
 from mbkit.engines.versions.description import STACKED, Convention
 from mbkit.engines.versions.engine_version import (
     PACKAGES,
@@ -25,6 +27,7 @@ from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
 from tests.random_trees import random_tree
 from tests.test_engine_versions import environments, installer, present  # noqa: F401  # fixtures
 
+EXUDYN = Path(__file__).parent / "on_exudyn.py"
 OURS = ("newton", "mujoco-warp", "mjx", "mjx-single")
 
 
@@ -62,7 +65,7 @@ class Single(PinocchioDynamics):
 
 
 @pytest.fixture
-def single(monkeypatch):
+def single():
     register_engine(EngineInfo("single", Single, package="single", shown=()))
     yield Single
     mb.engines.ENGINES.pop("single")
@@ -73,7 +76,8 @@ def compared(**more):
     return mb.compare(model, ("pinocchio", "single"), samples=8, terms_only=True, **more)
 
 
-def test_single_precision_agrees_and_says_its_digits(single):
+@pytest.mark.usefixtures("single")
+def test_single_precision_agrees_and_says_its_digits():
     result = compared()
     own = [r for r in result.rows if r.engine == "single"]
     assert result.passed
@@ -88,14 +92,16 @@ def test_single_precision_agrees_and_says_its_digits(single):
 
 
 @pytest.mark.parametrize("wrong", [1 + 1e-4, 1 + 3e-5])
-def test_what_single_precision_does_not_explain_is_an_error(single, monkeypatch, wrong):
+@pytest.mark.usefixtures("single")
+def test_what_single_precision_does_not_explain_is_an_error(monkeypatch, wrong):
     monkeypatch.setattr(Single, "wrong", wrong)
     failed = {(r.engine, r.term) for r in compared().rows if not r.passed}
     assert ("single", "M") in failed
     assert {engine for engine, _ in failed} == {"single"}
 
 
-def test_an_engine_in_double_precision_is_judged_as_before(single, monkeypatch):
+@pytest.mark.usefixtures("single")
+def test_an_engine_in_double_precision_is_judged_as_before(monkeypatch):
     monkeypatch.setattr(Single, "bits", 53)
     assert not compared().passed
 
@@ -149,7 +155,7 @@ class Engine:
 
 
 @pytest.fixture
-def one_of_ones_own(tmp_path, monkeypatch):
+def one_of_ones_own(tmp_path):
     """Return a function that registers an engine of one's own, in an environment of the present interpreter."""
 
     def register(stacked=True, before="pass", **more):
@@ -179,7 +185,7 @@ def test_an_engine_of_ones_own_is_refused_what_it_lacks(one_of_ones_own):
     dyn = one_of_ones_own()
     with pytest.raises(UnsupportedError, match="without the matrix"):
         dyn.coriolis_matrix([0.0, 0.0], [0.0, 0.0])
-    with pytest.raises(UnsupportedError, match="mujoco_rk4: not on the mine==1.0 engine"):
+    with pytest.raises(UnsupportedError, match=r"mujoco_rk4: not on the mine==1\.0 engine"):
         mb.simulate(dyn, [0.0, 0.0], [0.0, 0.0], 0.1, "mujoco_rk4", dt=0.01)
     with pytest.raises(UnsupportedError, match="no rollout"):
         dyn.rollout([0.0, 0.0], [0.0, 0.0], 0.01, 1)
@@ -209,7 +215,7 @@ def test_what_is_no_engine_of_ones_own_is_refused(tmp_path):
 
 def test_a_wheel_that_does_not_install_says_pips_reason_and_leaves_nothing(installer, environments):  # noqa: F811
     installer('[ "$1" = pip ] && echo "ERROR: No matching distribution found for newton" >&2; exit 1')
-    with pytest.raises(UnsupportedError, match="newton 1.8.0: no environment of it can be made here") as caught:
+    with pytest.raises(UnsupportedError, match=r"newton 1\.8\.0: no environment of it can be made here") as caught:
         mb.dynamics(mb.catalog.pendulum(), "newton")
     assert "No matching distribution" in str(caught.value)
     assert len(str(caught.value)) < 240
@@ -225,7 +231,7 @@ def test_extras_of_a_distribution_are_installed(installer):  # noqa: F811
 
 def test_helical_joints_are_refused_by_name_before_anything_is_made(environments):  # noqa: F811
     model = random_tree(1, 3, ("helical",), springs=False, damping=False, armature=False)
-    with pytest.raises(UnsupportedError, match="newton.*helical"):
+    with pytest.raises(UnsupportedError, match=r"newton.*helical"):
         mb.dynamics(model, "newton")
     assert not environments.exists()
 
@@ -260,17 +266,22 @@ def floating(joints: tuple[str, ...] = ("root", "hip", "foot", "neck", "eye")) -
     return b.build()
 
 
-@pytest.fixture(params=OURS)
-def real(request, monkeypatch):
-    """Return an engine in its real environment, or skip."""
-    # The user's own environments.
+@pytest.fixture
+def users_own(monkeypatch):
+    """Leave the folder of environments as the user has it."""
     monkeypatch.undo()
     end_all()
+    yield
+    end_all()
+
+
+@pytest.fixture(params=OURS)
+def real(request, users_own):
+    """Return an engine in its real environment, or skip."""
     version = mb.engine(request.param)
     if not version.installed:
         pytest.skip(f"no environment of {version}; mbkit check panda --engines lagrangian,{request.param} makes it")
-    yield version
-    end_all()
+    return version
 
 
 def test_terms_of_a_floating_tree_agree(real):
@@ -312,6 +323,25 @@ def test_a_method_that_an_engine_lacks_is_refused_by_name(real):
         dyn.rollout([0.1, 0.2], [0.0, 0.0], 1e-3, 2, "discrete")
     with pytest.raises(UnsupportedError, match="mujoco_discrete: not on"):
         mb.simulate(dyn, [0.1, 0.2], [0.0, 0.0], 0.01, "mujoco_discrete", dt=1e-3)
+
+
+@pytest.mark.usefixtures("users_own")
+def test_the_engine_of_the_book_agrees():
+    """Exudyn, as the page on extending has it."""
+    own = Package("exudyn", "exudyn", 136, 12, Convention(), STACKED, tested=("1.13.6",), file=str(EXUDYN))
+    register_remote_engine("exudyn", own)
+    try:
+        version = mb.engine("exudyn")
+        if not version.installed:
+            pytest.skip("no environment of exudyn; mbkit.engine('exudyn').interpreter() makes it when it is registered")
+        for robot in ("ur5", "panda"):
+            result = mb.compare(mb.load(robot), ("lagrangian", version), samples=8, terms_only=True)
+            assert result.passed, result.verdict
+            assert {"M", "g", "nle", "C v", "forward dynamics"} <= {r.term for r in result.rows if "==" in r.engine}
+        with pytest.raises(UnsupportedError, match="'root_joint' is free"):
+            mb.dynamics(mb.load("ur5", floating_base=True), version)
+    finally:
+        PACKAGES.pop("exudyn")
 
 
 def test_every_engine_here_is_registered():

@@ -41,6 +41,9 @@ PARTS = {
     "versions": Part(
         35, ("versions.json",), "versions of MuJoCo, Pinocchio and Drake; makes some 18 GB of environments"
     ),
+    "trained_engines": Part(
+        60, ("trained_engines.json",), "Newton, MuJoCo Warp and MJX on every robot; makes 2 GB of environments"
+    ),
     "planted": Part(7, ("planted.json",), "a hundred planted defects, and the tests that catch them"),
     "fuzz": Part(10, ("fuzz.json",), "random and damaged files, random trees"),
     "memory": Part(14, ("memory.json",), "memory that released models leave behind"),

@@ -1,8 +1,8 @@
 """The engines that robots are trained in, term by term on every robot of example-robot-data: ``trained_engines.json``.
 
 ``python -m validation.trained_engines [ENGINE ...] [ROBOT ...]`` measures Newton, MuJoCo Warp, and MJX in both
-precisions on every robot, or those that are named, and keeps the rows of the others. Each engine takes the description itself, not a file through its own
-importer. The reference has 34 digits. An environment that is missing is made.
+precisions on every robot, or those that are named, and keeps the rows of the others. Each engine takes the description
+itself, not a file through its own importer. The reference has 34 digits. An environment that is missing is made.
 """
 
 from __future__ import annotations

@@ -17,7 +17,6 @@ from mbkit.errors import UnsupportedError
 from mbkit.model import Joint, Model
 from mbkit.model.validation import static_bodies
 
-
 #: Joint type -> the joints that an engine has in its place, one after the other.
 Steps = Mapping[str, Callable[[Joint], list[dict[str, Any]]]]
 
@@ -50,7 +49,7 @@ def _stacked(joint: Joint) -> list[dict[str, Any]]:
     return [{"type": kind, "axes": [axis.tolist()], "pitch": 0.0} for kind, axis in STACKS[joint.kind](joint)]
 
 
-_OF_ALL: Final[Steps] = {
+_OF_ALL: Final[dict[str, Callable[[Joint], list[dict[str, Any]]]]] = {
     "fixed": lambda _: [],
     **dict.fromkeys(("revolute", "continuous", "prismatic", "planar"), _stacked),
     **dict.fromkeys(("helical", "ball", "free"), _one),

@@ -86,7 +86,11 @@ class VersionDynamics(MappedDynamics):
         }
         #: Whether the engine has an integrator of its own.
         self.runs = "rollout" in gives
-        vars(self)["refuses"] = {x: why for x, why in _REFUSED.items() if x not in gives}
+        lacks = {x: why for x, why in _REFUSED.items() if x not in gives}
+        for needed, quantities in (("frame", ("pose", "jacobian")), ("matter", ("potential_energy",))):
+            if needed not in gives and quantities[0] not in gives:
+                lacks |= dict.fromkeys(quantities, f"its file here has no function {needed}")
+        vars(self)["refuses"] = lacks
 
     @property
     def engine(self) -> str:  # type: ignore[override]  # of this object
@@ -128,6 +132,8 @@ class VersionDynamics(MappedDynamics):
         self._v_index = self._places.v_index
 
     def _ask(self, name: str, *arrays: Array, **plain: Any) -> list[Array]:
+        if name not in self._gives:
+            raise UnsupportedError(f"{self.engine} cannot give {name}: its file here has no such function")
         if self._process.start() != self._held:
             # The one that held the model has died since.
             self._build()
@@ -191,6 +197,8 @@ class VersionDynamics(MappedDynamics):
         return self._force(out + _turn(self._ask("mass_matrix", x)[0], b) if b.any() else out)
 
     def _coriolis_force(self, q: Array, v: Array) -> Array:
+        if "coriolis_force" not in self._gives:
+            return self._nle(q, v) - self._gravity(q)
         return self._with_rotation("coriolis_force", q, v)
 
     def _nle(self, q: Array, v: Array) -> Array:
@@ -223,6 +231,8 @@ class VersionDynamics(MappedDynamics):
         return np.asarray(X[..., 1, :3, 3] - X[..., 0, :3, 3])
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+        if "inverse_dynamics" not in self._gives:
+            return _turn(self._mass_matrix(q), a) + self._nle(q, v) - self._passive(q, v)
         x, u, b = self._native(q, v)
         out = self._force(self._ask("inverse_dynamics", x, u, self._to_engine(a) + b)[0])
         rotors = 0.0 if self._rotors is None else a @ self._rotors
@@ -293,8 +303,8 @@ class VersionDynamics(MappedDynamics):
         require_no_forces(model, self.engine)
         if not self.runs:
             raise UnsupportedError(f"{self.engine}: it has no rollout of its own here")
-        if self._beside is not None and (own := [*model.springs, *model.couplings]):
-            raise UnsupportedError(f"{self.engine}: its own runs leave out {first_names(repr(x.name) for x in own)}")
+        if self._beside is not None and (own := [*(x.name for x in model.springs), *(x.name for x in model.couplings)]):
+            raise UnsupportedError(f"{self.engine}: its own runs leave out {first_names(map(repr, own))}")
         x, u, _ = self._native(q0, v0)
         try:
             xs, us = self._ask("rollout", x, u, method=method, dt=dt, steps=steps)

@@ -178,8 +178,8 @@ def engine(name: str, *, seconds: float | None = None) -> EngineVersion:
     ----------
     name : str
         Engine and version, such as ``"mujoco==3.12.0"``, ``"pinocchio==2.7.0"`` or ``"drake==1.35.0"``; or
-        ``"newton"``, ``"mujoco-warp"``, ``"mjx"`` (double precision) and ``"mjx-single"``, which are their newest tested
-        versions where none is named.
+        ``"newton"``, ``"mujoco-warp"``, ``"mjx"`` (double precision) and ``"mjx-single"``, which are the newest
+        tested versions where none is named.
     seconds : float, optional
         That one evaluation may take before its process is ended: a minute, or ten where the engine compiles first.
 

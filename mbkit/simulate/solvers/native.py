@@ -1,4 +1,4 @@
-"""The engines' own integrators: MuJoCo's and those of engines in a process with a step, Drake's with a tolerance too."""
+"""The engines' own integrators: MuJoCo's and those in a process of their own with a step, Drake's with a tolerance."""
 
 from __future__ import annotations
 

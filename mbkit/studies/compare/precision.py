@@ -17,6 +17,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
+from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import DERIVED, find_engine
 from mbkit.errors import MbkitError
 from mbkit.model import Model
@@ -39,11 +40,10 @@ class Precision:
     bits : int
         Of the significand.
     scales : Scales
-    oracle : Dynamics
-        Its model's values in double precision.
+    oracle : OracleDynamics
     """
 
-    def __init__(self, model: Model, at: States, bits: int, scales: Scales, oracle: Dynamics) -> None:
+    def __init__(self, model: Model, at: States, bits: int, scales: Scales, oracle: OracleDynamics) -> None:
         self._model, self._at, self._scales, self._oracle = model, at, scales, oracle
         self.bits, self._eps = bits, epsilon(bits)
 
@@ -81,9 +81,9 @@ class Precision:
             def noise(shape: tuple[int, ...], rng: np.random.Generator = rng) -> Array:
                 return eps * rng.uniform(-1.0, 1.0, shape)
 
-            moved = [np.asarray(x) * (1.0 + noise(np.shape(x))) for x in (at.v, at.a, at.tau)]
+            v, a, tau = (np.asarray(x) * (1.0 + noise(np.shape(x))) for x in (at.v, at.a, at.tau))
             q = model.integrate(at.q, noise(at.v.shape))
-            states = States(q, *moved, at.kinds)
+            states = States(q, v, a, tau, at.kinds)
             bodies = tuple(
                 replace(
                     b,

@@ -26,8 +26,8 @@ from mbkit.studies._targets import engine_names, with_values
 from mbkit.studies.compare.beyond_terms import omissions, rollouts
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS, BodyScales
 from mbkit.studies.compare.errors import (
-    ROUNDINGS,
     EPS,
+    ROUNDINGS,
     Errors,
     Scales,
     condition_under_constraints,

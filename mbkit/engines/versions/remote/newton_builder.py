@@ -17,7 +17,8 @@ _OF_ONE = {"armature": "armature", "damping": "damping", "stiffness": "stiffness
 def built(data: dict[str, Any]) -> Any:
     """Return the builder of a description, the joints of each of its joints, and its bodies."""
     builder = newton.ModelBuilder(gravity=tuple(data["gravity"]))
-    bodies, numbers = {"world": -1}, {}
+    bodies: dict[str, int] = {"world": -1}
+    numbers: dict[str, list[Any]] = {}
     for joint in data["joints"]:
         parent, steps = bodies[joint["parent"]], joint["steps"] or [{"type": "fixed", "axes": []}]
         if steps[0]["type"] == "free" and parent >= 0:
@@ -36,12 +37,12 @@ def built(data: dict[str, Any]) -> Any:
     return builder, numbers, bodies
 
 
-def _link(builder: Any, name: str, body: dict[str, Any]) -> int:
+def _link(builder: Any, name: str, body: dict[str, Any]) -> Any:
     inertia = wp.mat33(np.array(body["inertia"]))
     return builder.add_link(mass=body["mass"], com=tuple(body["com"]), inertia=inertia, label=name)
 
 
-def _joint(builder: Any, step: dict[str, Any], parent: int, child: int, at: Any, own: dict[str, float]) -> int:
+def _joint(builder: Any, step: dict[str, Any], parent: int, child: int, at: Any, own: dict[str, Any]) -> Any:
     kind = step["type"]
     if kind in ("revolute", "prismatic"):
         own = {_OF_ONE[name]: value for name, value in own.items()}

@@ -36,7 +36,7 @@ class Engine:
         self._gravity = np.array(m.opt.gravity)
         self._compiled: dict[Any, Any] = {}
 
-    def joints(self) -> dict[str, Any]:
+    def joints(self) -> Any:
         """Return the places of each joint's numbers in qpos and qvel."""
         return places(self._m)
 
@@ -122,7 +122,7 @@ class Engine:
             return jax.lax.scan(step, self._d.replace(qpos=q, qvel=v), None, steps)[1]
 
         out = self._over(("rollout", method, steps), run, q, v, shared=(dt,))
-        return [np.concatenate([x[:, None], y], axis=1) for x, y in zip((q, v), out)]
+        return [np.concatenate([x[:, None], y], axis=1) for x, y in zip((q, v), out, strict=True)]
 
     def seconds(self, q: Any, v: Any, repeats: int) -> Any:
         """Return the shortest time of one forward dynamics of the stack, s, of rounds of so many calls."""

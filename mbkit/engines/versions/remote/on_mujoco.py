@@ -46,7 +46,7 @@ def places(m: Any) -> dict[str, Any]:
     return out
 
 
-def body_of(m: Any, name: str) -> int:
+def body_of(m: Any, name: str) -> Any:
     """Return the number of a body."""
     k = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, name)
     if k < 0:

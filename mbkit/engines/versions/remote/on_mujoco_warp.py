@@ -36,7 +36,7 @@ class Engine:
             self._w = mjw.put_model(m)
         self._data: dict[int, Any] = {}
 
-    def joints(self) -> dict[str, Any]:
+    def joints(self) -> Any:
         """Return the places of each joint's numbers in qpos and qvel."""
         return places(self._m)
 
@@ -138,7 +138,7 @@ class Engine:
             out.append((np.array(d.qpos.numpy()), np.array(d.qvel.numpy())))
         opt.integrator = before[0]
         opt.timestep.assign(before[1])
-        return [np.stack(x, axis=1) for x in zip(*out)]
+        return [np.stack(x, axis=1) for x in zip(*out, strict=True)]
 
     def seconds(self, q: Any, v: Any, repeats: int) -> Any:
         """Return the shortest time of one forward dynamics of the stack, s, of rounds of so many calls."""

@@ -9,13 +9,12 @@ from __future__ import annotations
 import newton
 import numpy as np
 import warp as wp
-from common import apply, best_time, center_of, rotation, skew
+from common import apply, center_of, rotation, skew
 from newton_builder import built
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
-
 __all__ = ["VERSION", "Engine", "built"]
 wp.config.quiet = True
 _OF_MUJOCO = ("euler", "implicitfast", "rk4")
@@ -39,7 +38,7 @@ class Engine:
                 at, frame = b.joint_qd_start[j], rotation(np.array(tuple(b.joint_X_p[j]))[3:])
                 self._world[at : at + 6, at : at + 6] = np.kron(np.eye(2), frame)
                 self._free.append((at, b.joint_q_start[j], b.joint_child[j]))
-        self._models: dict[int, Any] = {}
+        self._models: dict[tuple[int, bool], Any] = {}
 
     def joints(self) -> dict[str, Any]:
         """Return the places of each joint's numbers in joint_q and joint_qd."""
@@ -109,10 +108,8 @@ class Engine:
 
     def coriolis_force(self, q: Any, v: Any) -> Any:
         model, state, S, change = self._set(q, v)
-        own = self._force(self._passive(model, state, "coriolis_force"), S)
-        if not change.any():
-            return own
-        return own + apply(S.mT @ self._mass(model, state).numpy().astype(float), change)
+        M = self._mass(model, state).numpy().astype(float)
+        return self._force(self._passive(model, state, "coriolis_force"), S) + apply(S.mT @ M, change)
 
     def nle(self, q: Any, v: Any) -> Any:
         return self.coriolis_force(q, v) + self.gravity(q)
@@ -156,7 +153,7 @@ class Engine:
             state, after = after, state
             x, u = (np.array(y.numpy(), float).reshape(len(q), -1) for y in (state.joint_q, state.joint_qd))
             out.append((x, apply(np.linalg.inv(self._centre(x)), u)))
-        return [np.stack(x, axis=1) for x in zip(*out)]
+        return [np.stack(x, axis=1) for x in zip(*out, strict=True)]
 
     def frame(self, q: Any, body: str) -> Any:
         """Return R_WB, p_WB, and the Jacobians of the body's origin and turning in world axes."""
@@ -173,7 +170,3 @@ class Engine:
         """Return the mass of what moves and stands, kg, and its centre of mass, m."""
         X = self._set(q)[1].body_q.numpy().astype(float).reshape(len(q), -1, 7)
         return center_of(self._masses, X[..., :3] + apply(rotation(X[..., 3:]), self._coms))
-
-    def seconds(self, q: Any, v: Any, repeats: int) -> Any:
-        """Return the shortest time of one inverse dynamics of the stack, s, of rounds of so many calls."""
-        return [np.full(len(q), best_time(lambda: self.inverse_dynamics(q, v, np.zeros_like(v)), repeats))]

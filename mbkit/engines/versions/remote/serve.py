@@ -126,7 +126,7 @@ def _called(engine: Any, name: str, arrays: list[Any], plain: dict[str, Any], st
         return values(*arrays)
     if together:
         return [x[0] for x in values(*(np.asarray(x)[None] for x in arrays))]
-    return [np.array(column) for column in zip(*(values(*states) for states in zip(*arrays)))]
+    return [np.array(column) for column in zip(*(values(*row) for row in zip(*arrays, strict=True)), strict=True)]
 
 
 def serve(handle: int, file: str, folder: str) -> None:
