@@ -276,7 +276,7 @@ def users_own(monkeypatch):
 
 
 @pytest.fixture(params=OURS)
-def real(request, users_own):
+def real(request, users_own):  # noqa: ARG001  # for its effect
     """Return an engine in its real environment, or skip."""
     version = mb.engine(request.param)
     if not version.installed:

@@ -44,10 +44,8 @@ class Engine:
         """Return the places of each joint's numbers in joint_q and joint_qd."""
         b = self._builder
         starts = [*b.joint_q_start, b.joint_coord_count], [*b.joint_qd_start, b.joint_dof_count]
-        return {
-            name: [[k for j in own for k in range(start[j], start[j + 1])] for start in starts]
-            for name, own in self._numbers.items()
-        }
+        held = [[[*range(start[j], start[j + 1])] for j in range(b.joint_count)] for start in starts]
+        return {name: [[k for j in own for k in of[j]] for of in held] for name, own in self._numbers.items()}
 
     def _model(self, n: int, passive: bool) -> Any:
         """Return the model with as many worlds, and a state; `passive` springs and dampers act in its solvers alone."""
