@@ -100,7 +100,7 @@ def test_a_version_that_dies_or_refuses_is_a_row_and_the_rest_is_measured():
     names = [
         made("1.0"),
         made("1.1", "E.nle = lambda *x: os.abort()"),
-        made("1.2", "del E.potential_energy"),
+        made("1.2", "del E.potential_energy, E.matter"),
         made("1.3"),
     ]
     result = mb.versions(pendulum(), "mujoco", names, samples=2)

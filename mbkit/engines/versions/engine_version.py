@@ -40,7 +40,7 @@ class Package(NamedTuple):
     extra : str
         Of the distribution, such as ``"[sim]"``, which pip installs too.
     file : str
-        The engine's file in `remote` without its ending, ``on_`` and the name by default; or the path of one.
+        What follows ``on_`` in the name of the engine's file in `remote`, by default the engine; or a file's path.
     variables : mapping
         Environment variables of its process; ``{environment}`` in one stands for the environment's folder.
     limit : float
@@ -82,7 +82,7 @@ _MJX: Final = Package(
     _MUJOCO,
     inertias_about={"": TREE},
     tested=("3.17.0",),
-    file="on_mjx",
+    file="mjx",
     variables={**_JAX, "JAX_ENABLE_X64": "1"},
     limit=_COMPILING,
 )
@@ -113,7 +113,7 @@ PACKAGES: Final[dict[str, Package]] = {
         bits=24,
         inertias_about={"": TREE},
         tested=("4.0.0",),
-        file="on_mujoco_warp",
+        file="mujoco_warp",
         variables=_WARP,
         limit=_COMPILING,
     ),

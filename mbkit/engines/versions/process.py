@@ -74,7 +74,7 @@ class EngineProcess(Child):
 
     def _command(self, handle: int) -> tuple[Sequence[str], Mapping[str, str]]:
         self._python = self.version.interpreter()
-        file = self.version.package.file or f"on_{self.version.engine}"
+        file = self.version.package.file or self.version.engine
         command = [self._python, "-E", "-s", _SERVE, handle, file, self._folder]
         kept = {k: x for k, x in os.environ.items() if not k.startswith("PYTHON")}
         return [*map(str, command)], kept | self.version.variables()

@@ -77,7 +77,7 @@ class Curve:
 
     @property
     def turn(self) -> PrecisionPoint | None:
-        """The point of least error of a fixed step, where each finer step is worse by a half: rounding grows there.
+        """The point of least error of a fixed step, where each finer step is worse by a half and rounding grows.
 
         So it is of an engine in single precision, whose error in the sum of steps is some eps / dt.
         """

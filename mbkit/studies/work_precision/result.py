@@ -77,7 +77,7 @@ class WorkPrecision(ResultTable):
 
     @property
     def turns(self) -> tuple[str, ...]:
-        """Of each curve that rounding bends back: the best step, below which errors grow again."""
+        """Of each curve that rounding bends back, the best step, below which errors grow again."""
         return tuple(
             f"{c.name}: best at dt = {p.value:.2g} s, with an error of {p.error:.1e}; smaller steps are worse"
             for c in self.curves

@@ -130,10 +130,10 @@ def _called(engine: Any, name: str, arrays: list[Any], plain: dict[str, Any], st
 
 
 def serve(handle: int, file: str, folder: str) -> None:
-    """Answer calls of an engine, whose file is beside this one, or is a path."""
+    """Answer calls of an engine, by its name, whose file is beside this one, or by the path of a file."""
 
     def prepare(_: Connection) -> Callable[[bytes], bytes]:
-        place, name = os.path.split(os.path.splitext(file)[0] if file.endswith(".py") else file)
+        place, name = os.path.split(file[:-3]) if file.endswith(".py") else ("", "on_" + file)
         sys.path[:0] = [place] if place else []
         adapter = importlib.import_module(name)
         held: dict[int, Any] = {}
