@@ -61,7 +61,8 @@ def main() -> None:
                 for name in names:
                     rows[name] = measured(model, name)
         except mb.errors.MbkitError as error:
-            rows["refused"] = str(error)
+            # Without the folder of this machine.
+            rows["refused"] = str(error).replace(f"{robot.path.parent}/", "")
         versions = {name: engine(name).version for name in ENGINES}
         text = {"samples": SAMPLES, "engines": versions, "robots": robots, **stamp()}
         OUT.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
