@@ -96,7 +96,7 @@ PACKAGES: Final[dict[str, Package]] = {
         STACKED,
     ),
     "newton": Package(
-        *("newton", "newton", 560, 22),
+        *("newton", "newton", 680, 22),
         Convention(turned={"free": (0, 3), "ball": (0,)}),
         {kind: step for kind, step in STACKED.items() if kind != "helical"},
         bits=24,
