@@ -25,6 +25,9 @@ os.environ["HEYOKA_CACHE_DIR"] = os.environ["MBKIT_CACHE_DIR"] + "-heyoka"
 # which wait for each other, a hundred times as long as one of them.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# An example of an engine, whose package no test installs.
+collect_ignore = ["on_exudyn.py"]
+
 
 #: What another processor's arithmetic can change: linear algebra, seeds, methods, loops, machine code. `.ci/run` runs
 #: these under another kernel of BLAS and with code for any x86-64 too (``-m processors``).

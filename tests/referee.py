@@ -136,6 +136,8 @@ def runs() -> dict[str, str]:
     for name, model in _models().items():
         for method, info in mb.simulate.METHODS.items():
             engine = info.engines[0] if info.engines else "lagrangian"
+            if not mb.engines.ENGINES.keys() & {engine}:
+                continue
             if method.startswith("drake") and model.quaternions:
                 continue
             q, v = model.random_state(np.random.default_rng(2))

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from mbkit.engines.registry import ENGINES
 from mbkit.model import Model, ModelBuilder
+from mbkit.simulate import METHODS as ALL_METHODS
 
 BODY = ("mass", "com", "inertia")
+#: Methods but those of engines that have an environment of their own, which no test makes.
+METHODS = {name: m for name, m in ALL_METHODS.items() if not m.engines or {*m.engines} & {*ENGINES}}
 
 
 def chain(*links: dict[str, Any], name: str = "chain", **options: Any) -> ModelBuilder:

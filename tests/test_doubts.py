@@ -12,14 +12,13 @@ import pytest
 import mbkit as mb
 from mbkit.errors import DoubtfulRunWarning
 from mbkit.methods.registry import Tolerances
-from mbkit.simulate import METHODS
 from mbkit.simulate.diagnostics.checks import lost, massless_joints
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord
 from mbkit.simulate.torque import Torque
 from mbkit.studies.stress.cases.exact_motions import pendulum
-from tests.scenes import mounted
+from tests.scenes import METHODS, mounted
 
 # Drake's own runs have tests of their own.
 LINEAR = sorted(name for name, method in METHODS.items() if method.stability and method.name != "drake_sap")

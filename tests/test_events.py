@@ -14,7 +14,8 @@ from mbkit import catalog
 from mbkit.engines import dynamics
 from mbkit.errors import EventError, InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model, ModelBuilder
-from mbkit.simulate import METHODS, Event, at_energy, at_limits, at_section, simulate
+from mbkit.simulate import Event, at_energy, at_limits, at_section, simulate
+from tests.scenes import METHODS
 from validation import closed_forms
 
 SCIPY = ("dop853", "radau", "bdf", "lsoda")

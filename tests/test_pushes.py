@@ -14,9 +14,8 @@ from mbkit.engines import Dynamics
 from mbkit.errors import InputError, TorqueError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian import systems
 from mbkit.model import Model
-from mbkit.simulate import METHODS
 from tests.random_trees import random_tree
-from tests.scenes import mounted
+from tests.scenes import METHODS, mounted
 
 EPS = np.finfo(float).eps
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake")

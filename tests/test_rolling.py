@@ -12,7 +12,6 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, NumericalError, UnsupportedError
-from mbkit.lagrangian import from_model
 from mbkit.model import Model, Parameter
 from tests.scenes import mounted
 from validation import bicycle as paper
@@ -461,7 +460,6 @@ def test_writers_and_paper_refuse_them_by_name() -> None:
     for call in (
         lambda: mb.convert(model, "mjcf"),
         lambda: mb.convert(model, "urdf"),
-        lambda: from_model(model),
         lambda: mb.lagrangian.export_c(model, ["mass_matrix"]),
         lambda: model.base_parameters(),
     ):

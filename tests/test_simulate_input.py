@@ -14,9 +14,9 @@ import pytest
 from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError
-from mbkit.simulate import METHODS, Event, simulate
+from mbkit.simulate import Event, simulate
 from mbkit.simulate.time_grid import Grid
-from tests.scenes import slider
+from tests.scenes import METHODS, slider
 
 EPS = float(np.finfo(float).eps)
 ADAPTIVE = [m.name for m in METHODS.values() if m.kind == "adaptive"]

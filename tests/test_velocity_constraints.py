@@ -186,7 +186,7 @@ def made(seed: int, moving: bool) -> Lagrangian:
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("moving", [False, True])
 def test_each_elimination_is_the_motion_with_multipliers(seed, way, moving) -> None:
@@ -216,7 +216,7 @@ def test_each_elimination_is_the_motion_with_multipliers(seed, way, moving) -> N
     assert reactions == pytest.approx(lag.multipliers(q, v, t=now), abs=1e3 * EPS * max(1, scale))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_without_motion_of_the_rows_the_mass_matrix_rate_less_2_c_is_skew(seed) -> None:
     e = made(seed, False).maggi()
     rng, h = np.random.default_rng(seed), 1e-6
