@@ -93,6 +93,8 @@ class _Writer:
         for key, value in form.items():
             # Angles that are numbers are not independent: 2 · ½ and 1 are one sum.
             gather(poly, *_term(self._space, key, value))
+        if not poly:
+            return sp.Integer(0)
         by_angle: dict[tuple[tuple[sp.Expr, int], ...], Poly] = {}
         for atoms, value in poly.items():
             turned = tuple(a for a in atoms if isinstance(a[0], (sp.sin, sp.cos)))
