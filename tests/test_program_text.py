@@ -48,7 +48,7 @@ def run(code: str, quantity: str, *arguments: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("name", ["ur5", "cart_pole", "tree"])
 def test_the_python_of_a_program_is_the_engine(name, quantity) -> None:
-    models = {"ur5": lambda: mb.load("ur5"), "cart_pole": mb.catalog.cart_pole, "tree": lambda: random_tree(3)}
+    models = {"ur5": lambda: mb.load("ur5"), "cart_pole": mb.catalog.cart_pole, "tree": lambda: random_tree(3, n=4)}
     model = models[name]()
     given = state(model, QUANTITIES[quantity])
     expected = np.asarray(getattr(mb.dynamics(model, "lagrangian", compile=False), quantity)(*given))

@@ -172,13 +172,12 @@ def made(seed: int, moving: bool) -> Lagrangian:
         return sp.Rational(int(rng.integers(-9, 10)), 10)
 
     def wave() -> sp.Expr:
-        return number() * sp.sin(q[rng.integers(4)] + number()) + number() * q[rng.integers(4)]
+        return number() * sp.sin(q[rng.integers(4)] + number())
 
-    shifts = [wave(), sp.Integer(1), number()]
-    T = sum((3 + number()) * x**2 for x in v) / 2 + sum((v[k] * shifts[k] + v[3]) ** 2 for k in range(3)) / 4
+    T = sum((3 + number()) * x**2 for x in v) / 2 + (v[0] * sp.sin(q[2] + number()) + v[3]) ** 2 / 4
     if moving:
-        T += v[0] * wave() + wave() ** 2 * (1 + t / 5)
-    V = sum(wave() ** 2 for _ in range(2))
+        T += v[0] * wave() + (1 + t / 5) * wave()
+    V = wave() + q[1] ** 2
     rows = [v[k] + sp.sin(q[3 - k] + number()) * v[2] + number() * q[1 - k] * v[3] for k in range(1 + seed % 2)]
     if moving:
         rows = [row + wave() + number() * t for row in rows]

@@ -161,7 +161,8 @@ def nonholonomic_equations(system: EnergyForm, quasi_velocities: Any, form: str)
             f"{system.name}: has holonomic constraints too; write their rates as velocity_constraints"
         )
     frame = _Frame.of(system, quasi_velocities)
-    return {"Maggi": _maggi, "Hamel": _hamel, "Appell": _appell}[form](system, frame)
+    derive = {"Maggi": _maggi, "Hamel": _hamel, "Appell": _appell}[form]
+    return derive(system, frame, _Motion.of(system, frame))
 
 
 @dataclass(frozen=True)
@@ -311,8 +312,8 @@ def _made(system: EnergyForm, frame: _Frame, motion: _Motion, form: str, **field
     )
 
 
-def _maggi(system: EnergyForm, frame: _Frame) -> NonholonomicEquations:
-    motion, N, w = _Motion.of(system, frame), frame.N, frame.velocities
+def _maggi(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEquations:
+    N, w = frame.N, frame.velocities
     M = motion.equations.mass_matrix
     slow = dict(zip(system.velocities, N * sp.Matrix(w), strict=True))
     # Of what N w alone does: the rest, of drifts and of the time, is d.
@@ -332,8 +333,8 @@ def _maggi(system: EnergyForm, frame: _Frame) -> NonholonomicEquations:
     )
 
 
-def _appell(system: EnergyForm, frame: _Frame) -> NonholonomicEquations:
-    motion, maggi = _Motion.of(system, frame), _maggi(system, frame)
+def _appell(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEquations:
+    maggi = _maggi(system, frame, motion)
     wdot = sp.Matrix(maggi.accelerations)
     a, M = frame.N * wdot, motion.equations.mass_matrix
     S = tidy((a.T * M * a)[0] / 2) + tidy((a.T * motion.force)[0])
@@ -351,7 +352,7 @@ def _appell(system: EnergyForm, frame: _Frame) -> NonholonomicEquations:
     )
 
 
-def _hamel(system: EnergyForm, frame: _Frame) -> NonholonomicEquations:
+def _hamel(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEquations:
     held = {*(frame.N.free_symbols | frame.E.free_symbols)} & {system.time}
     if held or any(frame.drift):
         raise UnsupportedError(
@@ -370,7 +371,7 @@ def _hamel(system: EnergyForm, frame: _Frame) -> NonholonomicEquations:
     return _made(
         system,
         frame,
-        _Motion.of(system, frame),
+        motion,
         "Boltzmann and Hamel",
         mass_matrix=whole.mass_matrix[:r, :r],
         coriolis_matrix=tidy_matrix(C),
