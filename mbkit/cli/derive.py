@@ -151,13 +151,13 @@ def _about(system: Callable[..., Lagrangian]) -> str:
 def _program(model: Model, quantity: str, form: str | None, snap: float) -> tuple[str, str]:
     """Return one quantity as named terms, and the ending of its file."""
     from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
-    from mbkit.lagrangian.printing.program_text import ProgramText, program_text
+    from mbkit.lagrangian.printing.program_text import ProgramText, program
 
     if form in (None, "latex"):
         model, note = with_plain_turns(model, snap)
         if note:
             say("note", f"{note}. The terms to read differ from the model by that; --snap 0 leaves it as it is")
-    text = program_text(model, quantity)
+    text = program(model, quantity)
     forms: dict[str | None, tuple[Callable[[ProgramText], str], str]] = {
         None: (str, ".txt"),
         "latex": (ProgramText.latex, ".tex"),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.from_description import from_model as from_model
     from mbkit.lagrangian.independent_coordinates import Embedded as Embedded
     from mbkit.lagrangian.printing.program_text import ProgramText as ProgramText
-    from mbkit.lagrangian.printing.program_text import program_text as program
+    from mbkit.lagrangian.printing.program_text import program as program
     from mbkit.lagrangian.reduction.hamilton import CanonicalEquations as CanonicalEquations
     from mbkit.lagrangian.reduction.hamilton import ConservedQuantity as ConservedQuantity
     from mbkit.lagrangian.reduction.hamilton import Hamiltonian as Hamiltonian
@@ -52,6 +52,7 @@ _HOME = {
     "QuasiEquationsOfMotion": "mbkit.lagrangian.reduction.quasi_equations",
     "QuasiLagrangian": "mbkit.lagrangian.system",
     "Routhian": "mbkit.lagrangian.reduction.routh",
+    "program": "mbkit.lagrangian.printing.program_text",
     "from_model": "mbkit.lagrangian.from_description",
     "from_particles": "mbkit.lagrangian.statics.virtual_work",
     "newton_euler": "mbkit.lagrangian.statics.newton_euler",
@@ -59,15 +60,13 @@ _HOME = {
 }
 
 __all__ = ["FUNCTIONS", "CSource", "Equations", "ForwardDynamicsDerivatives", "InverseDynamicsDerivatives", "export_c"]
-__all__ += ["program", "systems", *_HOME]
+__all__ += ["systems", *_HOME]
 
 
 def __getattr__(name: str) -> Any:
     with needed("sympy", "mechanics on paper"):
         if name == "systems":
             return importlib.import_module("mbkit.lagrangian.systems")
-        if name == "program":
-            return importlib.import_module("mbkit.lagrangian.printing.program_text").program_text
         if name in _HOME:
             return getattr(importlib.import_module(_HOME[name]), name)
     raise AttributeError(f"module 'mbkit.lagrangian' has no attribute {name!r}; it has: {', '.join(__all__)}")

@@ -181,10 +181,12 @@ class Lagrangian(EnergyForm):
         """
         return QuasiLagrangian(self, D, names)
 
-    # Velocity constraints, eliminated
+    # Constraints, eliminated
 
     def maggi(self, quasi_velocities: Any = None) -> NonholonomicEquations:
-        """Return Maggi's equations: velocity constraints eliminated by independent quasi-velocities.
+        """Return Maggi's equations, with the constraints eliminated by independent quasi-velocities.
+
+        Of holonomic constraints the rates are eliminated: a state has to satisfy f(q, t) = 0, as of `project`.
 
         Parameters
         ----------
@@ -197,7 +199,7 @@ class Lagrangian(EnergyForm):
         InputError
             Too many or too few, or some that do not determine every velocity with the constraints.
         UnsupportedError
-            No velocity constraints, or holonomic ones beside them.
+            No constraints.
         """
         return nonholonomic_equations(self._in_rates, quasi_velocities, "Maggi")
 

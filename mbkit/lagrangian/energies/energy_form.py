@@ -146,6 +146,12 @@ class EnergyForm:
         J = f.jacobian(self.coordinates) if f else sp.zeros(0, len(self.coordinates))
         return sp.ImmutableMatrix(J.col_join(self.velocity_rows[0]))
 
+    @cached_property
+    def constraint_drift(self) -> sp.ImmutableMatrix:
+        """c (m, 1) of the rates J v + c, ∂f/∂t and a; zero where no constraint moves."""
+        by_time = [0 if self.time is None else sp.diff(f, self.time) for f in self.constraints]
+        return sp.ImmutableMatrix(len(self.multiplier_symbols), 1, [*by_time, *self.velocity_rows[1]])
+
     # Cyclic coordinates
 
     @cached_property

@@ -196,8 +196,7 @@ def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> Equatio
 def constraint_fields(system: EnergyForm, qdot: sp.Matrix) -> dict[str, Any]:
     """Return the fields of `EquationsOfMotion` that constraints fill, with the coordinates' rates in velocities."""
     m, t = len(system.multiplier_symbols), system.time
-    by_time = sp.Matrix(len(system.constraints), 1, [0 if t is None else sp.diff(f, t) for f in system.constraints])
-    rate = system.constraint_matrix * sp.Matrix(system.velocities) + by_time.col_join(system.velocity_rows[1])
+    rate = system.constraint_matrix * sp.Matrix(system.velocities) + system.constraint_drift
     gamma = rate.jacobian(system.coordinates) * qdot if m else rate
     return {
         "constraint_jacobian": system.constraint_matrix,

@@ -6,6 +6,7 @@ stands where it is used, and all others have a name.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +18,8 @@ from sympy.printing.c import C99CodePrinter
 from sympy.printing.numpy import NumPyPrinter
 
 from mbkit._escape import identifier, one_line, python_docstring, terminal
-from mbkit.codegen.program import Operation, program
+from mbkit.codegen.program import Operation
+from mbkit.codegen.program import program as operations_of
 from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.lagrangian.energies.symbols import free_name
@@ -49,7 +51,7 @@ _FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {
 
 
 #: Keywords of C, and functions that its lines call.
-_C_WORDS: Final = {*C99CodePrinter().reserved_words, *_FUNCTIONS, "fabs", "pow", "fmin", "fmax", "hypot"}
+_C_WORDS: Final = {*C99CodePrinter().reserved_words, *(_FUNCTIONS.keys() & dir(math)), "fmin", "fmax"}
 
 _Inputs = tuple[tuple[str, tuple[sp.Symbol, ...]], ...]
 
@@ -133,7 +135,7 @@ def _rounded(x: sp.Expr) -> sp.Expr:
     return x.xreplace({f: sp.Float(f"{float(f):.{_DIGITS}g}") for f in x.atoms(sp.Float)})
 
 
-def program_text(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
+def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
     """Return the equations of a model as a program of named terms, to read, in Python, LaTeX and C.
 
     Parameters
@@ -167,7 +169,7 @@ def program_text(model: Model, quantity: str = "inverse_dynamics") -> ProgramTex
     if not model.nv:
         raise UnsupportedError(f"program: {model.name} has no joint that moves")
     function = equations_of(model).function(quantity)
-    operations = program(function)
+    operations = operations_of(function)
     if len(operations.outputs) > 1:
         raise UnsupportedError(f"program: {quantity} has {len(operations.outputs)} results; expected a quantity of one")
     inputs, used = _inputs(function, model)

@@ -112,7 +112,6 @@ def impulse_equations(
     if e.is_number and not 0 <= e <= 1:
         raise InputError(f"restitution: expected a number from 0 to 1, got {restitution!r}")
     v, own = sp.Matrix(system.velocities), system.constraint_matrix
-    held = _moving(system)
     J = sp.Matrix(own).col_join(sp.Matrix(len(G), n, [x for row, _ in G for x in row]))
     rebound = [-e * (sp.Matrix([row]) * v)[0] - (1 + e) * rest for row, rest in G]
     # Symbols of the arguments keep their names.
@@ -128,14 +127,10 @@ def impulse_equations(
         mass_matrix=system.kinetic.M,
         impulses=sp.ImmutableMatrix(given),
         jacobian=sp.ImmutableMatrix(J),
-        right=sp.ImmutableMatrix([*(-x for x in held), *rebound]) if J.rows else sp.ImmutableMatrix(0, 1, []),
+        right=sp.ImmutableMatrix([*(-x for x in system.constraint_drift), *rebound])
+        if J.rows
+        else sp.ImmutableMatrix(0, 1, []),
     )
-
-
-def _moving(system: EnergyForm) -> list[sp.Expr]:
-    """Return c of J v + c = 0 of the system's own constraints."""
-    f, t = system.constraints, system.time
-    return [*(sp.Integer(0) if t is None else sp.diff(x, t) for x in f), *system.velocity_rows[1]]
 
 
 def _given(system: EnergyForm, impulses: Mapping[Any, Any]) -> list[sp.Expr]:

@@ -1,7 +1,7 @@
-"""Velocity constraints eliminated: equations of motion in independent quasi-velocities, without multipliers.
+"""Constraints eliminated: equations of motion in independent quasi-velocities, without multipliers.
 
-The rates of n coordinates satisfy A(q, t) q̇ + a(q, t) = 0, m rows. With r = n - m quasi-velocities w = B(q, t) q̇ beside
-them, D = (B; A)⁻¹ = (N E) gives every velocity that the rows allow::
+The rates of n coordinates satisfy A(q, t) q̇ + a(q, t) = 0, m rows, those of holonomic constraints first. With r = n
+- m quasi-velocities w = B(q, t) q̇ beside them, D = (B; A)⁻¹ = (N E) gives every velocity that the rows allow::
 
     q̇ = N w - E a        A N = 0        A E = 1
 
@@ -76,7 +76,7 @@ class NonholonomicEquations(EquationsOfMotion):
     determinant : sympy.Expr
         Of (B; A): where it is zero, w says nothing of some velocity, and the equations have no value.
     reactions : (m, 1) sympy.Matrix
-        λ of the velocity constraints, in coordinates, w and ẇ.
+        λ of the constraints, in coordinates, w and ẇ.
     S : sympy.Expr or None
         Gibbs's function, up to terms without ẇ, where the equations came from it.
     """
@@ -154,12 +154,8 @@ class NonholonomicEquations(EquationsOfMotion):
 
 def nonholonomic_equations(system: EnergyForm, quasi_velocities: Any, form: str) -> NonholonomicEquations:
     """Return the equations in independent quasi-velocities; `form` is one of Maggi, Hamel and Appell."""
-    if not system.velocity_constraints:
-        raise UnsupportedError(f"{system.name}: has no velocity constraints; give them as velocity_constraints=[...]")
-    if system.constraints:
-        raise UnsupportedError(
-            f"{system.name}: has holonomic constraints too; write their rates as velocity_constraints"
-        )
+    if not system.multiplier_symbols:
+        raise UnsupportedError(f"{system.name}: has no constraints; give them as velocity_constraints=[...]")
     frame = _Frame.of(system, quasi_velocities)
     derive = {"Maggi": _maggi, "Hamel": _hamel, "Appell": _appell}[form]
     return derive(system, frame, _Motion.of(system, frame))
@@ -179,10 +175,10 @@ class _Frame:
     @classmethod
     def of(cls, system: EnergyForm, choice: Any) -> _Frame:
         """Return the frame of what a user chose: names of coordinates, or definitions; the simplest one of None."""
-        n, (A, a) = len(system.coordinates), system.velocity_rows
+        n, A, a = len(system.coordinates), system.constraint_matrix, system.constraint_drift
         r = n - A.rows
         if r < 1:
-            raise InputError(f"{system.name}: {A.rows} velocity constraints leave none of {n} velocities free")
+            raise InputError(f"{system.name}: {A.rows} constraints leave none of {n} velocities free")
         if isinstance(choice, Mapping):
             w, defined = _defined(system, choice)
         else:
@@ -256,7 +252,7 @@ def _dependent(system: EnergyForm, A: sp.ImmutableMatrix) -> tuple[int, ...]:
     """Return velocities that the rows give by the others; refuse rows that depend on each other."""
     found = _places(A)
     if len(found) < A.rows:
-        raise InputError(f"{system.name}: its velocity constraints follow from each other or contradict each other")
+        raise InputError(f"{system.name}: its constraints follow from each other or contradict each other")
     return found
 
 
@@ -356,11 +352,13 @@ def _hamel(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEq
     held = {*(frame.N.free_symbols | frame.E.free_symbols)} & {system.time}
     if held or any(frame.drift):
         raise UnsupportedError(
-            f"boltzmann_hamel: {system.name} has velocity constraints that move; maggi() and appell() have them"
+            f"boltzmann_hamel: {system.name} has constraints that move; maggi() and appell() have them"
         )
     r, used = len(frame.velocities), {s.name for s in (*symbols_of(system), *frame.velocities)}
     names = [free_name(f"{x}_", used) for x in (*frame.velocities, *(f"rate{k + 1}" for k in range(frame.E.cols)))]
-    arguments, kinetic, quasi = in_quasi_velocities(system, sp.Matrix.hstack(frame.N, frame.E), names)
+    # In the first r equations no reaction stands.
+    free = EnergyForm(**{**system._arguments(), "constraints": (), "velocity_constraints": ()})
+    arguments, kinetic, quasi = in_quasi_velocities(free, sp.Matrix.hstack(frame.N, frame.E), names)
     form = EnergyForm(**arguments)
     form.__dict__["kinetic"] = kinetic
     whole = quasi_equations(form, quasi)
