@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -108,12 +107,16 @@ def _of_file(model: Model, target: str) -> Iterator[Finding]:
     from mbkit.studies import Finding
     from mbkit.studies.lint import lint
 
-    if model.sources:
-        with suppress(MbkitError):
-            found = lint(model)
-            parts = tuple(dict.fromkeys(row.part for row in found.rows))
-            says = f"no engine judges it: {found.verdict}" + (f"; mbkit lint {target}" if parts else "")
-            yield Finding("the file itself", says, parts, len(found.rows))
+    if not model.sources:
+        return
+    try:
+        found = lint(model)
+    except MbkitError as error:
+        yield Finding("the file itself", f"not judged: {error}", (), 0)
+        return
+    parts = tuple(dict.fromkeys(row.part for row in found.rows))
+    says = f"no engine judges it: {found.verdict}" + (f"; mbkit lint {target}" if parts else "")
+    yield Finding("the file itself", says, parts, len(found.rows))
 
 
 def _check_parsers(report: Report, target: str, **settings: Any) -> None:

@@ -181,10 +181,6 @@ def _comparable(at: Judged) -> Iterator[tuple[Body, Array, Array]]:
             yield body, body.inertia / np.trace(body.inertia), shape.hull.inertia / np.trace(shape.hull.inertia)
 
 
-def _flipped(inertia: Array) -> Array:
-    return np.asarray(2 * np.diag(np.diag(inertia)) - inertia)
-
-
 @check
 def sign_of_products(at: Judged) -> Iterator[LintFinding]:
     """Judge the signs of the products of inertia against the link's shapes."""
