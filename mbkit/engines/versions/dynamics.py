@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -26,6 +27,10 @@ _REFUSED: Final = {
     "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
 }
 
+
+#: A run by the engine's own integrator is left this often, s, for signals and progress; after so many steps first.
+_PERIOD: Final = 0.1
+_FIRST_STEPS: Final = 16
 
 #: Methods below that take stacks of states too: one call of the process for all of them.
 _STACKED: Final = frozenset(
@@ -295,8 +300,21 @@ class VersionDynamics(MappedDynamics):
             raise NumericalError(f"{self.engine}: its own run of {self.model.name} is not finite")
         return q, v
 
-    def own_run(self, q0: Array, v0: Array, dt: float, steps: int, method: str) -> tuple[Array, Array]:
-        """Return the same of one checked state or a stack of them; what is not finite is as the engine has it."""
+    def own_run(
+        self,
+        q0: Array,
+        v0: Array,
+        dt: float,
+        steps: int,
+        method: str,
+        tau: Array | None = None,
+        progress: Callable[[float], object] = lambda _: None,
+    ) -> tuple[Array, Array]:
+        """Return the same of one checked state or a stack of them; what is not finite is as the engine has it.
+
+        `tau` is held over each step, (steps, nv) or (N, steps, nv). `progress` gets the fraction done, and may end the
+        run by an exception.
+        """
         model = self.model
         if model.layout.reduced:
             raise UnsupportedError(f"{self.engine}: its own runs do not reduce mimic joints")
@@ -306,10 +324,21 @@ class VersionDynamics(MappedDynamics):
         if self._beside is not None and (own := [*(x.name for x in model.springs), *(x.name for x in model.couplings)]):
             raise UnsupportedError(f"{self.engine}: its own runs leave out {first_names(map(repr, own))}")
         x, u, _ = self._native(q0, v0)
-        try:
-            xs, us = self._ask("rollout", x, u, method=method, dt=dt, steps=steps)
-        except NumericalError as error:
-            raise UnsupportedError(str(error)) from None
+        forces = None if tau is None else self._torques(tau, (*np.shape(q0)[:-1], steps, model.nv))
+        parts, done, count = [(x[..., None, :], u[..., None, :])], 0, _FIRST_STEPS
+        while done < steps:
+            end, begun = min(done + count, steps), time.perf_counter()
+            held = () if forces is None else (forces[..., done:end, :],)
+            try:
+                xs, us = self._ask("rollout", x, u, *held, method=method, dt=dt, steps=end - done)
+            except NumericalError as error:
+                raise UnsupportedError(str(error)) from None
+            parts.append((xs[..., 1:, :], us[..., 1:, :]))
+            # The first call may have compiled the step.
+            count = max(_FIRST_STEPS, int(count * min(16.0, _PERIOD / (time.perf_counter() - begun))))
+            x, u, done = xs[..., -1, :], us[..., -1, :], end
+            progress(done / steps)
+        xs, us = (np.concatenate(one, axis=-2) for one in zip(*parts, strict=True))
         q = np.empty_like(xs)
         q[..., self._places.q_index] = xs
         for start, _ in model.quaternions:
@@ -317,6 +346,16 @@ class VersionDynamics(MappedDynamics):
             q[..., start : start + 4] /= np.linalg.norm(q[..., start : start + 4], axis=-1, keepdims=True)
         self._native(q)
         return q, self._force(us)
+
+    def _torques(self, tau: Array, shape: tuple[int, ...]) -> Array:
+        """Return torques in the engine's coordinates, which it holds in its own axes."""
+        out = np.broadcast_to(tau, shape)[..., self._v_index]
+        if any(out[..., part].any() for _, part in self._turned):
+            raise UnsupportedError(
+                f"{self.engine}: its own runs hold a force on a free or ball joint in the world's axes, mbkit in the "
+                "body's; use rk4, which any engine has"
+            )
+        return out
 
     def seconds(self, q: Array, v: Array, repeats: int = 200) -> float:
         """Return the shortest time of one forward dynamics in the engine's process, s, without the way there."""

@@ -11,7 +11,6 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.versions.dynamics import VersionDynamics
-from mbkit.errors import UnsupportedError
 from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
@@ -62,12 +61,10 @@ def _in_mujoco(problem: IntegrationProblem, dyn: Dynamics) -> _Rollout:
 
 
 def _in_its_process(problem: IntegrationProblem, dyn: VersionDynamics) -> _Rollout:
-    """Return the rollouts of an engine in an environment of its own, which sends no torques there."""
+    """Return the rollouts of an engine in an environment of its own."""
 
-    def rollout(integrator: str, q0: Array, v0: Array, dt: float, tau: Any, steps: int) -> tuple[Array, Array]:
-        if tau is not None and np.any(tau):
-            raise UnsupportedError(f"{problem.method} on {dyn.engine}: takes no torque; use rk4, which any engine has")
-        return dyn.own_run(q0, v0, dt, steps, integrator)
+    def rollout(integrator: str, **more: Any) -> tuple[Array, Array]:
+        return dyn.own_run(method=integrator, progress=problem.bar.update, **more)
 
     return rollout
 

@@ -105,24 +105,31 @@ class Engine:
         """Return the mass of what moves and stands, kg, and its centre of mass, m."""
         return center_of(np.array(self._m.body_mass), self._terms(q)[3])
 
-    def rollout(self, q: Any, v: Any, method: str, dt: float, steps: int) -> Any:
-        """Return qpos and qvel after each of so many steps."""
+    def rollout(self, q: Any, v: Any, tau: Any = None, *, method: str, dt: float, steps: int) -> Any:
+        """Return qpos and qvel after each of so many steps; tau is held over each, (n, steps, nv)."""
         kind = {"euler": "EULER", "rk4": "RK4", "implicitfast": "IMPLICITFAST"}.get(method)
         if kind is None:
             raise NotImplementedError(f"MJX has no integrator {method!r}; it has euler, rk4 and implicitfast")
         integrator = int(getattr(mujoco.mjtIntegrator, "mjINT_" + kind))
 
-        def run(q: Any, v: Any, dt: Any) -> Any:
+        def run(q: Any, v: Any, tau: Any, dt: Any) -> Any:
             mx = self._mx.replace(opt=self._mx.opt.replace(timestep=dt, integrator=integrator))
 
-            def step(d: Any, _: Any) -> Any:
-                d = mjx.step(mx, d)
+            def step(d: Any, tau: Any) -> Any:
+                d = mjx.step(mx, d.replace(qfrc_applied=tau))
                 return d, (d.qpos, d.qvel)
 
-            return jax.lax.scan(step, self._d.replace(qpos=q, qvel=v), None, steps)[1]
+            return jax.lax.scan(step, self._d.replace(qpos=q, qvel=v), tau)[1]
 
-        out = self._over(("rollout", method, steps), run, q, v, shared=(dt,))
-        return [np.concatenate([x[:, None], y], axis=1) for x, y in zip((q, v), out, strict=True)]
+        # A run of another length would be compiled again.
+        length = steps if steps == 1 else _LEAST * -(-steps // _LEAST)
+        parts = [(q[:, None], v[:, None])]
+        held = np.zeros((len(q), length, self._m.nv))
+        held[:, :steps] = 0.0 if tau is None else tau
+        for part in np.split(held, max(1, length // _LEAST), axis=1):
+            start = [x[:, -1] for x in parts[-1]]
+            parts.append(self._over(("rollout", method), run, *start, part, shared=(dt,)))
+        return [np.concatenate(x, axis=1)[:, : steps + 1] for x in zip(*parts, strict=True)]
 
     def seconds(self, q: Any, v: Any, repeats: int) -> Any:
         """Return the shortest time of one forward dynamics of the stack, s, of rounds of so many calls."""

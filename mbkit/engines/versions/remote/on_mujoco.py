@@ -135,15 +135,16 @@ class Engine:
         d, masses = self._set(q), np.array(self._m.body_mass)
         return [masses.sum(), masses @ np.array(d.xipos) / masses.sum()]
 
-    def rollout(self, q: Any, v: Any, method: str, dt: float, steps: int) -> Any:
-        """Return qpos and qvel after each of so many steps."""
+    def rollout(self, q: Any, v: Any, tau: Any = None, *, method: str, dt: float, steps: int) -> Any:
+        """Return qpos and qvel after each of so many steps; tau is held over each, (steps, nv)."""
         m = self._m
         before = m.opt.integrator, m.opt.timestep
         m.opt.integrator, m.opt.timestep = int(getattr(mujoco.mjtIntegrator, "mjINT_" + method.upper())), dt
         d = mujoco.MjData(m)
         d.qpos[:], d.qvel[:] = q, v
         out_q, out_v = [np.array(q)], [np.array(v)]
-        for _ in range(steps):
+        for k in range(steps):
+            d.qfrc_applied[:] = 0.0 if tau is None else tau[k]
             mujoco.mj_step(m, d)
             out_q.append(np.array(d.qpos))
             out_v.append(np.array(d.qvel))

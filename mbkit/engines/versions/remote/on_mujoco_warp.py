@@ -123,8 +123,8 @@ class Engine:
         """Return the mass of what moves and stands, kg, and its centre of mass, m."""
         return center_of(np.array(self._m.body_mass), self._placed(q).xipos.numpy())
 
-    def rollout(self, q: Any, v: Any, method: str, dt: float, steps: int) -> Any:
-        """Return qpos and qvel after each of so many steps."""
+    def rollout(self, q: Any, v: Any, tau: Any = None, *, method: str, dt: float, steps: int) -> Any:
+        """Return qpos and qvel after each of so many steps; tau is held over each, (n, steps, nv)."""
         if method not in _METHODS:
             raise NotImplementedError(f"no integrator {method!r} here; there are {', '.join(_METHODS)}")
         opt, d = self._w.opt, self._at(q, v)
@@ -132,7 +132,9 @@ class Engine:
         opt.integrator = int(getattr(mujoco.mjtIntegrator, "mjINT_" + method.upper()))
         opt.timestep.fill_(dt)
         out = [(np.array(q), np.array(v))]
-        for _ in range(steps):
+        for k in range(steps):
+            if tau is not None:
+                d.qfrc_applied.assign(tau[:, k])
             mjw.step(self._w, d)
             # A view of memory that the next step overwrites.
             out.append((np.array(d.qpos.numpy()), np.array(d.qvel.numpy())))

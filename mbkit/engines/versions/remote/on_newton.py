@@ -39,6 +39,7 @@ class Engine:
                 self._world[at : at + 6, at : at + 6] = np.kron(np.eye(2), frame)
                 self._free.append((at, b.joint_q_start[j], b.joint_child[j]))
         self._models: dict[tuple[int, bool], Any] = {}
+        self._solvers: dict[tuple[int, str], Any] = {}
 
     def joints(self) -> dict[str, Any]:
         """Return the places of each joint's numbers in joint_q and joint_qd."""
@@ -136,17 +137,28 @@ class Engine:
             out[:, linear] += np.cross(out[:, angular], q[:, at_q : at_q + 3]) + np.cross(v[:, angular], v[:, linear])
         return out
 
-    def rollout(self, q: Any, v: Any, method: str, dt: float, steps: int) -> Any:
-        """Return coordinates and velocities after each of so many steps of one of Newton's solvers."""
+    def _solver(self, model: Any, n: int, method: str) -> Any:
+        if (n, method) not in self._solvers:
+            if method == "featherstone":
+                solver = newton.solvers.SolverFeatherstone(model, angular_damping=0.0)
+            elif method in _OF_MUJOCO:
+                solver = newton.solvers.SolverMuJoCo(model, integrator=method, disable_contacts=True)
+            else:
+                raise NotImplementedError(f"no integrator {method!r}; there are featherstone, {', '.join(_OF_MUJOCO)}")
+            self._solvers[n, method] = solver
+        return self._solvers[n, method]
+
+    def rollout(self, q: Any, v: Any, tau: Any = None, *, method: str, dt: float, steps: int) -> Any:
+        """Return coordinates and velocities after each of so many steps of one of Newton's solvers.
+
+        tau, (n, steps, nv), is held over each; not on free joints, whose forces Newton turns.
+        """
         model, state, *_ = self._set(q, v, passive=True)
-        if method == "featherstone":
-            solver = newton.solvers.SolverFeatherstone(model, angular_damping=0.0)
-        elif method in _OF_MUJOCO:
-            solver = newton.solvers.SolverMuJoCo(model, integrator=method, disable_contacts=True)
-        else:
-            raise NotImplementedError(f"no integrator {method!r}; there are featherstone, {', '.join(_OF_MUJOCO)}")
+        solver = self._solver(model, len(q), method)
         out, after, control = [(np.array(q), np.array(v))], model.state(), model.control()
-        for _ in range(steps):
+        for k in range(steps):
+            if tau is not None:
+                control.joint_f.assign(tau[:, k].ravel())
             solver.step(state, after, control, None, dt)
             state, after = after, state
             x, u = (np.array(y.numpy(), float).reshape(len(q), -1) for y in (state.joint_q, state.joint_qd))
