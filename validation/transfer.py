@@ -1,0 +1,234 @@
+"""From one simulator to the other: how far each engine's own integrator is from the exact motion, and why.
+
+``python -m validation.transfer [PART ...]`` writes ``transfer.json``; a part is a robot below, or ``steps``.
+
+Each robot falls from a posture within its limits, and is held by a PD controller that samples every 2 ms, as a policy
+does. The exact motion is that of the same description under the same samples: rk853 at 1e-13 on the own derivation,
+beside Taylor's series at 1e-15. What differs by precision, by the integrator and by the model is told apart:
+
+- precision: an engine in single precision beside MuJoCo's run in double precision with the same formula and step;
+- integrator: that run in double precision beside the exact motion;
+- model: the exact motion of a changed description beside that of the right one, for each usual change.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mbkit as mb
+from mbkit.engines.versions.engine_version import engine, remote_engines
+from validation.stamp import stamp
+
+OUT = Path(__file__).parent / "transfer.json"
+#: Whether the base floats, and the name in example-robot-data.
+ROBOTS = {
+    "panda": (False, "panda_description/panda"),
+    "anymal": (True, "anymal_b_simple_description/anymal"),
+    "hyq": (False, "hyq_description/hyq_no_sensors"),
+    "talos": (False, "talos_data/talos_reduced"),
+}
+TIMES = (0.1, 1.0, 5.0)
+HOLD = 2e-3
+STEP = 2e-3
+#: Bandwidth of the controller, rad/s: kp = w² and kd = 2 w, for each unit of the inertia that a joint feels.
+BANDWIDTH = 30.0
+#: Engine, method, and the run in double precision with the same formula.
+TWIN = ("mujoco", "mujoco_euler")
+RUNS = (
+    TWIN,
+    ("mujoco", "mujoco_implicitfast"),
+    ("mujoco", "mujoco_rk4"),
+    ("drake", "drake_sap"),
+    ("mjx", "mujoco_euler"),
+    ("mjx-single", "mujoco_euler"),
+    ("newton", "newton_featherstone"),
+    ("mujoco-warp", "mujoco_rk4"),
+    ("mujoco-warp", "mujoco_euler"),
+)
+Law = Callable[[float, Any, Any], Any]
+Runs = dict[str, list[float]]
+
+
+class Case:
+    """A robot, its start, and its controller."""
+
+    def __init__(self, name: str) -> None:
+        self.floating, self.robot = ROBOTS[name]
+        self.model = mb.load(self.robot, mimic="free", floating_base=self.floating).without("friction")
+        m, self.first = self.model, 6 if self.floating else 0
+        rng = np.random.default_rng(0)
+        lower, upper = (np.concatenate([getattr(j, x) for j in m.joints]) for x in ("lower", "upper"))
+        low, high = np.maximum(lower, -1.0), np.minimum(upper, 1.0)
+        self.q = m.neutral()
+        at = slice(m.nq - m.nv + self.first, None)
+        self.q[at] = np.clip(self.q, low + 0.1 * (high - low), high - 0.1 * (high - low))[at]
+        self.v = 0.5 * rng.standard_normal(m.nv)
+        felt = 1.0 / np.diag(np.linalg.inv(mb.dynamics(m, "lagrangian").mass_matrix(self.q)))
+        self.felt = felt[self.first :]
+        self.target = self.q[at] + 0.3 * rng.choice([-1.0, 1.0], m.nv - self.first)
+
+    def order_of_file(self) -> list[int]:
+        """Return the place of each joint of the file, in its order, among the model's."""
+        text = next(r.path for r in mb.robots() if r.name == self.robot).read_text(encoding="utf-8")
+        own = list(self.model.joint_names)[1 if self.floating else 0 :]
+        return [own.index(x) for x in dict.fromkeys(re.findall(r'<joint\s+name="([^"]+)"', text)) if x in own]
+
+    def law(self, order: Any = slice(None)) -> Law:
+        """Return the controller; `order` is that in which its targets are read."""
+        kp, kd, first = BANDWIDTH**2 * self.felt, 2 * BANDWIDTH * self.felt, self.first
+
+        def torque(_: float, q: Any, v: Any) -> Any:
+            at, out = len(q) - len(v) + first, np.zeros(len(v))
+            out[first:] = kp * (self.target[order] - q[at:]) - kd * v[first:]
+            return out
+
+        return torque
+
+    def run(self, dyn: Any, law: Law | None, method: str, v: Any = None, **setting: float) -> Any:
+        """Return the trajectory at the times."""
+        more = {} if law is None else {"torque": law, "hold": HOLD}
+        start = self.q, self.v if v is None else v
+        return mb.simulate(dyn, *start, TIMES[-1], method, save=[0.0, *TIMES], doubt=False, **more, **setting)
+
+    def exact(self, model: Any, law: Law | None, **start: Any) -> Any:
+        return self.run(mb.dynamics(model, "lagrangian"), law, "rk853", rtol=1e-13, **start)
+
+
+def apart(model: Any, one: Any, other: Any) -> list[float]:
+    """Return the largest difference of a coordinate at each of the times; NaN after a run has ended."""
+    out = [math.nan] * len(TIMES)
+    for k in range(1, min(len(one.t), len(other.t))):
+        out[k - 1] = float(np.abs(model.difference(one.q[k], other.q[k])).max())
+    return out
+
+
+def energy(dyn: Any, run: Any) -> list[float]:
+    """Return kinetic plus potential energy at the start and the times, J, of the exact model."""
+    total = np.full(len(TIMES) + 1, math.nan)
+    total[: len(run.t)] = dyn.kinetic_energy(run.q, run.v) + dyn.potential_energy(run.q)
+    return [float(x) for x in total]
+
+
+def motion(case: Case, law: Law | None, row: dict[str, Any]) -> Iterator[None]:
+    """Fill the row of a robot's motion; yield after each run."""
+    model, own = case.model, mb.dynamics(case.model, "lagrangian")
+    truth = case.exact(model, law)
+    other = case.run(own, law, "taylor", rtol=1e-15) if law is None else case.run(own, law, "rk853", rtol=1e-11)
+    row["floor"] = apart(model, truth, other)
+    nudge = 1e-9 * np.random.default_rng(1).choice([-1.0, 1.0], model.nv)
+    row["growth"] = [x / 1e-9 for x in apart(model, truth, case.exact(model, law, v=case.v + nudge))]
+    row["moved"] = [float(np.abs(model.difference(case.q, q)).max()) for q in truth.q[1:]]
+    row["energy"] = energy(own, truth)
+    yield
+    runs = row.setdefault("runs", {})
+    for step in (STEP, STEP / 10):
+        twin = case.run(mb.dynamics(model, TWIN[0]), law, TWIN[1], dt=step)
+        for name, method in RUNS:
+            key = f"{name} {method} {step:g}"
+            if name == "mujoco-warp" and method == "mujoco_rk4" and step < STEP:
+                continue
+            try:
+                run = case.run(mb.dynamics(model, name), law, method, dt=step)
+            except mb.errors.MbkitError as error:
+                runs[key] = {"refused": str(error)}
+                continue
+            runs[key] = {"error": apart(model, truth, run), "energy": energy(own, run), "ended": run.stats.message}
+            if name in remote_engines() and method in (TWIN[1], "newton_featherstone"):
+                runs[key]["precision"] = apart(model, twin, run)
+            print(name, method, step, runs[key]["error"], runs[key].get("precision"), flush=True)
+            yield
+
+
+def changed(case: Case) -> dict[str, Any]:
+    """Return the changed descriptions by cause."""
+    m = case.model
+    rotors = iter(0.1 * case.felt)
+    joints = tuple(
+        j if j.name == "root_joint" else replace(j, armature=np.array([next(rotors) for _ in j.armature]))
+        for j in m.joints
+    )
+    bodies = tuple(replace(b, inertia=1.1 * b.inertia) for b in m.bodies)
+    out = {"armature": replace(m, joints=joints), "inertia": replace(m, bodies=bodies)}
+    out["gravity"] = replace(m, gravity=np.array([0.0, 0.0, -9.80665]))
+    return out | ({"damping": m.without("damping")} if m.needs.damping else {})
+
+
+def causes(case: Case, law: Law | None, row: dict[str, Any]) -> None:
+    """Fill in what each cause does to the exact motion."""
+    m, truth, found = case.model, case.exact(case.model, law), row.setdefault("causes", {})
+    for cause, model in changed(case).items():
+        found[cause] = apart(m, truth, case.exact(model, law))
+    order = case.order_of_file()
+    if law is not None and order != sorted(order):
+        found["joint order"] = apart(m, truth, case.exact(m, case.law(order)))
+    if case.floating:
+        v = case.v.copy()
+        v[3:6] = mb.spatial.matrix_from_quaternion(mb.spatial.quaternion_from_rpy([0.0, 0.0, 1.0])) @ v[3:6]
+        found["frame of the base"] = apart(m, truth, case.exact(m, law, v=v))
+
+
+def steps() -> dict[str, Any]:
+    """Return errors after 1 s of a Panda that falls, over the step, in both precisions."""
+    case, out = Case("panda"), {}
+    truth = mb.simulate(mb.dynamics(case.model, "lagrangian"), case.q, case.v, 1.0, "rk853", rtol=1e-13, save=[0.0, 1.0])
+    for name, method in (
+        TWIN,
+        ("mujoco", "mujoco_rk4"),
+        ("newton", "newton_featherstone"),
+        ("mjx-single", "mujoco_euler"),
+        ("mjx-single", "mujoco_rk4"),
+    ):
+        dyn = mb.dynamics(case.model, name)
+        for step in (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5):
+            run = mb.simulate(dyn, case.q, case.v, 1.0, method, dt=step, save=[0.0, 1.0], doubt=False)
+            out.setdefault(f"{name} {method}", []).append([step, float(np.abs(truth.q[-1] - run.q[-1]).max())])
+            print(name, method, out[f"{name} {method}"][-1], flush=True)
+    return out
+
+
+def main() -> None:
+    """Measure the parts one after the other, and write after each run."""
+    warnings.simplefilter("ignore")
+    wanted = sys.argv[1:] or [*ROBOTS, "steps"]
+
+    def write(part: str, value: Any) -> None:
+        # Another process may measure other parts.
+        held = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
+        robots = held.get("robots", {})
+        text = {"times": TIMES, "hold": HOLD, "step": STEP, "bandwidth": BANDWIDTH}
+        text |= {"engines": {name: engine(name).version for name in remote_engines()}}
+        text |= {"steps": value if part == "steps" else held.get("steps", {})}
+        text |= {"robots": robots | ({part: value} if part in ROBOTS else {}), **stamp()}
+        OUT.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+    for part in wanted:
+        if part == "steps":
+            write(part, steps())
+            continue
+        case = Case(part)
+        rows: dict[str, Any] = {"floating": case.floating, "nv": case.model.nv, "passive": {}, "controlled": {}}
+        laws = {"passive": None, "controlled": case.law()}
+        for name, law in laws.items():
+            causes(case, law, rows[name])
+        write(part, rows)
+        going = [motion(case, law, rows[name]) for name, law in laws.items()]
+        while going:
+            for one in tuple(going):
+                if next(one, going) is going:
+                    going.remove(one)
+                write(part, rows)
+            print(part, flush=True)
+
+
+if __name__ == "__main__":
+    main()
