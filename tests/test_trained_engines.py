@@ -241,6 +241,40 @@ def test_messages_name_stacks():
     assert head["stacked"]
 
 
+# A run in another process.
+
+ROLLOUT = """
+
+    def rollout(self, q, v, tau=None, *, method, dt, steps):
+        calls.append(steps)
+        import time
+        time.sleep(0.01 * steps)
+        out = [(q, v)]
+        for k in range(steps):
+            q = q + dt * v + (0.0 if tau is None else tau[:, k])
+            out.append((q, v))
+        return [np.stack(x, axis=1) for x in zip(*out)]
+"""
+
+
+def test_a_run_in_another_process_is_left_so_that_it_can_be_ended(one_of_ones_own, monkeypatch):
+    monkeypatch.setitem(globals(), "ENGINE", "import numpy as np\n" + ENGINE.rstrip() + ROLLOUT)
+    dyn = one_of_ones_own()
+    done = []
+
+    def enough(fraction):
+        done.append(fraction)
+        if fraction > 0.1:
+            raise TimeoutError
+
+    with pytest.raises(TimeoutError):
+        dyn.own_run(np.zeros(2), np.ones(2), 1e-3, 1000, "any", progress=enough)
+    assert 0.1 < done[-1] < 0.2
+    q, _ = dyn.own_run(np.zeros(2), np.ones(2), 1e-3, 40, "any", np.ones(2))
+    assert q.shape == (41, 2)
+    assert q[-1] == pytest.approx([40.04, 40.04]), "no step is lost between two calls"
+
+
 # The engines themselves, where their environments are.
 
 
@@ -314,6 +348,40 @@ def test_own_integrators_have_their_order(real):
         assert errors[0] < tolerance, method
         if method == "newton_featherstone":
             assert errors[1] < 0.65 * errors[0]
+
+
+# Newton's SolverMuJoCo damps its Euler implicitly.
+@pytest.mark.parametrize(("method", "twin"), [("mujoco_rk4", "mujoco_rk4"), ("newton_featherstone", "mujoco_euler")])
+def test_own_runs_take_torques_that_a_controller_samples(real, method, twin):
+    """As MuJoCo's run of the same formula and step, to what single precision costs a hundred steps."""
+    if method == "newton_featherstone" and real.engine != "newton":
+        pytest.skip("Newton's own")
+    model = floating(("root", "hip", "foot", "neck"))
+    dyn, mujoco = mb.dynamics(model, real), mb.dynamics(model, "mujoco")
+    q0, v0 = model.random_state(5)
+
+    def law(_, q, v):
+        out = np.zeros(model.nv)
+        out[6:8] = 30.0 * (0.4 - q[7:9]) - 3.0 * v[6:8]
+        return out
+
+    setting = {"dt": 2e-3, "torque": law, "hold": 4e-3, "doubt": False}
+    own = mb.simulate(dyn, q0, v0, 0.2, method, **setting)
+    same = mb.simulate(mujoco, q0, v0, 0.2, twin, **setting)
+    free = mb.simulate(mujoco, q0, v0, 0.2, twin, dt=2e-3)
+    rounding = np.abs(model.difference(same.q, own.q)).max()
+    assert rounding < 1e3 * epsilon(dyn.bits)
+    assert np.abs(model.difference(free.q, own.q)).max() > 100 * rounding
+    rows = np.zeros((50, model.nv))
+    rows[:, 6] = np.linspace(0.0, 1.0, 50)
+    whole = mb.simulate(dyn, q0, v0, 0.1, method, dt=2e-3, torque=rows)
+    same = mb.simulate(mujoco, q0, v0, 0.1, twin, dt=2e-3, torque=rows)
+    assert np.abs(model.difference(same.q, whole.q)).max() < 1e3 * epsilon(dyn.bits)
+    batch = mb.simulate(dyn, [q0, q0], v0, 0.1, method, dt=2e-3, torque=np.stack([rows, 0 * rows]))
+    assert np.abs(batch.q[0] - whole.q).max() < 1e3 * epsilon(dyn.bits)
+    assert np.abs(batch.q[1] - whole.q).max() > 100 * rounding
+    with pytest.raises(UnsupportedError, match="in the world's axes"):
+        mb.simulate(dyn, q0, v0, 0.1, method, dt=2e-3, torque=np.ones(model.nv))
 
 
 def test_a_method_that_an_engine_lacks_is_refused_by_name(real):

@@ -560,6 +560,19 @@ def test_a_sampled_controller_of_a_batch_saves_what_is_asked_for():
     np.testing.assert_allclose(exact.q, fine.q, atol=1e-9)
 
 
+@pytest.mark.parametrize("dt", [2e-3, 2e-4])
+def test_samples_far_from_zero_make_no_steps_of_rounding(dt):
+    """2,500 differences of times, a quarter of which are longer than the hold by rounding."""
+    dyn = dynamics(slider())
+    setting = {"dt": dt, "torque": lambda _, q, v: -5 * q - v, "hold": 2e-3, "save": [0.0, 0.1, 1.0, 5.0]}
+    run = simulate(dyn, [1.0], [0.0], 5.0, "semi_implicit_euler", **setting)
+    assert run.t == pytest.approx([0.0, 0.1, 1.0, 5.0], abs=1e-12)
+    assert run.stats.steps == round(5.0 / dt)
+    # An interval at the end that is no multiple of the step, and a batch.
+    ragged = simulate(dyn, [[1.0], [1.0]], [0.0], 1.0005 * 2e-3, "semi_implicit_euler", **(setting | {"save": None}))
+    assert ragged.t[-1] == pytest.approx(1.0005 * 2e-3, abs=1e-15)
+
+
 def test_a_sampled_controller_that_fails_keeps_what_it_reached():
     def control(t, q, v):
         if t > 0.35:

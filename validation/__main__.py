@@ -44,6 +44,9 @@ PARTS = {
     "trained_engines": Part(
         60, ("trained_engines.json",), "Newton, MuJoCo Warp and MJX on every robot; makes 2 GB of environments"
     ),
+    "transfer": Part(
+        40, ("transfer.json",), "four robots in six engines beside the exact motion, and what each usual change does"
+    ),
     "planted": Part(7, ("planted.json",), "a hundred planted defects, and the tests that catch them"),
     "fuzz": Part(10, ("fuzz.json",), "random and damaged files, random trees"),
     "memory": Part(14, ("memory.json",), "memory that released models leave behind"),

@@ -1,8 +1,8 @@
 """From one simulator to the other: how far each engine's own integrator is from the exact motion, and why.
 
-``python -m validation.transfer [PART ...]`` writes ``transfer.json``; a part is a robot below, or ``steps``.
+``python -m validation.transfer [PART ...]`` writes ``transfer.json``; a part is a robot below, ``steps`` or ``files``.
 
-Each robot falls from a posture within its limits, and is held by a PD controller that samples every 2 ms, as a policy
+Each robot falls from a posture within its limits, and is held by a PD controller that samples every 10 ms, as a policy
 does. The exact motion is that of the same description under the same samples: rk853 at 1e-13 on the own derivation,
 beside Taylor's series at 1e-15. What differs by precision, by the integrator and by the model is told apart:
 
@@ -30,6 +30,7 @@ from mbkit.engines.versions.engine_version import engine, remote_engines
 from validation.stamp import stamp
 
 OUT = Path(__file__).parent / "transfer.json"
+RECORD = OUT.parent / "importers.json"
 #: Whether the base floats, and the name in example-robot-data.
 ROBOTS = {
     "panda": (False, "panda_description/panda"),
@@ -38,7 +39,7 @@ ROBOTS = {
     "talos": (False, "talos_data/talos_reduced"),
 }
 TIMES = (0.1, 1.0, 5.0)
-HOLD = 2e-3
+HOLD = 1e-2
 STEP = 2e-3
 #: Bandwidth of the controller, rad/s: kp = w² and kd = 2 w, for each unit of the inertia that a joint feels.
 BANDWIDTH = 30.0
@@ -49,12 +50,12 @@ RUNS = (
     ("mujoco", "mujoco_implicitfast"),
     ("mujoco", "mujoco_rk4"),
     ("drake", "drake_sap"),
-    ("mjx", "mujoco_euler"),
     ("mjx-single", "mujoco_euler"),
     ("newton", "newton_featherstone"),
-    ("mujoco-warp", "mujoco_rk4"),
     ("mujoco-warp", "mujoco_euler"),
 )
+#: At the default step alone: a step of Warp on a CPU takes milliseconds.
+AT_DEFAULT = ("mujoco-warp",)
 Law = Callable[[float, Any, Any], Any]
 Runs = dict[str, list[float]]
 
@@ -72,6 +73,9 @@ class Case:
         self.q = m.neutral()
         at = slice(m.nq - m.nv + self.first, None)
         self.q[at] = np.clip(self.q, low + 0.1 * (high - low), high - 0.1 * (high - low))[at]
+        if self.floating:
+            # A frame of the base that is confused with another acts.
+            self.q[3:7] = [0.0, 0.0, math.sin(0.5), math.cos(0.5)]
         self.v = 0.5 * rng.standard_normal(m.nv)
         felt = 1.0 / np.diag(np.linalg.inv(mb.dynamics(m, "lagrangian").mass_matrix(self.q)))
         self.felt = felt[self.first :]
@@ -108,6 +112,7 @@ def apart(model: Any, one: Any, other: Any) -> list[float]:
     """Return the largest difference of a coordinate at each of the times; NaN after a run has ended."""
     out = [math.nan] * len(TIMES)
     for k in range(1, min(len(one.t), len(other.t))):
+        assert abs(one.t[k] - other.t[k]) < 1e-9
         out[k - 1] = float(np.abs(model.difference(one.q[k], other.q[k])).max())
     return out
 
@@ -119,34 +124,37 @@ def energy(dyn: Any, run: Any) -> list[float]:
     return [float(x) for x in total]
 
 
-def motion(case: Case, law: Law | None, row: dict[str, Any]) -> Iterator[None]:
-    """Fill the row of a robot's motion; yield after each run."""
+def truth(case: Case, law: Law | None, row: dict[str, Any]) -> Any:
+    """Return the exact motion; fill in how well it is known, and how it multiplies a small error."""
     model, own = case.model, mb.dynamics(case.model, "lagrangian")
-    truth = case.exact(model, law)
+    exact = case.exact(model, law)
     other = case.run(own, law, "taylor", rtol=1e-15) if law is None else case.run(own, law, "rk853", rtol=1e-11)
-    row["floor"] = apart(model, truth, other)
+    row["floor"] = apart(model, exact, other)
     nudge = 1e-9 * np.random.default_rng(1).choice([-1.0, 1.0], model.nv)
-    row["growth"] = [x / 1e-9 for x in apart(model, truth, case.exact(model, law, v=case.v + nudge))]
-    row["moved"] = [float(np.abs(model.difference(case.q, q)).max()) for q in truth.q[1:]]
-    row["energy"] = energy(own, truth)
-    yield
-    runs = row.setdefault("runs", {})
-    for step in (STEP, STEP / 10):
-        twin = case.run(mb.dynamics(model, TWIN[0]), law, TWIN[1], dt=step)
-        for name, method in RUNS:
-            key = f"{name} {method} {step:g}"
-            if name == "mujoco-warp" and method == "mujoco_rk4" and step < STEP:
-                continue
-            try:
-                run = case.run(mb.dynamics(model, name), law, method, dt=step)
-            except mb.errors.MbkitError as error:
-                runs[key] = {"refused": str(error)}
-                continue
-            runs[key] = {"error": apart(model, truth, run), "energy": energy(own, run), "ended": run.stats.message}
-            if name in remote_engines() and method in (TWIN[1], "newton_featherstone"):
-                runs[key]["precision"] = apart(model, twin, run)
-            print(name, method, step, runs[key]["error"], runs[key].get("precision"), flush=True)
-            yield
+    row["growth"] = [x / 1e-9 for x in apart(model, exact, case.exact(model, law, v=case.v + nudge))]
+    row["moved"] = [float(np.abs(model.difference(case.q, q)).max()) for q in exact.q[1:]]
+    row["energy"] = energy(own, exact)
+    return exact
+
+
+def motion(case: Case, law: Law | None, row: dict[str, Any], exact: Any, step: float) -> Iterator[None]:
+    """Fill in the runs of every engine at a step; yield after each."""
+    model, own, runs = case.model, mb.dynamics(case.model, "lagrangian"), row.setdefault("runs", {})
+    twin = case.run(mb.dynamics(model, TWIN[0]), law, TWIN[1], dt=step)
+    for name, method in RUNS:
+        key = f"{name} {method} {step:g}"
+        if name in AT_DEFAULT and step < STEP:
+            continue
+        try:
+            run = twin if (name, method) == TWIN else case.run(mb.dynamics(model, name), law, method, dt=step)
+        except mb.errors.MbkitError as error:
+            runs[key] = {"refused": str(error)}
+            continue
+        runs[key] = {"error": apart(model, exact, run), "energy": energy(own, run), "ended": run.stats.message}
+        if name in remote_engines():
+            runs[key]["precision"] = apart(model, twin, run)
+        print(name, method, step, runs[key]["error"], runs[key].get("precision"), flush=True)
+        yield
 
 
 def changed(case: Case) -> dict[str, Any]:
@@ -163,18 +171,45 @@ def changed(case: Case) -> dict[str, Any]:
     return out | ({"damping": m.without("damping")} if m.needs.damping else {})
 
 
-def causes(case: Case, law: Law | None, row: dict[str, Any]) -> None:
+def causes(case: Case, law: Law | None, row: dict[str, Any], exact: Any) -> None:
     """Fill in what each cause does to the exact motion."""
-    m, truth, found = case.model, case.exact(case.model, law), row.setdefault("causes", {})
+    m, found = case.model, row.setdefault("causes", {})
     for cause, model in changed(case).items():
-        found[cause] = apart(m, truth, case.exact(model, law))
+        found[cause] = apart(m, exact, case.exact(model, law))
     order = case.order_of_file()
     if law is not None and order != sorted(order):
-        found["joint order"] = apart(m, truth, case.exact(m, case.law(order)))
+        found["joint order"] = apart(m, exact, case.exact(m, case.law(order)))
     if case.floating:
         v = case.v.copy()
-        v[3:6] = mb.spatial.matrix_from_quaternion(mb.spatial.quaternion_from_rpy([0.0, 0.0, 1.0])) @ v[3:6]
-        found["frame of the base"] = apart(m, truth, case.exact(m, law, v=v))
+        v[3:6] = mb.spatial.matrix_from_quaternion(case.q[3:7]) @ v[3:6]
+        found["frame of the base"] = apart(m, exact, case.exact(m, law, v=v))
+
+
+def files() -> dict[str, Any]:
+    """Return on how many robots each cause can act, by what the files say and the importers' record has."""
+    record = json.loads(RECORD.read_text(encoding="utf-8"))["robots"]
+    every = [r for r in mb.robots() if r.name in record]
+    texts = {r.name: r.path.read_text(encoding="utf-8") for r in every}
+
+    def said(pattern: str) -> set[str]:
+        return {name for name, text in texts.items() if re.search(pattern, text)}
+
+    def recorded(test: Callable[[dict[str, Any]], bool]) -> set[str]:
+        return {name for name, row in record.items() if any(map(test, row.values()))}
+
+    nonzero = r'="0*(\.0*)?[1-9]'
+    found = {
+        "armature": said("armature|rotor_inertia"),
+        "damping": said(r"<dynamics[^>]*damping" + nonzero),
+        "friction": said(r"<dynamics[^>]*friction" + nonzero),
+        "mimic": said("<mimic"),
+        "joint order": recorded(lambda x: any("another order" in y for y in x.get("data", ()))),
+        "inertia refused": recorded(lambda x: "inertia" in x.get("why", "")),
+        "inertia replaced": recorded(lambda x: any(y["kind"] == "replaced inertia" for y in x.get("causes", ()))),
+        "gravity": recorded(lambda x: any(y["kind"] == "gravity" for y in x.get("causes", ()))),
+    }
+    found["inertia"] = found["inertia refused"] | found["inertia replaced"]
+    return {"robots": len(record), **{cause: len(names) for cause, names in found.items()}}
 
 
 def steps() -> dict[str, Any]:
@@ -196,10 +231,14 @@ def steps() -> dict[str, Any]:
     return out
 
 
+#: Parts that are no robot.
+WHOLE: dict[str, Callable[[], Any]] = {"files": files, "steps": steps}
+
+
 def main() -> None:
     """Measure the parts one after the other, and write after each run."""
     warnings.simplefilter("ignore")
-    wanted = sys.argv[1:] or [*ROBOTS, "steps"]
+    wanted = sys.argv[1:] or ["files", *ROBOTS, "steps"]
 
     def write(part: str, value: Any) -> None:
         # Another process may measure other parts.
@@ -207,27 +246,30 @@ def main() -> None:
         robots = held.get("robots", {})
         text = {"times": TIMES, "hold": HOLD, "step": STEP, "bandwidth": BANDWIDTH}
         text |= {"engines": {name: engine(name).version for name in remote_engines()}}
-        text |= {"steps": value if part == "steps" else held.get("steps", {})}
+        text |= {x: value if part == x else held.get(x, {}) for x in WHOLE}
         text |= {"robots": robots | ({part: value} if part in ROBOTS else {}), **stamp()}
         OUT.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
+    kept: dict[str, Any] = {}
     for part in wanted:
-        if part == "steps":
-            write(part, steps())
+        if part in WHOLE:
+            write(part, WHOLE[part]())
             continue
         case = Case(part)
-        rows: dict[str, Any] = {"floating": case.floating, "nv": case.model.nv, "passive": {}, "controlled": {}}
+        row: dict[str, Any] = {"floating": case.floating, "nv": case.model.nv, "passive": {}, "controlled": {}}
         laws = {"passive": None, "controlled": case.law()}
+        exact = {name: truth(case, law, row[name]) for name, law in laws.items()}
         for name, law in laws.items():
-            causes(case, law, rows[name])
-        write(part, rows)
-        going = [motion(case, law, rows[name]) for name, law in laws.items()]
-        while going:
-            for one in tuple(going):
-                if next(one, going) is going:
-                    going.remove(one)
-                write(part, rows)
+            causes(case, law, row[name], exact[name])
+        write(part, row)
+        kept[part] = case, laws, exact, row
+    # All robots at the default step first.
+    for step in (STEP, STEP / 10):
+        for part, (case, laws, exact, row) in kept.items():
             print(part, flush=True)
+            for name, law in laws.items():
+                for _ in motion(case, law, row[name], exact[name], step):
+                    write(part, row)
 
 
 if __name__ == "__main__":

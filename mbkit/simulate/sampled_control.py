@@ -76,11 +76,19 @@ def integrate_held(
             failed = error
             break
         rows.append(row)
-        steps = max(1, round((end - begin) / step)) if fixed else 1
+        length, steps = end - begin, 1
+        if fixed:
+            # The difference of two late times is rounded, and no multiple of the step.
+            whole = round(length / step)
+            length = whole * step if abs(length / step - whole) <= _MULTIPLE else length
+            steps = Grid.of(begin, length, step).steps
         held = row if batch is None else np.broadcast_to(row[:, None], (batch, steps, model.nv))
         kept = None if fixed else _kept(wanted, begin, end)
-        arguments = (q, v, end - begin, method, dt, rtol, atol, held, kept, None, None, doubt, begin)
+        arguments = (q, v, length, method, dt, rtol, atol, held, kept, None, None, doubt, begin)
         data, _ = integrate(dyn, *arguments, wrenches, wrench_axes)
+        if data.stats.finished:
+            # Where the next sample is taken.
+            data = replace(data, t=np.append(data.t[:-1], end))
         parts.append(data)
         if progress:
             _tell(progress, (end - start) / duration)
