@@ -384,6 +384,16 @@ def test_own_runs_take_torques_that_a_controller_samples(real, method, twin):
         mb.simulate(dyn, q0, v0, 0.1, method, dt=2e-3, torque=np.ones(model.nv))
 
 
+def test_newtons_euler_of_mujoco_damps_implicitly(real):
+    """What the book says of it; the others take damping as it is."""
+    b = mb.ModelBuilder("slider")
+    b.add_body("box", mass=1.0, inertia=(0.1, 0.1, 0.1))
+    b.add_joint("slide", "prismatic", parent="world", child="box", axis=(1.0, 0.0, 0.0), damping=20.0)
+    run = mb.simulate(mb.dynamics(b.build(), real), [0.0], [1.0], 0.01, "mujoco_euler", dt=0.01)
+    expected = 1 / 1.2 if real.engine == "newton" else 1 - 0.2
+    assert run.v[-1, 0] == pytest.approx(expected, rel=1e-6)
+
+
 def test_a_method_that_an_engine_lacks_is_refused_by_name(real):
     model = mb.catalog.double_pendulum()
     dyn = mb.dynamics(model, real)
