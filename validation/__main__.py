@@ -45,7 +45,7 @@ PARTS = {
         60, ("trained_engines.json",), "Newton, MuJoCo Warp and MJX on every robot; makes 2 GB of environments"
     ),
     "transfer": Part(
-        40, ("transfer.json",), "four robots in five engines beside the exact motion, and what each usual change does"
+        40, ("transfer.json",), "robots in five engines beside the exact motion, and what each usual change does"
     ),
     "planted": Part(7, ("planted.json",), "a hundred planted defects, and the tests that catch them"),
     "fuzz": Part(10, ("fuzz.json",), "random and damaged files, random trees"),
