@@ -357,6 +357,7 @@ def test_own_runs_take_torques_that_a_controller_samples(real, method, twin):
     if method == "newton_featherstone" and real.engine != "newton":
         pytest.skip("Newton's own")
     model = floating(("root", "hip", "foot"))
+    # Newton's Euler steps the centre of mass of a free body.
     dyn, mujoco = mb.dynamics(model, real), mb.dynamics(model, "mujoco")
     q0, v0 = model.random_state(5)
 
@@ -369,17 +370,18 @@ def test_own_runs_take_torques_that_a_controller_samples(real, method, twin):
     own = mb.simulate(dyn, q0, v0, 0.2, method, **setting)
     same = mb.simulate(mujoco, q0, v0, 0.2, twin, **setting)
     free = mb.simulate(mujoco, q0, v0, 0.2, twin, dt=2e-3)
+    limit = 1e3 * epsilon(dyn.bits) if method == twin else 5e-3
     rounding = np.abs(model.difference(same.q, own.q)).max()
-    assert rounding < 1e3 * epsilon(dyn.bits)
-    assert np.abs(model.difference(free.q, own.q)).max() > 100 * rounding
+    assert rounding < limit
+    assert np.abs(model.difference(free.q, own.q)).max() > 10 * rounding
     rows = np.zeros((50, model.nv))
     rows[:, 6] = np.linspace(0.0, 1.0, 50)
     whole = mb.simulate(dyn, q0, v0, 0.1, method, dt=2e-3, torque=rows)
     same = mb.simulate(mujoco, q0, v0, 0.1, twin, dt=2e-3, torque=rows)
-    assert np.abs(model.difference(same.q, whole.q)).max() < 1e3 * epsilon(dyn.bits)
+    assert np.abs(model.difference(same.q, whole.q)).max() < limit
     batch = mb.simulate(dyn, [q0, q0], v0, 0.1, method, dt=2e-3, torque=np.stack([rows, 0 * rows]))
     assert np.abs(batch.q[0] - whole.q).max() < 1e3 * epsilon(dyn.bits)
-    assert np.abs(batch.q[1] - whole.q).max() > 100 * rounding
+    assert np.abs(batch.q[1] - whole.q).max() > 1e-3
     with pytest.raises(UnsupportedError, match="in the world's axes"):
         mb.simulate(dyn, q0, v0, 0.1, method, dt=2e-3, torque=np.ones(model.nv))
 
