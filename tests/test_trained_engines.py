@@ -357,7 +357,7 @@ def test_own_runs_take_torques_that_a_controller_samples(real, method, twin):
     if method == "newton_featherstone" and real.engine != "newton":
         pytest.skip("Newton's own")
     model = floating(("root", "hip", "foot"))
-    # Newton's Euler steps the centre of mass of a free body.
+    # Newton's Euler is another one on a free base: 1.4e-3 after 0.2 s here.
     dyn, mujoco = mb.dynamics(model, real), mb.dynamics(model, "mujoco")
     q0, v0 = model.random_state(5)
 
