@@ -15,6 +15,12 @@ from mbkit.engines.linearization import ForwardDynamicsDerivatives, InverseDynam
 
 if TYPE_CHECKING:
     from mbkit.lagrangian import systems as systems
+    from mbkit.lagrangian.continua.assumed_modes import AssumedModes as AssumedModes
+    from mbkit.lagrangian.continua.beam import beam as beam
+    from mbkit.lagrangian.continua.beam import clamped_free as clamped_free
+    from mbkit.lagrangian.continua.continuum import Continuum as Continuum
+    from mbkit.lagrangian.continua.continuum import FieldEquations as FieldEquations
+    from mbkit.lagrangian.continua.ritz import NormalModes as NormalModes
     from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion as EquationsOfMotion
     from mbkit.lagrangian.from_description import from_model as from_model
     from mbkit.lagrangian.independent_coordinates import Embedded as Embedded
@@ -37,21 +43,27 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.system import QuasiLagrangian as QuasiLagrangian
 
 _HOME = {
+    "AssumedModes": "mbkit.lagrangian.continua.assumed_modes",
     "CanonicalEquations": "mbkit.lagrangian.reduction.hamilton",
     "ConservedQuantity": "mbkit.lagrangian.reduction.hamilton",
+    "Continuum": "mbkit.lagrangian.continua.continuum",
     "Embedded": "mbkit.lagrangian.independent_coordinates",
     "EquationsOfMotion": "mbkit.lagrangian.energies.equations_of_motion",
     "Equilibrium": "mbkit.lagrangian.statics.equilibrium",
+    "FieldEquations": "mbkit.lagrangian.continua.continuum",
     "FreeBodies": "mbkit.lagrangian.statics.newton_euler",
     "Hamiltonian": "mbkit.lagrangian.reduction.hamilton",
     "ImpulseEquations": "mbkit.lagrangian.reduction.impulses",
     "Integrability": "mbkit.lagrangian.reduction.nonholonomic",
     "Lagrangian": "mbkit.lagrangian.system",
     "NonholonomicEquations": "mbkit.lagrangian.reduction.nonholonomic",
+    "NormalModes": "mbkit.lagrangian.continua.ritz",
     "ProgramText": "mbkit.lagrangian.printing.program_text",
     "QuasiEquationsOfMotion": "mbkit.lagrangian.reduction.quasi_equations",
     "QuasiLagrangian": "mbkit.lagrangian.system",
     "Routhian": "mbkit.lagrangian.reduction.routh",
+    "beam": "mbkit.lagrangian.continua.beam",
+    "clamped_free": "mbkit.lagrangian.continua.beam",
     "program": "mbkit.lagrangian.printing.program_text",
     "from_model": "mbkit.lagrangian.from_description",
     "from_particles": "mbkit.lagrangian.statics.virtual_work",

@@ -72,6 +72,8 @@ class ExpressionPrinter:
             inside = [self._rank(s)[0] for s in base.free_symbols]
             parameters = max(inside, default=0) <= 4 and not base.has(sp.sin, sp.cos)
             return (min(inside, default=4) if parameters else 4.7, 0, False, str(base))
+        if isinstance(base, (AppliedUndef, sp.Derivative)) and not base.free_symbols & self._moving.keys():
+            return (4, 0, False, str(base))
         if isinstance(base, sp.Function):
             return (12, *self._place(base.args[0]), base.func is sp.cos, str(base))
         return (11, 0, False, str(base))

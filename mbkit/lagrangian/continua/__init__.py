@@ -1,0 +1,1 @@
+"""Strings and beams on paper: Hamilton's principle of one-dimensional continua, and assumed modes."""

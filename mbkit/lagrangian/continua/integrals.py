@@ -1,0 +1,192 @@
+"""Integrals of products of mode shapes over a continuum: exact of polynomials, else to some 30 digits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, Final
+
+import mpmath
+import sympy as sp
+from mpmath.calculus.quadrature import GaussLegendre
+
+from mbkit.errors import InputError, NumericalError
+from mbkit.lagrangian.energies.symbols import plain
+
+#: Of all shapes the place between 0 and 1, from end to end.
+XI: Final = sp.Symbol("xi", real=True)
+DIGITS: Final = 50
+#: Orders of two rules of Gauss and Legendre, of 48 and 96 nodes, whose results are compared.
+_ORDERS: Final = (5, 6)
+#: What two rules may differ by, and what is zero, of the integral of the absolute value.
+_SAME: Final = 1e-22
+#: Denominators of numbers that are written as quotients.
+_READ: Final = 10_000
+
+
+@lru_cache(4)
+def _rule(order: int) -> list[tuple[Any, Any]]:
+    with mpmath.workdps(DIGITS):
+        precision = mpmath.mp.prec
+        nodes: list[tuple[Any, Any]] = GaussLegendre(mpmath.mp).get_nodes(0, 1, order, precision)
+        return nodes
+
+
+class Shape:
+    """A function of ξ, with its derivatives as polynomials or as values at the nodes of a rule."""
+
+    def __init__(self, x: sp.Expr) -> None:
+        self.expression = x
+        self.polynomial = sp.Poly(x, XI, domain="QQ") if x.is_polynomial(XI) and not x.atoms(sp.Float) else None
+        self._slopes: dict[int, Shape] = {0: self}
+
+    def slope(self, times: int) -> Shape:
+        """Return a derivative."""
+        if times not in self._slopes:
+            before = self.slope(times - 1)
+            x = before.polynomial.diff().as_expr() if before.polynomial is not None else before.expression.diff(XI)
+            self._slopes[times] = Shape(x)
+        return self._slopes[times]
+
+    def __call__(self, xi: Any) -> Any:
+        """Return the value at a place, in 50 digits."""
+        with mpmath.workdps(DIGITS):
+            return self._function(mpmath.mpf(xi))
+
+    @property
+    def _function(self) -> Any:
+        if "_made" not in self.__dict__:
+            x = sp.horner(self.expression, XI) if self.expression.is_polynomial(XI) else self.expression
+            self.__dict__["_made"] = sp.lambdify(XI, x, "mpmath")
+        return self.__dict__["_made"]
+
+    def at_nodes(self, order: int) -> list[Any]:
+        """Return the values at the nodes of a rule."""
+        key = f"_nodes{order}"
+        if key not in self.__dict__:
+            with mpmath.workdps(DIGITS):
+                self.__dict__[key] = [mpmath.mpf(self._function(x)) for x, _ in _rule(order)]
+        values: list[Any] = self.__dict__[key]
+        return values
+
+
+class Integrals:
+    """∫₀¹ f(ξ) φ_a φ_b ... dξ, each once."""
+
+    def __init__(self, shapes: Sequence[Shape]) -> None:
+        self._shapes = shapes
+        self._weights: dict[sp.Expr, Shape] = {}
+        self._products: dict[Any, sp.Poly] = {}
+        self._done: dict[Any, sp.Expr] = {}
+
+    def __call__(self, weight: sp.Expr, factors: tuple[tuple[int, int], ...]) -> sp.Expr:
+        """Return the integral; each factor is a shape's number and its derivative.
+
+        Raises
+        ------
+        NumericalError
+            A function that is not smooth enough for 22 digits.
+        """
+        key = weight, tuple(sorted(factors))
+        if key not in self._done:
+            if weight not in self._weights:
+                self._weights[weight] = Shape(weight)
+            parts = [self._weights[weight], *(self._shapes[i].slope(k) for i, k in key[1])]
+            exact = all(p.polynomial is not None for p in parts)
+            self._done[key] = _of_polynomials(parts) if exact else _by_quadrature(parts)
+        return self._done[key]
+
+    def of_power(self, weight: sp.Expr, power: int) -> Any:
+        """Return ∫₀¹ f ξ^n dξ in the digits of mpmath."""
+        if weight.is_polynomial(XI):
+            rows = sp.Poly(weight, XI).terms()
+            return sum(mpmath.mpf(sp.Float(c, mpmath.mp.dps)) / (k[0] + power + 1) for k, c in rows)
+        return mpmath.mpf(self(weight * XI**power, ()))
+
+
+def _of_polynomials(parts: Sequence[Shape]) -> sp.Expr:
+    out = parts[0].polynomial
+    for p in parts[1:]:
+        out = out * p.polynomial
+    return number(sum((c / (k[0] + 1) for k, c in out.terms()), sp.Integer(0)))
+
+
+def _by_quadrature(parts: Sequence[Shape]) -> sp.Expr:
+    totals = []
+    with mpmath.workdps(DIGITS):
+        for order in _ORDERS:
+            products = [mpmath.fprod(x) for x in zip(*(p.at_nodes(order) for p in parts), strict=True)]
+            weights = [w for _, w in _rule(order)]
+            total = mpmath.fdot(weights, products)
+            size = mpmath.fdot(weights, map(abs, products))
+            totals.append(total)
+        if abs(totals[0] - totals[1]) > _SAME * size:
+            shown = " * ".join(f"({p.expression})" for p in parts)
+            raise NumericalError(
+                f"shapes: the integral of {shown} from 0 to 1 does not settle to 22 digits; give functions that are "
+                "smooth between the ends and vary less, or polynomials"
+            )
+        if abs(totals[1]) < _SAME * size:
+            return sp.Integer(0)
+        return number(sp.Float(totals[1], 40))
+
+
+def number(x: sp.Expr) -> sp.Expr:
+    """Return a number as a short quotient where it is one, else with 20 digits."""
+    x = sp.sympify(x)
+    if x.is_Rational and x.q <= _READ:
+        return x
+    near = sp.Rational(str(x.n(30))).limit_denominator(24)
+    if near != 0 and abs(x - near) < _SAME * abs(near):
+        return near
+    return sp.Float(x, 20)
+
+
+def read_shape(what: str, source: Any, x: sp.Symbol, ends: tuple[Any, ...]) -> Shape:
+    """Return a shape φ(x) as a function of ξ with x = lower + (upper - lower) ξ.
+
+    Raises
+    ------
+    InputError
+        Other symbols than x and those of the ends.
+    """
+    lower, upper = ends
+    out = sp.sympify(source).subs(x, lower + (upper - lower) * XI)
+    out = sp.expand(out) if out.is_polynomial(XI) else out.replace(lambda e: e.is_Function, _inside)
+    left = out.free_symbols - {XI}
+    if left:
+        out = sp.simplify(out)
+        left = out.free_symbols - {XI}
+    if left:
+        raise InputError(
+            f"{what}: {source} holds {plain(left)} beside {x}/length; a shape is a function of the place between the "
+            "ends alone: put numbers in first"
+        )
+    return Shape(out)
+
+
+def _inside(e: sp.Expr) -> sp.Expr:
+    return e.func(*(sp.cancel(a) for a in e.args))
+
+
+def weights_of(c: sp.Expr, x: sp.Symbol, ends: tuple[Any, ...], what: str) -> Mapping[sp.Expr, sp.Expr]:
+    """Return a coefficient as functions of ξ, each with its factor.
+
+    Raises
+    ------
+    InputError
+        A function of x with parameters in it that do not go out with the length.
+    """
+    lower, upper = ends
+    out: dict[sp.Expr, sp.Expr] = {}
+    for term in sp.Add.make_args(sp.expand(sp.expand(c).subs(x, lower + (upper - lower) * XI))):
+        factor, f = term.as_independent(XI, as_Add=False)
+        f = sp.simplify(f) if f.free_symbols - {XI} else f
+        again, f = f.as_independent(XI, as_Add=False)
+        if f.free_symbols - {XI} or f.atoms(sp.core.function.AppliedUndef):
+            raise InputError(
+                f"{what}: {term} depends on the place in a way that holds {plain(f.free_symbols - {XI}) or f}; "
+                "put numbers in first, or write it with x/length"
+            )
+        out[f] = out.get(f, sp.Integer(0)) + factor * again
+    return out

@@ -1,0 +1,203 @@
+"""Modes of free vibration of a continuum by Ritz's method, with powers of x as shapes, in 100 digits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+import mpmath
+import numpy as np
+import sympy as sp
+
+from mbkit._check import Array, real
+from mbkit._check import count as counted
+from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.lagrangian.continua.integrals import Integrals, weights_of
+from mbkit.lagrangian.continua.reduction import terms
+from mbkit.lagrangian.energies.symbols import name_of, plain
+
+if TYPE_CHECKING:
+    from mbkit.lagrangian.continua.continuum import Continuum
+
+
+@dataclass(frozen=True, repr=False)
+class NormalModes:
+    """Modes of free vibration, for `Continuum.discretized` and for `beam`.
+
+    Attributes
+    ----------
+    frequencies : (n,) array
+        Circular, rad/s; zero of a motion as a rigid body.
+    shapes : tuple
+        Polynomials in x, each with ∫ of the inertia = 1 kg m² at the values that were given.
+    """
+
+    frequencies: Array
+    shapes: tuple[Any, ...]
+
+    def __repr__(self) -> str:
+        return f"<NormalModes: {', '.join(f'{x:.6g}' for x in self.frequencies)} rad/s>"
+
+
+#: Digits of Ritz's matrices, of which monomials cost as many as there are.
+_DIGITS: Final = 120
+#: Monomials for n modes, and how many more have to give the same frequencies.
+_FIRST, _MORE, _ROUNDS = 12, 6, 4
+_SETTLED: Final = 1e-11
+#: Of a diagonal entry, what rounding leaves of a pivot that is zero; of the slowest motion, that of one that is rigid.
+_ZERO: Final = 1e-60
+_RIGID: Final = 1e-12
+
+
+def normal_modes(system: Continuum, count: int, values: Mapping[Any, float]) -> NormalModes:
+    """Return what `Continuum.normal_modes` does."""
+    count = counted("count", count, least=1)
+    held = system.T + system.V + sp.Add(*system.ends, *system.T_ends.values(), *system.V_ends.values())
+    own = held.free_symbols - {system.jets.x, *system.jets.among(held)}
+    given = {name_of(s): sp.Rational(real(f"values[{s}]", x)) for s, x in values.items()}
+    missing = [s for s in own if s.name not in given]
+    if missing:
+        raise InputError(f"values: no value for {plain(missing)}; a mode of free vibration takes one of each parameter")
+    ritz = _Ritz(system, {s: given[s.name] for s in own})
+    before: Any = None
+    for step in range(_ROUNDS):
+        squares, vectors = ritz.eigenpairs(2 * count + _FIRST + _MORE * step, count)
+        if before is not None and (np.abs(before - squares) <= _SETTLED * squares.max()).all():
+            break
+        before = squares
+    else:
+        raise NumericalError(
+            f"values: the frequencies do not settle to ten digits with {2 * count + _FIRST + _MORE * step} powers of "
+            "x; T and V need coefficients that are smooth between the ends, and not too many modes at once"
+        )
+    lower, upper = system.ends
+    place = (system.jets.x - lower) / (upper - lower)
+    names = [f.func.__name__ for f in system.jets.fields]
+    shapes: list[Any] = []
+    for mode in vectors:
+        own_shapes = [sp.Add(*(sp.Float(c, _DIGITS) * place**p for p, c in enumerate(rows))) for rows in mode]
+        shapes.append(dict(zip(names, own_shapes, strict=True)) if len(names) > 1 else own_shapes[0])
+    return NormalModes(np.sqrt(squares), tuple(shapes))
+
+
+class _Ritz:
+    """Mass and stiffness of the powers ξ^p of each field, which are near to dependent: hence the digits."""
+
+    def __init__(self, system: Continuum, numbers: Mapping[sp.Symbol, sp.Expr]) -> None:
+        self._system, self._numbers = system, numbers
+        self._length = (system.ends[1] - system.ends[0]).subs(numbers)
+        self._integrals = Integrals([])
+        #: Pairs of derivatives, each with a function of two powers.
+        self._pairs: list[tuple[Any, Any, Any]] = []
+        for sign, what, x in ((1, "T", system.T), (-1, "V", system.V)):
+            self._read(what, sign * x.subs(numbers), self._along(what))
+        for sign, what, parts in ((1, "T_ends", system.T_ends), (-1, "V_ends", system.V_ends)):
+            for end, x in parts.items():
+                self._read(what, sign * x.subs(numbers), self._at(end))
+
+    def _read(self, what: str, x: sp.Expr, measure: Any) -> None:
+        for product, c in terms(self._system, what, x):
+            if len(product) > 2:
+                raise UnsupportedError(f"{what}: modes of free vibration are of quadratic energies, got {product} in it")
+            if len(product) == 2:
+                orders = [self._system.jets.order(s) for s in product]
+                self._pairs.append((*orders, measure(c)))
+
+    def _along(self, what: str) -> Any:
+        def measure(c: sp.Expr) -> Any:
+            system = self._system
+            ends = tuple(e.subs(self._numbers) for e in system.ends)
+            weights = [(f, mpmath.mpf(sp.Float(k, _DIGITS))) for f, k in weights_of(c, system.jets.x, ends, what).items()]
+            length = mpmath.mpf(sp.Float(self._length, _DIGITS))
+            return cache(lambda n: length * sum(k * self._integrals.of_power(f, n) for f, k in weights))
+
+        return measure
+
+    def _at(self, end: sp.Expr) -> Any:
+        place = self._system.ends.index(end)
+
+        def measure(c: sp.Expr) -> Any:
+            value = mpmath.mpf(sp.Float(c.subs(self._system.jets.x, end.subs(self._numbers)), _DIGITS))
+            return lambda n: value if place or n == 0 else mpmath.mpf(0)
+
+        return measure
+
+    def _basis(self, powers: int) -> Any:
+        """Return columns of powers, field by field, that keep what is fixed."""
+        fields = len(self._system.jets.fields)
+        rows = []
+        for place, end in enumerate(self._system.ends):
+            for s in self._system.fixed[end]:
+                field, (along, _) = self._system.jets.order(s)
+                row = [sp.Integer(0)] * (fields * powers)
+                for p in range(along, powers):
+                    row[field * powers + p] = sp.ff(p, along) * sp.Integer(place) ** (p - along)
+                rows.append(row)
+        free = sp.Matrix(rows).nullspace() if rows else [sp.eye(fields * powers)[:, k] for k in range(fields * powers)]
+        return mpmath.matrix([[mpmath.mpf(int(x.p)) / int(x.q) for x in sp.Matrix.hstack(*free)[i, :]] for i in range(fields * powers)])
+
+    def _matrices(self, powers: int) -> tuple[Any, Any]:
+        n = len(self._system.jets.fields) * powers
+        forms = {rates: mpmath.matrix(n, n) for rates in range(3)}
+        length = mpmath.mpf(sp.Float(self._length, _DIGITS))
+        for (f, first), (g, second), of_power in self._pairs:
+            scale, rates = length ** (first[0] + second[0]), first[1] + second[1]
+            rows = [math.perm(p, first[0]) for p in range(powers)], [math.perm(p, second[0]) for p in range(powers)]
+            for p in range(first[0], powers):
+                for r in range(second[0], powers):
+                    x = rows[0][p] * rows[1][r] * of_power(p + r - first[0] - second[0]) / scale
+                    i, j = f * powers + p, g * powers + r
+                    if rates == 1 and first[1]:
+                        i, j = j, i
+                    forms[rates][i, j] += x
+                    if rates != 1:
+                        forms[rates][j, i] += x
+        G = forms[1]
+        if mpmath.mnorm(G - G.T, mpmath.inf) > _ZERO * mpmath.mnorm(G, mpmath.inf):
+            raise UnsupportedError(
+                "T: a term of a deflection and another one's rate couples the modes like a gyroscope, and they have no "
+                "shapes of real numbers; take shapes of the system at rest, and mbkit.simulate"
+            )
+        return forms[2], -forms[0]
+
+    def eigenpairs(self, powers: int, count: int) -> tuple[Array, list[list[list[Any]]]]:
+        """Return the least ω², and for each the coefficients of the powers, field by field."""
+        with mpmath.workdps(_DIGITS):
+            B = self._basis(powers)
+            M, K = (B.T * A * B for A in self._matrices(powers))
+            if _cholesky(M) is None:
+                raise NumericalError("T: some shape of a field has no kinetic energy, or a negative one")
+            shift, L = mpmath.mpf(0), _cholesky(K)
+            if L is None:
+                # Motions as a rigid body: what is left of them is small beside the slowest other one.
+                ratios = [K[i, i] / M[i, i] for i in range(K.rows)]
+                shift = min((x for x in ratios if x > _ZERO * max(ratios)), default=mpmath.mpf(1))
+                L = _cholesky(K + shift * M)
+            if L is None:
+                raise NumericalError("values: the state of rest is not stable: some shape lowers the potential energy")
+            inverse = mpmath.inverse(L)
+            flexibility = np.array((inverse * M * inverse.T).tolist(), dtype=np.float64)
+            # The largest flexibilities are the slowest modes, and exact to rounding.
+            sizes, ways = np.linalg.eigh((flexibility + flexibility.T) / 2)
+            squares = 1 / sizes[::-1][:count] - float(shift)
+            squares[np.abs(squares) < _RIGID * float(shift)] = 0.0
+            columns = inverse.T * mpmath.matrix(ways[:, ::-1][:, :count].tolist())
+            out = []
+            for k in range(count):
+                # The sign in which the upper end goes up.
+                own = B * columns[:, k] / mpmath.sqrt(sizes[-1 - k])
+                sign = mpmath.sign(mpmath.fsum(own[:powers])) or 1
+                out.append([[sign * x for x in own[f * powers : (f + 1) * powers]] for f in range(B.rows // powers)])
+            return squares, out
+
+
+def _cholesky(A: Any) -> Any:
+    """Return L of A = L Lᵀ; None where A is not positive definite."""
+    try:
+        L = mpmath.cholesky(A)
+    except ValueError:
+        return None
+    return None if any(L[i, i] ** 2 <= _ZERO * A[i, i] for i in range(A.rows)) else L
