@@ -160,11 +160,12 @@ class ExpressionPrinter:
         if isinstance(x, sp.Abs):
             return f"|{self.text(x.args[0])}|"
         if isinstance(x, sp.Derivative) and len(x.expr.args) == 1 and x.variables[0] == x.expr.args[0]:
-            return f"{x.expr.func.__name__}{'′' * x.derivative_count}({self.text(x.expr.args[0])})"
+            return f"{written(x.expr.func.__name__)}{'′' * x.derivative_count}({self.text(x.expr.args[0])})"
         if isinstance(x, sp.Function) and len(x.args) == 1:
             space = " " if isinstance(x, (sp.sin, sp.cos, sp.tan)) else ""
             text = self._argument(x.args[0]) if space else f"({self.text(x.args[0])})"
-            return f"{x.func.__name__}{space if not text.startswith('(') else ''}{text}"
+            name = written(x.func.__name__) if isinstance(x, AppliedUndef) else x.func.__name__
+            return f"{name}{space if not text.startswith('(') else ''}{text}"
         if x.is_Mul:
             return self._product(x)
         return one_line(str(x))

@@ -151,15 +151,22 @@ class Continuum:
     def _check(self) -> None:
         jets, most = self.jets, self.orders
         self.jets.check_parameters({"T": self.T, "V": self.V} | {"ends": sp.Add(*self.ends)})
-        for what, parts in (("T_ends", self.T_ends), ("V_ends", self.V_ends)):
-            for e, x in parts.items():
-                for s in jets.among(x):
-                    field, (along, _) = jets.order(s)
-                    if along >= most[field]:
-                        raise InputError(
-                            f"{what}[{e}]: {s} cannot be passed on: T and V hold derivatives of {jets.fields[field]} "
-                            f"along {jets.x} of order {most[field]} at most, so that an end holds those below"
-                        )
+        ends = [(what, e, x) for what in ("T_ends", "V_ends") for e, x in getattr(self, what).items()]
+        parts = [("T", self.T), ("V", self.V), *((f"{what}[{e}]", x) for what, e, x in ends)]
+        parts += [(f"forces[{jets.fields[k]}]", x) for k, x in self.forces.items()]
+        for what, x in parts:
+            for s in jets.among(x):
+                if jets.order(s)[1][1] > (0 if what.startswith("V") else 1):
+                    most_rates = "no rates" if what.startswith("V") else "no second derivatives by the time"
+                    raise InputError(f"{what}: expected {most_rates} of the fields, got {s}")
+        for what, e, x in ends:
+            for s in jets.among(x):
+                field, (along, _) = jets.order(s)
+                if along >= most[field]:
+                    raise InputError(
+                        f"{what}[{e}]: {s} cannot be passed on: T and V hold derivatives of {jets.fields[field]} along "
+                        f"{jets.x} of order {most[field]} at most, so that an end holds those below"
+                    )
         for e, conditions in self.fixed.items():
             for c in conditions:
                 if c not in jets.among(c) or jets.order(c)[1][1] or jets.order(c)[1][0] >= most[jets.order(c)[0]]:
@@ -170,8 +177,7 @@ class Continuum:
     def orders(self) -> tuple[int, ...]:
         """The highest derivative of each field along x in T and V."""
         found = [self.jets.order(s) for s in self.jets.among(self.T - self.V)]
-        orders = tuple(max((o[0] for f, o in found if f == k), default=0) for k in range(len(self.jets.fields)))
-        return orders
+        return tuple(max((o[0] for f, o in found if f == k), default=0) for k in range(len(self.jets.fields)))
 
     def equations(self) -> FieldEquations:
         """Return the partial differential equations and all boundary conditions.

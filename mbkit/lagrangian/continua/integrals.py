@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Final
 
 import mpmath
@@ -37,37 +38,36 @@ class Shape:
 
     def __init__(self, x: sp.Expr) -> None:
         self.expression = x
-        self.polynomial = sp.Poly(x, XI, domain="QQ") if x.is_polynomial(XI) and not x.atoms(sp.Float) else None
+        self._nodes: dict[int, list[Any]] = {}
         self._slopes: dict[int, Shape] = {0: self}
+
+    @cached_property
+    def polynomial(self) -> sp.Poly | None:
+        """The function with exact coefficients, where it has such."""
+        exact = self.expression.is_polynomial(XI) and not self.expression.atoms(sp.Float)
+        return sp.Poly(self.expression, XI, domain="QQ") if exact else None
 
     def slope(self, times: int) -> Shape:
         """Return a derivative."""
         if times not in self._slopes:
-            before = self.slope(times - 1)
-            x = before.polynomial.diff().as_expr() if before.polynomial is not None else before.expression.diff(XI)
-            self._slopes[times] = Shape(x)
+            self._slopes[times] = Shape(self.slope(times - 1).expression.diff(XI))
         return self._slopes[times]
 
-    def __call__(self, xi: Any) -> Any:
+    @cached_property
+    def _function(self) -> Any:
+        x = self.expression
+        return sp.lambdify(XI, sp.horner(x, XI) if x.is_polynomial(XI) else x, "mpmath")
+
+    def __call__(self, xi: float) -> Any:
         """Return the value at a place, in 50 digits."""
         with mpmath.workdps(DIGITS):
-            return self._function(mpmath.mpf(xi))
-
-    @property
-    def _function(self) -> Any:
-        if "_made" not in self.__dict__:
-            x = sp.horner(self.expression, XI) if self.expression.is_polynomial(XI) else self.expression
-            self.__dict__["_made"] = sp.lambdify(XI, x, "mpmath")
-        return self.__dict__["_made"]
+            return mpmath.mpf(self._function(mpmath.mpf(xi)))
 
     def at_nodes(self, order: int) -> list[Any]:
         """Return the values at the nodes of a rule."""
-        key = f"_nodes{order}"
-        if key not in self.__dict__:
-            with mpmath.workdps(DIGITS):
-                self.__dict__[key] = [mpmath.mpf(self._function(x)) for x, _ in _rule(order)]
-        values: list[Any] = self.__dict__[key]
-        return values
+        if order not in self._nodes:
+            self._nodes[order] = [self(x) for x, _ in _rule(order)]
+        return self._nodes[order]
 
 
 class Integrals:
@@ -76,7 +76,6 @@ class Integrals:
     def __init__(self, shapes: Sequence[Shape]) -> None:
         self._shapes = shapes
         self._weights: dict[sp.Expr, Shape] = {}
-        self._products: dict[Any, sp.Poly] = {}
         self._done: dict[Any, sp.Expr] = {}
 
     def __call__(self, weight: sp.Expr, factors: tuple[tuple[int, int], ...]) -> sp.Expr:
@@ -92,8 +91,8 @@ class Integrals:
             if weight not in self._weights:
                 self._weights[weight] = Shape(weight)
             parts = [self._weights[weight], *(self._shapes[i].slope(k) for i, k in key[1])]
-            exact = all(p.polynomial is not None for p in parts)
-            self._done[key] = _of_polynomials(parts) if exact else _by_quadrature(parts)
+            exact = [p.polynomial for p in parts if p.polynomial is not None]
+            self._done[key] = _of_polynomials(exact) if len(exact) == len(parts) else _by_quadrature(parts)
         return self._done[key]
 
     def of_power(self, weight: sp.Expr, power: int) -> Any:
@@ -104,11 +103,8 @@ class Integrals:
         return mpmath.mpf(self(weight * XI**power, ()))
 
 
-def _of_polynomials(parts: Sequence[Shape]) -> sp.Expr:
-    out = parts[0].polynomial
-    for p in parts[1:]:
-        out = out * p.polynomial
-    return number(sum((c / (k[0] + 1) for k, c in out.terms()), sp.Integer(0)))
+def _of_polynomials(parts: Sequence[sp.Poly]) -> sp.Expr:
+    return number(sum((c / (k[0] + 1) for k, c in math.prod(parts[1:], start=parts[0]).terms()), sp.Integer(0)))
 
 
 def _by_quadrature(parts: Sequence[Shape]) -> sp.Expr:

@@ -25,7 +25,9 @@ class Jets:
         self.fields = tuple(listed("fields", fields))
         places = {f.args for f in self.fields if isinstance(f, AppliedUndef)}
         if len(places) != 1 or not all(isinstance(f, AppliedUndef) and len(f.args) == 2 for f in self.fields):
-            raise InputError(f"fields: expected functions of one place and the time, such as w(x, t), got {self.fields}")
+            raise InputError(
+                f"fields: expected functions of one place and the time, such as w(x, t), got {self.fields}"
+            )
         self.x, self.t = next(iter(places))
         if not (isinstance(self.x, sp.Symbol) and isinstance(self.t, sp.Symbol)):
             raise InputError(f"fields: expected functions of two symbols, got {self.fields[0]}")

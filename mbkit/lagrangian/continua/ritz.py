@@ -1,9 +1,9 @@
-"""Modes of free vibration of a continuum by Ritz's method, with powers of x as shapes, in 100 digits."""
+"""Modes of free vibration of a continuum by Ritz's method, with powers of x as shapes, in 200 digits."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
@@ -16,8 +16,12 @@ from mbkit._check import Array, real
 from mbkit._check import count as counted
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.continua.integrals import Integrals, weights_of
+from mbkit.lagrangian.continua.jets import Order
 from mbkit.lagrangian.continua.reduction import terms
 from mbkit.lagrangian.energies.symbols import name_of, plain
+
+#: A number for each power of ξ.
+OfPower = Callable[[int], Any]
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.continua.continuum import Continuum
@@ -42,19 +46,23 @@ class NormalModes:
         return f"<NormalModes: {', '.join(f'{x:.6g}' for x in self.frequencies)} rad/s>"
 
 
-#: Digits of Ritz's matrices, of which monomials cost as many as there are.
-_DIGITS: Final = 120
+#: Modes up to which the digits below are enough.
+_COUNT: Final = 20
+#: Digits of Ritz's matrices: n powers cost 1.2 n of them.
+_DIGITS: Final = 200
 #: Monomials for n modes, and how many more have to give the same frequencies.
 _FIRST, _MORE, _ROUNDS = 12, 6, 4
 _SETTLED: Final = 1e-11
 #: Of a diagonal entry, what rounding leaves of a pivot that is zero; of the slowest motion, that of one that is rigid.
-_ZERO: Final = 1e-60
+_ZERO: Final = 1e-100
 _RIGID: Final = 1e-12
 
 
 def normal_modes(system: Continuum, count: int, values: Mapping[Any, float]) -> NormalModes:
     """Return what `Continuum.normal_modes` does."""
     count = counted("count", count, least=1)
+    if count > _COUNT:
+        raise UnsupportedError(f"count: expected at most {_COUNT} modes, got {count}")
     held = system.T + system.V + sp.Add(*system.ends, *system.T_ends.values(), *system.V_ends.values())
     own = held.free_symbols - {system.jets.x, *system.jets.among(held)}
     given = {name_of(s): sp.Rational(real(f"values[{s}]", x)) for s, x in values.items()}
@@ -64,8 +72,8 @@ def normal_modes(system: Continuum, count: int, values: Mapping[Any, float]) -> 
     ritz = _Ritz(system, {s: given[s.name] for s in own})
     before: Any = None
     for step in range(_ROUNDS):
-        squares, vectors = ritz.eigenpairs(2 * count + _FIRST + _MORE * step, count)
-        if before is not None and (np.abs(before - squares) <= _SETTLED * squares.max()).all():
+        squares, vectors, shift = ritz.eigenpairs(2 * count + _FIRST + _MORE * step, count)
+        if before is not None and (np.abs(before - squares) <= _SETTLED * max(squares.max(), shift)).all():
             break
         before = squares
     else:
@@ -87,64 +95,65 @@ class _Ritz:
     """Mass and stiffness of the powers ξ^p of each field, which are near to dependent: hence the digits."""
 
     def __init__(self, system: Continuum, numbers: Mapping[sp.Symbol, sp.Expr]) -> None:
-        self._system, self._numbers = system, numbers
-        self._length = (system.ends[1] - system.ends[0]).subs(numbers)
-        self._integrals = Integrals([])
-        #: Pairs of derivatives, each with a function of two powers.
-        self._pairs: list[tuple[Any, Any, Any]] = []
+        self._system, self._numbers, self._integrals = system, numbers, Integrals([])
+        self._length = _digits((system.ends[1] - system.ends[0]).subs(numbers))
+        #: Fields and derivatives of products in T - V, each with a function of the powers' sum.
+        self._pairs: list[tuple[tuple[int, Order], tuple[int, Order], OfPower]] = []
         for sign, what, x in ((1, "T", system.T), (-1, "V", system.V)):
             self._read(what, sign * x.subs(numbers), self._along(what))
         for sign, what, parts in ((1, "T_ends", system.T_ends), (-1, "V_ends", system.V_ends)):
             for end, x in parts.items():
                 self._read(what, sign * x.subs(numbers), self._at(end))
 
-    def _read(self, what: str, x: sp.Expr, measure: Any) -> None:
+    def _read(self, what: str, x: sp.Expr, measure: Callable[[sp.Expr], OfPower]) -> None:
         for product, c in terms(self._system, what, x):
             if len(product) > 2:
-                raise UnsupportedError(f"{what}: modes of free vibration are of quadratic energies, got {product} in it")
+                raise UnsupportedError(
+                    f"{what}: modes of free vibration are of quadratic energies, got {product} in it"
+                )
             if len(product) == 2:
-                orders = [self._system.jets.order(s) for s in product]
-                self._pairs.append((*orders, measure(c)))
+                first, second = (self._system.jets.order(s) for s in product)
+                self._pairs.append((first, second, measure(c)))
 
-    def _along(self, what: str) -> Any:
-        def measure(c: sp.Expr) -> Any:
-            system = self._system
-            ends = tuple(e.subs(self._numbers) for e in system.ends)
-            weights = [(f, mpmath.mpf(sp.Float(k, _DIGITS))) for f, k in weights_of(c, system.jets.x, ends, what).items()]
-            length = mpmath.mpf(sp.Float(self._length, _DIGITS))
-            return cache(lambda n: length * sum(k * self._integrals.of_power(f, n) for f, k in weights))
+    def _along(self, what: str) -> Callable[[sp.Expr], OfPower]:
+        """Return what makes ∫ c ξ^n dx of a coefficient, as a function of n."""
+        ends = tuple(e.subs(self._numbers) for e in self._system.ends)
+
+        def measure(c: sp.Expr) -> OfPower:
+            found = weights_of(c, self._system.jets.x, ends, what)
+            weights = [(f, self._length * _digits(k)) for f, k in found.items()]
+            return cache(lambda n: mpmath.fsum(k * self._integrals.of_power(f, n) for f, k in weights))
 
         return measure
 
-    def _at(self, end: sp.Expr) -> Any:
+    def _at(self, end: sp.Expr) -> Callable[[sp.Expr], OfPower]:
+        """Return what makes c ξ^n at an end."""
         place = self._system.ends.index(end)
 
-        def measure(c: sp.Expr) -> Any:
-            value = mpmath.mpf(sp.Float(c.subs(self._system.jets.x, end.subs(self._numbers)), _DIGITS))
+        def measure(c: sp.Expr) -> OfPower:
+            value = _digits(c.subs(self._system.jets.x, end.subs(self._numbers)))
             return lambda n: value if place or n == 0 else mpmath.mpf(0)
 
         return measure
 
     def _basis(self, powers: int) -> Any:
         """Return columns of powers, field by field, that keep what is fixed."""
-        fields = len(self._system.jets.fields)
-        rows = []
+        size, rows = len(self._system.jets.fields) * powers, []
         for place, end in enumerate(self._system.ends):
             for s in self._system.fixed[end]:
                 field, (along, _) = self._system.jets.order(s)
-                row = [sp.Integer(0)] * (fields * powers)
+                row = [sp.Integer(0)] * size
                 for p in range(along, powers):
-                    row[field * powers + p] = sp.ff(p, along) * sp.Integer(place) ** (p - along)
+                    row[field * powers + p] = sp.Integer(math.perm(p, along) * place ** (p - along))
                 rows.append(row)
-        free = sp.Matrix(rows).nullspace() if rows else [sp.eye(fields * powers)[:, k] for k in range(fields * powers)]
-        return mpmath.matrix([[mpmath.mpf(int(x.p)) / int(x.q) for x in sp.Matrix.hstack(*free)[i, :]] for i in range(fields * powers)])
+        free = sp.Matrix.hstack(*sp.Matrix(rows).nullspace()) if rows else sp.eye(size)
+        return mpmath.matrix([[_digits(x) for x in free[i, :]] for i in range(size)])
 
     def _matrices(self, powers: int) -> tuple[Any, Any]:
         n = len(self._system.jets.fields) * powers
         forms = {rates: mpmath.matrix(n, n) for rates in range(3)}
-        length = mpmath.mpf(sp.Float(self._length, _DIGITS))
         for (f, first), (g, second), of_power in self._pairs:
-            scale, rates = length ** (first[0] + second[0]), first[1] + second[1]
+            scale, rates = self._length ** (first[0] + second[0]), first[1] + second[1]
             rows = [math.perm(p, first[0]) for p in range(powers)], [math.perm(p, second[0]) for p in range(powers)]
             for p in range(first[0], powers):
                 for r in range(second[0], powers):
@@ -163,8 +172,8 @@ class _Ritz:
             )
         return forms[2], -forms[0]
 
-    def eigenpairs(self, powers: int, count: int) -> tuple[Array, list[list[list[Any]]]]:
-        """Return the least ω², and for each the coefficients of the powers, field by field."""
+    def eigenpairs(self, powers: int, count: int) -> tuple[Array, list[list[list[Any]]], float]:
+        """Return the least ω², for each the coefficients of the powers, field by field, and how much was added."""
         with mpmath.workdps(_DIGITS):
             B = self._basis(powers)
             M, K = (B.T * A * B for A in self._matrices(powers))
@@ -176,14 +185,17 @@ class _Ritz:
                 ratios = [K[i, i] / M[i, i] for i in range(K.rows)]
                 shift = min((x for x in ratios if x > _ZERO * max(ratios)), default=mpmath.mpf(1))
                 L = _cholesky(K + shift * M)
+            unstable = "values: the state of rest is not stable: some shape lowers the potential energy"
             if L is None:
-                raise NumericalError("values: the state of rest is not stable: some shape lowers the potential energy")
+                raise NumericalError(unstable)
             inverse = mpmath.inverse(L)
             flexibility = np.array((inverse * M * inverse.T).tolist(), dtype=np.float64)
             # The largest flexibilities are the slowest modes, and exact to rounding.
             sizes, ways = np.linalg.eigh((flexibility + flexibility.T) / 2)
             squares = 1 / sizes[::-1][:count] - float(shift)
             squares[np.abs(squares) < _RIGID * float(shift)] = 0.0
+            if (squares < 0).any():
+                raise NumericalError(unstable)
             columns = inverse.T * mpmath.matrix(ways[:, ::-1][:, :count].tolist())
             out = []
             for k in range(count):
@@ -191,7 +203,13 @@ class _Ritz:
                 own = B * columns[:, k] / mpmath.sqrt(sizes[-1 - k])
                 sign = mpmath.sign(mpmath.fsum(own[:powers])) or 1
                 out.append([[sign * x for x in own[f * powers : (f + 1) * powers]] for f in range(B.rows // powers)])
-            return squares, out
+            return squares, out, float(shift)
+
+
+def _digits(x: sp.Expr) -> Any:
+    """Return a number of mpmath."""
+    with mpmath.workdps(_DIGITS):
+        return mpmath.mpf(int(x.p)) / int(x.q) if x.is_Rational else mpmath.mpf(sp.Float(x, _DIGITS))
 
 
 def _cholesky(A: Any) -> Any:

@@ -93,6 +93,8 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
 _PLACES: Final = 3
 #: Of its largest eigenvalue, what rounding leaves of one that is zero.
 _NEGATIVE: Final = 1e-12
+#: How much nearer to zero coordinates are at every other place.
+_NEAR: Final = 1e-3
 #: Letters of a matrix that a message shows.
 _SHOWN: Final = 200
 
@@ -153,7 +155,9 @@ def warn_of_negative(
         return
     probe, n, way = RandomEvaluation([*M]), len(velocities), None
     for seed in range(2 * _PLACES):
-        found = probe({**probe.place(seed), **{s: mpmath.mpf(x) for s, x in held.items()}})
+        # Small deflections too: what holds for these alone, as of beams, may be negative far away.
+        near = {s: x * _NEAR ** (seed % 2) for s, x in probe.place(seed).items()}
+        found = probe({**near, **{s: mpmath.mpf(x) for s, x in held.items()}})
         if found is None or any(mpmath.im(x) for x in found):
             return
         sizes, ways = np.linalg.eigh(np.array(found, dtype=float).reshape(n, n))

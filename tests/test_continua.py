@@ -1,0 +1,276 @@
+"""Strings and beams on paper: their equations and ends, frequencies beside closed forms, and beams on moving roots."""
+
+import mpmath
+import numpy as np
+import pytest
+import sympy as sp
+
+import mbkit as mb
+from mbkit.errors import InputError, NumericalError, UnsupportedError
+from validation import beams, flexible
+
+x, s, t, L, rho, EI, P, m, J, Om, kGA, RI = sp.symbols("x s t L rho EI P m J Omega kGA rhoI")
+w, psi = sp.Function("w")(x, t), sp.Function("psi")(x, t)
+MOVING, BENT, TIP = rho * w.diff(t) ** 2 / 2, EI * w.diff(x, 2) ** 2 / 2, {L: m * w.diff(t) ** 2 / 2}
+CLAMP = {0: [w, w.diff(x)]}
+Continuum, Lagrangian, beam = mb.lagrangian.Continuum, mb.lagrangian.Lagrangian, mb.lagrangian.beam
+CANTILEVER = Continuum(MOVING, BENT, w, (0, L), fixed=CLAMP)
+TIMOSHENKO = Continuum(
+    MOVING + RI * psi.diff(t) ** 2 / 2,
+    EI * psi.diff(x) ** 2 / 2 + kGA * (w.diff(x) - psi) ** 2 / 2,
+    [w, psi],
+    (0, L),
+    fixed={0: [w, psi]},
+    T_ends={L: TIP[L] + J * psi.diff(t) ** 2 / 2},
+)
+ROTATING = Continuum(MOVING, BENT + rho * Om**2 * (L**2 - x**2) / 4 * w.diff(x) ** 2, w, (0, L), fixed=CLAMP)
+
+
+# Equations
+
+
+def test_a_string_with_a_mass():
+    string = Continuum(MOVING, P * w.diff(x) ** 2 / 2, w, (0, L), fixed={0: [w]}, T_ends=TIP, forces={w: -w.diff(t)})
+    lines = str(string.equations()).splitlines()
+    assert lines == ["ρ w_tt - P w_xx = -w_t", "w = 0   at x = 0", "m w_tt + P w_x = 0   at x = L"]
+
+
+def test_a_beam_with_a_body():
+    body = {L: TIP[L] + J * w.diff(x, t) ** 2 / 2}
+    spring = {L: P * w**2 / 2}
+    lines = str(Continuum(MOVING, BENT, w, (0, L), fixed=CLAMP, T_ends=body, V_ends=spring).equations()).splitlines()
+    assert lines[0] == "ρ w_tt + EI w_xxxx = 0"
+    assert lines[3:] == ["m w_tt + P w - EI w_xxx = 0   at x = L", "J w_xtt + EI w_xx = 0   at x = L"]
+
+
+def test_a_beam_with_shear():
+    first, second = TIMOSHENKO.equations().field_equations
+    jets = {str(a): a for a in first.lhs.free_symbols | second.lhs.free_symbols}
+    wtt, wx, wxx, turn, tx, txx, ttt = (jets[n] for n in "w_tt w_x w_xx psi psi_x psi_xx psi_tt".split())
+    assert sp.expand(first.lhs - (rho * wtt - kGA * (wxx - tx))) == 0
+    assert sp.expand(second.lhs - (RI * ttt - EI * txx - kGA * (wx - turn))) == 0
+    places = [str(end) for end, _ in TIMOSHENKO.equations().boundary_conditions]
+    assert places == ["0", "0", "L", "L"]
+    assert r"\ddot" not in TIMOSHENKO.equations().latex() and "(x = L)" in TIMOSHENKO.equations().latex()
+
+
+def test_a_section_that_changes():
+    stiff, heavy = sp.Function("EI")(x), sp.Function("rho")(x)
+    lines = str(Continuum(heavy * w.diff(t) ** 2 / 2, stiff * w.diff(x, 2) ** 2 / 2, w, (0, L)).equations())
+    assert lines.splitlines()[0] == "ρ(x) w_tt + EI′′(x) w_xx + 2 EI′(x) w_xxx + EI(x) w_xxxx = 0"
+
+
+def test_nothing_is_passed_on_at_the_free_end_of_a_turning_string():
+    string = Continuum(MOVING, rho * Om**2 * (L**2 - x**2) / 4 * w.diff(x) ** 2, w, (0, L), fixed={0: [w]})
+    assert len(string.equations().boundary_conditions) == 1
+    # Legendre's polynomials: ω² = n (2 n - 1) Ω².
+    squares = string.normal_modes(4, {rho: 1.3, Om: 1.0, L: 2.0}).frequencies ** 2
+    assert np.abs(squares / [1, 6, 15, 28] - 1).max() < 1e-13
+
+
+@pytest.mark.parametrize("system", [CANTILEVER, TIMOSHENKO, ROTATING], ids=["beam", "shear", "rotating"])
+def test_modes_satisfy_the_equations_and_every_boundary_condition(system):
+    values = {rho: 1.3, EI: 2.1, L: 1.7, m: 0.8, J: 0.3, kGA: 40.0, RI: 0.02, Om: 3.0}
+    found, equations = system.normal_modes(2, values), system.equations()
+    for omega, shape in zip(found.frequencies, found.shapes, strict=True):
+        fields = shape if isinstance(shape, dict) else {"w": shape}
+
+        def put(e, at, omega=omega, fields=fields):
+            for a in e.free_symbols:
+                name, _, order = a.name.partition("_")
+                if name in fields:
+                    value = sp.diff(fields[name], x, order.count("x")) * (-(omega**2)) ** (order.count("t") // 2)
+                    e = e.subs(a, value.subs(x, at))
+            return float(e.subs(x, at).subs(values))
+
+        rows = [(e.lhs, L / 3) for e in equations.field_equations]
+        rows += [(e.lhs, end) for end, e in equations.boundary_conditions]
+        for row, at in rows:
+            size = max(abs(put(term, at)) for term in sp.Add.make_args(sp.expand(row)))
+            curvature = max(abs(put(system.jets.symbol(0, (2, 0)), L / 5)), 1)
+            assert abs(put(row, at)) < 1e-9 * max(size, curvature), row
+
+
+# Frequencies
+
+
+def test_frequencies_are_those_of_closed_forms():
+    assert max(flexible.strings_and_beams().values()) < 1e-12
+
+
+def test_a_free_beam_moves_as_a_rigid_body_too():
+    free = Continuum(MOVING, BENT, w, (0, L)).normal_modes(4, {rho: 1.3, EI: 2.1, L: 1.7})
+    assert (free.frequencies[:2] == 0).all()
+    betas = np.sqrt(free.frequencies[2:] * np.sqrt(1.3 / 2.1)) * 1.7
+    assert np.abs(np.cos(betas) * np.cosh(betas) - 1).max() < 1e-9 * np.cosh(betas).max()
+
+
+def test_a_column_buckles_under_its_own_weight():
+    g, v = sp.symbols("g"), {EI: 1.0, rho: 1.0, L: 1.0}
+    column = beam(L, EI, rho, rotation=sp.pi / 2, gravity=(0, -g))
+    # Greenhill 1881: the first zero of J of order -1/3.
+    j = mpmath.findroot(lambda z: mpmath.besselj(-mpmath.mpf(1) / 3, z), 1.87)
+    critical = float(9 * j**2 / 4)
+    assert column.normal_modes(1, {**v, g: critical * (1 - 1e-9)}).frequencies[0] < 1e-3
+    with pytest.raises(NumericalError, match="not stable"):
+        column.normal_modes(1, {**v, g: critical * (1 + 1e-9)})
+    hanging = beam(L, EI, rho, rotation=-sp.pi / 2, gravity=(0, -g)).normal_modes(1, {**v, g: 8.0})
+    assert hanging.frequencies[0] > 3.52
+
+
+def test_exact_modes_of_a_cantilever():
+    a = CANTILEVER.discretized(mb.lagrangian.clamped_free(4, x, L))
+    k = Lagrangian(a.T, a.V, a.coordinates, parameters={rho: 1.0, EI: 1.0, L: 1.0})
+    assert k.kinetic.M.subs({rho: 1, L: 1}) == sp.eye(4)
+    assert k.V.subs({EI: 1, L: 1}).coeff(a.coordinates[0] * a.coordinates[1]) == 0
+    found, exact = mb.equilibrium(k, np.zeros(4)).frequencies, beams.cantilever(1, 1, 1, 0, 0, 4)
+    assert np.abs(np.sort(found) / np.array(exact, dtype=float) - 1).max() < 1e-13
+    assert np.abs(np.abs(a.at(1.0)) - 2).max() < 1e-14 and a.at([0.0, 1.0]).shape == (2, 4)
+
+
+def test_forces_and_large_deflections_of_a_string():
+    f, EA = sp.symbols("f EA")
+    V = P * w.diff(x) ** 2 / 2 + EA * w.diff(x) ** 4 / 8
+    string = Continuum(MOVING, V, w, (0, L), fixed={0: [w], L: [w]}, forces={w: f - 2 * w.diff(t)})
+    a = string.discretized([sp.sin(sp.pi * x / L)])
+    (q,), (v,) = a.coordinates, a.velocities
+    with mpmath.workdps(20):
+        exact = (P * sp.pi**2 / (4 * L)) * q**2 + 3 * EA * sp.pi**4 / (64 * L**3) * q**4
+        for numbers in ({P: 1, EA: 0, L: 3, q: 1}, {P: 0, EA: 1, L: 3, q: 1}):
+            assert abs((a.V / exact).subs(numbers).evalf(20) - 1) < 1e-18
+    assert abs((a.forces[q] - (2 * L * f / sp.pi - L * v)).subs({f: 1, L: 3, v: 1}).evalf(20)) < 1e-17
+
+
+# Beams on moving roots
+
+
+def second_order(root, R, shapes):
+    """Return T of a beam without stretch to second order in its deflection, from the places of its points."""
+    e = sp.symbols("e")
+    a = [sp.Function(f"a{i + 1}")(t) for i in range(len(shapes[0]))]
+    bent = [e * sum(f * b for f, b in zip(row, a, strict=True)) for row in shapes]
+    u = -sum(sp.integrate(sp.expand(b.diff(s) ** 2), (s, 0, s)) for b in bent) / 2
+    place = root + R * sp.Matrix([s + u, *bent])
+    T = sum(c**2 for c in place.diff(t)) * rho / 2
+    T = sum(T.diff(e, k).subs(e, 0) / sp.factorial(k) for k in range(3))
+    return sp.integrate(sp.expand(T.doit()), (s, 0, L)), a
+
+
+@pytest.mark.parametrize("space", [False, True], ids=["plane", "space"])
+def test_the_energy_of_a_beam_is_that_of_its_points_to_second_order(space):
+    names = "X Y Z theta phi"
+    X, Y, Z, th, ph = sp.symbols(names)
+    shapes = [[(s / L) ** 2, (s / L) ** 3], [(s / L) ** 2, 0]][: 1 + space]
+    c, d, C, D = sp.cos(th), sp.sin(th), sp.cos(ph), sp.sin(ph)
+    R = sp.Matrix([[c, -d], [d, c]])
+    root = sp.Matrix([X + d, Y * X])
+    coordinates = [X, Y, th]
+    if space:
+        R = sp.Matrix([[c, -d, 0], [d, c, 0], [0, 0, 1]]) * sp.Matrix([[C, 0, D], [0, 1, 0], [-D, 0, C]])
+        root, coordinates = sp.Matrix([*root, Z]), [X, Y, Z, th, ph]
+    one = beam(L, EI, rho, position=root, rotation=R if space else th, coordinates=coordinates)
+    modes = [dict(zip("vw", pair, strict=False)) if space else pair[0] for pair in zip(*shapes, strict=True)]
+    found = one.discretized(modes)
+    moved = {q: sp.Function(q.name)(t) for q in coordinates}
+    exact, a = second_order(root.subs(moved), R.subs(moved), shapes)
+    put = [(sp.Derivative(f, t), sp.Symbol(f"{f.func.__name__}dot")) for f in moved.values()]
+    put += [(sp.Derivative(f, t), v) for f, v in zip(a, found.velocities, strict=True)]
+    put += [(f, q) for q, f in moved.items()] + list(zip(a, found.coordinates, strict=True))
+    named = {n: sp.Symbol(f"{n.name}dot") for n in coordinates}
+    exact = exact.subs(put)
+    rng = np.random.default_rng(3)
+    for _ in range(4):
+        symbols = (exact.free_symbols | found.T.free_symbols) | set(named.values())
+        numbers = {y: sp.Rational(int(rng.integers(-9, 10)), 7) for y in sorted(symbols, key=str)}
+        numbers[L] = sp.Rational(5, 3)
+        a0, b0 = (sp.N(e.subs(numbers), 30) for e in (exact, found.T))
+        assert abs(a0 - b0) < 1e-14 * abs(a0)
+
+
+def test_without_stiffening_the_energy_is_that_of_points_that_move_across_only():
+    th = sp.Symbol("theta")
+    found = beam(L, EI, rho, rotation=th, coordinates=[th], stiffening=False).discretized([(s / L) ** 2])
+    turn = sp.Symbol("thetadot")
+    assert sp.expand(found.T.coeff(turn**2)).coeff(sp.Symbol("a1") ** 2) == L * rho / 10
+
+
+def test_the_spin_up_of_kane_ryan_and_banerjee():
+    times = np.linspace(0, beams.RISE, 31)
+    lag, a = flexible.paper(3)
+    run = mb.simulate(lag.dynamics(), *np.zeros((2, 3)), beams.RISE, "rk853", save=times, rtol=1e-11, atol=1e-13)
+    tip, exact = run.q @ a.at(1.0), beams.spin_up(3, times)
+    assert np.abs(tip - exact).max() < 1e-10 * np.abs(exact).max()
+    own, oracle = (lag.dynamics(e).at(t=3.0) for e in ("lagrangian", "oracle"))
+    state = np.array([0.3, 0.1, -0.1]), np.array([0.2, 0.1, 0.1]), np.zeros(3)
+    assert np.abs(own.forward_dynamics(*state) - oracle.forward_dynamics(*state)).max() < 1e-12
+
+
+def test_chains_of_rigid_segments_come_to_the_beam_as_the_square_of_their_length():
+    exact = float(beams.cantilever(beams.EI, beams.DENSITY, beams.LENGTH, 0, 0, 1)[0])
+    for engine in ("pinocchio", "mujoco"):
+        errors = []
+        for n in (6, 12):
+            M = mb.dynamics(flexible.chain(n), engine).mass_matrix(np.zeros(n + 1))[1:, 1:]
+            K = np.eye(n) * beams.EI * n / beams.LENGTH
+            errors.append(np.sqrt(np.linalg.eigvals(np.linalg.solve(M, K)).real.min()) / exact - 1)
+        assert 1.9 < np.log2(errors[0] / errors[1]) < 2.1
+
+
+def test_the_chain_of_the_study_of_a_turning_hub_in_numbers():
+    data = flexible.json.loads((flexible.HERE / "flexible.json").read_text(encoding="utf-8"))
+    assert max(data["frequencies"].values()) < 1e-12
+    assert all(1.9 < order < 2.1 for of in data["chain"]["orders"].values() for order in of.values())
+
+
+def test_a_string_and_a_body_at_the_end():
+    th = sp.Symbol("theta")
+    string = beam(L, 0, rho, tension=P, rotation=th, coordinates=[th], tip_mass=m)
+    assert [str(c.lhs) for e, c in string.equations().boundary_conditions if e == 0] == ["v"]
+    tip = beam(L, EI, rho, rotation=th, coordinates=[th], tip_mass=m, tip_inertia=J).discretized([(s / L) ** 2])
+    rate, a, adot = sp.symbols("thetadot a1 adot1")
+    body = sp.expand(tip.T).coeff(J)
+    assert sp.expand(body - (rate + 2 * adot / L) ** 2 / 2) == 0
+    # v² - ∫ v′² L dx at the end: a² (1 - 4/3).
+    of_mass = ((L * rate + adot) ** 2 - rate**2 * a**2 / 3) / 2
+    assert sp.expand(sp.expand(tip.T).coeff(m) - of_mass) == 0
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: Continuum(MOVING, BENT, sp.Symbol("w"), (0, L)), InputError, "functions of one place"),
+        (lambda: Continuum(MOVING, BENT, w, (0, 0)), InputError, "places that differ"),
+        (lambda: Continuum(MOVING, BENT, w, (0, L), fixed={1: [w]}), InputError, "no end"),
+        (lambda: Continuum(MOVING, BENT, w, (0, L), fixed={0: [w.diff(x, 2)]}), InputError, "below the highest"),
+        (lambda: Continuum(MOVING, P * w.diff(x) ** 2, w, (0, L), T_ends={L: w.diff(x, t) ** 2}), InputError, "w_xt"),
+        (lambda: Continuum(w.diff(t, 2) ** 2, BENT, w, (0, L)), InputError, "second derivatives by the time"),
+        (lambda: Continuum(MOVING, w.diff(t) ** 2, w, (0, L)), InputError, "no rates"),
+        (lambda: Continuum(0, BENT, w, (0, L)), InputError, "kinetic"),
+        (lambda: Continuum(MOVING, sp.Symbol("w_x") * w.diff(x) ** 2, w, (0, L)), InputError, "rename"),
+        (lambda: Continuum(MOVING, psi**2, w, (0, L)), InputError, "no field"),
+        (lambda: CANTILEVER.discretized([x / L]), InputError, "w_x = 1"),
+        (lambda: CANTILEVER.discretized([]), InputError, "at least one"),
+        (lambda: CANTILEVER.discretized([m * x**2]), InputError, "m beside"),
+        (lambda: TIMOSHENKO.discretized([x**2]), InputError, "mapping of w, psi"),
+        (lambda: TIMOSHENKO.discretized([{"u": x}]), InputError, "no field"),
+        (lambda: CANTILEVER.discretized([sp.Abs(x / L - sp.Rational(1, 3)) ** 3 - 0]), InputError, "fixed"),
+        (lambda: Continuum(MOVING, sp.cos(w.diff(x)), w, (0, L)).discretized([x / L]), UnsupportedError, "polynomial"),
+        (lambda: CANTILEVER.normal_modes(2, {L: 1.0}), InputError, "EI, rho"),
+        (lambda: CANTILEVER.normal_modes(0, {}), InputError, "count"),
+        (lambda: CANTILEVER.normal_modes(40, {}), UnsupportedError, "at most 20"),
+        (lambda: beam(L, EI, rho, position=[0]), InputError, "2 or 3"),
+        (lambda: beam(L, EI, rho, position=[0, 0, 0], rotation=sp.ones(3)), InputError, "orthonormal"),
+        (lambda: beam(L, EI, rho, rotation=s, coordinates=[s]), InputError, "place along the beam"),
+        (lambda: beam(L, EI, rho, gravity=[1]), InputError, "gravity"),
+        (lambda: beam(L, [EI, EI], rho), InputError, "stiffness"),
+        (lambda: mb.lagrangian.clamped_free(21, x, L), UnsupportedError, "at most 20"),
+        (lambda: CANTILEVER.discretized([(x / L) ** 2]).at(2.0), InputError, "from 0 to 1"),
+        (lambda: CANTILEVER.discretized([(x / L) ** 2]).at(0.5, "u"), InputError, "expected one of w"),
+    ],
+)
+def test_what_is_refused(make, error, words):
+    with pytest.raises(error, match=words):
+        make()

@@ -1,0 +1,207 @@
+"""Flexible parts on paper: frequencies beside closed forms, and a beam beside chains of rigid segments in two engines.
+
+Run ``python -m validation.flexible``; it writes ``validation/flexible.json``. The closed forms and the spin-up are those
+of `validation.beams`, which uses nothing of mbkit. A chain has hinges with springs EI/h between segments of the length
+h, the first half a segment from the root: its frequencies and motions come to those of the beam as h².
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import sympy as sp
+
+import mbkit as mb
+from validation import beams
+from validation.stamp import stamp
+
+HERE = Path(__file__).parent
+x, s, t, L, RHO, EI = sp.symbols("x s t L rho EI")
+#: Segments of the chains; both engines take each.
+SEGMENTS = (5, 10, 20)
+#: The hub's inertia kg m², its speed rad/s, the torque N m that grows and falls in so long, s, and steps of it.
+HUB, TURN, TORQUE, PULSE = 50.0, 6.0, 2.0, 1.0
+TIMES = np.linspace(0, PULSE, 21)
+
+
+# Frequencies
+
+
+def strings_and_beams() -> dict[str, float]:
+    """Return the largest relative difference of the first three frequencies from the roots of closed forms."""
+    w, psi = (sp.Function(n)(x, t) for n in ("w", "psi"))
+    P, m, J, kGA, RI, Om = sp.symbols("P m J kGA rhoI Omega")
+    Continuum, moving, bent = mb.lagrangian.Continuum, RHO * w.diff(t) ** 2 / 2, EI * w.diff(x, 2) ** 2 / 2
+    body = {L: m * w.diff(t) ** 2 / 2}
+    clamped, numbers = {0: [w, w.diff(x)]}, {RHO: 1.3, EI: 2.1, L: 1.7}
+    tip = {m: 0.8, J: 0.3}
+    shear = {kGA: 40.0, RI: 0.02}
+    cases = {
+        "string with a mass": (
+            Continuum(moving, P * w.diff(x) ** 2 / 2, w, (0, L), fixed={0: [w]}, T_ends=body),
+            {RHO: 1.3, P: 2.1, L: 1.7, m: 0.8},
+            beams.string(2.1, 1.3, 1.7, 0.8, 3),
+        ),
+        "Euler-Bernoulli beam": (
+            Continuum(moving, bent, w, (0, L), fixed=clamped),
+            numbers,
+            beams.cantilever(2.1, 1.3, 1.7, 0, 0, 3),
+        ),
+        "Euler-Bernoulli beam with a body": (
+            Continuum(moving, bent, w, (0, L), fixed=clamped, T_ends={L: body[L] + J * w.diff(x, t) ** 2 / 2}),
+            numbers | tip,
+            beams.cantilever(2.1, 1.3, 1.7, 0.8, 0.3, 3),
+        ),
+        "Timoshenko beam with a body": (
+            Continuum(
+                moving + RI * psi.diff(t) ** 2 / 2,
+                EI * psi.diff(x) ** 2 / 2 + kGA * (w.diff(x) - psi) ** 2 / 2,
+                [w, psi],
+                (0, L),
+                fixed={0: [w, psi]},
+                T_ends={L: body[L] + J * psi.diff(t) ** 2 / 2},
+            ),
+            numbers | tip | shear,
+            beams.timoshenko(2.1, 40.0, 1.3, 0.02, 1.7, 0.8, 0.3, 3, 0.3),
+        ),
+        "rotating beam": (
+            Continuum(moving, bent + RHO * Om**2 * (L**2 - x**2) / 4 * w.diff(x) ** 2, w, (0, L), fixed=clamped),
+            numbers | {Om: 3.0},
+            beams.rotating(2.1, 1.3, 1.7, 3.0, 3, 0.5),
+        ),
+    }
+    out = {}
+    for name, (system, values, exact) in cases.items():
+        modes = system.normal_modes(3, values)
+        # Once as they are found, and once more as coordinates of a Lagrangian.
+        a = system.discretized(modes)
+        lag = mb.lagrangian.Lagrangian(a.T, a.V, a.coordinates, parameters=values)
+        found = np.array([modes.frequencies, np.sort(mb.equilibrium(lag, np.zeros(3)).frequencies)])
+        out[name] = float(np.abs(found / np.array(exact, dtype=float) - 1).max())
+    return out
+
+
+# Spin-up
+
+
+def paper(count: int, *, stiffening: bool = True) -> mb.lagrangian.Lagrangian:
+    """Return the beam whose root turns by θ(t)."""
+    theta = beams.angle(t, sp)[0]
+    beam = mb.lagrangian.beam(L, EI, RHO, rotation=theta, stiffening=stiffening)
+    a = beam.discretized(mb.lagrangian.clamped_free(count, s, L))
+    numbers = {L: beams.LENGTH, EI: beams.EI, RHO: beams.DENSITY}
+    return mb.lagrangian.Lagrangian(a.T, a.V, a.coordinates, time=t, parameters=numbers, name="spin-up"), a
+
+
+def spin_up() -> dict[str, object]:
+    """Return the deflection of the tip beside Kane's equations, and that of the naive form."""
+    times, out = np.linspace(0, beams.RISE, 151), {}
+    for name, stiffening in (("stiffened", True), ("naive", False)):
+        lag, a = paper(3, stiffening=stiffening)
+        run = mb.simulate(
+            lag.dynamics(), *np.zeros((2, 3)), beams.RISE, "rk853", save=times, rtol=1e-12, atol=1e-14, doubt=False
+        )
+        tip, exact = run.q @ a.at(1.0), beams.spin_up(3, times, stiffening=stiffening)
+        at = int(np.abs(tip).argmax())
+        out[name] = {
+            "largest_m": float(tip[at]),
+            "at_s": float(times[at]),
+            "error": float(np.abs(tip - exact).max() / np.abs(exact).max()),
+        }
+    out["of_modes_m"] = {}
+    for count in (1, 2, 3, 4, 5):
+        out["of_modes_m"][str(count)] = float(beams.spin_up(count, np.linspace(0, beams.RISE, 1501)).min())
+    return out
+
+
+# Chains of rigid segments
+
+
+def chain(segments: int) -> mb.Model:
+    """Return a hub on a vertical axis that carries a chain, the beam of the spin-up."""
+    h, rho = beams.LENGTH / segments, beams.DENSITY
+    b = mb.ModelBuilder(f"chain of {segments}", gravity=(0, 0, 0))
+    across = rho * (h / 2) ** 3 / 12
+    hub = HUB + across + rho * h / 2 * (h / 4) ** 2
+    # About its centre of mass, which lies on the axis: the half segment at the root belongs to the hub.
+    b.add_body("hub", mass=1.0, com=(0, 0, 0), inertia=np.diag([1.0, hub, hub]))
+    b.add_joint("turn", "revolute", parent="world", child="hub", axis=(0, 0, 1))
+    before, place = "hub", h / 2
+    for k in range(segments):
+        long = h if k < segments - 1 else h / 2
+        J = rho * long**3 / 12
+        b.add_body(f"s{k}", mass=rho * long, com=(long / 2, 0, 0), inertia=np.diag([1e-6 * J, J, J]))
+        joint = {"parent": before, "child": f"s{k}", "axis": (0, 0, 1), "translation": (place, 0, 0)}
+        b.add_joint(f"h{k}", "revolute", stiffness=beams.EI / h, **joint)
+        before, place = f"s{k}", h
+    return b.build()
+
+
+def tip_of(q: np.ndarray, segments: int) -> np.ndarray:
+    """Return how far the chain's end lies across the line of the root."""
+    h = beams.LENGTH / segments
+    lengths = np.array([*[h] * (segments - 1), h / 2])
+    return np.sin(np.cumsum(q[:, 1:], axis=1)) @ lengths
+
+
+def torque(time, q, v):  # noqa: ARG001
+    out = np.zeros(len(v))
+    out[0] = TORQUE * np.sin(np.pi * time / PULSE) ** 2
+    return out
+
+
+def chains() -> dict[str, object]:
+    """Return frequencies and the tip's deflection on a turning hub, from the modes and from chains in two engines."""
+    th, J = sp.symbols("theta J")
+    beam = mb.lagrangian.beam(L, EI, RHO, rotation=th, coordinates=[th])
+    numbers = {L: beams.LENGTH, EI: beams.EI, RHO: beams.DENSITY, J: HUB}
+    tips: dict[int, np.ndarray] = {}
+    for count in (2, 4, 6, 8):
+        a = beam.discretized(mb.lagrangian.clamped_free(count, s, L))
+        T = J * sp.Symbol("thetadot") ** 2 / 2 + a.T
+        lag = mb.lagrangian.Lagrangian(T, a.V, [th, *a.coordinates], parameters=numbers)
+        start = np.zeros(count + 1), np.array([TURN, *np.zeros(count)])
+        run = mb.simulate(lag.dynamics(), *start, PULSE, "rk853", torque=torque, save=TIMES, rtol=1e-11, atol=1e-13)
+        tips[count] = run.q[:, 1:] @ a.at(1.0)
+    size = np.abs(tips[8]).max()
+    of_modes = {str(n): float(np.abs(tip - tips[8]).max() / size) for n, tip in tips.items() if n < 8}
+    out: dict[str, object] = {"tip_m": float(size), "errors_of_modes": of_modes, "chains": []}
+    exact = [float(w) for w in beams.cantilever(beams.EI, beams.DENSITY, beams.LENGTH, 0, 0, 3)]
+    for n in SEGMENTS:
+        model = chain(n)
+        for engine in ("pinocchio", "mujoco"):
+            dyn = mb.dynamics(model, engine)
+            M, K = dyn.mass_matrix(np.zeros(n + 1))[1:, 1:], np.eye(n) * beams.EI * n / beams.LENGTH
+            squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, K)).real)[:3]
+            start = np.zeros(n + 1), np.array([TURN, *np.zeros(n)])
+            run = mb.simulate(dyn, *start, PULSE, "rk853", torque=torque, save=TIMES, rtol=1e-9, atol=1e-12)
+            row = {"segments": n, "engine": engine, "tip_error": float(np.abs(tip_of(run.q, n) - tips[8]).max() / size)}
+            row["frequency_errors"] = (np.sqrt(squares) / exact - 1).tolist()
+            out["chains"].append(row)
+            print(row, flush=True)
+    by = {e: [r for r in out["chains"] if r["engine"] == e] for e in ("pinocchio", "mujoco")}
+    out["orders"] = {
+        e: {
+            "frequency": float(np.log2(abs(rows[-2]["frequency_errors"][0] / rows[-1]["frequency_errors"][0]))),
+            "tip": float(np.log2(abs(rows[-2]["tip_error"] / rows[-1]["tip_error"]))),
+        }
+        for e, rows in by.items()
+    }
+    return out
+
+
+def main() -> None:
+    data = stamp()
+    data["frequencies"] = strings_and_beams()
+    print(data["frequencies"], flush=True)
+    data["spin_up"] = spin_up()
+    print(data["spin_up"], flush=True)
+    data["chain"] = chains()
+    print(data["chain"]["errors_of_modes"], data["chain"]["orders"], flush=True)
+    (HERE / "flexible.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
