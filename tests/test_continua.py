@@ -40,24 +40,24 @@ def test_a_beam_with_a_body():
     spring = {L: P * w**2 / 2}
     lines = str(Continuum(MOVING, BENT, w, (0, L), fixed=CLAMP, T_ends=body, V_ends=spring).equations()).splitlines()
     assert lines[0] == "ρ w_tt + EI w_xxxx = 0"
-    assert lines[3:] == ["m w_tt + P w - EI w_xxx = 0   at x = L", "J w_xtt + EI w_xx = 0   at x = L"]
+    assert lines[3:] == ["m w_tt - EI w_xxx + P w = 0   at x = L", "J w_xtt + EI w_xx = 0   at x = L"]
 
 
 def test_a_beam_with_shear():
     first, second = TIMOSHENKO.equations().field_equations
     jets = {str(a): a for a in first.lhs.free_symbols | second.lhs.free_symbols}
-    wtt, wx, wxx, turn, tx, txx, ttt = (jets[n] for n in "w_tt w_x w_xx psi psi_x psi_xx psi_tt".split())
+    wtt, wx, wxx, turn, tx, txx, ttt = (jets[n] for n in ["w_tt", "w_x", "w_xx", "psi", "psi_x", "psi_xx", "psi_tt"])
     assert sp.expand(first.lhs - (rho * wtt - kGA * (wxx - tx))) == 0
     assert sp.expand(second.lhs - (RI * ttt - EI * txx - kGA * (wx - turn))) == 0
     places = [str(end) for end, _ in TIMOSHENKO.equations().boundary_conditions]
     assert places == ["0", "0", "L", "L"]
-    assert r"\ddot" not in TIMOSHENKO.equations().latex() and "(x = L)" in TIMOSHENKO.equations().latex()
+    assert "(x = L)" in TIMOSHENKO.equations().latex()
 
 
 def test_a_section_that_changes():
     stiff, heavy = sp.Function("EI")(x), sp.Function("rho")(x)
     lines = str(Continuum(heavy * w.diff(t) ** 2 / 2, stiff * w.diff(x, 2) ** 2 / 2, w, (0, L)).equations())
-    assert lines.splitlines()[0] == "ρ(x) w_tt + EI′′(x) w_xx + 2 EI′(x) w_xxx + EI(x) w_xxxx = 0"
+    assert lines.splitlines()[0] == "ρ(x) w_tt + EI(x) w_xxxx + 2 EI′(x) w_xxx + EI′′(x) w_xx = 0"
 
 
 def test_nothing_is_passed_on_at_the_free_end_of_a_turning_string():
@@ -125,7 +125,8 @@ def test_exact_modes_of_a_cantilever():
     assert k.V.subs({EI: 1, L: 1}).coeff(a.coordinates[0] * a.coordinates[1]) == 0
     found, exact = mb.equilibrium(k, np.zeros(4)).frequencies, beams.cantilever(1, 1, 1, 0, 0, 4)
     assert np.abs(np.sort(found) / np.array(exact, dtype=float) - 1).max() < 1e-13
-    assert np.abs(np.abs(a.at(1.0)) - 2).max() < 1e-14 and a.at([0.0, 1.0]).shape == (2, 4)
+    assert np.abs(np.abs(a.at(1.0)) - 2).max() < 1e-14
+    assert a.at([0.0, 1.0]).shape == (2, 4)
 
 
 def test_forces_and_large_deflections_of_a_string():
@@ -230,7 +231,7 @@ def test_a_string_and_a_body_at_the_end():
     rate, a, adot = sp.symbols("thetadot a1 adot1")
     body = sp.expand(tip.T).coeff(J)
     assert sp.expand(body - (rate + 2 * adot / L) ** 2 / 2) == 0
-    # v² - ∫ v′² L dx at the end: a² (1 - 4/3).
+    # v² - L ∫ v′² L dx at the end: a² (1 - 4/3).
     of_mass = ((L * rate + adot) ** 2 - rate**2 * a**2 / 3) / 2
     assert sp.expand(sp.expand(tip.T).coeff(m) - of_mass) == 0
 

@@ -58,6 +58,7 @@ PARTS = {
     "four_bar": Part(1, ("four_bar.json",), "a loop in four engines: error, gap and time of a step"),
     "mechanisms": Part(5, ("mechanisms.json",), "mechanisms with loops: errors, softness, time of a step"),
     "bicycle": Part(1, ("bicycle.json",), "the benchmark bicycle's eigenvalues beside its paper's formulas and print"),
+    "flexible": Part(1, ("flexible.json",), "strings and beams beside closed forms, and chains of rigid segments"),
     "iftomm": Part(15, ("iftomm.json",), "published problems with loops: Andrews' squeezer, IFToMM's A01 to A05"),
     "variants": Part(
         6, ("variants.json",), "changed robots beside Pinocchio's and MuJoCo's own changes, and a thousand variants"

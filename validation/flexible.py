@@ -1,8 +1,8 @@
 """Flexible parts on paper: frequencies beside closed forms, and a beam beside chains of rigid segments in two engines.
 
-Run ``python -m validation.flexible``; it writes ``validation/flexible.json``. The closed forms and the spin-up are those
-of `validation.beams`, which uses nothing of mbkit. A chain has hinges with springs EI/h between segments of the length
-h, the first half a segment from the root: its frequencies and motions come to those of the beam as h².
+Run ``python -m validation.flexible``; it writes ``validation/flexible.json``. The closed forms and the spin-up are
+those of `validation.beams`, which uses nothing of mbkit. A chain has hinges with springs EI/h between segments of the
+length h, the first half a segment from the root: its frequencies and motions come to those of the beam as h².
 """
 
 from __future__ import annotations

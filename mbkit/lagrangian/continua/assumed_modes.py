@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import mpmath
 import numpy as np
@@ -14,13 +14,11 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, real_array, require_finite
 from mbkit._escape import one_line
 from mbkit.errors import InputError
+from mbkit.lagrangian.continua.densities import Densities
 from mbkit.lagrangian.continua.integrals import Shape, read_shape
 from mbkit.lagrangian.continua.reduction import Reduction
 from mbkit.lagrangian.continua.ritz import NormalModes
 from mbkit.lagrangian.energies.symbols import name_of, plain, velocity_of
-
-if TYPE_CHECKING:
-    from mbkit.lagrangian.continua.continuum import Continuum
 
 #: What a shape may move of what is fixed, of its largest value.
 _MOVES: Final = 1e-12
@@ -74,7 +72,7 @@ class AssumedModes:
         return one_line(f"<AssumedModes {', '.join(map(str, self.coordinates))} of {', '.join(self._fields)}>")
 
 
-def assumed_modes(system: Continuum, shapes: Any, name: str) -> AssumedModes:
+def assumed_modes(system: Densities, shapes: Any, name: str) -> AssumedModes:
     """Return what `Continuum.discretized` does."""
     fields = tuple(f.func.__name__ for f in system.jets.fields)
     if isinstance(shapes, NormalModes):
@@ -102,7 +100,7 @@ def assumed_modes(system: Continuum, shapes: Any, name: str) -> AssumedModes:
     return AssumedModes(T, V, q, tuple(map(velocity_of, q)), acting, fields, tuple(read))
 
 
-def _mode(system: Continuum, what: str, source: Any, fields: tuple[str, ...]) -> tuple[Shape, ...]:
+def _mode(system: Densities, what: str, source: Any, fields: tuple[str, ...]) -> tuple[Shape, ...]:
     """Return the shape of each field in one mode."""
     if not isinstance(source, Mapping):
         if len(fields) > 1:
@@ -115,7 +113,7 @@ def _mode(system: Continuum, what: str, source: Any, fields: tuple[str, ...]) ->
     return tuple(read_shape(what, named.get(f, 0), system.jets.x, system.ends) for f in fields)
 
 
-def _require_fixed(system: Continuum, what: str, mode: tuple[Shape, ...]) -> None:
+def _require_fixed(system: Densities, what: str, mode: tuple[Shape, ...]) -> None:
     for place, end in enumerate(system.ends):
         for s in system.fixed[end]:
             k, (along, _) = system.jets.order(s)

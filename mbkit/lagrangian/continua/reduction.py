@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import mpmath
 import sympy as sp
 
 from mbkit.errors import UnsupportedError
+from mbkit.lagrangian.continua.densities import Densities
 from mbkit.lagrangian.continua.integrals import DIGITS, Integrals, Shape, number, weights_of
 from mbkit.lagrangian.energies.symbols import velocity_of
-
-if TYPE_CHECKING:
-    from mbkit.lagrangian.continua.continuum import Continuum
 
 #: Shapes by their number, each with its derivative.
 Factors = tuple[tuple[int, int], ...]
@@ -22,7 +19,7 @@ Factors = tuple[tuple[int, int], ...]
 class Reduction:
     """Energies per length and of ends, with the modes put in."""
 
-    def __init__(self, system: Continuum, modes: Sequence[tuple[Shape, ...]], q: Sequence[sp.Symbol]) -> None:
+    def __init__(self, system: Densities, modes: Sequence[tuple[Shape, ...]], q: Sequence[sp.Symbol]) -> None:
         self._system, self._q = system, q
         self._shapes = [shape for mode in modes for shape in mode]
         self._integrals = Integrals(self._shapes)
@@ -67,7 +64,7 @@ class Reduction:
         return self._sum(what, x, (), measured)
 
 
-def terms(system: Continuum, what: str, x: sp.Expr) -> list[tuple[tuple[sp.Symbol, ...], sp.Expr]]:
+def terms(system: Densities, what: str, x: sp.Expr) -> list[tuple[tuple[sp.Symbol, ...], sp.Expr]]:
     """Return an expression as products of derivatives, with the coefficient of each.
 
     Raises

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import mpmath
 import numpy as np
@@ -15,6 +15,7 @@ import sympy as sp
 from mbkit._check import Array, real
 from mbkit._check import count as counted
 from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.lagrangian.continua.densities import Densities
 from mbkit.lagrangian.continua.integrals import Integrals, weights_of
 from mbkit.lagrangian.continua.jets import Order
 from mbkit.lagrangian.continua.reduction import terms
@@ -22,9 +23,6 @@ from mbkit.lagrangian.energies.symbols import name_of, plain
 
 #: A number for each power of ξ.
 OfPower = Callable[[int], Any]
-
-if TYPE_CHECKING:
-    from mbkit.lagrangian.continua.continuum import Continuum
 
 
 @dataclass(frozen=True, repr=False)
@@ -50,6 +48,7 @@ class NormalModes:
 _COUNT: Final = 20
 #: Digits of Ritz's matrices: n powers cost 1.2 n of them.
 _DIGITS: Final = 200
+_WRITTEN: Final = 60
 #: Monomials for n modes, and how many more have to give the same frequencies.
 _FIRST, _MORE, _ROUNDS = 12, 6, 4
 _SETTLED: Final = 1e-11
@@ -58,7 +57,7 @@ _ZERO: Final = 1e-100
 _RIGID: Final = 1e-12
 
 
-def normal_modes(system: Continuum, count: int, values: Mapping[Any, float]) -> NormalModes:
+def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> NormalModes:
     """Return what `Continuum.normal_modes` does."""
     count = counted("count", count, least=1)
     if count > _COUNT:
@@ -86,7 +85,7 @@ def normal_modes(system: Continuum, count: int, values: Mapping[Any, float]) -> 
     names = [f.func.__name__ for f in system.jets.fields]
     shapes: list[Any] = []
     for mode in vectors:
-        own_shapes = [sp.Add(*(sp.Float(c, _DIGITS) * place**p for p, c in enumerate(rows))) for rows in mode]
+        own_shapes = [sp.Add(*(sp.Float(c, _WRITTEN) * place**p for p, c in enumerate(rows))) for rows in mode]
         shapes.append(dict(zip(names, own_shapes, strict=True)) if len(names) > 1 else own_shapes[0])
     return NormalModes(np.sqrt(squares), tuple(shapes))
 
@@ -94,7 +93,7 @@ def normal_modes(system: Continuum, count: int, values: Mapping[Any, float]) -> 
 class _Ritz:
     """Mass and stiffness of the powers ξ^p of each field, which are near to dependent: hence the digits."""
 
-    def __init__(self, system: Continuum, numbers: Mapping[sp.Symbol, sp.Expr]) -> None:
+    def __init__(self, system: Densities, numbers: Mapping[sp.Symbol, sp.Expr]) -> None:
         self._system, self._numbers, self._integrals = system, numbers, Integrals([])
         self._length = _digits((system.ends[1] - system.ends[0]).subs(numbers))
         #: Fields and derivatives of products in T - V, each with a function of the powers' sum.

@@ -1,0 +1,91 @@
+"""A continuum as its energies per length: the data that everything else in `mbkit.lagrangian.continua` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import sympy as sp
+
+from mbkit.errors import InputError
+from mbkit.lagrangian.continua.jets import Jets
+from mbkit.lagrangian.energies.symbols import expression
+
+
+class Densities:
+    """Energies per length and of the ends, checked; arguments are those of `Continuum`."""
+
+    def __init__(
+        self,
+        T: Any,
+        V: Any,
+        fields: Any,
+        ends: Sequence[Any],
+        *,
+        fixed: Mapping[Any, Iterable[Any]] | None = None,
+        T_ends: Mapping[Any, Any] | None = None,
+        V_ends: Mapping[Any, Any] | None = None,
+        forces: Mapping[Any, Any] | None = None,
+        coordinates: Sequence[Any] = (),
+        velocities: Sequence[Any] | None = None,
+    ) -> None:
+        self.jets = jets = Jets(fields, coordinates, velocities)
+        self.T, self.V = jets("T", T), jets("V", V)
+        if isinstance(ends, (str, sp.Basic)) or len(ends) != 2:
+            raise InputError(f"ends: expected two places, such as (0, L), got {ends!r}")
+        self.ends = tuple(expression("ends", e) for e in ends)
+        if self.ends[0] == self.ends[1] or any(e.has(jets.x, jets.t) for e in self.ends):
+            raise InputError(f"ends: expected two places that differ and do not hold {jets.x} or {jets.t}, got {ends}")
+        self.T_ends = {e: jets(f"T_ends[{e}]", x) for e, x in self._at_ends("T_ends", T_ends)}
+        self.V_ends = {e: jets(f"V_ends[{e}]", x) for e, x in self._at_ends("V_ends", V_ends)}
+        self.forces = {}
+        for f, x in (forces or {}).items():
+            if f not in jets.fields:
+                raise InputError(f"forces: {f} is no field here; the fields are {', '.join(map(str, jets.fields))}")
+            self.forces[jets.fields.index(f)] = jets(f"forces[{f}]", x)
+        if self.T == 0:
+            raise InputError("T: a continuum without kinetic energy has no equation of motion")
+        self.fixed: dict[sp.Expr, list[sp.Symbol]] = {e: [] for e in self.ends}
+        for e, conditions in self._at_ends("fixed", fixed):
+            rows = [conditions] if isinstance(conditions, (str, sp.Basic)) else conditions
+            self.fixed[e] = [jets(f"fixed[{e}]", x) for x in rows]
+        self._check()
+
+    def _at_ends(self, what: str, source: Mapping[Any, Any] | None) -> list[tuple[sp.Expr, Any]]:
+        out = [(expression(what, e), x) for e, x in (source or {}).items()]
+        for e, _ in out:
+            if e not in self.ends:
+                raise InputError(f"{what}: {e} is no end; the ends are {self.ends[0]} and {self.ends[1]}")
+        return out
+
+    def _check(self) -> None:
+        jets, most = self.jets, self.orders
+        self.jets.check_parameters({"T": self.T, "V": self.V} | {"ends": sp.Add(*self.ends)})
+        ends = [(what, e, x) for what in ("T_ends", "V_ends") for e, x in getattr(self, what).items()]
+        parts = [("T", self.T), ("V", self.V), *((f"{what}[{e}]", x) for what, e, x in ends)]
+        parts += [(f"forces[{jets.fields[k]}]", x) for k, x in self.forces.items()]
+        for what, x in parts:
+            for s in jets.among(x):
+                if jets.order(s)[1][1] > (0 if what.startswith("V") else 1):
+                    most_rates = "no rates" if what.startswith("V") else "no second derivatives by the time"
+                    raise InputError(f"{what}: expected {most_rates} of the fields, got {s}")
+        for what, e, x in ends:
+            for s in jets.among(x):
+                field, (along, _) = jets.order(s)
+                if along >= most[field]:
+                    raise InputError(
+                        f"{what}[{e}]: {s} cannot be passed on: T and V hold derivatives of {jets.fields[field]} along "
+                        f"{jets.x} of order {most[field]} at most, so that an end holds those below"
+                    )
+        for e, conditions in self.fixed.items():
+            for c in conditions:
+                if c not in jets.among(c) or jets.order(c)[1][1] or jets.order(c)[1][0] >= most[jets.order(c)[0]]:
+                    below = f"derivatives along {jets.x} below the highest in T and V"
+                    raise InputError(f"fixed[{e}]: expected a field or one of its {below}, got {c}")
+
+    @cached_property
+    def orders(self) -> tuple[int, ...]:
+        """The highest derivative of each field along x in T and V."""
+        found = [self.jets.order(s) for s in self.jets.among(self.T - self.V)]
+        return tuple(max((o[0] for f, o in found if f == k), default=0) for k in range(len(self.jets.fields)))
