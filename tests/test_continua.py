@@ -142,6 +142,18 @@ def test_forces_and_large_deflections_of_a_string():
     assert abs((a.forces[q] - (2 * L * f / sp.pi - L * v)).subs({f: 1, L: 3, v: 1}).evalf(20)) < 1e-17
 
 
+def test_a_section_that_is_no_polynomial():
+    # ρ and P as e^(2 x): w = e^-x sin kx with ω² = k² + 1, and tan k = k at the free end; x e^-x is the first mode.
+    horn = sp.exp(2 * x)
+    string = Continuum(horn * w.diff(t) ** 2 / 2, horn * w.diff(x) ** 2 / 2, w, (0, 1), fixed={0: [w]})
+    found = string.normal_modes(3, {})
+    roots = [mpmath.findroot(lambda k: mpmath.sin(k) - k * mpmath.cos(k), guess) for guess in (4.49, 7.73)]
+    exact = [1.0, *(float(mpmath.sqrt(k**2 + 1)) for k in roots)]
+    assert np.abs(found.frequencies / exact - 1).max() < 1e-12
+    a = string.discretized(found)
+    assert (sp.hessian(a.T, a.velocities) - sp.eye(3)).norm() < 1e-12
+
+
 # Beams on moving roots
 
 
@@ -259,6 +271,13 @@ def test_a_string_and_a_body_at_the_end():
         (lambda: TIMOSHENKO.discretized([{"u": x}]), InputError, "no field"),
         (lambda: CANTILEVER.discretized([sp.Abs(x / L - sp.Rational(1, 3)) ** 3 - 0]), InputError, "fixed"),
         (lambda: Continuum(MOVING, sp.cos(w.diff(x)), w, (0, L)).discretized([x / L]), UnsupportedError, "polynomial"),
+        (lambda: CANTILEVER.discretized([sp.sqrt(x / L - 2)]), InputError, "no real value"),
+        (lambda: CANTILEVER.discretized([L**2 / x**2]), InputError, "no real value"),
+        (lambda: CANTILEVER.discretized(5), InputError, "expected a list"),
+        (lambda: CANTILEVER.discretized([sp.sqrt(x / L) ** 5, (x / L) ** 2]), NumericalError, "does not settle"),
+        (lambda: CANTILEVER.normal_modes(1, [1.0]), InputError, "mapping"),
+        (lambda: Continuum(MOVING, BENT, w, (0, L), fixed=[w]), InputError, "mapping"),
+        (lambda: Continuum(MOVING, BENT, w, 5), InputError, "two places"),
         (lambda: CANTILEVER.normal_modes(2, {L: 1.0}), InputError, "EI, rho"),
         (lambda: CANTILEVER.normal_modes(0, {}), InputError, "count"),
         (lambda: CANTILEVER.normal_modes(40, {}), UnsupportedError, "at most 20"),

@@ -18,7 +18,7 @@ from mbkit.lagrangian.continua.densities import Densities
 from mbkit.lagrangian.continua.integrals import Shape, read_shape
 from mbkit.lagrangian.continua.reduction import Reduction
 from mbkit.lagrangian.continua.ritz import NormalModes
-from mbkit.lagrangian.energies.symbols import name_of, plain, velocity_of
+from mbkit.lagrangian.energies.symbols import listed, name_of, plain, velocity_of
 
 #: What a shape may move of what is fixed, of its largest value.
 _MOVES: Final = 1e-12
@@ -77,9 +77,7 @@ def assumed_modes(system: Densities, shapes: Any, name: str) -> AssumedModes:
     fields = tuple(f.func.__name__ for f in system.jets.fields)
     if isinstance(shapes, NormalModes):
         shapes = shapes.shapes
-    sources = [shapes] if isinstance(shapes, (sp.Basic, Mapping, str)) else list(shapes)
-    if not sources:
-        raise InputError("shapes: expected at least one, got none")
+    sources = [shapes] if isinstance(shapes, Mapping) else listed("shapes", shapes)
     read = [_mode(system, f"shapes[{i}]", source, fields) for i, source in enumerate(sources)]
     for i, mode in enumerate(read):
         _require_fixed(system, f"shapes[{i}]", mode)

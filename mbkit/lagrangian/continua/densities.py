@@ -32,7 +32,7 @@ class Densities:
     ) -> None:
         self.jets = jets = Jets(fields, coordinates, velocities)
         self.T, self.V = jets("T", T), jets("V", V)
-        if isinstance(ends, (str, sp.Basic)) or len(ends) != 2:
+        if not isinstance(ends, (tuple, list, sp.Tuple)) or len(ends) != 2:
             raise InputError(f"ends: expected two places, such as (0, L), got {ends!r}")
         self.ends = tuple(expression("ends", e) for e in ends)
         if self.ends[0] == self.ends[1] or any(e.has(jets.x, jets.t) for e in self.ends):
@@ -40,7 +40,7 @@ class Densities:
         self.T_ends = {e: jets(f"T_ends[{e}]", x) for e, x in self._at_ends("T_ends", T_ends)}
         self.V_ends = {e: jets(f"V_ends[{e}]", x) for e, x in self._at_ends("V_ends", V_ends)}
         self.forces = {}
-        for f, x in (forces or {}).items():
+        for f, x in _mapping("forces", forces).items():
             if f not in jets.fields:
                 raise InputError(f"forces: {f} is no field here; the fields are {', '.join(map(str, jets.fields))}")
             self.forces[jets.fields.index(f)] = jets(f"forces[{f}]", x)
@@ -53,7 +53,7 @@ class Densities:
         self._check()
 
     def _at_ends(self, what: str, source: Mapping[Any, Any] | None) -> list[tuple[sp.Expr, Any]]:
-        out = [(expression(what, e), x) for e, x in (source or {}).items()]
+        out = [(expression(what, e), x) for e, x in _mapping(what, source).items()]
         for e, _ in out:
             if e not in self.ends:
                 raise InputError(f"{what}: {e} is no end; the ends are {self.ends[0]} and {self.ends[1]}")
@@ -89,3 +89,9 @@ class Densities:
         """The highest derivative of each field along x in T and V."""
         found = [self.jets.order(s) for s in self.jets.among(self.T - self.V)]
         return tuple(max((o[0] for f, o in found if f == k), default=0) for k in range(len(self.jets.fields)))
+
+
+def _mapping(what: str, source: Any) -> Mapping[Any, Any]:
+    if source is not None and not isinstance(source, Mapping):
+        raise InputError(f"{what}: expected a mapping such as {{L: ...}}, got {source!r}")
+    return source or {}

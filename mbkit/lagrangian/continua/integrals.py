@@ -12,7 +12,7 @@ import sympy as sp
 from mpmath.calculus.quadrature import GaussLegendre
 
 from mbkit.errors import InputError, NumericalError
-from mbkit.lagrangian.energies.symbols import plain
+from mbkit.lagrangian.energies.symbols import expression, plain
 
 #: Of all shapes the place between 0 and 1, from end to end.
 XI: Final = sp.Symbol("xi", real=True)
@@ -25,11 +25,10 @@ _SAME: Final = 1e-22
 _READ: Final = 10_000
 
 
-@lru_cache(4)
-def _rule(order: int) -> list[tuple[Any, Any]]:
-    with mpmath.workdps(DIGITS):
-        precision = mpmath.mp.prec
-        nodes: list[tuple[Any, Any]] = GaussLegendre(mpmath.mp).get_nodes(0, 1, order, precision)
+@lru_cache(8)
+def _rule(order: int, digits: int) -> list[tuple[Any, Any]]:
+    with mpmath.workdps(digits):
+        nodes: list[tuple[Any, Any]] = GaussLegendre(mpmath.mp).get_nodes(0, 1, order, mpmath.mp.prec)
         return nodes
 
 
@@ -38,7 +37,7 @@ class Shape:
 
     def __init__(self, x: sp.Expr) -> None:
         self.expression = x
-        self._nodes: dict[int, list[Any]] = {}
+        self._nodes: dict[tuple[int, int], list[Any]] = {}
         self._slopes: dict[int, Shape] = {0: self}
 
     @cached_property
@@ -58,16 +57,21 @@ class Shape:
         x = self.expression
         return sp.lambdify(XI, sp.horner(x, XI) if x.is_polynomial(XI) else x, "mpmath")
 
-    def __call__(self, xi: float) -> Any:
-        """Return the value at a place, in 50 digits."""
-        with mpmath.workdps(DIGITS):
-            return mpmath.mpf(self._function(mpmath.mpf(xi)))
+    def __call__(self, xi: Any, digits: int = DIGITS) -> Any:
+        """Return the value at a place; InputError where there is none."""
+        with mpmath.workdps(digits):
+            try:
+                return mpmath.mpf(self._function(mpmath.mpf(xi)))
+            except (ArithmeticError, TypeError, ValueError, NameError) as error:
+                at = mpmath.nstr(xi, 6)
+                raise InputError(f"shapes: {self.expression} has no real value at {XI} = {at}, of 0 to 1") from error
 
-    def at_nodes(self, order: int) -> list[Any]:
+    def at_nodes(self, order: int, digits: int = DIGITS) -> list[Any]:
         """Return the values at the nodes of a rule."""
-        if order not in self._nodes:
-            self._nodes[order] = [self(x) for x, _ in _rule(order)]
-        return self._nodes[order]
+        key = order, digits
+        if key not in self._nodes:
+            self._nodes[key] = [self(x, digits) for x, _ in _rule(order, digits)]
+        return self._nodes[key]
 
 
 class Integrals:
@@ -88,19 +92,30 @@ class Integrals:
         """
         key = weight, tuple(sorted(factors))
         if key not in self._done:
-            if weight not in self._weights:
-                self._weights[weight] = Shape(weight)
-            parts = [self._weights[weight], *(self._shapes[i].slope(k) for i, k in key[1])]
+            parts = [self._weight(weight), *(self._shapes[i].slope(k) for i, k in key[1])]
             exact = [p.polynomial for p in parts if p.polynomial is not None]
             self._done[key] = _of_polynomials(exact) if len(exact) == len(parts) else _by_quadrature(parts)
         return self._done[key]
 
+    def _weight(self, weight: sp.Expr) -> Shape:
+        return self._weights.setdefault(weight, Shape(weight))
+
     def of_power(self, weight: sp.Expr, power: int) -> Any:
-        """Return ∫₀¹ f ξ^n dξ in the digits of mpmath."""
+        """Return ∫₀¹ f ξ^n dξ in the digits of mpmath, of which half have to be right."""
+        digits = mpmath.mp.dps
         if weight.is_polynomial(XI):
-            rows = sp.Poly(weight, XI).terms()
-            return sum(mpmath.mpf(sp.Float(c, mpmath.mp.dps)) / (k[0] + power + 1) for k, c in rows)
-        return mpmath.mpf(self(weight * XI**power, ()))
+            return mpmath.fsum(
+                mpmath.mpf(sp.Float(c, digits)) / (k + power + 1) for (k,), c in sp.Poly(weight, XI).terms()
+            )
+        f = self._weight(weight)
+        rules = [_rule(order, digits) for order in _ORDERS]
+        values = [f.at_nodes(order, digits) for order in _ORDERS]
+        totals = [
+            mpmath.fsum(y * w * x**power for y, (x, w) in zip(*pair, strict=True))
+            for pair in zip(values, rules, strict=True)
+        ]
+        _settled([f], totals, mpmath.mpf(10) ** (-digits / 2), max(map(abs, values[0])))
+        return totals[1]
 
 
 def _of_polynomials(parts: Sequence[sp.Poly]) -> sp.Expr:
@@ -112,19 +127,24 @@ def _by_quadrature(parts: Sequence[Shape]) -> sp.Expr:
     with mpmath.workdps(DIGITS):
         for order in _ORDERS:
             products = [mpmath.fprod(x) for x in zip(*(p.at_nodes(order) for p in parts), strict=True)]
-            weights = [w for _, w in _rule(order)]
+            weights = [w for _, w in _rule(order, DIGITS)]
             total = mpmath.fdot(weights, products)
             size = mpmath.fdot(weights, map(abs, products))
             totals.append(total)
-        if abs(totals[0] - totals[1]) > _SAME * size:
-            shown = " * ".join(f"({p.expression})" for p in parts)
-            raise NumericalError(
-                f"shapes: the integral of {shown} from 0 to 1 does not settle to 22 digits; give functions that are "
-                "smooth between the ends and vary less, or polynomials"
-            )
+        _settled(parts, totals, _SAME, size)
         if abs(totals[1]) < _SAME * size:
             return sp.Integer(0)
         return number(sp.Float(totals[1], 40))
+
+
+def _settled(parts: Sequence[Shape], totals: Sequence[Any], same: Any, size: Any) -> None:
+    """Refuse an integral of which two rules give different numbers."""
+    if abs(totals[0] - totals[1]) > same * size:
+        shown = " * ".join(f"({p.expression})" for p in parts)
+        raise NumericalError(
+            f"shapes: the integral of {shown} from 0 to 1 does not settle; give functions that are smooth between the "
+            "ends and vary less, or polynomials"
+        )
 
 
 def number(x: sp.Expr) -> sp.Expr:
@@ -147,7 +167,7 @@ def read_shape(what: str, source: Any, x: sp.Symbol, ends: tuple[Any, ...]) -> S
         Other symbols than x and those of the ends.
     """
     lower, upper = ends
-    out = sp.sympify(source).subs(x, lower + (upper - lower) * XI)
+    out = expression(what, source).subs(x, lower + (upper - lower) * XI)
     out = sp.expand(out) if out.is_polynomial(XI) else out.replace(lambda e: e.is_Function, _inside)
     left = out.free_symbols - {XI}
     if left:

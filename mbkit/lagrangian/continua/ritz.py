@@ -62,6 +62,8 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
     count = counted("count", count, least=1)
     if count > _COUNT:
         raise UnsupportedError(f"count: expected at most {_COUNT} modes, got {count}")
+    if not isinstance(values, Mapping):
+        raise InputError(f"values: expected a mapping of parameters to numbers, got {values!r}")
     held = system.T + system.V + sp.Add(*system.ends, *system.T_ends.values(), *system.V_ends.values())
     own = held.free_symbols - {system.jets.x, *system.jets.among(held)}
     given = {name_of(s): sp.Rational(real(f"values[{s}]", x)) for s, x in values.items()}
