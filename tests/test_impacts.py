@@ -184,5 +184,7 @@ def test_bad_impacts_are_refused() -> None:
         lag.impulse(rows=[lag.velocities[0] ** 2])
     with pytest.raises(InputError, match="from 0 to 1"):
         lag.impulse(rows=[lag.velocities[0]], restitution=2)
+    with pytest.raises(InputError, match=f"restitution: .*the velocity {lag.velocities[0]}"):
+        lag.impulse(rows=[lag.velocities[0]], restitution=lag.velocities[0])
     with pytest.raises(InputError, match="depend on each other"):
         lag.impulse(rows=[lag.velocities[0], 2 * lag.velocities[0]]).after()

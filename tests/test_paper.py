@@ -17,6 +17,7 @@ from sympy.physics.mechanics import dynamicsymbols
 import mbkit as mb
 from mbkit.errors import InputError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.lagrangian import Lagrangian
+from mbkit.lagrangian.printer import ExpressionPrinter
 from mbkit.lagrangian.systems import one_degree
 from mbkit.lagrangian.trig.simplify import forms, is_zero, tidy
 from mbkit.simulate import METHODS as METHODS_OF
@@ -633,6 +634,15 @@ def test_functions_that_are_not_given_stand_in_the_equation():
         Lagrangian(J(c) * thdot**2, 0, [th])
     with pytest.raises(InputError, match="F is no parameter or function"):
         system.substituted({sp.Function("F"): th})
+
+
+def test_the_slope_of_a_function_at_another_angle_is_written_and_gets_a_value():
+    J, y = sp.Function("J"), sp.Symbol("y")
+    system = one_degree(1, J(2 * th).diff(th), coordinate=th)
+    assert ExpressionPrinter().text(system.V) == "2 J′(2 θ)"
+    with pytest.raises(UnsupportedError, match=r"^a derivative of J: .*substituted\(\{J\(x\)"):
+        one_degree(1, 0, J(2 * th).diff(th), coordinate=th).dynamics().forward_dynamics([0.1], [0.0], [0.0])
+    assert 24 * th**2 == system.substituted({J(y): y**3}).V
 
 
 def test_a_function_of_several_arguments_gets_one_value():

@@ -98,6 +98,35 @@ def test_the_c_of_a_program_computes_the_same(tmp_path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc here")
+@pytest.mark.parametrize("case", ["abs", "max", "piecewise", "both"])
+def test_cases_are_lines_too(case, tmp_path) -> None:
+    x, xdot = sp.symbols("x xdot")
+    potentials = {
+        "abs": sp.Abs(x),
+        "max": sp.Max(x, x**2),
+        "piecewise": sp.Piecewise((x**2, x > 0), (3 * x, x > -1), (0, True)),
+        "both": sp.Piecewise((x**4, sp.And(x > 0, x < 1)), (sp.Abs(x) * x, True)),
+    }
+    model = Lagrangian(xdot**2 / 2, potentials[case], [x]).model
+    dyn, text = mb.dynamics(model, "lagrangian", compile=False), program(model, "gravity")
+    source = text.c() + (
+        "#include <stdio.h>\nint main(void) {\ndouble out[1];\n"
+        + "".join(
+            f'{{double q[] = {{{x}}}; gravity(q, out); printf("%.17g\\n", out[0]);}}\n' for x in (-1.5, -0.4, 0.3, 1.7)
+        )
+        + "return 0;\n}\n"
+    )
+    (tmp_path / "main.c").write_text(source)
+    subprocess.run(["gcc", "-std=c99", "-o", "main", "main.c", "-lm"], cwd=tmp_path, check=True)
+    printed = subprocess.run(["./main"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout.split()
+    for q, out in zip((-1.5, -0.4, 0.3, 1.7), printed, strict=True):
+        expected = dyn.gravity([q])[0]
+        assert run(text.python(), "gravity", np.array([q])) == pytest.approx(expected, abs=1e-14)
+        assert float(out) == pytest.approx(expected, abs=1e-14)
+    assert "Piecewise" not in str(text)
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc here")
 @pytest.mark.parametrize("names", [("double", "static"), ("q_", "v_"), ("sin", "cos")])
 def test_names_of_parameters_that_c_has_for_itself_are_others(names, tmp_path) -> None:
     x, xdot = sp.symbols("x xdot")

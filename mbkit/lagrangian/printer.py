@@ -161,6 +161,12 @@ class ExpressionPrinter:
             return f"|{self.text(x.args[0])}|"
         if isinstance(x, sp.Derivative) and len(x.expr.args) == 1 and x.variables[0] == x.expr.args[0]:
             return f"{written(x.expr.func.__name__)}{'′' * x.derivative_count}({self.text(x.expr.args[0])})"
+        if isinstance(x, sp.Subs) and isinstance(x.expr, sp.Derivative) and len(x.point) == len(x.expr.expr.args) == 1:
+            name = written(x.expr.expr.func.__name__)
+            return f"{name}{'′' * x.expr.derivative_count}({self.text(x.point[0])})"
+        if isinstance(x, sp.Piecewise):
+            cases = [f"{self.text(y)} if {_compared(c, self)}" if c != sp.true else self.text(y) for y, c in x.args]
+            return f"({' else '.join(cases)})"
         if isinstance(x, sp.Function) and len(x.args) == 1:
             space = " " if isinstance(x, (sp.sin, sp.cos, sp.tan)) else ""
             text = self._argument(x.args[0]) if space else f"({self.text(x.args[0])})"
@@ -269,6 +275,13 @@ def _signed(x: sp.Expr) -> tuple[bool, sp.Expr]:
         if f.is_Add and all(t.as_coeff_Mul()[0].is_negative for t in f.args):
             factors[k], flipped = -f, not flipped
     return flipped, sp.Mul(abs(number), *factors)
+
+
+def _compared(x: Any, board: ExpressionPrinter) -> str:
+    """Return a comparison, or several joined, as text."""
+    if isinstance(x, sp.core.relational.Relational):
+        return f"{board.text(x.lhs)} {x.rel_op} {board.text(x.rhs)}"
+    return one_line(str(x))
 
 
 def _number(x: sp.Expr) -> str:

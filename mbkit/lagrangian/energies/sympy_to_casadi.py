@@ -72,9 +72,12 @@ class Conversion:
             return out
         if x.func is sp.Piecewise:
             return self._pieces(x)
-        if isinstance(x, (AppliedUndef, sp.Derivative)):
+        if isinstance(x, (AppliedUndef, sp.Derivative, sp.Subs)):
+            function = min(x.atoms(AppliedUndef), key=str)
+            shown = function if isinstance(x, AppliedUndef) else f"a derivative of {name_of(function)}"
             raise UnsupportedError(
-                f"{x}: an undefined function has no value; give it one with substituted({{{name_of(x)}: ...}})"
+                f"{shown}: an undefined function has no value; give it one with "
+                f"substituted({{{name_of(function)}(x): ...}})"
             )
         raise UnsupportedError(
             f"{x.func}: no engine computes this function; there are powers, sin, cos, tan, their inverses, "

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 from typing import Any, Final
@@ -22,6 +21,7 @@ from mbkit.codegen.program import Operation
 from mbkit.codegen.program import program as operations_of
 from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.lagrangian.elements import SYMPY
 from mbkit.lagrangian.energies.symbols import free_name
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned, folded
 from mbkit.model import Model
@@ -30,28 +30,8 @@ from mbkit.model import Model
 _LONG: Final = 10
 _WIDTH: Final = 100
 _DIGITS: Final = 6
-_FUNCTIONS: Final[dict[str, Callable[..., Any]]] = {
-    **{n: getattr(sp, n) for n in ("sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "exp", "log", "sign")},
-    **{n: getattr(sp, n) for n in ("sinh", "cosh", "tanh", "asinh", "acosh", "atanh")},
-    "neg": lambda a: -a,
-    "sq": lambda a: a**2,
-    "twice": lambda a: 2 * a,
-    "inv": lambda a: 1 / a,
-    "fabs": sp.Abs,
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "div": lambda a, b: a / b,
-    "pow": lambda a, b: a**b,
-    "atan2": sp.atan2,
-    "hypot": lambda a, b: sp.sqrt(a**2 + b**2),
-    "fmin": sp.Min,
-    "fmax": sp.Max,
-}
-
-
 #: Keywords of C, and functions that its lines call.
-_C_WORDS: Final = {*C99CodePrinter().reserved_words, *(_FUNCTIONS.keys() & dir(math)), "fmin", "fmax"}
+_C_WORDS: Final = {*C99CodePrinter().reserved_words, *(SYMPY.operations.keys() & dir(math)), "fmin", "fmax"}
 
 _Inputs = tuple[tuple[str, tuple[sp.Symbol, ...]], ...]
 
@@ -186,7 +166,7 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
 
     numbered = count(1)
     for k, o in enumerate(operations.operations):
-        x = _expression(o, known, [named[name] for name, _ in inputs], model.name)
+        x = _expression(o, known, [named[name] for name, _ in inputs])
         turned = isinstance(x, (sp.sin, sp.cos)) and x.args[0] in named.get("q", ())
         if turned:
             x = called(x, f"{'s' if isinstance(x, sp.sin) else 'c'}{named['q'].index(x.args[0]) + 1}")
@@ -213,11 +193,9 @@ def _inputs(function: Any, model: Model) -> tuple[_Inputs, set[str]]:
     return tuple(out), used
 
 
-def _expression(o: Operation, known: list[sp.Expr], inputs: list[tuple[sp.Symbol, ...]], model: str) -> sp.Expr:
+def _expression(o: Operation, known: list[sp.Expr], inputs: list[tuple[sp.Symbol, ...]]) -> sp.Expr:
     if o.name == "input":
         return inputs[o.arguments[0]][o.arguments[1]]
     if o.name == "const":
         return sp.Integer(int(o.value)) if o.value == int(o.value) and abs(o.value) < 1e6 else sp.Float(o.value, 17)
-    if o.name not in _FUNCTIONS:
-        raise UnsupportedError(f"program: {model} decides between cases ({o.name}), which has no line of its own")
-    return _FUNCTIONS[o.name](*(known[j] for j in o.arguments))
+    return sp.sympify(SYMPY.operations[o.name](*(known[j] for j in o.arguments)))

@@ -19,7 +19,7 @@ from sympy.matrices.exceptions import NonInvertibleMatrixError
 from mbkit._escape import terminal
 from mbkit.errors import InputError
 from mbkit.lagrangian.energies.energy_form import EnergyForm, read_expression, symbols_of, vanish
-from mbkit.lagrangian.energies.symbols import free_name, listed, name_of
+from mbkit.lagrangian.energies.symbols import free_name, listed, name_of, plain
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.trig.simplify import tidy
 
@@ -111,6 +111,9 @@ def impulse_equations(
     e = read_expression(system, "restitution", restitution, others=True)
     if e.is_number and not 0 <= e <= 1:
         raise InputError(f"restitution: expected a number from 0 to 1, got {restitution!r}")
+    moving = e.free_symbols & set(system.velocities)
+    if moving:
+        raise InputError(f"restitution: expected a number or parameters, got the velocity {plain(moving)} in {e}")
     v, own = sp.Matrix(system.velocities), system.constraint_matrix
     J = sp.Matrix(own).col_join(sp.Matrix(len(G), n, [x for row, _ in G for x in row]))
     rebound = [-e * (sp.Matrix([row]) * v)[0] - (1 + e) * rest for row, rest in G]

@@ -29,6 +29,8 @@ _BALANCED: Final = 1e-11
 # Random starts, and steps from each.
 _STARTS: Final = 30
 _MOST: Final = 200
+#: Halvings of a start from which a search ends nowhere.
+_NEARER: Final = 12
 # rad or m: a neighbourhood, in which stiffness that vanishes at a threshold does not.
 _ASIDE: Final = 0.1
 #: Step of differences of fourth order, whose error is far below half of the digits.
@@ -125,7 +127,8 @@ def equilibrium(
     dynamics : Dynamics or Lagrangian
         Of any engine. The own derivation differentiates the forces exactly, others by differences.
     q0 : (nq,) array_like, optional
-        Start of the search; by default the neutral configuration, then random ones.
+        Start of the search, and then, for a system on paper, places nearer zero; by default the neutral configuration,
+        then random ones.
     tau : (nv,) array_like, optional
         Generalized force that acts; zero by default.
     holding : (nq,) array_like, optional
@@ -176,6 +179,8 @@ def equilibrium(
         acting = np.zeros(model.nv) if tau is None else finite_array("tau", tau, (model.nv,))
         if q0 is not None:
             starts = [balance.allowed(model.check_q(finite_array("q0", q0, (model.nq,)), "q0"))]
+            # Far out a force fades, and the search runs away from where it balances.
+            starts += [] if model.has_bodies or model.constrained else [starts[0] / 2**k for k in range(1, _NEARER)]
         else:
             rng = generator("seed", seed)
             starts = [model.random_state(rng)[0] for _ in range(_STARTS)]
