@@ -108,6 +108,19 @@ def test_squares_are_found():
     assert m * u**2 / 2 + m * (l + s) ** 2 * w**2 / 2 == lag.T
 
 
+def test_gravity_is_not_lost_in_products():
+    b = mb.ModelBuilder("rod", gravity=(0, 0, -9.81))
+    b.add_body("rod", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("theta", "revolute", parent="world", child="rod", axis=(0, 1, 0))
+    lag = mb.lagrangian.from_model(b.build())
+    assert str(lag.equations()) == "0.35*thetaddot + g*sin(theta)/2 = 0"
+    assert {s.name: x for s, x in lag.parameters.items()} == {"g": 9.81}
+    kept = mb.lagrangian.from_model(b.build(), symbols=False)
+    at = [0.3], [0.1], [0.0]
+    assert not kept.parameters
+    assert lag.dynamics().forward_dynamics(*at) == pytest.approx(kept.dynamics().forward_dynamics(*at), rel=1e-14)
+
+
 def test_numbers_are_the_description_s():
     lag = from_model(mb.catalog.pendulum(length=0.5, mass=2.0), symbols=False)
     w, th = sp.symbols("thetadot theta")

@@ -14,6 +14,7 @@ from mbkit.lagrangian.description_kinematics import (
     SymbolicKinematics,
     closure,
     coupled,
+    exact,
     instead_of_writing,
     rolling,
 )
@@ -22,6 +23,7 @@ from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.energy_model import EnergyModel
 from mbkit.lagrangian.printing.catalog_symbols import in_symbols
 from mbkit.lagrangian.system import Lagrangian
+from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Model
 
 #: Velocities up to which equations are written out.
@@ -58,7 +60,8 @@ def from_model(
         Of joints whose velocities are the rates of their coordinates: not ball and free ones.
     symbols : bool, optional
         Whether a catalog system is written in the textbooks' symbols, with the model's numbers as their values:
-        cart_pole in m_c, m_p, l and g. By default, if the model has no named parameters of its own.
+        cart_pole in m_c, m_p, l and g. By default, if the model has no named parameters of its own; of others the
+        default writes g alone.
     coordinates : sequence of str, optional
         Names instead of the model's, such as ``["q1", "q2"]``, prescribed ones included.
     drives : bool
@@ -116,7 +119,10 @@ def from_model(
         raise InputError(f"coordinates: {clash[0]!r} is a parameter of {model.name}; give coordinates=... other names")
     v = [velocity_of(s) for s in q]
     kin = SymbolicKinematics(source, q, v, parameters, progress or (lambda *_: None))
-    T, V, R = kin.kinetic_energy, kin.gravity_energy + spring_energy(kin.written), dissipation(kin.written)
+    T, R = kin.kinetic_energy, dissipation(kin.written)
+    plain = symbols is None and not source.parameters
+    weight, g = _weight(kin, {s.name for s in (*q, *v)}) if plain else (kin.gravity_energy, {})
+    V = weight + spring_energy(kin.written)
     t = _time({*parameters, *(s.name for s in (*q, *v))})
     moved = {model.coordinate_names.index(p.joint): law(kin, p, t) for p in model.prescribed}
     rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]
@@ -147,9 +153,20 @@ def from_model(
         constraints=constraints,
         velocity_constraints=moving,
         # What only a frame needs is no part of the equation; a name of the user's own is kept all the same.
-        parameters={s: source.parameters[n] for n, s in parameters.items() if named is None or s in used},
+        parameters={s: source.parameters[n] for n, s in parameters.items() if named is None or s in used} | g,
         name=model.name,
     )
+
+
+def _weight(kin: SymbolicKinematics, used: set[str]) -> tuple[sp.Expr, dict[sp.Symbol, float | None]]:
+    """Return the potential of weights with g for a number that would be lost in products, and g's value."""
+    V, model = kin.gravity_energy, kin.model
+    numbers = [abs(float(x)) for x in model.gravity if x != 0]
+    # A force that holds weights has the number too.
+    if V == 0 or len(numbers) != 1 or "g" in used or model.forces:
+        return V, {}
+    g = sp.Symbol("g")
+    return g * tidy(V / exact(numbers[0])), {g: numbers[0]}
 
 
 def _check(model: Model) -> None:
