@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.statics.equilibrium import Equilibrium as Equilibrium
     from mbkit.lagrangian.statics.newton_euler import FreeBodies as FreeBodies
     from mbkit.lagrangian.statics.newton_euler import newton_euler as newton_euler
+    from mbkit.lagrangian.statics.portrait import portrait as portrait
     from mbkit.lagrangian.statics.virtual_work import from_particles as from_particles
     from mbkit.lagrangian.statics.virtual_work import generalized_force as generalized_force
     from mbkit.lagrangian.system import Lagrangian as Lagrangian
@@ -68,6 +69,7 @@ _HOME = {
     "from_model": "mbkit.lagrangian.from_description",
     "from_particles": "mbkit.lagrangian.statics.virtual_work",
     "newton_euler": "mbkit.lagrangian.statics.newton_euler",
+    "portrait": "mbkit.lagrangian.statics.portrait",
     "generalized_force": "mbkit.lagrangian.statics.virtual_work",
 }
 

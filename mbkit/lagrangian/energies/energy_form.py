@@ -80,7 +80,8 @@ class EnergyForm:
     ) -> None:
         self.parameters = _parameters(parameters)
         into = PlainSymbols(coordinates, velocities, time, among=getattr(T, "free_symbols", ()), named=self.parameters)
-        self.T, self.V, self.dissipation = into("T", T), into("V", V), into("dissipation", dissipation)
+        self.T, self.V = _without_rates(into("T", T), into("V", V), into.velocities)
+        self.dissipation = into("dissipation", dissipation)
         acting = _forces(into, forces or {})
         self.constraints = _rows(into, "constraints", constraints)
         self.velocity_constraints = _rows(into, "velocity_constraints", velocity_constraints)
@@ -335,6 +336,20 @@ def _forces(into: PlainSymbols, source: Any) -> dict[sp.Symbol, sp.Expr]:
     return out
 
 
+def _without_rates(T: sp.Expr, V: sp.Expr, velocities: Sequence[sp.Symbol]) -> tuple[sp.Expr, sp.Expr]:
+    """Return T and V with terms of V that are linear in the velocities as terms of T: L = T - V stays."""
+    slopes = [sp.diff(V, w) for w in velocities]
+    if not any(slopes):
+        return T, V
+    if not vanish(sp.diff(a, w) for a in slopes for w in velocities):
+        raise InputError(
+            f"V: expected at most the first degree in the velocities, as of a magnetic field, got {V}; other forces "
+            "belong in forces or dissipation"
+        )
+    linear = sp.Add(*(a * w for a, w in zip(slopes, velocities, strict=True)))
+    return T - linear, V.subs(dict.fromkeys(velocities, 0))
+
+
 def _rows(into: PlainSymbols, what: str, source: Any) -> tuple[sp.Expr, ...]:
     if isinstance(source, (sp.Basic, str)) and not isinstance(source, sp.Tuple):
         source = [source]
@@ -416,14 +431,14 @@ def _warn_of_mass_in_time(d: EnergyForm) -> None:
 
 
 def _check_velocities(d: EnergyForm) -> None:
-    """Refuse velocities in V and constraints, and expressions that hold no coordinate or velocity."""
+    """Refuse velocities in constraints, and expressions that hold no coordinate or velocity."""
     moving = set(d.velocities)
     unknown = [f for f in d.T.atoms(AppliedUndef) if f.free_symbols & moving]
     if unknown:
         raise InputError(f"T: {unknown[0]} is a function of a velocity; T is of second degree in the velocities")
     for name, x in _parts(d).items():
         held = x.free_symbols & moving
-        if held and (name == "V" or name.startswith("constraints")):
+        if held and name.startswith("constraints"):
             raise InputError(f"{name}: expected coordinates, time and parameters only, got the velocity {plain(held)}")
     if d.dissipation != 0 and not d.dissipation.free_symbols & moving:
         raise InputError(

@@ -59,6 +59,16 @@ class EquationsOfMotion(Printable):
         # One product is as short as its factors.
         return tidy_matrix(C * v) if len(v) > 1 else sp.ImmutableMatrix(C * v)
 
+    def velocity_terms(self) -> tuple[sp.ImmutableMatrix, sp.ImmutableMatrix]:
+        """Return C v in two parts, (n, 1) each: centrifugal terms of v_i², and Coriolis terms of v_i v_j.
+
+        Craig 2005, Introduction to Robotics, ch. 6.8.
+        """
+        C, v = self.coriolis_matrix, self.velocities
+        squares = [sum((sp.diff(C[i, j], w) * w**2 for j, w in enumerate(v)), sp.Integer(0)) for i in range(len(v))]
+        centrifugal = tidy_matrix(sp.Matrix(squares))
+        return centrifugal, tidy_matrix(self.coriolis_force - centrifugal)
+
     @property
     def applied(self) -> sp.ImmutableMatrix:
         """Q - C v - d - ∂V/∂q (+ Jᵀ λ), which is M v̇, (n, 1)."""
@@ -107,13 +117,19 @@ class EquationsOfMotion(Printable):
             ) from None
         return tuple(sp.Eq(a, shorter(x), evaluate=False) for a, x in zip(self.accelerations, solved, strict=True))
 
-    def latex(self) -> str:
-        """Return the equations as an aligned LaTeX block, in the order of textbooks."""
+    def latex(self, *, apart: bool = False) -> str:
+        """Return the equations as an aligned LaTeX block, in the order of textbooks.
+
+        Parameters
+        ----------
+        apart : bool
+            Whether centrifugal terms, of v_i², stand before Coriolis terms, of v_i v_j, and not in one bracket.
+        """
         board = ExpressionPrinter(self.coordinates, self.velocities, self.accelerations, self.multipliers)
         shown = (*self.mass_matrix, *self.coriolis_force, *self.drift, *self.potential_gradient, *self.forces)
         shown = (*shown, *self.constraints)
         short = Abbreviations(shown, set().union(*(x.free_symbols for x in shown)))
-        pairs = printed_equations(self, board, short, latex=True)
+        pairs = printed_equations(self, board, short, latex=True, apart=apart)
         pairs += [(board.latex(letter), board.latex(root)) for letter, root in short.roots.items()]
         return aligned(pairs)
 
@@ -140,15 +156,17 @@ def printed_equations(
     short: Abbreviations,
     *,
     latex: bool = False,
+    apart: bool = False,
     progress: Callable[[float, str], object] = lambda fraction, what: None,  # noqa: ARG005
 ) -> list[tuple[str, str]]:
     """Return the two sides of each equation and of each constraint; `progress` gets the fraction done."""
     join = board.latex_of if latex else board.text_of
     out, n = [], len(e.coordinates)
+    moving = e.velocity_terms() if apart else (e.coriolis_force,)
     for i, force in enumerate(e._right_side):
         progress(i / n, f"equation {i + 1} of {n}")
         parts = [m * a for m, a in zip(e.mass_matrix[i, :], e.accelerations, strict=True)]
-        parts += [_by_speeds(e.coriolis_force[i], e.velocities), e.drift[i], spread(e.potential_gradient[i])]
+        parts += [*(_by_speeds(x[i], e.velocities) for x in moving), e.drift[i], spread(e.potential_gradient[i])]
         out.append((join(short(part) for part in parts), join([short(force)])))
     write = board.latex if latex else board.text
     return out + [(write(short(f)), "0") for f in e.constraints]
