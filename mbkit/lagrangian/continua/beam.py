@@ -113,6 +113,8 @@ def beam(
     >>> a = arm.discretized([(sp.Symbol("s") / L) ** 2])
     >>> T = J * sp.Symbol("thetadot") ** 2 / 2 + a.T
     >>> print(mb.lagrangian.Lagrangian(T, a.V, [theta, *a.coordinates], parameters=[L, EI, rho, J]).equations())
+    thetaddot*(J + L*rho*(5*L**2 - a1**2)/15) + L**2*addot1*rho/4 - 2*L*a1*adot1*rho*thetadot/15 = 0
+    L**2*rho*thetaddot/4 + L*addot1*rho/5 + L*a1*rho*thetadot**2/15 + 4*EI*a1/L**3 = 0
     """
     place = list(position)
     if len(place) not in (2, 3):
