@@ -1,12 +1,14 @@
 """Strings and beams on paper: their equations and ends, frequencies beside closed forms, and beams on moving roots."""
 
+import warnings
+
 import mpmath
 import numpy as np
 import pytest
 import sympy as sp
 
 import mbkit as mb
-from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.errors import InputError, MbkitWarning, NumericalError, UnsupportedError
 from validation import beams, flexible
 
 x, s, t, L, rho, EI, P, m, J, Om, kGA, RI = sp.symbols("x s t L rho EI P m J Omega kGA rhoI")
@@ -248,6 +250,17 @@ def test_a_string_and_a_body_at_the_end():
     assert sp.expand(sp.expand(tip.T).coeff(m) - of_mass) == 0
 
 
+def test_a_beam_of_small_deflections_is_no_negative_mass():
+    th, arm = sp.Symbol("theta"), {L: 10.0, EI: 1.4e4, rho: 1.2, J: 50.0}
+    a = beam(L, EI, rho, rotation=th, coordinates=[th]).discretized(mb.lagrangian.clamped_free(2, s, L))
+    T = J * sp.Symbol("thetadot") ** 2 / 2 + a.T
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MbkitWarning)
+        Lagrangian(T, a.V, [th, *a.coordinates], parameters=arm)
+    with pytest.warns(MbkitWarning, match="negative kinetic energy"):
+        Lagrangian(-T, a.V, [th, *a.coordinates], parameters=arm)
+
+
 # What is refused
 
 
@@ -275,6 +288,15 @@ def test_a_string_and_a_body_at_the_end():
         (lambda: CANTILEVER.discretized([L**2 / x**2]), InputError, "no real value"),
         (lambda: CANTILEVER.discretized(5), InputError, "expected a list"),
         (lambda: CANTILEVER.discretized([sp.sqrt(x / L) ** 5, (x / L) ** 2]), NumericalError, "does not settle"),
+        (lambda: Continuum(MOVING, BENT, [w, w], (0, L)), InputError, "different functions"),
+        (lambda: Continuum(MOVING, BENT, w, (0, L), fixed={0: 5}), InputError, "expected a list"),
+        (lambda: CANTILEVER.discretized([(x / L) ** 2], name=5), InputError, "name: expected a text"),
+        (lambda: CANTILEVER.normal_modes(1, {L: 0, EI: 1, rho: 1}), InputError, "not above zero"),
+        (lambda: beam(L, EI, rho, position=5), InputError, "position: expected a list"),
+        (lambda: beam(L, EI, rho, gravity=5), InputError, "gravity: expected a list"),
+        (lambda: beam(L, EI, rho, position=[0, 0, 0], rotation=0.3), InputError, "rotation: expected a"),
+        (lambda: beam(L, EI, rho, coordinates=5), InputError, "coordinates: expected a list"),
+        (lambda: mb.lagrangian.clamped_free(2, "x", L), InputError, "x: expected a SymPy symbol"),
         (lambda: CANTILEVER.normal_modes(1, [1.0]), InputError, "mapping"),
         (lambda: Continuum(MOVING, BENT, w, (0, L), fixed=[w]), InputError, "mapping"),
         (lambda: Continuum(MOVING, BENT, w, 5), InputError, "two places"),

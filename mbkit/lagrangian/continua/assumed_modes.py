@@ -48,19 +48,19 @@ class AssumedModes:
     _fields: tuple[str, ...]
     _shapes: tuple[tuple[Shape, ...], ...]
 
-    def at(self, xi: ArrayLike, field: str | None = None) -> Array:
+    def at(self, xi: ArrayLike, field: Any = None) -> Array:
         """Return each mode's shape at places, (n,) or (N, n): ``q @ modes.at(1.0)`` is the deflection of the end.
 
         Parameters
         ----------
         xi : float or (N,) array_like
             0 at the lower end to 1 at the upper one.
-        field : str, optional
-            Its name; the first by default.
+        field : sympy function or str, optional
+            By itself or its name; the first by default.
         """
-        if field is not None and str(field) not in self._fields:
+        if field is not None and name_of(field) not in self._fields:
             raise InputError(f"field: expected one of {', '.join(self._fields)}, got {field!r}")
-        k = 0 if field is None else self._fields.index(str(field))
+        k = 0 if field is None else self._fields.index(name_of(field))
         places = real_array("xi", xi)
         require_finite("xi", places)
         if places.ndim > 1 or (places < 0).any() or (places > 1).any():
@@ -81,6 +81,8 @@ def assumed_modes(system: Densities, shapes: Any, name: str) -> AssumedModes:
     read = [_mode(system, f"shapes[{i}]", source, fields) for i, source in enumerate(sources)]
     for i, mode in enumerate(read):
         _require_fixed(system, f"shapes[{i}]", mode)
+    if not isinstance(name, str) or not name.strip():
+        raise InputError(f"name: expected a text, got {name!r}")
     q = tuple(sp.Symbol(f"{name}{i + 1}") for i in range(len(read)))
     taken = {s.name for s in (system.T + system.V + sp.Add(*system.ends)).free_symbols}
     clash = [s for s in q if s.name in taken]

@@ -40,6 +40,8 @@ def clamped_free(count: int, x: sp.Symbol, length: Any) -> tuple[sp.Expr, ...]:
     count = counted("count", count, least=1)
     if count > _MOST:
         raise UnsupportedError(f"count: expected at most {_MOST} modes, got {count}; take Continuum.normal_modes")
+    if not isinstance(x, sp.Symbol):
+        raise InputError(f"x: expected a SymPy symbol, got {x!r}")
     place, out = x / expression("length", length), []
     with mpmath.workdps(_DIGITS):
         for k in range(count):
@@ -116,7 +118,7 @@ def beam(
     thetaddot*(J + L*rho*(5*L**2 - a1**2)/15) + L**2*addot1*rho/4 - 2*L*a1*adot1*rho*thetadot/15 = 0
     L**2*rho*thetaddot/4 + L*addot1*rho/5 + L*a1*rho*thetadot**2/15 + 4*EI*a1/L**3 = 0
     """
-    place = list(position)
+    place = listed("position", position)
     if len(place) not in (2, 3):
         raise InputError(f"position: expected a vector of 2 or 3 components, got {position!r}")
     space = len(place) == 3
@@ -126,7 +128,8 @@ def beam(
     if len(bent) != len(own) or any(len(f.args) != 2 for f in bent):
         raise InputError(f"fields: expected {len(own)} functions of a place and the time, got {fields!r}")
     s, t = bent[0].args
-    into = PlainSymbols(coordinates, velocities, t) if len(coordinates) else None
+    moved = listed("coordinates", coordinates) if coordinates != () else []
+    into = PlainSymbols(moved, velocities, t) if moved else None
     q, rates = (into.coordinates, into.velocities) if into else ((), ())
     if s.name in {x.name for x in q}:
         raise InputError(f"coordinates: {s} is the place along the beam; give others as fields=Function('v')(xi, t)")
@@ -154,7 +157,7 @@ def beam(
         T -= square * (mass * u0.dot(turn[:, 0]) + moment * turn[:, 0].dot(turn[:, 0])) / 2
         T -= mass * u0[0] * slopes.dot(slopes.diff(t))
     if gravity is not None:
-        down = sp.Matrix([read(f"gravity[{k}]", x) for k, x in enumerate(gravity)])
+        down = sp.Matrix([read(f"gravity[{k}]", x) for k, x in enumerate(listed("gravity", gravity))])
         if len(down) != len(r):
             raise InputError(f"gravity: {len(down)} components, but the position has {len(r)}")
         height = -down.dot(r + R * point)
@@ -185,9 +188,12 @@ def _rotation(source: Any, read: Callable[[str, Any], sp.Expr], *, space: bool) 
     if not space:
         angle = read("rotation", source)
         return sp.Matrix([[sp.cos(angle), -sp.sin(angle)], [sp.sin(angle), sp.cos(angle)]])
-    R = sp.eye(3) if isinstance(source, int) and source == 0 else sp.Matrix(source)
+    try:
+        R = sp.eye(3) if isinstance(source, int) and source == 0 else sp.Matrix(source)
+    except (TypeError, ValueError):
+        R = sp.zeros(0, 0)
     if R.shape != (3, 3):
-        raise InputError(f"rotation: expected a (3, 3) matrix in space, got the shape {R.shape}")
+        raise InputError(f"rotation: expected a (3, 3) matrix in space, got {source!r}")
     R = R.applyfunc(lambda x: read("rotation", x))
     if not vanish([*(R.T * R - sp.eye(3)), R.det() - 1]):
         raise InputError("rotation: its columns are not orthonormal and right-handed, so that it turns nothing")

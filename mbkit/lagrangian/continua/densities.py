@@ -10,7 +10,7 @@ import sympy as sp
 
 from mbkit.errors import InputError
 from mbkit.lagrangian.continua.jets import Jets
-from mbkit.lagrangian.energies.symbols import expression
+from mbkit.lagrangian.energies.symbols import expression, listed
 
 
 class Densities:
@@ -48,8 +48,7 @@ class Densities:
             raise InputError("T: a continuum without kinetic energy has no equation of motion")
         self.fixed: dict[sp.Expr, list[sp.Symbol]] = {e: [] for e in self.ends}
         for e, conditions in self._at_ends("fixed", fixed):
-            rows = [conditions] if isinstance(conditions, (str, sp.Basic)) else conditions
-            self.fixed[e] = [jets(f"fixed[{e}]", x) for x in rows]
+            self.fixed[e] = [jets(f"fixed[{e}]", x) for x in listed(f"fixed[{e}]", conditions)]
         self._check()
 
     def _at_ends(self, what: str, source: Mapping[Any, Any] | None) -> list[tuple[sp.Expr, Any]]:

@@ -28,6 +28,8 @@ class Jets:
             raise InputError(
                 f"fields: expected functions of one place and the time, such as w(x, t), got {self.fields}"
             )
+        if len({f.func.__name__ for f in self.fields}) < len(self.fields):
+            raise InputError(f"fields: expected different functions, got {self.fields}")
         self.x, self.t = next(iter(places))
         if not (isinstance(self.x, sp.Symbol) and isinstance(self.t, sp.Symbol)):
             raise InputError(f"fields: expected functions of two symbols, got {self.fields[0]}")

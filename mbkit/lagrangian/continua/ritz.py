@@ -98,6 +98,8 @@ class _Ritz:
     def __init__(self, system: Densities, numbers: Mapping[sp.Symbol, sp.Expr]) -> None:
         self._system, self._numbers, self._integrals = system, numbers, Integrals([])
         self._length = _digits((system.ends[1] - system.ends[0]).subs(numbers))
+        if self._length <= 0:
+            raise InputError(f"values: the length from {system.ends[0]} to {system.ends[1]} is not above zero")
         #: Fields and derivatives of products in T - V, each with a function of the powers' sum.
         self._pairs: list[tuple[tuple[int, Order], tuple[int, Order], OfPower]] = []
         for sign, what, x in ((1, "T", system.T), (-1, "V", system.V)):
