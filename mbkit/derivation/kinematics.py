@@ -315,5 +315,22 @@ def dissipation(kin: Kinematics) -> Any:
 
 
 def damping_forces(kin: Kinematics) -> Any:
-    """Return -∂R/∂v."""
-    return -ca.gradient(dissipation(kin), kin.v)
+    """Return -∂R/∂v, and dry friction at speed."""
+    smooth = -ca.gradient(dissipation(kin), kin.v)
+    return smooth + friction_forces(kin) if kin.model.needs.friction else smooth
+
+
+def friction_forces(kin: Kinematics) -> Any:
+    """Return -f(|v|) sign(v) of each joint, by the law of `mbkit.model.changes.dry_friction`; zero at rest."""
+    total = ca.SX(kin.model.nv, 1)
+    for joint in kin.model.joints:
+        values = kin.values.joints[joint.name]
+        for k, rate in enumerate(kin.velocities(joint)):
+            size, bound = values.friction[k], getattr(values, "stiction", values.friction)[k]
+            if is_zero(size) and is_zero(bound):
+                continue
+            width = getattr(values, "stribeck_velocity", [0.0] * joint.type.nv)[k]
+            if not is_zero(width):
+                size += (bound - size) * ca.exp(-((rate / width) ** 2))
+            total -= ca.gradient(rate, kin.v) * (size * ca.sign(rate))
+    return total

@@ -99,7 +99,9 @@ Constants = Literal["literal", "symbols"]
 
 _BODY: Final = ("mass", "com", "inertia")
 _PLACE: Final = ("rotation", "translation")
-_JOINT: Final = (*_PLACE, "axes", "pitch", "armature", "damping", "stiffness", "rest")
+_JOINT: Final = (*_PLACE, "axes", "pitch", "armature", "damping", "stiffness", "rest", "friction")
+#: Of dry friction, where they are given.
+_FRICTION: Final = ("stiction", "stribeck_velocity")
 _MIMIC: Final = ("ratio", "offset")
 _COUPLING: Final = ("factors", "stiffness", "rest_length", "damping", "armature")
 _SPRING: Final = ("point_a", "point_b", "stiffness", "rest_length", "damping")
@@ -207,6 +209,8 @@ class Values:
 
     def _joint(self, joint: Joint) -> Any:
         values = self._read("joints", joint.name, joint, _JOINT)
+        given = [name for name in _FRICTION if getattr(joint, name) is not None]
+        values.__dict__.update(self._read("joints", joint.name, joint, tuple(given)).__dict__)
         if joint.mimic:
             values.__dict__.update(self._read("joints", joint.name, joint.mimic, _MIMIC).__dict__)
         return values

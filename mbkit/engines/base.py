@@ -21,6 +21,7 @@ from mbkit._check import Array, all_finite, batch_of, rows
 from mbkit._fork import fork_safe
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
 from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
+from mbkit.engines.elements.dry_friction import DryFriction
 from mbkit.engines.frames_and_momenta import (
     ALIGNED,
     JOINT,
@@ -516,6 +517,28 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     # Checks and batches
 
     def _method(self, quantity: str) -> Callable[..., Any]:
+        """Return the method for a quantity, with dry friction; raise `UnsupportedError` where there is none."""
+        method = self._without_friction(quantity)
+        return self._friction.beside(quantity, method, self) if self.model.needs.friction else method
+
+    def _of_sample(self, i: int) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
+        """Return the dynamics of one sample of a batch."""
+        return self
+
+    def _of_model(self, model: Model, form: str) -> Dynamics:  # noqa: ARG002  # for engines that derive a form once
+        """Return the dynamics of another model on this engine, with the same choices; `form` is its form's digest."""
+        return type(self)(model)
+
+    def _rounded(self, value: Any) -> Array:
+        """Return what the adapter's methods return in double precision."""
+        return np.asarray(value, dtype=np.float64)
+
+    @cached_property
+    def _friction(self) -> DryFriction:
+        """Dry friction of the model's joints."""
+        return DryFriction(self.model)
+
+    def _without_friction(self, quantity: str) -> Callable[..., Any]:
         """Return the adapter's method for a quantity; raise `UnsupportedError` where it has none."""
         if quantity in _OF_BODIES:
             self.model.require_bodies(quantity)

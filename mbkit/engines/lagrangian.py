@@ -18,6 +18,7 @@ from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_o
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity
 from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import Dynamics, scalar
+from mbkit.engines.elements.dry_friction import UNDER_FORCE
 from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.engines.loads import Wrenches
@@ -189,6 +190,8 @@ class LagrangianDynamics(Dynamics):
         #: For steps that the others lose to their constraints.
         self._thorough_steps: dict[str, tuple[Method, CompiledStep]] = {}
         self._wrenched: dict[Any, LagrangianDynamics] = {}
+        #: Of models that differ in the values of parameters alone, by their form.
+        self._others: dict[str, LagrangianDynamics] = {}
         self._parametric = bool(model.parameters)
 
     @cached_property
@@ -229,7 +232,9 @@ class LagrangianDynamics(Dynamics):
                 starts = [start for start, _ in self.model.quaternions] if name in _TRIM else None
                 named = self.form, *map(str, key)
                 code = executable(named, derive, compile=self.compile, device=self.device, quaternions=starts)
-            if name in _TRIM and not isinstance(code, Machine):
+            # At rest, dry friction is decided outside of machine code.
+            undecided = self.model.needs.friction and name in UNDER_FORCE
+            if name in _TRIM and not (isinstance(code, Machine) or undecided):
                 # Loads LLVM, which interpreting never needs.
                 from mbkit.engines.compiled_calls import quantity_call
 
@@ -302,11 +307,23 @@ class LagrangianDynamics(Dynamics):
         index = index.astype(int)
         return self._with(self.model, {name: x[index] for name, x in self._batched.items()})
 
+    def _of_sample(self, i: int) -> LagrangianDynamics:
+        own = {name: float(x[i]) for name, x in self._batched.items()}
+        return self._with(self.model.with_nominal(own), {}) if own else self
+
+    def _of_model(self, model: Model, form: str) -> LagrangianDynamics:
+        if form not in self._others:
+            # The choice of the elimination is this model's own.
+            chosen: Any = {"compile": self.compile, "elimination": self.elimination, "device": self.device}
+            self._others[form] = type(self)(model, threads=self.threads, **chosen)
+        return self._others[form]._with(model, self._batched)
+
     def _with(self, model: Model, batched: dict[str, Array]) -> LagrangianDynamics:
         out = object.__new__(type(self))
         # Both share derived and compiled functions, now and later.
         out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
-        out.__dict__.pop("parameter_values", None)
+        for name in ("parameter_values", "_phases"):
+            out.__dict__.pop(name, None)
         vars(out).update(model=model, _batched=batched, _wrenched={})
         return out
 

@@ -142,6 +142,9 @@ class OracleDynamics(Dynamics):
         #: The last value of each thread, in all its digits.
         self._values = threading.local()
         self._held: tuple[_Key, _Key, dict[str, Any]] | None = None
+        self._digest = model.digest
+        #: Of models that differ in the values of parameters alone, by their form.
+        self._others: dict[str, OracleDynamics] = {}
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         return type(self), (self.model, self._given, self._arithmetic.name)
@@ -184,6 +187,18 @@ class OracleDynamics(Dynamics):
         if self._given is not None:
             raise InputError("at: this oracle already has its constants; put the parameters' values among them")
         return type(self)(self.model.with_nominal(values), backend=self._arithmetic.name)
+
+    def _of_model(self, model: Model, form: str) -> OracleDynamics:
+        if form not in self._others:
+            self._others[form] = type(self)(model, backend=self._arithmetic.name)
+        out, own = copy(self._others[form]), self._arithmetic
+        vars(out).update(model=model, _held=None)
+        values = own.array(np.array(list(model.parameters.values()), dtype=np.float64))
+        out._constants = [np.concatenate([values, out._constants[0][0][len(values) :]])[None]]
+        return out
+
+    def _rounded(self, value: Any) -> Array:
+        return np.asarray(self._arithmetic.pair(value)[0])
 
     def _under(self, frames: tuple[Frame, ...], axes: str) -> OracleDynamics:
         key = tuple(frame.name for frame in frames), axes
@@ -272,7 +287,7 @@ class OracleDynamics(Dynamics):
     def _form(self) -> str:
         """All that the programs depend on but their names."""
         frames, axes = self._acting
-        return f"{self.model.digest} under {[x.name for x in frames]} {axes} in {self._arithmetic.name}"
+        return f"{self._digest} under {[x.name for x in frames]} {axes} in {self._arithmetic.name}"
 
     @cached_property
     def _pattern(self) -> Array:

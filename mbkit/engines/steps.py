@@ -8,6 +8,7 @@ solved for are differentiated by the implicit function theorem.
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -134,7 +135,12 @@ class Steps:
         # An overflow is reported as an error.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             try:
-                q1, v1 = self._step(chosen, **states, dt=h)
+                if self.model.needs.friction:
+                    # By name: the phases of friction are those of runs, a floor above.
+                    one: Any = import_module("mbkit.simulate.solvers.friction.single_step")
+                    q1, v1 = one.step(self, chosen, **states, dt=h)
+                else:
+                    q1, v1 = self._step(chosen, **states, dt=h)
                 good = _finite_rows(q1, v1)
             except _NotFiniteError as error:
                 good = error.args[0]

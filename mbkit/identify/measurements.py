@@ -39,7 +39,7 @@ class Unknowns:
     nominal : (p,) array
         Their values in the model.
     acting : (p,) array
-        The same, but zero for dry friction, which inverse dynamics leaves out.
+        The same: what of them is in the model's inverse dynamics.
     friction, armature : bool
     """
 
@@ -47,7 +47,6 @@ class Unknowns:
     names: tuple[str, ...]
     combinations: tuple[str, ...]
     nominal: Array
-    acting: Array
     friction: bool
     armature: bool
 
@@ -61,9 +60,8 @@ class Unknowns:
         loss = [damping, dry] if friction else []
         rest = [rotors[list(columns.rotors)]] if armature else []
         nominal = np.concatenate([base.values, *loss, *rest])
-        acting = np.concatenate([base.values, *([damping, 0.0 * dry] if friction else []), *rest])
         combinations = (*base.combinations, *names[base.count :])
-        return cls(base, names, combinations, nominal, acting, friction, armature)
+        return cls(base, names, combinations, nominal, friction, armature)
 
 
 def of_velocities(model: Model, field: str) -> Array:
@@ -162,7 +160,7 @@ def equations(dyn: Dynamics, unknowns: Unknowns, data: Measurements, progress: P
 def _blocks(dyn: Dynamics, unknowns: Unknowns, data: Measurements) -> Iterator[tuple[slice, Array, Array]]:
     """Yield samples with their regressor and the torque that it has to explain."""
     model, needs = dyn.model, dyn.model.needs
-    known = needs.springs or needs.damping or needs.armature or needs.forces
+    known = needs.springs or needs.damping or needs.friction or needs.armature or needs.forces
     size = max(64, _BLOCK // max(model.nv * len(unknowns.names), 1))
     for start in range(0, len(data), size):
         part = slice(start, min(start + size, len(data)))
@@ -171,7 +169,7 @@ def _blocks(dyn: Dynamics, unknowns: Unknowns, data: Measurements) -> Iterator[t
         tau = data.tau[part]
         if known:
             # Springs, and what else is not to be found, as the model has them.
-            tau = tau - (dyn.inverse_dynamics(*state) - Y @ unknowns.acting)
+            tau = tau - (dyn.inverse_dynamics(*state) - Y @ unknowns.nominal)
         yield part, Y, tau
 
 

@@ -63,8 +63,7 @@ def identify(
         Whether the parameters have to be those of matter: pseudo-inertias positive definite, friction and armature not
         negative. Needs the packages of ``pip install 'mbkit[identify]'``. Bodies without mass stay without.
     friction : bool
-        Whether to identify viscous and dry friction of every velocity. Without, dampers are taken from the model, and
-        there is no dry friction.
+        Whether to identify viscous and dry friction of every velocity. Without, both are taken from the model.
     armature : bool
         Whether to identify the armature of joints with one velocity.
     prior : {"entropic", "euclidean"}, optional

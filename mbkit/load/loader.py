@@ -8,7 +8,7 @@ import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from importlib import import_module
@@ -90,7 +90,7 @@ def load(
 
     No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF
     its inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers where their
-    forces are linear, and the rotors of its actuators as armature. Dry friction and limits are data: no engine applies
+    forces are linear, and the rotors of its actuators as armature. Limits are data: no engine applies
     them.
 
     Parameters
@@ -216,16 +216,8 @@ def load(
     doubts = scale_doubts(model)
     if doubts:
         warn(f"{path}: engines may lose digits: {'; '.join(doubts)}", MbkitWarning)
-    model = replace(model, notes=(*root.notes, *model.notes, *_friction(model)), source=file)
+    model = replace(model, notes=(*root.notes, *model.notes), source=file)
     return model if mount is None else mounted(model, mount)
-
-
-def _friction(model: Model) -> Iterator[str]:
-    """Yield a note on dry friction."""
-    if having := [j for j in model.joints if j.friction.any()]:
-        worst = max(having, key=lambda j: float(j.friction.max()))
-        of = f"{len(having)} joint{'s' * (len(having) > 1)}"
-        yield f"dry friction is data, and acts in no engine: {of}, up to {worst.friction.max():g} at {worst.name}"
 
 
 def _locate(source: str | os.PathLike[str]) -> tuple[Path, bool]:

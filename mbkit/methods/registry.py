@@ -45,6 +45,8 @@ SCIPY_METHOD: Final = "dop853"
 SCIPY_STIFF_METHOD: Final = "radau"
 #: SUNDIALS' multistep method for stiff systems.
 BDF_METHOD: Final = "cvodes"
+#: With a step, for dry friction at many joints.
+FRICTION_METHOD: Final = "moreau"
 #: The most accurate implicit one with a fixed step.
 GAUSS_METHOD: Final = "gauss6"
 #: One of each kind, and MuJoCo's own beside the same formulas.
@@ -103,8 +105,8 @@ class Method:
         often slows it.
     own : str
         Of an engine's integrator: the method of mbkit with the same formula.
-    wrenches : bool
-        Whether wrenches may act on frames.
+    wrenches, dry_friction : bool
+        Whether wrenches may act on frames; whether it solves dry friction itself, and is not run phase by phase.
     """
 
     name: str
@@ -130,6 +132,7 @@ class Method:
     multistep: bool = False
     own: str = ""
     wrenches: bool = True
+    dry_friction: bool = False
 
     @cached_property
     def formula(self) -> Formula | None:
@@ -174,6 +177,8 @@ _MIDPOINT: Final = ImplicitTableau("implicit_midpoint", [[0.5]], [1.0], 2)
 _ABOUT: Final = {
     DEFAULT_METHOD: "Kutta's method of 1901; Munthe-Kaas (1999) on rotations, as MuJoCo 4 does it",
     EULER_METHOD: "new velocity, then the position with it, as MuJoCo does it",
+    FRICTION_METHOD: "semi-implicit Euler with dry friction as impulses (Moreau 1988, Jean 1999); its cone is solved "
+    "exactly at each step",
     "implicit_midpoint": "the midpoint rule in (q, p), on rotations its variational form: symplectic",
     "gauss4": "Gauss-Legendre collocation, 2 stages (Hairer, Nørsett, Wanner 1993, II.7)",
     GAUSS_METHOD: "Gauss-Legendre collocation, 3 stages (Hairer, Nørsett, Wanner 1993, II.7)",
@@ -280,6 +285,15 @@ METHODS: Final[dict[str, Method]] = {
                 tableau.name, tableau.order, formula_source=tableau, stability=TableauStability(tableau), compiled=True
             )
             for tableau in (gauss_legendre(2), gauss_legendre(3))
+        ),
+        _fixed(
+            FRICTION_METHOD,
+            1,
+            stages=1,
+            stability=SYMPLECTIC_EULER,
+            dry_friction=True,
+            compiled=True,
+            solver="friction.moreau:run_moreau",
         ),
         _adaptive(
             ADAPTIVE_METHOD, 8, "adaptive:run_embedded", stages=12, formula_source=dormand_prince_853, compiled=True

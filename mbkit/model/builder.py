@@ -329,6 +329,8 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         friction: ArrayLike = 0.0,
         stiffness: _Numbers = 0.0,
         rest: _Numbers = 0.0,
+        stiction: ArrayLike | None = None,
+        stribeck_velocity: ArrayLike | None = None,
         mimic: Mimic | tuple[str, Number, Number] | None = None,
     ) -> None:
         """Add the joint that carries `child`.
@@ -349,12 +351,14 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
             free take none.
         pitch : float
             Helical: metres per radian.
-        lower, upper, velocity_limit, effort_limit, friction : float, (nq,) or (nv,) array_like, optional
+        lower, upper, velocity_limit, effort_limit : float, (nq,) or (nv,) array_like, optional
             Data, not dynamics.
         armature : float
             Added to M's diagonal, kg m² (kg for a prismatic joint); joints of one velocity, and ball joints.
         damping, stiffness, rest : float or (nv,) array_like
             N m s/rad (N s/m), and a spring's torque -stiffness (q - rest), not for ball and free joints.
+        friction, stiction, stribeck_velocity : float or (nv,) array_like, optional
+            Dry friction, N m or N; the largest at rest, if another; and the velocity at which it falls to the first.
         mimic : Mimic or (joint, ratio, offset), optional
             The joint that this one follows.
         """
@@ -366,11 +370,10 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
             read.faults.append(f"{item}: unknown kind {shown(kind)}; use one of {', '.join(near or KINDS)}")
             # The other faults of this call would follow from this one.
             kind, axis, axis2, pitch, mimic = FIXED.name, None, None, 0.0, None
-            lower = upper = velocity_limit = effort_limit = None
+            lower = upper = velocity_limit = effort_limit = stiction = stribeck_velocity = None
             armature = damping = friction = stiffness = rest = 0.0
-        limits = lower, upper, velocity_limit, effort_limit
-        numbers = armature, damping, friction, stiffness, rest
-        given: dict[str, Any] = dict(zip(NUMBERS_OF_JOINTS, (*limits, *numbers), strict=True))
+        numbers = lower, upper, velocity_limit, effort_limit, armature, damping, friction, stiffness, rest
+        given: dict[str, Any] = dict(zip(NUMBERS_OF_JOINTS, (*numbers, stiction, stribeck_velocity), strict=True))
         given |= {"axes": (axis, axis2)} | ({} if mimic is None else {"mimic": mimic})
         turn = {"kind": kind, "rotation": read.orientation(item, rotation, rpy)}
         ready = turn | self._joint_fields(name, kind_of(kind), given)
@@ -390,8 +393,8 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
                 out[field] = read.limits(item, x, type_.nq, -np.inf if field == "lower" else np.inf)
             elif field.endswith("_limit"):
                 out[field] = read.limits(item, x, type_.nv, np.inf)
-            elif field == "friction":
-                out[field] = read.array(item, x, (type_.nv,), each=True)
+            elif field in ("friction", "stiction", "stribeck_velocity"):
+                out[field] = x if x is None else read.array(item, x, (type_.nv,), each=True)
             elif field != "mimic":
                 out[field] = read.quantities(item, x, type_.nv, each=True)
             elif (follows := read.mimic(f"joint {name!r}", x)) is not None:

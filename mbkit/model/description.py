@@ -25,9 +25,14 @@ from mbkit.model.parts import Body, Coupler, Frame, Joint, JointCoupling, Loop, 
 CONSTRAINT_FEATURES: Final = ("loops", "couplers", "prescribed", "no_slip")
 
 
+#: Fields that came later than digests which users keep: without a value they are not in these.
+_LATER: Final = ("stiction", "stribeck_velocity")
+
+
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+        given = {f.name: getattr(value, f.name) for f in fields(value)}
+        return {name: _plain(x) for name, x in given.items() if x is not None or name not in _LATER}
     if isinstance(value, np.ndarray):
         return [_plain(x) for x in value.tolist()]
     if isinstance(value, (list, tuple)):
@@ -52,8 +57,8 @@ SERVOS: Final = "servos"
 class Needs:
     """One flag per feature; True where the description has it.
 
-    Friction, limits and loops are data; the smooth terms of every engine leave friction and limits out. `forces` are
-    those given by functions and what holds weights; their parts do not count as springs and dampers.
+    Limits are data, and no engine applies them. `forces` are those given by functions and what holds weights; their
+    parts do not count as springs and dampers.
     """
 
     gravity: bool
@@ -99,7 +104,7 @@ class Needs:
             springs=present("stiffness", between),
             damping=present("damping", between),
             armature=present("armature", (*joints, *couplings)),
-            friction=any(np.any(j.friction) for j in joints),
+            friction=any(np.any(j.friction) or (j.stiction is not None and np.any(j.stiction)) for j in joints),
             limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
             effort_limits=any(np.any(np.isfinite([j.effort_limit, j.velocity_limit])) for j in joints),
             mimic=any(j.mimic is not None for j in joints),
@@ -116,7 +121,7 @@ class Needs:
 
     def __str__(self) -> str:
         there, absent = ([k for k, x in self.as_dict().items() if x is on] for on in (True, False))
-        there = ["dry friction (in no engine)" if name == "friction" else name for name in there]
+        there = ["dry friction" if name == "friction" else name for name in there]
         return f"has {', '.join(there) or 'nothing'}; without {', '.join(absent) or 'nothing'}"
 
 
@@ -397,8 +402,8 @@ class Description:
 
     @cached_property
     def loses_energy(self) -> bool:
-        """Whether dampers, or forces without a potential, do work that the energy does not account for."""
-        return self.needs.damping or lost(self)
+        """Whether dampers, dry friction, or forces without a potential do work that no energy accounts for."""
+        return self.needs.damping or self.needs.friction or lost(self)
 
     @cached_property
     def interval(self) -> tuple[float, float]:

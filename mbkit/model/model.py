@@ -436,7 +436,8 @@ class Model(Description):
         if feature == "limits":
             return replace(self, joints=tuple(_unlimited(j) for j in self.joints))
         name = _PER_VELOCITY[feature]
-        joints = tuple(replace(j, **{name: np.zeros(j.type.nv)}) for j in self.joints)  # type: ignore[arg-type]
+        more: Any = {"stiction": None, "stribeck_velocity": None} if name == "friction" else {}
+        joints = tuple(replace(j, **{name: np.zeros(j.type.nv)} | more) for j in self.joints)
         bindings = tuple(b for b in self.bindings if b.field != name)
         changes: Any = {"joints": joints}
         for where, acting in _ACTING.items():

@@ -243,4 +243,4 @@ def with_numbers(part: Any, numbers: Iterable[tuple[str, tuple[int, ...], Number
             array[index] = nominal(value)
         else:
             changes[field] = nominal(value)
-    return replace(part, **changes)
+    return replace(part, **changes) if changes else part

@@ -37,7 +37,7 @@ class _Frozen:
     def __post_init__(self) -> None:
         for f in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
             value = getattr(self, f.name)
-            if f.type not in ("Array", "float"):
+            if f.type not in ("Array", "float") and (f.type != "Array | None" or value is None):
                 continue
             try:
                 # + 0.0 makes one of the two zeros, which are equal and hash apart.
@@ -119,7 +119,10 @@ class Mimic(_Frozen):
     offset: float = 0.0
 
 
-_PER_VELOCITY: Final = ("velocity_limit", "effort_limit", "armature", "damping", "friction", "stiffness", "rest")
+_PER_VELOCITY: Final = (
+    *("velocity_limit", "effort_limit", "armature", "damping", "friction", "stiffness", "rest"),
+    *("stiction", "stribeck_velocity"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +142,12 @@ class Joint(_Frozen):
     lower, upper : (nq,) arrays
         Limits of the coordinates, infinite where there are none.
     velocity_limit, effort_limit, armature, damping, friction, stiffness, rest : (nv,) arrays
-        Per velocity. `stiffness` acts on q - `rest`, `damping` on v; dry `friction` and the limits are data only.
+        Per velocity. `stiffness` acts on q - `rest`, `damping` on v, dry `friction` against v at any speed; the limits
+        are data only.
     mimic : Mimic or None
         The joint that this one follows; its coordinate is then not free.
+    stiction, stribeck_velocity : (nv,) arrays or None
+        The largest dry friction at rest, that of motion without; and the velocity at which it falls to that.
     """
 
     name: str
@@ -162,6 +168,8 @@ class Joint(_Frozen):
     stiffness: Array
     rest: Array
     mimic: Mimic | None = None
+    stiction: Array | None = None
+    stribeck_velocity: Array | None = None
 
     def __repr__(self) -> str:
         follows = f", follows {self.mimic.joint!r}" if self.mimic else ""

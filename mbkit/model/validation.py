@@ -113,6 +113,24 @@ def _negative(item: str, part: Any, *names: str) -> Iterator[str]:
             yield f"{item}: {name} {value if np.ndim(value) else format(value, 'g')} is negative"
 
 
+def _friction_faults(item: str, joint: Joint) -> Iterator[str]:
+    bound, curve = joint.stiction, joint.stribeck_velocity
+    given = [x for x in (joint.friction, bound, curve) if x is not None]
+    if not all(np.isfinite(x).all() for x in given):
+        yield f"{item}: dry friction: expected finite numbers; lock(...) holds a joint that nothing moves"
+    elif any(np.any(x < 0) for x in given[1:]):
+        yield f"{item}: stiction or stribeck_velocity is negative; expected 0 or more"
+    elif bound is not None and np.any(bound < joint.friction):
+        yield f"{item}: stiction {bound} is below the friction of motion, {joint.friction}; give at least that"
+    elif curve is not None and bound is None:
+        yield f"{item}: stribeck_velocity without stiction, from which the friction would fall; give stiction too"
+    if any(np.any(x) for x in given) and not joint.type.coordinate_velocities:
+        yield (
+            f"{item}: dry friction on a {joint.kind} joint, whose velocities are along moving axes: friction by axis "
+            "is no law of matter there; use joints of one axis, or a force that is a function of the velocity"
+        )
+
+
 def _joint_faults(joint: Joint) -> Iterator[str]:
     item, type_ = f"joint {joint.name!r}", joint.type
     if joint.child == "world":
@@ -120,6 +138,7 @@ def _joint_faults(joint: Joint) -> Iterator[str]:
     if np.any(joint.lower > joint.upper):
         yield f"{item}: lower limit {joint.lower} above upper limit {joint.upper}"
     yield from _negative(item, joint, "armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
+    yield from _friction_faults(item, joint)
     if type_.quaternion is not None and np.isfinite([x[type_.quaternion :] for x in (joint.lower, joint.upper)]).any():
         yield f"{item}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite"
     # The same about three axes is a sphere's, which has no gyroscopic term.

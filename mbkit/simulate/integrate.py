@@ -103,7 +103,7 @@ def integrate(
             read = Torque(torque, model, batch, grid.steps, wrenches)
             problem = IntegrationProblem.on_grid(own, method, q, v, grid, indices, read, bar)
             applied = read.applied(grid.times)
-        outcome = _solver(own, chosen, read)(problem)
+        outcome = _outcome(problem, chosen)
     seconds = time.perf_counter() - started
     outcome = along_constraints(dyn, outcome)
     settings = RunSettings(start, q.copy(), v.copy(), setting, outcome.doubts)
@@ -141,6 +141,20 @@ def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | 
             f"got {type(wrenches).__name__}"
         )
     return (tuple(map(dyn.model.frame, wrenches)), axes) if wrenches else None
+
+
+def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
+    dyn, read = problem.dyn, problem.torque
+    if not dyn.model.needs.friction or method.dry_friction:
+        return _solver(dyn, method, read)(problem)
+    if method.kind == "native" or not (method.events or problem.equal_steps):
+        raise UnsupportedError(
+            f"{method.name}: does not know dry friction, which {dyn.model.name} has; use {DEFAULT_METHOD!r} or "
+            f"{ADAPTIVE_METHOD!r}, or model.without('friction')"
+        )
+    from mbkit.simulate.solvers.friction.runs import run_in_phases
+
+    return run_in_phases(problem, lambda phase: _solver(phase, method, read))
 
 
 def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Callable[[IntegrationProblem], SolverResult]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._warn import warn
@@ -14,16 +13,12 @@ from mbkit.engines.base import no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.errors import DoubtfulRunWarning, FunctionError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
-from mbkit.model.joint_numbers import dry_friction
 from mbkit.simulate.events import Event
 from mbkit.simulate.integrate import integrate
 from mbkit.simulate.progress import ProgressFunction
 from mbkit.simulate.sampled_control import integrate_held
 from mbkit.simulate.torque import RunWrenches, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
-
-#: Trajectories of a batch whose starts are looked at for the size of what is left out.
-_MOST_STARTS: Final = 64
 
 if TYPE_CHECKING:
     from mbkit.lagrangian.independent_coordinates import Embedded
@@ -114,8 +109,8 @@ def simulate(
     -------
     Trajectory
         Of a run that diverged, the states up to then, with `stats.ended`, `stats.reached` and `stats.message`, and an
-        `MbkitWarning`. In a batch the others go on. Where the description has dry friction, an `MbkitWarning` says
-        that it does not act, and its size.
+        `MbkitWarning`. In a batch the others go on. Where joints have dry friction, `events` has where each of them
+        stops, lets go or turns, and a run in which that cannot be decided ends there.
 
     Raises
     ------
@@ -175,21 +170,6 @@ def simulate(
     title = f"{run.model.name}: {run.method}"
     if run.stats.message and run.stats.ended != "event":
         warn(f"{title} {run.stats.message}", MbkitWarning)
-    if doubt:
-        _warn_of_friction(dyn, run)
     for one in run.stats.doubts:
         warn(f"{title}: {one}", DoubtfulRunWarning)
     return run
-
-
-def _warn_of_friction(dyn: Dynamics | Embedded, run: Trajectory) -> None:
-    """Warn that dry friction does not act, with its size beside the other forces at the start."""
-    if not (isinstance(dyn, Dynamics) and run.model.needs.friction):
-        return
-    q, v = (np.atleast_2d(x[..., 0, :])[:_MOST_STARTS] for x in (run.q, run.v))
-    forces = np.abs(dyn.nle(q, v)) + np.abs(dyn.passive(q, v))
-    warn(
-        f"{run.model.name}: dry friction is data, and does not act in this run: {dry_friction(run.model, forces)}, at "
-        'its start; model.without("friction") leaves it out knowingly',
-        MbkitWarning,
-    )

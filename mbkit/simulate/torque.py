@@ -7,6 +7,7 @@ its generalized force Σ Jᵀ w follows the configuration within a step (`mbkit.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -245,6 +246,14 @@ class Torque:
         self._functions = tuple(functions)
         self._with_functions = ForceFunctions(PiecewiseConstantTorque(self._constant, None), self._functions)
 
+    @classmethod
+    def of_force(cls, force: Array, model: Model) -> Torque:
+        """Return a constant force, (n,): τ, and behind it what wrenches there are."""
+        out = cls(None, model, None, None)
+        out._size, out._constant, out._of_all = len(force), force, force
+        out._with_functions = ForceFunctions(PiecewiseConstantTorque(force, None), ())
+        return out
+
     @property
     def held(self) -> bool:
         """Whether the force jumps between steps."""
@@ -282,6 +291,25 @@ class Torque:
             return partial(self._with_functions.one, row, member=i) if self._functions else row
 
         return during
+
+    def of_part(self, member: int | None, start: int, stop: int | None) -> Torque:
+        """Return the force of one trajectory from step `start` on, up to `stop`, as that of a run of one state."""
+        out = copy(self)
+        if self._rows is not None:
+            rows = self._rows if self._rows.ndim == 2 else self._rows[0 if member is None else member]
+            out._rows = rows[start:stop]
+        else:
+            out._constant = self._constant if member is None else self._of_all[member]
+        out._of_all = out._constant
+        out._with_functions = ForceFunctions(PiecewiseConstantTorque(out._constant, None), self._functions)
+        return out
+
+    def over_states(self, member: int | None, start: int, count: int) -> Array | None:
+        """Return the force that leads to each of some states of one trajectory, (count, n); None of functions."""
+        if self._functions:
+            return None
+        own = self.of_part(member, start, start + count)
+        return np.broadcast_to(own._constant if own._rows is None else own._rows, (count, self._size))
 
     def columns(self, members: Indices | slice, start: int, stop: int) -> Array:
         """Return an array's rows of steps start to stop for members of a batch: (steps, n, members or 1)."""

@@ -135,8 +135,12 @@ def _to_mjcf(model: Model) -> Converted:
         notes.append("mimic joints are free joints with equality constraints, which MuJoCo keeps softly")
     if model.needs.loops:
         notes.append("loops are equality constraints, which MuJoCo keeps softly")
-    if model.needs.limits or model.needs.friction:
-        notes.append("MuJoCo acts on joint limits and dry friction, softly, which mbkit's terms leave out")
+    if model.needs.limits:
+        notes.append("MuJoCo acts on joint limits, softly, which mbkit's terms leave out")
+    if model.needs.friction:
+        notes.append("MuJoCo's dry friction is soft; mbkit's holds exactly at rest")
+    if any(j.stiction is not None for j in model.joints):
+        notes.append("MJCF has no static friction and no Stribeck curve")
     if any(np.isfinite(j.velocity_limit).any() for j in model.joints):
         notes.append("MJCF has no velocity limits")
     # Bodies whose moments MuJoCo would not take as they are.

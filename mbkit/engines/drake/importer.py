@@ -127,7 +127,7 @@ def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> M
             b.add_frame(name, body=bodies[body], translation=X.translation(), rotation=snap(X.rotation().matrix()))
     held = f"the base {base!r} floats in SDF, and is held here at its pose; floating_base=True lets it move"
     dry = [x for e in root.walk() if e.tag == "friction" for x in [e.text.strip()] if x.strip("0.")]
-    ignored = "dry friction of joints is not read; it acts in no engine" if dry else ""
+    ignored = "dry friction of joints is not read" if dry else ""
     for note in (held if base else "", ignored, *told, snap.note):
         if note:
             b.note(note)

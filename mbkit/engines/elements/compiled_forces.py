@@ -94,8 +94,8 @@ class CompiledForces:
         trailing: list[Array] = []
         if self._model.parameters:
             # The own derivation's may differ from sample to sample.
-            held = getattr(dyn, "parameter_values", None)
-            values = np.array(list(dyn.model.parameters.values()), dtype=np.float64) if held is None else held
+            own = hasattr(type(dyn), "parameter_values")
+            values = dyn.parameter_values if own else np.array([*dyn.model.parameters.values()], dtype=np.float64)
             trailing = [np.broadcast_to(values, (*states[0].shape[:-1], values.shape[-1]))]
         given = [np.ascontiguousarray(x, dtype=np.float64) for x in (*states, *trailing)]
         return np.asarray(self._codes[name](*given)[0])

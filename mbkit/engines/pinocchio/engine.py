@@ -205,7 +205,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
             bare |= own
         if self.model.constrained:
             bare["forward_dynamics"] = self._locked(self._forward_dynamics)
-        if self.model.forces:
+        if self.model.forces or needs.friction:
             # They are added the checked way.
             del bare["inverse_dynamics"], bare["forward_dynamics"]
         elif self.model.prescribed:

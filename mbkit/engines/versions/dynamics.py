@@ -118,6 +118,9 @@ class VersionDynamics(MappedDynamics):
     def at(self, /, **values: Any) -> VersionDynamics:
         return type(self)(self.model.with_nominal(values), self.version)
 
+    def _of_model(self, model: Model, form: str) -> VersionDynamics:  # noqa: ARG002  # nothing is derived
+        return type(self)(model, self.version)
+
     def _call(self, name: str, *arrays: Array, **plain: Any) -> tuple[dict[str, Any], list[Array]]:
         stacked = bool(arrays) and arrays[0].ndim > 1
         return self._process.call(name, arrays, self._key, self.version.seconds, stacked, **plain)

@@ -37,7 +37,7 @@ _FIELDS: Final = {
     "prescribed": ("offset", "rate", "amplitude", "frequency", "phase"),
     "no_slip": ("translation_a", "translation_b", "radius", "speed"),
 }
-#: What no engine applies.
+#: What no engine applies, or none as a parameter.
 _DATA: Final = ("friction", "lower", "upper", "velocity_limit", "effort_limit")
 _Entry = tuple[str, str, str, tuple[int, ...]]
 #: The ten numbers of a log-Cholesky factor, and the end of their path.
@@ -179,7 +179,8 @@ def _nothing(model: Model, every: list[Number], pattern: str) -> str:
     name, _, field = pattern.rpartition(".")
     item = f"paths: {pattern!r} fits no number of {model.name}"
     if field in _DATA:
-        return f"{item}: {field} is data, and acts in no engine"
+        why = "dry friction is a number in every engine, as set_joint sets it" if field == "friction" else "it is data"
+        return f"{item}: {field} cannot be free: {why}"
     frame = next((f for f in model.frames if pattern.startswith(f"{f.name}.")), None)
     if frame is not None and field.split(".")[0] in _FIELDS["bodies"]:
         end = pattern.removeprefix(f"{frame.name}.")

@@ -26,7 +26,7 @@ _FEW: Final = 3
 #: Arguments of joints that are limits or one number for each velocity.
 NUMBERS_OF_JOINTS: Final = (
     *("lower", "upper", "velocity_limit", "effort_limit"),
-    *("armature", "damping", "friction", "stiffness", "rest"),
+    *("armature", "damping", "friction", "stiffness", "rest", "stiction", "stribeck_velocity"),
 )
 
 
@@ -146,6 +146,8 @@ class EditingBuilder:
         friction: ArrayLike | None = None,
         stiffness: _Numbers | None = None,
         rest: _Numbers | None = None,
+        stiction: ArrayLike | None = None,
+        stribeck_velocity: ArrayLike | None = None,
         mimic: Mimic | tuple[str, Number, Number] | EllipsisType | None = ...,
     ) -> None:
         """Set numbers of a joint, which are those of `add_joint`; an infinite limit is no limit.
@@ -157,7 +159,7 @@ class EditingBuilder:
         if joint is None:
             return
         limits = lower, upper, velocity_limit, effort_limit
-        numbers = armature, damping, friction, stiffness, rest
+        numbers = armature, damping, friction, stiffness, rest, stiction, stribeck_velocity
         given: dict[str, Any] = dict(zip(NUMBERS_OF_JOINTS, (*limits, *numbers), strict=True))
         given |= {"axes": None if axis is None and axis2 is None else (axis, axis2)}
         given |= {} if mimic is ... else {"mimic": mimic}

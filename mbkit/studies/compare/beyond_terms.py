@@ -194,7 +194,7 @@ _NEEDS: Final = (
     ("geometry", "", (), "meshes and shapes never opened (measured with one small sphere on each body)"),
     ("contacts", "", ("CONTACT", "CONSTRAINT"), "collision detection and contact forces (with the same spheres)"),
     ("limits", "limits", ("LIMIT", "CONSTRAINT"), "joint limits kept as data; no limit rows, no constraint solver"),
-    ("dry friction", "friction", ("FRICTIONLOSS", "CONSTRAINT"), "dry friction kept as data; no constraint solver"),
+    ("dry friction", "friction", ("FRICTIONLOSS", "CONSTRAINT"), "MuJoCo's soft dry friction; no constraint solver"),
     ("damping", "damping", ("DAMPER",), "dampers"),
     ("springs", "springs", ("SPRING",), "springs"),
     ("gravity", "gravity", ("GRAVITY",), "gravity"),

@@ -31,7 +31,7 @@ def _friction(model: Model, forces: Array) -> Finding | None:
     if (friction := dry_friction(model, forces)) is None:
         return None
     says = (
-        f"no engine applies it: {friction} (gravity, velocities, springs and dampers, at the median state); "
+        f"{friction} (gravity, velocities, springs and dampers, at the median state); "
         f"{counted(len(friction.joints), 'joint')} in all"
     )
     return Finding(FRICTION, says, friction.joints, friction.ratio)

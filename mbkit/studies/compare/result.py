@@ -302,11 +302,6 @@ class Comparison(ResultTable):
             f"{100 * 10**-x:.2g} % off the rigid ones at the median state"
             for name, x in self.softness.items()
         ]
-        out += [
-            f"dry friction is in no engine ({x.size:.2g} times the other forces)"
-            for x in self.findings
-            if x.kind == FRICTION
-        ]
         rows = [r for r in self.rollouts if not r.informs]
         judged = [r for r in rows if r.judged]
         if rows and not judged:

@@ -19,6 +19,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import STANDARD, find_engine
 from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError
 from mbkit.model import Model
+from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.model.joint_numbers import owners
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
@@ -81,6 +82,8 @@ class Judge:
             with contextlib.suppress(NumericalError):
                 self.forces = self.forces + np.abs(quantity(at.q, at.v))
         acting = np.abs(at.tau) + self.forces
+        # Its size is told beside the other forces.
+        self.forces = self.forces - np.abs(DryFrictionLaw(model).force(at.v)) if model.needs.friction else self.forces
         gravity = float(np.linalg.norm(model.gravity))
         heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
         self.scales: Scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)

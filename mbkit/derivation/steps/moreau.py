@@ -1,0 +1,123 @@
+"""Moreau and Jean's step as parts: one round of the parts is one attempt, with what slides and what rests given.
+
+The new velocity solves M (v⁺ - v) = h (τ + τ_passive - nle) + P at the step's start, with the impulse P_j = -h f_j of a
+velocity that slides along its side, and any |P_j| <= h f_j of one that is to have none (Moreau 1988, Unilateral contact
+and dry friction in finite freedom dynamics; Jean 1999, Computer Methods in Applied Mechanics and Engineering 177). The
+position moves with the new velocity. Where a velocity turns against its side, or an impulse passes its bound, the
+sides are changed and the attempt is repeated: all at once as long as fewer of them fail than before, then the last one
+alone (Murty 1974), so that the exact solution is found after finitely many.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import casadi as ca
+
+from mbkit.derivation.equations import Equations
+from mbkit.derivation.steps.fixed import Part, function_of
+from mbkit.derivation.steps.symbols import SymbolicSpace, choose
+
+#: A round reads these and writes the same names with a 1 behind. `side` and `still` are of the velocities with
+#: friction; `k` is the number of steps so far, `end` that to make; `best` is the least number of failures so far and
+#: `left` how many attempts may fail to have fewer; `go` is 1 while there are steps to make.
+STATE: Final = ("q", "w", "side", "still", "k", "end", "best", "left", "go")
+#: Attempts that may not have fewer failures before sides are changed one by one.
+PATIENCE: Final = 3
+#: A bound of impulses is passed where it is by more than this part, as rounding of their sums may.
+ROUNDING: Final = 1e-13
+#: Of `best`, more than all velocities.
+MANY: Final = 1e9
+
+
+def moreau_parts(
+    equations: Equations, which: list[int], sides: list[str], locks: list[str], resting: float
+) -> list[Part]:
+    """Return the parts of an attempt, of the equations of a model whose joints slide or rest as parameters say.
+
+    `which` are the velocities with friction, `sides` and `locks` the parameters of their sides and of their armatures
+    at rest, `resting` for those that rest. The parts read `STATE`, tau, dt, bound (the friction at rest, in the order
+    of `which`) and the other parameters.
+    """
+    model, space = equations.model, SymbolicSpace(equations.model)
+    n, nv = len(which), model.nv
+    s = {name: ca.SX.sym(name, size) for name, size in (("q", model.nq), ("w", nv), ("side", n), ("still", n))}
+    s |= {name: ca.SX.sym(name) for name in STATE[4:]}
+    s |= {"tau": ca.SX.sym("tau", equations.force.numel()), "dt": ca.SX.sym("dt"), "bound": ca.SX.sym("bound", n)}
+    rest = [name for name in model.parameters if name not in {*sides, *locks}]
+    others = ca.SX.sym("parameters", len(rest))
+    place = {name: i for i, name in enumerate((*sides, *locks, *rest))}
+    order = [place[name] for name in model.parameters]
+    pick = ca.DM(ca.Sparsity.triplet(n, nv, list(range(n)), which), 1.0)
+    v, h, still, side = space.to_body_velocity(s["q"], s["w"]), s["dt"], s["still"], s["side"]
+
+    def spread(x: Any) -> Any:
+        """Return numbers of the velocities with friction among all."""
+        return ca.mtimes(pick.T, x)
+
+    def parameters(side: Any, lock: Any) -> Any:
+        return ca.vertcat(side, lock, others)[order]
+
+    def solve() -> ca.Function:
+        # What comes to rest is accelerated so that it has no velocity at the end: a force on a giant armature.
+        target = -ca.mtimes(pick, v) / h
+        force = s["tau"] + ca.vertcat(spread(resting * still * target), ca.SX(s["tau"].numel() - nv, 1))
+        forward = equations.function("forward_dynamics")
+        a = forward(s["q"], v, force, parameters(side * (1 - still), resting * still))
+        a = (1 - spread(still)) * a + spread(still * target)
+        inverse = equations.function("inverse_dynamics")
+        free = ca.SX(n, 1)
+        needed = inverse(s["q"], v, a, parameters(side * (1 - still), free)) - s["tau"][:nv]
+        # Friction at this speed is what the sides make of the passive force; at rest its bound may be larger.
+        passive = equations.function("passive")
+        slid = passive(s["q"], v, parameters(free, free)) - passive(s["q"], v, parameters(free + 1, free))
+        most = choose(ca.mtimes(pick, v) == 0, s["bound"], ca.mtimes(pick, slid))
+        given = {name: s[name] for name in ("q", "w", "side", "still", "tau", "dt", "bound")} | extra
+        return function_of("moreau_solve", given, {"a": a, "needed": ca.mtimes(pick, needed), "most": most})
+
+    extra = {"parameters": others} if others.numel() else {}
+    a, needed, most = ca.SX.sym("a", nv), ca.SX.sym("needed", n), ca.SX.sym("most", n)
+
+    def decide() -> ca.Function:
+        after = v + h * a
+        after = (1 - spread(still)) * after
+        along = ca.mtimes(pick, after)
+        back = (1 - still) * (side * along < 0)
+        # A velocity of zero that is to slide, and does not, rests.
+        loose = still * (ca.fabs(needed) > most * (1 + ROUNDING))
+        wrong = back + loose
+        count = ca.sum1(wrong)
+        fewer = count < s["best"]
+        best, left = choose(fewer, count, s["best"]), choose(fewer, PATIENCE, s["left"] - (s["left"] > 0))
+        alone = (1 - fewer) * (s["left"] <= 0)
+        later, last = ca.SX(0), []
+        for k in reversed(range(n)):
+            last.append(wrong[k] * (later <= 0))
+            later = later + wrong[k]
+        change = choose(alone, ca.vertcat(*reversed(last)), wrong)
+        new_still = choose(change, 1 - still, still)
+        new_side = choose(change * loose, -ca.sign(needed), side)
+        good = count <= 0
+        q1 = space.retract(s["q"], h * space.to_integrator_velocity(s["q"], after))
+        w1 = space.to_integrator_velocity(q1, after)
+        k = s["k"] + good
+        state = {
+            "q1": choose(good, q1, s["q"]),
+            "w1": choose(good, w1, s["w"]),
+            "side1": choose(good, side, new_side),
+            "still1": choose(good, still, new_still),
+            "k1": k,
+            "end1": s["end"],
+            "best1": choose(good, MANY, best),
+            "left1": choose(good, PATIENCE, left),
+            "go1": k < s["end"],
+        }
+        given = {name: s[name] for name in (*STATE[:-1], "dt")} | {"a": a, "needed": needed, "most": most}
+        return function_of("moreau_decide", given, state)
+
+    first = ("q", "w", "side", "still", "tau", "dt", "bound", *extra)
+    second = (*STATE[:-1], "dt", "a", "needed", "most")
+    return [
+        Part("moreau_solve", first, ("a", "needed", "most"), solve),
+        Part("moreau_decide", second, tuple(f"{name}1" for name in STATE), decide),
+    ]

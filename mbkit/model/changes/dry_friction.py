@@ -1,0 +1,188 @@
+"""Dry friction at joints: its law, and a model in which every joint slides one way or rests.
+
+At speed v the force is -f(|v|) sign(v); at rest it is any force up to the bound s::
+
+    f(|v|) = f + (s - f) exp(-(v / v_s)²)        s: `Joint.stiction`, f where none is given
+
+(Stribeck's curve; Armstrong-Hélouvry et al. 1994, Automatica 30(7), eq. 6. Without a Stribeck velocity v_s the force
+falls from s to f at once.) A joint that mimics another has its own friction, which acts at its own rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbkit._check import Array
+from mbkit.model.elements.forces import JointForce
+from mbkit.model.elements.formula import Formula, Operation
+from mbkit.model.model import Model, unchecked
+from mbkit.model.parameters import Binding, Parameter
+from mbkit.model.parts import Joint
+
+#: Armature of a joint that rests, kg m² or kg: what accelerates it is smaller than any rounding, and articulated
+#: inertias beside it are those of a fixed joint to the last bit.
+RESTING: Final = 1e30
+
+
+class FrictionNumbers(NamedTuple):
+    """Sliding friction, bound at rest and Stribeck velocity of each full velocity; (n,) each, and all zero without."""
+
+    sliding: Array
+    bound: Array
+    stribeck: Array
+
+    @classmethod
+    def of(cls, joints: Sequence[Joint]) -> FrictionNumbers:
+        """Read them off joints."""
+        none = np.zeros(0)
+        sliding = np.concatenate([none, *(j.friction for j in joints)])
+        bound = np.concatenate([none, *(j.friction if j.stiction is None else j.stiction for j in joints)])
+        curve = (np.zeros(j.type.nv) if j.stribeck_velocity is None else j.stribeck_velocity for j in joints)
+        return cls(sliding, bound, np.concatenate([none, *curve]))
+
+    def at(self, v: Array) -> Array:
+        """Return f(|v|) of full velocities, (n,) or (N, n)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fall = np.exp(-np.square(v / self.stribeck))
+        return self.sliding + np.where(self.stribeck > 0, (self.bound - self.sliding) * fall, 0.0)
+
+
+class DryFrictionLaw:
+    """The law of a model's friction by its independent velocities."""
+
+    def __init__(self, model: Model) -> None:
+        self._numbers = FrictionNumbers.of(model.joints)
+        self._G = model.layout.G if model.layout.reduced else None
+        sizes = np.abs(self._G.T) if self._G is not None else np.eye(len(self._numbers.bound))
+        #: The largest force at rest, (nv,); zero where a joint has no friction.
+        self.bound: Array = sizes @ self._numbers.bound
+        #: That of a joint that has just let go, (nv,).
+        self.just_moving: Array = sizes @ self._numbers.at(np.zeros(len(self._numbers.bound)))
+
+    def force(self, v: Array) -> Array:
+        """Return the force at speed, zero at rest; (nv,) or (N, nv)."""
+        full = v if self._G is None else v @ self._G.T
+        out = -self._numbers.at(full) * np.sign(full)
+        return np.asarray(out if self._G is None else out @ self._G)
+
+    def force_at(self, v: Array) -> Array:
+        """Return the force of motion along each velocity at this speed, zero at rest or not; of the shape of v."""
+        full = v if self._G is None else v @ self._G.T
+        sizes = -self._numbers.at(full)
+        return np.asarray(sizes if self._G is None else sizes @ np.abs(self._G))
+
+    def slope(self, v: Array) -> Array:
+        """Return ∂force/∂v where no joint rests, (nv, nv) or (N, nv, nv)."""
+        full, own = (v if self._G is None else v @ self._G.T), self._numbers
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fall = np.exp(-np.square(full / own.stribeck)) * 2 * np.abs(full) / np.square(own.stribeck)
+        out = np.where(own.stribeck > 0, (own.bound - own.sliding) * fall, 0.0)[..., None] * np.eye(full.shape[-1])
+        return np.asarray(out if self._G is None else self._G.T @ out @ self._G)
+
+    def at_rest(self, v: Array) -> NDArray[np.bool_]:
+        """Return where joints with friction have no velocity, of the shape of v."""
+        return np.asarray((v == 0) & (self.bound > 0), dtype=np.bool_)
+
+
+def names_of(model: Model) -> list[str]:
+    """Return the names of the velocities with friction, each that of its joint or a numbered one."""
+    out = []
+    for joint in model.independent_joints:
+        part = model.layout.v[joint.name]
+        out += [joint.name if joint.type.nv == 1 else f"{joint.name} {k}" for k in range(part.stop - part.start)]
+    return out
+
+
+class Sliding:
+    """The model whose joints slide one way or rest, as parameters say, and these parameters' values.
+
+    Friction is a force with a given sign there, smooth through rest; a joint that rests has an armature that nothing
+    moves. So each phase between two changes is an ordinary smooth system, of one derivation.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.law = DryFrictionLaw(model)
+        self.names = names_of(model)
+        #: Independent velocities with friction.
+        self.which = np.flatnonzero(self.law.bound > 0)
+        self.sides = {int(i): f"friction side of {self.names[i]}" for i in self.which}
+        self.locks = {int(i): f"friction lock of {self.names[i]}" for i in self.which}
+        self.model = self._of(model)
+
+    def at(self, sides: Array, still: NDArray[np.bool_], model: Model) -> Model:
+        """Return the model in which velocities have these signs, or stay at rest; (nv,) each.
+
+        The time and the other parameters are those of `model`, which has the friction.
+        """
+        values: dict[str, Any] = dict(model.parameters)
+        values |= {name: 0.0 if still[i] else float(sides[i]) for i, name in self.sides.items()}
+        values |= {name: RESTING * bool(still[i]) for i, name in self.locks.items()}
+        with unchecked():
+            return replace(self.model._substituted(lambda p: Parameter(p.name, values[p.name])), time=model.time)
+
+    def _of(self, model: Model) -> Model:
+        layout, numbers = model.layout, FrictionNumbers.of(model.joints)
+        joints, forces, bindings = [], [], list[Binding]()
+        for joint in model.joints:
+            part = layout.full_v[joint.name]
+            joints.append(replace(joint, friction=np.zeros(joint.type.nv), stiction=None, stribeck_velocity=None))
+            if not numbers.bound[part].any():
+                continue
+            name = f"friction of {joint.name}"
+            rows = [np.flatnonzero(layout.G[i])[0] for i in range(part.start, part.stop)]
+            signs = [float(np.sign(layout.G[part.start + k, i])) for k, i in enumerate(rows)]
+            own = [k for k, i in enumerate(rows) if int(i) in self.sides]
+            forces.append(_force(name, joint, FrictionNumbers(*(x[part] for x in numbers)), signs))
+            bindings += [
+                Binding("forces", name, "numbers", (k,), Parameter(self.sides[int(rows[k])], 0.0)) for k in own
+            ]
+        bound = {(b.part, b.index): b for b in model.bindings if b.where == "joints" and b.field == "armature"}
+        for i, lock in self.locks.items():
+            joint, k = next(
+                (j, i - layout.v[j.name].start)
+                for j in model.independent_joints
+                if layout.v[j.name].start <= i < layout.v[j.name].stop
+            )
+            held = bound.pop((joint.name, (k,)), None)
+            own_number: Any = float(joint.armature[k]) if held is None else held.expression
+            bindings.append(Binding("joints", joint.name, "armature", (k,), Parameter(lock, 0.0) + own_number))
+        kept = [b for b in model.bindings if not (b.where == "joints" and b.field == "armature")]
+        with unchecked():
+            return replace(
+                model,
+                joints=tuple(joints),
+                forces=(*model.forces, *forces),
+                bindings=(*kept, *bound.values(), *bindings),
+            )
+
+
+def _force(name: str, joint: Joint, numbers: FrictionNumbers, signs: Sequence[float]) -> JointForce:
+    """Return -side f(|v|) of each velocity, with the side as a parameter."""
+    n = joint.type.nv
+    sides = tuple("side" if n == 1 else f"side_{k}" for k in range(n))
+    speeds = tuple("v" if n == 1 else f"v_{k}" for k in range(n))
+    curved = bool((numbers.stribeck > 0).any())
+    arguments = (*sides, *(speeds if curved else ()))
+    operations: list[Operation] = [("input", (k,), 0.0) for k in range(len(arguments))]
+
+    def add(operation: str, *operands: int, value: float = 0.0) -> int:
+        operations.append((operation, operands, value))
+        return len(operations) - 1
+
+    def results() -> Iterator[int]:
+        for k, (f, s, w) in enumerate(zip(*(x.tolist() for x in numbers), strict=True)):
+            size = add("const", value=-signs[k] * f)
+            if w > 0:
+                square = add("sq", add("mul", n + k, add("const", value=1.0 / w)))
+                fall = add("exp", add("neg", square))
+                size = add("add", size, add("mul", add("const", value=-signs[k] * (s - f)), fall))
+            yield add("mul", k, size)
+
+    outputs = tuple(results())
+    formula = Formula(arguments, tuple(operations), outputs)
+    return JointForce(name, joint.name, formula, None, sides, np.zeros(n))

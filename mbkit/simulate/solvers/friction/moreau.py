@@ -1,0 +1,188 @@
+"""Runs by Moreau and Jean's step: dry friction with a fixed step, any number of joints, no events.
+
+On the own derivation the step with its choice of sides is machine code; elsewhere, and under torques that are
+functions, the same problem is solved in Python for each step.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.engines.base import at_time
+from mbkit.engines.elements.dry_friction import forces_at_rest
+from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.model.changes.dry_friction import RESTING
+from mbkit.model.integration_space import Space
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.result import SolverResult
+from mbkit.simulate.solvers.fixed_step import GridRecord
+from mbkit.simulate.solvers.friction.phases import Friction, applied
+from mbkit.simulate.solvers.vector_field import DIVERGED
+
+#: Attempts at once, and the most for one step for each velocity with friction.
+_ROUNDS: Final = 512
+_PATIENCE: Final = 40
+_RUNAWAY: Final = 1e100
+_UNDECIDED: Final = "which joints rest cannot be decided"
+
+
+def run_moreau(problem: IntegrationProblem) -> SolverResult:
+    """Step one state or a batch over the grid."""
+    dyn = problem.dyn
+    if dyn.model.constrained:
+        raise UnsupportedError(
+            f"moreau: {dyn.model.name} has loops or other constraints, which its step does not hold; use a method of "
+            "phases without dry friction, by model.without('friction')"
+        )
+    record, reasons, evaluations = GridRecord(problem), dict[int, str](), 0
+    compiled = dyn.derived and not problem.torque.callable and dyn.model.needs.friction
+    compiled = compiled and dyn.model.time_parameter is None and getattr(dyn, "compiles_steps", False)
+    for i in range(len(problem.q)):
+        member = problem.member(i)
+        own = dyn if member is None else dyn._of_sample(i)
+        steps, attempts, reasons[i] = (_Compiled if compiled else _InPython)(problem, own, member, record, i).run()
+        record.steps[i] = steps
+        evaluations += attempts
+        problem.report(i)(problem.end)
+    return record.result(lambda i: reasons[i], evaluations)
+
+
+class _InPython:
+    """The steps of one trajectory, each as a problem of impulses with bounds."""
+
+    def __init__(
+        self, problem: IntegrationProblem, dyn: Dynamics, member: int | None, record: GridRecord, i: int
+    ) -> None:
+        self._problem, self._dyn, self._record, self._i = problem, dyn, record, i
+        self._force = problem.torque.of_member(member)
+        self._law, self._space = dyn._friction.law, Space(dyn.model)
+        self._which = np.flatnonzero(self._law.bound > 0)
+        none = np.zeros(dyn.model.nv)
+        # Without friction: neither a side nor rest.
+        self._smooth = dyn._friction.phase(dyn, none, none > 0) if len(self._which) else dyn
+
+    def run(self) -> tuple[int, int, str]:
+        """Return the good steps, the evaluations, and why there are not more."""
+        grid, record, i = self._problem.grid, self._record, self._i
+        q, v = self._problem.q[i], self._problem.v[i]
+        for k in range(grid.steps):
+            try:
+                q, v = self._step(grid.time(k), grid.step(k), q, v, self._force(k))
+            except NumericalError as error:
+                return k, k, str(error)
+            if not (np.abs(q).max(initial=0) < _RUNAWAY and np.abs(v).max(initial=0) < _RUNAWAY):
+                return k, k, DIVERGED
+            rows = record.rows(k + 1, k + 1)
+            record.q[i, rows], record.v[i, rows] = q, v
+        return grid.steps, grid.steps, ""
+
+    def _step(self, t: float, h: float, q: Array, v: Array, force: Any) -> tuple[Array, Array]:
+        dyn, tau, which, space = at_time(self._smooth, t), applied(force, t, q, v), self._which, self._space
+        free = v + h * dyn.forward_dynamics(q, v, tau)
+        if len(which):
+            columns = np.linalg.solve(dyn.mass_matrix(q), np.eye(len(v))[:, which])
+            bound = h * np.where(v == 0, self._law.bound, np.abs(self._law.force_at(v)))[which]
+            impulse = forces_at_rest(columns[which], free[which], bound)
+            free = free + columns @ impulse
+            free[which[np.abs(impulse) < bound * (1 - 1e-13)]] = 0.0
+        q1 = space.retract(q, h * space.to_integrator_velocity(q, free))
+        return q1, free
+
+
+class _Compiled:
+    """The steps of one trajectory as machine code: rounds of attempts."""
+
+    def __init__(
+        self, problem: IntegrationProblem, dyn: Dynamics, member: int | None, record: GridRecord, i: int
+    ) -> None:
+        from mbkit.codegen.compiled import aligned
+        from mbkit.codegen.step_loop import compiled_step_loop, width
+        from mbkit.derivation.steps.moreau import MANY, PATIENCE, STATE, moreau_parts
+
+        self._problem, self._record, self._i, self._state = problem, record, i, STATE
+        friction, sliding = Friction(dyn), dyn._friction.sliding
+        self._force, self._space = problem.torque.of_member(member), Space(dyn.model)
+        none = np.zeros(dyn.model.nv)
+        own: Any = dyn._friction.phase(dyn, none, none > 0)
+        names = own.model.parameters
+        which, sides, locks = sliding.which.tolist(), [*sliding.sides.values()], [*sliding.locks.values()]
+        kept: dict[str, Any] = own.equations.kept
+        if "moreau" not in kept:
+            kept["moreau"] = compiled_step_loop(
+                (own.form, "moreau"), lambda: moreau_parts(own.equations, which, sides, locks, RESTING), STATE
+            )
+        self._code = kept["moreau"]
+        self._room = aligned(self._code.size * width()).reshape(self._code.size, width())
+        self._room[:] = 0.0
+        self._ways, self._lanes = np.zeros(5, dtype=np.int64), width()
+        self["bound"][:] = friction.law.bound[which, None]
+        if "parameters" in self._code.rows:
+            others = [x for name, x in names.items() if name not in {*sides, *locks}]
+            self["parameters"][:] = np.array(others, dtype=float)[:, None]
+        rows = self._code.rows
+        zero = rows[f"{STATE[0]}1"][0]
+        self._at = {name: slice(rows[f"{name}1"][0] - zero, sum(rows[f"{name}1"]) - zero) for name in STATE}
+        self._count = sum(rows[name][1] for name in STATE)
+        self._now = self._room[zero : zero + self._count]
+        q, v, grid = problem.q[i], problem.v[i], problem.grid
+        phase = friction.phase(grid.start, q, v, self._force(0)) if grid.steps else None
+        start = {"q": q, "w": self._space.to_integrator_velocity(q, v), "best": MANY, "left": PATIENCE, "go": 1.0}
+        if phase is not None:
+            start |= {"side": phase.sides[which], "still": 1.0 * phase.still[which]}
+        for name, value in start.items():
+            self._now[self._at[name]] = np.reshape(value, (-1, 1))
+        self._log = aligned(_ROUNDS * self._now.size).reshape(_ROUNDS, *self._now.shape)
+        self._most = _PATIENCE * (len(which) + 1)
+
+    def __getitem__(self, name: str) -> Array:
+        first, count = self._code.rows[name]
+        return self._room[first : first + count]
+
+    def run(self) -> tuple[int, int, str]:
+        """Return the good steps, the attempts, and why there are not more steps."""
+        grid, held = self._problem.grid, self._problem.torque.held
+        k, attempts, why = 0, 0, ""
+        while k < grid.steps and not why:
+            # As many steps at once as have one length and one force.
+            last = k + 1 if held or k == grid.steps - 1 else grid.steps - (grid.step(grid.steps - 1) != grid.dt)
+            self["tau"][:] = np.asarray(self._force(k))[:, None]
+            self["dt"][:] = grid.step(k)
+            since = 0
+            while k < last and not why:
+                done, tried, since, why = self._advance(k, last, since)
+                k, attempts = k + done, attempts + tried
+        return k, attempts, why
+
+    def _advance(self, k: int, last: int, since: int) -> tuple[int, int, int, str]:
+        """Return the steps made, the attempts, those since the last step, and why there are not more."""
+        self._now[self._at["end"]] = last
+        self._now[self._at["go"]] = 1.0
+        self._ways[:] = self._now.ctypes.data, 0, self._log.ctypes.data, 0, 1
+        rounds = min(_ROUNDS, max(2, 2 * (last - k)))
+        self._code.loaded.run(self._room.ctypes.data, self._ways.ctypes.data, 0, rounds)
+        count = int(self._ways[3])
+        states = self._log[:count, :, 0]
+        reached = states[:, self._at["k"].start]
+        good = np.flatnonzero(np.diff(np.append(float(k), reached)) > 0)
+        q, w = states[good][:, self._at["q"]], states[good][:, self._at["w"]]
+        with np.errstate(invalid="ignore"):
+            fine = (np.abs(q).max(axis=1, initial=0) < _RUNAWAY) & (np.abs(w).max(axis=1, initial=0) < _RUNAWAY)
+        made, why = len(good), ""
+        if not fine.all():
+            made, why = int(np.argmin(fine)), DIVERGED
+        since = count - 1 - int(good[-1]) if len(good) else since + count
+        if not why and since > self._most:
+            why = DIVERGED if not np.isfinite(states[-1]).all() else _UNDECIDED
+        self._keep(k, q[:made], w[:made])
+        return made, count, since, why
+
+    def _keep(self, k: int, q: Array, w: Array) -> None:
+        record, i = self._record, self._i
+        rows = record.rows(k + 1, k + len(q))
+        which = record.kept[rows] - (k + 1)
+        record.q[i, rows] = q[which]
+        record.v[i, rows] = self._space.to_body_velocity(q[which], w[which])

@@ -1,0 +1,107 @@
+"""What slides and what rests: how it is decided, when it ends, and the smooth dynamics in between."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.engines.base import at_time
+from mbkit.simulate.time_grid import Indices
+from mbkit.simulate.torque import Force
+
+#: Of its bound, by how much a force at rest may be above it by rounding.
+_ROUNDING: Final = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Phase:
+    """Smooth dynamics in which velocities have signs, (nv,), or rest."""
+
+    dyn: Dynamics
+    sides: Array
+    still: NDArray[np.bool_]
+
+
+class Friction:
+    """Dry friction of one trajectory's dynamics."""
+
+    def __init__(self, dyn: Dynamics) -> None:
+        self._dyn, self._own = dyn, dyn._friction
+        self.law = self._own.law
+        #: Velocities with friction.
+        self.which = np.flatnonzero(self.law.bound > 0)
+
+    def phase(self, t: float, q: Array, v: Array, force: Force, leaving: Array | None = None) -> Phase:
+        """Return the phase that begins in a state; `leaving` has the signs of velocities that are about to be."""
+        tau = applied(force, t, q, v)
+        resting, signs, none = self.law.at_rest(v), np.sign(v), np.zeros(len(v), dtype=bool)
+        held, still = np.zeros(len(v)), none
+        if resting.any():
+            sliding = at_time(self._own.phase(self._dyn, signs, none), t)
+            held, still = self._own.decided(
+                sliding, lambda f: sliding.forward_dynamics(q, v, f), q, tau, resting, leaving
+            )
+        sides = np.where(resting, -np.sign(held), signs)
+        return Phase(self._own.phase(self._dyn, sides, still), sides, still)
+
+    def sliding(self, signs: Array, rows: Indices) -> Iterator[tuple[Indices, Dynamics]]:
+        """Yield the dynamics in which rows of a batch slide along their signs, (N, nv), and which rows they are."""
+        if len(rows):
+            yield from self._own.sliding_together(self._dyn, signs, rows, self.which)
+
+    def margins(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> Array:
+        """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).
+
+        Of one that slides it is the speed, of one that rests the part of its bound that is left.
+        """
+        out = phase.sides * v
+        if phase.still.any():
+            out = np.where(phase.still, 1 + _ROUNDING - np.abs(self.holding(phase, t, q, v, force)) / self._bound, out)
+        return out[..., self.which]
+
+    def holding(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> Array:
+        """Return the forces of friction on what rests, and zero elsewhere; of the shape of v."""
+        tau = applied(force, t, q, v)
+        # Without the friction of what rests, and without its armature.
+        free = self._own.phase(self._dyn, np.where(phase.still, 0.0, phase.sides), phase.still & False)
+        dyn, loose = (at_time(x, t) for x in (phase.dyn, free._bare or free))
+        a = np.where(phase.still, 0.0, dyn.forward_dynamics(q, v, tau))
+        pulled = loose.inverse_dynamics(q, v, a) - tau[..., : v.shape[-1]]
+        if dyn._acting[0]:
+            pulled = pulled - self._of_wrenches(q, tau)
+        return np.where(phase.still, pulled, 0.0)
+
+    @property
+    def _bound(self) -> Array:
+        return np.where(self.law.bound > 0, self.law.bound, 1.0)
+
+    def _of_wrenches(self, q: Array, tau: Array) -> Array:
+        frames, axes = self._dyn._acting
+        wrenches = np.split(tau[..., self._dyn.model.nv :], len(frames), axis=-1)
+        bare = self._dyn._bare or self._dyn
+        return bare.generalized_force(q, dict(zip((f.name for f in frames), wrenches, strict=True)), axes)
+
+    def ended(self, margins: Array) -> Indices:
+        """Return which velocities end their phase, as indices: those with the least margins, to rounding."""
+        return self.which[margins <= max(float(margins.min()), 0.0) + 1e-15]
+
+    def after(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> tuple[Array, Array]:
+        """Return the velocity at the end of a phase, zero of what stopped there, and the signs of what lets go."""
+        ended = self.ended(self.margins(phase, t, q, v, force))
+        lets_go = ended[phase.still[ended]]
+        out, leaving = np.where(phase.still, 0.0, v), np.zeros(len(v))
+        out[ended] = 0.0
+        if lets_go.size:
+            leaving[lets_go] = -np.sign(self.holding(phase, t, q, v, force)[lets_go])
+        return out, leaving
+
+
+def applied(force: Force, t: float, q: Array, v: Array) -> Array:
+    """Return the force at one state, (n,), or at several of a trajectory, (N, n)."""
+    return np.asarray(force(t, q, v) if callable(force) else force)
