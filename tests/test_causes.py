@@ -167,7 +167,7 @@ def names(m: Model) -> Planted:
 
 PLANTS = {x.__name__: x for x in (fused_unturned, lost_tool, gravity, order, names)}
 PLANTS |= {kind: in_one_part(kind) for kind in IN_ONE_PART}
-SILENT = {"friction", "limits", "joint order"}
+SILENT = {"limits", "joint order"}
 
 
 @pytest.mark.parametrize(

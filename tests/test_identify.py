@@ -74,9 +74,7 @@ def motion(model: Model, n: int = 200, seed: int = 0) -> tuple[np.ndarray, np.nd
 
 
 def torques(model: Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return inverse dynamics with the dry friction that the terms leave out."""
-    dry = np.concatenate([j.friction for j in model.independent_joints])
-    return mb.dynamics(model, "pinocchio").inverse_dynamics(q, v, a) + dry * np.sign(v)
+    return mb.dynamics(model, "pinocchio").inverse_dynamics(q, v, a)
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])
@@ -179,7 +177,7 @@ def test_joints_that_mimic_keep_their_own_friction() -> None:
     model = chain(finger, finger | {"mimic": ("j0", -2.0, 0.0)}).build()
     q, v, a = motion(model)
     # Damping 0.5 + 4 · 0.1 and friction 0.7 + 2 · 0.2 as the leader feels them.
-    bodies = mb.dynamics(model.without("damping"), "pinocchio").inverse_dynamics(q, v, a)
+    bodies = mb.dynamics(model.without("damping", "friction"), "pinocchio").inverse_dynamics(q, v, a)
     found = mb.identify(model, q, v, a, bodies + 0.9 * v + 1.1 * np.sign(v), friction=True)
     leader, follower = (found.model.joint(name) for name in ("j0", "j1"))
     assert (leader.damping[0], leader.friction[0]) == pytest.approx((0.5, 0.7))

@@ -95,6 +95,9 @@ def spatial_inertia(mass: Any, com: Any, inertia: Any) -> Any:
     return blocks((inner + inner.T) / 2 + m * c * c.T, m * c, m * c.T, m * mp.eye(3))
 
 
+_OF_JOINT = ("armature", "damping", "stiffness", "rest", "friction")
+
+
 @dataclass
 class Link:
     """A body, or a massless one between the screws of a joint, and how it moves on its parent.
@@ -118,6 +121,7 @@ class Link:
     damping: list[Any] = field(default_factory=list)
     stiffness: list[Any] = field(default_factory=list)
     rest: list[Any] = field(default_factory=list)
+    friction: list[Any] = field(default_factory=list)
 
 
 class Reading:
@@ -157,7 +161,7 @@ class Reading:
                 subspace[row, column] = 1
             q = [(joint["q"] + i, mp.mpf(1), mp.mpf(0)) for i in range(4 if n == 3 else 7)]
             v = [(joint["v"] + i, mp.mpf(1)) for i in range(n)]
-            own = {k: [mp.mpf(x) for x in joint[k]] for k in ("armature", "damping", "stiffness", "rest")}
+            own = {k: [mp.mpf(x) for x in joint[k]] for k in _OF_JOINT}
             link = Link(joint["name"], parent, *place, joint["kind"], None, pitch, q, v, subspace, inertia, **own)
             self.links.append(link)
         screws = _SCREWS.get(joint["kind"], ()) if joint["kind"] not in ("ball", "free") else None
@@ -169,7 +173,7 @@ class Reading:
             a = self.axes[joint["name"]][axis] if isinstance(axis, int) else vector(axis)
             none = mp.zeros(3, 1)
             motion = {"hinge": stacked(a, none), "slide": stacked(none, a), "screw": stacked(a, pitch * a)}[kind]
-            own = {k: [mp.mpf(joint[k][i])] for k in ("armature", "damping", "stiffness", "rest")}
+            own = {k: [mp.mpf(joint[k][i])] for k in _OF_JOINT}
             q = [(leader["q"] + i, ratio, offset)]
             v = [(leader["v"] + i, ratio)]
             last = i == len(screws) - 1
@@ -209,7 +213,8 @@ def inverse_dynamics(
             for i, (entry, ratio) in enumerate(link.sources):
                 own = link.armature[i] * ratio * mp.mpf(a[entry]) if inertial else mp.mpf(0)
                 if passive:
-                    own += link.damping[i] * ratio * mp.mpf(v[entry])
+                    rate = ratio * mp.mpf(v[entry])
+                    own += link.damping[i] * rate + link.friction[i] * mp.sign(rate)
                     if link.stiffness[i]:
                         where, scale, offset = link.coordinates[i]
                         own += link.stiffness[i] * (scale * mp.mpf(q[where]) + offset - link.rest[i])

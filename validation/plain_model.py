@@ -14,7 +14,7 @@ def plain(model: Any) -> dict[str, Any]:
         q, v = (None, None) if mimic else (layout.q[j.name].start, layout.v[j.name].start)
         entry = {"name": j.name, "kind": j.kind, "parent": j.parent, "child": j.child, "q": q, "v": v, "mimic": mimic}
         entry |= {"pitch": j.pitch, "rotation": j.rotation.tolist(), "translation": j.translation.tolist()}
-        entry |= {n: getattr(j, n).tolist() for n in ("axes", "armature", "damping", "stiffness", "rest")}
+        entry |= {n: getattr(j, n).tolist() for n in ("axes", "armature", "damping", "stiffness", "rest", "friction")}
         joints.append(entry)
     return {
         "name": model.name,

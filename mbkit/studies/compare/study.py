@@ -335,6 +335,10 @@ def _beyond_terms(
     moving, movers, note = model, engines, ""
     if model.layout.reduced:
         moving, note = free_of_mimic(model), "mimic joints free"
+    if model.needs.friction:
+        # What engines integrate themselves has no exact friction.
+        moving, note = moving.without("friction"), "; ".join(x for x in (note, "without dry friction") if x)
+    if moving is not model:
         movers, _, _, _ = _build(moving, tuple(engines), silent, compile=True)
     methods = {engine: shown for engine in movers if (shown := find_engine(engine).shown)}
     settings: dict[str, Any] = {"duration": _HORIZON, "repeats": _REPEATS, "seconds": _SECONDS, "work": _WORK}

@@ -35,7 +35,8 @@ from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_s
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
-from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
+from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, states_of
+from mbkit.studies.explain.terms import model_terms as terms_with_friction
 from mbkit.studies.importers.loops import (
     WrittenLoops,
     activated,
@@ -269,6 +270,11 @@ def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str]
     q[:, q_order], v[:, v_order] = at.q, at.v
     terms = imported.terms(q, v, ())
     return {k: x[:, v_order][:, :, v_order] if x.ndim == 3 else x[:, v_order] for k, x in terms.items()}
+
+
+def model_terms(model: Model, at: States) -> Values:
+    """Return a model's terms without dry friction, which is in no importer's own terms."""
+    return terms_with_friction(model.without("friction"), at)
 
 
 def own_terms(

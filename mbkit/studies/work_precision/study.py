@@ -72,7 +72,7 @@ def work_precision(
     Parameters
     ----------
     model : Model
-        Its mimic joints are free where MuJoCo's own integrators are among the methods: MuJoCo would make them soft.
+        Without its dry friction, of which a note tells. Its mimic joints are free where MuJoCo's own integrators are among the methods: MuJoCo would make them soft.
     engines : sequence of str
     methods : sequence of str, or mapping of str to sequence of str, optional
         Names of `mbkit.simulate.METHODS`, for all engines that have them or for each; by default every method on every
@@ -177,6 +177,8 @@ def work_precision(
     facts = results.model_info(integrated)
     if integrated is not model and model.layout.reduced:
         facts["notes"] = [*facts["notes"], "mimic joints free"]
+    if model.needs.friction:
+        facts["notes"] = [*facts["notes"], "without the dry friction of its joints"]
     soft = [name for name in methods_of if model.constrained and find_engine(name).load().soft_constraints]
     if soft:
         which = " and ".join(soft)
@@ -299,8 +301,11 @@ def _check_executor(executor: Executor | None, torque: object) -> None:
 
 
 def _integrated_model(model: Model, pairs: Mapping[str, Sequence[str]]) -> Model:
-    """Return the model with parameters as numbers, and mimic joints free where MuJoCo's own integrators run."""
-    model = with_values(model)
+    """Return the model with parameters as numbers, and mimic joints free where MuJoCo's own integrators run.
+
+    Dry friction is left out: no reference of series crosses its jumps, and no engine's own integrator holds it.
+    """
+    model = with_values(model).without("friction")
     native = any(METHODS[m].kind == "native" for ms in pairs.values() for m in ms)
     return free_of_mimic(model) if model.layout.reduced and native else model
 

@@ -35,7 +35,7 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
     dyn = problem.dyn
     if dyn.model.constrained:
         raise UnsupportedError(
-            f"moreau: {dyn.model.name} has loops or other constraints, which its step does not hold; use a method of "
+            f"{problem.method}: {dyn.model.name} has loops or other constraints, which its step does not hold; use a method of "
             "phases without dry friction, by model.without('friction')"
         )
     record, reasons, evaluations = GridRecord(problem), dict[int, str](), 0
@@ -111,11 +111,11 @@ class _Compiled:
         names = own.model.parameters
         which, sides, locks = sliding.which.tolist(), [*sliding.sides.values()], [*sliding.locks.values()]
         kept: dict[str, Any] = own.equations.kept
-        if "moreau" not in kept:
-            kept["moreau"] = compiled_step_loop(
-                (own.form, "moreau"), lambda: moreau_parts(own.equations, which, sides, locks, RESTING), STATE
+        if problem.method not in kept:
+            kept[problem.method] = compiled_step_loop(
+                (own.form, problem.method), lambda: moreau_parts(own.equations, which, sides, locks, RESTING), STATE
             )
-        self._code = kept["moreau"]
+        self._code = kept[problem.method]
         self._room = aligned(self._code.size * width()).reshape(self._code.size, width())
         self._room[:] = 0.0
         self._ways, self._lanes = np.zeros(5, dtype=np.int64), width()
