@@ -108,10 +108,15 @@ def require_tree(
 
 
 def require_no_forces(model: Model, engine: str, *, holds_weights: bool = False) -> None:
-    """Raise `UnsupportedError` for a model with forces by functions, in the name of an engine's own integrators.
+    """Raise `UnsupportedError` for a model with forces by functions or friction, in the name of own integrators.
 
     Those of an engine that `holds_weights` know gravity compensation.
     """
+    if model.needs.friction:
+        raise UnsupportedError(
+            f"{engine}: its own integrators do not hold the dry friction of {model.name}; use a method that any engine "
+            "has, such as rk4, or model.without('friction')"
+        )
     if forces := by_functions(model) if holds_weights else model.forces:
         names = first_names((repr(f.name) for f in forces), ", ...")
         raise UnsupportedError(

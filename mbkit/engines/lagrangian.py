@@ -363,6 +363,11 @@ class LagrangianDynamics(Dynamics):
     def _on_device(self, quantity: str, more: tuple[Any, ...], given: dict[str, Any]) -> Any:
         from mbkit.codegen.cuda.arrays import batch_on_device
 
+        if self.model.needs.friction and quantity in UNDER_FORCE:
+            raise UnsupportedError(
+                f"{quantity} with dry friction takes arrays of the host, not of a GPU; copy them with numpy first, or "
+                "take model.without('friction')"
+            )
         names = tuple(map(_names, more))
         key = (quantity, *names) if quantity in _TRIM else (_STACKED, quantity)
         if key[0] == _STACKED and quantity not in _DERIVATIVES:

@@ -315,7 +315,7 @@ class LinearizationQuantities:
         >>> float(round(step.A[0, 0] * step.A[1, 1] - step.A[0, 1] * step.A[1, 0], 12))  # keeps areas
         1.0
         """
-        chosen, h = differentiable_method(self.engine, method), real("dt", dt, positive=True)
+        chosen, h = differentiable_method(self.model, self.engine, method), real("dt", dt, positive=True)
         states, _ = self._states({"q": q, "v": v, "tau": tau})
         q1, v1, slopes = self._step_slopes(chosen, h, parameters=False, **states)
         n, model = self.model.nv, self.model

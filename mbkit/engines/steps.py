@@ -326,10 +326,16 @@ class _DualStages:
         raise NotImplementedError
 
 
-def differentiable_method(engine: str, name: object) -> Method:
+def differentiable_method(model: Model, engine: str, name: object) -> Method:
     """Return the method of this name, if the derivative of its step is known."""
+    if model.needs.friction:
+        raise UnsupportedError(
+            f"{model.name} has dry friction: its steps have no derivative where a joint stops or lets go; "
+            "take model.without('friction'), or a smooth force, as by add_joint_force"
+        )
     method = method_of(name)
-    known = [m.name for m in METHODS.values() if m.kind == "fixed" and (not m.engines or engine in m.engines)]
+    fixed = [m for m in METHODS.values() if m.kind == "fixed" and not m.dry_friction]
+    known = [m.name for m in fixed if not m.engines or engine in m.engines]
     if method.name not in known:
         lacks = method.kind == "fixed" and f"{engine} {method.lacks}"
         raise UnsupportedError(

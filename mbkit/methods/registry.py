@@ -156,7 +156,7 @@ class Method:
     @property
     def in_momenta(self) -> bool:
         """Whether its fixed step is one of (q, p), and no formula of velocities and accelerations."""
-        return self.kind == "fixed" and self.formula is None
+        return self.kind == "fixed" and self.formula is None and not self.dry_friction
 
     @property
     def code_name(self) -> str:

@@ -157,7 +157,7 @@ def sensitivities(
             "torque: expected an array; the slope of a function is not known: give the forces that it returned, "
             "(steps, nv), and close the loop with A + B K"
         )
-    chosen, model = differentiable_method(dyn.engine, method), dyn.model
+    chosen, model = differentiable_method(dyn.model, dyn.engine, method), dyn.model
     h, n = real("dt", dt, positive=True), model.nv
     by_parameters = bool(parameters) and bool(model.parameters)
     run = simulate(dyn, q0, v0, duration, chosen.name, h, torque=torque, doubt=False)

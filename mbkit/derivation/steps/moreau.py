@@ -17,6 +17,7 @@ import casadi as ca
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import Part, function_of
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
+from mbkit.model.changes.dry_friction import RESTING, ROUNDING
 
 #: A round reads these and writes the same names with a 1 behind. `side` and `still` are of the velocities with
 #: friction; `k` is the number of steps so far, `end` that to make; `best` is the least number of failures so far and
@@ -24,19 +25,15 @@ from mbkit.derivation.steps.symbols import SymbolicSpace, choose
 STATE: Final = ("q", "w", "side", "still", "k", "end", "best", "left", "go")
 #: Attempts that may not have fewer failures before sides are changed one by one.
 PATIENCE: Final = 3
-#: A bound of impulses is passed where it is by more than this part, as rounding of their sums may.
-ROUNDING: Final = 1e-13
 #: Of `best`, more than all velocities.
 MANY: Final = 1e9
 
 
-def moreau_parts(
-    equations: Equations, which: list[int], sides: list[str], locks: list[str], resting: float
-) -> list[Part]:
+def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks: list[str]) -> list[Part]:
     """Return the parts of an attempt, of the equations of a model whose joints slide or rest as parameters say.
 
     `which` are the velocities with friction, `sides` and `locks` the parameters of their sides and of their armatures
-    at rest, `resting` for those that rest. The parts read `STATE`, tau, dt, bound (the friction at rest, in the order
+    at rest. The parts read `STATE`, tau, dt, bound (the friction at rest, in the order
     of `which`) and the other parameters.
     """
     model, space = equations.model, SymbolicSpace(equations.model)
@@ -46,6 +43,11 @@ def moreau_parts(
     s |= {"tau": ca.SX.sym("tau", equations.force.numel()), "dt": ca.SX.sym("dt"), "bound": ca.SX.sym("bound", n)}
     rest = [name for name in model.parameters if name not in {*sides, *locks}]
     others = ca.SX.sym("parameters", len(rest))
+    # The time is that of step zero, if all steps had this length.
+    at_step = [
+        x + s["k"] * s["dt"] if n == model.time_parameter else x
+        for n, x in zip(rest, ca.vertsplit(others), strict=True)
+    ]
     place = {name: i for i, name in enumerate((*sides, *locks, *rest))}
     order = [place[name] for name in model.parameters]
     pick = ca.DM(ca.Sparsity.triplet(n, nv, list(range(n)), which), 1.0)
@@ -56,14 +58,14 @@ def moreau_parts(
         return ca.mtimes(pick.T, x)
 
     def parameters(side: Any, lock: Any) -> Any:
-        return ca.vertcat(side, lock, others)[order]
+        return ca.vertcat(side, lock, *at_step)[order]
 
     def solve() -> ca.Function:
         # What comes to rest is accelerated so that it has no velocity at the end: a force on a giant armature.
         target = -ca.mtimes(pick, v) / h
-        force = s["tau"] + ca.vertcat(spread(resting * still * target), ca.SX(s["tau"].numel() - nv, 1))
+        force = s["tau"] + ca.vertcat(spread(RESTING * still * target), ca.SX(s["tau"].numel() - nv, 1))
         forward = equations.function("forward_dynamics")
-        a = forward(s["q"], v, force, parameters(side * (1 - still), resting * still))
+        a = forward(s["q"], v, force, parameters(side * (1 - still), RESTING * still))
         a = (1 - spread(still)) * a + spread(still * target)
         inverse = equations.function("inverse_dynamics")
         free = ca.SX(n, 1)
@@ -72,10 +74,11 @@ def moreau_parts(
         passive = equations.function("passive")
         slid = passive(s["q"], v, parameters(free, free)) - passive(s["q"], v, parameters(free + 1, free))
         most = choose(ca.mtimes(pick, v) == 0, s["bound"], ca.mtimes(pick, slid))
-        given = {name: s[name] for name in ("q", "w", "side", "still", "tau", "dt", "bound")} | extra
+        given = {name: s[name] for name in first[: -len(extra) or None]} | extra
         return function_of("moreau_solve", given, {"a": a, "needed": ca.mtimes(pick, needed), "most": most})
 
     extra = {"parameters": others} if others.numel() else {}
+    first = ("q", "w", "side", "still", "k", "tau", "dt", "bound", *extra)
     a, needed, most = ca.SX.sym("a", nv), ca.SX.sym("needed", n), ca.SX.sym("most", n)
 
     def decide() -> ca.Function:
@@ -115,7 +118,6 @@ def moreau_parts(
         given = {name: s[name] for name in (*STATE[:-1], "dt")} | {"a": a, "needed": needed, "most": most}
         return function_of("moreau_decide", given, state)
 
-    first = ("q", "w", "side", "still", "tau", "dt", "bound", *extra)
     second = (*STATE[:-1], "dt", "a", "needed", "most")
     return [
         Part("moreau_solve", first, ("a", "needed", "most"), solve),

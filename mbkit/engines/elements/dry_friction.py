@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit.errors import NumericalError
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import DryFrictionLaw, Sliding
+from mbkit.model.changes.dry_friction import ROUNDING, DryFrictionLaw, Sliding
 
 Indices = NDArray[np.intp]
 #: What is at rest of velocities.
@@ -41,7 +41,14 @@ _ROUNDING: Final = 64 * _EPS
 
 
 def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
-    """Return the λ with |λ| <= bound that minimizes ½ λᵀ A λ + bᵀ λ, for a positive semidefinite A; (n,).
+    """Return the forces of `solve_at_rest`."""
+    return solve_at_rest(A, b, bound)[0]
+
+
+def solve_at_rest(A: Array, b: Array, bound: Array) -> tuple[Array, Mask]:
+    """Return the λ with |λ| <= bound that minimizes ½ λᵀ A λ + bᵀ λ, and where it is inside; (n,) each.
+
+    A is positive semidefinite.
 
     The set of forces at their bounds is exchanged as a whole as long as fewer conditions fail, then one by one, the
     last first, which ends (Murty 1974, Linear Algebra and its Applications 9; Júdice and Pires 1994, Computers and
@@ -58,10 +65,10 @@ def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
         a = b + A @ forces
         # What is undecided to rounding is at rest.
         noise = _ROUNDING * (np.abs(b) + np.abs(A) @ bound)
-        wrong = np.where(inner, np.abs(forces) > bound * (1 + _ROUNDING), side * a > noise)
+        wrong = np.where(inner, np.abs(forces) > bound * (1 + ROUNDING), side * a > noise)
         count = int(wrong.sum())
         if not count:
-            return forces
+            return forces, inner
         if count < best:
             best, left = count, 3
         elif left:
@@ -72,6 +79,22 @@ def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
     raise NumericalError(
         f"dry friction: which of {n} joints at rest begin to move cannot be decided; their inertia is singular"
     )
+
+
+def friction_forces(A: Array, b: Array, bound: Array, less: Array, known: Array) -> tuple[Array, Mask]:
+    """Return the forces of friction as `forces_at_rest` does, and which of them hold; those `known` beforehand do not.
+
+    What lets go has the friction of motion. Where that is `less` than the bound, the others feel it.
+    """
+    forces, free = known.copy(), known != 0
+    holds = ~free
+    while True:
+        on = ~free
+        pushed = b[on] + A[np.ix_(on, free)] @ forces[free]
+        forces[on], holds[on] = solve_at_rest(A[np.ix_(on, on)], pushed, bound[on])
+        if not (drops := on & ~holds & (less < bound)).any():
+            return forces, holds
+        forces[drops], free, holds = np.sign(forces[drops]) * less[drops], free | drops, holds & ~drops
 
 
 class DryFriction:
@@ -159,19 +182,11 @@ class DryFriction:
         law, which = self.law, np.flatnonzero(resting)
         A = self._responses(dyn, accelerate, q, tau, which)
         b = np.asarray(accelerate(tau), dtype=np.float64)[which]
-        bound, less = law.bound[which], law.just_moving[which]
-        forces = np.zeros(len(which)) if leaving is None else -leaving[which] * less
-        free = forces != 0
-        while True:
-            on = ~free
-            forces[on] = forces_at_rest(A[np.ix_(on, on)], b[on] + A[np.ix_(on, free)] @ forces[free], bound[on])
-            loose = on & (np.abs(forces) >= bound * (1 - _ROUNDING))
-            # A joint that lets go has the friction of motion; where that is less, the others feel it.
-            if not (drops := loose & (less < bound)).any():
-                break
-            forces[drops], free = np.sign(forces[drops]) * less[drops], free | drops
+        less = law.just_moving[which]
+        known = np.zeros(len(which)) if leaving is None else -leaving[which] * less
+        forces, holds = friction_forces(A, b, law.bound[which], less, known)
         held, still = np.zeros(len(tau[..., : len(resting)])), np.zeros(len(resting), dtype=bool)
-        held[which], still[which] = forces, ~(free | loose)
+        held[which], still[which] = forces, holds
         return held, still
 
     def _responses(self, dyn: Any, accelerate: Callable[[Array], Array], q: Array, tau: Array, which: Indices) -> Array:

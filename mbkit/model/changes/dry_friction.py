@@ -24,6 +24,8 @@ from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Parameter
 from mbkit.model.parts import Joint
 
+#: A force at rest is above its bound where it is so by more than this part, as rounding of its sums may be.
+ROUNDING: Final = 1e-13
 #: Armature of a joint that rests, kg m² or kg: what accelerates it is smaller than any rounding, and articulated
 #: inertias beside it are those of a fixed joint to the last bit.
 RESTING: Final = 1e30

@@ -305,9 +305,8 @@ class Comparison(ResultTable):
         rows = [r for r in self.rollouts if not r.informs]
         rubbing = [x.size for x in self.findings if x.kind == FRICTION]
         if rows and rubbing:
-            out += [
-                f"rollouts and error against run time are without dry friction ({rubbing[0]:.2g} times the other forces)"
-            ]
+            size = f"{rubbing[0]:.2g} times the other forces"
+            out += [f"rollouts and error against run time are without dry friction ({size})"]
         judged = [r for r in rows if r.judged]
         if rows and not judged:
             out.append(f"none of {len(rows)} rollouts judged" if len(rows) > 1 else "the rollout not judged")

@@ -13,9 +13,8 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.engines.elements.dry_friction import forces_at_rest
+from mbkit.engines.elements.dry_friction import friction_forces
 from mbkit.errors import NumericalError, UnsupportedError
-from mbkit.model.changes.dry_friction import RESTING
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
@@ -35,12 +34,12 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
     dyn = problem.dyn
     if dyn.model.constrained:
         raise UnsupportedError(
-            f"{problem.method}: {dyn.model.name} has loops or other constraints, which its step does not hold; use a method of "
-            "phases without dry friction, by model.without('friction')"
+            f"{problem.method}: {dyn.model.name} has loops or other constraints, which its step does not hold; take "
+            "another method, and model.without('friction')"
         )
     record, reasons, evaluations = GridRecord(problem), dict[int, str](), 0
     compiled = dyn.derived and not problem.torque.callable and dyn.model.needs.friction
-    compiled = compiled and dyn.model.time_parameter is None and getattr(dyn, "compiles_steps", False)
+    compiled = compiled and getattr(dyn, "compiles_steps", False)
     for i in range(len(problem.q)):
         member = problem.member(i)
         own = dyn if member is None else dyn._of_sample(i)
@@ -85,10 +84,11 @@ class _InPython:
         free = v + h * dyn.forward_dynamics(q, v, tau)
         if len(which):
             columns = np.linalg.solve(dyn.mass_matrix(q), np.eye(len(v))[:, which])
-            bound = h * np.where(v == 0, self._law.bound, np.abs(self._law.force_at(v)))[which]
-            impulse = forces_at_rest(columns[which], free[which], bound)
+            slides = np.abs(self._law.force_at(v))[which]
+            bound = np.where(v[which] == 0, self._law.bound[which], slides)
+            impulse, holds = friction_forces(columns[which], free[which], h * bound, h * slides, 0 * bound)
             free = free + columns @ impulse
-            free[which[np.abs(impulse) < bound * (1 - 1e-13)]] = 0.0
+            free[which[holds]] = 0.0
         q1 = space.retract(q, h * space.to_integrator_velocity(q, free))
         return q1, free
 
@@ -113,16 +113,18 @@ class _Compiled:
         kept: dict[str, Any] = own.equations.kept
         if problem.method not in kept:
             kept[problem.method] = compiled_step_loop(
-                (own.form, problem.method), lambda: moreau_parts(own.equations, which, sides, locks, RESTING), STATE
+                (own.form, problem.method), lambda: moreau_parts(own.equations, which, sides, locks), STATE
             )
         self._code = kept[problem.method]
         self._room = aligned(self._code.size * width()).reshape(self._code.size, width())
         self._room[:] = 0.0
         self._ways, self._lanes = np.zeros(5, dtype=np.int64), width()
+        self._clock: int | None = None
         self["bound"][:] = friction.law.bound[which, None]
         if "parameters" in self._code.rows:
-            others = [x for name, x in names.items() if name not in {*sides, *locks}]
-            self["parameters"][:] = np.array(others, dtype=float)[:, None]
+            others = {name: x for name, x in names.items() if name not in {*sides, *locks}}
+            self["parameters"][:] = np.array([*others.values()], dtype=float)[:, None]
+            self._clock = [*others].index(own.model.time_parameter) if own.model.time_parameter else None
         rows = self._code.rows
         zero = rows[f"{STATE[0]}1"][0]
         self._at = {name: slice(rows[f"{name}1"][0] - zero, sum(rows[f"{name}1"]) - zero) for name in STATE}
@@ -151,6 +153,8 @@ class _Compiled:
             last = k + 1 if held or k == grid.steps - 1 else grid.steps - (grid.step(grid.steps - 1) != grid.dt)
             self["tau"][:] = np.asarray(self._force(k))[:, None]
             self["dt"][:] = grid.step(k)
+            if self._clock is not None:
+                self["parameters"][self._clock] = grid.time(k) - k * grid.step(k)
             since = 0
             while k < last and not why:
                 done, tried, since, why = self._advance(k, last, since)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +11,9 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
+from mbkit.model.changes.dry_friction import ROUNDING
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
-
-#: Of its bound, by how much a force at rest may be above it by rounding.
-_ROUNDING: Final = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +59,7 @@ class Friction:
         """
         out = phase.sides * v
         if phase.still.any():
-            out = np.where(phase.still, 1 + _ROUNDING - np.abs(self.holding(phase, t, q, v, force)) / self._bound, out)
+            out = np.where(phase.still, 1 + ROUNDING - np.abs(self.holding(phase, t, q, v, force)) / self._bound, out)
         return out[..., self.which]
 
     def holding(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> Array:

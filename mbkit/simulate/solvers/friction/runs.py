@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.optimize import brentq
@@ -189,13 +189,15 @@ def _good(run: _Member, phase: Phase, k: int, result: SolverResult) -> int:
     if not phase.still.any():
         return n
     rows = run.problem.torque.over_states(run.member, k, n)
-    if rows is None or phase.dyn.model.time_parameter is not None:
+    timed = phase.dyn.model.time_parameter is not None
+    if rows is None or (timed and not phase.dyn.takes_parameters):
         forces = [run.force(k + i) for i in range(n)]
         states = zip(forces, result.q[1 : n + 1], result.v[1 : n + 1], strict=True)
         each = [friction.margins(phase, grid.time(k + 1 + i), q, v, f) for i, (f, q, v) in enumerate(states)]
         margins = np.array(each).reshape(n, -1)
     else:
-        margins = friction.margins(phase, 0.0, result.q[1 : n + 1], result.v[1 : n + 1], rows)
+        times: Any = np.array([grid.time(k + 1 + i) for i in range(n)]) if timed else 0.0
+        margins = friction.margins(phase, times, result.q[1 : n + 1], result.v[1 : n + 1], rows)
     over = np.flatnonzero((margins < 0).any(axis=1))
     return int(over[0]) if over.size else n
 
