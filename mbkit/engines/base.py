@@ -341,7 +341,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         return self._evaluate("nle", q=q, v=v)
 
     def passive(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return the generalized force of springs and dampers, shape (nv,) or (N, nv).
+        """Return the generalized force of springs and dampers, and of dry friction at speed; (nv,) or (N, nv).
 
         Examples
         --------
@@ -379,7 +379,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         """Return v̇ = M⁻¹ (τ + τ_passive - nle + Σ Jᵀ w), shape (nv,) or (N, nv).
 
         `wrenches` on frames and their `axes` are those of `generalized_force`. Under constraints the first call warns
-        where the state does not satisfy them; `constraint_residual` tells it of any.
+        where the state does not satisfy them; `constraint_residual` tells it of any. Where velocities with dry friction
+        are zero, it holds them as Gauss's principle has it, or lets them go (Moreau 1966, Comptes Rendus 262).
 
         Examples
         --------

@@ -56,7 +56,8 @@ def simulate(
     duration : float
         s. The run ends exactly there: where it is no multiple of `dt`, the last step is shorter.
     method : str
-        With a step: ``"rk4"`` and ``"semi_implicit_euler"``, MuJoCo 4's formulas on any engine; ``"gauss4"`` and
+        With a step: ``"rk4"`` and ``"semi_implicit_euler"``, MuJoCo 4's formulas on any engine; ``"moreau"``, for dry
+        friction at many joints; ``"gauss4"`` and
         ``"gauss6"``, implicit, on any engine; ``"implicit_midpoint"``, symplectic, on the own derivation;
         ``"mujoco_euler"``, ``"mujoco_rk4"``, ``"mujoco_implicit"``, ``"mujoco_implicitfast"`` and
         ``"mujoco_discrete"``, MuJoCo's own on its engine. With a tolerance: ``"rk853"``, fastest on the own

@@ -152,17 +152,18 @@ class DryFriction:
     ) -> tuple[Array, Mask]:
         """Return `decided` of a state or of each of a batch."""
         forward = quantity.startswith(_FORWARD)
-        accelerate = method if forward else dyn._without_friction("forward_dynamics")
 
-        def one(i: Any) -> tuple[Array, Mask]:
+        def one(i: Any, own: Any) -> tuple[Array, Mask]:
+            same = own is dyn and forward
+            accelerate = method if same else own._without_friction(quantity if forward else _FORWARD)
             more = tuple(x[i] if isinstance(x, np.ndarray) else x for x in rest) if forward else ()
-            return self.decided(dyn, lambda tau: accelerate(q[i], v[i], tau, *more), q[i], tau[i], resting[i])
+            return self.decided(own, lambda tau: accelerate(q[i], v[i], tau, *more), q[i], tau[i], resting[i])
 
         if v.ndim == 1:
-            return one(...)
+            return one(..., dyn)
         held, still = np.zeros_like(v), np.zeros(v.shape, dtype=bool)
         for i in np.flatnonzero(resting.any(axis=1)):
-            held[i], still[i] = one(i)
+            held[i], still[i] = one(i, dyn._of_sample(int(i)))
         return held, still
 
     def decided(

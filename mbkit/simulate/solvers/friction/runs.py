@@ -186,7 +186,7 @@ def _good(run: _Member, phase: Phase, k: int, result: SolverResult) -> int:
     friction, grid, n = run.friction, run.problem.grid, len(result.t) - 1
     sliding = np.flatnonzero(((phase.sides * result.v[1:])[:, friction.which] < 0).any(axis=1))
     n = int(sliding[0]) if sliding.size else n
-    if not phase.still.any():
+    if not (n and phase.still.any()):
         return n
     rows = run.problem.torque.over_states(run.member, k, n)
     timed = phase.dyn.model.time_parameter is not None
