@@ -36,7 +36,7 @@ from mbkit.load.mjcf_reader import (
 from mbkit.load.shapes import NOTHING, together
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
-from mbkit.model import Body, Model, ModelBuilder, quaternions
+from mbkit.model import Body, Model, ModelBuilder, kind_of, quaternions
 from mbkit.model.validation import body_fault
 
 _REFUSED: Final = {
@@ -248,6 +248,12 @@ class _Tree:
         if any(higher["damping"]) and "damper" not in self.off:
             self.b.add_joint_force(f"damper of {joint.name}", joint.name, _damper(joint, *higher["damping"]))
         friction = read.number(element, "frictionloss", item, 0.0)
+        if friction and not kind_of(kind).coordinate_velocities:
+            self.b.note(
+                f"dry friction {friction:g} of {joint.kind} joint {joint.name!r} is left out: it acts on each velocity, "
+                "and their axes move with the body"
+            )
+            friction = 0.0
         self.b.add_joint(
             joint.name, kind, parent=parent, child=child, translation=p, rotation=R, friction=friction, **values
         )

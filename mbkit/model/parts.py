@@ -15,6 +15,9 @@ from mbkit._check import Array, shown
 from mbkit.errors import ModelError
 from mbkit.model.joint_types import JointType, kind_of, register_joint_type
 
+#: Armature of a joint that rests, kg m² or kg: what accelerates it is smaller than any rounding, and articulated
+#: inertias beside it are those of a fixed joint to the last bit.
+RESTING: Final = 1e30
 _ONE: Final = np.eye(3)
 #: Of a matrix: what digits of a file leave of its orthogonality and symmetry.
 _TURNED: Final = 1e-6

@@ -16,7 +16,7 @@ from mbkit.model.description import Description
 from mbkit.model.elements.forces import force_faults
 from mbkit.model.elements.motion_laws import motion_faults
 from mbkit.model.loops import held_directions
-from mbkit.model.parts import Body, Joint, JointCoupling, Loop, NoSlip
+from mbkit.model.parts import RESTING, Body, Joint, JointCoupling, Loop, NoSlip
 from mbkit.model.rolling import LIES_FLAT, ROLLING_KINDS
 from mbkit.spatial import skew
 
@@ -141,9 +141,9 @@ def _joint_faults(joint: Joint) -> Iterator[str]:
     yield from _friction_faults(item, joint)
     if type_.quaternion is not None and np.isfinite([x[type_.quaternion :] for x in (joint.lower, joint.upper)]).any():
         yield f"{item}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite"
-    # The same about three axes is a sphere's, which has no gyroscopic term.
+    # The same about three axes is a sphere's, which has no gyroscopic term; neither has what rests.
     sphere = type_.quaternion == 0 and not np.ptp(joint.armature) > 0
-    if np.any(joint.armature) and type_.nv != 1 and not sphere:
+    if not np.isin(joint.armature, (0.0, RESTING)).all() and type_.nv != 1 and not sphere:
         yield (
             f"{item}: armature on a {joint.kind} joint; expected a joint of one velocity, or one number for the three "
             "of a ball joint (engines leave out the gyroscopic term otherwise): add a rotor as a body"

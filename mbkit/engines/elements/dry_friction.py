@@ -210,7 +210,7 @@ class DryFriction:
         if key not in held:
             if len(held) >= _PHASES:
                 held.clear()
-            held[key] = bare._of_model(sliding.at(sides, still, dyn.model), sliding.model.form_digest)
+            held[key] = bare._of_model(sliding.at(sides, still, dyn.model), sliding.form)
         return held[key]._under(*dyn._acting) if dyn._acting[0] else held[key]
 
     def sliding_together(self, dyn: Any, signs: Array, rows: Indices, which: Indices) -> Iterator[tuple[Indices, Any]]:

@@ -53,7 +53,7 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
             raise UnsupportedError(f"mujoco: {lines.removeprefix('XML Error: ').removeprefix('Error: ')}") from None
     described, extras = _Description(m), list(_extras(m))
     dyn = _Read.of(checked("mujoco", described.model), m, described.numbers, {x.key: y for x, y in extras})
-    notes = (*_constraints(m), *(" ".join(w.split()) for w in heard))
+    notes = (*_constraints(m), *_rubbing(m), *(" ".join(w.split()) for w in heard))
     beside = tuple(x._replace(without=described.without(x.key)) if x.key in described.parts else x for x, _ in extras)
     couplers = described.couplers()
     held = "by soft equality constraints" if couplers else ""
@@ -127,6 +127,15 @@ def _constraints(m: Any) -> list[str]:
         more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
         out.append(f"{what} ({', '.join(names[:_MAX_NAMES])}{more}), in none of the terms")
     return out
+
+
+def _rubbing(m: Any) -> Iterator[str]:
+    """Name the joints whose dry friction no description holds: their velocities are along moving axes."""
+    for j in range(m.njnt):
+        type_ = kind_of(kind := _KINDS[int(m.jnt_type[j])])
+        first = int(m.jnt_dofadr[j])
+        if m.dof_frictionloss[first : first + type_.nv].any() and not type_.coordinate_velocities:
+            yield f"dry friction of {kind} joint {_called(m.joint(j), j)} is left out"
 
 
 def _extras(m: Any) -> Iterator[tuple[Beside, _Removal]]:
@@ -304,7 +313,9 @@ class _Description:
     def _joint(self, name: str, kind: str, parent: str, child: str, R: Array, p: Array, j: int) -> None:
         m, nv = self.m, kind_of(kind).nv
         v = slice(int(m.jnt_dofadr[j]), int(m.jnt_dofadr[j]) + nv) if j >= 0 else slice(0, 0)
-        numbers: dict[str, Any] = {"armature": np.array(m.dof_armature[v]), "friction": np.array(m.dof_frictionloss[v])}
+        numbers: dict[str, Any] = {"armature": np.array(m.dof_armature[v])}
+        if kind_of(kind).coordinate_velocities:
+            numbers["friction"] = np.array(m.dof_frictionloss[v])
         if kind == "free" and numbers["armature"].any():
             raise UnsupportedError(
                 f"joint {name!r} is free and has armature, which mbkit.load reads as a body without weight; MuJoCo's "

@@ -22,13 +22,10 @@ from mbkit.model.elements.forces import JointForce
 from mbkit.model.elements.formula import Formula, Operation
 from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Parameter
-from mbkit.model.parts import Joint
+from mbkit.model.parts import RESTING, Joint
 
 #: A force at rest is above its bound where it is so by more than this part, as rounding of its sums may be.
 ROUNDING: Final = 1e-13
-#: Armature of a joint that rests, kg m² or kg: what accelerates it is smaller than any rounding, and articulated
-#: inertias beside it are those of a fixed joint to the last bit.
-RESTING: Final = 1e30
 
 
 class FrictionNumbers(NamedTuple):
@@ -115,6 +112,8 @@ class Sliding:
         self.sides = {int(i): f"friction side of {self.names[i]}" for i in self.which}
         self.locks = {int(i): f"friction lock of {self.names[i]}" for i in self.which}
         self.model = self._of(model)
+        with unchecked():
+            self.form = self.model.form_digest
 
     def at(self, sides: Array, still: NDArray[np.bool_], model: Model) -> Model:
         """Return the model in which velocities have these signs, or stay at rest; (nv,) each.
@@ -125,7 +124,9 @@ class Sliding:
         values |= {name: 0.0 if still[i] else float(sides[i]) for i, name in self.sides.items()}
         values |= {name: RESTING * bool(still[i]) for i, name in self.locks.items()}
         with unchecked():
-            return replace(self.model._substituted(lambda p: Parameter(p.name, values[p.name])), time=model.time)
+            out = replace(self.model._substituted(lambda p: Parameter(p.name, values[p.name])), time=model.time)
+        vars(out)["form_digest"] = self.form
+        return out
 
     def _of(self, model: Model) -> Model:
         layout, numbers = model.layout, FrictionNumbers.of(model.joints)

@@ -485,6 +485,8 @@ def _changes(part: Any, numbers: Mapping[str, Any], were_free: set[str], free: s
 
 
 def _short(x: Any) -> str:
+    if x is None:
+        return "none"
     # The shortest text that is the number.
     texts = [f"{v:g}" if float(f"{v:g}") == v else repr(v) for v in np.ravel(x).tolist()]
     return texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]"
