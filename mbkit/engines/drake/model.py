@@ -189,10 +189,10 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
     else:
         # Metres per radian here, per turn there.
         added = plant.AddJoint(tree.ScrewJoint(name, at, body, axis, _TURN * joint.pitch, damping))
-    if joint.type.nv == 1 and joint.armature[0]:
+    if joint.armature[k]:
         # Drake knows armature as the inertia of an actuator's rotor.
         actuator = plant.AddJointActuator(f"{name}.rotor", added)
-        actuator.set_default_rotor_inertia(float(joint.armature[0]))
+        actuator.set_default_rotor_inertia(float(joint.armature[k]))
         actuator.set_default_gear_ratio(1.0)
     stiffness, rest = float(joint.stiffness[k]), float(joint.rest[k])
     if stiffness:

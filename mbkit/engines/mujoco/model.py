@@ -343,8 +343,7 @@ def _add_joint(new: Any, joint: Joint, R: Array, p: Array, placed: Placed, at_or
         if type_ in (_HINGE, _SLIDE):
             j.stiffness[0], j.springref = joint.stiffness[k], joint.rest[k]
             j.damping[0], j.frictionloss = joint.damping[k], joint.friction[k]
-            if joint.type.nv == 1:
-                j.armature = joint.armature[0]
+            j.armature = joint.armature[k]
             low, high = float(joint.lower[k]), float(joint.upper[k])
             if np.isfinite([low, high]).any() and low < high:
                 # MuJoCo has no open end; this one is never reached.

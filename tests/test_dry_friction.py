@@ -1,0 +1,500 @@
+"""Dry friction: optimal at rest on every engine, its law at speed, runs against closed forms, bad input."""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
+
+import mbkit as mb
+from mbkit.engines.elements.dry_friction import forces_at_rest
+from mbkit.errors import InputError, ModelError, UnsupportedError
+from mbkit.model import Model
+from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
+
+EPS = float(np.finfo(float).eps)
+ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake")
+
+
+def rubbed(seed: int, n: int = 6, kinds: tuple[str, ...] = IN_MUJOCO, *, curve: bool = True, **more: bool) -> Model:
+    """Return a random tree with friction wherever a joint may have it, of the size of the other forces."""
+    rng = np.random.default_rng([seed, 7])
+    model = random_tree(seed, n, kinds, **more)
+    b = mb.ModelBuilder.of(model)
+    for joint in model.joints:
+        if joint.type.coordinate_velocities and joint.type.nv:
+            sliding = rng.uniform(0, 3, joint.type.nv)
+            b.set_joint(joint.name, friction=sliding)
+            if curve:
+                b.set_joint(joint.name, stiction=sliding * rng.uniform(1, 2))
+            if curve and rng.random() < 0.7:
+                b.set_joint(joint.name, stribeck_velocity=rng.uniform(0.1, 1, joint.type.nv))
+    return b.build()
+
+
+def mostly_at_rest(model: Model, n: int, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Return q, v, tau, with two thirds of the velocities zero and forces around what friction holds."""
+    q, v, _, tau = states(model, n, seed)
+    rng = np.random.default_rng([seed, 5])
+    v[rng.random(v.shape) < 2 / 3] = 0.0
+    return q, v, 4 * tau * rng.random((n, 1)) ** 2
+
+
+def sizes(model: Model, v: np.ndarray) -> np.ndarray:
+    """Return f(|v|) of full velocities, from the joints' numbers."""
+    out = np.zeros(model.layout.G.shape[0])
+    for joint in model.joints:
+        part = model.layout.full_v[joint.name]
+        f = joint.friction
+        fall = np.zeros(joint.type.nv)
+        if joint.stiction is not None and joint.stribeck_velocity is not None:
+            fall = (joint.stiction - f) * np.exp(-((v[part] / joint.stribeck_velocity) ** 2))
+        out[part] = f + fall
+    return out
+
+
+def bounds(model: Model) -> np.ndarray:
+    """Return the largest friction at rest of independent velocities."""
+    full = [j.friction if j.stiction is None else j.stiction for j in model.joints]
+    return np.abs(model.layout.G.T) @ np.concatenate([np.zeros(0), *full])
+
+
+# The law
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_at_speed_it_is_a_passive_force_against_the_velocity_of_each_joint(engine: str) -> None:
+    model = rubbed(0, mimic=True)
+    q, v, a, tau = states(model, 4)
+    dyn, bare = mb.dynamics(model, engine), mb.dynamics(model.without("friction"), engine)
+    full = v @ model.layout.G.T
+    force = -np.array([sizes(model, x) * np.sign(x) for x in full]) @ model.layout.G
+    assert off(dyn.passive(q, v) - bare.passive(q, v), force) < 1e3 * EPS
+    assert off(bare.inverse_dynamics(q, v, a) - dyn.inverse_dynamics(q, v, a), force) < 1e4 * EPS
+    assert off(dyn.forward_dynamics(q, v, tau), bare.forward_dynamics(q, v, tau + force)) < 1e4 * EPS
+    # Power is lost, and never won.
+    assert ((force * v).sum(axis=1) < 0).all()
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_derivatives_at_speed_are_those_of_the_curve(engine: str) -> None:
+    model = rubbed(3, 4, SOUND, mimic=True, springs=False, damping=False)
+    q, v, a, tau = (x[0] for x in states(model, 1))
+    dyn, h = mb.dynamics(model, engine), 1e-6
+    for derivatives, of, x in (
+        (dyn.inverse_dynamics_derivatives, dyn.inverse_dynamics, a),
+        (dyn.forward_dynamics_derivatives, dyn.forward_dynamics, tau),
+    ):
+        by_v = np.array([of(q, v + h * e, x) - of(q, v - h * e, x) for e in np.eye(len(v))]).T / (2 * h)
+        # Differences lose half of the digits.
+        assert off(derivatives(q, v, x).v, by_v) < 1e-7
+
+
+# At rest
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_at_rest_friction_is_what_the_least_constraint_needs(engine: str, seed: int) -> None:
+    model = rubbed(seed, curve=False, mimic=seed % 2 == 0)
+    q, v, tau = mostly_at_rest(model, 12, seed)
+    a = mb.dynamics(model, engine).forward_dynamics(q, v, tau)
+    # Friction of what moves is in the passive force of the model itself.
+    held = mb.dynamics(model, engine).inverse_dynamics(q, v, a) - tau
+    rest = (v == 0) & (bounds(model) > 0)
+    bound = np.where(rest, bounds(model), 0.0)
+    noise = 1e-10 * (1 + np.abs(held).max() + np.abs(a).max())
+    assert (np.abs(held) <= bound + noise).all()
+    begins = rest & (a != 0)
+    assert off(held[begins], (-bound * np.sign(a))[begins]) < noise
+    assert begins.any() and (rest & (a == 0)).any()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_at_rest_accelerations_are_the_best_of_all_patterns(seed: int) -> None:
+    model = rubbed(seed, 4, ("revolute", "prismatic", "universal"), curve=False)
+    q, v, tau = mostly_at_rest(model, 4, seed)
+    bare = mb.dynamics(model.without("friction"), "lagrangian")
+    law = -np.array([sizes(model, x) * np.sign(x) for x in v])
+    M, free = bare.mass_matrix(q), tau + law + bare.passive(q, v) - bare.nle(q, v)
+    got = mb.dynamics(model, "lagrangian").forward_dynamics(q, v, tau)
+    for i in range(len(q)):
+        rest = np.flatnonzero((v[i] == 0) & (bounds(model) > 0))
+
+        def cost(a: np.ndarray, i: int = i, rest: np.ndarray = rest) -> float:
+            return float(a @ M[i] @ a / 2 - free[i] @ a + bounds(model)[rest] @ np.abs(a[rest]))
+
+        best, value = np.zeros(model.nv), np.inf
+        for signs in itertools.product((-1, 0, 1), repeat=len(rest)):
+            force, moves = free[i].copy(), np.ones(model.nv, dtype=bool)
+            force[rest] -= np.array(signs) * bounds(model)[rest]
+            moves[rest[np.array(signs) == 0]] = False
+            a = np.zeros(model.nv)
+            a[moves] = np.linalg.solve(M[i][np.ix_(moves, moves)], force[moves])
+            if cost(a) < value:
+                best, value = a, cost(a)
+        assert off(got[i], best) < 1e-11
+
+
+@pytest.mark.parametrize(("seed", "kinds"), [(0, IN_MUJOCO), (5, IN_MUJOCO), (2, ("revolute", "prismatic", "helical"))])
+def test_engines_agree_with_the_oracle_at_rest(seed: int, kinds: tuple[str, ...]) -> None:
+    model = rubbed(seed, 6, kinds, mimic=True, springs="helical" not in kinds)
+    q, v, tau = mostly_at_rest(model, 5, seed)
+    exact = np.asarray(mb.dynamics(model, "oracle").forward_dynamics(q, v, tau), dtype=float)
+    M = mb.dynamics(model, "lagrangian").mass_matrix(q)
+    tolerance = 1e3 * EPS * np.linalg.cond(M).max()
+    for engine in ENGINES:
+        if engine == "mujoco" and "helical" in kinds:
+            continue
+        a = mb.dynamics(model, engine).forward_dynamics(q, v, tau)
+        assert off(a, exact) < tolerance, engine
+        assert ((a == 0) == (exact == 0)).all(), engine
+
+
+@pytest.mark.parametrize("engine", [*ENGINES, "oracle"])
+def test_batches_are_their_samples_one_by_one(engine: str) -> None:
+    model = rubbed(4, 5)
+    q, v, tau = mostly_at_rest(model, 4)
+    dyn = mb.dynamics(model, engine)
+    alone = [dyn.forward_dynamics(*x) for x in zip(q, v, tau, strict=True)]
+    assert off(np.asarray(dyn.forward_dynamics(q, v, tau), dtype=float), np.asarray(alone, dtype=float)) < 1e4 * EPS
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_wrench_moves_what_rests_as_its_generalized_force_does(engine: str) -> None:
+    model = rubbed(1, 5)
+    q, v, tau = (x[0] for x in mostly_at_rest(model, 1))
+    dyn, push = mb.dynamics(model, engine), {"tip": np.array([3.0, -2.0, 5.0, 1.0, 2.0, -1.0])}
+    force = dyn.generalized_force(q, push)
+    assert off(dyn.forward_dynamics(q, v, tau, wrenches=push), dyn.forward_dynamics(q, v, tau + force)) < 1e5 * EPS
+
+
+@settings(max_examples=150)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.integers(0, 8), st.sampled_from([0.0, 1e-3, 1.0, 1e3]))
+def test_forces_with_bounds_are_the_least_squares_of_scipy(seed: int, n: int, rank: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    # A has this rank; with bodies' inertias it is regular, with loops it need not be.
+    C, d, bound = rng.standard_normal((rank, n)), rng.standard_normal(rank), scale * rng.random(n)
+    A, b = C.T @ C, C.T @ d
+    forces = forces_at_rest(A, b, bound)
+    assert (np.abs(forces) <= bound * (1 + 1e-13)).all()
+    wide = bound + 1e-300
+    best = lsq_linear(C, -d, (-wide, wide), method="bvls", tol=1e-14).x if rank and scale else np.zeros(n)
+    size = np.abs(b) + np.abs(A) @ bound
+
+    def cost(x: np.ndarray) -> float:
+        return float(x @ A @ x / 2 + b @ x)
+
+    assert cost(forces) <= cost(best) + 1e-12 * (1 + float(size @ bound))
+    # The accelerations are unique, though the forces of a singular A are not.
+    a = b + A @ forces
+    noise = 1e-10 * size
+    assert (((np.abs(a) <= noise) | (forces == -np.sign(a) * bound)) | (bound == 0)).all()
+
+
+def test_a_follower_rubs_at_its_own_rate() -> None:
+    """A slider of 1 kg, another of 2 kg at -3 times its rate: friction 4 + 3 * 5 N against m = 1 + 9 * 2 kg."""
+    b = mb.ModelBuilder("pair", gravity=np.zeros(3))
+    b.add_body("one", mass=1.0)
+    b.add_body("two", mass=2.0)
+    b.add_joint("x", "prismatic", parent="world", child="one", axis=(1, 0, 0), friction=4.0)
+    b.add_joint("y", "prismatic", parent="world", child="two", axis=(0, 1, 0), friction=5.0, mimic=("x", -3.0, 0.1))
+    model = b.build()
+    for engine in ENGINES:
+        dyn = mb.dynamics(model, engine)
+        pulled = dyn.forward_dynamics([[0.0]] * 4, [[0.0]] * 4, [[18.9], [-18.9], [20.9], [-20.9]])
+        assert pulled[:, 0] == pytest.approx([0, 0, 0.1, -0.1], abs=1e-14)
+        assert dyn.passive([0.0], [-2.0])[0] == pytest.approx(19.0, rel=1e-15)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_a_four_bar_at_rest_yields_to_what_friction_cannot_hold(engine: str) -> None:
+    friction = np.array([0.5, 1.0, 2.0])
+    model = four_bar(friction)
+    dyn, bare = mb.dynamics(model, engine), mb.dynamics(model.without("friction"), "lagrangian")
+    q, _ = bare.project([1.2, -0.6, 1.5], np.zeros(3))
+    # The one direction in which it can move: everything else follows from its inertia and what pulls along it.
+    n = np.linalg.svd(bare.constraint_jacobian(q))[2][-1]
+    assert np.abs(n).min() > 0.1
+    still, M = np.zeros(3), bare.mass_matrix(q)
+    resists = friction @ np.abs(n)
+    for pull in (0.0, 0.9, 1.1, -0.9, -1.5, 4.0):
+        tau = bare.nle(q, still) + pull * resists * n
+        rate = np.sign(pull) * max(abs(pull) - 1, 0) * resists / (n @ M @ n)
+        assert off(dyn.forward_dynamics(q, still, tau), rate * n) < 1e-9
+
+
+def four_bar(friction: np.ndarray) -> Model:
+    b = mb.ModelBuilder("four_bar", gravity=(0, -9.81, 0))
+    rods = (("crank", "world", 0.0, 0.3), ("coupler", "crank", 0.3, 0.9), ("rocker", "world", 1.0, 0.7))
+    for (name, parent, x, length), f in zip(rods, friction, strict=True):
+        b.add_body(name, mass=2 * length, com=(length / 2, 0, 0), inertia=2 * length**3 / 12 * np.ones(3))
+        place = {"axis": (0, 0, 1), "translation": (x, 0, 0)}
+        b.add_joint(name, "continuous", parent=parent, child=name, friction=f, **place)
+    ends = {"translation_a": (0.9, 0, 0), "translation_b": (0.7, 0, 0)}
+    b.add_loop("pin", "point", body_a="coupler", body_b="rocker", **ends)
+    return b.build()
+
+
+# What is without it
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_without_it_every_number_is_that_of_the_bare_model(engine: str) -> None:
+    bare = random_tree(0, 6, IN_MUJOCO, mimic=True)
+    model = rubbed(0, mimic=True).without("friction")
+    assert not model.needs.friction
+    q, v, tau = mostly_at_rest(bare, 4)
+    for name, args in (("forward_dynamics", (q, v, tau)), ("inverse_dynamics", (q, v, tau)), ("passive", (q, v))):
+        ours, theirs = (getattr(mb.dynamics(m, engine), name)(*args) for m in (model, bare))
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_model_with_friction_outlives_pickling_and_building_again() -> None:
+    model = rubbed(1)
+    assert pickle.loads(pickle.dumps(model)) == model
+    assert mb.ModelBuilder.of(model).build() == model
+    q, v, tau = mostly_at_rest(model, 3)
+    dyn = mb.dynamics(model, "lagrangian")
+    a = dyn.forward_dynamics(q, v, tau)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(dyn)).forward_dynamics(q, v, tau), a)
+
+
+# Runs
+
+
+def slider(**friction: float) -> Model:
+    """Return 2 kg on a spring of 50 N/m."""
+    b = mb.ModelBuilder("slider", gravity=np.zeros(3))
+    b.add_body("block", mass=2.0)
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), stiffness=50.0, **friction)
+    return b.build()
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize(("method", "more"), [("rk853", {"rtol": 1e-13}), ("auto", {"rtol": 1e-13})])
+def test_an_oscillator_loses_the_same_in_each_half_swing_and_rests_in_its_dead_band(
+    engine: str, method: str, more: dict[str, float]
+) -> None:
+    """Den Hartog 1931: amplitudes fall by 2 f/k; each half swing takes π √(m/k); it rests where k |x| <= f."""
+    run = mb.simulate(mb.dynamics(slider(friction=3.0), engine), [1.0], [0.0], 8.0, method, **more)
+    turns = [1 - 0.12 * k for k in range(1, 9)]
+    half = np.pi / 5
+    assert [e.name for e in run.events] == ["x turns"] * 7 + ["x stops"]
+    assert [e.t for e in run.events] == pytest.approx([half * k for k in range(1, 9)], rel=1e-12)
+    assert [e.q[0] * (-1) ** k for k, e in enumerate(run.events, 1)] == pytest.approx(turns, rel=1e-11, abs=1e-12)
+    assert run.q[-1, 0] == run.events[-1].q[0]
+    assert run.v[-1, 0] == 0.0
+
+
+@pytest.mark.parametrize("method", ["rk4", "gauss6", "moreau", "semi_implicit_euler", "rodas5"])
+def test_what_rests_stays_where_it_is_to_the_last_bit(method: str) -> None:
+    model = slider(friction=1.0, stiction=3.0)
+    more = {"dt": 1e-2} if method != "rodas5" else {}
+    run = mb.simulate(mb.dynamics(model, "lagrangian"), [0.059], [0.0], 1.0, method, **more)
+    assert (run.q == 0.059).all()
+    assert not run.v.any()
+    moved = mb.simulate(mb.dynamics(model, "lagrangian"), [0.061], [0.0], 1.0, method, **more)
+    assert moved.q[-1, 0] < 0.061
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_step_is_a_run_of_one_step(engine: str) -> None:
+    model = rubbed(2, 4, ("revolute", "universal", "prismatic", "spherical_zyx"))
+    q, v, tau = mostly_at_rest(model, 5)
+    v *= 0.05
+    dyn = mb.dynamics(model, engine)
+    for method in ("rk4", "semi_implicit_euler"):
+        together = dyn.step(q, v, tau, 1e-2, method)
+        for i in range(len(q)):
+            run = mb.simulate(dyn, q[i], v[i], 1e-2, method, dt=1e-2, torque=tau[i])
+            for ours, own, theirs in zip(
+                together, dyn.step(q[i], v[i], tau[i], 1e-2, method), (run.q, run.v), strict=True
+            ):
+                assert off(ours[i], theirs[-1]) < 1e3 * EPS
+                assert off(own, theirs[-1]) < 1e3 * EPS
+
+
+def test_a_run_loses_energy_and_all_methods_and_engines_find_the_same_way() -> None:
+    model = rubbed(7, 4, ("revolute", "universal", "prismatic", "spherical_zyx"), damping=False)
+    q, v = model.random_state(np.random.default_rng(3), 1)
+    save = np.linspace(0, 1, 21)
+    first = mb.simulate(mb.dynamics(model, "lagrangian"), q[0], v[0], 1.0, "rk853", rtol=1e-12, save=save)
+    other = mb.simulate(mb.dynamics(model, "pinocchio"), q[0], v[0], 1.0, "auto", rtol=1e-12, save=save)
+    fixed = mb.simulate(mb.dynamics(model, "lagrangian"), q[0], v[0], 1.0, "rk4", dt=1e-3)
+    assert first.events
+    assert [e.name for e in first.events] == [e.name for e in other.events] == [e.name for e in fixed.events]
+    assert off(other.q, first.q) < 1e-9
+    assert off(fixed.q[::50], first.q) < 1e-8
+    dyn = mb.dynamics(model, "lagrangian")
+    energy = dyn.kinetic_energy(first.q, first.v) + dyn.potential_energy(first.q)
+    assert (np.diff(energy) < 1e-12 * np.abs(energy).max()).all()
+
+
+def test_a_block_slides_down_a_slope_up_to_where_it_rests() -> None:
+    """3 kg thrown up a slope of 30°, μ = 0.7 and so at rest at its height: v²/2 (sin + μ cos) g; or down with 0.3."""
+    for mu, rests in ((0.7, True), (0.3, False)):
+        up, down = (9.81 * (0.5 + sign * mu * np.sqrt(0.75)) for sign in (1, -1))
+        b = mb.ModelBuilder("slope", gravity=(-9.81 * 0.5, 0, -9.81 * np.sqrt(0.75)))
+        b.add_body("block", mass=3.0)
+        force = 3 * 9.81 * mu * np.sqrt(0.75)
+        b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), friction=force)
+        run = mb.simulate(mb.dynamics(b.build(), "lagrangian"), [0.0], [4.0], 2.0, "rk853")
+        (event,) = run.events
+        assert event.name == ("x stops" if rests else "x turns")
+        assert event.t == pytest.approx(4 / up, rel=1e-13)
+        assert event.q[0] == pytest.approx(8 / up, rel=1e-13)
+        end = 8 / up - (0 if rests else down * (2 - 4 / up) ** 2 / 2)
+        assert run.q[-1, 0] == pytest.approx(end, rel=1e-12)
+
+
+def belt(speed: float) -> Model:
+    """Return 2 kg on a spring of 50 N/m to the ground, seen from a belt that moves: 3 N of friction, 5 N at rest."""
+    b = mb.ModelBuilder("belt", gravity=np.zeros(3))
+    b.add_body("block", mass=2.0)
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), friction=3.0, stiction=5.0)
+    b.add_joint_force("spring", "x", lambda t, q, v: -50.0 * (q + speed * t))
+    return b.build()
+
+
+@pytest.mark.parametrize("method", ["rk853", "auto"])
+def test_a_block_on_a_belt_sticks_and_slips_with_the_period_of_the_closed_form(method: str) -> None:
+    """It lets go at s/k, and slips about f/k until it has the belt's speed again."""
+    speed, k, m, f, s = 0.2, 50.0, 2.0, 3.0, 5.0
+    omega = np.sqrt(k / m)
+    slip = (2 * np.pi - 2 * np.arctan((s - f) * omega / (k * speed))) / omega
+    stick = 2 * (s - f) / (k * speed)
+    start = (2 * f - s) / k
+    run = mb.simulate(
+        mb.dynamics(belt(speed), "lagrangian"), [start], [0.0], 4 * (slip + stick) + 0.1, method, rtol=1e-13
+    )
+    exact = np.array([(n + 1) * stick + n * slip + late * slip for n in range(4) for late in (0, 1)])
+    assert [e.name for e in run.events] == ["x lets go", "x stops"] * 4
+    assert [e.t for e in run.events] == pytest.approx(exact.tolist(), rel=1e-11)
+    places = [e.q[0] + speed * e.t for e in run.events]
+    assert places == pytest.approx([s / k, start] * 4, abs=1e-12)
+
+
+def test_moreau_s_step_in_machine_code_is_that_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mbkit.simulate.solvers.friction import moreau
+
+    model = rubbed(2, 4, ("revolute", "universal", "prismatic", "spherical_zyx"), mimic=True)
+    q, v, tau = mostly_at_rest(model, 2)
+    dyn = mb.dynamics(model, "lagrangian")
+    pulls = np.repeat(tau[:, None], 100, axis=1)
+    fast = mb.simulate(dyn, q, v, 0.5, "moreau", dt=5e-3, torque=pulls)
+    monkeypatch.setattr(moreau, "_Compiled", moreau._InPython)
+    slow = mb.simulate(dyn, q, v, 0.5, "moreau", dt=5e-3, torque=pulls)
+    assert off(fast.q, slow.q) < 1e-11
+    assert ((fast.v == 0) == (slow.v == 0)).all()
+    assert (fast.v[:, 1:] == 0).any()
+    own = mb.simulate(mb.dynamics(model, "mujoco"), q[0], v[0], 0.5, "moreau", dt=5e-3, torque=tau[0])
+    assert off(own.q, fast.q[0]) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("method", "order", "steps"),
+    [("moreau", 1, (100, 200, 400, 800, 1600)), ("semi_implicit_euler", 1, (100, 200, 400)), ("rk4", 4, (80, 160, 320))]
+    + [("gauss6", 6, (10, 20, 40, 80))],
+)
+def test_methods_keep_their_order_across_turns(method: str, order: int, steps: tuple[int, ...]) -> None:
+    dyn = mb.dynamics(slider(friction=3.0, stiction=4.0), "lagrangian")
+    exact = mb.simulate(dyn, [1.0], [0.3], 1.5, "rk853", rtol=1e-13)
+    assert len(exact.events) == 3
+    runs = [mb.simulate(dyn, [1.0], [0.3], 1.5, method, dt=1.5 / n) for n in steps]
+    errors = [abs(run.q[-1] - exact.q[-1])[0] for run in runs]
+    assert -np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(order, abs=0.35), errors
+
+
+def test_samples_of_a_batch_have_their_own_parameters() -> None:
+    b = mb.ModelBuilder("slider", gravity=np.zeros(3))
+    b.add_body("block", mass=mb.Parameter("m", 2.0))
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), stiffness=50.0, friction=3.0)
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    masses = [1.0, 2.0, 5.0]
+    for method, more in (("rk853", {"save": np.linspace(0, 3, 4)}), ("rk4", {"dt": 1e-2}), ("moreau", {"dt": 1e-2})):
+        together = mb.simulate(dyn.at(m=masses), [[1.0]] * 3, [[0.0]] * 3, 3.0, method, **more)
+        for i, m in enumerate(masses):
+            alone = mb.simulate(dyn.at(m=m), [1.0], [0.0], 3.0, method, **more)
+            assert off(together.q[i], alone.q) < 1e-11
+            assert [e.t for e in together.events if e.member == i] == [e.t for e in alone.events]
+
+
+def test_runs_beside_loops_and_by_an_engine_s_own_integrator_are_refused_with_a_way_out() -> None:
+    bar = mb.dynamics(four_bar(np.ones(3)), "lagrangian")
+    q, v = bar.project([1.2, -0.6, 1.5], np.zeros(3))
+    for method, more in (("rk4", {"dt": 1e-2}), ("rk853", {}), ("moreau", {"dt": 1e-2})):
+        with pytest.raises(UnsupportedError, match=r"without\('friction'\)"):
+            mb.simulate(bar, q, v, 0.1, method, **more)
+    with pytest.raises(UnsupportedError, match=r"does not know dry friction.*without\('friction'\)"):
+        mb.simulate(mb.dynamics(slider(friction=1.0), "mujoco"), [1.0], [0.0], 0.1, "mujoco_rk4", dt=1e-2)
+
+
+# Files and builders
+
+
+def test_an_mjcf_with_friction_on_a_ball_or_free_joint_loads_without_it_and_says_so(tmp_path: Path) -> None:
+    body = '<body name="{0}"><joint name="{1}" {2}/><inertial pos="0 0 .1" mass="1" diaginertia="1 1 1"/>{3}</body>'
+    inner = body.format("b", "hip", 'type="ball" frictionloss="0.5"', body.format("c", "knee", 'frictionloss=".1"', ""))
+    text = body.format("a", "base", 'type="free" frictionloss="2"', inner)
+    path = tmp_path / "robot.xml"
+    path.write_text(f"<mujoco><worldbody>{text}</worldbody></mujoco>", encoding="utf-8")
+    model = mb.load(path)
+    assert [j.friction.tolist() for j in model.joints] == [[0.0] * 6, [0.0] * 3, [0.1]]
+    for joint in ("free joint 'base'", "ball joint 'hip'"):
+        assert sum(joint in note and "left out" in note for note in model.notes) == 1
+    (parsed,) = mb.compare_parsers(path, ("mujoco",)).importers
+    assert parsed.agrees
+    assert sum("left out" in note for note in parsed.notes) == 2
+
+
+def test_a_builder_gives_stiction_to_a_joint_that_had_none_and_takes_it_away_with_friction() -> None:
+    b = mb.ModelBuilder.of(slider(friction=1.0))
+    b.set_joint("x", stiction=3.0, stribeck_velocity=0.2)
+    model = b.build()
+    joint = model.joint("x")
+    assert (joint.friction, joint.stiction, joint.stribeck_velocity) == (1.0, 3.0, 0.2)
+    bare = model.without("friction").joint("x")
+    assert (bare.friction, bare.stiction, bare.stribeck_velocity) == (0.0, None, None)
+
+
+# Bad input
+
+
+def joint_with(kind: str = "revolute", **numbers: object) -> Model:
+    b = mb.ModelBuilder("bad")
+    b.add_body("body", mass=1.0, inertia=np.ones(3))
+    b.add_joint(
+        "hinge", kind, parent="world", child="body", **({"axis": (0, 0, 1)} if kind == "revolute" else {}), **numbers
+    )
+    return b.build()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "says"),
+    [
+        ({"friction": -1.0}, "friction"),
+        ({"friction": np.inf}, "finite"),
+        ({"friction": np.nan}, "friction"),
+        ({"friction": "much"}, "friction"),
+        ({"friction": [1.0, 2.0]}, "friction"),
+        ({"friction": 2.0, "stiction": 1.0}, "stiction"),
+        ({"friction": 0.0, "stiction": -1.0}, "stiction"),
+        ({"friction": 0.0, "stiction": np.inf}, "finite"),
+        ({"friction": 1.0, "stribeck_velocity": 1.0}, "stiction"),
+        ({"friction": 1.0, "stiction": 2.0, "stribeck_velocity": -1.0}, "stribeck_velocity"),
+        ({"kind": "ball", "friction": 1.0}, "moving axes"),
+        ({"kind": "free", "friction": 1.0}, "moving axes"),
+        ({"kind": "planar", "stiction": [1.0, -1.0, 0.0]}, "stiction"),
+    ],
+)
+def test_impossible_friction_is_refused_by_name(numbers: dict[str, object], says: str) -> None:
+    with pytest.raises((ModelError, InputError), match=says) as refusal:
+        joint_with(**numbers)
+    assert "hinge" in str(refusal.value)
