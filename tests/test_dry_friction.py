@@ -359,7 +359,7 @@ def belt(speed: float) -> Model:
     b = mb.ModelBuilder("belt", gravity=np.zeros(3))
     b.add_body("block", mass=2.0)
     b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), friction=3.0, stiction=5.0)
-    b.add_joint_force("spring", "x", lambda t, q, v: -50.0 * (q + speed * t))
+    b.add_joint_force("spring", "x", lambda t, q, v: -50.0 * (q + speed * t))  # noqa: ARG005
     return b.build()
 
 
@@ -400,8 +400,12 @@ def test_moreau_s_step_in_machine_code_is_that_in_python(monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize(
     ("method", "order", "steps"),
-    [("moreau", 1, (100, 200, 400, 800, 1600)), ("semi_implicit_euler", 1, (100, 200, 400)), ("rk4", 4, (80, 160, 320))]
-    + [("gauss6", 6, (10, 20, 40, 80))],
+    [
+        ("moreau", 1, (100, 200, 400, 800, 1600)),
+        ("semi_implicit_euler", 1, (100, 200, 400)),
+        ("rk4", 4, (80, 160, 320)),
+        ("gauss6", 6, (10, 20, 40, 80)),
+    ],
 )
 def test_methods_keep_their_order_across_turns(method: str, order: int, steps: tuple[int, ...]) -> None:
     dyn = mb.dynamics(slider(friction=3.0, stiction=4.0), "lagrangian")

@@ -250,8 +250,8 @@ class _Tree:
         friction = read.number(element, "frictionloss", item, 0.0)
         if friction and not kind_of(kind).coordinate_velocities:
             self.b.note(
-                f"dry friction {friction:g} of {joint.kind} joint {joint.name!r} is left out: it acts on each velocity, "
-                "and their axes move with the body"
+                f"dry friction {friction:g} of {joint.kind} joint {joint.name!r} is left out: "
+                "it acts along each velocity, whose axes move with the body"
             )
             friction = 0.0
         self.b.add_joint(

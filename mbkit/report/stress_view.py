@@ -39,6 +39,7 @@ _FAMILIES: Final = {
     "length": "Length",
     "spin": "Spin",
     "near-singular": "Near-singular",
+    "friction": "Dry friction",
     "large": "Large and small",
     "long": "Long runs",
     "step": "Step size",

@@ -13,7 +13,7 @@ from mbkit.errors import InputError
 from mbkit.model import Model
 
 #: In the order of a study: stiff ones first, those that take longest last.
-Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "large", "step", "long"]
+Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "friction", "large", "step", "long"]
 #: The error of q along a run, of the energy along a run, or of terms at states.
 Measure = Literal["motion", "energy", "terms"]
 

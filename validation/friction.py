@@ -1,0 +1,379 @@
+"""Dry friction against references of its own: ends of phases, orders across them, Moreau's step, a smoothed law.
+
+Run ``python -m validation.friction``; it writes ``validation/friction.json``. References are closed forms, a quadrature
+of the pendulum's energy, and a two-link arm of its own in numbers of 40 digits, whose friction is decided by trying
+every pattern of what rests: nothing of them is mbkit's.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import time
+from pathlib import Path
+
+import mpmath as mp
+import numpy as np
+
+from validation.stamp import stamp
+
+HERE = Path(__file__).parent
+mp.mp.dps = 40
+G = mp.mpf("9.81")
+
+
+# References: times at which something stops, lets go or turns, with the positions there, and those at the end
+
+
+def slope():
+    """3 kg thrown up a slope of 30° with μ = 0.7, which rests where it stops; Coulomb's law."""
+    force = mp.mpf("0.7") * 3 * G * mp.sqrt(3) / 2
+    slowed = G / 2 + force / 3
+    end = [mp.mpf(4) ** 2 / 2 / slowed]
+    return {"friction": float(force), "events": [(4 / slowed, end)], "end": end}
+
+
+def oscillator(m=2, k=50, f=3, start=1):
+    """Each half swing is about ±f/k and takes π √(m/k), so that amplitudes fall by 2 f/k (Den Hartog 1931)."""
+    half, step, x, events = mp.pi * mp.sqrt(mp.mpf(m) / k), 2 * mp.mpf(f) / k, mp.mpf(start), []
+    while abs(x) * k > f:
+        x = -mp.sign(x) * (abs(x) - step)
+        events.append((half * (len(events) + 1), [x]))
+    return {"events": events, "end": [x]}
+
+
+BELT = {"m": 2, "k": 50, "f": 3, "s": 5, "speed": mp.mpf("0.2")}
+
+
+def belt(periods=25):
+    """Return when a block on a belt lets go, at s/k, and when it has the belt's speed again, about f/k as far."""
+    m, k, f, s, u = BELT.values()
+    omega = mp.sqrt(mp.mpf(m) / k) ** -1
+    slip = (2 * mp.pi - 2 * mp.atan((s - f) * omega / (k * u))) / omega
+    stick, low, high, events = 2 * (s - f) / (k * u), mp.mpf(2 * f - s) / k, mp.mpf(s) / k, []
+    for n in range(periods):
+        go = n * (stick + slip) + stick
+        events += [(go, [high - u * go]), (go + slip, [low - u * (go + slip)])]
+    # A third of a slip behind the last stop and a stick.
+    late = events[-1][0] + stick + slip / 3
+    events.append((late - slip / 3, [high - u * (late - slip / 3)]))
+    wave = (s - f) / mp.mpf(k) * mp.cos(omega * slip / 3) + u / omega * mp.sin(omega * slip / 3)
+    return {"start": [low], "duration": late, "events": events, "end": [f / mp.mpf(k) + wave - u * late]}
+
+
+PENDULUM = {"inertia": mp.mpf(1) / 3, "torque": G / 2, "f": mp.mpf("0.4"), "start": mp.mpf("2.5")}
+
+
+def pendulum():
+    """A rod of 1 kg and 1 m with a dry hinge: turns from the energy, times by quadrature, and where it rests."""
+    J, T, f, angle = PENDULUM.values()
+    now, events = mp.mpf(0), []
+    while abs(T * mp.sin(angle)) > f:
+        way = -mp.sign(mp.sin(angle))
+
+        def left(x, a=angle, way=way):
+            return T * (mp.cos(x) - mp.cos(a)) - f * way * (x - a)
+
+        # The energy is largest where friction holds gravity, and used up before the same height on the other side.
+        end = mp.findroot(left, (-angle, -way * mp.asin(f / T)), solver="anderson", tol=1e-70, verify=False)
+        middle, half = (angle + end) / 2, (end - angle) / 2
+
+        def rate(u, a=middle, h=half, left=left):
+            # x = a - h cos u takes the roots at both ends away.
+            return abs(h) * mp.sin(u) / mp.sqrt(2 * abs(left(a - h * mp.cos(u))) / J)
+
+        mp.mp.dps += 20
+        now += mp.quad(rate, mp.linspace(0, mp.pi, 5))
+        mp.mp.dps -= 20
+        angle = end
+        events.append((now, [angle]))
+    return {"events": events, "end": [angle]}
+
+
+# Lengths, masses, friction of shoulder and elbow; bodies are thin rods, angles from the horizontal.
+ARM = {"l": (mp.mpf("0.8"), mp.mpf("0.6")), "m": (2, 1), "f": (mp.mpf("1.5"), mp.mpf("1.2"))}
+ARM_START, ARM_TIME = [mp.mpf("0.3"), mp.mpf("0.4"), mp.mpf(0), mp.mpf(3)], mp.mpf(3)
+_SUBSTEPS = tuple(range(2, 22, 2))
+
+
+def arm_terms(y):
+    """Return M and what accelerates the arm without friction; Lagrange's equations of two rods."""
+    (l1, l2), (m1, m2) = ARM["l"], ARM["m"]
+    q1, q2, v1, v2 = y
+    cross = m2 * l1 * l2 / 2
+    m22 = m2 * l2**2 / 3
+    m12 = m22 + cross * mp.cos(q2)
+    m11 = m1 * l1**2 / 3 + m2 * l1**2 + m22 + 2 * cross * mp.cos(q2)
+    bend = cross * mp.sin(q2)
+    tip = m2 * G * l2 / 2 * mp.cos(q1 + q2)
+    pull = [bend * (2 * v1 * v2 + v2**2) - (m1 / mp.mpf(2) + m2) * G * l1 * mp.cos(q1) - tip, -bend * v1**2 - tip]
+    return [[m11, m12], [m12, m22]], pull
+
+
+def arm_accelerations(y, sides, rests):
+    """Return accelerations with given sides of friction, and of what rests the force that holds it."""
+    M, pull = arm_terms(y)
+    force = [p - (0 if r else s * f) for p, s, r, f in zip(pull, sides, rests, ARM["f"], strict=True)]
+    if all(rests):
+        return [mp.mpf(0)] * 2, [-p for p in pull]
+    if any(rests):
+        i = rests.index(False)
+        a = [mp.mpf(0)] * 2
+        a[i] = force[i] / M[i][i]
+        return a, [M[j][i] * a[i] - pull[j] if rests[j] else mp.mpf(0) for j in (0, 1)]
+    det = M[0][0] * M[1][1] - M[0][1] ** 2
+    return [(M[1][1] * force[0] - M[0][1] * force[1]) / det, (M[0][0] * force[1] - M[0][1] * force[0]) / det], [0, 0]
+
+
+def arm_pattern(y, moving):
+    """Return sides and rests: of all patterns of what has no velocity, the one of the least constraint."""
+    M, pull = arm_terms(y)
+    best = None
+    for pattern in itertools.product(*[(s,) if s else (0, 1, -1) for s in moving]):
+        sides, rests = list(pattern), [s == 0 for s in pattern]
+        a, _ = arm_accelerations(y, sides, rests)
+        cost = sum(a[i] * M[i][j] * a[j] / 2 for i in (0, 1) for j in (0, 1)) - sum(map(mp.fmul, pull, a))
+        cost += sum(f * (s * x if s else abs(x)) for f, s, x in zip(ARM["f"], moving, a, strict=True))
+        if best is None or cost < best[0]:
+            best = cost, sides, rests
+    return best[1:]
+
+
+def arm_step(y, h, sides, rests):
+    """Return the state after h seconds of a phase: the midpoint rule extrapolated."""
+
+    def rates(y):
+        return [*y[2:], *arm_accelerations(y, sides, rests)[0]]
+
+    def moved(y, d, r):
+        return [a + d * b for a, b in zip(y, r, strict=True)]
+
+    table = []
+    for i, n in enumerate(_SUBSTEPS):
+        d = h / n
+        before, now = y, moved(y, d, rates(y))
+        for _ in range(n - 1):
+            before, now = now, moved(before, 2 * d, rates(now))
+        row = [[(a + b + d * r) / 2 for a, b, r in zip(before, now, rates(now), strict=True)]]
+        for j in range(i):
+            factor = (mp.mpf(n) / _SUBSTEPS[i - j - 1]) ** 2 - 1
+            row.append([a + (a - b) / factor for a, b in zip(row[j], table[-1][j], strict=True)])
+        table.append(row)
+    return table[-1][-1]
+
+
+def arm_margins(y, sides, rests):
+    _, held = arm_accelerations(y, sides, rests)
+    parts = zip(sides, rests, y[2:], held, ARM["f"], strict=True)
+    return [f - abs(x) if r else s * v for s, r, v, x, f in parts]
+
+
+def arm(step=mp.mpf("0.02")):
+    """Return events of the arm, a phase after the other, with the joints named 0 and 1."""
+    y, t, events = list(ARM_START), mp.mpf(0), []
+    sides, rests = arm_pattern(y, [int(mp.sign(v)) for v in y[2:]])
+    while t < ARM_TIME:
+        h = min(step, ARM_TIME - t)
+        after = arm_step(y, h, sides, rests)
+        margins = arm_margins(after, sides, rests)
+        # A joint that has just begun to move is on its way from zero.
+        if min(margins) >= 0:
+            y, t = after, t + h
+            continue
+        ends = []
+        for i in (i for i in (0, 1) if margins[i] < 0):
+
+            def margin(s, i=i):
+                return arm_margins(arm_step(y, s, sides, rests), sides, rests)[i]
+
+            low = h * mp.mpf("1e-6")
+            assert margin(low) > 0
+            ends.append((mp.findroot(margin, (low, h), solver="anderson", tol=1e-60, maxsteps=60, verify=False), i))
+        s, i = min(ends)
+        y, t = arm_step(y, s, sides, rests), t + s
+        moving = [0 if r else side for side, r in zip(sides, rests, strict=True)]
+        if rests[i]:
+            # It lets go against the force that held it.
+            moving[i] = -int(mp.sign(arm_accelerations(y, sides, rests)[1][i]))
+            sides, rests = moving, [m == 0 for m in moving]
+        else:
+            y[2 + i], moving[i] = mp.mpf(0), 0
+            sides, rests = arm_pattern(y, moving)
+        events.append((t, y[:2]))
+    return {"events": events, "end": y[:2]}
+
+
+# The same by mbkit
+
+
+def described():
+    """Return name -> model and start: q, v."""
+    import mbkit as mb
+
+    def one(name, kind, friction, gravity=(0, 0, 0), **more):
+        b = mb.ModelBuilder(name, gravity=gravity)
+        body = more.pop("body")
+        b.add_body("block", **body)
+        joint = {"axis": (1, 0, 0) if kind == "prismatic" else (0, 0, 1), **more}
+        b.add_joint("x", kind, parent="world", child="block", friction=friction, **joint)
+        return b
+
+    tilt = float(mp.sqrt(3) / 2)
+    on_slope = one("slope", "prismatic", slope()["friction"], (-9.81 / 2, 0, -9.81 * tilt), body={"mass": 3.0})
+    spring = one("oscillator", "prismatic", 3.0, body={"mass": 2.0}, stiffness=50.0)
+    on_belt = one("belt", "prismatic", 3.0, body={"mass": 2.0}, stiction=5.0)
+    speed = float(BELT["speed"])
+    on_belt.add_joint_force("spring", "x", lambda t, q, v: -50.0 * (q + speed * t))  # noqa: ARG005
+    rod = {"mass": 1.0, "com": (0, -0.5, 0), "inertia": (1 / 12, 0, 1 / 12)}
+    hinge = one("pendulum", "continuous", float(PENDULUM["f"]), (0, -9.81, 0), body=rod)
+    b, parent = mb.ModelBuilder("arm", gravity=(0, -9.81, 0)), "world"
+    for name, length, mass, f in zip(("shoulder", "elbow"), ARM["l"], ARM["m"], ARM["f"], strict=True):
+        length, x = float(length), 0.0 if parent == "world" else float(ARM["l"][0])
+        turn = mass * length**2 / 12
+        b.add_body(name, mass=mass, com=(length / 2, 0, 0), inertia=(0, turn, turn))
+        place = {"axis": (0, 0, 1), "translation": (x, 0, 0)}
+        b.add_joint(name, "continuous", parent=parent, child=name, friction=float(f), **place)
+        parent = name
+    start = [float(x) for x in ARM_START]
+    return {
+        "block on a slope": (on_slope.build(), [0.0], [4.0], 2.0, slope()),
+        "Coulomb oscillator": (spring.build(), [1.0], [0.0], 6.0, oscillator()),
+        "block on a belt": (on_belt.build(), *map(_floats, (belt()["start"], [0])), float(belt()["duration"]), belt()),
+        "pendulum": (hinge.build(), [float(PENDULUM["start"])], [0.0], 12.0, pendulum()),
+        "two-link arm": (b.build(), start[:2], start[2:], float(ARM_TIME), arm()),
+    }
+
+
+def _floats(x):
+    return [float(y) for y in x]
+
+
+def accuracy(problems):
+    """Return for each problem and method the worst relative error of times, and errors of positions."""
+    import mbkit as mb
+
+    rows = []
+    for name, (model, q, v, duration, truth) in problems.items():
+        dyn = mb.dynamics(model, "lagrangian")
+        for method in ("rk853", "auto", "taylor"):
+            run = mb.simulate(dyn, q, v, duration, method, rtol=1e-13, atol=1e-15)
+            found, exact = run.events, truth["events"]
+            same = len(found) == len(exact)
+            times = [abs(float((e.t - t) / t)) for e, (t, _) in zip(found, exact, strict=False)]
+            places = [abs(float(a - b)) for e, (_, x) in zip(found, exact, strict=False) for a, b in zip(e.q, x, strict=True)]
+            end = max(abs(float(a - b)) for a, b in zip(run.q[-1], truth["end"], strict=True))
+            rows.append({"problem": name, "method": method, "phases": len(found), "events_found": same})
+            rows[-1] |= {"times": max(times), "places": max(places), "end": end}
+            print(f"{name:20} {method:8} {len(found):3} of {len(exact):3} {max(times):8.1e} {max(places):8.1e} {end:8.1e}")
+    return rows
+
+
+def orders(problem):
+    """Return the observed order of methods across 50 phases of stick and slip."""
+    import mbkit as mb
+
+    model, q, v, duration, truth = problem
+    dyn, rows = mb.dynamics(model, "lagrangian"), []
+    counts = {
+        "moreau": [2000 * 2**i for i in range(5)],
+        "semi_implicit_euler": [1000 * 2**i for i in range(4)],
+        "rk4": [400 * 2**i for i in range(4)],
+        "gauss6": [200, 300, 400, 600],
+        "rk853": [10.0**-i for i in range(4, 11)],
+    }
+    for method, settings in counts.items():
+        points = []
+        for x in settings:
+            more = {"rtol": x, "atol": x * 1e-2} if method == "rk853" else {"dt": duration / x}
+            run = mb.simulate(dyn, q, v, duration, method, doubt=False, **more)
+            error = abs(float(run.q[-1, 0] - truth["end"][0]))
+            points.append([run.stats.steps if method == "rk853" else x, error, len(run.events)])
+        steps, errors = (np.array([p[i] for p in points]) for i in (0, 1))
+        order = float(-np.polyfit(np.log(steps), np.log(errors), 1)[0])
+        rows.append({"method": method, "order": order, "points": points})
+        print(f"{method:20} {order:.2f}", *(f"{n}:{e:.1e}({k})" for n, e, k in points))
+    return rows
+
+
+def cost(names=("double_pendulum", "ur5", "panda", "anymal"), steps=20_000, rounds=5):
+    """Return the time of a step of Moreau's beside that of semi_implicit_euler without friction, in one process."""
+    import mbkit as mb
+
+    rows = []
+    for name in names:
+        bare = mb.catalog.double_pendulum() if name == "double_pendulum" else mb.load(name).without("friction")
+        b, rng = mb.ModelBuilder.of(bare), np.random.default_rng(1)
+        dyn = mb.dynamics(bare, "lagrangian")
+        weight = np.abs(dyn.gravity(bare.random_state(rng, 50)[0])).max(axis=0)
+        for joint in bare.independent_joints:
+            if joint.type.nv == 1:
+                b.set_joint(joint.name, friction=0.1 * max(float(weight[bare.layout.v[joint.name]][0]), 0.1))
+        rubbed = mb.dynamics(b.build(), "lagrangian")
+        q, v = bare.neutral(), rng.uniform(-1, 1, bare.nv)
+        runs = {"moreau": (rubbed, []), "semi_implicit_euler": (dyn, [])}
+        ended = {}
+        for _ in range(rounds + 1):
+            for method, (of, seconds) in runs.items():
+                begun = time.process_time()
+                run = mb.simulate(of, q, v, steps * 1e-4, method, dt=1e-4, doubt=False)
+                seconds.append(time.process_time() - begun)
+                ended[method] = run.stats.ended
+        # The first run compiles.
+        each = {method: float(np.median(x[1:])) / steps * 1e6 for method, (_, x) in runs.items()}
+        ratio = each["moreau"] / each["semi_implicit_euler"]
+        rows.append({"model": name, "us_a_step": each, "ratio": ratio, "ended": ended})
+        print(f"{name:20} {each} {ratio:.2f} {ended}")
+    return rows
+
+
+def smoothed(problem, friction):
+    """Return errors and times of a two-link arm whose friction is f tanh(v/ε), beside the exact law."""
+    import casadi as ca
+
+    import mbkit as mb
+
+    model, q, v, duration, truth = problem
+    rows = []
+
+    def measure(law, dyn, method, **settings):
+        mb.simulate(dyn, q, v, duration, method, doubt=False, **settings)
+        begun = time.process_time()
+        run = mb.simulate(dyn, q, v, duration, method, doubt=False, **settings)
+        seconds = time.process_time() - begun
+        error = max(abs(float(a - b)) for a, b in zip(run.q[-1], truth["end"], strict=True))
+        row = {"law": law, "method": method, **settings, "error": error, "seconds": seconds}
+        rows.append(row | {"evaluations": run.stats.evaluations, "steps": run.stats.steps})
+        print(f"{law:8} {method:8} {settings} {error:8.1e} {seconds * 1e3:8.1f} ms {run.stats.evaluations}")
+
+    exact = mb.dynamics(model, "lagrangian")
+    for rtol in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
+        measure("exact", exact, "rk853", rtol=rtol, atol=rtol)
+    for dt in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4):
+        measure("exact", exact, "rk4", dt=dt)
+        measure("exact", exact, "moreau", dt=dt)
+    for width in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+        b = mb.ModelBuilder.of(model.without("friction"))
+        for joint, f in zip(("shoulder", "elbow"), friction, strict=True):
+            b.add_joint_force(f"dry {joint}", joint, lambda t, q, v, f=float(f), w=width: -f * ca.tanh(v / w))  # noqa: ARG005
+        dyn = mb.dynamics(b.build(), "lagrangian")
+        # An implicit method, whose steps the steep law does not bound.
+        measure(f"tanh {width:g}", dyn, "rodas5", rtol=1e-8, atol=1e-10)
+        if width >= 1e-4:
+            measure(f"tanh {width:g}", dyn, "rk853", rtol=1e-8, atol=1e-10)
+    return rows
+
+
+def main():
+    problems = described()
+    data = {"accuracy": accuracy(problems), "orders": orders(problems["block on a belt"])}
+    finer = arm(mp.mpf("0.01"))
+    known = zip(finer["events"], problems["two-link arm"][-1]["events"], strict=True)
+    data["arm_known_to"] = max(float(abs(a[0] - b[0])) for a, b in known)
+    print("arm known to", data["arm_known_to"])
+    data["cost_of_moreau"] = cost()
+    data["smoothed"] = smoothed(problems["two-link arm"], ARM["f"])
+    (HERE / "friction.json").write_text(json.dumps({**stamp(), **data}, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
