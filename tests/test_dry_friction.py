@@ -113,7 +113,8 @@ def test_at_rest_friction_is_what_the_least_constraint_needs(engine: str, seed: 
     assert (np.abs(held) <= bound + noise).all()
     begins = rest & (a != 0)
     assert off(held[begins], (-bound * np.sign(a))[begins]) < noise
-    assert begins.any() and (rest & (a == 0)).any()
+    assert begins.any()
+    assert (rest & (a == 0)).any()
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -379,6 +380,18 @@ def test_a_block_on_a_belt_sticks_and_slips_with_the_period_of_the_closed_form(m
     assert [e.t for e in run.events] == pytest.approx(exact.tolist(), rel=1e-11)
     places = [e.q[0] + speed * e.t for e in run.events]
     assert places == pytest.approx([s / k, start] * 4, abs=1e-12)
+
+
+def test_what_lets_go_in_moreau_s_step_has_the_friction_of_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mbkit.simulate.solvers.friction import moreau
+
+    dyn, pull = mb.dynamics(slider(friction=3.0, stiction=5.0), "lagrangian"), np.linspace(0, 20, 101)[:-1, None]
+    fast = mb.simulate(dyn, [0.0], [0.0], 1.0, "moreau", dt=1e-2, torque=pull)
+    monkeypatch.setattr(moreau, "_Compiled", moreau._InPython)
+    slow = mb.simulate(dyn, [0.0], [0.0], 1.0, "moreau", dt=1e-2, torque=pull)
+    first = np.flatnonzero(fast.v[:, 0])[0]
+    assert fast.v[first, 0] == pytest.approx(1e-2 * (pull[first - 1, 0] - 3) / 2, rel=1e-13)
+    assert off(slow.q, fast.q) < 1e2 * EPS
 
 
 def test_moreau_s_step_in_machine_code_is_that_in_python(monkeypatch: pytest.MonkeyPatch) -> None:

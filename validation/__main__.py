@@ -55,6 +55,7 @@ PARTS = {
     "bench_terms": Part(15, ("terms.json",), "one sample of inverse and forward dynamics"),
     "operations": Part(10, ("operations.json",), "operations of each form, and the vector units' limit"),
     "bench_single_calls": Part(1, ("single_calls.json",), "a single call, beside the bare call of the engine"),
+    "friction": Part(6, ("friction.json",), "dry friction: references, orders across phases, a smoothed law"),
     "four_bar": Part(1, ("four_bar.json",), "a loop in four engines: error, gap and time of a step"),
     "mechanisms": Part(5, ("mechanisms.json",), "mechanisms with loops: errors, softness, time of a step"),
     "bicycle": Part(1, ("bicycle.json",), "the benchmark bicycle's eigenvalues beside its paper's formulas and print"),
