@@ -16,7 +16,6 @@ from mbkit.engines.base import at_time
 from mbkit.engines.elements.dry_friction import friction_forces
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model.integration_space import Space
-from mbkit.model.parts import RESTING
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.fixed_step import GridRecord
