@@ -21,7 +21,7 @@ from mbkit._check import Array, all_finite, batch_of, rows
 from mbkit._fork import fork_safe
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
 from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
-from mbkit.engines.elements.dry_friction import DryFriction
+from mbkit.engines.elements.dry_friction import UNDER_FORCE, DryFriction
 from mbkit.engines.frames_and_momenta import (
     ALIGNED,
     JOINT,
@@ -525,7 +525,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     def _method(self, quantity: str) -> Callable[..., Any]:
         """Return the method for a quantity, with dry friction; raise `UnsupportedError` where there is none."""
         method = self._without_friction(quantity)
-        return self._friction.beside(quantity, method, self) if self.model.needs.friction else method
+        exact = self.model.needs.friction and not (self.soft_friction and quantity in UNDER_FORCE)
+        return self._friction.beside(quantity, method, self) if exact else method
 
     def _of_sample(self, i: int) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
         """Return the dynamics of one sample of a batch."""
@@ -663,7 +664,8 @@ class WrenchedDynamics(Dynamics):
     _bare: Dynamics
 
     def __init__(self, dyn: Dynamics, frames: tuple[Frame, ...], axes: str) -> None:
-        self._bare, self._acting, self.soft_constraints = dyn, (frames, axes), dyn.soft_constraints
+        self._bare, self._acting = dyn, (frames, axes)
+        self.soft_constraints, self.soft_friction = dyn.soft_constraints, dyn.soft_friction
         super().__init__(dyn.model)
         self._forward_dynamics = dyn._method("forward_dynamics")
         dyn._method("jacobian")

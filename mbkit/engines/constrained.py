@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,6 +54,9 @@ class Constrained:
     model: Model
     #: Whether the engine lets constraints give way: its states are those of its own equations, and none is projected.
     soft_constraints: bool = False
+    #: Options with which the engine holds dry friction by its own soft law, and whether it does.
+    own_friction: ClassVar[Mapping[str, Any]] = {}
+    soft_friction: bool = False
     _evaluate: Callable[..., Array]
 
     @property

@@ -145,7 +145,7 @@ def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | 
 
 def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
     dyn, read = problem.dyn, problem.torque
-    if not dyn.model.needs.friction or method.dry_friction:
+    if not dyn.model.needs.friction or dyn.soft_friction or method.dry_friction:
         return _solver(dyn, method, read)(problem)
     if method.kind == "native" or not (method.events or problem.equal_steps):
         raise UnsupportedError(

@@ -1,4 +1,4 @@
-"""Loops in MuJoCo: the law of its soft equality constraints, and the rows of the contract from its kinematics.
+"""Loops and dry friction in MuJoCo: the law of its soft constraints, and the rows of loops from its kinematics.
 
 The law is that of the chapter "Computation" of MuJoCo's documentation, sections "Constraint model" and "Parameters";
 the names solref and solimp are those of "Modeling", section "Solver parameters". Of one equality with rows J, residual
@@ -14,6 +14,10 @@ r and its size |r|::
 The chapter's first equations have J̇ v; MuJoCo 4.0 forms it for points and frames. As d goes to 1, R goes to zero: the
 acceleration of a closed loop becomes the rigid one. MuJoCo keeps d below 0.9999, so that it keeps four digits of it
 or so.
+
+Friction loss ("Computation", section "Friction loss") is a row of its joint alone, without a residual, J̇ v or k. Its
+force has a bound: f minimizes ½ fᵀ (A + R) f + fᵀ (J a_0 - a_ref) with |f| <= the joint's friction, and d is d_0. So
+below the bound a joint creeps, at a rate at which b J v makes up for R f.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array, real, rows
+from mbkit.engines.elements.dry_friction import forces_at_rest
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
 
@@ -48,7 +53,7 @@ OF_JOINTS: Final = mujoco.mjtEq.mjEQ_JOINT
 
 @dataclass(frozen=True)
 class Softness:
-    """How soft MuJoCo's equality constraints are; the numbers of MJCF.
+    """How soft MuJoCo's equality constraints and its friction loss are; the numbers of MJCF.
 
     Attributes
     ----------
@@ -105,7 +110,7 @@ def _numbers(name: str, x: Any, size: int) -> Array:
 
 
 def stiffest(dt: float) -> dict[str, tuple[float, ...]]:
-    """Return the options of the stiffest equalities that MuJoCo holds with a step of `dt` seconds.
+    """Return the options of the stiffest constraints that MuJoCo holds with a step of `dt` seconds.
 
     A time constant of two steps is the least one that its documentation allows ("Modeling", section "Solver
     parameters"), and 0.9999 the greatest impedance.
@@ -126,13 +131,14 @@ class ConstraintLaw:
     """What MuJoCo's documentation says of one state, by formulas of mbkit's own: `constraints.py` in this folder.
 
     Rows are MuJoCo's: of each loop the gap in world axes, and of a frame the imaginary part of the turn's quaternion.
-    Of each coupler it is the excess of its joint's coordinate.
+    Of each coupler it is the excess of its joint's coordinate; each velocity with friction has a row of its own.
 
     Attributes
     ----------
     softness : Softness
     acceleration, rigid : (nv,) arrays
-        v̇ of the soft law, and that of rigid loops, R = 0 and a_ref = -J̇ v.
+        v̇ of the soft law, and that of rigid loops, R = 0 and a_ref = -J̇ v; of friction, the exact one of
+        `mbkit.Joint.friction`.
     jacobian : (m, nv) array
     residual, rate, bias : (m,) arrays
         r, J v and J̇ v.
@@ -167,7 +173,7 @@ class ConstraintLaw:
     def __str__(self) -> str:
         return (
             f"{len(self.residual)} rows, solref {self.softness.solref}, solimp {self.softness.solimp}: "
-            f"{self.digits:.1f} digits of the rigid acceleration"
+            f"{self.digits:.1f} digits of the exact acceleration"
         )
 
 
@@ -201,6 +207,24 @@ def law(
     rigid = free + np.linalg.lstsq(B, -bias - B @ free, rcond=_DEPENDENT)[0]
     soft, rigid = (turned(np.linalg.solve(L.T, x)) for x in (free + B.T @ f, rigid))
     return ConstraintLaw(softness, soft, rigid, columns(J), r, rate, bias, impedance, R, reference, f)
+
+
+def friction_law(
+    m: Any, d: Any, M: Array, softness: Softness, turned: Callable[[Array], Array], columns: Callable[[Array], Array]
+) -> ConstraintLaw:
+    """Return the law of friction loss at the state that `mj_forward` was called with, beside no loops.
+
+    Arguments are those of `law`. `rigid` is the acceleration without friction, until the caller puts the exact one in.
+    """
+    which = np.flatnonzero(m.dof_frictionloss)
+    J, rate, none = np.eye(m.nv)[which], d.qvel[which], np.zeros(len(which))
+    impedance = none + softness.impedance(0.0)
+    R = np.maximum((1 - impedance) / impedance * m.dof_invweight0[which], _TINY)
+    reference = -softness.gains[1] * rate
+    responses, free = np.linalg.solve(M, J.T), np.linalg.solve(M, d.qfrc_smooth)
+    f = forces_at_rest(responses[which] + np.diag(R), free[which] - reference, m.dof_frictionloss[which])
+    soft, free = turned(free + responses @ f), turned(free)
+    return ConstraintLaw(softness, soft, free, columns(J), none, rate, none, impedance, R, reference, f)
 
 
 def _bias(m: Any, d: Any, i: int) -> Array:

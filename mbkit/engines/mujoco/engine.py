@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._attributes import single_values
-from mbkit._check import Array, batch_of, count, real
+from mbkit._check import Array, batch_of, count, real, shown
 from mbkit._warn import warn
 from mbkit.engines import known_defects, regressors
 from mbkit.engines.base import MappedDynamics, require_no_forces
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.mujoco.bodies import MujocoBodies
-from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopEnds, Softness, law
+from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopEnds, Softness, friction_law, law
 from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, NumericalError, UnsupportedError
@@ -53,7 +53,9 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
     disabled : tuple of str
         Features that are off, because the smooth terms do not need them.
     softness : Softness
-        Of its equality constraints, which hold the loops.
+        Of its equality constraints, which hold the loops, and of its friction loss.
+    soft_friction : bool
+        Whether dry friction is MuJoCo's own.
 
     Notes
     -----
@@ -62,6 +64,10 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
     MuJoCo's; ``**mbkit.engines.mujoco.constraints.stiffest(dt)`` are the stiffest ones for a step. Runs by MuJoCo's
     and by mbkit's methods follow these accelerations: no state is projected, and what a loop opens is MuJoCo's. All
     other terms are those of the tree.
+
+    Dry friction of joints is exact, by mbkit, beside MuJoCo's terms. With ``soft_friction=True`` it is MuJoCo's own
+    friction loss in accelerations and runs, a soft constraint too: joints at rest creep. `constraint_law` tells how
+    far that is from exact friction; other terms have exact friction at speed.
     """
 
     engine = "mujoco"
@@ -83,18 +89,30 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         "and generalized_constraint_force(q, v, tau) is Jᵀ λ",
     }
     softness = Softness()
+    own_friction: ClassVar[dict[str, Any]] = {"soft_friction": True}
 
-    def __init__(self, model: Model, *, solref: ArrayLike | None = None, solimp: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        *,
+        solref: ArrayLike | None = None,
+        solimp: ArrayLike | None = None,
+        soft_friction: bool = False,
+    ) -> None:
         super().__init__(model)
         self.softness = Softness.of(solref, solimp)
-        self._hold(build(model, softness=self.softness))
+        if not isinstance(soft_friction, (bool, np.bool_)):
+            raise InputError(f"soft_friction: expected True or False, got {shown(soft_friction)}")
+        # Without friction there is nothing to hold.
+        self.soft_friction = bool(soft_friction) and model.needs.friction
+        self._hold(build(model, softness=self.softness, soft_friction=self.soft_friction))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, (type(self), self.model, self.softness)
+        return _rebuilt, (type(self), self.model, self.softness, self.soft_friction)
 
     def at(self, /, **values: Any) -> MujocoDynamics:
         return self._at_time(values) or _rebuilt(
-            type(self), self.model.with_nominal(single_values(values)), self.softness
+            type(self), self.model.with_nominal(single_values(values)), self.softness, self.soft_friction
         )
 
     def _hold(self, compiled: MujocoModel) -> None:
@@ -107,9 +125,9 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         self.mj_model = self._m = compiled.model
         self.disabled = compiled.disabled
         self._d = mujoco.MjData(self._m)
-        # Model and data with the loops; all terms but the accelerations are those of the tree.
+        # Model and data with what is soft; all terms but the accelerations are those of the tree.
         self._closed = self._m, self._d
-        if self.model.needs.loops:
+        if self.model.needs.loops or self.soft_friction:
             self._m = copy.copy(self._m)
             self._m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
             self._d = mujoco.MjData(self._m)
@@ -191,7 +209,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         Raises
         ------
         UnsupportedError
-            A model without loops.
+            A model without loops, on an engine without `soft_friction`.
 
         Examples
         --------
@@ -205,15 +223,39 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         >>> 0 < said.digits < 3
         True
         """
-        if not self.model.needs.loops:
-            raise UnsupportedError(f"constraint_law: {self.model.name} has no loops")
+        if not (self.model.needs.loops or self.soft_friction):
+            raise UnsupportedError(
+                f"constraint_law: {self.model.name} has no loops; dry friction is soft with soft_friction=True alone"
+            )
         q, v, tau = self.model.check_q(q), self.model.check_v(v), self.model.check_v(tau, "tau")
         if q.ndim > 1 or v.ndim > 1 or tau.ndim > 1:
             raise InputError(f"constraint_law: expected one state, got shapes {q.shape}, {v.shape}, {tau.shape}")
-        with self._lock, heard_warnings(), self._with_loops():
-            b = self._set(q, v)
-            self._accelerated(tau + self._elements.force(self, q, v) if self.model.forces else tau)
-            return self._law(b)
+        if self.model.forces:
+            tau = tau + self._elements.force(self, q, v)
+        with self._lock, heard_warnings():
+            if self.model.needs.friction and not self.soft_friction:
+                _, tau = self._exact_friction(q, v, tau, self._forward_dynamics)
+            with self._with_loops():
+                b = self._set(q, v)
+                self._accelerated(tau)
+                return self._law(b, q, v, tau)
+
+    def _exact_friction(self, q: Array, v: Array, tau: Array, own: Callable[..., Array]) -> tuple[Array, Array]:
+        """Return the accelerations of exact dry friction beside those of `own`, and τ with its forces."""
+        forces: list[Array] = []
+
+        def method(q: Array, v: Array, tau: Array) -> Array:
+            forces.append(tau)
+            return own(q, v, tau)
+
+        out = self._friction.beside("forward_dynamics", method, self)(q, v, tau)
+        return np.asarray(out), forces[-1]
+
+    def _smooth_acceleration(self, q: Array, v: Array, tau: Array) -> Array:
+        """Return the accelerations without any constraint."""
+        b = self._set(q, v)
+        self._accelerated(tau)
+        return self._force(self._d.qacc_smooth - b)
 
     @cached_property
     def _loop_ends(self) -> LoopEnds:
@@ -320,29 +362,36 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         with self._with_loops(), self._applied(q, *acting) if acting else contextlib.nullcontext():
             b = self._set(q, v)
             self._accelerated(tau)
-            if self.model.needs.loops:
-                self._warn_of_softness(b)
-            return self._directed(self._force(self._d.qacc - b))
+            out = self._directed(self._force(self._d.qacc - b))
+            if self.model.needs.loops or self.soft_friction:
+                self._warn_of_softness(b, q, v, tau)
+            return out
 
-    def _warn_of_softness(self, b: Array) -> None:
-        """Warn, once for each model, how far the soft law is from rigid loops at the state that is in."""
+    def _warn_of_softness(self, b: Array, q: Array, v: Array, tau: Array) -> None:
+        """Warn, once for each model, how far the soft law is from the exact one at a state."""
         key = self.model.form_digest, self.softness
         if key in _TOLD:
             return
         # A singular M has an error of its own.
         with contextlib.suppress(np.linalg.LinAlgError):
-            error = self._law(b).error
+            error = self._law(b, q, v, tau).error
             _TOLD.add(key)
+            what, rigid = ("dry friction", "exact friction") if self.soft_friction else ("loops", "rigid loops")
             warn(
-                f"{self.model.name}: MuJoCo holds loops by soft constraints: its accelerations are {100 * error:.2g} % "
-                "off those of rigid loops at this state; constraint_law(q, v, tau).digits tells it of any state, and "
+                f"{self.model.name}: MuJoCo holds {what} by soft constraints: its accelerations are {100 * error:.2g} % "
+                f"off those of {rigid} at this state; constraint_law(q, v, tau).digits tells it of any state, and "
                 "stiffer solref and solimp leave less",
                 MbkitWarning,
             )
 
-    def _law(self, b: Array) -> ConstraintLaw:
+    def _law(self, b: Array, q: Array, v: Array, tau: Array) -> ConstraintLaw:
+        """Return the law at the state that is in, where τ acts; what that is matters to exact friction alone."""
         M = full_mass_matrix(self._m, self._d)
-        return law(self._m, self._d, M, self.softness, lambda a: self._force(a - b), self._columns)
+        own = friction_law if self.soft_friction else law
+        out = own(self._m, self._d, M, self.softness, lambda a: self._force(a - b), self._columns)
+        if not self.soft_friction:
+            return out
+        return replace(out, rigid=self._exact_friction(q, v, tau, self._smooth_acceleration)[0])
 
     def _accelerated(self, tau: Array) -> None:
         """Have MuJoCo compute its accelerations at the state in its data."""
@@ -397,9 +446,15 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         ------
         UnsupportedError
             For reduced mimic joints (MuJoCo would make them soft), and forces on a free joint's translation (MuJoCo
-            holds them in world axes), and forces given by functions, which MuJoCo does not know.
+            holds them in world axes), and forces given by functions, which MuJoCo does not know, and exact dry
+            friction.
         """
         require_no_forces(self.model, "mujoco", holds_weights=True)
+        if self.model.needs.friction and not self.soft_friction:
+            raise UnsupportedError(
+                f"mujoco: native rollouts know no exact dry friction, which {self.model.name} has; give "
+                "soft_friction=True for MuJoCo's own, or model.without('friction')"
+            )
         if self._reduced:
             names = ", ".join(j.name for j in self.model.joints if j.mimic)
             raise UnsupportedError(
@@ -419,9 +474,9 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         self._require_loops_that_meet()
         model = copy.copy(self.mj_model)
         model.body_gravcomp[:] = self._gravcomp
-        if self.model.needs.loops and 0 < self.softness.solref[0] < 2 * dt:
+        if (self.model.needs.loops or self.soft_friction) and 0 < self.softness.solref[0] < 2 * dt:
             warn(
-                f"{self.model.name}: MuJoCo raises the time constant of its equalities from {self.softness.solref[0]:g}"
+                f"{self.model.name}: MuJoCo raises the time constant of its constraints from {self.softness.solref[0]:g}"
                 f" s to two steps, {2 * dt:g} s",
                 DoubtfulRunWarning,
             )
@@ -430,8 +485,10 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         return rollout(self.model, replace(self._maps, model=model), integrator, q0, v0, dt, tau, steps, progress)
 
 
-def _rebuilt(kind: type[MujocoDynamics], model: Model, softness: Softness) -> MujocoDynamics:
-    return kind(model, solref=softness.solref, solimp=softness.solimp)
+def _rebuilt(
+    kind: type[MujocoDynamics], model: Model, softness: Softness, soft_friction: bool = False
+) -> MujocoDynamics:
+    return kind(model, solref=softness.solref, solimp=softness.solimp, soft_friction=soft_friction)
 
 
 class Variant:

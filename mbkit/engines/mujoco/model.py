@@ -18,7 +18,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.base import STACKS, unknown_joint
+from mbkit.engines.base import first_names, STACKS, unknown_joint
 from mbkit.engines.imported import unused
 from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, Softness
 from mbkit.errors import MbkitError, UnsupportedError
@@ -93,12 +93,13 @@ def build(
     description: Model,
     *,
     softness: Softness | None = None,
+    soft_friction: bool = False,
     spheres: bool = False,
     shapes: Sequence[Shape] | None = None,
 ) -> MujocoModel:
     """Compile the description, with shapes to draw and sites of its frames where shapes are given, if only none.
 
-    `spheres` gives every body a sphere of 1 µm, to measure the cost of geometry.
+    `soft_friction` leaves MuJoCo's friction loss on. `spheres` gives every body a sphere of 1 µm, to measure the cost of geometry.
 
     Raises `UnsupportedError` for a joint or a body that MuJoCo cannot hold, and names it.
     """
@@ -108,7 +109,9 @@ def build(
             f"mujoco: {description.name} has loops and mimic joints ({mimics}), which MuJoCo's own equations would "
             "hold softly; the lagrangian engine reduces them, and mimic='free' loads independent joints"
         )
-    spec, placed, disabled = specified(description, softness)
+    if soft_friction:
+        _require_friction_loss(description)
+    spec, placed, disabled = specified(description, softness, soft_friction)
     if spheres:
         for name, body in placed.bodies.items():
             if name != "world":
@@ -144,7 +147,28 @@ class Placed:
     static: set[str]
 
 
-def specified(description: Model, softness: Softness | None = None) -> tuple[Any, Placed, tuple[str, ...]]:
+def _require_friction_loss(description: Model) -> None:
+    """Raise `UnsupportedError` for dry friction that MuJoCo's friction loss is not."""
+    curves = [j.name for j in description.joints if j.stiction is not None and np.any(j.stiction > j.friction)]
+    why = (
+        f"no static friction and no Stribeck curve, which {first_names(map(repr, curves))} has"
+        if curves
+        else "a mimic joint is held softly by MuJoCo, and friction of its own would act on that"
+        if description.layout.reduced
+        else "its solver would answer for loops and friction at once"
+        if description.needs.loops
+        else ""
+    )
+    if why:
+        raise UnsupportedError(
+            f"soft_friction: MuJoCo's friction loss does not hold the dry friction of {description.name}: {why}; "
+            "leave soft_friction out for mbkit's exact law"
+        )
+
+
+def specified(
+    description: Model, softness: Softness | None = None, soft_friction: bool = False
+) -> tuple[Any, Placed, tuple[str, ...]]:
     """Return the specification, not compiled yet, the places of the parts in it, and the features that are off.
 
     Raises `UnsupportedError` for a joint or a loop of a kind that MuJoCo does not have, a prescribed motion, or an
@@ -169,7 +193,7 @@ def specified(description: Model, softness: Softness | None = None) -> tuple[Any
     compiler.balanceinertia, compiler.fusestatic, compiler.inertiafromgeom = False, False, 0
     compiler.boundmass = compiler.boundinertia = 0.0
     compiler.alignfree = False
-    disabled = _switch_off(spec, description)
+    disabled = _switch_off(spec, description, soft_friction)
     placed = _add_tree(spec, description)
     for force in _held(description):
         # A body without mass, within a stack, has no weight.
@@ -181,6 +205,12 @@ def specified(description: Model, softness: Softness | None = None) -> tuple[Any
     _add_springs(spec, description, placed)
     _add_couplings(spec, description, placed)
     _add_loops(spec, description, placed, softness or Softness())
+    if soft_friction:
+        for name in (x for joint in description.joints if joint.friction.any() for x in placed.joints[joint.name]):
+            spec.joint(name).solref_friction = (softness or Softness()).solref
+            spec.joint(name).solimp_friction = (softness or Softness()).solimp
+    if soft_friction or description.needs.loops:
+        _solve_to_rounding(spec, softness or Softness())
     return spec, placed, disabled
 
 
@@ -223,6 +253,8 @@ _OFF: Final = {
 }
 #: Bits of what holds loops together.
 _FOR_LOOPS: Final = ("EQUALITY", "CONSTRAINT")
+#: And of friction loss.
+_FOR_FRICTION: Final = ("FRICTIONLOSS", "CONSTRAINT")
 _OFF_WITHOUT: Final = {
     "gravity": ("gravity", "GRAVITY"),
     "springs": ("springs", "SPRING"),
@@ -234,8 +266,9 @@ def _held(description: Model) -> list[GravityCompensation]:
     return [f for f in description.forces if isinstance(f, GravityCompensation)]
 
 
-def _switch_off(spec: Any, description: Model) -> tuple[str, ...]:
-    bits = {need: bit for need, bit in _OFF.items() if not (description.needs.loops and bit in _FOR_LOOPS)}
+def _switch_off(spec: Any, description: Model, soft_friction: bool) -> tuple[str, ...]:
+    needed = _FOR_LOOPS if description.needs.loops else _FOR_FRICTION if soft_friction else ()
+    bits = {need: bit for need, bit in _OFF.items() if bit not in needed}
     bits |= dict(pair for need, pair in _OFF_WITHOUT.items() if not getattr(description.needs, need))
     if _held(description):
         # Without springs and dampers MuJoCo leaves out gravity compensation too.
@@ -393,12 +426,14 @@ def _add_loops(spec: Any, description: Model, placed: Placed, softness: Softness
         equality.name1, equality.name2 = placed.joints[coupler.joint][0], placed.joints[coupler.leader][0]
         equality.data[:5] = [coupler.offset, coupler.ratio, 0.0, 0.0, 0.0]
         equality.solref, equality.solimp = softness.solref, softness.solimp
-    if description.needs.loops:
-        # Newton's solver ends at rounding: equalities alone are linear equations.
-        spec.option.solver, spec.option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 0.0
-        if softness.solref[0] > 0:
-            # MuJoCo raises a time constant to two steps; without steps there is none to raise it for.
-            spec.option.timestep = min(spec.option.timestep, softness.solref[0] / 2)
+
+
+def _solve_to_rounding(spec: Any, softness: Softness) -> None:
+    # Newton's solver ends at rounding: equalities alone are linear equations, and friction loss is linear in pieces.
+    spec.option.solver, spec.option.tolerance = mujoco.mjtSolver.mjSOL_NEWTON, 0.0
+    if softness.solref[0] > 0:
+        # MuJoCo raises a time constant to two steps; without steps there is none to raise it for.
+        spec.option.timestep = min(spec.option.timestep, softness.solref[0] / 2)
 
 
 def _refusal(description: Model, error: str) -> str:
