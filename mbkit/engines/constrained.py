@@ -59,6 +59,10 @@ class Constrained:
     soft_friction: bool = False
     _evaluate: Callable[..., Array]
 
+    def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
+        """Return the forces of dry friction in accelerations under τ, less those in `passive`; (N, nv)."""
+        return np.zeros_like(v)
+
     @property
     def projects(self) -> bool:
         """Whether runs project their states onto constraints."""

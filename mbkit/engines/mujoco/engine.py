@@ -251,6 +251,12 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         out = self._friction.beside("forward_dynamics", method, self)(q, v, tau)
         return np.asarray(out), forces[-1]
 
+    def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:
+        if not self.soft_friction:
+            return super()._friction_beside_passive(q, v, tau)
+        laws = [self.constraint_law(*state) for state in zip(q, v, tau, strict=True)]
+        return np.array([x.jacobian.T @ x.force for x in laws]) - self._friction.law.force(v)
+
     def _smooth_acceleration(self, q: Array, v: Array, tau: Array) -> Array:
         """Return the accelerations without any constraint."""
         b = self._set(q, v)

@@ -45,10 +45,11 @@ _NATIVE: Final = {m.own: m.name for m in METHODS.values() if m.own}
 def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str) -> tuple[RolloutRow, ...]:
     """Compare trajectories of 1 s at 1 ms of MuJoCo and other engines, for rk4 and semi-implicit Euler."""
     ours_on = [name for name in (PINOCCHIO, DERIVED) if name in engines]
-    if model.constrained:
-        # Where loops are rigid the motion is another one: the same formula on the same soft accelerations is compared.
+    soft = "loops are" if model.constrained else "dry friction is" if model.needs.friction else ""
+    if soft and MUJOCO in engines:
+        # Exact motion is another one: the same formula on the same soft accelerations is compared.
         ours_on = [MUJOCO]
-        note = "; ".join(x for x in (note, "on MuJoCo's own accelerations, whose loops are soft") if x)
+        note = "; ".join(x for x in (note, f"on MuJoCo's own accelerations, whose {soft} soft") if x)
     # MuJoCo's own integrators know no forces by functions.
     if MUJOCO not in engines or not ours_on or by_functions(model):
         return ()
@@ -202,6 +203,8 @@ _NEEDS: Final = (
 )
 #: What is on where the description has it.
 _KEPT: Final = ("damping", "springs", "gravity", "loops")
+#: What acts instead of what is off.
+_WITHOUT: Final = {"dry friction": "without it mbkit's exact dry friction acts"}
 
 
 def omissions(model: Model, engines: Mapping[str, Dynamics], seed: int) -> tuple[Omission, ...]:
@@ -240,7 +243,7 @@ def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
         saved = times[need][0] - times["lean"][0]
         spread = math.hypot(times[need][1], times["lean"][1])
         # What is there and off would act: leaving it out is a choice, said aloud, and no engine's fault.
-        note = "it is off in every engine, so that the smooth terms compare" if present else ""
+        note = _WITHOUT.get(need, "it is off in every engine, so that the smooth terms compare") if present else ""
         unchanged = changes[need] <= _UNCHANGED
         rows.append(Omission(need, present, what, saved, spread, math.nan, changes[need], unchanged, note))
     return rows

@@ -203,7 +203,7 @@ class Comparison(ResultTable):
 
     `facts` has nq, nv, mass, digest, needs and notes of the model. `reference` is what the terms of all `engines` were
     measured by: the oracle. Accelerations of an engine with soft constraints are measured by its own written law
-    instead, and `softness` has the digits that it keeps of the rigid ones, at the median state. `findings` are what the
+    instead, and `softness` has the digits that it keeps of the exact ones, at the median state. `findings` are what the
     description has that no engine uses, and its stiff joints. `precision` is the error against run time of a few
     methods on a short horizon. `setup` has the seconds to build each engine; the derivation works when first called.
     `seconds` is the time of the whole study.
@@ -297,9 +297,11 @@ class Comparison(ResultTable):
         absent = dict.fromkeys(r.engine for r in self.refusals if not r.term and r.engine not in self.engines)
         out += [f"{', '.join(absent)} left out"] if absent else []
         out += [f"no {r.term}" for r in self.refusals if not r.engine]
+        loops = self.facts["needs"]["loops"] if self.softness else False
+        what, them, exact = ("loops", "them", "rigid") if loops else (FRICTION, "it", "exact")
         out += [
-            f"{name} holds loops softly, and agrees with its own law of them; its accelerations are "
-            f"{100 * 10**-x:.2g} % off the rigid ones at the median state"
+            f"{name} holds {what} softly, and agrees with its own law of {them}; its accelerations are "
+            f"{100 * 10**-x:.2g} % off the {exact} ones at the median state"
             for name, x in self.softness.items()
         ]
         rows = [r for r in self.rollouts if not r.informs]

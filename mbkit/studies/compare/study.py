@@ -17,7 +17,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import STANDARD, find_engine
-from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError
+from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.model.joint_numbers import owners
@@ -73,7 +73,7 @@ class Judge:
     def __post_init__(self) -> None:
         model, oracle, at = self.model, self.oracle, self.at
         self.refusals: list[Refusal] = []
-        #: Of each engine with soft constraints the digits of the rigid acceleration that are left, at the median state.
+        #: Of each engine with soft constraints the digits of the exact acceleration that are left, at the median state.
         self.softness: dict[str, float] = {}
         #: Gravity, velocity and passive forces at all states, as sums of their sizes.
         self.forces = np.zeros_like(at.tau)
@@ -151,8 +151,9 @@ class Judge:
         ]
         for name, value in values.items():
             against, exact, rest = reference, high, low
-            soft = self.model.constrained and self.engines[name].soft_constraints
-            if soft and term.quantity in OF_CONSTRAINED_MOTION:
+            dyn = self.engines[name]
+            soft = dyn.soft_friction or (self.model.constrained and dyn.soft_constraints)
+            if soft and term.quantity in (OF_CONSTRAINED_MOTION if self.model.constrained else (FORWARD_DYNAMICS,)):
                 against, exact, rest = OWN_LAW, self._own_law(term, name), np.zeros_like(value)
             errors = term.errors((value - exact) - rest, exact, self.scales)
             row = self._row(term.name, name, errors, defects[name], self._allowed(term, name, errors))
@@ -376,7 +377,16 @@ def _build(
         with warnings.catch_warnings(record=True, action="always", category=KnownDefectWarning) as caught:
             try:
                 # A few dozen states are no reason to compile; run times are.
-                engines[name] = dynamics(model, name, **({} if compile else find_engine(name).brief))
+                options = {} if compile else find_engine(name).brief
+                own = find_engine(name).load().own_friction if model.needs.friction else {}
+                try:
+                    engines[name] = dynamics(model, name, **options, **own)
+                except UnsupportedError as error:
+                    if not own:
+                        raise
+                    # Exact friction stands in.
+                    engines[name] = dynamics(model, name, **options)
+                    refusals.append(Refusal.of(name, error, f"dry friction as {name} holds it"))
             except MbkitError as error:
                 refusals.append(Refusal.of(name, error))
         setup[name] = time.perf_counter() - start

@@ -166,6 +166,7 @@ def power_errors(dyn: Dynamics, oracle: OracleDynamics, at: States, scales: Scal
     still = np.zeros_like(at.v)
     # Of functions without a potential, what acts at rest does work too.
     damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, still) + dyn._lost_force(at.q, still)
+    damping = damping + dyn._friction_beside_passive(at.q, at.v, at.tau)
     inertial, rate = oracle.inverse_dynamics(at.q, at.v, a), oracle.energy_rate(at.q, at.v, a)
     # Drives do work, and so do constraints that give way.
     held = dyn.generalized_constraint_force(at.q, at.v, at.tau) if dyn.model.constrained else np.zeros_like(at.v)
