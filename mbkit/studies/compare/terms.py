@@ -30,6 +30,7 @@ from mbkit.studies.compare.errors import (
 # An angle this far from gimbal lock loses four digits in anything that divides
 # by its cosine; none of the terms should.
 _NEAR: float = 1e-4
+_AT_REST: Final = "at rest"
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ class States:
 def states(model: Model, samples: int, seed: int) -> States:
     """Return `samples` random states; without constraints also neutral, at-limit and near-singular ones.
 
-    Near singular: every angle 1e-4 from a multiple of a right angle, which is near gimbal lock and stretched arms.
+    Near singular: every angle 1e-4 from a multiple of a right angle, which is near gimbal lock and stretched arms. With
+    dry friction, also states in which every other velocity is at rest, or all are.
     """
     rng = np.random.default_rng(seed)
     q, v = model.random_state(rng, samples)
@@ -56,10 +58,15 @@ def states(model: Model, samples: int, seed: int) -> States:
         parts.append(("neutral", np.tile(model.neutral(), (2, 1))))
         parts.append(("at limits", _at_limits(model, rng, few)))
         parts.append(("near singular", _near_singular(model, rng, few)))
+        if model.needs.friction:
+            parts.append((_AT_REST, model.random_state(rng, few)[0]))
     q = np.concatenate([x for _, x in parts])
     v = np.concatenate([v, rng.standard_normal((len(q) - samples, model.nv))])
     a, tau = rng.standard_normal((2, len(q), model.nv))
-    return States(q, v, a, tau, tuple(kind for kind, x in parts for _ in x))
+    kinds = tuple(kind for kind, x in parts for _ in x)
+    resting = [k for k, kind in enumerate(kinds) if kind == _AT_REST]
+    v[resting[:1]], v[resting[1:], ::2] = 0.0, 0.0
+    return States(q, v, a, tau, kinds)
 
 
 def _at_limits(model: Model, rng: np.random.Generator, n: int) -> Array:
