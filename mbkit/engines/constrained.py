@@ -58,6 +58,7 @@ class Constrained:
     own_friction: ClassVar[Mapping[str, Any]] = {}
     soft_friction: bool = False
     _evaluate: Callable[..., Array]
+    _without_friction: Callable[[str], Callable[..., Any]]
 
     def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
         """Return the forces of dry friction in accelerations under τ, less those in `passive`; (N, nv)."""
@@ -244,7 +245,8 @@ class Constrained:
         return self._bound("generalized_constraint_force", q=q, v=v, tau=tau)
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:
-        J, forces = self.constraint_jacobian(q), self.constraint_forces(q, v, tau)
+        # Dry friction is in τ already.
+        J, forces = self.constraint_jacobian(q), self._without_friction("constraint_forces")(q, v, tau)
         return (np.swapaxes(J, -1, -2) @ forces[..., None])[..., 0]
 
     def project(self, q: ArrayLike, v: ArrayLike, hold: Sequence[str] = ()) -> tuple[Array, Array]:

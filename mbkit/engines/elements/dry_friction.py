@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit.errors import NumericalError
+from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import ROUNDING, DryFrictionLaw, Sliding
 
@@ -31,6 +31,8 @@ UNDER_FORCE: Final = (
     *("forward_dynamics", "forward_dynamics_with_wrenches"),
     *("constraint_forces", "generalized_constraint_force"),
 )
+#: Loads of mechanisms, by the place of the force among their arguments.
+_LOADS: Final = {"loads_under_force": 2, "loads_of_motion": 3}
 #: Phases that dynamics keep, at most.
 _PHASES: Final = 256
 _FORWARD: Final = "forward_dynamics"
@@ -122,6 +124,19 @@ class DryFriction:
                 return np.where(still, 0.0, out) if quantity.startswith(_FORWARD) else out
 
             return pushed
+        if quantity in _LOADS:
+            place = _LOADS[quantity]
+
+            def loaded(*states: Any) -> Any:
+                if law.at_rest(states[1]).any():
+                    raise UnsupportedError(
+                        f"loads of joints and loops: {self._model.name} has joints with dry friction at rest, whose "
+                        "share of the loads is not known; give velocities, or take model.without('friction')"
+                    )
+                force = law.force(states[1]) if added else 0.0
+                return method(*states[:place], states[place] + force, *states[place + 1 :])
+
+            return loaded
         if not added:
             return method
         if quantity == "passive":
@@ -233,18 +248,21 @@ class DryFriction:
         self, quantity: str, dyn: Any, q: Array, v: Array, tau: Array, rest: tuple[Any, ...], resting: Mask
     ) -> Any:
         """Return a quantity of more digits than a double's, by the model whose joints slide or rest; (N, ...)."""
-        forward = dyn._without_friction(_FORWARD)
+        moves = quantity.startswith(_FORWARD)
+        forward = dyn._without_friction(quantity if moves else _FORWARD)
 
         def one(i: int) -> Any:
-            states, more = [x[i : i + 1] for x in (q, v)], [x[i : i + 1] if np.ndim(x) else x for x in rest]
+            # Frames and axes of wrenches are those of all states.
+            states = [x[i : i + 1] for x in (q, v)]
+            more = [x[i : i + 1] if isinstance(x, np.ndarray) else x for x in rest]
 
             def accelerate(force: Array) -> Array:
-                return np.asarray(dyn._rounded(forward(*states, force[None]))[0])
+                return np.asarray(dyn._rounded(forward(*states, force[None], *(more if moves else ())))[0])
 
             held, still = self.decided(dyn, accelerate, q[i], tau[i], resting[i])
             phase = self.phase(dyn, np.where(resting[i], -np.sign(held), np.sign(v[i])), still)
             value = phase._without_friction(quantity)(*states, tau[i : i + 1], *more)
-            return value * phase._arithmetic.array(1.0 - still) if quantity == _FORWARD else value
+            return value * phase._arithmetic.array(1.0 - still) if moves else value
 
         return np.concatenate([one(i) for i in range(len(v))])
 
