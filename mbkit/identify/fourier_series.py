@@ -23,6 +23,7 @@ import numpy as np
 from mbkit._check import Array, count, generator, real
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnsupportedError
+from mbkit.identify.measurements import REST, moving
 from mbkit.model import Model
 from mbkit.model.base_parameters import PARAMETER_SETS, regressor_columns
 from mbkit.model.builder import expect_model
@@ -111,7 +112,7 @@ def excitation(
     margin : float
         Part of the range and of the speed that is left free, from 0 to below 1.
     friction : bool
-        Whether the columns of friction count too.
+        Whether the columns of friction count too; of joints near rest nothing counts then, as in `identify`.
     iterations : int
         Of the search, after the best of some random motions; 0 takes that.
     progress : bool or callable, optional
@@ -198,16 +199,19 @@ class _Search:
         return np.concatenate([centre[..., None], grown], axis=-1)
 
     def regressor(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the equations of all samples, (N nv, p)."""
-        Y = self._dyn.regressor(q, v, a, _BASE, friction=self._friction)
-        return Y.reshape(-1, Y.shape[-1])
+        """Return the equations of all samples of some motions, (..., N nv, p); with friction of those that move."""
+        flat = (x.reshape(-1, self._shape[0]) for x in (q, v, a))
+        Y = self._dyn.regressor(*flat, _BASE, friction=self._friction)
+        if self._friction:
+            # As `identify` leaves them out.
+            Y = Y * moving(v, REST).reshape(*Y.shape[:2], 1)
+        return Y.reshape(*v.shape[:-2], -1, Y.shape[-1])
 
     def _equations(self, x: Array) -> Array:
         """Return the equations of some motions, (B, N nv, p)."""
         c = self.bounded(x)
         q, v, a = _series(self._t, self._frequency, c[..., 1:])
-        flat = (y.reshape(-1, self._shape[0]) for y in (q + c[:, None, :, 0], v, a))
-        return self.regressor(*flat).reshape(len(x), -1, len(self._columns.bodies) + 2 * len(self._columns.friction))
+        return self.regressor(q + c[:, None, :, 0], v, a)
 
     @staticmethod
     def value(Y: Array) -> tuple[float, Array]:

@@ -8,7 +8,7 @@ velocity, their noise can be found and weighted afterwards, without the samples.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -22,6 +22,8 @@ from mbkit.model.base_parameters import PARAMETER_SETS, BaseParameters, regresso
 from mbkit.simulate.progress import Progress
 
 _BASE: Final = PARAMETER_SETS[1]
+#: Part of a joint's greatest speed below which it counts as at rest.
+REST: Final = 0.05
 #: Numbers of a regressor that are held at once.
 _BLOCK: Final = 250_000
 #: Columns that no state moves are found at so many.
@@ -104,8 +106,25 @@ class Measurements:
         checked = _weights(weights, arrays["tau"])
         return cls(arrays["q"], arrays["v"], arrays["a"], arrays["tau"], checked)
 
+    def moving(self, dry: NDArray[np.bool_], rest: float) -> Measurements:
+        """Return the samples without the torques of joints with dry friction, (nv,), that are at rest.
+
+        There friction holds with any force up to its bound, and noise decides the sign of v.
+        """
+        if not dry.any():
+            return self
+        kept = moving(self.v, rest) | ~dry
+        weights = 1.0 if self.weights is None else self.weights
+        return self if kept.all() else replace(self, weights=weights * kept)
+
     def __len__(self) -> int:
         return len(self.tau)
+
+
+def moving(v: Array, rest: float) -> NDArray[np.bool_]:
+    """Return where joints are faster than a part of their greatest speed, (..., N, nv); of none at rest all along."""
+    speed = np.abs(v)
+    return np.asarray(speed >= rest * speed.max(axis=-2, keepdims=True, initial=0.0), dtype=np.bool_)
 
 
 def _weights(weights: ArrayLike | None, tau: Array) -> Array | None:

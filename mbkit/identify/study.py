@@ -13,12 +13,13 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.identify.consistency import ENTROPIC, NEGLIGIBLE, PRIORS, consistent, nearest
 from mbkit.identify.least_squares import Fit, fit, stacked
-from mbkit.identify.measurements import Equations, Measurements, Unknowns, equations
+from mbkit.identify.measurements import REST, Equations, Measurements, Unknowns, equations
 from mbkit.identify.motion_noise import bias, motion_noise
 from mbkit.identify.result import Identification, IdentifiedParameter, Residual, Undetermined
 from mbkit.model import Model
 from mbkit.model.base_parameters import POWERS, length_of, standard_names
 from mbkit.model.builder import expect_model
+from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.simulate.progress import Progress, ProgressFunction
 
 #: Standard deviations of bias from which on the user is warned.
@@ -40,6 +41,7 @@ def identify(
     prior_weight: float = 1.0,
     progress: bool | ProgressFunction | None = None,
     cutoff: float | None = None,
+    rest: float = REST,
 ) -> Identification:
     """Identify the base parameters of a model from measured motions and torques, by weighted least squares.
 
@@ -76,6 +78,9 @@ def identify(
         True for a bar, or a function of the fraction done.
     cutoff : float, optional
         Hz, of the filter that the positions went through; it is kept in the result.
+    rest : float
+        Part of a joint's greatest speed below which its torque gets no weight, where it has dry friction or `friction`
+        is asked for: at rest friction holds with any force, and near it noise decides the sign of v.
 
     Returns
     -------
@@ -124,7 +129,11 @@ def identify(
         raise InputError("prior: expected physical=True with it; without, the data alone decide")
     prior_weight = real("prior_weight", prior_weight, positive=True)
     unknowns = Unknowns.of(model, bool(friction), bool(armature))
-    data = Measurements.of(model, q, v, a, tau, weights)
+    rest = real("rest", rest, nonnegative=True)
+    if rest >= 1:
+        raise InputError(f"rest: expected a part of the greatest speed below 1, got {rest:g}")
+    dry = np.full(model.nv, True) if friction else DryFrictionLaw(model).bound > 0
+    data = Measurements.of(model, q, v, a, tau, weights).moving(dry, rest)
     _require_enough(model, unknowns, data)
     with Progress(progress, "identify") as reported:
         given = equations(LagrangianDynamics(model), unknowns, data, reported)
