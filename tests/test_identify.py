@@ -136,7 +136,7 @@ def test_a_weight_of_zero_leaves_a_torque_out() -> None:
     weights = np.ones(tau.shape)
     tau[::7, 1] += 100.0
     weights[::7, 1] = 0.0
-    found = mb.identify(other_masses(model), q, v, a, tau, weights=weights, friction=True)
+    found = mb.identify(other_masses(model), q, v, a, tau, weights=weights, friction=True, rest=0.0)
     assert np.allclose(values(found)[: model.base_parameters().count], model.base_parameters().values, atol=1e-10)
     assert found.residuals[1].samples == len(tau) - len(tau[::7])
 

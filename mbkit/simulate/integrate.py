@@ -145,12 +145,19 @@ def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | 
 
 def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
     dyn, read = problem.dyn, problem.torque
+    if dyn.soft_friction and method.dry_friction:
+        raise UnsupportedError(
+            f"{method.name}: solves exact dry friction, and {dyn.engine} was asked for its own; leave soft_friction out"
+        )
     if not dyn.model.needs.friction or dyn.soft_friction or method.dry_friction:
         return _solver(dyn, method, read)(problem)
-    if method.kind == "native" or not (method.events or problem.equal_steps):
+    native = method.kind == "native"
+    if native or not (method.events or problem.equal_steps):
+        own = ", ".join(f"{name}={value}" for name, value in dyn.own_friction.items() if native)
         raise UnsupportedError(
             f"{method.name}: does not know dry friction, which {dyn.model.name} has; use {DEFAULT_METHOD!r} or "
             f"{ADAPTIVE_METHOD!r}, or model.without('friction')"
+            + (f"; mbkit.dynamics(model, {dyn.engine!r}, {own}) has that engine's own, which is soft" if own else "")
         )
     from mbkit.simulate.solvers.friction.runs import run_in_phases
 

@@ -384,8 +384,8 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             _TOLD.add(key)
             what, rigid = ("dry friction", "exact friction") if self.soft_friction else ("loops", "rigid loops")
             warn(
-                f"{self.model.name}: MuJoCo holds {what} by soft constraints: its accelerations are {100 * error:.2g} % "
-                f"off those of {rigid} at this state; constraint_law(q, v, tau).digits tells it of any state, and "
+                f"{self.model.name}: MuJoCo holds {what} by soft constraints: its accelerations are {100 * error:.2g} "
+                f"% off those of {rigid} at this state; constraint_law(q, v, tau).digits tells it of any state, and "
                 "stiffer solref and solimp leave less",
                 MbkitWarning,
             )
@@ -482,8 +482,8 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         model.body_gravcomp[:] = self._gravcomp
         if (self.model.needs.loops or self.soft_friction) and 0 < self.softness.solref[0] < 2 * dt:
             warn(
-                f"{self.model.name}: MuJoCo raises the time constant of its constraints from {self.softness.solref[0]:g}"
-                f" s to two steps, {2 * dt:g} s",
+                f"{self.model.name}: MuJoCo raises the time constant of its constraints from "
+                f"{self.softness.solref[0]:g} s to two steps, {2 * dt:g} s",
                 DoubtfulRunWarning,
             )
         if euler_damping:

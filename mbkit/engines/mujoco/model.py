@@ -18,7 +18,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.base import first_names, STACKS, unknown_joint
+from mbkit.engines.base import STACKS, first_names, unknown_joint
 from mbkit.engines.imported import unused
 from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, Softness
 from mbkit.errors import MbkitError, UnsupportedError
@@ -99,7 +99,8 @@ def build(
 ) -> MujocoModel:
     """Compile the description, with shapes to draw and sites of its frames where shapes are given, if only none.
 
-    `soft_friction` leaves MuJoCo's friction loss on. `spheres` gives every body a sphere of 1 µm, to measure the cost of geometry.
+    `soft_friction` leaves MuJoCo's friction loss on. `spheres` gives every body a sphere of 1 µm, to measure the cost
+    of geometry.
 
     Raises `UnsupportedError` for a joint or a body that MuJoCo cannot hold, and names it.
     """
