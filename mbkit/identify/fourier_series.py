@@ -200,8 +200,8 @@ class _Search:
 
     def regressor(self, q: Array, v: Array, a: Array) -> Array:
         """Return the equations of all samples of some motions, (..., N nv, p); with friction of those that move."""
-        flat = (x.reshape(-1, self._shape[0]) for x in (q, v, a))
-        Y = self._dyn.regressor(*flat, _BASE, friction=self._friction)
+        at, rates, second = (x.reshape(-1, self._shape[0]) for x in (q, v, a))
+        Y = self._dyn.regressor(at, rates, second, _BASE, friction=self._friction)
         if self._friction:
             # As `identify` leaves them out.
             Y = Y * moving(v, REST).reshape(*Y.shape[:2], 1)

@@ -114,8 +114,8 @@ class Measurements:
         if not dry.any():
             return self
         kept = moving(self.v, rest) | ~dry
-        weights = 1.0 if self.weights is None else self.weights
-        return self if kept.all() else replace(self, weights=weights * kept)
+        weights = np.ones(self.v.shape) if self.weights is None else self.weights
+        return self if kept.all() else replace(self, weights=np.asarray(weights * kept))
 
     def __len__(self) -> int:
         return len(self.tau)

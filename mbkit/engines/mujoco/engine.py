@@ -230,15 +230,14 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         q, v, tau = self.model.check_q(q), self.model.check_v(v), self.model.check_v(tau, "tau")
         if q.ndim > 1 or v.ndim > 1 or tau.ndim > 1:
             raise InputError(f"constraint_law: expected one state, got shapes {q.shape}, {v.shape}, {tau.shape}")
-        if self.model.forces:
-            tau = tau + self._elements.force(self, q, v)
+        pushed: Array = tau + self._elements.force(self, q, v) if self.model.forces else tau
         with self._lock, heard_warnings():
             if self.model.needs.friction and not self.soft_friction:
-                _, tau = self._exact_friction(q, v, tau, self._forward_dynamics)
+                _, pushed = self._exact_friction(q, v, pushed, self._forward_dynamics)
             with self._with_loops():
                 b = self._set(q, v)
-                self._accelerated(tau)
-                return self._law(b, q, v, tau)
+                self._accelerated(pushed)
+                return self._law(b, q, v, pushed)
 
     def _exact_friction(self, q: Array, v: Array, tau: Array, own: Callable[..., Array]) -> tuple[Array, Array]:
         """Return the accelerations of exact dry friction beside those of `own`, and τ with its forces."""
