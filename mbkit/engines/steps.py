@@ -47,6 +47,7 @@ class Steps:
     # Of `Dynamics`.
     engine: ClassVar[str]
     model: Model
+    soft_friction: bool
     projects: Any
     at: Callable[..., Any]
     forward_dynamics: Callable[..., Array]

@@ -222,7 +222,9 @@ def friction_law(
     R = np.maximum((1 - impedance) / impedance * m.dof_invweight0[which], _TINY)
     reference = -softness.gains[1] * rate
     responses, free = np.linalg.solve(M, J.T), np.linalg.solve(M, d.qfrc_smooth)
-    f = forces_at_rest(np.asarray(responses[which] + np.diag(R), dtype=np.float64), free[which] - reference, m.dof_frictionloss[which])
+    f = forces_at_rest(
+        np.asarray(responses[which] + np.diag(R), dtype=np.float64), free[which] - reference, m.dof_frictionloss[which]
+    )
     soft, free = turned(free + responses @ f), turned(free)
     return ConstraintLaw(softness, soft, free, columns(J), none, rate, none, impedance, R, reference, f)
 
