@@ -138,8 +138,7 @@ def test_exact_friction_is_no_motion_of_own_integrators() -> None:
     dyn, (q, v) = mb.dynamics(model, "mujoco"), model.random_state(0)
     with pytest.raises(UnsupportedError, match="'mujoco', soft_friction=True"):
         mb.simulate(dyn, q, v, 0.1, "mujoco_rk4", 1e-3)
-    # It ran without any friction, and said nothing.
-    with pytest.raises(UnsupportedError, match="soft_friction=True for MuJoCo's own"):
+    with pytest.raises(UnsupportedError, match="do not hold the dry friction of double_pendulum"):
         dyn.rollout("rk4", q, v, 1e-3, None, 10)
     with pytest.raises(UnsupportedError, match="moreau: solves exact dry friction"):
         mb.simulate(soft(model), q, v, 0.1, "moreau", 1e-3)
@@ -177,9 +176,7 @@ def test_rollouts_and_run_times_of_a_robot_with_friction() -> None:
     assert result.passed, result.verdict
     assert "no rollouts" not in result.verdict
     assert result.precision is not None
-    by_method = {c.method: c.points[-1].error for c in result.precision.curves}
-    assert by_method["rk853"] < 1e-9 < 1e-4 < by_method["mujoco_rk4"]
-    assert any("dry friction by a soft law" in x for x in result.precision.facts["notes"])
+    assert "are without dry friction" in result.verdict
 
 
 def test_a_reference_goes_through_changes_of_sign() -> None:

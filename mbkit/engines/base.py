@@ -107,12 +107,12 @@ def require_tree(
             )
 
 
-def require_no_forces(model: Model, engine: str, *, holds_weights: bool = False) -> None:
+def require_no_forces(model: Model, engine: str, *, holds_weights: bool = False, holds_friction: bool = False) -> None:
     """Raise `UnsupportedError` for a model with forces by functions or friction, in the name of own integrators.
 
-    Those of an engine that `holds_weights` know gravity compensation.
+    Those of an engine that `holds_weights` know gravity compensation, and of one that `holds_friction` its own.
     """
-    if model.needs.friction:
+    if model.needs.friction and not holds_friction:
         raise UnsupportedError(
             f"{engine}: its own integrators do not hold the dry friction of {model.name}; use a method that any engine "
             "has, such as rk4, or model.without('friction')"

@@ -6,11 +6,11 @@ import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from types import FrameType
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,9 +18,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.consistent.random_states import states_of
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.engines.registry import find_engine
 from mbkit.errors import InputError, MbkitError, MbkitWarning
-from mbkit.methods.registry import METHODS
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.model.manifold import limits_box
@@ -57,12 +55,6 @@ def require_motion(model: object, purpose: str) -> Model:
 def free_of_mimic(model: Model) -> Model:
     """Return the model with its mimic joints independent: MuJoCo's own steps would make them soft."""
     return replace(model, joints=tuple(replace(j, mimic=None) for j in model.joints))
-
-
-def own_friction(model: Model, engine: str, method: str) -> Mapping[str, Any]:
-    """Return the options with which an engine's own integrator runs a model with dry friction, by its soft law."""
-    native = model.needs.friction and METHODS[method].kind == "native"
-    return find_engine(engine).load().own_friction if native else {}
 
 
 def start_state(model: Model, seed: int) -> tuple[Array, Array]:

@@ -454,12 +454,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             holds them in world axes), and forces given by functions, which MuJoCo does not know, and exact dry
             friction.
         """
-        require_no_forces(self.model, "mujoco", holds_weights=True)
-        if self.model.needs.friction and not self.soft_friction:
-            raise UnsupportedError(
-                f"mujoco: native rollouts know no exact dry friction, which {self.model.name} has; give "
-                "soft_friction=True for MuJoCo's own, or model.without('friction')"
-            )
+        require_no_forces(self.model, "mujoco", holds_weights=True, holds_friction=self.soft_friction)
         if self._reduced:
             names = ", ".join(j.name for j in self.model.joints if j.mimic)
             raise UnsupportedError(

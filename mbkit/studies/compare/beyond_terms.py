@@ -45,11 +45,10 @@ _NATIVE: Final = {m.own: m.name for m in METHODS.values() if m.own}
 def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str) -> tuple[RolloutRow, ...]:
     """Compare trajectories of 1 s at 1 ms of MuJoCo and other engines, for rk4 and semi-implicit Euler."""
     ours_on = [name for name in (PINOCCHIO, DERIVED) if name in engines]
-    soft = "loops are" if model.constrained else "dry friction is" if model.needs.friction else ""
-    if soft and MUJOCO in engines:
-        # Exact motion is another one: the same formula on the same soft accelerations is compared.
+    if model.constrained:
+        # Where loops are rigid the motion is another one: the same formula on the same soft accelerations is compared.
         ours_on = [MUJOCO]
-        note = "; ".join(x for x in (note, f"on MuJoCo's own accelerations, whose {soft} soft") if x)
+        note = "; ".join(x for x in (note, "on MuJoCo's own accelerations, whose loops are soft") if x)
     # MuJoCo's own integrators know no forces by functions.
     if MUJOCO not in engines or not ours_on or by_functions(model):
         return ()

@@ -20,7 +20,7 @@ from mbkit.simulate.torque import TorqueFunction
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies._targets import methods_by_engine, numbers_of, with_values
-from mbkit.studies.study_runs import free_of_mimic, own_friction, require_motion, start_state
+from mbkit.studies.study_runs import free_of_mimic, require_motion, start_state
 from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.reference import reference as compute_reference
 from mbkit.studies.work_precision.result import WorkPrecision
@@ -184,9 +184,6 @@ def work_precision(
     if soft:
         which = " and ".join(soft)
         facts["notes"] = [*facts["notes"], f"{which}: holds loops by its own law; the curves end at that law's motion"]
-    if own := [m for name, ms in methods_of.items() for m in ms if own_friction(integrated, name, m)]:
-        which = ", ".join(dict.fromkeys(own))
-        facts["notes"] = [*facts["notes"], f"{which}: dry friction by a soft law, at whose motion the curves end"]
 
     def result(*, complete: bool) -> WorkPrecision:
         outcomes = sweep.outcomes()

@@ -28,7 +28,7 @@ from mbkit.methods.registry import METHODS, Method, method_of
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
 from mbkit.studies.results import Refusal
-from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, energy_drift, own_friction, patience, quiet_simulate
+from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, energy_drift, patience, quiet_simulate
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
 from mbkit.studies.worker import run
 
@@ -76,7 +76,7 @@ def first_run(model: Model, engine: str, method: str, start: Callable[[Dynamics]
     _import_for(engine, method)
     with force_recompile(), _without_heyoka_cache() if "heyoka" in sys.modules else contextlib.nullcontext():
         begun = time.perf_counter()
-        dyn = dynamics(model, engine, **own_friction(model, engine, method))
+        dyn = dynamics(model, engine)
         start(dyn)
         cold = time.perf_counter() - begun
     begun = time.perf_counter()
