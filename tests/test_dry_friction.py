@@ -323,16 +323,16 @@ def test_a_step_is_a_run_of_one_step(engine: str) -> None:
 
 
 def test_a_run_loses_energy_and_all_methods_and_engines_find_the_same_way() -> None:
-    model = rubbed(7, 4, ("revolute", "universal", "prismatic", "spherical_zyx"), damping=False)
+    model = rubbed(7, 3, ("revolute", "universal", "prismatic"), damping=False)
     q, v = model.random_state(np.random.default_rng(3), 1)
-    save = np.linspace(0, 1, 21)
-    first = mb.simulate(mb.dynamics(model, "lagrangian"), q[0], v[0], 1.0, "rk853", rtol=1e-12, save=save)
-    other = mb.simulate(mb.dynamics(model, "pinocchio"), q[0], v[0], 1.0, "auto", rtol=1e-12, save=save)
-    fixed = mb.simulate(mb.dynamics(model, "lagrangian"), q[0], v[0], 1.0, "rk4", dt=1e-3)
+    save = np.linspace(0, 0.6, 13)
+    first = mb.simulate(mb.dynamics(model, "lagrangian"), q[0], v[0], 0.6, "rk853", rtol=1e-12, save=save)
+    other = mb.simulate(mb.dynamics(model, "pinocchio"), q[0], v[0], 0.6, "auto", rtol=1e-12, save=save)
+    fixed = mb.simulate(mb.dynamics(model, "lagrangian"), q[0], v[0], 0.6, "rk4", dt=2e-3)
     assert first.events
     assert [e.name for e in first.events] == [e.name for e in other.events] == [e.name for e in fixed.events]
     assert off(other.q, first.q) < 1e-9
-    assert off(fixed.q[::50], first.q) < 1e-8
+    assert off(fixed.q[::25], first.q) < 1e-7
     dyn = mb.dynamics(model, "lagrangian")
     energy = dyn.kinetic_energy(first.q, first.v) + dyn.potential_energy(first.q)
     assert (np.diff(energy) < 1e-12 * np.abs(energy).max()).all()
