@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -60,7 +60,9 @@ def many_at_rest(count: float) -> Problem:
     for i in range(n + 1):
         b.add_body(f"block{i}", mass=1.0)
         parent = f"block{i - 1}" if i else "world"
-        holds = {"friction": 1.01 * (n + 1 - i) * reach * frequency**2} if i else {"stiffness": (n + 1) * frequency**2}
+        holds: dict[str, Any] = (
+            {"friction": 1.01 * (n + 1 - i) * reach * frequency**2} if i else {"stiffness": (n + 1) * frequency**2}
+        )
         b.add_joint(f"x{i}", "prismatic", parent=parent, child=f"block{i}", axis=(1.0, 0.0, 0.0), **holds)
     q = np.zeros(n + 1)
     q[0] = reach
