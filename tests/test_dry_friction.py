@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import pickle
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.optimize import lsq_linear
 
 import mbkit as mb
 from mbkit.engines.elements.dry_friction import forces_at_rest
-from mbkit.errors import InputError, ModelError, UnsupportedError
+from mbkit.errors import InputError, MbkitWarning, ModelError, UnsupportedError
 from mbkit.model import Model
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
 
@@ -515,3 +516,18 @@ def test_impossible_friction_is_refused_by_name(numbers: dict[str, object], says
     with pytest.raises((ModelError, InputError), match=says) as refusal:
         joint_with(**numbers)
     assert "hinge" in str(refusal.value)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_a_check_of_the_step_sees_no_mode_in_the_jump_of_friction_and_derivatives_at_rest_warn(engine):
+    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
+    b.add_body("m", mass=2.0)
+    b.add_joint("x", "prismatic", parent="world", child="m", axis=(1, 0, 0), friction=3.0, stiffness=50.0)
+    dyn = mb.dynamics(b.build(), engine)
+    run = mb.simulate(dyn, [1.0], [0.0], 0.2, "rk4", 1e-3)
+    assert run.check()
+    with pytest.warns(MbkitWarning, match="dry friction at rest has no derivative"):
+        dyn.linearize([0.1], [0.0], [0.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        dyn.linearize([0.1], [1.0], [0.0])

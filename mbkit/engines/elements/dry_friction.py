@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit.errors import NumericalError, UnsupportedError
+from mbkit._warn import warn
+from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import ROUNDING, DryFrictionLaw, Sliding
 
@@ -124,6 +125,21 @@ class DryFriction:
                 return np.where(still, 0.0, out) if quantity.startswith(_FORWARD) else out
 
             return pushed
+        if quantity == "forward_dynamics_derivatives":
+
+            def of_forward(q: Array, v: Array, tau: Array) -> Array:
+                if law.at_rest(v).any():
+                    warn(
+                        f"{self._model.name}: dry friction at rest has no derivative, and is left out of these; take "
+                        "model.without('friction') to do so knowingly, or velocities that are not zero",
+                        MbkitWarning,
+                    )
+                if not added:
+                    return np.asarray(method(q, v, tau))
+                own = method(q, v, tau + law.force(v))
+                return np.asarray(own + _by_velocity(own[..., 2, :, :] @ law.slope(v)))
+
+            return of_forward
         if quantity in _LOADS:
             place = _LOADS[quantity]
 
@@ -145,13 +161,6 @@ class DryFriction:
             return lambda q, v, *rest: method(q, v, *rest) - law.force(v)
         if quantity == "inverse_dynamics_derivatives":
             return lambda q, v, a: method(q, v, a) - _by_velocity(law.slope(v))
-        if quantity == "forward_dynamics_derivatives":
-
-            def of_forward(q: Array, v: Array, tau: Array) -> Array:
-                own = method(q, v, tau + law.force(v))
-                return np.asarray(own + _by_velocity(own[..., 2, :, :] @ law.slope(v)))
-
-            return of_forward
         return method
 
     def _each(

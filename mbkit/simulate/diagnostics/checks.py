@@ -85,7 +85,7 @@ def diagnostics(
     checks = [gimbal_lock(dyn, q)]
     if not isinstance(setting, Tolerances) and not quick and method.stability is not None:
         # The cause before its consequences.
-        checks.insert(0, step_size(dyn, method, setting, float(t[-1] - t[0]), q[0], v[0]))
+        checks.insert(0, step_size(_smooth(dyn), method, setting, float(t[-1] - t[0]), q[0], v[0]))
     # The forces of a system on paper may drive it.
     if most >= 2 and not (driven or model.constraints_do_work or (not model.has_bodies and model.needs.damping)):
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
@@ -107,6 +107,12 @@ def diagnostics(
         with suppress(MbkitError, np.linalg.LinAlgError):
             signs += check
     return signs
+
+
+def _smooth(dyn: Dynamics) -> Dynamics:
+    """Return the dynamics between jumps of dry friction, which no step goes across."""
+    bare = dyn.model.without("friction")
+    return dyn._of_model(bare, bare.form_digest) if dyn.model.needs.friction else dyn
 
 
 class _Sample:
