@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -72,7 +72,7 @@ class VersionDynamics(MappedDynamics):
         self.version = version
         super().__init__(model)
         self._convention = version.package.convention
-        self._data, self._names = travelling(version.engine, version.package.steps, model)
+        self._data, self._names = self._travelling()
         self._process, self._key, self._held = process_of(version), new_key(), 0
         weakref.finalize(self, self._process.unneeded.append, self._key)
         self._build()
@@ -129,6 +129,10 @@ class VersionDynamics(MappedDynamics):
         together = size and getattr(method, "__name__", "") in _STACKED
         return method(*states, *more) if together else super()._value(method, states, more, size)
 
+    def _travelling(self) -> tuple[dict[str, Any], Mapping[str, Sequence[str]]]:
+        """Return what is sent, and the engine's joints of each joint."""
+        return travelling(self.version.engine, self.version.package.steps, self.model)
+
     def _build(self) -> None:
         """Send the model, to a process that does not hold it yet."""
         self._held = self._process.start()
@@ -136,7 +140,11 @@ class VersionDynamics(MappedDynamics):
             head, _ = self._call("build", **self._data)
         except RemoteError as error:
             raise UnsupportedError(f"{self.engine}: refuses {self.model.name}: {error}") from None
-        self._places = places(self._convention, self.model, self._names, head["joints"])
+        self._place(head["joints"])
+
+    def _place(self, joints: Mapping[str, Any]) -> None:
+        """Take the places of the engine's coordinates."""
+        self._places = places(self._convention, self.model, self._names, joints)
         self._v_index = self._places.v_index
 
     def _ask(self, name: str, *arrays: Array, **plain: Any) -> list[Array]:

@@ -45,6 +45,8 @@ class Package(NamedTuple):
         Environment variables of its process; ``{environment}`` in one stands for the environment's folder.
     limit : float
         Seconds that one evaluation may take, compiling included.
+    importer : str
+        Its file in `remote` that describes what its own importer reads; empty where there is none.
     """
 
     distribution: str
@@ -60,6 +62,7 @@ class Package(NamedTuple):
     file: str = ""
     variables: Mapping[str, str] = {}
     limit: float = 60.0
+    importer: str = ""
 
 
 _MUJOCO: Final = Convention((0, 1, 2, 6, 3, 4, 5), ball_q=(3, 0, 1, 2), turned={"free": (0,)})
@@ -107,6 +110,7 @@ PACKAGES: Final[dict[str, Package]] = {
         extra="[sim]",
         variables=_WARP,
         limit=_COMPILING,
+        importer="newton_importer",
     ),
     "mujoco-warp": Package(
         *("mujoco-warp", "mujoco_warp", 590, 20, _MUJOCO),

@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import metadata
 from operator import itemgetter
 from pathlib import Path
@@ -20,7 +21,19 @@ from mbkit._check import Array, count, real
 from mbkit._child_process import WorkerDiedError, WorkerStartError, WorkerTimeoutError
 from mbkit.engines.imported import IMPORTERS, Beside, Imported, Importer, check_installed, reader
 from mbkit.engines.registry import MUJOCO
-from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
+from mbkit.engines.versions import own_importer
+from mbkit.engines.versions.engine_version import EngineVersion, names_version
+from mbkit.engines.versions.engine_version import engine as engine_of
+from mbkit.errors import (
+    EngineProcessError,
+    InputError,
+    MbkitError,
+    MbkitWarning,
+    NumericalError,
+    OutputError,
+    UnknownNameError,
+    UnsupportedError,
+)
 from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
@@ -121,6 +134,29 @@ class Reading:
                 return f"its importer: {error}"
             return f"its importer ended the process with {error.signal}" + (f" ({error.last})" if error.last else "")
         return describe(error).removeprefix(f"{self._engine}: ")
+
+
+class RemoteReading:
+    """The same of an importer in an environment of its own, which has the time of its engine."""
+
+    def __init__(self, version: EngineVersion, file: Stripped, floating_base: bool) -> None:
+        self._version, self._file = version, (file.text, file.format, floating_base, file.meshes)
+
+    def result(self) -> Imported:
+        """Return the reading; raises `ImporterError`."""
+        read = _telling(self._version, own_importer.read, self._version, *self._file)
+        return replace(read, terms=partial(_telling, self._version, read.terms))
+
+    def end(self) -> None:
+        """Do nothing: nothing was begun."""
+
+
+def _telling(version: EngineVersion, function: Callable[..., Any], *args: Any) -> Any:
+    """Return what a function of an engine's process gives; raises `ImporterError`."""
+    try:
+        return function(*args)
+    except (UnsupportedError, UnknownNameError, NumericalError, EngineProcessError, OutputError) as error:
+        raise ImporterError(str(error).removeprefix(f"{version}: ")) from None
 
 
 def _read(
@@ -336,7 +372,7 @@ def with_own_terms(
 
 def compare_parsers(
     source: str | os.PathLike[str],
-    importers: Sequence[str] = tuple(IMPORTERS),
+    importers: Sequence[str | EngineVersion] = tuple(IMPORTERS),
     *,
     floating_base: bool = False,
     samples: int = 3,
@@ -379,19 +415,18 @@ def compare_parsers(
         The base of an MJCF is to float, and no single body stands still in its world.
     """
     begun = time.perf_counter()
-    for name in importers:
-        if name not in IMPORTERS:
-            raise UnknownNameError("importer", str(name), IMPORTERS)
-    if isinstance(importers, str) or not importers:
-        raise InputError(f"importers: expected some of {', '.join(IMPORTERS)}, got {importers!r}")
+    if isinstance(importers, (str, EngineVersion)) or not importers:
+        raise InputError(f"importers: expected some of {', '.join(_known())}, got {importers!r}")
+    remote = _remote(importers)
     asked: dict[str, Any] = {"samples": count("samples", samples, least=1), "seed": count("seed", seed)}
     asked["tolerance"] = real("tolerance", tolerance, positive=True)
     real("seconds", seconds, positive=True)
     stripped = strip(_path(source), floating_base=floating_base)
-    engines = tuple(dict.fromkeys(importers))
+    engines = tuple(dict.fromkeys(str(remote.get(x, x)) for x in importers))
+    elsewhere = {version.name: version for version in remote.values()}
     parsed: dict[str, Parsed] = {}
     with _lock:
-        read, refused = _readings(stripped, engines, floating_base, seconds)
+        read, refused = _readings(stripped, engines, elsewhere, floating_base, seconds)
         reference, label, faults = _reference(stripped, read, floating_base)
         loops = _written_loops(stripped, reference, floating_base)
         for engine, imported in read.items():
@@ -418,14 +453,21 @@ def compare_parsers(
 
 
 def _readings(
-    stripped: Stripped, engines: Sequence[str], floating_base: bool, seconds: float
+    stripped: Stripped,
+    engines: Sequence[str],
+    elsewhere: Mapping[str, EngineVersion],
+    floating_base: bool,
+    seconds: float,
 ) -> tuple[dict[str, Imported], dict[str, str]]:
     """Return each importer's reading of a file, and why the others refuse it; all read at the same time."""
-    begun: dict[str, Reading] = {}
+    begun: dict[str, Reading | RemoteReading] = {}
     read: dict[str, Imported] = {}
     refused: dict[str, str] = {}
     try:
         for engine in engines:
+            if engine in elsewhere:
+                begun[engine] = RemoteReading(elsewhere[engine], stripped, floating_base)
+                continue
             try:
                 check_installed(engine)
                 begun[engine] = Reading(engine, stripped, floating_base, seconds)
@@ -570,7 +612,24 @@ def _notes(stripped: Stripped) -> list[str]:
     return out
 
 
+def _known() -> tuple[str, ...]:
+    return (*IMPORTERS, *own_importer.importers())
+
+
+def _remote(importers: Sequence[str | EngineVersion]) -> dict[str | EngineVersion, EngineVersion]:
+    """Return the importers in environments of their own among some; raises `UnknownNameError`."""
+    out = {}
+    for x in importers:
+        if isinstance(x, EngineVersion) or names_version(x):
+            out[x] = x if isinstance(x, EngineVersion) else engine_of(x)
+        if (out[x].package.importer if x in out else x in IMPORTERS) in ("", False):
+            raise UnknownNameError("importer", str(x), _known())
+    return out
+
+
 def _version(engine: str) -> str:
+    if "==" in engine:
+        return engine.partition("==")[2]
     try:
         return metadata.version(IMPORTERS[engine].distribution)
     except metadata.PackageNotFoundError:

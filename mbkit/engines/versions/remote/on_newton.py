@@ -40,6 +40,7 @@ class Engine:
                 self._free.append((at, b.joint_q_start[j], b.joint_child[j]))
         self._models: dict[tuple[int, bool], Any] = {}
         self._solvers: dict[tuple[int, str], Any] = {}
+        self._validated = False
 
     def joints(self) -> dict[str, Any]:
         """Return the places of each joint's numbers in joint_q and joint_qd."""
@@ -53,8 +54,10 @@ class Engine:
         if (n, passive) not in self._models:
             worlds = newton.ModelBuilder(gravity=tuple(self._builder.gravity))
             worlds.replicate(self._builder, n)
+            # By name, where it is asked what it changes.
+            worlds.validate_inertia_detailed = self._validated
             # What a description says is judged, not what a validation makes of it.
-            model = worlds.finalize(device="cpu", skip_validation_inertia=True)
+            model = worlds.finalize(device="cpu", skip_validation_inertia=not self._validated)
             if not passive:
                 model.joint_damping.zero_()
                 model.joint_stiffness.zero_()

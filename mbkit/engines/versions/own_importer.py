@@ -1,0 +1,102 @@
+"""What an engine in an environment of its own reads from a file by its own importer, described as it is."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit._check import Array
+from mbkit.engines.imported import Imported, Parts, checked, written
+from mbkit.engines.versions.dynamics import VersionDynamics
+from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion
+from mbkit.engines.versions.process import RemoteError, new_key, process_of
+from mbkit.errors import UnsupportedError
+from mbkit.load.urdf_reader import BASE_JOINT
+from mbkit.model import Coupler, Model
+from mbkit.model.joint_types import kind_of
+
+#: What Newton calls the joint of a base that floats.
+_BASES: Final = ("floating_base", "base_joint")
+
+
+def importers() -> tuple[str, ...]:
+    """Return the engines whose importers are judged in an environment of their own."""
+    return tuple(name for name, package in PACKAGES.items() if package.importer)
+
+
+def read(version: EngineVersion, text: str, format_: str, floating_base: bool, files: Mapping[str, bytes]) -> Imported:
+    """Return an importer's reading of a text; an MJCF says by itself that its base floats.
+
+    Raises `UnsupportedError` where it refuses the text, and `EngineProcessError` where it ends its process or takes
+    longer than `version.seconds`.
+    """
+    dyn = _Read(version, text, format_, floating_base, files)
+    said = dyn.said
+    notes = [*said["notes"]]
+    if said["loops"]:
+        notes.append(f"joints that close a loop, in none of the terms: {', '.join(said['loops'])}")
+    if said["drives"]:
+        notes.append(f"joints with a drive, which no term has: {', '.join(said['drives'])}")
+    couplers = tuple(Coupler(*x) for x in said["couplers"])
+    return Imported(dyn.model, dyn.terms, tuple(notes), couplers=couplers, holds_mimics=said["holds"] * bool(couplers))
+
+
+class _Read(VersionDynamics):
+    """An engine on its own reading of a file."""
+
+    def __init__(self, version: EngineVersion, *file: Any) -> None:
+        self.version, self._file = version, file
+        self._own_key = new_key()
+        process = process_of(version)
+        weakref.finalize(self, process.unneeded.append, self._own_key)
+        self._generation = process.start()
+        self.said = self._import()
+        super().__init__(checked(version.name, _model(version.engine, self.said)), version)
+
+    def _import(self) -> dict[str, Any]:
+        text, format_, floating, files = self._file
+        ask = partial(process_of(self.version).call, "import", (), self._own_key, self.version.seconds)
+        try:
+            with written(text, files) as path:
+                module = self.version.package.importer
+                return ask(module=module, path=str(path), format_=format_, floating=floating)[0]
+        except RemoteError as error:
+            raise UnsupportedError(f"{self.version}: {error}") from None
+
+    def _travelling(self) -> tuple[dict[str, Any], Mapping[str, Sequence[str]]]:
+        return {}, {j.name: (j.name,) for j in self.model.joints}
+
+    def _build(self) -> None:
+        self._held, self._key = self._process.start(), self._own_key
+        if self._held != self._generation:
+            # The process that held the reading has died since.
+            self._import()
+            self._generation = self._held
+        self._place(self.said["places"])
+
+    def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:
+        """Return M, g, nle and passive at a batch of states."""
+        out = {"M": self._mass_matrix(q), "g": self._gravity(q), "nle": self._nle(q, v), "passive": self._passive(q, v)}
+        return {name: np.asarray(x, float) for name, x in out.items()}
+
+
+def _model(name: str, said: Mapping[str, Any]) -> Model:
+    """Return the description that an importer's file in `remote` sent as plain data."""
+    parts = Parts()
+    for body, mass, com, inertia in said["bodies"]:
+        parts.body(body, mass, np.array(com), np.array(inertia))
+    for (joint, kind, parent, child, R, p), numbers in said["joints"]:
+        values = {k: np.array([_SIGN[k] * np.inf if y is None else y for y in x]) for k, x in numbers.items() if k in _SIGN}
+        values |= {k: np.array(x) for k, x in numbers.items() if k not in _SIGN}
+        if kind == "revolute" and np.isinf(values["lower"]).all() and np.isinf(values["upper"]).all():
+            kind = "continuous"
+        parts.joint(joint, kind, parent, child, np.array(R), np.array(p), **values)
+    return parts.model(name, np.array(said["gravity"]))
+
+
+#: The infinity that stands for no limit.
+_SIGN: Final = {"lower": -1.0, "upper": 1.0, "velocity_limit": 1.0, "effort_limit": 1.0}
