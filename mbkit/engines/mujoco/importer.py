@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -51,13 +51,28 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
         except Exception as error:
             lines = " ".join(str(error).split())
             raise UnsupportedError(f"mujoco: {lines.removeprefix('XML Error: ').removeprefix('Error: ')}") from None
-    described, extras = _Description(m), list(_extras(m))
-    dyn = _Read.of(checked("mujoco", described.model), m, described.numbers, {x.key: y for x, y in extras})
-    notes = (*_constraints(m), *_rubbing(m), *(" ".join(w.split()) for w in heard))
-    beside = tuple(x._replace(without=described.without(x.key)) if x.key in described.parts else x for x, _ in extras)
-    couplers = described.couplers()
-    held = "by soft equality constraints" if couplers else ""
-    return Imported(described.model, dyn.terms, notes, beside, described.loops(), couplers, held)
+    described = Described("mujoco", m)
+    dyn = _Read.of(checked("mujoco", described.model), m, described.numbers, described.removals)
+    return described.imported(dyn.terms, [" ".join(w.split()) for w in heard])
+
+
+class Described:
+    """A compiled model, or what has its numbers and names, with all that acts in it."""
+
+    def __init__(self, name: str, m: Any) -> None:
+        self._description, extras = _Description(m), list(_extras(m))
+        self.model, self.numbers = replace(self._description.model, name=name), self._description.numbers
+        self._beside, self._constraints = [x for x, _ in extras], (*_constraints(m), *_rubbing(m))
+        #: By key of `Beside`: takes it out of a compiled model.
+        self.removals = {x.key: remove for x, remove in extras}
+
+    def imported(self, terms: Callable[..., dict[str, Array]], said: Sequence[str]) -> Imported:
+        """Return the reading, with the terms of the engine that holds it and what it said."""
+        own = self._description
+        beside = tuple(x._replace(without=own.without(x.key)) if x.key in own.parts else x for x in self._beside)
+        couplers = own.couplers()
+        held = "by soft equality constraints" if couplers else ""
+        return Imported(self.model, terms, (*self._constraints, *said), beside, own.loops(), couplers, held)
 
 
 def _floating(text: str) -> Any:

@@ -88,6 +88,7 @@ _MJX: Final = Package(
     file="mjx",
     variables={**_JAX, "JAX_ENABLE_X64": "1"},
     limit=_COMPILING,
+    importer="mujoco_importer",
 )
 #: Engines with a file of their own in `remote`.
 PACKAGES: Final[dict[str, Package]] = {
@@ -120,6 +121,7 @@ PACKAGES: Final[dict[str, Package]] = {
         file="mujoco_warp",
         variables=_WARP,
         limit=_COMPILING,
+        importer="mujoco_importer",
     ),
     "mjx": _MJX,
     "mjx-single": _MJX._replace(bits=24, variables=_JAX),

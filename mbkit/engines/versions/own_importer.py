@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import weakref
 from collections.abc import Mapping, Sequence
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -15,12 +17,10 @@ from mbkit.engines.versions.dynamics import VersionDynamics
 from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion
 from mbkit.engines.versions.process import RemoteError, new_key, process_of
 from mbkit.errors import UnsupportedError
-from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.model import Coupler, Model
-from mbkit.model.joint_types import kind_of
 
-#: What Newton calls the joint of a base that floats.
-_BASES: Final = ("floating_base", "base_joint")
+#: The file in `remote` of engines that take MuJoCo's model.
+_MUJOCO: Final = "mujoco_importer"
 
 
 def importers() -> tuple[str, ...]:
@@ -34,28 +34,21 @@ def read(version: EngineVersion, text: str, format_: str, floating_base: bool, f
     Raises `UnsupportedError` where it refuses the text, and `EngineProcessError` where it ends its process or takes
     longer than `version.seconds`.
     """
-    dyn = _Read(version, text, format_, floating_base, files)
-    said = dyn.said
-    notes = [*said["notes"]]
-    if said["loops"]:
-        notes.append(f"joints that close a loop, in none of the terms: {', '.join(said['loops'])}")
-    if said["drives"]:
-        notes.append(f"joints with a drive, which no term has: {', '.join(said['drives'])}")
-    couplers = tuple(Coupler(*x) for x in said["couplers"])
-    return Imported(dyn.model, dyn.terms, tuple(notes), couplers=couplers, holds_mimics=said["holds"] * bool(couplers))
+    return (_OfMujoco if version.package.importer == _MUJOCO else _Read)(version, text, format_, floating_base, files).imported()
 
 
 class _Read(VersionDynamics):
     """An engine on its own reading of a file."""
 
-    def __init__(self, version: EngineVersion, *file: Any) -> None:
-        self.version, self._file = version, file
-        self._own_key = new_key()
+    def __init__(self, version: EngineVersion, *file: Any, changes: Mapping[str, Any] | None = None) -> None:
+        self.version, self._file, self._own_key = version, file, new_key()
+        #: Numbers to set in the model before it is held.
+        self._changes = {} if changes is None else {"changes": changes}
         process = process_of(version)
         weakref.finalize(self, process.unneeded.append, self._own_key)
         self._generation = process.start()
         self.said = self._import()
-        super().__init__(checked(version.name, _model(version.engine, self.said)), version)
+        super().__init__(checked(version.name, self._described()), version)
 
     def _import(self) -> dict[str, Any]:
         text, format_, floating, files = self._file
@@ -63,9 +56,23 @@ class _Read(VersionDynamics):
         try:
             with written(text, files) as path:
                 module = self.version.package.importer
-                return ask(module=module, path=str(path), format_=format_, floating=floating)[0]
+                return ask(module=module, path=str(path), format_=format_, floating=floating, **self._changes)[0]
         except RemoteError as error:
             raise UnsupportedError(f"{self.version}: {error}") from None
+
+    def _described(self) -> Model:
+        return _model(self.version.engine, self.said)
+
+    def imported(self) -> Imported:
+        """Return the reading."""
+        said = self.said
+        notes = [*said["notes"]]
+        if said["loops"]:
+            notes.append(f"joints that close a loop, in none of the terms: {', '.join(said['loops'])}")
+        couplers = tuple(Coupler(*x) for x in said["couplers"])
+        return Imported(
+            self.model, self.terms, tuple(notes), couplers=couplers, holds_mimics=said["holds"] * bool(couplers)
+        )
 
     def _travelling(self) -> tuple[dict[str, Any], Mapping[str, Sequence[str]]]:
         return {}, {j.name: (j.name,) for j in self.model.joints}
@@ -79,9 +86,51 @@ class _Read(VersionDynamics):
         self._place(self.said["places"])
 
     def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:
-        """Return M, g, nle and passive at a batch of states."""
+        """Return M, g, nle and passive at a batch of states, without some of what acts beside bodies and joints."""
+        if without:
+            return self._less(without).terms(q, v)
         out = {"M": self._mass_matrix(q), "g": self._gravity(q), "nle": self._nle(q, v), "passive": self._passive(q, v)}
         return {name: np.asarray(x, float) for name, x in out.items()}
+
+
+    def _less(self, without: tuple[str, ...]) -> _Read:
+        raise NotImplementedError
+
+
+class _OfMujoco(_Read):
+    """The same of MuJoCo's model as `put_model` holds it."""
+
+    def __init__(self, version: EngineVersion, *file: Any, changes: Mapping[str, Any] | None = None) -> None:
+        super().__init__(version, *file, changes=changes or {})
+
+    def _described(self) -> Model:
+        # The import loads MuJoCo.
+        from mbkit.engines.mujoco import importer
+
+        self._held_model = _HeldModel(self.said)
+        self._reading = importer.Described(self.version.engine, self._held_model)
+        return self._reading.model
+
+    def imported(self) -> Imported:
+        return self._reading.imported(self.terms, self.said["notes"])
+
+    def _less(self, without: tuple[str, ...]) -> _Read:
+        m = copy.deepcopy(self._held_model)
+        for key in without:
+            self._reading.removals[key](m)
+        before = vars(self._held_model)
+        changes = {k: x.tolist() for k, x in vars(m).items() if isinstance(x, np.ndarray) and (x != before[k]).any()}
+        return type(self)(self.version, *self._file, changes=changes)
+
+
+class _HeldModel:
+    """The numbers and names of a compiled model, as `mujoco.MjModel` has them."""
+
+    def __init__(self, said: Mapping[str, Any]) -> None:
+        vars(self).update({name: np.array(x) if isinstance(x, list) else x for name, x in said["fields"].items()})
+        self.opt = SimpleNamespace(**{k: np.array(x) if isinstance(x, list) else x for k, x in said["opt"].items()})
+        for kind, names in said["labels"].items():
+            setattr(self, kind, [SimpleNamespace(name=x) for x in names].__getitem__)
 
 
 def _model(name: str, said: Mapping[str, Any]) -> Model:

@@ -51,7 +51,7 @@ class Imported(Engine):
         return _Description(self, m, elements).data | {"notes": [*dict.fromkeys(heard)]}
 
 
-def imported(path: str, format_: str, floating: bool) -> tuple[Any, dict[str, Any]]:
+def imported(adapter: Any, path: str, format_: str, floating: bool) -> tuple[Any, dict[str, Any]]:  # noqa: ARG001
     """Return the engine of a file that Newton reads, and the description of what it read."""
     builder, heard = newton.ModelBuilder(), []
     with warnings.catch_warnings(record=True) as said:
@@ -73,12 +73,13 @@ class _Description:
     """Reads a finalized model of one world joint by joint."""
 
     def __init__(self, engine: Imported, m: Any, elements: list[Any]) -> None:
-        self._m, self._taken = m, Counter[str]()
+        self._m, self._taken = m, Counter(("world",))
         #: By what Newton's labels end with.
         self._names = {_plain(x): x for x in (e.get("name") for e in elements) if x}
         self._slides = {e.get("name") for e in elements if e.tag == "joint" and e.get("type") == "slide"}
         self._labels = m.joint_label, m.body_label
         self._of = {k: getattr(m, x).numpy().astype(float) for k, x in _NUMBERS.items() if getattr(m, x) is not None}
+        self._drive()
         axes, dims = m.joint_axis.numpy().astype(float), m.joint_dof_dim.numpy()
         starts = m.joint_q_start.numpy().tolist(), m.joint_qd_start.numpy().tolist()
         placed = [m.joint_X_p.numpy().astype(float), m.joint_X_c.numpy().astype(float)]
@@ -122,11 +123,16 @@ class _Description:
         engine._places = self.data["places"]
         self.data["loops"] = loops
         self._couple(own)
-        drives = [own[j] for j in own if np.any(m.joint_target_ke.numpy()[self._velocities(own[j])])]
-        self.data["drives"] = [name for some in drives for name in some]
 
-    def _velocities(self, names: list[str]) -> list[int]:
-        return [k for name in names for k in self.data["places"][name][1]]
+    def _drive(self) -> None:
+        """Add drives at zero control to springs and dampers: they act as these in Newton's solvers."""
+        m, of = self._m, self._of
+        on = m.joint_target_mode.numpy() != 0
+        stiffness = of["stiffness"] + on * m.joint_target_ke.numpy()
+        pull = of["stiffness"] * of["rest"] + (on * m.joint_target_ke.numpy() * _targets(m))
+        of["damping"] = of["damping"] + on * m.joint_target_kd.numpy()
+        of["rest"] = np.where(stiffness > 0, pull / np.where(stiffness > 0, stiffness, 1.0), 0.0)
+        of["stiffness"] = stiffness
 
     def _label(self, what: int, k: int) -> str:
         """Return the name in the file of a joint (0) or body (1): Newton puts the names above it before."""
@@ -182,6 +188,18 @@ class _Description:
             some = []
         for j, leader, offset, ratio in some:
             self.data["couplers"].append(["", own[j][0], own[leader][0], ratio, offset])
+
+
+def _targets(m: Any) -> Any:
+    """Return the target of each velocity's drive; joints that turn freely have none."""
+    q, at = m.joint_target_q.numpy().astype(float), np.zeros(m.joint_dof_count)
+    starts = m.joint_target_q_start.numpy() if m.joint_target_q_start is not None else m.joint_qd_start.numpy()
+    first, ends = m.joint_qd_start.numpy(), [*m.joint_qd_start.numpy()[1:], m.joint_dof_count]
+    for j in range(m.joint_count):
+        n = ends[j] - first[j]
+        if n <= len(q) - starts[j]:
+            at[first[j] : ends[j]] = q[starts[j] : starts[j] + n]
+    return at
 
 
 def _matrix(x: Any) -> Any:

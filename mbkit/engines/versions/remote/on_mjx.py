@@ -24,14 +24,19 @@ VERSION = version("mujoco-mjx")
 _LEAST = 16
 
 
+def put(m: Any) -> Any:
+    """Return a model as MJX holds it."""
+    return mjx.put_model(m)
+
+
 class Engine:
     """A model on JAX, with all off that its smooth dynamics do not need. Each method takes a stack of states."""
 
     STACKED = True
 
-    def __init__(self, m: Any) -> None:
-        self._m = smooth(m)
-        self._mx = mjx.put_model(m)
+    def __init__(self, m: Any, acting: bool = False) -> None:
+        self._m, self._acting = smooth(m, acting), acting
+        self._mx = put(m)
         self._d = mjx.make_data(self._mx)
         self._gravity = np.array(m.opt.gravity)
         self._compiled: dict[Any, Any] = {}
@@ -58,7 +63,10 @@ class Engine:
         def terms(q: Any, v: Any, gravity: Any) -> Any:
             mx = self._mx.replace(opt=self._mx.opt.replace(gravity=gravity))
             d = mjx.fwd_velocity(mx, mjx.fwd_position(mx, self._d.replace(qpos=q, qvel=v)))
-            return mjx.full_m(mx, d), d.qfrc_bias, d.qfrc_passive, d.xipos
+            passive = d.qfrc_passive
+            if self._acting:
+                passive += mjx.fwd_actuation(mx, d).qfrc_actuator
+            return mjx.full_m(mx, d), d.qfrc_bias, passive, d.xipos
 
         v = np.zeros((len(q), self._m.nv)) if v is None else v
         return self._over("terms", terms, q, v, shared=(self._gravity if gravity is None else gravity,))

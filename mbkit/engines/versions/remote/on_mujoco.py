@@ -27,9 +27,11 @@ def parsed(text: str, format_: str) -> Any:  # noqa: ARG001  # MuJoCo sees it in
     return mujoco.MjModel.from_xml_string(text)
 
 
-def smooth(m: Any) -> Any:
-    """Return a model with all off that its smooth dynamics do not need."""
+def smooth(m: Any, acting: bool = False) -> Any:
+    """Return a model with all off that its smooth dynamics do not need; actuators may stay `acting`."""
     for name in _OFF:
+        if acting and name == "ACTUATION":
+            continue
         m.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, "mjDSBL_" + name, 0))
     m.opt.jacobian = int(mujoco.mjtJacobian.mjJAC_DENSE)
     return m

@@ -22,18 +22,23 @@ VERSION = mjw.__version__
 _METHODS = ("euler", "implicitfast", "rk4")
 
 
+def put(m: Any) -> Any:
+    """Return a model as Warp holds it."""
+    with wp.ScopedDevice("cpu"):
+        return mjw.put_model(m)
+
+
 class Engine:
     """A model on Warp, with all off that its smooth dynamics do not need. Each method takes a stack of states."""
 
     STACKED = True
 
-    def __init__(self, m: Any) -> None:
-        self._m = smooth(m)
+    def __init__(self, m: Any, acting: bool = False) -> None:
+        self._m, self._acting = smooth(m, acting), acting
         # It refuses flags that it has no counterpart of.
         m.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         m.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
-        with wp.ScopedDevice("cpu"):
-            self._w = mjw.put_model(m)
+        self._w = put(m)
         self._data: dict[int, Any] = {}
 
     def joints(self) -> Any:
@@ -86,7 +91,11 @@ class Engine:
             self._w.opt.gravity.assign(before)
 
     def passive(self, q: Any, v: Any) -> Any:
-        return self._placed(q, v).qfrc_passive.numpy()
+        d = self._placed(q, v)
+        if not self._acting:
+            return d.qfrc_passive.numpy()
+        mjw.fwd_actuation(self._w, d)
+        return d.qfrc_passive.numpy() + d.qfrc_actuator.numpy()
 
     def inverse_dynamics(self, q: Any, v: Any, a: Any) -> Any:
         d = self._at(q, v)

@@ -107,7 +107,8 @@ def _answer(adapter: Any, held: dict[int, Any], head: dict[str, Any], arrays: li
         held[key] = adapter.Engine(adapter.parsed(head["with"]["text"], head["with"]["format"]))
         return packed({"joints": held[key].joints()})
     if name == "import":
-        held[key], said = importlib.import_module(head["with"].pop("module")).imported(**head["with"])
+        module = importlib.import_module(head["with"].pop("module"))
+        held[key], said = module.imported(adapter, **head["with"])
         return packed(said)
     if name == "forget":
         held.pop(key, None)
