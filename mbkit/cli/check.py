@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from mbkit import _interrupt
 from mbkit.cli import _shared as shared
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     "mbkit check panda",
     "mbkit check arm.urdf --floating-base --engines pinocchio,mujoco",
     "mbkit check panda --own-parsers",
+    "mbkit check panda --own-parsers --engines mujoco,newton",
     "mbkit check --all --no-rollouts",
 )
 @click.argument("target", required=False)
@@ -52,8 +54,9 @@ def check(
     TARGET is a robot (mbkit robots lists them), a catalog system, a path to a URDF or
     MJCF file, or package.module:function for a function that returns a Model. Printed are the verdict, what the
     file has that no engine uses, faults, and each engine's worst row; --full and the page have the rest. With
-    --own-parsers it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves; with --floating-base
-    its base moves freely in all of them.
+    --own-parsers it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves, or those of --engines:
+    newton, mujoco-warp and mjx too, in environments of their own; with --floating-base its base moves freely in all of
+    them.
     """
     others = {"--all": everything, "--no-rollouts": no_rollouts} | dict.fromkeys(
         options.keys() - {"floating_base"}, True
@@ -61,7 +64,7 @@ def check(
     if own_parsers and (target is None or any(others.values())):
         given = [f"--{name.strip('-').replace('_', '-')}" for name, on in others.items() if on]
         raise click.UsageError(
-            "--own-parsers takes one TARGET as it is written, and --floating-base, --seed, --json and --out"
+            "--own-parsers takes one TARGET as it is written, and --engines, --floating-base, --seed, --json and --out"
             + (f"; not {', '.join(given)}" if given else "")
         )
     if everything and (target is not None or "nonphysical" in options):
@@ -70,7 +73,11 @@ def check(
         raise click.UsageError("--full goes with one TARGET; --all and --own-parsers print everything")
     if not everything and jobs is not None:
         raise click.UsageError("--jobs goes with --all")
-    if not own_parsers:
+    if own_parsers:
+        # Not those that the comparison of terms takes by default.
+        named = click.get_current_context().get_parameter_source("engines") is not ParameterSource.DEFAULT
+        options |= {"importers": settings["engines"]} if named else {}
+    else:
         shared.check_engines(settings["engines"], least=2)
     report.prepare()
     if everything:
