@@ -79,7 +79,7 @@ def importers_view(result: ParserComparison) -> Document:
         *(_importer(p) for p in read),
     ]
     plural = "s" * (result.samples != 1)
-    refused = [Bullet(f"{p.engine} {p.version}", p.refused, "✗", "bad") for p in result.importers if p.refused]
+    refused = [Bullet(p.label, p.refused, "✗", "bad") for p in result.importers if p.refused]
     notes = [Bullet("the file", note) for note in (*([result.faults] if result.faults else []), *result.notes)]
     notes += [Bullet(p.engine, note) for p in (*read, *alone) for note in p.notes]
     fused = (
@@ -129,7 +129,7 @@ def _importers_sentence(result: ParserComparison, read: list[Parsed]) -> str:
 
 
 def _importer(p: Parsed) -> Column:
-    return Column(f"{p.engine} {p.version}", lambda k: _stage(p.stages[k]))
+    return Column(p.label, lambda k: _stage(p.stages[k]))
 
 
 def _setting(result: ParserComparison, read: list[Parsed], alone: list[Parsed]) -> str:

@@ -257,6 +257,10 @@ def _inertia_difference(
             return "quaternion order", "has the inertia in axes whose quaternion was read in the wrong order"
         axes = f"{number_text(a.inertia)} -> {number_text(b.inertia)} kg m²"
         return "inertia axes", f"has the same principal moments in other axes: {axes}"
+    # Newton's correction of an inertia that no body can have, or of less than 1e-6 kg m².
+    more = np.trace(b.inertia - a.inertia) / 3
+    if more > 0 and near.inertia(a.inertia + more * np.eye(3), b.inertia, a.mass):
+        return "corrected inertia", f"has {number_text(float(more))} kg m² more about every axis"
     factor = np.trace(b.inertia) / np.trace(a.inertia) if np.trace(a.inertia) else 0.0
     if near.inertia(factor * a.inertia, b.inertia, a.mass):
         return "inertia", f"has {number_text(float(factor))} times the inertia"

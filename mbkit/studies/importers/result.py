@@ -54,6 +54,11 @@ class Parsed:
     _derived: ClassVar = ("agrees",)
 
     @property
+    def label(self) -> str:
+        """The importer and its version."""
+        return self.engine if "==" in self.engine else f"{self.engine} {self.version}"
+
+    @property
     def agrees(self) -> bool:
         """Whether it moves as the reference does, mimic joints left free and loops open."""
         return bool(self.stages) and all(s.same for s in self.stages if s.name in DECIDING)

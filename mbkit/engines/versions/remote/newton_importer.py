@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from typing import Any
 
 _KINDS = {"REVOLUTE": "revolute", "PRISMATIC": "prismatic", "BALL": "ball", "FREE": "free", "FIXED": "fixed"}
+#: What its validation says of a body.
+_OF_BODY = re.compile(r"for body '([^']+)'")
 #: Newton's numbers of velocities, and the description's.
 _NUMBERS = {
     **{name: "joint_" + name for name in ("armature", "damping", "friction", "stiffness")},
@@ -47,7 +49,11 @@ class Imported(Engine):
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             m = self._model(1, True)[0]
-        heard += [" ".join(str(w.message).split()) for w in said]
+        checks = [" ".join(str(w.message).split()) for w in said]
+        found = [_OF_BODY.search(text) for text in checks]
+        heard += [text for text, of_body in zip(checks, found) if not of_body]
+        if names := [*dict.fromkeys(x[1].rsplit("/", maxsplit=1)[-1] for x in found if x)]:
+            heard.append(f"its validation corrected the inertia of {', '.join(names)}")
         return _Description(self, m, elements).data | {"notes": [*dict.fromkeys(heard)]}
 
 
