@@ -3,6 +3,9 @@
 Run ``python -m validation.importers``; it writes ``validation/importers.json``, with the base held still, and
 ``validation/importers_floating.json``, with a floating base, in about a minute.
 
+``python -m validation.importers newton mujoco-warp`` measures importers in environments of their own, with the base held
+still, and keeps the columns of the others in ``validation/importers_trained.json``: some minutes each.
+
 For each robot and importer: whether it moves as the file says, why not, and the lines of the file
 that make the difference, so that each cause can be checked by eye. With a floating base the reasons
 alone, of those that do not agree.
@@ -12,6 +15,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -78,8 +82,25 @@ def briefly(p: Parsed) -> dict[str, Any]:
     return {"status": "differs", "worst": worst, "causes": says, "explained": p.explanation.explained}
 
 
+def trained(names: list[str]) -> None:
+    """Measure importers in environments of their own, and write after each robot."""
+    path = HERE / "importers_trained.json"
+    held = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    table: dict[str, Any] = held.get("robots", {})
+    for robot in robots():
+        result = compare_parsers(robot.path, names)
+        root, lines = xml_reader.read(robot.path), robot.path.read_text(encoding="utf-8").splitlines()
+        row = {p.engine.partition("==")[0]: told(p, root, lines) for p in result.importers if p.stages or p.refused}
+        table[robot.name] = table.get(robot.name, {}) | row
+        path.write_text(json.dumps(stamp() | {"robots": to_plain(table)}, indent=1) + "\n", encoding="utf-8")
+        print(f"{robot.name}: {result.verdict}", flush=True)
+
+
 def main() -> None:
     """Run and write."""
+    if sys.argv[1:]:
+        trained(sys.argv[1:])
+        return
     table: dict[str, Any] = {}
     floating: dict[str, Any] = {}
     for robot in robots():

@@ -120,7 +120,9 @@ class _OfMujoco(_Read):
             self._reading.removals[key](m)
         before = vars(self._held_model)
         changes = {k: x.tolist() for k, x in vars(m).items() if isinstance(x, np.ndarray) and (x != before[k]).any()}
-        return type(self)(self.version, *self._file, changes=changes)
+        was = vars(self._held_model.opt)
+        changes |= {k: x for k, x in vars(m.opt).items() if np.any(np.asarray(x) != was[k])}
+        return type(self)(self.version, *self._file, changes=self._changes["changes"] | changes)
 
 
 class _HeldModel:

@@ -40,7 +40,10 @@ def imported(adapter: Any, path: str, format_: str, floating: bool, changes: dic
     if not m.nv:
         raise NotImplementedError("nothing moves in the model that it built from the file (nv = 0)")
     for name, values in changes.items():
-        getattr(m, name)[:] = np.reshape(values, np.shape(getattr(m, name)))
+        if name in _OPTIONS:
+            setattr(m.opt, name, values)
+        else:
+            getattr(m, name)[:] = np.reshape(values, np.shape(getattr(m, name)))
     # As users call it: what it lacks is refused here, contacts and sensors too.
     held = adapter.put(m)
     fields, notes = {}, []

@@ -28,9 +28,11 @@ _OF_BODY = re.compile(r"for body '([^']+)'")
 #: Newton's numbers of velocities, and the description's.
 _NUMBERS = {
     **{name: "joint_" + name for name in ("armature", "damping", "friction", "stiffness")},
-    **{"rest": "joint_rest_q", "lower": "joint_limit_lower", "upper": "joint_limit_upper"},
+    **{"lower": "joint_limit_lower", "upper": "joint_limit_upper"},
     **{"velocity_limit": "joint_velocity_limit", "effort_limit": "joint_effort_limit"},
 }
+#: Those of joints of several velocities too.
+_OF_ALL = ("armature", "damping", "friction")
 _LIMITS = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
@@ -44,11 +46,25 @@ class Imported(Engine):
     def joints(self) -> dict[str, Any]:
         return self._places
 
+    def _mass_numbers(self, model: Any, state: Any) -> Any:
+        """Return the mass matrix, of which Newton has a block for each articulation."""
+        blocks = super()._mass_numbers(model, state)
+        n = model.joint_dof_count // self._nv
+        starts = self._builder.articulation_start
+        ends = [*starts[1:], self._builder.joint_count]
+        firsts = [*self._builder.joint_qd_start, self._nv]
+        out, blocks = np.zeros((n, self._nv, self._nv)), blocks.reshape(n, -1, *blocks.shape[1:])
+        for k, (start, end) in enumerate(zip(starts, ends)):
+            v = slice(firsts[start], firsts[end])
+            out[:, v, v] = blocks[:, k, : v.stop - v.start, : v.stop - v.start]
+        return out
+
     def described(self, heard: list[str], elements: list[Any]) -> dict[str, Any]:
         """Return the description of the model, with what validation says added to `heard`."""
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            m = self._model(1, True)[0]
+            self._builder.validate_inertia_detailed = True
+            m = self._builder.finalize(device="cpu")
         checks = [" ".join(str(w.message).split()) for w in said]
         found = [_OF_BODY.search(text) for text in checks]
         heard += [text for text, of_body in zip(checks, found) if not of_body]
@@ -84,10 +100,14 @@ class _Description:
         self._names = {_plain(x): x for x in (e.get("name") for e in elements) if x}
         self._slides = {e.get("name") for e in elements if e.tag == "joint" and e.get("type") == "slide"}
         self._labels = m.joint_label, m.body_label
-        self._of = {k: getattr(m, x).numpy().astype(float) for k, x in _NUMBERS.items() if getattr(m, x) is not None}
+        held = {k: getattr(m, x, None) for k, x in _NUMBERS.items()}
+        self._of = {k: x.numpy().astype(float) for k, x in held.items() if x is not None}
         self._drive()
         axes, dims = m.joint_axis.numpy().astype(float), m.joint_dof_dim.numpy()
-        starts = m.joint_q_start.numpy().tolist(), m.joint_qd_start.numpy().tolist()
+        starts = (
+            [*m.joint_q_start.numpy().tolist()[: m.joint_count], m.joint_coord_count],
+            [*m.joint_qd_start.numpy().tolist()[: m.joint_count], m.joint_dof_count],
+        )
         placed = [m.joint_X_p.numpy().astype(float), m.joint_X_c.numpy().astype(float)]
         parents, children = m.joint_parent.numpy(), m.joint_child.numpy()
         masses, coms, inertias = (
@@ -103,7 +123,7 @@ class _Description:
             if child in frames:
                 loops.append(self._label(0, j))
                 continue
-            q, v = (range(s[j], s[j + 1]) if j + 1 < len(s) else range(0) for s in starts)
+            q, v = (range(s[j], s[j + 1]) for s in starts)
             X = np.linalg.inv(frames[int(parents[j])]) @ _matrix(placed[0][j])
             frames[child], names[child] = _matrix(placed[1][j]), self._name(self._label(1, child))
             steps = self._steps(kind, dims[j], list(q), list(v))
@@ -113,7 +133,8 @@ class _Description:
                 if k < len(steps) - 1:
                     body = self._name(f"{names[child]} before {name}")
                     self.data["bodies"].append([body, 0.0, [0.0] * 3, np.zeros((3, 3)).tolist()])
-                numbers = {x: y[at_v].tolist() for x, y in self._of.items()} if len(at_v) == 1 else {}
+                some = self._of if len(at_v) == 1 else {x: self._of[x] for x in _OF_ALL if x in self._of}
+                numbers = {x: y[at_v].tolist() for x, y in some.items()}
                 numbers |= {x: [None if abs(y) > 1e5 else y for y in numbers[x]] for x in _LIMITS if x in numbers}
                 if not any(numbers.get("stiffness", [])):
                     numbers.pop("rest", None)
@@ -134,11 +155,27 @@ class _Description:
         """Add drives at zero control to springs and dampers: they act as these in Newton's solvers."""
         m, of = self._m, self._of
         on = m.joint_target_mode.numpy() != 0
-        stiffness = of["stiffness"] + on * m.joint_target_ke.numpy()
-        pull = of["stiffness"] * of["rest"] + (on * m.joint_target_ke.numpy() * _targets(m))
-        of["damping"] = of["damping"] + on * m.joint_target_kd.numpy()
-        of["rest"] = np.where(stiffness > 0, pull / np.where(stiffness > 0, stiffness, 1.0), 0.0)
-        of["stiffness"] = stiffness
+        ke, kd = (on * getattr(m, "joint_target_" + x).numpy().astype(float) for x in ("ke", "kd"))
+        stiffness = of.get("stiffness", 0.0) + ke
+        pull = of.get("stiffness", 0.0) * self._by_velocity("joint_rest_q") + ke * self._by_velocity("joint_target_q")
+        of["damping"], of["stiffness"] = of.get("damping", 0.0) + kd, stiffness
+        of["rest"] = np.divide(pull, stiffness, out=np.zeros(len(ke)), where=stiffness > 0)
+
+    def _by_velocity(self, name: str) -> Any:
+        """Return numbers that Newton has for each coordinate; joints that turn freely have none here."""
+        m, out = self._m, np.zeros(self._m.joint_dof_count)
+        if getattr(m, name, None) is None:
+            return out
+        given = getattr(m, name).numpy().astype(float)
+        starts = [*m.joint_q_start.numpy()[: m.joint_count], m.joint_coord_count]
+        firsts = [*m.joint_qd_start.numpy()[: m.joint_count], m.joint_dof_count]
+        for j in range(m.joint_count):
+            q, v = slice(starts[j], starts[j + 1]), slice(firsts[j], firsts[j + 1])
+            if len(given) == len(out):
+                out[v] = given[v]
+            elif q.stop - q.start == v.stop - v.start:
+                out[v] = given[q]
+        return out
 
     def _label(self, what: int, k: int) -> str:
         """Return the name in the file of a joint (0) or body (1): Newton puts the names above it before."""
@@ -194,18 +231,6 @@ class _Description:
             some = []
         for j, leader, offset, ratio in some:
             self.data["couplers"].append(["", own[j][0], own[leader][0], ratio, offset])
-
-
-def _targets(m: Any) -> Any:
-    """Return the target of each velocity's drive; joints that turn freely have none."""
-    q, at = m.joint_target_q.numpy().astype(float), np.zeros(m.joint_dof_count)
-    starts = m.joint_target_q_start.numpy() if m.joint_target_q_start is not None else m.joint_qd_start.numpy()
-    first, ends = m.joint_qd_start.numpy(), [*m.joint_qd_start.numpy()[1:], m.joint_dof_count]
-    for j in range(m.joint_count):
-        n = ends[j] - first[j]
-        if n <= len(q) - starts[j]:
-            at[first[j] : ends[j]] = q[starts[j] : starts[j] + n]
-    return at
 
 
 def _matrix(x: Any) -> Any:

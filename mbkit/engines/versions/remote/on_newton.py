@@ -91,9 +91,12 @@ class Engine:
         # root's origin, and a light finger loses two more digits (version 1.8).
         return newton.eval_mass_matrix(model, state, J=newton.eval_jacobian(model, state))
 
+    def _mass_numbers(self, model: Any, state: Any) -> Any:
+        return self._mass(model, state).numpy().astype(float)
+
     def mass_matrix(self, q: Any) -> Any:
         model, state, S, _ = self._set(q)
-        return S.mT @ self._mass(model, state).numpy().astype(float) @ S
+        return S.mT @ self._mass_numbers(model, state) @ S
 
     def _force(self, f: Any, S: Any) -> Any:
         """Return forces; those of a free joint are given in world axes, about the centre of mass."""
@@ -110,7 +113,7 @@ class Engine:
 
     def coriolis_force(self, q: Any, v: Any) -> Any:
         model, state, S, change = self._set(q, v)
-        M = self._mass(model, state).numpy().astype(float)
+        M = self._mass_numbers(model, state)
         return self._force(self._passive(model, state, "coriolis_force"), S) + apply(S.mT @ M, change)
 
     def nle(self, q: Any, v: Any) -> Any:
