@@ -38,6 +38,11 @@ PARTS = {
     "long_loops": Part(1, ("long_loops.json",), "a million steps of mechanisms with loops: gap and energy"),
     "lint": Part(5, ("lint.json",), "what lint finds on the robots, with verdicts, and of planted mistakes"),
     "importers": Part(1, ("importers.json", "importers_floating.json"), "one file through three importers"),
+    "importer_defects": Part(
+        20,
+        ("importer_defects.json",),
+        "smallest files through importers of trained engines; environments of 600 MB each",
+    ),
     "versions": Part(
         35, ("versions.json",), "versions of MuJoCo, Pinocchio and Drake; makes some 18 GB of environments"
     ),

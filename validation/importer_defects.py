@@ -39,7 +39,8 @@ def link(name: str, mass: float, moments: tuple[float, float, float] | None, bes
         return f'<link name="{name}">{beside}</link>'
     xx, yy, zz = moments
     inertia = f'<inertia ixx="{xx}" iyy="{yy}" izz="{zz}" ixy="0" ixz="0" iyz="0"/>'
-    return f'<link name="{name}"><inertial><origin xyz="0 0 0.1"/><mass value="{mass}"/>{inertia}</inertial>{beside}</link>'
+    inertial = f'<inertial><origin xyz="0 0 0.1"/><mass value="{mass}"/>{inertia}</inertial>'
+    return f'<link name="{name}">{inertial}{beside}</link>'
 
 
 def joint(name: str, kind: str, parent: str, child: str, beside: str = "") -> str:
@@ -60,14 +61,16 @@ def mjcf(body: str, before: str = "") -> str:
 
 #: What the file has -> its text.
 FILES = {
-    "link_of_tiny_inertia": urdf(*HINGE, joint("weld", "fixed", "arm", "tool"), link("tool", 1e-3, (1e-7,) * 3)),
+    "link_without_inertia": urdf(*HINGE, joint("weld", "fixed", "arm", "tool"), link("tool", 1e-3, (0.0,) * 3)),
     "impossible_inertia": urdf(HINGE[0], link("arm", 1.0, (0.01, 0.01, 0.03))),
     "shape_without_inertial": urdf(*HINGE, joint("weld", "fixed", "arm", "tool"), link("tool", 0.0, None, BOX)),
     "mimic_of_a_fixed_joint": urdf(
         *(*HINGE, link("tool", 1.0, (0.02, 0.02, 0.01))),
         joint("weld", "fixed", "arm", "tool", '<mimic joint="hinge" multiplier="2"/>'),
     ),
-    "joints_at_two_places": mjcf(f'<joint name="a" axis="1 0 0"/><joint name="b" axis="0 1 0" pos="0.3 0 0"/>{INERTIAL}'),
+    "joints_at_two_places": mjcf(
+        f'<joint name="a" axis="1 0 0"/><joint name="b" axis="0 1 0" pos="0.3 0 0"/>{INERTIAL}'
+    ),
     "hinge_before_slide": mjcf(f'<joint name="a" axis="0 1 0"/><joint name="b" type="slide" axis="1 0 0"/>{INERTIAL}'),
     "oblique_axes": mjcf(f'<joint name="a" axis="1 0 0"/><joint name="b" axis="1 1 0"/>{INERTIAL}'),
     "gravity": mjcf(f'<joint name="a" axis="1 0 0"/>{INERTIAL}', '<option gravity="0 3 -5"/>'),

@@ -3,8 +3,8 @@
 Run ``python -m validation.importers``; it writes ``validation/importers.json``, with the base held still, and
 ``validation/importers_floating.json``, with a floating base, in about a minute.
 
-``python -m validation.importers newton mujoco-warp`` measures importers in environments of their own, with the base held
-still, and keeps the columns of the others in ``validation/importers_trained.json``: some minutes each.
+``python -m validation.importers newton mujoco-warp`` measures importers in environments of their own, with the base
+held still, and keeps the columns of the others in ``validation/importers_trained.json``: some minutes each.
 
 For each robot and importer: whether it moves as the file says, why not, and the lines of the file
 that make the difference, so that each cause can be checked by eye. With a floating base the reasons

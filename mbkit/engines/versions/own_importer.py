@@ -34,7 +34,8 @@ def read(version: EngineVersion, text: str, format_: str, floating_base: bool, f
     Raises `UnsupportedError` where it refuses the text, and `EngineProcessError` where it ends its process or takes
     longer than `version.seconds`.
     """
-    return (_OfMujoco if version.package.importer == _MUJOCO else _Read)(version, text, format_, floating_base, files).imported()
+    kind = _OfMujoco if version.package.importer == _MUJOCO else _Read
+    return kind(version, text, format_, floating_base, files).imported()
 
 
 class _Read(VersionDynamics):
@@ -92,7 +93,6 @@ class _Read(VersionDynamics):
         out = {"M": self._mass_matrix(q), "g": self._gravity(q), "nle": self._nle(q, v), "passive": self._passive(q, v)}
         return {name: np.asarray(x, float) for name, x in out.items()}
 
-
     def _less(self, without: tuple[str, ...]) -> _Read:
         raise NotImplementedError
 
@@ -141,8 +141,8 @@ def _model(name: str, said: Mapping[str, Any]) -> Model:
     for body, mass, com, inertia in said["bodies"]:
         parts.body(body, mass, np.array(com), np.array(inertia))
     for (joint, kind, parent, child, R, p), numbers in said["joints"]:
-        values = {k: np.array([_SIGN[k] * np.inf if y is None else y for y in x]) for k, x in numbers.items() if k in _SIGN}
-        values |= {k: np.array(x) for k, x in numbers.items() if k not in _SIGN}
+        # None stands for no limit.
+        values = {k: np.array([_SIGN.get(k, 1.0) * np.inf if y is None else y for y in x]) for k, x in numbers.items()}
         if kind == "revolute" and np.isinf(values["lower"]).all() and np.isinf(values["upper"]).all():
             kind = "continuous"
         parts.joint(joint, kind, parent, child, np.array(R), np.array(p), **values)

@@ -19,8 +19,8 @@ import numpy as np
 
 from mbkit._check import Array, count, real
 from mbkit._child_process import WorkerDiedError, WorkerStartError, WorkerTimeoutError
-from mbkit.engines.imported import IMPORTERS, Beside, Imported, Importer, check_installed, reader
 from mbkit.engines.base import DOUBLE_BITS
+from mbkit.engines.imported import IMPORTERS, Beside, Imported, Importer, check_installed, reader
 from mbkit.engines.registry import MUJOCO
 from mbkit.engines.versions import own_importer
 from mbkit.engines.versions.engine_version import EngineVersion, names_version
@@ -403,13 +403,17 @@ def compare_parsers(
     source : str or path
         A URDF or MJCF file, or a robot of example-robot-data.
     importers : sequence of str
-        Of pinocchio, mujoco and drake. One that is not installed is named as such.
+        Of pinocchio, mujoco and drake; one that is not installed is named as such. Or ``"newton"``, ``"mujoco-warp"``,
+        ``"mjx"`` and ``"mjx-single"``, also with a version or as `mbkit.engine` gives them, in environments of their
+        own: Newton's ``add_urdf`` and ``add_mjcf``, and what ``put_model`` holds of MuJoCo's model. Newton gives no
+        passive force apart from its solvers; it is that of its numbers. Single precision counts above 1.5e-5 alone.
     floating_base : bool
         Whether the base moves freely, in the file's reading and in every importer's.
     samples, seed, tolerance : int, int, float
         Random states for the terms, and the relative difference that counts.
     seconds : float
-        Processor time that an importer may take over the file.
+        Processor time that an importer may take over the file; ``mbkit.engine(name, seconds=...)`` sets that of an
+        importer in an environment of its own.
 
     Raises
     ------

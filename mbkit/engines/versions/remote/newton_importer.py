@@ -6,7 +6,6 @@ and inertias in the model alone, not in the builder, and says which where it is 
 
 from __future__ import annotations
 
-import os
 import re
 import warnings
 import xml.etree.ElementTree as ET
@@ -14,7 +13,6 @@ from collections import Counter
 
 import newton
 import numpy as np
-import warp as wp
 from common import rotation
 from on_newton import Engine
 
@@ -28,8 +26,10 @@ _OF_BODY = re.compile(r"for body '([^']+)'")
 #: Newton's numbers of velocities, and the description's.
 _NUMBERS = {
     **{name: "joint_" + name for name in ("armature", "damping", "friction", "stiffness")},
-    **{"lower": "joint_limit_lower", "upper": "joint_limit_upper"},
-    **{"velocity_limit": "joint_velocity_limit", "effort_limit": "joint_effort_limit"},
+    "lower": "joint_limit_lower",
+    "upper": "joint_limit_upper",
+    "velocity_limit": "joint_velocity_limit",
+    "effort_limit": "joint_effort_limit",
 }
 #: Those of joints of several velocities too.
 _OF_ALL = ("armature", "damping", "friction")
@@ -54,7 +54,7 @@ class Imported(Engine):
         ends = [*starts[1:], self._builder.joint_count]
         firsts = [*self._builder.joint_qd_start, self._nv]
         out, blocks = np.zeros((n, self._nv, self._nv)), blocks.reshape(n, -1, *blocks.shape[1:])
-        for k, (start, end) in enumerate(zip(starts, ends)):
+        for k, (start, end) in enumerate(zip(starts, ends, strict=True)):
             v = slice(firsts[start], firsts[end])
             out[:, v, v] = blocks[:, k, : v.stop - v.start, : v.stop - v.start]
         return out
@@ -67,7 +67,7 @@ class Imported(Engine):
             m = self._builder.finalize(device="cpu")
         checks = [" ".join(str(w.message).split()) for w in said]
         found = [_OF_BODY.search(text) for text in checks]
-        heard += [text for text, of_body in zip(checks, found) if not of_body]
+        heard += [text for text, of_body in zip(checks, found, strict=True) if not of_body]
         if names := [*dict.fromkeys(x[1].rsplit("/", maxsplit=1)[-1] for x in found if x)]:
             heard.append(f"its validation corrected the inertia of {', '.join(names)}")
         return _Description(self, m, elements).data | {"notes": [*dict.fromkeys(heard)]}
@@ -110,11 +110,10 @@ class _Description:
         )
         placed = [m.joint_X_p.numpy().astype(float), m.joint_X_c.numpy().astype(float)]
         parents, children = m.joint_parent.numpy(), m.joint_child.numpy()
-        masses, coms, inertias = (
-            x.numpy().astype(float) for x in (m.body_mass, m.body_com, m.body_inertia)
-        )
+        masses, coms, inertias = (x.numpy().astype(float) for x in (m.body_mass, m.body_com, m.body_inertia))
         frames, names = {-1: _matrix(np.array([0, 0, 0, 0, 0, 0, 1.0]))}, {-1: "world"}
-        self.data: dict[str, Any] = {"bodies": [], "joints": [], "places": {}, "couplers": [], "holds": "by its solvers"}
+        self.data: dict[str, Any] = {"bodies": [], "joints": [], "places": {}, "couplers": []}
+        self.data["holds"] = "by its solvers"
         self.data["gravity"] = m.gravity.numpy().astype(float).reshape(-1, 3)[0].tolist()
         own: dict[int, list[str]] = {}
         loops = []
@@ -128,7 +127,7 @@ class _Description:
             frames[child], names[child] = _matrix(placed[1][j]), self._name(self._label(1, child))
             steps = self._steps(kind, dims[j], list(q), list(v))
             parent, own[j] = names[int(parents[j])], self._own_names(self._label(0, j), steps)
-            for k, ((step, at_q, at_v), name) in enumerate(zip(steps, own[j])):
+            for k, ((step, at_q, at_v), name) in enumerate(zip(steps, own[j], strict=True)):
                 body = names[child]
                 if k < len(steps) - 1:
                     body = self._name(f"{names[child]} before {name}")
@@ -199,7 +198,7 @@ class _Description:
         if not v:
             return [("fixed", q, v)]
         kinds = ["prismatic"] * int(dims[0]) + ["revolute"] * int(dims[1])
-        return [(one, [a], [b]) for one, a, b in zip(kinds, q, v)]
+        return [(one, [a], [b]) for one, a, b in zip(kinds, q, v, strict=True)]
 
     def _own_names(self, label: str, steps: list[Any]) -> list[str]:
         """Return the file's names of joints that Newton made one, whose label joins them by "_"."""
@@ -222,11 +221,11 @@ class _Description:
         """Add the joints that mimic others."""
         m = self._m
         if getattr(m, "joint_mimic_joint", None) is not None:
-            held = zip(m.joint_mimic_joint.numpy().tolist(), m.joint_mimic_coeffs.numpy().tolist())
+            held = zip(m.joint_mimic_joint.numpy().tolist(), m.joint_mimic_coeffs.numpy().tolist(), strict=True)
             some = [(j, leader, *numbers) for j, (leader, numbers) in enumerate(held) if leader >= 0]
         elif getattr(m, "constraint_mimic_count", 0):
             ends = ("joint0", "joint1", "coef0", "coef1")
-            some = [*zip(*(getattr(m, "constraint_mimic_" + x).numpy().tolist() for x in ends))]
+            some = [*zip(*(getattr(m, "constraint_mimic_" + x).numpy().tolist() for x in ends), strict=False)]
         else:
             some = []
         for j, leader, offset, ratio in some:

@@ -57,10 +57,12 @@ class Engine:
             # By name, where it is asked what it changes.
             worlds.validate_inertia_detailed = self._validated
             # What a description says is judged, not what a validation makes of it.
-            model = worlds.finalize(device="cpu", skip_validation_inertia=not self._validated)
+            unlike = {} if self._validated else {"skip_validation_inertia": True}
+            model = worlds.finalize(device="cpu", **unlike)
             if not passive:
-                model.joint_damping.zero_()
-                model.joint_stiffness.zero_()
+                for name in ("joint_damping", "joint_stiffness"):
+                    if hasattr(model, name):
+                        getattr(model, name).zero_()
             self._models[n, passive] = model, model.state()
         return self._models[n, passive]
 
