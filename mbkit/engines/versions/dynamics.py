@@ -140,9 +140,9 @@ class VersionDynamics(MappedDynamics):
             head, _ = self._call("build", **self._data)
         except RemoteError as error:
             raise UnsupportedError(f"{self.engine}: refuses {self.model.name}: {error}") from None
-        self._place(head["joints"])
+        self._take_places(head["joints"])
 
-    def _place(self, joints: Mapping[str, Any]) -> None:
+    def _take_places(self, joints: Mapping[str, Any]) -> None:
         """Take the places of the engine's coordinates."""
         self._places = places(self._convention, self.model, self._names, joints)
         self._v_index = self._places.v_index

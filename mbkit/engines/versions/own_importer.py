@@ -44,7 +44,7 @@ class _Read(VersionDynamics):
     def __init__(self, version: EngineVersion, *file: Any, changes: Mapping[str, Any] | None = None) -> None:
         self.version, self._file, self._own_key = version, file, new_key()
         #: Numbers to set in the model before it is held.
-        self._changes = {} if changes is None else {"changes": changes}
+        self._changes: dict[str, Any] = {} if changes is None else {"changes": changes}
         process = process_of(version)
         weakref.finalize(self, process.unneeded.append, self._own_key)
         self._generation = process.start()
@@ -84,7 +84,7 @@ class _Read(VersionDynamics):
             # The process that held the reading has died since.
             self._import()
             self._generation = self._held
-        self._place(self.said["places"])
+        self._take_places(self.said["places"])
 
     def terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> dict[str, Array]:
         """Return M, g, nle and passive at a batch of states, without some of what acts beside bodies and joints."""
@@ -122,7 +122,7 @@ class _OfMujoco(_Read):
         changes = {k: x.tolist() for k, x in vars(m).items() if isinstance(x, np.ndarray) and (x != before[k]).any()}
         was = vars(self._held_model.opt)
         changes |= {k: x for k, x in vars(m.opt).items() if np.any(np.asarray(x) != was[k])}
-        return type(self)(self.version, *self._file, changes=self._changes["changes"] | changes)
+        return type(self)(self.version, *self._file, changes={**self._changes["changes"], **changes})
 
 
 class _HeldModel:

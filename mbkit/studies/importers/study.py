@@ -148,7 +148,7 @@ class RemoteReading:
 
     def result(self) -> Imported:
         """Return the reading; raises `ImporterError`."""
-        read = _telling(self._version, own_importer.read, self._version, *self._file)
+        read: Imported = _telling(self._version, own_importer.read, self._version, *self._file)
         return replace(read, terms=partial(_telling, self._version, read.terms))
 
     def end(self) -> None:
