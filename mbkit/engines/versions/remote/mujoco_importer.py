@@ -85,7 +85,7 @@ def _notes(m: Any, name: str, whole: Any, own: Any) -> list[str]:
         own, whole = own.astype(float), whole.astype(float)
         lost, says = np.abs(own - whole) > 1e-6 * np.maximum(np.abs(whole), 1e-6), "is another number in its model"
     kind = name.split("_", maxsplit=1)[0].removesuffix("0")
-    rows = np.flatnonzero(lost.reshape(len(lost), -1).any(axis=1)) if lost.size else []
+    rows: Any = np.flatnonzero(lost.reshape(len(lost), -1).any(axis=1)) if lost.size else []
     if not len(rows):
         return []
     return [f"put_model: {name} of {', '.join(_label(m, kind, int(k)) for k in rows[:6])} {says}"]

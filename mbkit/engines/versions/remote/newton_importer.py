@@ -14,7 +14,7 @@ from collections import Counter
 import newton
 import numpy as np
 from common import rotation
-from on_newton import Engine
+from on_newton import Engine  # type: ignore[import-not-found]  # beside this file
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ _OF_ALL = ("armature", "damping", "friction")
 _LIMITS = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
-class Imported(Engine):
+class Imported(Engine):  # type: ignore[misc]  # of the file beside
     """A model that Newton's importer built from a file, with what its validation changes."""
 
     def __init__(self, builder: Any) -> None:
