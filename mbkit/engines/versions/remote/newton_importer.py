@@ -14,7 +14,7 @@ from collections import Counter
 import newton
 import numpy as np
 from common import rotation
-from on_newton import Engine  # type: ignore[import-not-found]  # beside this file
+from on_newton import Engine
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -44,7 +44,8 @@ class Imported(Engine):  # type: ignore[misc]  # of the file beside
         self._validated = True
 
     def joints(self) -> dict[str, Any]:
-        return self._places
+        out: dict[str, Any] = self._places
+        return out
 
     def _mass_numbers(self, model: Any, state: Any) -> Any:
         """Return the mass matrix, of which Newton has a block for each articulation."""
@@ -178,11 +179,11 @@ class _Description:
 
     def _label(self, what: int, k: int) -> str:
         """Return the name in the file of a joint (0) or body (1): Newton puts the names above it before."""
-        label = self._labels[what][k]
+        label = str(self._labels[what][k])
         parts = label.split("/")
         for n in range(len(parts)):
             if (tail := _plain("/".join(parts[n:]))) in self._names:
-                return self._names[tail]
+                return str(self._names[tail])
         return parts[-1]
 
     def _name(self, name: str) -> str:
