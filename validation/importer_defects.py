@@ -23,7 +23,7 @@ from validation.stamp import stamp
 
 OUT = Path(__file__).parent / "importer_defects.json"
 VERSIONS = (
-    *(f"newton=={x}" for x in ("1.8.0", "1.7.0", "1.6.1", "1.5.2", "1.4.0", "1.3.0")),
+    *(f"newton=={x}" for x in ("1.8.0", "1.7.0", "1.6.1", "1.5.2")),
     *(f"mujoco-warp=={x}" for x in ("4.0.0", "3.17.0", "3.16.0", "3.15.0", "3.14.0", "3.13.0")),
     "mjx==3.17.0",
 )
