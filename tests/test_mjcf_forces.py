@@ -71,7 +71,7 @@ def test_gravity_compensation_of_random_files_is_that_of_mujoco(seed: int, tmp_p
     numbers = iter(np.random.default_rng(seed).uniform(-1, 2, 100))
     text = re.sub("<body ", lambda _: f'<body gravcomp="{float(next(numbers))!r}" ', random_mjcf(seed))
     model, at = mb.load(written(text, tmp_path)), mujoco_terms(text, 3, seed)
-    passive = mb.dynamics(model, "lagrangian").passive(at.q, at.v)
+    passive = mb.dynamics(model.without("friction"), "lagrangian").passive(at.q, at.v)
     assert model.forces
     # Weights cancel in the sums that MuJoCo and mbkit form in another order.
     assert np.abs(passive - at.passive).max() < 1e-13 * max(np.abs(at.passive).max(), np.abs(at.nle).max(), 1.0)
