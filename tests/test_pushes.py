@@ -140,6 +140,7 @@ def exact() -> Any:
 #: Of the motion below, with a step of 5 ms or a tolerance of 1e-9.
 ERRORS = {
     "semi_implicit_euler": 0.05,
+    "moreau": 0.05,
     "implicit_midpoint": 1e-3,
     "rk4": 1e-8,
     "gauss4": 1e-8,

@@ -139,7 +139,7 @@ def test_a_parser_that_reads_a_file_otherwise_is_seen(tmp_path):
 def test_its_own_run_is_measured():
     tree = mb.load("ur5", floating_base=True)
     wrong_order = (
-        'old = E.rollout; E.rollout = lambda self, q, v, method, dt, steps: old(self, q, v, "euler", dt, steps)'
+        'old = E.rollout; E.rollout = lambda self, q, v, method, **more: old(self, q, v, method="euler", **more)'
     )
     result = mb.versions(tree, "mujoco", [made("1.0"), made("1.1", wrong_order)], samples=1)
     assert found(result) == [("own RK4", "1.1", AWAY)]

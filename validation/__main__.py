@@ -38,6 +38,7 @@ PARTS = {
     "long_loops": Part(1, ("long_loops.json",), "a million steps of mechanisms with loops: gap and energy"),
     "lint": Part(5, ("lint.json",), "what lint finds on the robots, with verdicts, and of planted mistakes"),
     "importers": Part(1, ("importers.json", "importers_floating.json"), "one file through three importers"),
+    "importers_trained": Part(20, ("importers_trained.json",), "the robots through importers of trained engines"),
     "importer_defects": Part(
         20,
         ("importer_defects.json",),

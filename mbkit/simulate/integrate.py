@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from typing import Final, Protocol, runtime_checkable
 
@@ -16,7 +17,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError
-from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, METHODS, Method, Tolerances, method_of
+from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD, METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
 from mbkit.simulate.diagnostics.checks import diagnostics, massless_joints
@@ -145,6 +146,10 @@ def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | 
 
 def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
     dyn, read = problem.dyn, problem.torque
+    if method.dry_friction and not dyn.model.needs.friction:
+        # Without friction its step is that of this method.
+        method = METHODS[EULER_METHOD]
+        problem = replace(problem, method=method.name)
     if dyn.soft_friction and method.dry_friction:
         raise UnsupportedError(
             f"{method.name}: solves exact dry friction, and {dyn.engine} was asked for its own; leave soft_friction out"

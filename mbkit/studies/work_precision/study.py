@@ -306,7 +306,8 @@ def _integrated_model(model: Model, pairs: Mapping[str, Sequence[str]]) -> Model
 
     Dry friction is left out: no reference of series crosses its jumps, and no engine's own integrator holds it.
     """
-    model = with_values(model).without("friction")
+    model = with_values(model)
+    model = model.without("friction") if model.needs.friction else model
     native = any(METHODS[m].kind == "native" for ms in pairs.values() for m in ms)
     return free_of_mimic(model) if model.layout.reduced and native else model
 

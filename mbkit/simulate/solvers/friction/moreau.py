@@ -14,7 +14,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.engines.elements.dry_friction import friction_forces
-from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.errors import FunctionError, NumericalError, UnsupportedError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
@@ -43,15 +43,21 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
     for i in range(len(problem.q)):
         member = problem.member(i)
         own = dyn if member is None else dyn._of_sample(i)
-        steps, attempts, reasons[i] = (_Compiled if compiled else _InPython)(problem, own, member, record, i).run()
+        run = (_Compiled if compiled else _InPython)(problem, own, member, record, i)
+        steps, attempts, reasons[i] = run.run()
         record.steps[i] = steps
         evaluations += attempts
+        if run.error is not None:
+            return record.result(lambda i: reasons[i], evaluations, error=run.error)
         problem.report(i)(problem.end)
     return record.result(lambda i: reasons[i], evaluations)
 
 
 class _InPython:
     """The steps of one trajectory, each as a problem of impulses with bounds."""
+
+    #: Of a torque function that failed.
+    error: FunctionError | None = None
 
     def __init__(
         self, problem: IntegrationProblem, dyn: Dynamics, member: int | None, record: GridRecord, i: int
@@ -72,6 +78,9 @@ class _InPython:
             try:
                 q, v = self._step(grid.time(k), grid.step(k), q, v, self._force(k))
             except NumericalError as error:
+                return k, k, str(error)
+            except FunctionError as error:
+                self.error = error
                 return k, k, str(error)
             if not (np.abs(q).max(initial=0) < _RUNAWAY and np.abs(v).max(initial=0) < _RUNAWAY):
                 return k, k, DIVERGED
@@ -95,6 +104,8 @@ class _InPython:
 
 class _Compiled:
     """The steps of one trajectory as machine code: rounds of attempts."""
+
+    error: FunctionError | None = None
 
     def __init__(
         self, problem: IntegrationProblem, dyn: Dynamics, member: int | None, record: GridRecord, i: int
