@@ -287,8 +287,8 @@ def test_the_first_screen_has_the_verdict_what_acts_nowhere_and_the_worst_rows()
         text, page = (" ".join(x.split()) for x in ("\n".join(lines), Tags(check_page(result)).text))
         first = page[: page.index("The model")]
         for told in (
-            "dry friction is in no engine (5 times the other forces)",
-            "dry friction: no engine applies it: 3 N m at j1",
+            "rollouts and error against run time are without dry friction (5 times the other forces)",
+            "dry friction: 3 N m at j1",
             "no curve of pinocchio taylor: needs the own derivation",
             "drake: not installed",
             "worst row of",
