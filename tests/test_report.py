@@ -280,7 +280,7 @@ def test_what_a_study_left_out_is_said_first():
 
 
 def test_the_first_screen_has_the_verdict_what_acts_nowhere_and_the_worst_rows():
-    found = (Finding("dry friction", "no engine applies it: 3 N m at j1", ("j1",), 5.0),)
+    found = (Finding("dry friction", "3 N m at j1", ("j1",), 5.0),)
     for result in (replace(AGREEING, findings=found), replace(DIFFERING, findings=found)):
         lines = printed(check_table(result, full=False), 160).splitlines()
         assert len(lines) <= 24
