@@ -301,7 +301,7 @@ def test_the_first_screen_has_the_verdict_what_acts_nowhere_and_the_worst_rows()
         assert "Rollouts against" not in text
         assert "Rollouts against" in page
         assert Comparison.from_json(result.to_json()).findings == found
-        assert "no engine applies it" in result.to_markdown()
+        assert "3 N m at j1" in result.to_markdown()
 
 
 def test_many_stiff_joints_do_not_fill_the_first_screen():
