@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 
 import mbkit as mb
 from mbkit.engines.elements.dry_friction import forces_at_rest
-from mbkit.errors import InputError, MbkitWarning, ModelError, UnsupportedError
+from mbkit.errors import InputError, MbkitWarning, ModelError, TorqueError, UnsupportedError
 from mbkit.model import Model
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
 
@@ -531,3 +531,34 @@ def test_a_check_of_the_step_sees_no_mode_in_the_jump_of_friction_and_derivative
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         dyn.linearize([0.1], [1.0], [0.0])
+
+
+@pytest.mark.parametrize("method", ["rk4", "rk853", "moreau"])
+@pytest.mark.parametrize("calls", [0, 60])
+def test_a_torque_that_fails_where_a_phase_is_looked_at_keeps_the_run(method, calls):
+    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
+    b.add_body("m", mass=2.0)
+    b.add_joint("x", "prismatic", parent="world", child="m", axis=(1, 0, 0), friction=3.0, stiffness=50.0)
+    asked = itertools.count()
+
+    def torque(_t, _q, _v):
+        return [1 / (next(asked) < calls) - 1]
+
+    with pytest.raises(TorqueError, match="ZeroDivisionError") as failed:
+        mb.simulate(mb.dynamics(b.build(), "lagrangian"), [1.0], [0.0], 3.0, method, torque=torque)
+    assert failed.value.trajectory.stats.ended == "function_failed"
+    assert failed.value.trajectory.q[0].tolist() == [1.0]
+
+
+def test_friction_of_what_follows_by_a_ratio_of_zero_does_nothing():
+    b = mb.ModelBuilder("still")
+    part = {"mass": 1.0, "com": (0.1, 0, 0), "inertia": (1, 1, 1)}
+    b.add_body("a", **part)
+    b.add_body("b", **part)
+    b.add_joint("j", "revolute", parent="world", child="a", axis=(0, 1, 0), friction=0.1)
+    b.add_joint("k", "revolute", parent="a", child="b", axis=(0, 1, 0), friction=5.0, mimic=("j", 0.0, 0.3))
+    model = b.build()
+    bare = mb.ModelBuilder.of(model)
+    bare.set_joint("k", friction=0.0)
+    runs = [mb.simulate(mb.dynamics(m, "lagrangian"), [0.1], [1.0], 0.5).q for m in (model, bare.build())]
+    np.testing.assert_array_equal(*runs)

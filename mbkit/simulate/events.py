@@ -15,7 +15,7 @@ import numpy as np
 from mbkit._check import Array, real
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.errors import EventError, InputError, UnknownNameError
+from mbkit.errors import EventError, FunctionError, InputError, UnknownNameError
 from mbkit.model import Model
 
 #: state(t) -> (q, v) within a step
@@ -57,6 +57,9 @@ class Event:
         when = f"at t = {t:.9g} s"
         try:
             value = float(self.function(t, q.copy(), v.copy()))
+        except FunctionError:
+            # Of a torque that it asks, which has a name and a message of its own.
+            raise
         except Exception as error:
             raise EventError(
                 f"events: {self.name!r} {when}: expected a number from the function; "

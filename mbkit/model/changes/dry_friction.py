@@ -134,7 +134,8 @@ class Sliding:
         for joint in model.joints:
             part = layout.full_v[joint.name]
             joints.append(replace(joint, friction=np.zeros(joint.type.nv), stiction=None, stribeck_velocity=None))
-            if not numbers.bound[part].any():
+            # What follows by a ratio of zero does not move.
+            if not numbers.bound[part].any() or not layout.G[part].any():
                 continue
             name = f"friction of {joint.name}"
             rows = [np.flatnonzero(layout.G[i])[0] for i in range(part.start, part.stop)]

@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.errors import UnsupportedError
+from mbkit.errors import FunctionError, NumericalError, UnsupportedError
 from mbkit.methods.registry import method_of
 from mbkit.model.changes.dry_friction import names_of
 from mbkit.simulate.events import Event, Hit
@@ -44,8 +44,20 @@ def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solv
             f"simulate: {dyn.model.name} has dry friction beside loops or other constraints, of which what rests may "
             "leave too many; forward_dynamics has both, and model.without('friction') runs without friction"
         )
-    run = _fixed if problem.equal_steps is not None else _adaptive
-    return _merged(problem, [run(_Member(problem, i, solver)) for i in range(len(problem.q))])
+    walk = _fixed if problem.equal_steps is not None else _adaptive
+    parts = []
+    for i in range(len(problem.q)):
+        run = _Member(problem, i, solver)
+        parts.append(run.part)
+        try:
+            walk(run)
+        except FunctionError as error:
+            # Of a torque that is asked whether a phase ends.
+            run.part.error = error
+            break
+        except NumericalError as error:
+            run.part.ended, run.part.message = "diverged", f"diverged after t = {run.part.reached:.6g} s: {error}"
+    return _merged(problem, parts)
 
 
 @dataclass(eq=False)
@@ -61,7 +73,10 @@ class _Part:
     evaluations: int = 0
     rejected: int = 0
     jacobians: int = 0
+    #: How it ended, and why, where the solver of its last phase does not tell.
+    ended: Ended | None = None
     message: str = ""
+    error: FunctionError | None = None
     reached: float = 0.0
 
     def count(self, result: SolverResult) -> None:
@@ -80,11 +95,15 @@ class _Part:
             self.q.append(q)
             self.v.append(v)
 
-    @property
-    def states(self) -> tuple[Array, Array, Array]:
-        """Kept states."""
-        t, q, v = (np.concatenate(x) if x else np.empty(0) for x in (self.t, self.q, self.v))
-        return t, q, v
+    def end(self) -> tuple[Ended, str]:
+        """Return how it ended, and why."""
+        if self.error is not None:
+            return "function_failed", str(self.error)
+        if self.ended is not None:
+            return self.ended, self.message
+        if self.last is None or not self.message:
+            return "finished", ""
+        return self.last.ended, self.message
 
 
 class _Member:
@@ -117,8 +136,11 @@ class _Member:
         v, leaving = self.friction.after(phase, t, q, v, self.force(k))
         self._stuck = 0 if moved else self._stuck + 1
         if self._stuck > _MOST:
-            self.part.message = (
-                f"stopped, as which joints rest cannot be decided at t = {t:.9g} s: their phases end where they begin"
+            self.part.ended, self.part.message = (
+                "step_too_small",
+                (
+                    f"stopped, as which joints rest cannot be decided at t = {t:.9g} s: their phases end where they begin"
+                ),
             )
             return None
         self.q, self.v = q, v
@@ -134,7 +156,7 @@ class _Member:
             self.part.hits.append(Hit(f"{self.names[i]} {what}", t, self.q.copy(), self.v.copy(), self.member))
 
 
-def _fixed(run: _Member) -> _Part:
+def _fixed(run: _Member) -> None:
     problem, grid, part = run.problem, run.problem.grid, run.part
     wanted = set(problem.kept.tolist())
     if 0 in wanted:
@@ -169,7 +191,6 @@ def _fixed(run: _Member) -> _Part:
             part.reached = grid.time(k)
             if k in wanted:
                 part.keep(np.array([grid.time(k)]), run.q[None], run.v[None])
-    return part
 
 
 def _on_grid(grid: Grid) -> dict[str, object]:
@@ -256,7 +277,7 @@ def _across(run: _Member, phase: Phase, k: int) -> Phase | None:
         current = following
 
 
-def _adaptive(run: _Member) -> _Part:
+def _adaptive(run: _Member) -> None:
     problem, part = run.problem, run.part
     t, k, rows = problem.start, 0, problem.save
     stops = np.array(problem.stops)
@@ -288,7 +309,6 @@ def _adaptive(run: _Member) -> _Part:
         phase = run.next(own, min(k, len(stops) - 1), t, hit.q, hit.v, moved=moved)
         if rows is None and moved:
             part.keep(np.array([t]), run.q[None], run.v[None])
-    return part
 
 
 def _keep(part: _Part, result: SolverResult, rows: Array | None, begun: float, *, at_end: bool) -> None:
@@ -302,28 +322,30 @@ def _keep(part: _Part, result: SolverResult, rows: Array | None, begun: float, *
 
 def _merged(problem: IntegrationProblem, parts: list[_Part]) -> SolverResult:
     """Return the trajectories as one result."""
-    states = [part.states for part in parts]
-    nq, nv = problem.q.shape[1], problem.v.shape[1]
-    ends = [_end(part) for part in parts]
+    nq, nv, n = problem.q.shape[1], problem.v.shape[1], len(problem.q)
+    none = np.empty(0), np.empty((0, nq)), np.empty((0, nv))
+    states = [[np.concatenate([x, *kept]) for x, kept in zip(none, (p.t, p.q, p.v), strict=True)] for p in parts]
+    ends = [part.end() for part in parts]
     early = [i for i, end in enumerate(ends) if end[0] != "finished"]
     ended, message = ends[early[0]] if early else ("finished", "")
     if problem.batch is None:
         (t, q, v), reached = states[0], np.asarray(parts[0].reached)
     else:
-        wanted = (
-            problem.save if problem.save is not None else np.array([problem.grid.time(int(i)) for i in problem.kept])
-        )
+        wanted = problem.save
+        if wanted is None:
+            wanted = np.array([problem.grid.time(int(i)) for i in problem.kept])
         count = max((len(x[0]) for x in states), default=len(wanted))
-        t, reached = wanted[:count], np.array([part.reached for part in parts])
-        q, v = np.full((len(parts), count, nq), np.nan), np.full((len(parts), count, nv), np.nan)
+        t, reached = wanted[:count], np.full(n, problem.start)
+        reached[: len(parts)] = [part.reached for part in parts]
+        q, v = np.full((n, count, nq), np.nan), np.full((n, count, nv), np.nan)
         for i, (own, *state) in enumerate(states):
             inside = min(len(own), count)
             q[i, :inside], v[i, :inside] = (x[:inside] for x in state)
-        message += f"; {len(early)} of {len(parts)} trajectories ended early, see reached" if early else ""
+        message += f"; {len(early)} of {n} trajectories ended early, see reached" if early else ""
     lasts = [part.last for part in parts if part.last is not None]
     return SolverResult(
         t=t,
-        q=q.reshape(*q.shape[:-1], nq) if q.size else np.empty((*q.shape[:-1], 0, nq))[..., :0, :],
+        q=q,
         v=v,
         steps=sum(part.steps for part in parts),
         evaluations=sum(part.evaluations for part in parts),
@@ -333,16 +355,8 @@ def _merged(problem: IntegrationProblem, parts: list[_Part]) -> SolverResult:
         rejected=sum(part.rejected for part in parts),
         jacobians=sum(part.jacobians for part in parts),
         events=tuple(sorted((hit for part in parts for hit in part.hits), key=lambda hit: (hit.member or 0, hit.t))),
-        error=next((x.error for x in lasts if x.error), None),
+        error=next((p.error for p in parts if p.error), next((x.error for x in lasts if x.error), None)),
         chosen=next((x.chosen for x in lasts if x.chosen), ""),
         doubts=tuple(dict.fromkeys(one for x in lasts for one in x.doubts)),
         last=next((x.last for x in lasts if x.last is not None), None),
     )
-
-
-def _end(part: _Part) -> tuple[Ended, str]:
-    if part.message and part.message.startswith("stopped, as which"):
-        return "step_too_small", part.message
-    if part.last is None or (part.last.ended in ("finished", "event") and not part.message):
-        return "finished", ""
-    return part.last.ended, part.message
