@@ -53,7 +53,7 @@ def check(
 
     TARGET is a robot (mbkit robots lists them), a catalog system, a path to a URDF or
     MJCF file, or package.module:function for a function that returns a Model. Printed are the verdict, what the
-    file has that no engine uses, faults, and each engine's worst row; --full and the page have the rest. With
+    file has that bears on runs, faults, and each engine's worst row; --full and the page have the rest. With
     --own-parsers it is a robot or a file, which Pinocchio, MuJoCo and Drake read by themselves, or those of --engines:
     newton, mujoco-warp and mjx too, in environments of their own; with --floating-base its base moves freely in all of
     them.

@@ -11,7 +11,7 @@ are bound by loops, M⁻¹ is the response of the accelerations to forces, and a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Final
 
@@ -23,8 +23,8 @@ from mbkit._warn import warn
 from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import ROUNDING, DryFrictionLaw, Sliding
+from mbkit.model.parts import RESTING
 
-Indices = NDArray[np.intp]
 #: What is at rest of velocities.
 Mask = NDArray[np.bool_]
 #: Quantities whose argument is a force, the third one.
@@ -34,6 +34,8 @@ UNDER_FORCE: Final = (
 )
 #: Loads of mechanisms, by the place of the force among their arguments.
 _LOADS: Final = {"loads_under_force": 2, "loads_of_motion": 3}
+#: Exchanges that may leave as many conditions failing, before they go one by one.
+_PATIENCE: Final = 3
 #: Phases that dynamics keep, at most.
 _PHASES: Final = 256
 _FORWARD: Final = "forward_dynamics"
@@ -44,60 +46,76 @@ _ROUNDING: Final = 64 * _EPS
 
 
 def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
-    """Return the forces of `solve_at_rest`."""
-    return solve_at_rest(A, b, bound)[0]
+    """Return the forces of `solve_at_rest` of one problem whose A may be singular, (n,)."""
+    every = np.ones((1, len(b)), dtype=bool)
+    return np.asarray(solve_at_rest(A[None], b[None], bound[None], every, definite=False)[0][0])
 
 
-def solve_at_rest(A: Array, b: Array, bound: Array) -> tuple[Array, Mask]:
-    """Return the λ with |λ| <= bound that minimizes ½ λᵀ A λ + bᵀ λ, and where it is inside; (n,) each.
+def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool) -> tuple[Array, Mask]:
+    """Return the λ with |λ| <= bound that minimize ½ λᵀ A λ + bᵀ λ, and where they are inside; (N, n) each.
 
-    A is positive semidefinite.
+    λ is zero where `on` is False. A, (N, n, n), is positive definite or semidefinite.
 
     The set of forces at their bounds is exchanged as a whole as long as fewer conditions fail, then one by one, the
     last first, which ends (Murty 1974, Linear Algebra and its Applications 9; Júdice and Pires 1994, Computers and
     Operations Research 21).
     """
-    n, side = len(b), np.zeros(len(b))
-    best, left = n + 1, 3
+    size, n = b.shape
+    forces, inside = np.zeros((size, n)), on.copy()
+    side, best, left = np.zeros((size, n)), np.full(size, n + 1), np.full(size, _PATIENCE)
+    going = np.arange(size)
+    # What is undecided to rounding is at rest.
+    noise = _ROUNDING * (np.abs(b) + (np.abs(A) @ bound[..., None])[..., 0])
     for _ in range(100 * (n + 1) ** 2):
-        inner = side == 0
-        forces = side * bound
-        if inner.any():
-            right = -(b[inner] + A[np.ix_(inner, ~inner)] @ forces[~inner])
-            forces[inner] = np.linalg.lstsq(A[np.ix_(inner, inner)], right, rcond=None)[0]
-        a = b + A @ forces
-        # What is undecided to rounding is at rest.
-        noise = _ROUNDING * (np.abs(b) + np.abs(A) @ bound)
-        wrong = np.where(inner, np.abs(forces) > bound * (1 + ROUNDING), side * a > noise)
-        count = int(wrong.sum())
-        if not count:
-            return forces, inner
-        if count < best:
-            best, left = count, 3
-        elif left:
-            left -= 1
-        else:
-            wrong[: np.flatnonzero(wrong)[-1]] = False
-        side = np.where(wrong, np.where(inner, np.sign(forces), 0.0), side)
+        own, here = A[going], side[going]
+        inner = on[going] & (here == 0)
+        at_bound = here * bound[going]
+        pushed = b[going] + (own @ at_bound[..., None])[..., 0]
+        x = np.where(inner, _restricted(own, -pushed, inner, definite), at_bound)
+        a = b[going] + (own @ x[..., None])[..., 0]
+        wrong = np.where(inner, np.abs(x) > bound[going] * (1 + ROUNDING), here * a > noise[going])
+        forces[going], inside[going] = x, inner
+        counts = wrong.sum(axis=1)
+        fewer = counts < best[going]
+        alone = ~fewer & (left[going] == 0)
+        last = np.cumsum(wrong[:, ::-1], axis=1)[:, ::-1] == 1
+        change = np.where(alone[:, None], wrong & last, wrong)
+        best[going] = np.where(fewer, counts, best[going])
+        left[going] = np.where(fewer, _PATIENCE, np.maximum(left[going] - 1, 0))
+        side[going] = np.where(change, np.where(inner, np.sign(x), 0.0), here)
+        going = going[counts > 0]
+        if not len(going):
+            return forces, inside
     raise NumericalError(
         f"dry friction: which of {n} joints at rest begin to move cannot be decided; their inertia is singular"
     )
 
 
-def friction_forces(A: Array, b: Array, bound: Array, less: Array, known: Array) -> tuple[Array, Mask]:
-    """Return the forces of friction as `forces_at_rest` does, and which of them hold; those `known` beforehand do not.
+def _restricted(A: Array, right: Array, on: Mask, definite: bool) -> Array:
+    """Return the x with A x = right in the entries that are on, and zero in the others, (N, n)."""
+    # The others have an equation of their own, of the size of A.
+    size = np.abs(np.einsum("nii->ni", A)).max(axis=1, initial=1e-300)[:, None, None]
+    own = np.where(on[:, :, None] & on[:, None, :], A, size * np.eye(A.shape[-1]) * ~on[:, :, None])
+    right = np.where(on, right, 0.0)[..., None]
+    x = np.linalg.solve(own, right) if definite else np.linalg.pinv(own, hermitian=True) @ right
+    return np.asarray(x[..., 0])
+
+
+def friction_forces(
+    A: Array, b: Array, bound: Array, less: Array, on: Mask, known: Array, *, definite: bool = True
+) -> tuple[Array, Mask]:
+    """Return the forces of friction as `solve_at_rest` does, and which of them hold; those `known` do not; (N, n).
 
     What lets go has the friction of motion. Where that is `less` than the bound, the others feel it.
     """
-    forces, free = known.copy(), known != 0
-    holds = ~free
+    forces, free = np.where(on, known, 0.0), on & (known != 0)
     while True:
-        on = ~free
-        pushed = b[on] + A[np.ix_(on, free)] @ forces[free]
-        forces[on], holds[on] = solve_at_rest(A[np.ix_(on, on)], pushed, bound[on])
-        if not (drops := on & ~holds & (less < bound)).any():
+        pushed = b + (A @ np.where(free, forces, 0.0)[..., None])[..., 0]
+        held, inside = solve_at_rest(A, pushed, bound, on & ~free, definite=definite)
+        forces, holds = np.where(free, forces, held), inside & ~free & on
+        if not (drops := on & ~free & ~holds & (less < bound)).any():
             return forces, holds
-        forces[drops], free, holds = np.sign(forces[drops]) * less[drops], free | drops, holds & ~drops
+        forces, free = np.where(drops, np.sign(forces) * less, forces), free | drops
 
 
 class DryFriction:
@@ -174,20 +192,19 @@ class DryFriction:
         rest: tuple[Any, ...],
         resting: Mask,
     ) -> tuple[Array, Mask]:
-        """Return `decided` of a state or of each of a batch."""
+        """Return `decided` of a state or of each of a batch, of which only those with joints at rest are looked at."""
+        single = v.ndim == 1
+        rows: Any = ... if single else np.flatnonzero(resting.any(axis=1))
+        own = dyn if single else dyn.of_samples(rows)
         forward = quantity.startswith(_FORWARD)
-
-        def one(i: Any, own: Any) -> tuple[Array, Mask]:
-            same = own is dyn and forward
-            accelerate = method if same else own._without_friction(quantity if forward else _FORWARD)
-            more = tuple(x[i] if isinstance(x, np.ndarray) else x for x in rest) if forward else ()
-            return self.decided(own, lambda tau: accelerate(q[i], v[i], tau, *more), q[i], tau[i], resting[i])
-
-        if v.ndim == 1:
-            return one(..., dyn)
-        held, still = np.zeros_like(v), np.zeros(v.shape, dtype=bool)
-        for i in np.flatnonzero(resting.any(axis=1)):
-            held[i], still[i] = one(i, dyn._of_sample(int(i)))
+        accelerate = (
+            own._without_friction(quantity if forward else _FORWARD) if own is not dyn or not forward else method
+        )
+        more = [x[rows] if isinstance(x, np.ndarray) else x for x in rest] if forward else []
+        held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
+        held[rows], still[rows] = self.decided(
+            own, lambda f: accelerate(q[rows], v[rows], f, *more), q[rows], tau[rows], resting[rows]
+        )
         return held, still
 
     def decided(
@@ -199,31 +216,31 @@ class DryFriction:
         resting: Mask,
         leaving: Array | None = None,
     ) -> tuple[Array, Mask]:
-        """Return the forces of friction at rest of one state, (nv,), and which joints stay at rest.
+        """Return the forces of friction at rest, and which joints stay at rest; (nv,) or (N, nv).
 
         `accelerate` gives accelerations under a force without friction at rest; `leaving` has the signs of the
-        velocities that joints at rest are about to have, where that is known, (nv,).
+        velocities that joints at rest are about to have, where that is known, (nv,) or (N, nv).
         """
-        law, which = self.law, np.flatnonzero(resting)
-        A = self._responses(dyn, accelerate, q, tau, which)
-        b = np.asarray(accelerate(tau), dtype=np.float64)[which]
-        less = law.just_moving[which]
-        known = np.zeros(len(which)) if leaving is None else -leaving[which] * less
-        forces, holds = friction_forces(A, b, law.bound[which], less, known)
-        held, still = np.zeros(len(tau[..., : len(resting)])), np.zeros(len(resting), dtype=bool)
-        held[which], still[which] = forces, holds
-        return held, still
+        law, shape = self.law, resting.shape
+        b = np.asarray(accelerate(tau), dtype=np.float64)
+        A = self._responses(dyn, accelerate, q, tau, b)
+        n = shape[-1]
+        A, b, on = A.reshape(-1, n, n), b.reshape(-1, n), resting.reshape(-1, n)
+        bound, less = (np.broadcast_to(x, on.shape) for x in (law.bound, law.just_moving))
+        known = np.zeros(on.shape) if leaving is None else (-leaving * law.just_moving).reshape(on.shape)
+        forces, holds = friction_forces(A, b, bound, less, on, known, definite=not self._constrained)
+        return forces.reshape(shape), holds.reshape(shape)
 
-    def _responses(self, dyn: Any, accelerate: Callable[[Array], Array], q: Array, tau: Array, which: Indices) -> Array:
-        """Return the accelerations of joints per force on each of them, (k, k)."""
-        n = len(self.law.bound)
-        unit = np.eye(n)[which]
+    def _responses(self, dyn: Any, accelerate: Callable[[Array], Array], q: Array, tau: Array, a: Array) -> Array:
+        """Return the accelerations of joints per force on each of them, (nv, nv) or (N, nv, nv)."""
         if not self._constrained:
-            return np.asarray(np.linalg.solve(np.asarray((dyn._bare or dyn).mass_matrix(q)), unit.T)[which])
+            return np.asarray(np.linalg.inv(np.asarray((dyn._bare or dyn).mass_matrix(q))))
         # Accelerations are linear in the force; a large one loses fewest digits of the difference.
-        size = max(1.0, float(np.abs(tau).max()), float(self.law.bound.max()))
-        out = np.array([accelerate(tau + _padded(size * e, tau)) - accelerate(tau) for e in unit])[:, which] / size
-        return np.asarray(0.5 * (out + out.T))
+        out, size = np.zeros((*a.shape, a.shape[-1])), max(1.0, float(np.abs(tau).max()), float(self.law.bound.max()))
+        for j in np.flatnonzero(self.law.bound):
+            unit = np.broadcast_to(size * np.eye(a.shape[-1])[j], a.shape)
+            out[..., j] = (np.asarray(accelerate(tau + _padded(unit, tau)), dtype=np.float64) - a) / size
+        return np.asarray(0.5 * (out + out.mT))
 
     def phase(self, dyn: Any, sides: Array, still: Mask) -> Any:
         """Return the dynamics in which velocities have these signs, or stay at rest: smooth, and without friction."""
@@ -237,16 +254,11 @@ class DryFriction:
             held[key] = bare._of_model(sliding.at(sides, still, dyn.model), sliding.form)
         return held[key]._under(*dyn._acting) if dyn._acting[0] else held[key]
 
-    def sliding_together(self, dyn: Any, signs: Array, rows: Indices, which: Indices) -> Iterator[tuple[Indices, Any]]:
-        """Yield the dynamics of rows of a batch that slide along their signs, (N, nv), and which rows they are."""
-        none = np.zeros(signs.shape[1], dtype=bool)
-        if hasattr(type(dyn), "of_samples") and dyn.takes_parameters and not dyn._acting[0]:
-            own = self.phase(dyn.of_samples(rows), np.ones(len(none)), none)
-            yield rows, own.at(**{name: signs[rows, i] for i, name in self.sliding.sides.items()})
-            return
-        for row in np.unique(signs[np.ix_(rows, which)], axis=0):
-            same = rows[(signs[np.ix_(rows, which)] == row).all(axis=1)]
-            yield same, self.phase(dyn.of_samples(same), signs[same[0]], none)
+    def phases(self, dyn: Any, sides: Array, still: Mask) -> Any:
+        """Return the dynamics of a batch in which each state has its own signs and rest, (N, nv); own derivation."""
+        own, sliding = self.phase(dyn, np.ones(sides.shape[1]), np.zeros(sides.shape[1], dtype=bool)), self.sliding
+        values = {name: np.where(still, 0.0, sides)[:, i] for i, name in sliding.sides.items()}
+        return own.at(**values, **{name: RESTING * still[:, i] for i, name in sliding.locks.items()})
 
     @cached_property
     def sliding(self) -> Sliding:

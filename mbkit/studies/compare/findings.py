@@ -1,4 +1,4 @@
-"""What a description has that no engine of a comparison uses, and its joints that are too fast for ordinary steps."""
+"""What a description has that bears on runs: servos, dry friction, limits, joints too fast for ordinary steps."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ class RolloutRow:
 
 @dataclass(frozen=True)
 class Finding:
-    """What the description has that no engine of the comparison uses, or that asks for other methods.
+    """What the description has that bears on runs: what no engine uses, dry friction, joints for other methods.
 
     `kind` is ``"dry friction"``, ``"limits"`` or ``"stiff joint"``; `says` tells it in words, and `joints` has its
     joints. `mbkit check` adds ``"the file itself"``, with the links and joints that `mbkit.lint` names.
@@ -204,7 +204,7 @@ class Comparison(ResultTable):
     `facts` has nq, nv, mass, digest, needs and notes of the model. `reference` is what the terms of all `engines` were
     measured by: the oracle. Accelerations of an engine with soft constraints are measured by its own written law
     instead, and `softness` has the digits that it keeps of the exact ones, at the median state. `findings` are what the
-    description has that no engine uses, and its stiff joints. `precision` is the error against run time of a few
+    description has that no engine uses, its dry friction and its stiff joints. `precision` is the error against run time of a few
     methods on a short horizon. `setup` has the seconds to build each engine; the derivation works when first called.
     `seconds` is the time of the whole study.
     """
@@ -232,7 +232,7 @@ class Comparison(ResultTable):
     def passed(self) -> bool:
         """Whether at least two engines were compared, in terms that are not all zero, and nothing differed.
 
-        What the description has and no engine uses (`findings`) is no difference between engines.
+        What the description has and no engine uses, among `findings`, is no difference between engines.
         """
         agreed = bool(self.rows) and not self.nothing and all(r.passed for r in self.rows)
         return agreed and not self._beyond

@@ -92,12 +92,12 @@ class _InPython:
         dyn, tau, which, space = at_time(self._smooth, t), applied(force, t, q, v), self._which, self._space
         free = v + h * dyn.forward_dynamics(q, v, tau)
         if len(which):
-            columns = np.linalg.solve(dyn.mass_matrix(q), np.eye(len(v))[:, which])
-            slides = np.abs(self._law.force_at(v))[which]
-            bound = np.where(v[which] == 0, self._law.bound[which], slides)
-            impulse, holds = friction_forces(columns[which], free[which], h * bound, h * slides, 0 * bound)
-            free = free + columns @ impulse
-            free[which[holds]] = 0.0
+            inverse, rubs = np.linalg.inv(dyn.mass_matrix(q)), self._law.bound > 0
+            slides = np.abs(self._law.force_at(v))
+            bound = np.where(v == 0, self._law.bound, slides)
+            most, less, none = h * bound[None], h * slides[None], np.zeros((1, len(v)))
+            (impulse,), (holds,) = friction_forces(inverse[None], free[None], most, less, rubs[None], none)
+            free = np.where(holds, 0.0, free + inverse @ impulse)
         q1 = space.retract(q, h * space.to_integrator_velocity(q, free))
         return q1, free
 

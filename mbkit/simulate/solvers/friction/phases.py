@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,22 +34,25 @@ class Friction:
         self.which = np.flatnonzero(self.law.bound > 0)
 
     def phase(self, t: float, q: Array, v: Array, force: Force, leaving: Array | None = None) -> Phase:
-        """Return the phase that begins in a state; `leaving` has the signs of velocities that are about to be."""
+        """Return the phase that begins in a state, or those of a batch on the own derivation.
+
+        `leaving` has the signs of velocities that are about to be.
+        """
         tau = applied(force, t, q, v)
-        resting, signs, none = self.law.at_rest(v), np.sign(v), np.zeros(len(v), dtype=bool)
-        held, still = np.zeros(len(v)), none
+        resting, signs = self.law.at_rest(v), np.sign(v)
+        held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
         if resting.any():
-            sliding = at_time(self._own.phase(self._dyn, signs, none), t)
+            sliding = at_time(self._dynamics(signs, still), t)
             held, still = self._own.decided(
                 sliding, lambda f: sliding.forward_dynamics(q, v, f), q, tau, resting, leaving
             )
         sides = np.where(resting, -np.sign(held), signs)
-        return Phase(self._own.phase(self._dyn, sides, still), sides, still)
+        return Phase(self._dynamics(sides, still), sides, still)
 
-    def sliding(self, signs: Array, rows: Indices) -> Iterator[tuple[Indices, Dynamics]]:
-        """Yield the dynamics in which rows of a batch slide along their signs, (N, nv), and which rows they are."""
-        if len(rows):
-            yield from self._own.sliding_together(self._dyn, signs, rows, self.which)
+    def _dynamics(self, sides: Array, still: NDArray[np.bool_]) -> Dynamics:
+        make = self._own.phases if sides.ndim == 2 else self._own.phase
+        out: Dynamics = make(self._dyn, sides, still)
+        return out
 
     def margins(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> Array:
         """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).
@@ -66,7 +68,7 @@ class Friction:
         """Return the forces of friction on what rests, and zero elsewhere; of the shape of v."""
         tau = applied(force, t, q, v)
         # Without the friction of what rests, and without its armature.
-        free = self._own.phase(self._dyn, np.where(phase.still, 0.0, phase.sides), phase.still & False)
+        free = self._dynamics(np.where(phase.still, 0.0, phase.sides), phase.still & False)
         dyn, loose = (at_time(x, t) for x in (phase.dyn, free._bare or free))
         a = np.where(phase.still, 0.0, dyn.forward_dynamics(q, v, tau))
         pulled = loose.inverse_dynamics(q, v, a) - tau[..., : v.shape[-1]]

@@ -34,6 +34,7 @@ _EPS: Final = float(np.finfo(float).eps)
 #: Of a step, from where on the end of a phase is looked for.
 _FROM: Final = 1e-6
 _END: Final = "end of a phase"
+_UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
 
 
 def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
@@ -136,12 +137,8 @@ class _Member:
         v, leaving = self.friction.after(phase, t, q, v, self.force(k))
         self._stuck = 0 if moved else self._stuck + 1
         if self._stuck > _MOST:
-            self.part.ended, self.part.message = (
-                "step_too_small",
-                (
-                    f"stopped, as which joints rest cannot be decided at t = {t:.9g} s: their phases end where they begin"
-                ),
-            )
+            self.part.ended = "step_too_small"
+            self.part.message = f"{_UNDECIDED} at t = {t:.9g} s: their phases end where they begin"
             return None
         self.q, self.v = q, v
         # What let go and came to rest at once did not let go.

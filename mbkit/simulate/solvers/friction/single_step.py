@@ -24,14 +24,14 @@ def step(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: floa
     """
     if q.ndim == 1:
         return _one(dyn, method, q, v, tau, dt)
-    friction, law = Friction(dyn), dyn._friction.law
-    # What rests has to be decided first.
-    slides = ~law.at_rest(v).any(axis=1)
-    q1, v1 = q.copy(), v.copy()
-    for rows, phase in friction.sliding(np.sign(v), np.flatnonzero(slides)):
-        q1[rows], v1[rows] = phase.step(q[rows], v[rows], tau[rows], dt, method.name)
-    changes = (np.sign(v) * v1)[:, friction.which] < 0
-    for i in np.flatnonzero(changes.any(axis=1) | ~slides):
+    if not dyn.derived or dyn._acting[0] or dyn.model.time_parameter is not None:
+        each = [_one(dyn._of_sample(i), method, *state, dt) for i, state in enumerate(zip(q, v, tau, strict=True))]
+        return np.array([x for x, _ in each]).reshape(q.shape), np.array([x for _, x in each]).reshape(v.shape)
+    friction = Friction(dyn)
+    phase = friction.phase(0.0, q, v, tau)
+    q1, v1 = phase.dyn.step(q, v, tau, dt, method.name)
+    v1 = np.where(phase.still, 0.0, v1)
+    for i in np.flatnonzero((friction.margins(phase, dt, q1, v1, tau) < 0).any(axis=1)):
         q1[i], v1[i] = _one(dyn._of_sample(int(i)), method, q[i], v[i], tau[i], dt)
     return q1, v1
 
