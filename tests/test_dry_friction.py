@@ -562,3 +562,19 @@ def test_friction_of_what_follows_by_a_ratio_of_zero_does_nothing():
     bare.set_joint("k", friction=0.0)
     runs = [mb.simulate(mb.dynamics(m, "lagrangian"), [0.1], [1.0], 0.5).q for m in (model, bare.build())]
     np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.parametrize("method", ["rk4", "rk853", "moreau"])
+def test_what_rests_keeps_its_place_to_the_bit(method):
+    """Beside joints that move, at zero too, where an armature alone would let it creep by 1e-34."""
+    model = mb.load("talos_arm")
+    dyn, q, v = mb.dynamics(model, "lagrangian"), model.neutral(), np.zeros(model.nv)
+    push = 20.0 * np.eye(model.nv)[3]
+    still = dyn.forward_dynamics(q, v, push) == 0
+    run = mb.simulate(dyn, q, v, 1e-3, method, torque=push, doubt=False)
+    assert not run.events
+    assert still.any()
+    assert not still.all()
+    assert not run.q[:, still].any()
+    stepped = dyn.step(q, v, push, 1e-3)[0], dyn.step([q, q], v, push, 1e-3)[0][1]
+    assert not any(x[still].any() for x in stepped)

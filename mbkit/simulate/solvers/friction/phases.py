@@ -32,6 +32,12 @@ class Friction:
         self.law = self._own.law
         #: Velocities with friction.
         self.which = np.flatnonzero(self.law.bound > 0)
+        layout = dyn.model.layout
+        places = (
+            range(layout.q[j.name].start, layout.q[j.name].start + j.type.nv) for j in dyn.model.independent_joints
+        )
+        # Joints with friction have a coordinate for each velocity.
+        self._places = np.array([i for part in places for i in part], dtype=np.intp)[self.which]
 
     def phase(self, t: float, q: Array, v: Array, force: Force, leaving: Array | None = None) -> Phase:
         """Return the phase that begins in a state, or those of a batch on the own derivation.
@@ -53,6 +59,14 @@ class Friction:
         make = self._own.phases if sides.ndim == 2 else self._own.phase
         out: Dynamics = make(self._dyn, sides, still)
         return out
+
+    def held(self, phase: Phase, start: Array, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return states of a phase from `start` on in which what rests keeps its place and no velocity, to the bit."""
+        if not phase.still.any():
+            return q, v
+        rests = np.zeros((*phase.still.shape[:-1], q.shape[-1]), dtype=bool)
+        rests[..., self._places] = phase.still[..., self.which]
+        return np.where(rests, start, q), np.where(phase.still, 0.0, v)
 
     def margins(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> Array:
         """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).

@@ -129,11 +129,12 @@ class _Member:
         torque = self.problem.torque.of_part(self.member, k, k + steps if steps else None)
         own = replace(self.problem, dyn=phase.dyn, q0=self.q, v0=self.v, torque=torque, **changes)  # type: ignore[arg-type]
         result = self._solver(phase.dyn)(own)
-        still = phase.still
-        return replace(result, v=np.where(still, 0.0, result.v)) if still.any() else result
+        q, v = self.friction.held(phase, self.q, result.q, result.v)
+        return replace(result, q=q, v=v)
 
     def next(self, phase: Phase, k: int, t: float, q: Array, v: Array, *, moved: bool) -> Phase | None:
         """Go to the end of a phase, and return the next one; None where it cannot be decided."""
+        q, v = self.friction.held(phase, self.q, q, v)
         v, leaving = self.friction.after(phase, t, q, v, self.force(k))
         self._stuck = 0 if moved else self._stuck + 1
         if self._stuck > _MOST:
@@ -233,7 +234,7 @@ class _PartOfStep:
         run, phase = self._run, self._phase
         if self._stepped:
             q, v = phase.dyn.step(run.q, run.v, np.asarray(self._force), s, run.problem.method)
-            return q, np.where(phase.still, 0.0, v)
+            return run.friction.held(phase, run.q, q, v)
         result = run.solve(phase, self._k, 1, **_on_grid(Grid(self._t, self._t + s, s, 1, s)))
         run.part.evaluations += result.evaluations
         return result.q[-1], result.v[-1]

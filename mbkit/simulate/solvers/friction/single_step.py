@@ -29,8 +29,7 @@ def step(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: floa
         return np.array([x for x, _ in each]).reshape(q.shape), np.array([x for _, x in each]).reshape(v.shape)
     friction = Friction(dyn)
     phase = friction.phase(0.0, q, v, tau)
-    q1, v1 = phase.dyn.step(q, v, tau, dt, method.name)
-    v1 = np.where(phase.still, 0.0, v1)
+    q1, v1 = friction.held(phase, q, *phase.dyn.step(q, v, tau, dt, method.name))
     for i in np.flatnonzero((friction.margins(phase, dt, q1, v1, tau) < 0).any(axis=1)):
         q1[i], v1[i] = _one(dyn._of_sample(int(i)), method, q[i], v[i], tau[i], dt)
     return q1, v1
@@ -41,8 +40,7 @@ def _one(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: floa
     start = 0.0 if clock is None else float(dyn.model.parameters[clock] or 0.0)
     friction = Friction(dyn)
     phase = friction.phase(start, q, v, tau)
-    q1, v1 = at_time(phase.dyn, start).step(q, v, tau, dt, method.name)
-    v1 = np.where(phase.still, 0.0, v1)
+    q1, v1 = friction.held(phase, q, *at_time(phase.dyn, start).step(q, v, tau, dt, method.name))
     if not (friction.margins(phase, start + dt, q1, v1, tau) < 0).any():
         return q1, v1
     grid = Grid(start, start + dt, dt, 1, dt)
