@@ -110,7 +110,7 @@ def test_at_rest_friction_is_what_the_least_constraint_needs(engine: str, seed: 
     held = mb.dynamics(model, engine).inverse_dynamics(q, v, a) - tau
     rest = (v == 0) & (bounds(model) > 0)
     bound = np.where(rest, bounds(model), 0.0)
-    noise = 1e-10 * (1 + np.abs(held).max() + np.abs(a).max())
+    noise = 1e-11 * (1 + np.abs(held).max() + np.abs(a).max())
     assert (np.abs(held) <= bound + noise).all()
     begins = rest & (a != 0)
     assert off(held[begins], (-bound * np.sign(a))[begins]) < noise

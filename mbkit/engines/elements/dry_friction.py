@@ -228,7 +228,12 @@ class DryFriction:
         A, b, on = A.reshape(-1, n, n), b.reshape(-1, n), resting.reshape(-1, n)
         bound, less = (np.broadcast_to(x, on.shape) for x in (law.bound, law.just_moving))
         known = np.zeros(on.shape) if leaving is None else (-leaving * law.just_moving).reshape(on.shape)
-        forces, holds = friction_forces(A, b, bound, less, on, known, definite=not self._constrained)
+        definite = not self._constrained
+        forces, holds = friction_forces(A, b, bound, less, on, known, definite=definite)
+        # A has the rounding of M; what the engine's own accelerations still leave corrects that.
+        left = accelerate(tau + _padded(forces.reshape(shape), tau))
+        left = np.asarray(left, dtype=np.float64).reshape(on.shape)
+        forces = forces - _restricted(A, left, holds, definite)
         return forces.reshape(shape), holds.reshape(shape)
 
     def _responses(self, dyn: Any, accelerate: Callable[[Array], Array], q: Array, tau: Array, a: Array) -> Array:
