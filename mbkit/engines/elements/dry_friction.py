@@ -43,6 +43,11 @@ _DOUBLE: Final = 53
 _EPS: Final = float(np.finfo(float).eps)
 #: Of forces, what their sums lose to rounding.
 _ROUNDING: Final = 64 * _EPS
+#: Of a singular A, what is added to its diagonal: far from its own rounding and from what is not rounding.
+_PROXIMAL: Final = 2.0**-32
+#: Proximal points, at most; two are enough, unless A is nearly singular, too.
+_POINTS: Final = 10_000
+_UNDECIDED: Final = "dry friction: which of {n} joints at rest begin to move cannot be decided: singular inertia"
 
 
 def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
@@ -54,7 +59,26 @@ def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
 def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool) -> tuple[Array, Mask]:
     """Return the λ with |λ| <= bound that minimize ½ λᵀ A λ + bᵀ λ, and where they are inside; (N, n) each.
 
-    λ is zero where `on` is False. A, (N, n, n), is positive definite or semidefinite.
+    λ is zero where `on` is False. A, (N, n, n), is positive definite or semidefinite. Of a semidefinite one, λ is the
+    limit of proximal points, whose A is definite (Rockafellar 1976, SIAM Journal on Control and Optimization 14).
+    """
+    if definite:
+        return _of_definite(A, b, bound, on)
+    size = np.abs(np.einsum("nii->ni", A)).max(axis=1, initial=0.0)
+    near = _PROXIMAL * np.where(size > 0, size, 1.0)[:, None]
+    own = A + near[..., None] * np.eye(b.shape[1])
+    noise = _noise(A, b, bound)
+    forces = np.zeros(b.shape)
+    for _ in range(_POINTS):
+        before = forces
+        forces, inside = _of_definite(own, b - near * before, bound, on)
+        if (near * np.abs(forces - before) <= noise).all():
+            return forces, inside
+    raise NumericalError(_UNDECIDED.format(n=b.shape[1]))
+
+
+def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Mask]:
+    """Return what `solve_at_rest` does, where A is positive definite.
 
     The set of forces at their bounds is exchanged as a whole as long as fewer conditions fail, then one by one, the
     last first, which ends (Murty 1974, Linear Algebra and its Applications 9; Júdice and Pires 1994, Computers and
@@ -65,13 +89,13 @@ def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool)
     side, best, left = np.zeros((size, n)), np.full(size, n + 1), np.full(size, _PATIENCE)
     going = np.arange(size)
     # What is undecided to rounding is at rest.
-    noise = _ROUNDING * (np.abs(b) + (np.abs(A) @ bound[..., None])[..., 0])
+    noise = _noise(A, b, bound)
     for _ in range(100 * (n + 1) ** 2):
         own, here = A[going], side[going]
         inner = on[going] & (here == 0)
         at_bound = here * bound[going]
         pushed = b[going] + (own @ at_bound[..., None])[..., 0]
-        x = np.where(inner, _restricted(own, -pushed, inner, definite), at_bound)
+        x = np.where(inner, _restricted(own, -pushed, inner), at_bound)
         a = b[going] + (own @ x[..., None])[..., 0]
         wrong = np.where(inner, np.abs(x) > bound[going] * (1 + ROUNDING), here * a > noise[going])
         forces[going], inside[going] = x, inner
@@ -86,18 +110,21 @@ def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool)
         going = going[counts > 0]
         if not len(going):
             return forces, inside
-    raise NumericalError(
-        f"dry friction: which of {n} joints at rest begin to move cannot be decided; their inertia is singular"
-    )
+    raise NumericalError(_UNDECIDED.format(n=n))
 
 
-def _restricted(A: Array, right: Array, on: Mask, definite: bool) -> Array:
+def _noise(A: Array, b: Array, bound: Array) -> Array:
+    """Return the rounding of accelerations under forces up to their bounds, (N, n)."""
+    return np.asarray(_ROUNDING * (np.abs(b) + (np.abs(A) @ bound[..., None])[..., 0]))
+
+
+def _restricted(A: Array, right: Array, on: Mask, *, definite: bool = True) -> Array:
     """Return the x with A x = right in the entries that are on, and zero in the others, (N, n)."""
     # The others have an equation of their own, of the size of A.
     size = np.abs(np.einsum("nii->ni", A)).max(axis=1, initial=1e-300)[:, None, None]
     own = np.where(on[:, :, None] & on[:, None, :], A, size * np.eye(A.shape[-1]) * ~on[:, :, None])
     right = np.where(on, right, 0.0)[..., None]
-    x = np.linalg.solve(own, right) if definite else np.linalg.pinv(own, hermitian=True) @ right
+    x = np.linalg.solve(own, right) if definite else np.linalg.pinv(own, rcond=_PROXIMAL, hermitian=True) @ right
     return np.asarray(x[..., 0])
 
 
@@ -233,7 +260,7 @@ class DryFriction:
         # A has the rounding of M; what the engine's own accelerations still leave corrects that.
         left = accelerate(tau + _padded(forces.reshape(shape), tau))
         left = np.asarray(left, dtype=np.float64).reshape(on.shape)
-        forces = forces - _restricted(A, left, holds, definite)
+        forces = forces - _restricted(A, left, holds, definite=definite)
         return forces.reshape(shape), holds.reshape(shape)
 
     def _responses(self, dyn: Any, accelerate: Callable[[Array], Array], q: Array, tau: Array, a: Array) -> Array:
