@@ -430,7 +430,10 @@ def smoothed(problem, friction):
 
 def main():
     problems = described()
-    data = {"accuracy": accuracy(problems), "orders": orders(problems["block on a belt"], problems["block with a rider"])}
+    data = {
+        "accuracy": accuracy(problems),
+        "orders": orders(problems["block on a belt"], problems["block with a rider"]),
+    }
     finer = arm(ARM_STEP / 2)
     known = zip(finer["events"], problems["two-link arm"][-1]["events"], strict=True)
     data["arm_known_to"] = max(float(abs(a[0] - b[0])) for a, b in known)
