@@ -1,7 +1,8 @@
-"""Versions of MuJoCo, Pinocchio and Drake against the oracle: which changed which number, and when.
+"""Versions of engines against the oracle: which changed which number, and when.
 
 Run ``python -m validation.versions``; it writes ``validation/versions.json``. Environments are made below the user's
-cache folder, or below ``MBKIT_ENVIRONMENTS``: 18 GB, and twenty minutes where none is there yet.
+cache folder, or below ``MBKIT_ENVIRONMENTS``: 18 GB, and twenty minutes where none is there yet. Those of Newton and
+MuJoCo Warp take 7 GB more, and are measured on a few robots: each version compiles its own kernels.
 
 All robots of example-robot-data are measured, random trees, and one arm that is written in eight ways. Seven say the
 same, the eighth in other units; a parser that reads one of them otherwise is wrong. That they do is checked with
@@ -52,7 +53,12 @@ VERSIONS: dict[str, tuple[str, ...]] = {
         *("3.3.1", "3.4.0", "3.7.0", "3.8.0", "3.9.0", "4.0.0", "4.1.0"),
     ),
     "drake": (*(f"1.{k}.0" for k in range(35, 52)), "1.51.1"),
+    "newton": ("1.5.1", "1.5.2", "1.6.0", "1.6.1", "1.7.0", "1.8.0"),
+    "mujoco-warp": (*(f"3.{k}.0" for k in range(13, 18)), "4.0.0"),
 }
+#: Of engines in which robots are trained, the last six versions, on these.
+TRAINED = {"newton", "mujoco-warp"}
+FEW = ("ur5", "panda", "hyq", "anymal")
 BARE = {"springs": False, "damping": False}
 TREES = {
     "turning": lambda: random_tree(5, 6, ("revolute", "free", "ball", "planar"), armature=False, **BARE),
@@ -61,8 +67,8 @@ TREES = {
     "rotors": lambda: random_tree(6, 5, ("revolute", "prismatic"), armature=True, **BARE),
 }
 
-#: Fewer digits are wrong.
-RIGHT = 8.0
+#: Fewer digits are wrong, of engines in double precision and in single.
+RIGHT = {False: 8.0, True: 4.0}
 #: What a reason says of one robot alone: its name, its parts.
 OF_ONE = re.compile(
     r"^\S+:\d+: | of \S+(?= is not finite)| at index .*| (?:Object|Element) name.*|: (?:body|joint) .*|; suspect: .*|"
@@ -93,7 +99,7 @@ def study(engine: str, targets: list[Any]) -> dict[str, Any]:
     return kept | {
         "changes": together(result.changes, versions_of(engine)),
         "robots": {name: summary(rows, last) for name, rows in by_robot.items()},
-        "wrong": wrong(result.rows, last),
+        "wrong": wrong(result.rows, last, RIGHT[engine in TRAINED]),
         "times": times_of(result.rows),
         "reasons": reasons(result.rows),
     }
@@ -150,18 +156,18 @@ def summary(rows: list[VersionRow], last: str) -> dict[str, Any]:
     }
 
 
-def wrong(rows: Iterable[VersionRow], last: str) -> list[dict[str, Any]]:
+def wrong(rows: Iterable[VersionRow], last: str, least: float) -> list[dict[str, Any]]:
     """Return terms that are wrong in the last version, and since which measured one they are."""
     of: dict[tuple[str, str], list[VersionRow]] = {}
     for r in rows:
         of.setdefault((r.robot, r.term), []).append(r)
     out = []
     for (robot, term), some in of.items():
-        if term == RUN or some[-1].version != last or not some[-1].digits < RIGHT:
+        if term == RUN or some[-1].version != last or not some[-1].digits < least:
             continue
         since = last
         for r in reversed(some):
-            if not r.digits < RIGHT:
+            if not r.digits < least:
                 break
             since = r.version
         out.append({"robot": robot, "term": term, "digits": round(some[-1].digits, 1), "since": since})
@@ -240,8 +246,11 @@ def main() -> None:
         trees = [replace(make(), name=name) for name, make in TREES.items()]
         models = [*written(Path(folder)), *trees]
         for engine in names:
-            out.setdefault("engines", {})[engine] = study(engine, [*robots(), *models])
-            out.setdefault("smallest", {})[engine] = smallest(engine)
+            trained = engine in TRAINED
+            few = [*FEW, *trees] if trained else [*robots(), *models]
+            out.setdefault("engines", {})[engine] = study(engine, few)
+            if not trained:
+                out.setdefault("smallest", {})[engine] = smallest(engine)
             print(out["engines"][engine]["verdict"])
     path.write_text(json.dumps(to_plain(out), indent=1) + "\n", encoding="utf-8")
 

@@ -35,6 +35,8 @@ from mbkit.studies.worker import describe, run
 _CLEAR: Final = 2.0
 #: Digits of a double.
 _MOST_DIGITS: Final = -math.log10(np.finfo(float).eps)
+#: By bits of a significand, what rounding alone moves no number by.
+_MOVED: Final = {53: 1e-9, 24: 1e-4}
 LATEST: Final = "latest"
 
 
@@ -48,7 +50,7 @@ def versions(
     most: int = 12,
     samples: int = 4,
     seed: int = 0,
-    tolerance: float = 1e-9,
+    tolerance: float | None = None,
     keep: int | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -64,7 +66,7 @@ def versions(
     ----------
     targets : str, Model, or several
         Robots, catalog systems, files, ``package.module:function``, or models.
-    engine : {"mujoco", "pinocchio", "drake"}
+    engine : {"mujoco", "pinocchio", "drake", "newton", "mujoco-warp", "mjx"}
     versions : iterable of str, optional
         By default those that pip can install, from `first` to `last`.
     first, last : str
@@ -75,7 +77,8 @@ def versions(
     samples, seed : int
         Random states, beside neutral, at-limit and near-singular ones.
     tolerance : float
-        A number has changed where it moved by more, relative as errors are in `mbkit.compare`.
+        A number has changed where it moved by more, relative as errors are in `mbkit.compare`. By default 1e-9, and
+        1e-4 for an engine in single precision.
     keep : int, optional
         Environments that this call made and leaves on the disk; by default all.
     executor : concurrent.futures.Executor, optional
@@ -99,6 +102,8 @@ def versions(
         raise UnknownNameError("engine with versions", str(engine), PACKAGES)
     count("most", most, least=2)
     count("samples", samples, least=1)
+    if tolerance is None:
+        tolerance = _MOVED[PACKAGES[engine].bits]
     real("tolerance", tolerance, positive=True)
     if keep is not None:
         count("keep", keep)

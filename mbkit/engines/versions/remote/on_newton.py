@@ -1,4 +1,4 @@
-"""Newton of any version from 1.8, on a CPU: terms of a description in Newton's own coordinates, in single precision.
+"""Newton of any version from 1.5, on a CPU: terms of a description in Newton's own coordinates, in single precision.
 
 Newton moves a free body by the velocity of its centre of mass, and states its forces there. Here it is the velocity of
 the body's origin, v_G = v + ω × R c, so that quantities are turned into it, in double precision.
@@ -56,9 +56,12 @@ class Engine:
             worlds.replicate(self._builder, n)
             # By name, where it is asked what it changes.
             worlds.validate_inertia_detailed = self._validated
-            # What a description says is judged, not what a validation makes of it.
-            unlike = {} if self._validated else {"skip_validation_inertia": True}
-            model = worlds.finalize(device="cpu", **unlike)
+            model = worlds.finalize(device="cpu")
+            if not self._validated:
+                # What a description says is judged, not what a validation makes of it.
+                for name in ("body_mass", "body_inv_mass", "body_inertia", "body_inv_inertia"):
+                    held, values = getattr(model, name), np.array(getattr(self._builder, name) * n, dtype=np.float32)
+                    held.assign(values.reshape(held.numpy().shape))
             if not passive:
                 for name in ("joint_damping", "joint_stiffness"):
                     if hasattr(model, name):
