@@ -45,7 +45,8 @@ def _link(builder: Any, name: str, body: dict[str, Any]) -> Any:
 def _joint(builder: Any, step: dict[str, Any], parent: int, child: int, at: Any, own: dict[str, Any]) -> Any:
     kind = step["type"]
     if kind in ("revolute", "prismatic"):
-        own = {_OF_ONE[name]: value for name, value in own.items()}
+        # Versions before 1.8 have no springs of joints.
+        own = {_OF_ONE[name]: value for name, value in own.items() if value and (name != "rest" or own["stiffness"])}
         own["axis"] = wp.vec3(step["axes"][0])
     if kind == "free":
         return builder.add_joint_free(child, parent=parent, parent_xform=at)
