@@ -225,7 +225,7 @@ def test_chains_of_rigid_segments_come_to_the_beam_as_the_square_of_their_length
     for engine in ("pinocchio", "mujoco"):
         errors = []
         for n in (6, 12):
-            M = mb.dynamics(flexible.chain(n), engine).mass_matrix(np.zeros(n + 1))[1:, 1:]
+            M = mb.dynamics(flexible.rotor(1).segmented(n), engine).mass_matrix(np.zeros(n + 1))[1:, 1:]
             K = np.eye(n) * beams.EI * n / beams.LENGTH
             errors.append(np.sqrt(np.linalg.eigvals(np.linalg.solve(M, K)).real.min()) / exact - 1)
         assert 1.9 < np.log2(errors[0] / errors[1]) < 2.1

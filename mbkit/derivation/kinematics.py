@@ -72,11 +72,10 @@ class Kinematics:
         self._v_of: dict[str, Vector] = {}
         for joint in model.joints:
             if joint.mimic:
-                leader_q = scalar(self.q[layout.q[joint.mimic.joint].start])
-                leader_v = scalar(self.v[layout.v[joint.mimic.joint].start])
-                values = self.values.joints[joint.name]
-                self._q_of[joint.name] = [values.ratio * leader_q + values.offset]
-                self._v_of[joint.name] = [values.ratio * leader_v]
+                values, leader = self.values.joints[joint.name], joint.mimic.joint
+                leading = [scalar(self.q[i]) for i in _range(layout.q[leader])]
+                self._q_of[joint.name] = [values.ratio * x + values.offset for x in leading]
+                self._v_of[joint.name] = [values.ratio * scalar(self.v[i]) for i in _range(layout.v[leader])]
             else:
                 self._q_of[joint.name] = [scalar(self.q[i]) for i in _range(layout.q[joint.name])]
                 self._v_of[joint.name] = [scalar(self.v[i]) for i in _range(layout.v[joint.name])]

@@ -755,7 +755,7 @@ def unknown_joint(engine: str, joint: Joint) -> UnsupportedError:
     """Return the error for a joint of a type that an adapter has no counterpart of."""
     return UnsupportedError(
         f"{engine}: joint {joint.name!r} is {joint.kind}, a type that this engine does not have; "
-        "the lagrangian engine takes every joint type"
+        f"the lagrangian engine takes every joint type{joint.type.instead and f', and {joint.type.instead}'}"
     )
 
 

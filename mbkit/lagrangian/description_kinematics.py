@@ -114,11 +114,10 @@ class SymbolicKinematics(Kinematics):
         """Return a joint's coordinates or velocities; those of a mimic joint from its leader's."""
         if not joint.mimic:
             return symbols[layout[joint.name]] if joint.type.nv else []
-        (leader,) = symbols[layout[joint.mimic.joint]]
         ratio, offset = (
             self.bound.get(("joints", joint.name, f, ()), exact(getattr(joint.mimic, f))) for f in ("ratio", "offset")
         )
-        return [ratio * leader + (0 if still else offset)]
+        return [ratio * leader + (0 if still else offset) for leader in symbols[layout[joint.mimic.joint]]]
 
     def carried(self, way: _Way, x: Vector, weight: int) -> Vector:
         """Return a point (weight 1) or a direction (0) of a way's first body in the axes of its last."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from itertools import chain, count
 from typing import Final, cast
 
@@ -24,7 +25,9 @@ from mbkit.lagrangian.energy_model import EnergyModel
 from mbkit.lagrangian.printing.catalog_symbols import in_symbols
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.lagrangian.trig.simplify import tidy
-from mbkit.model import Model
+from mbkit.model import Joint, Model
+from mbkit.model.elements.beams import BeamEnd
+from mbkit.model.elements.references import names_in
 
 #: Velocities up to which equations are written out.
 _MOST: Final = 24
@@ -112,7 +115,7 @@ def from_model(
         if named is None and symbols:
             known = "it has named parameters already" if model.bindings else "it is no system of the catalog"
             raise InputError(f"symbols: {model.name}: {known}; leave symbols out to keep its numbers")
-    source = named or model
+    source = _with_points(named or model)
     parameters = {name: sp.Symbol(name) for name in source.parameters if name != source.time_parameter}
     clash = [s.name for s in q if s.name in parameters]
     if clash:
@@ -156,6 +159,34 @@ def from_model(
         parameters={s: source.parameters[n] for n, s in parameters.items() if named is None or s in used} | g,
         name=model.name,
     )
+
+
+def _with_points(model: Model) -> Model:
+    """Return the model with the ends of its beams as points, whose turns are no sums of cosines and sines."""
+    joints = []
+    for joint in model.joints:
+        if isinstance(joint.type, BeamEnd):
+            if turned := _turned(model, joint):
+                raise UnsupportedError(
+                    f"{model.name}: {turned} at the end of beam {joint.name!r} turns with it, and is not written out; "
+                    'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
+                )
+            joint = replace(joint, kind=joint.type.point.name)
+        joints.append(joint)
+    return replace(model, joints=tuple(joints)) if joints != [*model.joints] else model
+
+
+def _turned(model: Model, end: Joint) -> str:
+    """Return what is more than a mass at the end of a beam; empty without anything."""
+    beyond = {end.child}
+    for joint in model.tree:
+        if joint.parent in beyond:
+            if joint.type.nv or joint.translation.any():
+                return f"joint {joint.name!r}"
+            beyond.add(joint.child)
+    bodies = [f"body {b.name!r}" for b in model.bodies if b.name in beyond and (b.com.any() or b.inertia.any())]
+    acting = (x for kind in ("springs", "loops", "forces", "no_slip") for x in getattr(model, kind))
+    return [*bodies, *(repr(x.name) for x in acting if names_in(x) & beyond), ""][0]
 
 
 def _weight(kin: SymbolicKinematics, used: set[str]) -> tuple[sp.Expr, dict[sp.Symbol, float | None]]:

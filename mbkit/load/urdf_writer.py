@@ -50,7 +50,9 @@ def _unsupported(model: Model) -> Iterator[str]:
     for joint in model.joints:
         item = f"joint {joint.name!r}"
         if joint.kind not in _TYPES:
-            yield f"{item} is {'a ball joint' if joint.kind == 'ball' else joint.kind.replace('_', '-')}"
+            # What follows another type is told with it.
+            if not joint.mimic:
+                yield f"{item} is {'a ball joint' if joint.kind == 'ball' else joint.kind.replace('_', '-')}"
             continue
         if joint.armature.any():
             yield f"{item} has armature"

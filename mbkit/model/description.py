@@ -200,7 +200,7 @@ class Layout:
         for j in self.joints:
             part = rows[j.name]
             if j.mimic:
-                G[part, columns[j.mimic.joint]] = j.mimic.ratio
+                G[part, columns[j.mimic.joint]] = j.mimic.ratio * np.eye(part.stop - part.start)
             else:
                 G[part, columns[j.name]] = np.eye(part.stop - part.start)
         return read_only(G)

@@ -352,6 +352,34 @@ class Model(Description):
         reduced: tuple[Array, Array] = _changes("locking").reduced_state(self, q, v)
         return reduced
 
+    def segmented(self, segments: int) -> Model:
+        """Return the model with each beam of `ModelBuilder.add_beam` as a chain of rigid segments, for every engine.
+
+        Springs EI/h sit in hinges between segments of the length h, the first of them half a segment from the clamp:
+        frequencies and motions come to those of the beam as h². Deflections may be large. Bodies ``name.s0``,
+        ``name.s1``, ... are the segments, and the body at the beam's end stays.
+
+        Parameters
+        ----------
+        segments : int
+            Hinges of each beam.
+
+        Raises
+        ------
+        UnsupportedError
+            A part that acts on the modes or on points of a beam, or stiffnesses of modes that belong to no EI.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("wing")
+        >>> b.add_beam("beam", parent="world", length=2.0, stiffness=30.0, density=0.4, modes=2)
+        >>> mb.dynamics(b.build().segmented(10), "pinocchio").model.nv
+        10
+        """
+        made: Model = _changes("segments").segmented(self, segments)
+        return made
+
     def with_free(self, *paths: Any) -> Model:
         """Return the same model with numbers that are parameters, by path, for `Dynamics.at` and batches of variants.
 

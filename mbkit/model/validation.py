@@ -236,7 +236,7 @@ def _mimic_faults(joints: Sequence[Joint]) -> Iterator[str]:
             near = suggestions.near(joint.mimic.joint, by_name)
             yield f"{item}: mimics unknown joint {joint.mimic.joint!r}" + (f"; near: {near!r}" if near else "")
             continue
-        if joint.type.nv != 1 or leader.type.nv != 1:
+        if joint.type.nv != leader.type.nv or (joint.type.nv != 1 and joint.type.built_in):
             yield f"{item}: mimics {leader.name!r}, but both must have one velocity"
         seen, at = {joint.name}, leader
         while at.name not in ends and at.mimic is not None and at.mimic.joint in by_name:

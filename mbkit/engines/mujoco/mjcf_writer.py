@@ -67,8 +67,9 @@ def read_back(model: Model, text: str) -> MujocoDynamics:
 def _unsupported(model: Model) -> Iterator[str]:
     for joint in model.joints:
         name = f"joint {joint.name!r}"
-        if joint.kind not in JOINT_TYPES:
-            yield f"{name} is {joint.kind}"
+        # What follows another type is told with it.
+        if joint.kind not in JOINT_TYPES and not joint.mimic:
+            yield f"{name} is {joint.kind}{joint.type.instead and f' ({joint.type.instead})'}"
         parts = [joint.damping] if joint.kind == "ball" else np.split(joint.damping, 2) if joint.kind == "free" else []
         if any(np.ptp(x) > 0 for x in parts):
             yield f"{name} is damped differently along its body axes"

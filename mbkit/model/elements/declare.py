@@ -1,4 +1,4 @@
-"""The part of `ModelBuilder` for elements that are given by functions: forces, bushings and motions in time."""
+"""The part of `ModelBuilder` for elements: beams, and what functions give: forces, bushings and motions in time."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, shown
 from mbkit.errors import MbkitError
+from mbkit.model.elements.beams import beam_types, modes_of
 from mbkit.model.elements.forces import (
     DISPLACEMENT,
     POINT,
@@ -25,7 +26,8 @@ from mbkit.model.elements.forces import (
 )
 from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.motion_laws import FormulaMotion, SplineMotion
-from mbkit.model.parameters import Expression, Number
+from mbkit.model.joint_types import FIXED
+from mbkit.model.parameters import Expression, Number, nominal
 from mbkit.model.parts import Prescribed
 
 Axes = Literal["local", "local_world_aligned", "world"]
@@ -33,6 +35,8 @@ Ends = Literal["natural", "clamped", "quintic"]
 _AXES: Final = get_args(Axes)
 _ENDS: Final = get_args(Ends)
 _Vector = ArrayLike | Sequence[Number]
+#: Limit of a beam's amplitudes together, as a part of its length.
+_DEFLECTION: Final = 0.1
 #: Values by the names that stand for them in expressions.
 Constants = Mapping[str, Number]
 
@@ -51,6 +55,8 @@ class ElementBuilder:
 
     _read: Any
     _add: Callable[..., None]
+    add_body: Callable[..., None]
+    add_joint: Callable[..., None]
 
     def prescribe(
         self,
@@ -336,6 +342,103 @@ class ElementBuilder:
         a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
         self._add(Bushing, "forces", "bushing", name, a | b, matrices | formulas | constants)
+
+    def add_beam(
+        self,
+        name: str,
+        *,
+        parent: str,
+        length: float,
+        stiffness: Number | Sequence[Number],
+        density: Number,
+        modes: int | None = None,
+        shapes: Any = None,
+        damping: Number = 0.0,
+        translation: _Vector = (0.0, 0.0, 0.0),
+        rotation: ArrayLike | None = None,
+        rpy: ArrayLike | None = None,
+    ) -> None:
+        """Add an Euler-Bernoulli beam, clamped to a body, by assumed modes: small deflections on any motion.
+
+        Its axis is x of the root's frame; it deflects along y, and in space along z too. The coordinates are amplitudes
+        a of normal modes φ with ∫ φ_i φ_j ds = length δ_ij, as `mbkit.lagrangian.clamped_free` writes them: the end of
+        an exact mode deflects by ±2 a. It does not stretch: as it bends, its points move towards the root by
+        ½ ∫ (v′² + w′²) ds, without which a beam that turns would soften (Kane, Ryan, Banerjee 1987). Rotary inertia,
+        shear and torsion are left out, and terms beyond the second order in the deflections.
+
+        A body of the beam's name is the frame at its end, which turns with the axis; bodies and joints may hang on it.
+        ``name.root`` is the clamp, and ``name.1``, ``name.2``, ... are the points of Gauss's quadrature with the mass.
+        The lagrangian engine and the oracle take it; `Model.segmented` makes rigid segments for the others.
+
+        Parameters
+        ----------
+        name, parent : str
+        length : float
+            m.
+        stiffness : float or (EI_v, EI_w)
+            EI against bending along y alone, or along y and along z, N m².
+        density : float
+            Mass a metre, kg/m.
+        modes : int, optional
+            How many exact modes of a clamped and free beam, in each plane.
+        shapes : sequence of numpy.polynomial.Polynomial, optional
+            Instead: shapes of s/length, which are zero with their slopes at 0. The modes are those of the uniform beam
+            within their span, by Ritz's method.
+        damping : float
+            Of the material (Kelvin and Voigt), s: on rates it is this times the stiffness on deflections.
+        translation, rotation, rpy : array_like, optional
+            The root's frame in the parent, as of `add_joint`.
+
+        Notes
+        -----
+        `random_state` bends a beam by a tenth of its length or so; a limit of the coordinates says that. Two to four
+        modes in a plane do for most motions, and the time to derive and compile grows fast with their number. Where a
+        heavy body turns at the end, shapes of polynomials come closer than exact modes, which fit a free end.
+
+        Examples
+        --------
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("rotor", gravity=(0, 0, 0))
+        >>> b.add_body("hub", mass=1.0, inertia=(50.0, 50.0, 50.0))
+        >>> b.add_joint("turn", "revolute", parent="world", child="hub", axis=(0, 0, 1))
+        >>> b.add_beam("blade", parent="hub", length=10.0, stiffness=1.4e4, density=1.2, modes=2)
+        >>> dyn = mb.dynamics(b.build(), "lagrangian")
+        >>> dyn.model.coordinate_names, dyn.mass_matrix([0.0, 0.0, 0.0]).diagonal().round(6).tolist()
+        (('turn', 'blade.1', 'blade.2'), [450.0, 12.0, 12.0])
+        """
+        read, known = self._read, len(self._read.faults)
+        name = read.name("beam name", name)
+        item = f"beam {name!r}"
+        long = read.real(f"{item}: length", length)
+        pair = isinstance(stiffness, (list, tuple, np.ndarray))
+        EI = read.quantities(f"{item}: stiffness", stiffness, 2 if pair else 1, each=not pair)
+        rho, tau = read.quantity(f"{item}: density", density), read.quantity(f"{item}: damping", damping)
+        least = [("length", long, True), *(("stiffness", x, False) for x in EI)]
+        for what, x, above in (*least, ("density", rho, True), ("damping", tau, False)):
+            value = nominal(x)
+            if len(read.faults) == known and (value < 0 or (above and value == 0)):
+                read.faults.append(f"{item}: {what}: expected a number {'above' if above else 'from'} 0, got {value:g}")
+        good, found = self._asked(item, (modes, shapes), lambda: modes_of(modes, shapes))
+        root = f"{name}.root"
+        self.add_body(root)
+        self.add_joint(
+            *(root, FIXED.name), parent=parent, child=root, translation=translation, rotation=rotation, rpy=rpy
+        )
+        self.add_body(name)
+        if not good or len(read.faults) > known:
+            # Whatever hangs on the beam finds its body.
+            self.add_joint(name, FIXED.name, parent=root, child=name)
+            return
+        end, points = beam_types(long, found, len(EI))
+        each = end.nv // len(EI)
+        K = [EI[k // each] * c for k, c in enumerate(end.squares)]
+        loss = 0.0 if _is_zero(tau) else [tau * k for k in K]
+        reach = _DEFLECTION * long / each
+        self.add_joint(*(name, end.name), parent=root, child=name, stiffness=K, damping=loss, lower=-reach, upper=reach)
+        for k, (point, weight) in enumerate(zip(points, end.weights, strict=True)):
+            own = f"{name}.{k + 1}"
+            self.add_body(own, mass=rho * weight)
+            self.add_joint(own, point.name, parent=root, child=own, mimic=(name, 1.0, 0.0))
 
     def _asked(self, item: str, value: Any, call: Callable[[], Any]) -> tuple[bool, Any]:
         """Return whether a call succeeded and what it returned; its error is a fault of an argument."""

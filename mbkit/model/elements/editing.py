@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, nearest
+from mbkit.model.elements.beams import OnBeam
 from mbkit.model.elements.forces import RATE
 from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on, moved_by, names_in, renamed
 from mbkit.model.parameters import Binding, Number, split
@@ -158,6 +159,11 @@ class EditingBuilder:
         joint = self._named("joints", name)
         if joint is None:
             return
+        if isinstance(joint.type, OnBeam) and joint.mimic:
+            self._read.faults.append(
+                f"joint {name!r} is a point of beam {joint.mimic.joint!r}; set that joint, or its root"
+            )
+            return
         limits = lower, upper, velocity_limit, effort_limit
         numbers = armature, damping, friction, stiffness, rest, stiction, stribeck_velocity
         given: dict[str, Any] = dict(zip(NUMBERS_OF_JOINTS, (*limits, *numbers), strict=True))
@@ -290,6 +296,10 @@ class EditingBuilder:
         """
         joint = self._named("joints", name)
         if joint is None:
+            return
+        if isinstance(joint.type, OnBeam):
+            whole = f"remove_joint({joint.parent!r}) removes it whole"
+            self._read.faults.append(f"joint {name!r} is a part of a beam; {whole}")
             return
         bodies, joints = {joint.child}, {joint.name}
         # Parts may stand in any order.

@@ -6,7 +6,7 @@ Bodies that fixed joints hold together are one link. Places follow from the desc
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, finite_array
 from mbkit.errors import InputError
 from mbkit.model import Joint, Model
+from mbkit.model.elements.beams import OnBeam
 from mbkit.model.poses import body_poses, inertia_box
 
 
@@ -47,6 +48,9 @@ def skeleton(model: Model, q: Array) -> Skeleton:
     tree = _Tree(model, q)
     parts: dict[str, list[Any]] = {name: [] for name in Skeleton.__dataclass_fields__ if name != "path"}
     for joint in tree.moving:
+        if isinstance(joint.type, OnBeam):
+            parts["links"] += tree.bend(joint)
+            continue
         parent, base, place = tree.link[joint.parent], tree.bases[joint.name], tree.origin(joint.child)
         flies, slides = joint.type.floating, _slides(joint)
         if parent != "world":
@@ -104,6 +108,12 @@ class _Tree:
             self.ground[child] = self.ground.get(parent, child)
             if joint.type.nv:
                 self.depth[child] = self.depth[self.link[parent]] + 1
+
+    def bend(self, joint: Joint) -> list[list[Array]]:
+        """Return the pieces of a beam's axis, of its end."""
+        points = [j for j in self.moving if j.mimic and j.mimic.joint == joint.name]
+        line = [self.bases[joint.name], *(self.origin(j.child) for j in points), self.origin(joint.child)]
+        return [] if joint.mimic else [[a, b] for a, b in pairwise(line)]
 
     def at(self, body: str, point: Array) -> Array:
         """Return a point of a body in world axes, (n, 3)."""
