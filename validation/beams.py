@@ -140,14 +140,14 @@ def rotating(stiffness: float, density: float, length: float, speed: float, coun
 # Spin-up in the plane
 
 
-def angle(t: Any, module: Any = np) -> tuple[Any, Any, Any]:
+def angle(t: Any, module: Any = np, speed: float = SPEED) -> tuple[Any, Any, Any]:
     """Return θ, its rate and its acceleration: Ω (t/T - sin(2π t/T)/(2π)) until T, then Ω."""
     c = 2 * np.pi / RISE
-    rate = SPEED / RISE * (t - module.sin(c * t) / c)
-    return SPEED / RISE * (t**2 / 2 + (module.cos(c * t) - 1) / c**2), rate, SPEED / RISE * (1 - module.cos(c * t))
+    rate = speed / RISE * (t - module.sin(c * t) / c)
+    return speed / RISE * (t**2 / 2 + (module.cos(c * t) - 1) / c**2), rate, speed / RISE * (1 - module.cos(c * t))
 
 
-def spin_up(count: int, times: np.ndarray, *, stiffening: bool = True) -> np.ndarray:
+def spin_up(count: int, times: np.ndarray, *, stiffening: bool = True, speed: float = SPEED) -> np.ndarray:
     """Return the deflection of the tip, m, at times up to the end of the rise, by Kane's equation of each mode."""
     modes = []
     for k in range(count):
@@ -173,7 +173,7 @@ def spin_up(count: int, times: np.ndarray, *, stiffening: bool = True) -> np.nda
 
     def rates(t: float, z: np.ndarray) -> np.ndarray:
         a, v = z[:count], z[count:]
-        _, w, dw = angle(t)
+        _, w, dw = angle(t, speed=speed)
         return np.concatenate([v, -K @ a - w**2 * (stiffer - np.eye(count)) @ a - dw * moment])
 
     run = solve_ivp(rates, (0, times[-1]), np.zeros(2 * count), method="DOP853", t_eval=times, rtol=1e-12, atol=1e-14)
