@@ -226,9 +226,9 @@ def _every_row(kin: Kinematics, time: Any) -> Iterator[_Row]:
         for name, row in zip(names, rows(_ends(kin, loop)), strict=True):
             yield _Row(loop.name, f"loop {loop.name!r} {name}", row)
     for coupler in model.couplers:
-        (at,), (leading,) = (kin.coordinates(model.joint(name)) for name in (coupler.joint, coupler.leader))
-        curve = follower(kin.values.couplers[coupler.name], leading)
-        yield _Row(coupler.name, f"coupler {coupler.name!r}", at - curve)
+        at, *leading = (kin.coordinates(model.joint(name))[0] for name in (coupler.joint, *coupler.leaders))
+        follows = follower(kin.values.couplers[coupler.name], leading)
+        yield _Row(coupler.name, f"coupler {coupler.name!r}", at - follows)
     for motion in model.prescribed:
         (at,) = kin.coordinates(model.joint(motion.joint))
         numbers = casadi_arithmetic(kin.values.number)

@@ -41,14 +41,16 @@ def constant_transposed_times(A: list[Vector], x: Vector) -> Vector:
     return [sum((A[k][i] * x[k] for k in range(3) if not is_zero(A[k][i])), 0.0) for i in range(3)]
 
 
-def follower(coupler: Any, leading: Any) -> Any:
-    """Return the coordinate that a coupler's numbers give a joint where its leader's is `leading`."""
-    coefficients = [coupler.offset, coupler.ratio, *coupler.curve]
+def follower(coupler: Any, leading: Vector) -> Any:
+    """Return the coordinate that a coupler's numbers give a joint where its leaders' are `leading`."""
+    (first, *others), (ratio, *ratios) = leading, coupler.ratios
+    constant = sum((r * x for r, x in zip(ratios, others, strict=True)), coupler.offset)
+    coefficients = [constant, ratio, *coupler.curve]
     while len(coefficients) > 2 and is_zero(coefficients[-1]):
         coefficients.pop()
     out = coefficients.pop()
     while coefficients:
-        out = out * leading + coefficients.pop()
+        out = out * first + coefficients.pop()
     return out
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import InputError
-from mbkit.model import Frame, Joint, Model, NoSlip
+from mbkit.model import Coupler, Frame, Joint, Model, NoSlip
 from mbkit.model.elements.forces import Bushing, FrameForce, GravityCompensation, JointForce
 from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.rolling import tangents
@@ -184,7 +184,7 @@ class Values:
         self.loops = {x.name: self._read("loops", x.name, x, _LOOP) for x in model.loops}
         self.forces = {f.name: self._read("forces", f.name, f, _FORCES[type(f)]) for f in model.forces}
         self.no_slip = {x.name: self._contact(x) for x in model.no_slip}
-        self.couplers = {x.name: self._read("couplers", x.name, x, _COUPLER) for x in model.couplers}
+        self.couplers = {x.name: self._coupler(x) for x in model.couplers}
         self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}
 
     @property
@@ -218,6 +218,11 @@ class Values:
     def _contact(self, part: NoSlip) -> Any:
         values = self._read("no_slip", part.name, part, _NO_SLIP)
         values.tangents = self._entries(("no_slip", part.name, "tangents"), (), tangents(part.axis_b))
+        return values
+
+    def _coupler(self, part: Coupler) -> Any:
+        values = self._read("couplers", part.name, part, _COUPLER)
+        values.ratios = values.ratio if isinstance(values.ratio, list) else [values.ratio]
         return values
 
     def _read(self, where: str, part: str, source: Any, fields: tuple[str, ...]) -> Any:

@@ -277,12 +277,12 @@ def motion(kin: SymbolicKinematics, prescribed: Prescribed, t: sp.Symbol) -> sp.
 
 
 def coupled(kin: SymbolicKinematics, coupler: Coupler) -> sp.Expr:
-    """Return q less what its leader gives it."""
+    """Return q less what its leaders give it."""
     x = kin.written.values.couplers[coupler.name]
-    (at,), (leading,) = (kin.symbols_of[name] for name in (coupler.joint, coupler.leader))
+    at, *leading = (kin.symbols_of[name][0] for name in (coupler.joint, *coupler.leaders))
     offset = _read(x.offset) if kin.model.joint(coupler.joint).type.angular and x.offset else x.offset
-    higher = sum((c * leading ** (k + 2) for k, c in enumerate(x.curve)), sp.Integer(0))
-    return at - x.ratio * leading - offset - higher
+    higher = sum((c * leading[0] ** (k + 2) for k, c in enumerate(x.curve)), sp.Integer(0))
+    return at - sum(r * y for r, y in zip(x.ratios, leading, strict=True)) - offset - higher
 
 
 def angle(x: float) -> sp.Expr:

@@ -1,6 +1,6 @@
 """Equality constraints of an MJCF as loops (XML reference of MuJoCo 4.0, section "equality").
 
-A <connect> becomes a loop of two points, a <weld> one of two frames, and a <joint> or <tendon> that holds two joints a
+A <connect> becomes a loop of two points, a <weld> one of two frames, and a <joint> or <tendon> that holds joints a
 coupler, all exact where MuJoCo's are soft. What an element with bodies does not say is measured in the reference
 configuration, the pose of the file: the second anchor of a <connect>, and the relative pose of a <weld>.
 """
@@ -29,8 +29,8 @@ _KINDS: Final = {"connect": "point", "weld": "frame"}
 _SOFT: Final = ("solref", "solimp", "torquescale")
 _JOINT: Final = "joint"
 _COUPLED: Final = (_JOINT, "tendon")
-#: Joint, leader, ratio, offset and curve of a coupler.
-_Curve = tuple[str, str, float, float, list[float]]
+#: Joint, leaders, their ratios, offset and curve of a coupler.
+_Curve = tuple[str, list[str], list[float], float, list[float]]
 
 
 def coupled(sides: Sequence[Mapping[str, float]], shape: Sequence[float], refs: Mapping[str, float]) -> _Curve | str:
@@ -41,19 +41,21 @@ def coupled(sides: Sequence[Mapping[str, float]], shape: Sequence[float], refs: 
     """
     a, b = (*sides, {})[:2]
     if len(a) == len(b) == 1 and a.keys() != b.keys():
-        ((joint, c), (leader, d)) = (*a.items(), *b.items())
+        ((joint, c), (leader, d)), leaders = (*a.items(), *b.items()), [*b]
         curve = Polynomial(shape)(Polynomial([-d * refs[leader], d])) if d != 1 or refs[leader] else Polynomial(shape)
+        constant, *ratios = (float(x) / c for x in (*curve.coef, *[0.0] * 5)[:5])
+        ratios, higher = ratios[:1], ratios[1:]
     elif b and any(shape[2:]):
         return "it is a polynomial of a sum of coordinates"
     else:
         row = {name: a.get(name, 0.0) - shape[1] * b.get(name, 0.0) for name in (*a, *b)}
         row = {name: x for name, x in row.items() if x}
-        if len(row) != 2:
-            return f"it holds {len(row)} joints at once" if len(row) > 1 else "it holds a single joint"
-        ((joint, c), (leader, d)) = row.items()
-        curve = Polynomial([shape[0] + d * refs[leader], -d])
-    constant, ratio, *higher = (float(x) / c for x in (*curve.coef, *[0.0] * 5)[:5])
-    return joint, leader, ratio, refs[joint] + constant, higher
+        if len(row) < 2:
+            return "it holds a single joint"
+        (joint, c), *others = row.items()
+        constant = sum((d * refs[leader] for leader, d in others), shape[0]) / c
+        leaders, ratios, higher = [x for x, _ in others], [-d / c for _, d in others], [0.0] * 3
+    return joint, leaders, ratios, refs[joint] + constant, higher
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,7 @@ class Equalities:
                 self._left_out.append(f"{label} ({bound_parts(element)}){'' if why == 'no loop' else f': {why}'}")
 
     def _couple(self, element: Element, item: str) -> str:
-        """Take an equality of two joints or of tendons, or return why it is left out."""
+        """Take an equality of joints or of tendons, or return why it is left out."""
         kind = element.tag
         joints = {j.name: {j.name: 1.0} for body in self._scene.bodies for j in body.joints if j.scalar}
         known, expected = (joints, "hinge or slide") if kind == _JOINT else (self._tendons, "tendon")
@@ -208,8 +210,8 @@ class Equalities:
                 sides[f"translation_{side}"] = end.pose.p - self._anchors[end.body]
                 sides[f"rotation_{side}"] = snap(end.pose.R) if kind == "frame" else None
             b.add_loop(name, kind, **sides)  # type: ignore[arg-type]  # of the kinds
-        for name, (joint, leader, ratio, offset, curve) in self._couplers.items():
-            b.add_coupler(name, joint, leader, ratio=ratio, offset=offset, curve=curve)
+        for name, (joint, leaders, ratios, offset, curve) in self._couplers.items():
+            b.add_coupler(name, joint, leaders, ratio=ratios, offset=offset, curve=curve)
         if self._couplers:
             held = listing([repr(x) for x in self._couplers], 6)
             b.note(f"couplers of joints, held exactly where MuJoCo's are soft: {held}")

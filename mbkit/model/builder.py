@@ -22,7 +22,7 @@ from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.loops import LOOP_KINDS, LoopKind
 from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
-from mbkit.model.parts import Body, Coupler, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring
 from mbkit.model.rolling import ROLLING_KINDS, RollingKind
 from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
@@ -51,6 +51,15 @@ class ArgumentReader:
         if len(text) > longest:
             self.faults.append(f"{what}: expected up to {longest} characters, got {len(text)}")
         return text[:longest]
+
+    def names(self, what: str, value: Any) -> str | tuple[str, ...]:
+        """Return a name, or a tuple of at least two."""
+        if not isinstance(value, (list, tuple)):
+            return self.name(what, value)
+        if not value:
+            self.faults.append(f"{what}: expected a name or several, got none")
+        several = tuple(self.name(f"{what}[{i}]", x) for i, x in enumerate(value))
+        return several[0] if len(several) == 1 else several
 
     def array(self, name: str, value: Any, shape: tuple[int, ...], *, each: bool = False) -> Array:
         """Return finite numbers; a single one stands for `each` of a vector that says so, as of velocities."""
@@ -210,7 +219,7 @@ class ArgumentReader:
 
 #: How the fields of parts are read.
 _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
-    **dict.fromkeys(("parent", "child", "body", "body_a", "body_b", "joint", "leader"), ArgumentReader.name),
+    **dict.fromkeys(("parent", "child", "body", "body_a", "body_b", "joint"), ArgumentReader.name),
     **dict.fromkeys(
         ("com", "translation", "point_a", "point_b", "translation_a", "translation_b"), ArgumentReader.place
     ),
@@ -226,6 +235,7 @@ _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
     "inertia": ArgumentReader.inertia,
     "curve": lambda read, name, value: read.quantities(name, value, 3),
     "joints": lambda read, name, value: tuple(read.name(name, x) for x in value),
+    "leader": ArgumentReader.names,
     "factors": lambda read, name, value: read.quantities(name, value, len(value)),
 }
 
@@ -511,35 +521,6 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
         self._add(Loop, "loops", "loop", name, a | b | {"length": length}, {"kind": kind})
-
-    def add_coupler(
-        self,
-        name: str,
-        joint: str,
-        leader: str,
-        *,
-        ratio: Number = 1.0,
-        offset: Number = 0.0,
-        curve: _Vector = (0.0, 0.0, 0.0),
-    ) -> None:
-        """Hold the coordinates of two joints in a fixed ratio, q = ratio * leader + offset, by a constraint.
-
-        A pair of gears, a belt, a screw, or with a curve a cam or a knee. Each joint keeps its coordinate; the
-        multiplier is the torque on `joint`, between its parent and child, and in `leader` acts -dq/dleader times it. A
-        mimic joint has no coordinate, and is the cheaper one where nothing else closes on it.
-
-        Parameters
-        ----------
-        name : str
-        joint, leader : str
-            Two joints of one velocity each.
-        ratio, offset : float
-            As rad or m of `joint` for rad or m of `leader`.
-        curve : (3,) array_like
-            Coefficients of the leader's second, third and fourth power, which are added.
-        """
-        values = {"joint": joint, "leader": leader, "ratio": ratio, "offset": offset, "curve": curve}
-        self._add(Coupler, "couplers", "coupler", name, values)
 
     def add_blade(
         self,

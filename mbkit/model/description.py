@@ -212,10 +212,12 @@ class Layout:
             row[self.full_v[joint]] += factor
         return row
 
-    def coupler_row(self, coupler: Coupler, leading: float = 0.0) -> Array:
-        """Return the Jacobian of a coupler's constraint on the full velocities at a coordinate of its leader."""
-        row, slope = np.zeros(self.sizes[3]), float(coupler.polynomial.deriv()(leading))
-        row[self.full_v[coupler.joint]], row[self.full_v[coupler.leader]] = 1.0, -slope
+    def coupler_row(self, coupler: Coupler, slopes: Array | None = None) -> Array:
+        """Return the row of a coupler on the full velocities, (full nv,), of given slopes or those at zero."""
+        row = np.zeros(self.sizes[3])
+        row[self.full_v[coupler.joint]] = 1.0
+        for name, slope in zip(coupler.leaders, coupler.ratios if slopes is None else slopes, strict=True):
+            row[self.full_v[name]] = -slope
         return row
 
     def expand_q(self, q: Array) -> Array:

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from numpy.typing import ArrayLike
 
 from mbkit._check import Array, shown
 from mbkit.errors import ModelError
@@ -40,7 +41,7 @@ class _Frozen:
     def __post_init__(self) -> None:
         for f in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
             value = getattr(self, f.name)
-            if f.type not in ("Array", "float") and (f.type != "Array | None" or value is None):
+            if f.type not in ("Array", "float", "float | Array") and (f.type != "Array | None" or value is None):
                 continue
             try:
                 # + 0.0 makes one of the two zeros, which are equal and hash apart.
@@ -54,7 +55,7 @@ class _Frozen:
                 raise self._fault(f"{f.name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
             if f.name == "inertia" and np.abs(number - number.T).max() > _TURNED * np.abs(number).max():
                 raise self._fault("inertia is not symmetric; expected I = Iᵀ")
-            object.__setattr__(self, f.name, float(number) if f.type == "float" else read_only(number))
+            object.__setattr__(self, f.name, float(number) if wanted == () else read_only(number))
 
     def _fault(self, text: str) -> ModelError:
         what = type(self).__name__.lower()
@@ -321,34 +322,67 @@ class Loop(_Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Coupler(_Frozen):
-    """A fixed ratio of two coordinates, or a curve, as a constraint.
+    """A coordinate that follows others in fixed ratios, or one by a curve, as a constraint.
 
-    q = offset + ratio * leader + curve[0] leader² + curve[1] leader³ + curve[2] leader⁴. Both joints keep their
-    coordinates. A joint that mimics has none of its own.
+    q = offset + Σ ratio leader, and of one leader + curve[0] leader² + curve[1] leader³ + curve[2] leader⁴. All joints
+    keep their coordinates. A joint that mimics has none of its own.
 
     Attributes
     ----------
-    name, joint, leader : str
-        The joints have one velocity each.
-    ratio, offset : float
-        As rad or m of `joint` for rad or m of `leader`.
+    name, joint : str
+    leader : str or tuple of str
+        One joint, or several; each has one velocity, as `joint` has.
+    ratio : float or (k,) array
+        Of the one leader, or of each: as rad or m of `joint` for rad or m of the leader.
+    offset : float
+        rad or m.
     curve : (3,) array
-        Coefficients of the leader's second, third and fourth power.
+        Coefficients of the second, third and fourth power of a single leader.
     """
 
     name: str
     joint: str
-    leader: str
-    ratio: float = 1.0
+    leader: str | tuple[str, ...]
+    ratio: float | Array = 1.0
     offset: float = 0.0
     curve: Array = field(default_factory=lambda: np.zeros(3))
 
+    def __post_init__(self) -> None:
+        if isinstance(self.leader, list):
+            object.__setattr__(self, "leader", tuple(self.leader))
+        if not all(isinstance(x, str) for x in (self.leader if isinstance(self.leader, tuple) else (self.leader,))):
+            raise self._fault(f"leader: expected the name of a joint or of several, got {shown(self.leader)}")
+        if isinstance(self.leader, tuple) and isinstance(self.ratio, (int, float)):
+            object.__setattr__(self, "ratio", np.full(len(self.leader), self.ratio))
+        super().__post_init__()
+        if isinstance(self.leader, tuple) and len(self.leader) == 1:
+            # One leader has one form: equal parts are equal, whoever wrote them.
+            object.__setattr__(self, "leader", self.leader[0])
+            object.__setattr__(self, "ratio", float(self.ratios[0]))
+
+    @property
+    def leaders(self) -> tuple[str, ...]:
+        """The joints that lead, also where it is one."""
+        return (self.leader,) if isinstance(self.leader, str) else self.leader
+
+    @property
+    def ratios(self) -> Array:
+        """The ratio of each leader, (k,)."""
+        return np.atleast_1d(self.ratio)
+
     @property
     def polynomial(self) -> Polynomial:
-        """The joint's coordinate as a function of the leader's."""
-        return Polynomial([self.offset, self.ratio, *self.curve])
+        """The joint's coordinate as a function of the first leader's, with all others at zero."""
+        return Polynomial([self.offset, self.ratios[0], *self.curve])
+
+    def follow(self, leading: ArrayLike) -> tuple[float, Array]:
+        """Return the joint's coordinate where the leaders' are `leading`, (k,), and its derivatives by them, (k,)."""
+        (first, *others), curve, ratios = np.asarray(leading), self.polynomial, self.ratios[1:]
+        return float(curve(first) + ratios @ others), np.array([curve.deriv()(first), *ratios])
 
     def _shape(self, name: str) -> tuple[int, ...] | None:
+        if name == "ratio":
+            return () if isinstance(self.leader, str) else (len(self.leader),)
         return (3,) if name == "curve" else super()._shape(name)
 
 

@@ -90,12 +90,18 @@ def structure_faults(description: Description) -> Iterator[str]:
     single, sizes = {j.name for j in joints if j.type.nv == 1 and not j.mimic}, {j.name: j.type.nv for j in joints}
     for coupler in description.couplers:
         item = f"coupler {coupler.name!r}"
-        yield from unknown(item, (coupler.joint, coupler.leader), sizes.keys(), "joint")
-        for name in (coupler.joint, coupler.leader):
+        yield from unknown(item, (coupler.joint, *coupler.leaders), sizes.keys(), "joint")
+        for name, count in Counter((coupler.joint, *coupler.leaders)).items():
             if name in sizes and name not in single:
                 yield f"{item}: expected joints of one velocity that mimic none, got {name!r}"
-        if coupler.joint == coupler.leader:
-            yield f"{item}: joint {coupler.joint!r} against itself; name two joints"
+            if count > 1 and name == coupler.joint:
+                yield f"{item}: joint {name!r} against itself; name another leader"
+            elif count > 1:
+                yield f"{item}: leader {name!r} stands {count} times; give one ratio, the sum"
+        if len(coupler.leaders) > 1 and coupler.curve.any():
+            yield f"{item}: curve with {len(coupler.leaders)} leaders; a curve is of one leader"
+        if len(coupler.leaders) > 1 and not coupler.ratio.any():
+            yield f"{item}: ratio is zero for all leaders; expected one that leads"
     for name, count in Counter(p.joint for p in description.prescribed).items():
         if name not in single:
             there = ", ".join(sorted(single)) or "none"

@@ -147,11 +147,13 @@ def coupler_rows(model: Model, q: Array, v: Array) -> list[Rows]:
     """Return the rows of couplers, from the description's q and v."""
     layout, out = model.layout, []
     for x in model.couplers:
-        i, k = layout.full_q[x.joint].start, layout.full_q[x.leader].start
-        at = layout.G_q[[i, k]] @ q + layout.offsets[[i, k]]
-        to, curve = layout.coupler_row(x, at[1]) @ layout.G, x.polynomial
-        rate = layout.G[layout.full_v[x.leader].start] @ v
-        out.append(_row(at[0] - curve(at[1]), to, to @ v, -curve.deriv(2)(at[1]) * rate**2))
+        places = [layout.full_q[name].start for name in (x.joint, *x.leaders)]
+        at, *leading = layout.G_q[places] @ q + layout.offsets[places]
+        follows, slopes = x.follow(leading)
+        to = layout.coupler_row(x, slopes) @ layout.G
+        # A curve is of the first leader alone.
+        rate = layout.G[layout.full_v[x.leaders[0]].start] @ v
+        out.append(_row(at - follows, to, to @ v, -x.polynomial.deriv(2)(leading[0]) * rate**2))
     return out
 
 

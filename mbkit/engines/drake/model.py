@@ -77,9 +77,12 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True, st
     for coupler in description.couplers if step else ():
         if coupler.curve.any():
             raise UnsupportedError(f"drake: coupler {coupler.name!r} is a curve; Drake has fixed ratios alone")
-        (follower,), (leader,) = added[coupler.joint], added[coupler.leader]
+        (follower,), *leaders = (added[name] for name in (coupler.joint, *coupler.leaders))
+        if len(leaders) > 1:
+            several = ", ".join(map(repr, coupler.leaders))
+            raise UnsupportedError(f"drake: coupler {coupler.name!r} has the leaders {several}; Drake takes one alone")
         with _refusal(f"drake: refuses coupler {coupler.name!r}"):
-            plant.AddCouplerConstraint(follower, leader, coupler.ratio, coupler.offset)
+            plant.AddCouplerConstraint(follower, *leaders[0], coupler.ratio, coupler.offset)
     with _refusal(f"drake: refuses {description.name}"):
         plant.Finalize()
     return mapped(plant, description, added, bodies, bushings_)

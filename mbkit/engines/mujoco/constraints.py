@@ -47,8 +47,9 @@ _DEFAULT_SOLREF: Final = (0.02, 1.0)
 _DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
 #: MuJoCo's equality for each kind of loop that it holds.
 EQUALITIES: Final = {"point": mujoco.mjtEq.mjEQ_CONNECT, "frame": mujoco.mjtEq.mjEQ_WELD}
-#: And for couplers.
+#: And for couplers of one leader and of several, which are a tendon's joints.
 OF_JOINTS: Final = mujoco.mjtEq.mjEQ_JOINT
+OF_TENDON: Final = mujoco.mjtEq.mjEQ_TENDON
 
 
 @dataclass(frozen=True)
@@ -195,6 +196,9 @@ def law(
         if m.eq_type[i] == OF_JOINTS:
             estimate[own] = sum(m.dof_invweight0[m.jnt_dofadr[j]] for j in (m.eq_obj1id[i], m.eq_obj2id[i]))
             continue
+        if m.eq_type[i] == OF_TENDON:
+            estimate[own] = m.tendon_invweight0[m.eq_obj1id[i]]
+            continue
         weights = sum(m.body_invweight0[m.site_bodyid[s]] for s in (m.eq_obj1id[i], m.eq_obj2id[i]))
         estimate[own] = np.repeat(weights, 3)[: len(own)]
     R = np.maximum((1 - impedance) / impedance * estimate, _TINY)
@@ -230,8 +234,8 @@ def friction_law(
 
 
 def _bias(m: Any, d: Any, i: int) -> Array:
-    """Return J̇ v of an equality's rows; a ratio of coordinates has none."""
-    if m.eq_type[i] == OF_JOINTS:
+    """Return J̇ v of an equality's rows; ratios of coordinates have none."""
+    if m.eq_type[i] in (OF_JOINTS, OF_TENDON):
         return np.zeros(1)
     (rate_a, a), (rate_b, b) = (_motion(m, d, s) for s in (m.eq_obj1id[i], m.eq_obj2id[i]))
     gap = a[:3] - b[:3]

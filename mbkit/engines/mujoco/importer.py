@@ -274,7 +274,7 @@ class _Description:
         return tuple(out)
 
     def couplers(self) -> tuple[Coupler, ...]:
-        """Return the active equalities that hold two joints, of joints and of tendons."""
+        """Return the active equalities that hold joints, of joints and of tendons."""
         m, out = self.m, []
         names = {j: name for name, j in self.numbers.items()}
         refs = {name: float(m.qpos0[m.jnt_qposadr[j]]) for name, j in self.numbers.items()}

@@ -13,7 +13,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
-from mbkit.engines.mujoco.constraints import OF_JOINTS
+from mbkit.engines.mujoco.constraints import OF_JOINTS, OF_TENDON
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import JOINT_TYPES, Placed, heard_warnings, mapped, not_held, specified
 from mbkit.errors import MbkitError, UnsupportedError
@@ -178,6 +178,10 @@ def _equalities(spec: Any, model: Model) -> Iterator[str]:
             if loop.type == OF_JOINTS:
                 ends = {"joint1": loop.name1, "joint2": loop.name2, "polycoef": loop.data[:5]}
                 yield f"    <joint{_attributes(name=loop.name, **ends)}/>"
+                continue
+            if loop.type == OF_TENDON:
+                ends = {"tendon1": loop.name1, "polycoef": loop.data[:5]}
+                yield f"    <tendon{_attributes(name=loop.name, **ends)}/>"
                 continue
             tag = "connect" if loop.type == mujoco.mjtEq.mjEQ_CONNECT else "weld"
             yield f"    <{tag}{_attributes(name=loop.name, site1=loop.name1, site2=loop.name2)}/>"

@@ -20,7 +20,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines.base import STACKS, first_names, unknown_joint
 from mbkit.engines.imported import unused
-from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, Softness
+from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, GravityCompensation, Joint, Model
 from mbkit.model.validation import static_bodies
@@ -423,9 +423,18 @@ def _add_loops(spec: Any, description: Model, placed: Placed, softness: Softness
         equality.name1, equality.name2 = names
         equality.solref, equality.solimp = softness.solref, softness.solimp
     for coupler in description.couplers:
-        equality = spec.add_equality(name=coupler.name, type=OF_JOINTS, objtype=mujoco.mjtObj.mjOBJ_JOINT)
-        equality.name1, equality.name2 = placed.joints[coupler.joint][0], placed.joints[coupler.leader][0]
-        equality.data[:5] = [coupler.offset, coupler.ratio, 0.0, 0.0, 0.0]
+        first, *others = (placed.joints[name][0] for name in (coupler.joint, *coupler.leaders))
+        if len(others) == 1:
+            equality = spec.add_equality(name=coupler.name, type=OF_JOINTS, objtype=mujoco.mjtObj.mjOBJ_JOINT)
+            equality.name1, equality.name2 = first, *others
+        else:
+            tendon = spec.add_tendon(name=unused(coupler.name, {x.name for x in spec.tendons}))
+            for joint, factor in zip((first, *others), (1.0, *-coupler.ratios), strict=True):
+                tendon.wrap_joint(joint, float(factor))
+            equality = spec.add_equality(name=coupler.name, type=OF_TENDON, objtype=mujoco.mjtObj.mjOBJ_TENDON)
+            equality.name1 = tendon.name
+        # Of a tendon the first number alone counts.
+        equality.data[:5] = [coupler.offset, coupler.ratios[0], 0.0, 0.0, 0.0]
         equality.solref, equality.solimp = softness.solref, softness.solimp
 
 

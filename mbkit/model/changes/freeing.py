@@ -144,7 +144,8 @@ def _of_part(where: str, part: Any, field: str) -> Iterator[Number]:
                 yield Number(path, path, where, part.name, field, every, float(value[0]))
             if field in ("armature", "stiffness", "rest"):
                 return
-        yield from _entries(path, where, part.name, field, value, part.type.velocity_suffixes if of_joint else _AXES)
+        ends = part.leaders if where == "couplers" else part.type.velocity_suffixes if of_joint else _AXES
+        yield from _entries(path, where, part.name, field, value, ends)
 
 
 def _entries(path: str, where: str, part: str, field: str, values: Any, ends: Iterable[str]) -> Iterator[Number]:

@@ -23,8 +23,8 @@ from mbkit.model.elements.references import entries, moved_by, with_fields
 from mbkit.model.joint_types import FIXED
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.model import Model
-from mbkit.model.parameters import Binding
-from mbkit.model.parts import Joint, JointCoupling, Loop
+from mbkit.model.parameters import Binding, nominal
+from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop
 from mbkit.model.poses import body_poses
 
 #: Of limits and of what is closed: digits of a typed number.
@@ -45,7 +45,7 @@ def lock(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike |
     _refuse_driven(model, values)
     bindings, notes = list(model.bindings), []
     parts: dict[str, Any] = {"joints": tuple(_fixed(j, values, bindings) for j in model.joints)}
-    parts["couplers"] = tuple(x for x in model.couplers if x.joint not in values)
+    parts["couplers"] = tuple(y for x in model.couplers if (y := _left(x, values, bindings)) is not None)
     couplings = [_shortened(x, values, bindings) for x in model.couplings]
     parts["couplings"] = tuple(x for x in couplings if x is not None)
     parts["forces"] = tuple(x for force in model.forces for x in _acting(model, force, values))
@@ -135,19 +135,21 @@ def _with_followers(model: Model, given: Values) -> Values:
     values = dict(given)
     ties = list(model.couplers)
     while True:
-        tied = next((c for c in ties if c.joint in values or c.leader in values), None)
+        tied = next((c for c in ties if sum(name not in values for name in (c.joint, *c.leaders)) < 2), None)
         if tied is None:
             break
         ties.remove(tied)
         item = f"joints: coupler {tied.name!r}"
         _require_numbers(model, "couplers", tied.name, item)
-        if tied.leader in values:
-            follows = np.array([float(tied.polynomial(values[tied.leader][0]))])
-            name = tied.joint
-        elif tied.curve.any() or not tied.ratio:
-            raise InputError(f"{item} does not tell {tied.leader!r} from {tied.joint!r}; lock {tied.leader!r} instead")
-        else:
-            follows, name = (values[tied.joint] - tied.offset) / tied.ratio, tied.leader
+        name = next((x for x in tied.leaders if x not in values), tied.joint)
+        # Without the leader that is sought, or of all.
+        follows, slopes = tied.follow([values.get(x, [0.0])[0] for x in tied.leaders])
+        if name != tied.joint:
+            slope = slopes[tied.leaders.index(name)]
+            if tied.curve.any() or not slope:
+                raise InputError(f"{item} does not tell {name!r} from {tied.joint!r}; lock {name!r} instead")
+            follows = (values[tied.joint][0] - follows) / slope
+        follows = np.array([follows])
         there = values.setdefault(name, follows)
         if abs(there[0] - follows[0]) > _TYPED * max(1.0, abs(follows[0])):
             raise InputError(f"{item} asks for {name!r} at {follows[0]:g}, and it is locked at {there[0]:g}")
@@ -214,6 +216,30 @@ def _shortened(coupling: JointCoupling, values: Values, bindings: list[Binding])
     fields = {"factors": factors[moving], "rest_length": rest}
     shorter = replace(coupling, joints=tuple(coupling.joints[k] for k in moving), factors=np.ones(len(moving)))
     return with_fields(shorter, "couplings", fields, bindings)  # type: ignore[no-any-return]  # a coupling
+
+
+def _left(coupler: Coupler, values: Values, bindings: list[Binding]) -> Coupler | None:
+    """Return a coupler with the locked part of its sum in its offset; None where nothing is left."""
+    moving = [x for x in coupler.leaders if x not in values]
+    if not moving or len(moving) == len(coupler.leaders) and coupler.joint not in values:
+        return coupler if moving else None
+    ratios = dict(zip(coupler.leaders, np.atleast_1d(entries(coupler, "couplers", "ratio", bindings)), strict=True))
+    offset, joint = entries(coupler, "couplers", "offset", bindings), coupler.joint
+    for name in coupler.leaders:
+        if name in values:
+            offset = offset + ratios[name] * float(values[name][0])
+    if joint in values:
+        # The largest term of a locked sum follows the others.
+        joint = max(moving, key=lambda x: abs(nominal(ratios[x])))
+        if not nominal(ratios[joint]):
+            raise InputError(f"joints: coupler {coupler.name!r} does not tell {joint!r} from {coupler.joint!r}")
+        moving.remove(joint)
+        offset = (float(values[coupler.joint][0]) - offset) / ratios[joint]
+        ratios = {x: -ratios[x] / ratios[joint] for x in moving}
+    left = np.array([ratios[x] for x in moving])
+    fields = {"ratio": left if len(left) > 1 else left[0], "offset": offset}
+    shorter = replace(coupler, joint=joint, leader=tuple(moving), ratio=1.0)
+    return with_fields(shorter, "couplers", fields, bindings)  # type: ignore[no-any-return]  # a coupler
 
 
 def _acting(model: Model, force: Force, values: Values) -> Iterator[Force]:

@@ -1,4 +1,4 @@
-"""The part of `ModelBuilder` for elements: beams, and what functions give: forces, bushings and motions in time."""
+"""The part of `ModelBuilder` for elements: beams, couplers, and what functions give: forces, bushings, motions in time."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.motion_laws import FormulaMotion, SplineMotion
 from mbkit.model.joint_types import FIXED
 from mbkit.model.parameters import Expression, Number, nominal
-from mbkit.model.parts import Prescribed
+from mbkit.model.parts import Coupler, Prescribed
 
 Axes = Literal["local", "local_world_aligned", "world"]
 Ends = Literal["natural", "clamped", "quintic"]
@@ -51,7 +51,7 @@ def _is_zero(x: Any) -> bool:
 
 
 class ElementBuilder:
-    """Declares forces by functions and motions in time; `ModelBuilder` inherits it."""
+    """Declares forces by functions, motions in time and couplers; `ModelBuilder` inherits it."""
 
     _read: Any
     _add: Callable[..., None]
@@ -128,6 +128,60 @@ class ElementBuilder:
         formulas, constants = self._formulas(item, parameters, law=((law, 1),), given={"law": (TIME,)})
         if formulas["law"] is not None:
             self._add(FormulaMotion, "prescribed", "prescribed", joint, {}, {"formula": formulas["law"]} | constants)
+
+    def add_coupler(
+        self,
+        name: str,
+        joint: str,
+        leader: str | Sequence[str],
+        *,
+        ratio: Number | Sequence[Number] | ArrayLike = 1.0,
+        offset: Number = 0.0,
+        curve: _Vector = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Hold a joint's coordinate at a sum of others, q = Σ ratio leader + offset, by a constraint.
+
+        A pair of gears, a belt, a screw; with several leaders an epicyclic train or a differential; with a curve a cam
+        or a knee. Each joint keeps its coordinate; the multiplier is the torque on `joint`, between its parent and
+        child, and in a leader acts -∂q/∂leader times it. A mimic joint has no coordinate, and is the cheaper one where
+        it follows one joint and nothing else closes on it.
+
+        Parameters
+        ----------
+        name : str
+        joint : str
+            A joint of one velocity, as every leader.
+        leader : str or sequence of str
+            The joint that leads, or several.
+        ratio : float or (k,) array_like
+            As rad or m of `joint` for rad or m of the leader; one number is that of each leader.
+        offset : float
+            rad or m.
+        curve : (3,) array_like
+            Coefficients of the second, third and fourth power of a single leader, which are added.
+
+        Examples
+        --------
+        The ring gear of a differential turns at the mean of both wheels.
+
+        >>> import mbkit as mb
+        >>> b = mb.ModelBuilder("differential", gravity=(0, 0, 0))
+        >>> for part, inertia in (("left", 1.0), ("right", 1.0), ("ring", 2.0)):
+        ...     b.add_body(part, mass=1.0, inertia=(inertia,) * 3)
+        ...     b.add_joint(f"{part}_axle", "revolute", parent="world", child=part, axis=(0, 1, 0))
+        >>> b.add_coupler("gears", "ring_axle", ("left_axle", "right_axle"), ratio=0.5)
+        >>> mb.dynamics(b.build(), "lagrangian").forward_dynamics([0.0] * 3, [0.0] * 3, [0.0, 0.0, 4.0]).tolist()
+        [1.0, 1.0, 1.0]
+        """
+        values = {"joint": joint, "leader": leader, "offset": offset, "curve": curve}
+        ready = {"ratio": self._ratio(f"coupler {shown(name)}", leader, ratio)}
+        self._add(Coupler, "couplers", "coupler", name, values, ready)
+
+    def _ratio(self, item: str, leader: Any, ratio: Any) -> Any:
+        """Return a number or expression for one leader, an array of them for several."""
+        several = isinstance(leader, (list, tuple)) and len(leader) != 1
+        numbers = self._read.quantities(f"{item}: ratio", ratio, len(leader) if several else 1, each=True)
+        return numbers if several else numbers[0]
 
     def add_joint_force(
         self,

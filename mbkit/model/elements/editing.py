@@ -55,6 +55,7 @@ class EditingBuilder:
     _time: float
     _read_fields: Callable[..., dict[str, Any]]
     _joint_fields: Callable[..., dict[str, Any]]
+    _ratio: Callable[..., Any]
     add_body: Callable[..., None]
     add_joint: Callable[..., None]
     note: Callable[[str], None]
@@ -231,10 +232,13 @@ class EditingBuilder:
         self._set("loops", name, a | {"translation_b": translation_b, "rotation_b": rotation_b, "length": length})
 
     def set_coupler(
-        self, name: str, *, ratio: Number | None = None, offset: Number | None = None, curve: _Vector | None = None
+        self, name: str, *, ratio: _Numbers | None = None, offset: Number | None = None, curve: _Vector | None = None
     ) -> None:
-        """Set the ratio, the offset or the curve of a coupler; the arguments are those of `add_coupler`."""
-        self._set("couplers", name, {"ratio": ratio, "offset": offset, "curve": curve})
+        """Set the ratios, the offset or the curve of a coupler; the arguments are those of `add_coupler`."""
+        ready = {}
+        if ratio is not None and (there := [x for x in self._parts["couplers"] if x.name == name]):
+            ready["ratio"] = self._ratio(f"coupler {shown(name)}", there[0].leader, ratio)
+        self._set("couplers", name, {"offset": offset, "curve": curve}, ready)
 
     # Add, remove, rename
 

@@ -551,7 +551,7 @@ def _other_numbers(a: Any, b: Any, near: Tolerances) -> str:
         return ", and ".join(loop_differences(a, b, near))
     if isinstance(a, Coupler) and not _alike(a, b, near):
         one, other = (
-            f"{x.joint} = {number_text(x.ratio)} {x.leader}"
+            f"{x.joint} = {' + '.join(f'{number_text(r)} {name}' for r, name in zip(x.ratios, x.leaders, strict=True))}"
             + (f" + {number_text(x.offset)}" if x.offset else "")
             + (f", with curve {number_text(x.curve)}" if x.curve.any() else "")
             for x in (a, b)

@@ -192,7 +192,7 @@ def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
         couplings=tuple(replace(c, joints=tuple(joints.get(n, n) for n in c.joints)) for c in b.model.couplings),
         loops=tuple(replace(x, body_a=bodies[x.body_a], body_b=bodies[x.body_b]) for x in b.model.loops),
         couplers=tuple(
-            replace(x, joint=joints.get(x.joint, x.joint), leader=joints.get(x.leader, x.leader))
+            replace(x, joint=joints.get(x.joint, x.joint), leader=tuple(joints.get(n, n) for n in x.leaders))
             for x in b.model.couplers
         ),
         prescribed=tuple(replace(p, joint=joints.get(p.joint, p.joint)) for p in b.model.prescribed),

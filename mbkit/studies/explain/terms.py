@@ -188,7 +188,7 @@ def restricted(model: Model, joints: Collection[str]) -> Model:
         springs=tuple(s for s in model.springs if {s.body_a, s.body_b} <= here),
         couplings=tuple(trimmed_couplings(model, joints)),
         loops=tuple(x for x in model.loops if {x.body_a, x.body_b} <= here),
-        couplers=tuple(x for x in model.couplers if {x.joint, x.leader} <= set(joints)),
+        couplers=tuple(x for x in model.couplers if {x.joint, *x.leaders} <= set(joints)),
         prescribed=tuple(p for p in model.prescribed if p.joint in joints),
         no_slip=tuple(x for x in model.no_slip if {x.body_a, x.body_b} <= here),
         nonphysical=tuple(x for x in model.nonphysical if x[0] in bodies),

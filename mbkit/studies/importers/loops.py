@@ -123,27 +123,32 @@ def coupler_differences(
     An importer may hold the file's mimic joints by couplers, or leave them free, which is not counted here.
     """
     out: list[tuple[float, str, str]] = []
-    left = [_ordered(replace(x, joint=names.get(x.joint, ""), leader=names.get(x.leader, ""))) for x in read]
+    left = [
+        _ordered(replace(x, joint=names.get(x.joint, ""), leader=tuple(names.get(n, "") for n in x.leaders)))
+        for x in read
+    ]
     inactive = list(map(_ordered, written.every_coupler))
     for a in map(_ordered, written.couplers):
         _taken(a, inactive)
         if (b := _taken(a, left)) is None:
             out.append((1.0, _says(a), "missing"))
-        elif (far := _apart(a, b)) > tolerance * max(1.0, abs(a.ratio) + abs(a.offset)):
-            says = f"ratio {b.ratio:.6g} and offset {b.offset:.6g} for {a.ratio:.6g} and {a.offset:.6g}"
+        elif (far := _apart(a, b)) > tolerance * max(1.0, float(np.abs(a.ratio).sum()) + abs(a.offset)):
+            says = f"ratio {_text(b.ratios)} and offset {b.offset:.6g} for {_text(a.ratios)} and {a.offset:.6g}"
             if (a.curve != b.curve).any():
-                says += f", curve {' '.join(f'{x:.6g}' for x in b.curve)} for {' '.join(f'{x:.6g}' for x in a.curve)}"
+                says += f", curve {_text(b.curve)} for {_text(a.curve)}"
             out.append((far, _says(a), says))
     mimics = {j.name: j.mimic for j in file.joints if j.mimic}
     for b in left:
-        (root, r1, o1), (other, r2, o2) = (_from_root(name, mimics) for name in (b.joint, b.leader))
-        far = abs(r1 - b.ratio * r2) + abs(o1 - b.ratio * o2 - b.offset)
+        (root, r1, o1), *others = (_from_root(name, mimics) for name in (b.joint, *b.leaders))
+        far = abs(r1 - sum(c * r for c, (_, r, _) in zip(b.ratios, others, strict=True)))
+        far += abs(o1 - sum(c * o for c, (_, _, o) in zip(b.ratios, others, strict=True)) - b.offset)
         far += float(np.abs(b.curve).sum())
-        if root == other and far <= tolerance * max(1.0, abs(r1) + abs(o1)):
+        mimicked = all(name == root for name, *_ in others)
+        if mimicked and far <= tolerance * max(1.0, abs(r1) + abs(o1)):
             continue
         off = _taken(b, inactive) is not None
-        unlike = "other numbers than the file's mimic joints" if root == other else "not in the file"
-        out.append((far if root == other else 1.0, _says(b), "inactive, read as active" if off else unlike))
+        unlike = "other numbers than the file's mimic joints" if mimicked else "not in the file"
+        out.append((far if mimicked else 1.0, _says(b), "inactive, read as active" if off else unlike))
     return out
 
 
@@ -157,23 +162,30 @@ def _from_root(name: str, mimics: Mapping[str, Mimic]) -> tuple[str, float, floa
 
 def _taken(a: Coupler, some: list[Coupler]) -> Coupler | None:
     """Take the nearest coupler of the same joints out of some."""
-    near = [(_apart(a, b), k) for k, b in enumerate(some) if (a.joint, a.leader) == (b.joint, b.leader)]
+    near = [(_apart(a, b), k) for k, b in enumerate(some) if (a.joint, a.leaders) == (b.joint, b.leaders)]
     return some.pop(min(near)[1]) if near else None
 
 
 def _apart(a: Coupler, b: Coupler) -> float:
-    return abs(a.ratio - b.ratio) + abs(a.offset - b.offset) + float(np.abs(a.curve - b.curve).sum())
+    return sum(float(np.abs(x - y).sum()) for x, y in zip(a._values()[3:], b._values()[3:], strict=True))
 
 
 def _ordered(x: Coupler) -> Coupler:
     """Return a coupler with its joints in the order of their names, which its equation has either way without curve."""
-    if x.joint <= x.leader or not x.ratio or x.curve.any():
+    if x.curve.any() or not x.ratios.all():
         return x
-    return replace(x, joint=x.leader, leader=x.joint, ratio=1 / x.ratio, offset=-x.offset / x.ratio)
+    (joint, c), *others = sorted(zip((x.joint, *x.leaders), (1.0, *-x.ratios), strict=True))
+    leaders, factors = zip(*others, strict=True)
+    return replace(x, joint=joint, leader=leaders, ratio=[-d / c for d in factors], offset=x.offset / c)
 
 
 def _says(x: Coupler) -> str:
-    return f"{repr(x.name) if x.name else 'a coupler'} (of {x.joint!r} and {x.leader!r})"
+    *first, last = map(repr, (x.joint, *x.leaders))
+    return f"{repr(x.name) if x.name else 'a coupler'} (of {', '.join(first)} and {last})"
+
+
+def _text(numbers: Array) -> str:
+    return " ".join(f"{x:.6g}" for x in numbers)
 
 
 def _paired(some: Sequence[Closure], left: list[Closure]) -> tuple[list[tuple[Closure, Closure]], list[Closure]]:
