@@ -41,10 +41,10 @@ def coupled(sides: Sequence[Mapping[str, float]], shape: Sequence[float], refs: 
     """
     a, b = (*sides, {})[:2]
     if len(a) == len(b) == 1 and a.keys() != b.keys():
-        ((joint, c), (leader, d)), leaders = (*a.items(), *b.items()), [*b]
+        ((joint, c), (leader, d)) = (*a.items(), *b.items())
         curve = Polynomial(shape)(Polynomial([-d * refs[leader], d])) if d != 1 or refs[leader] else Polynomial(shape)
-        constant, *ratios = (float(x) / c for x in (*curve.coef, *[0.0] * 5)[:5])
-        ratios, higher = ratios[:1], ratios[1:]
+        constant, ratio, *higher = (float(x) / c for x in (*curve.coef, *[0.0] * 5)[:5])
+        leaders, ratios = [leader], [ratio]
     elif b and any(shape[2:]):
         return "it is a polynomial of a sum of coordinates"
     else:

@@ -348,10 +348,8 @@ class Coupler(_Frozen):
     curve: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        if isinstance(self.leader, list):
-            object.__setattr__(self, "leader", tuple(self.leader))
         if not all(isinstance(x, str) for x in (self.leader if isinstance(self.leader, tuple) else (self.leader,))):
-            raise self._fault(f"leader: expected the name of a joint or of several, got {shown(self.leader)}")
+            raise self._fault(f"leader: expected the name of a joint or a tuple of several, got {shown(self.leader)}")
         if isinstance(self.leader, tuple) and isinstance(self.ratio, (int, float)):
             object.__setattr__(self, "ratio", np.full(len(self.leader), self.ratio))
         super().__post_init__()

@@ -100,7 +100,7 @@ def structure_faults(description: Description) -> Iterator[str]:
                 yield f"{item}: leader {name!r} stands {count} times; give one ratio, the sum"
         if len(coupler.leaders) > 1 and coupler.curve.any():
             yield f"{item}: curve with {len(coupler.leaders)} leaders; a curve is of one leader"
-        if len(coupler.leaders) > 1 and not coupler.ratio.any():
+        if len(coupler.leaders) > 1 and not coupler.ratios.any():
             yield f"{item}: ratio is zero for all leaders; expected one that leads"
     for name, count in Counter(p.joint for p in description.prescribed).items():
         if name not in single:

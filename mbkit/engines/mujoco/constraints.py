@@ -235,7 +235,7 @@ def friction_law(
 
 def _bias(m: Any, d: Any, i: int) -> Array:
     """Return J̇ v of an equality's rows; ratios of coordinates have none."""
-    if m.eq_type[i] in (OF_JOINTS, OF_TENDON):
+    if m.eq_objtype[i] != mujoco.mjtObj.mjOBJ_SITE:
         return np.zeros(1)
     (rate_a, a), (rate_b, b) = (_motion(m, d, s) for s in (m.eq_obj1id[i], m.eq_obj2id[i]))
     gap = a[:3] - b[:3]

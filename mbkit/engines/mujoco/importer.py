@@ -287,7 +287,8 @@ class _Description:
             sides = [{names[j]: x for j, x in row.items() if x} for row in rows]
             held = coupled(sides, m.eq_data[i][:5].tolist(), refs) if all(sides) else ""
             if not isinstance(held, str):
-                out.append(Coupler(m.eq(i).name, *held[:4], np.array(held[4])))
+                joint, leaders, ratios, offset, curve = held
+                out.append(Coupler(m.eq(i).name, joint, tuple(leaders), np.array(ratios), offset, np.array(curve)))
         return tuple(out)
 
     def _equalities(self) -> list[int]:

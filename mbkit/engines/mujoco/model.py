@@ -433,8 +433,7 @@ def _add_loops(spec: Any, description: Model, placed: Placed, softness: Softness
                 tendon.wrap_joint(joint, float(factor))
             equality = spec.add_equality(name=coupler.name, type=OF_TENDON, objtype=mujoco.mjtObj.mjOBJ_TENDON)
             equality.name1 = tendon.name
-        # Of a tendon the first number alone counts.
-        equality.data[:5] = [coupler.offset, coupler.ratios[0], 0.0, 0.0, 0.0]
+        equality.data[:5] = [coupler.offset, coupler.ratio if len(others) == 1 else 1.0, 0.0, 0.0, 0.0]
         equality.solref, equality.solimp = softness.solref, softness.solimp
 
 

@@ -142,14 +142,14 @@ def _with_followers(model: Model, given: Values) -> Values:
         item = f"joints: coupler {tied.name!r}"
         _require_numbers(model, "couplers", tied.name, item)
         name = next((x for x in tied.leaders if x not in values), tied.joint)
-        # Without the leader that is sought, or of all.
-        follows, slopes = tied.follow([values.get(x, [0.0])[0] for x in tied.leaders])
+        # Where the leader that is sought has no part in it.
+        value, slopes = tied.follow([values[x][0] if x in values else 0.0 for x in tied.leaders])
         if name != tied.joint:
             slope = slopes[tied.leaders.index(name)]
             if tied.curve.any() or not slope:
                 raise InputError(f"{item} does not tell {name!r} from {tied.joint!r}; lock {name!r} instead")
-            follows = (values[tied.joint][0] - follows) / slope
-        follows = np.array([follows])
+            value = (values[tied.joint][0] - value) / slope
+        follows = np.array([value])
         there = values.setdefault(name, follows)
         if abs(there[0] - follows[0]) > _TYPED * max(1.0, abs(follows[0])):
             raise InputError(f"{item} asks for {name!r} at {follows[0]:g}, and it is locked at {there[0]:g}")
@@ -221,7 +221,7 @@ def _shortened(coupling: JointCoupling, values: Values, bindings: list[Binding])
 def _left(coupler: Coupler, values: Values, bindings: list[Binding]) -> Coupler | None:
     """Return a coupler with the locked part of its sum in its offset; None where nothing is left."""
     moving = [x for x in coupler.leaders if x not in values]
-    if not moving or len(moving) == len(coupler.leaders) and coupler.joint not in values:
+    if not moving or (len(moving) == len(coupler.leaders) and coupler.joint not in values):
         return coupler if moving else None
     ratios = dict(zip(coupler.leaders, np.atleast_1d(entries(coupler, "couplers", "ratio", bindings)), strict=True))
     offset, joint = entries(coupler, "couplers", "offset", bindings), coupler.joint

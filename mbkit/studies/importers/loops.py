@@ -175,8 +175,8 @@ def _ordered(x: Coupler) -> Coupler:
     if x.curve.any() or not x.ratios.all():
         return x
     (joint, c), *others = sorted(zip((x.joint, *x.leaders), (1.0, *-x.ratios), strict=True))
-    leaders, factors = zip(*others, strict=True)
-    return replace(x, joint=joint, leader=leaders, ratio=[-d / c for d in factors], offset=x.offset / c)
+    ratios = np.array([-d / c for _, d in others])
+    return replace(x, joint=joint, leader=tuple(name for name, _ in others), ratio=ratios, offset=x.offset / c)
 
 
 def _says(x: Coupler) -> str:
