@@ -89,6 +89,18 @@ def random_tree(
     return b.build()
 
 
+def coupled(tree: Model, seed: int, n: int = 2) -> Model:
+    """Return the tree with n couplers, each of a random joint of one velocity and one to three leaders of it."""
+    rng = np.random.default_rng([seed, 98])
+    free = [j.name for j in tree.joints if j.type.nv == 1 and not j.mimic]
+    b = mb.ModelBuilder.of(tree)
+    for k in range(n):
+        joint, *leaders = map(str, rng.permutation(free)[: rng.integers(2, 5)])
+        ratio = rng.choice([-1.0, 1.0], len(leaders)) * rng.uniform(0.3, 2, len(leaders))
+        b.add_coupler(f"coupler{k}", joint, leaders, ratio=ratio, offset=rng.uniform(-1, 1))
+    return b.build()
+
+
 def states(model: Model, n: int, seed: int = 0) -> tuple[np.ndarray, ...]:
     """Return q, v, a, tau, each (n, ·)."""
     rng = np.random.default_rng([seed, 99])

@@ -304,6 +304,39 @@ def free_spin(t: Array, inertia: Array, w0: Array) -> tuple[Array, float]:
     return out, float(4 * ellipkm1(complement) / rate)
 
 
+def epicyclic_train(
+    teeth: tuple[float, float], inertias: tuple[float, float, float], planets: tuple[int, float], torque: Array
+) -> tuple[Array, float]:
+    """Return the accelerations of sun, carrier and ring, rad/s², and the torque of the gears on the ring, N m.
+
+    Of sun and ring the teeth z_s and z_r are given, of sun, carrier (with the planets' masses) and ring the moments of
+    inertia, kg m², and of the planets the number and the moment of inertia of each. Willis's equation
+    (w_s - w_c)/(w_r - w_c) = -z_r/z_s puts the ring in terms of the sun and the carrier, w_r = (1 + k) w_c - k w_s with
+    k = z_s/z_r, and a planet, z_p = (z_r - z_s)/2, turns with w_p = (1 + j) w_c - j w_s, j = z_s/z_p. Lagrange's
+    equations of w_s and w_c are then two linear ones.
+    """
+    (z_s, z_r), (I_s, I_c, I_r), (n, I_p), (T_s, T_c, T_r) = teeth, inertias, planets, torque
+    k, j = z_s / z_r, 2 * z_s / (z_r - z_s)
+    a = I_s + k**2 * I_r + n * j**2 * I_p
+    b = -k * (1 + k) * I_r - n * j * (1 + j) * I_p
+    c = I_c + (1 + k) ** 2 * I_r + n * (1 + j) ** 2 * I_p
+    p, q = T_s - k * T_r, T_c + (1 + k) * T_r
+    sun, carrier = (c * p - b * q) / (a * c - b**2), (a * q - b * p) / (a * c - b**2)
+    ring = (1 + k) * carrier - k * sun
+    return np.array([sun, carrier, ring]), I_r * ring - T_r
+
+
+def differential(wheel: float, ring: float, torque: Array) -> Array:
+    """Return the accelerations of left wheel, right wheel and ring gear of a car's differential, rad/s².
+
+    w_ring = (w_left + w_right)/2: the ring's torque is shared by halves, and the difference of the wheels' rates feels
+    their moments of inertia, kg m², alone.
+    """
+    left, right, gear = torque
+    total, apart = (left + right + gear) / (wheel + ring / 2), (left - right) / wheel
+    return np.array([(total + apart) / 2, (total - apart) / 2, total / 2])
+
+
 def light_cart_pole_cart(theta: Array, theta0: float, cart_mass: float, pole_mass: float, length: float) -> Array:
     """Return the cart's position from the pole's angle, from rest at x = 0: momentum along x stays zero."""
     return np.asarray(pole_mass * length * (np.sin(theta0) - np.sin(theta)) / (cart_mass + pole_mass))

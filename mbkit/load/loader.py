@@ -115,7 +115,7 @@ def load(
         Whether an MJCF's meshes are read where a body has no other inertia, which MuJoCo's compiler then infers; with
         "never" such bodies are refused.
     loops : bool, path or sequence of Loop or dict
-        Whether an MJCF's active <connect> and <weld> elements become loops, and those of two joints couplers,
+        Whether an MJCF's active <connect> and <weld> elements become loops, and those of joints couplers,
         which hold exactly; without, they are left out and noted, as others always are. Or loops
         beside those of the file: dicts with the arguments of `ModelBuilder.add_loop`, `Loop` objects, or a TOML file
         with a table ``[[loop]]`` of these arguments for each. A URDF has no loops of its own. Their bodies may be

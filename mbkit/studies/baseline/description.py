@@ -136,7 +136,7 @@ def default(field: str, like: Any) -> Any:
     """Return the value of a field that is left out, of the shape of another."""
     if isinstance(like, str):
         return ""
-    if not isinstance(like, list):
+    if not isinstance(like, list) or field == "ratio":
         return 1.0 if field == "ratio" else 0.0
     if field.startswith("rotation"):
         return [float(x) for x in np.eye(3).ravel()]

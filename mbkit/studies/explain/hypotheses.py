@@ -550,16 +550,17 @@ def _other_numbers(a: Any, b: Any, near: Tolerances) -> str:
     if isinstance(a, Loop):
         return ", and ".join(loop_differences(a, b, near))
     if isinstance(a, Coupler) and not _alike(a, b, near):
-        one, other = (
-            f"{x.joint} = {' + '.join(f'{number_text(r)} {name}' for r, name in zip(x.ratios, x.leaders, strict=True))}"
-            + (f" + {number_text(x.offset)}" if x.offset else "")
-            + (f", with curve {number_text(x.curve)}" if x.curve.any() else "")
-            for x in (a, b)
-        )
-        return f"has {other} for {one}"
+        return f"has {_follows(b)} for {_follows(a)}"
     if type(a) in MOTION_LAWS:
         return "" if _same_motion(a, b, near) else "moves it otherwise"
     return "" if _alike(a, b, near) else "has other numbers for it"
+
+
+def _follows(x: Coupler) -> str:
+    terms = [f"{number_text(r)} {name}" for r, name in zip(x.ratios, x.leaders, strict=True)]
+    terms += [number_text(x.offset)] if x.offset else []
+    curve = f", with curve {number_text(x.curve)}" if x.curve.any() else ""
+    return f"{x.joint} = {' + '.join(terms).replace('+ -', '- ')}{curve}"
 
 
 def _same_motion(a: Motion, b: Motion, near: Tolerances) -> bool:
