@@ -218,6 +218,11 @@ def test_an_epicyclic_train_has_the_accelerations_of_the_closed_form(planets: in
         assert off(a[:3], exact) < 1e-12
         # Willis: beside the carrier, sun and ring turn against each other as their teeth are.
         assert (a[0] - a[1]) * TEETH[0] == pytest.approx(-(a[2] - a[1]) * TEETH[1], rel=1e-12)
+        # On sun and carrier alone: what drives them to this motion, and the inertia that they feel.
+        drives = dyn.actuator_forces(zero, zero, a, ["sun", "carrier"]).tau[:2]
+        assert drives == pytest.approx([tau[0] - tau[2] / 3, tau[1] + tau[2] * 4 / 3], abs=1e-12)
+        J, *_ = dyn.reduced_inertia(zero, ["sun", "carrier"])
+        assert off(J @ exact[:2], drives) < 1e-12
         force = dyn.generalized_constraint_force(zero, zero, tau)
         assert force[2] == pytest.approx(on_ring, rel=1e-12)
         # The gears do no work, and have no resultant moment beside what the carrier's bearings take.
@@ -304,7 +309,7 @@ def test_a_row_is_the_same_whichever_of_its_joints_is_called_the_first() -> None
         ((size, where, says),) = differ(written, replace(other, offset=other.offset + 1e-3))
         assert 1e-4 < size < 1e-2
         assert where == "'c' (of 'a', 'b' and 'c')"
-        assert "offset" in says
+        assert says.startswith("ratio 0.5 0.25 and offset")
     assert [says for *_, says in differ(written, Coupler("", "b", "a", 2.0, 0.3))] == ["missing", "not in the file"]
 
 
@@ -341,7 +346,7 @@ def test_one_leader_has_one_form() -> None:
 @pytest.mark.parametrize(
     ("leader", "more", "words"),
     [
-        ((), {}, "coupler 'gear': leader: expected a name or several, got none"),
+        ((), {}, "coupler 'gear': leader: expected a joint or several, got none"),
         (("j1", "j1"), {}, "leader 'j1' stands 2 times; give one ratio, the sum"),
         (("j1", "j0"), {}, "joint 'j0' against itself"),
         (("j1", "j9"), {}, "unknown joint 'j9'"),

@@ -53,11 +53,9 @@ class ArgumentReader:
         return text[:longest]
 
     def names(self, what: str, value: Any) -> str | tuple[str, ...]:
-        """Return a name, or a tuple of at least two."""
+        """Return a name, or a tuple of none or several."""
         if not isinstance(value, (list, tuple)):
             return self.name(what, value)
-        if not value:
-            self.faults.append(f"{what}: expected a name or several, got none")
         several = tuple(self.name(f"{what}[{i}]", x) for i, x in enumerate(value))
         return several[0] if len(several) == 1 else several
 

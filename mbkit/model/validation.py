@@ -98,6 +98,8 @@ def structure_faults(description: Description) -> Iterator[str]:
                 yield f"{item}: joint {name!r} against itself; name another leader"
             elif count > 1:
                 yield f"{item}: leader {name!r} stands {count} times; give one ratio, the sum"
+        if not coupler.leaders:
+            yield f"{item}: leader: expected a joint or several, got none"
         if len(coupler.leaders) > 1 and coupler.curve.any():
             yield f"{item}: curve with {len(coupler.leaders)} leaders; a curve is of one leader"
         if len(coupler.leaders) > 1 and not coupler.ratios.any():
