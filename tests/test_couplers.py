@@ -367,8 +367,10 @@ def test_what_is_no_coupler_is_refused_by_name(leader: Any, more: dict[str, Any]
     wheel = {"mass": 1.0, "com": (0.1, 0.1, 0), "inertia": (0.1,) * 3, "axis": (0, 1, 0), "parent": "world"}
     b = chain(wheel, wheel, wheel, {**wheel, "joint": "turn", "kind": "ball", "axis": None})
     b.add_coupler("gear", "j0", leader, **more)
-    with pytest.raises(ModelError, match=words):
+    with pytest.raises(ModelError, match=words) as caught:
         b.build()
+    # A faulty number brings no other fault along.
+    assert ("zero for all" in str(caught.value)) is ("zero for all" in words)
 
 
 def test_parts_made_alone_are_checked_too() -> None:
@@ -380,6 +382,8 @@ def test_parts_made_alone_are_checked_too() -> None:
     ):
         with pytest.raises(ModelError, match=words):
             faulty()
+    with pytest.raises(InputError, match=r"leading: expected shape \(2,\), got \(1,\)"):
+        Coupler("c", "a", ("b", "d")).follow([1.0])
 
 
 def test_what_cannot_be_held_or_solved_is_refused_by_name() -> None:

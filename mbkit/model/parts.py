@@ -12,7 +12,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, shown
+from mbkit._check import Array, finite_array, shown
 from mbkit.errors import ModelError
 from mbkit.model.joint_types import JointType, kind_of, register_joint_type
 
@@ -375,7 +375,8 @@ class Coupler(_Frozen):
 
     def follow(self, leading: ArrayLike) -> tuple[float, Array]:
         """Return the joint's coordinate where the leaders' are `leading`, (k,), and its derivatives by them, (k,)."""
-        (first, *others), curve, ratios = np.asarray(leading), self.polynomial, self.ratios[1:]
+        (first, *others), ratios = finite_array("leading", leading, (len(self.leaders),)), self.ratios[1:]
+        curve = self.polynomial
         return float(curve(first) + ratios @ others), np.array([curve.deriv()(first), *ratios])
 
     def _shape(self, name: str) -> tuple[int, ...] | None:

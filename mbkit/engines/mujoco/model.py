@@ -429,7 +429,7 @@ def _add_loops(spec: Any, description: Model, placed: Placed, softness: Softness
             equality.name1, equality.name2 = first, *others
         else:
             tendon = spec.add_tendon(name=unused(coupler.name, {x.name for x in spec.tendons}))
-            for joint, factor in zip((first, *others), (1.0, *-coupler.ratios), strict=True):
+            for joint, factor in zip((first, *others), (1.0, *(0.0 - coupler.ratios)), strict=True):
                 tendon.wrap_joint(joint, float(factor))
             equality = spec.add_equality(name=coupler.name, type=OF_TENDON, objtype=mujoco.mjtObj.mjOBJ_TENDON)
             equality.name1 = tendon.name

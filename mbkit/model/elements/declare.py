@@ -179,8 +179,10 @@ class ElementBuilder:
 
     def _ratio(self, item: str, leader: Any, ratio: Any) -> Any:
         """Return a number or expression for one leader, an array of them for several."""
-        several = isinstance(leader, (list, tuple)) and len(leader) != 1
+        several, known = isinstance(leader, (list, tuple)) and len(leader) != 1, len(self._read.faults)
         numbers = self._read.quantities(f"{item}: ratio", ratio, len(leader) if several else 1, each=True)
+        # Zeros, which stand for faulty numbers, would be another fault.
+        numbers = np.ones(len(numbers)) if len(self._read.faults) > known else numbers
         return numbers if several else numbers[0]
 
     def add_joint_force(
