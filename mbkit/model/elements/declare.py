@@ -1,4 +1,4 @@
-"""The part of `ModelBuilder` for elements: beams, couplers, and what functions give: forces, bushings, motions in time."""
+"""The part of `ModelBuilder` for elements: beams, couplers, and by functions forces, bushings and motions in time."""
 
 from __future__ import annotations
 
