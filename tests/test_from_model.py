@@ -11,10 +11,12 @@ import sympy as sp
 import mbkit as mb
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.from_description import from_model
+from mbkit.lagrangian.system import QuasiLagrangian
 from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters
 from mbkit.lagrangian.trig.shortest_form import number
 from mbkit.lagrangian.trig.simplify import forms, tidy
 from mbkit.model.parts import Loop, Prescribed
+from mbkit.spatial import matrix_from_quaternion
 from tests.random_trees import off, random_tree, states
 from tests.scenes import mounted
 
@@ -26,20 +28,36 @@ SMALL = {"chain": {"n": 3}, "clamped_beam": {"segments": 3}, "flexible_spacecraf
 READ = [n for n, f in mb.catalog.systems().items() if not f().quaternions and not f().constrained]
 
 
+def in_chart(model, q):
+    """Return coordinates with each quaternion as yaw, pitch and roll."""
+    out, taken = [], 0
+    for joint in model.independent_joints:
+        own, k = q[..., taken : taken + joint.type.nq], joint.type.quaternion
+        taken += joint.type.nq
+        out.append(own[..., :k])
+        if k is not None:
+            R = matrix_from_quaternion(own[..., k:])
+            yaw, roll = (np.arctan2(R[..., i, j], R[..., k, k]) for i, j, k in ((1, 0, 0), (2, 1, 2)))
+            out.append(np.stack([yaw, -np.arcsin(R[..., 2, 0]), roll], axis=-1))
+    return np.concatenate(out, axis=-1)
+
+
 def assert_same(model, lag):
+    """Compare at random states; velocities are the model's own."""
     dyn, ref = lag.dynamics(options={"compile": False}), mb.dynamics(model, "lagrangian")
     q, v, a, tau = states(model, 4)
     M = ref.mass_matrix(q)
-    assert off(dyn.mass_matrix(q), M) < CLOSE
-    assert off(dyn.kinetic_energy(q, v), ref.kinetic_energy(q, v)) < CLOSE
-    assert off(dyn.coriolis_matrix(q, v), ref.coriolis_matrix(q, v)) < CLOSE
+    p = in_chart(model, q)
+    assert off(dyn.mass_matrix(p), M) < CLOSE
+    assert off(dyn.kinetic_energy(p, v), ref.kinetic_energy(q, v)) < CLOSE
+    assert off(dyn.coriolis_matrix(p, v), ref.coriolis_matrix(q, v)) < CLOSE
     # Springs are in V on paper, and among the passive forces of a model.
     for x in (0 * v, v):
-        assert off(dyn.nle(q, x) - dyn.passive(q, x), ref.nle(q, x) - ref.passive(q, x)) < CLOSE
-    assert off(dyn.inverse_dynamics(q, v, a), ref.inverse_dynamics(q, v, a)) < CLOSE
+        assert off(dyn.nle(p, x) - dyn.passive(p, x), ref.nle(q, x) - ref.passive(q, x)) < CLOSE
+    assert off(dyn.inverse_dynamics(p, v, a), ref.inverse_dynamics(q, v, a)) < CLOSE
     close = 1e-14 * np.linalg.cond(M).max()
-    assert off(dyn.forward_dynamics(q, v, tau), ref.forward_dynamics(q, v, tau)) < max(close, CLOSE)
-    potential = dyn.potential_energy(q) - ref.potential_energy(q)
+    assert off(dyn.forward_dynamics(p, v, tau), ref.forward_dynamics(q, v, tau)) < max(close, CLOSE)
+    potential = dyn.potential_energy(p) - ref.potential_energy(q)
     assert np.abs(potential - potential[0]).max() < CLOSE * max(1.0, np.abs(ref.potential_energy(q)).max())
     return dyn, ref
 
@@ -63,6 +81,15 @@ def test_random_trees_move_as_they_do(seed):
 def test_joints_of_several_velocities_move_as_they_do(kinds):
     model = random_tree(7, len(kinds), kinds, armature=False)
     assert_same(model, from_model(model))
+
+
+@pytest.mark.parametrize("kinds", [("free",), ("ball", "revolute"), ("free", "prismatic"), ("ball", "ball")])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_ball_and_free_joints_move_as_they_do_in_their_own_velocities(seed, kinds):
+    model = random_tree(seed, len(kinds), kinds, nearest=1)
+    lag = from_model(model)
+    assert isinstance(lag, QuasiLagrangian)
+    assert_same(model, lag)
 
 
 def test_a_robot_moves_as_it_does():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from fractions import Fraction
 from functools import cached_property
+from itertools import product
 from math import atan2, pi
 from types import SimpleNamespace
 from typing import Any, Final
@@ -17,6 +18,10 @@ from mbkit._reproducible import pivoted
 from mbkit.derivation.kinematics import Kinematics, compensation_energies, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError
+from mbkit.lagrangian.energies.charts import angle_rates, quaternion, turning
+from mbkit.lagrangian.energies.energy_form import QuasiVelocities
+from mbkit.lagrangian.energies.kinetic_energy import inverse
+from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 from mbkit.lagrangian.trig.shortest_form import number, shortest_form
 from mbkit.lagrangian.trig.simplify import tidy
@@ -85,9 +90,11 @@ class SymbolicKinematics(Kinematics):
         opaque = {x for x in bound.values() if not _is_polynomial(x)}
         self._opaque = {x: sp.Dummy(f"n{i}") for i, x in enumerate(sorted(opaque, key=sp.default_sort_key))}
         self.bound = {place: self._opaque.get(x, x) for place, x in bound.items()}
-        self.symbols_of = {j.name: self._own(j, coordinates, model.layout.q) for j in model.joints}
+        # A chart has as many coordinates as velocities.
+        self.symbols_of = {j.name: self._own(j, coordinates, model.layout.v) for j in model.joints}
         self.rates_of = {j.name: self._own(j, velocities, model.layout.v, still=True) for j in model.joints}
-        angles = list(dict.fromkeys(_turn(self.symbols_of[j.name][i]) for j in model.joints for i in j.type.angular))
+        turns = [_turn(self.symbols_of[j.name][i]) for j in model.joints for i in j.type.angular]
+        halves = [x / 2 for j in self._charted for x in self.symbols_of[j.name][j.type.quaternion :]]
         lengths = {
             s
             for j in model.joints
@@ -98,15 +105,14 @@ class SymbolicKinematics(Kinematics):
         generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
         self._lengths = [i for i, g in enumerate(generators) if g in lengths]
         self.formulas = space = TrigRing(
-            model.name, angles, [*generators, *velocities], instead=instead_of_writing(model)
+            model.name, [*halves, *dict.fromkeys(turns)], [*generators, *velocities], instead=instead_of_writing(model)
         )
+        self._halved = len(halves)
+        self._written_in = TrigRing(model.name, [*(2 * x for x in halves), *space.angles[len(halves) :]], space.generators)
         self.zero = space.number(0)
         numbers = {place: space.of(x) for place, x in self.bound.items()}
         self.values = _Numbers(model, numbers, lambda x: space.number(Fraction(repr(x))) if x else 0.0)
-        self._q_of = {
-            j.name: [space.of(x) if _advances(j, i) else SimpleNamespace(expression=x) for i, x in enumerate(q)]
-            for j, q in zip(model.joints, self.symbols_of.values(), strict=True)
-        }
+        self._q_of = {j.name: self._exact_coordinates(j) for j in model.joints}
         self._v_of = {name: [space.of(x) for x in v] for name, v in self.rates_of.items()}
         self._carrier = {j.child: j for j in model.joints}
 
@@ -118,6 +124,58 @@ class SymbolicKinematics(Kinematics):
             self.bound.get(("joints", joint.name, f, ()), exact(getattr(joint.mimic, f))) for f in ("ratio", "offset")
         )
         return [ratio * leader + (0 if still else offset) for leader in symbols[layout[joint.mimic.joint]]]
+
+    @property
+    def _charted(self) -> list[Joint]:
+        """Joints with a quaternion, which stands as three angles on paper."""
+        return [j for j in self.model.independent_joints if j.type.quaternion is not None]
+
+    def _exact_coordinates(self, joint: Joint) -> Vector:
+        q, k, space = self.symbols_of[joint.name], joint.type.quaternion, self.formulas
+        plain = [space.of(x) if _advances(joint, i) else SimpleNamespace(expression=x) for i, x in enumerate(q[:k])]
+        return plain if k is None else plain + quaternion(*([space.turned(f, {x / 2: 1}) for f in (0, 1)] for x in q[k:]))
+
+    def described(self, joint: Joint) -> list[sp.Expr]:
+        """Return a joint's coordinates as its description has them, a quaternion by its angles."""
+        q, k = self.symbols_of[joint.name], joint.type.quaternion
+        return q if k is None else [*q[:k], *quaternion(*((sp.cos(x / 2), sp.sin(x / 2)) for x in q[k:]))]
+
+    @cached_property
+    def velocity_matrix(self) -> sp.Matrix:
+        """D of q̇ = D v, (n, n): a unit matrix but for ball and free joints."""
+        D, first = sp.eye(self.model.nv), len(self.formulas.generators) - self.model.nv
+        for joint in self._charted:
+            k, own, q = joint.type.quaternion, self.model.layout.v[joint.name], self._q_of[joint.name]
+            rate = [self.zero + x for x in joint.type.qdot(q, self._v_of[joint.name])]
+            sums = [*rate[:k], *turning(q[k:], rate[k:])]
+            for j in range(own.start, own.stop):
+                *column, a, b, c = (self.shown(x.coefficient(first + j)) for x in sums)
+                D[own, j] = sp.Matrix([*column, *angle_rates(self.symbols_of[joint.name][k:], (a, b, c))])
+        return D
+
+    @cached_property
+    def qdot(self) -> list[sp.Expr]:  # type: ignore[override]
+        """D v, the coordinates' rates in the velocities."""
+        return list(self.velocity_matrix * sp.Matrix(self.rates))
+
+    def quasi_velocities(self, kept: list[int]) -> QuasiVelocities | None:
+        """Return how the velocities of these coordinates give their rates; None where they are the rates."""
+        if not self._charted:
+            return None
+        D, n = sp.ImmutableMatrix(self.velocity_matrix.extract(kept, kept)), len(kept)
+        gamma = sp.MutableDenseNDimArray.zeros(n, n, n)
+        for joint in self._charted:
+            units = np.eye(joint.type.nv, dtype=int).tolist()
+            first = kept.index(self.model.layout.v[joint.name].start)
+            for (j, v), (k, p) in product(enumerate(units), repeat=2):
+                for i, x in enumerate(joint.type.hamel(v, p)):
+                    gamma[first + k, first + i, first + j] = sp.nsimplify(x)
+        q = tuple(self.symbols[i] for i in kept)
+        none = sp.ImmutableMatrix.zeros(n, 1)
+        out = QuasiVelocities(D, inverse(D, "D"), q, tuple(map(velocity_of, q)), none, none)
+        # Joint types know theirs, which brackets of D's columns would give again.
+        out.__dict__["hamel_coefficients"] = sp.ImmutableDenseNDimArray(gamma)
+        return out
 
     def carried(self, way: _Way, x: Vector, weight: int) -> Vector:
         """Return a point (weight 1) or a direction (0) of a way's first body in the axes of its last."""
@@ -166,7 +224,7 @@ class SymbolicKinematics(Kinematics):
     def _by_heights(self, total: Any) -> sp.Expr:
         self.drop_dust([total])
         # Height by height rather than with g before them all, so that forces read term by term.
-        return self.back(shortest_form(total, whole=False))
+        return self.back(shortest_form(self._in_angles(total), whole=False))
 
     def turns(self, joint: Joint) -> list[sp.Expr]:
         """Return a joint's coordinates that turn, those of a mimic joint by its leader's."""
@@ -179,7 +237,15 @@ class SymbolicKinematics(Kinematics):
 
     def shown(self, x: Any) -> sp.Expr:
         """Return a sum as it is shown."""
-        return self.back(shortest_form(x))
+        return self.back(shortest_form(self._in_angles(x)))
+
+    def _in_angles(self, x: Any) -> Any:
+        """Return a sum that holds whole multiples of a chart's angles alone in these, and not in their halves."""
+        k = self._halved
+        if not k or any(n % 2 for _, multiples, _ in x.terms for n in multiples[:k]):
+            return x
+        halved = {(f, (*(n // 2 for n in m[:k]), *m[k:]), powers): value for (f, m, powers), value in x.terms.items()}
+        return TrigPolynomial(self._written_in, halved)
 
     def moves(self, key: Key) -> bool:
         """Return whether a term of a sum depends on a coordinate."""
@@ -226,7 +292,7 @@ class WrittenKinematics(Kinematics):
 
     def length_rate(self, square: sp.Expr) -> sp.Expr:
         """Return the rate of a length from its square."""
-        pairs = zip(self._exact.symbols, self._exact.rates, strict=True)
+        pairs = zip(self._exact.symbols, self._exact.qdot, strict=True)
         return sum((sp.diff(square, q) * v for q, v in pairs), sp.Integer(0)) / sp.sqrt(square) / 2
 
 
@@ -311,7 +377,7 @@ def rolling(kin: SymbolicKinematics, part: NoSlip) -> tuple[list[sp.Expr], list[
         return [kin.shown(e) for e in sums]
 
     def rate(u: Vector) -> Vector:
-        pairs = list(zip(kin.symbols, kin.rates, strict=True))
+        pairs = list(zip(kin.symbols, kin.qdot, strict=True))
         return [sum((sp.diff(e, q) * v for q, v in pairs), sp.Integer(0)) for e in u]
 
     def material(way: _Way, point: Vector, at: Vector) -> Vector:

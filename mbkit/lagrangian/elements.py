@@ -105,15 +105,16 @@ def acting(kin: SymbolicKinematics, t: sp.Symbol) -> tuple[sp.Expr, list[sp.Expr
                 "mbkit.dynamics(model, 'lagrangian') has it, and model.without('forces') is the system without forces"
             )
         joint, constants = model.joint(force.joint), kin.written.values.forces[force.name].numbers
+        coordinates = [x for j in model.independent_joints for x in kin.described(j)]
         others = dict(
             zip(
                 (*model.coordinate_names, *(n + RATE for n in model.velocity_names)),
-                (*kin.symbols, *kin.rates),
+                (*coordinates, *kin.rates),
                 strict=True,
             )
         )
         rates = kin.rates_of[joint.name]
-        own = dict(zip(force.own(model), (*kin.symbols_of[joint.name], *rates), strict=True))
+        own = dict(zip(force.own(model), (*kin.described(joint), *rates), strict=True))
         values = others | dict(zip(force.symbols, constants, strict=True)) | {TIME: t} | own
         if force.potential is not None:
             V += force.potential(values, SYMPY)[0]

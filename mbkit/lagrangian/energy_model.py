@@ -55,7 +55,12 @@ class EnergyModel(Model):
     """
 
     def __init__(self, form: EnergyForm, values: Mapping[str, float | None] | None = None) -> None:
-        held = form.quasi.D.free_symbols - set(form.coordinates) if form.quasi is not None else None
+        held = form.quasi.D.free_symbols - set(form.coordinates) if form.quasi is not None else set()
+        if form.quasi is not None and (any(form.quasi.drift) or form.clock in held):
+            raise UnsupportedError(
+                f"quasi_velocities: {form.name} runs with q̇ = D(q) w, without time in D and without drift; run its "
+                ".system, the same in the coordinates' rates, and read w by to_quasi_velocity"
+            )
         if held:
             raise UnsupportedError(
                 f"D: to run, it must hold coordinates and numbers only, but it holds {plain(held)}; "

@@ -20,12 +20,13 @@ from mbkit.lagrangian.description_kinematics import (
     rolling,
 )
 from mbkit.lagrangian.elements import acting, law
-from mbkit.lagrangian.energies.symbols import velocity_of
+from mbkit.lagrangian.energies.charts import chart_names, chart_velocities
 from mbkit.lagrangian.energy_model import EnergyModel
 from mbkit.lagrangian.printing.catalog_symbols import in_symbols
-from mbkit.lagrangian.system import Lagrangian
+from mbkit.lagrangian.system import Lagrangian, QuasiLagrangian
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model
+from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.beams import BeamEnd
 from mbkit.model.elements.references import names_in
 
@@ -57,16 +58,22 @@ def from_model(
     Blades and what rolls become velocity constraints, in world axes; the height of what rolls is a holonomic one.
     Prescribed coordinates become functions of the time, and T has terms of first and zeroth degree then.
 
+    A ball or free joint has three angles in place of its quaternion: ``psi``, ``theta`` and ``phi``, yaw, pitch and
+    roll about z, y and x in turn, with the joint's name as an index where several joints have such. Beside them stand
+    the model's own velocities, ``omega1`` to ``omega3`` and ``v1`` to ``v3`` of the child's origin, in the child's
+    axes, as quasi-velocities: the equations are Newton's and Euler's, M is that of the model and regular everywhere.
+    Only q̇ = D(q) v is singular, at theta = ±π/2.
+
     Parameters
     ----------
     model : Model
-        Of joints whose velocities are the rates of their coordinates: not ball and free ones.
     symbols : bool, optional
         Whether a catalog system is written in the textbooks' symbols, with the model's numbers as their values:
         cart_pole in m_c, m_p, l and g. By default, if the model has no named parameters of its own; of others the
         default writes g alone.
     coordinates : sequence of str, optional
-        Names instead of the model's, such as ``["q1", "q2"]``, prescribed ones included.
+        Names instead of the model's, such as ``["q1", "q2"]``, prescribed ones included; of a ball or free joint those
+        of its position and its three angles.
     drives : bool
         Whether prescribed coordinates stay, each bound by a constraint behind those of the loops: its
         multiplier is the force (or torque) of the drive that moves it.
@@ -76,7 +83,7 @@ def from_model(
     Raises
     ------
     UnsupportedError
-        Ball or free joints, forces by functions elsewhere than at joints, too many terms
+        Ball or free joints beside loops or what rolls, forces by functions elsewhere than at joints, too many terms
         to read, or no coordinate that is left to move.
     InputError
         `symbols` of a model that is not in the catalog, names that do not fit, or a loop whose ends never meet or do
@@ -120,21 +127,21 @@ def from_model(
     clash = [s.name for s in q if s.name in parameters]
     if clash:
         raise InputError(f"coordinates: {clash[0]!r} is a parameter of {model.name}; give coordinates=... other names")
-    v = [velocity_of(s) for s in q]
+    v = chart_velocities(model, q)
     kin = SymbolicKinematics(source, q, v, parameters, progress or (lambda *_: None))
     T, R = kin.kinetic_energy, dissipation(kin.written)
     plain = symbols is None and not source.parameters
     weight, g = _weight(kin, {s.name for s in (*q, *v)}) if plain else (kin.gravity_energy, {})
     V = weight + spring_energy(kin.written)
     t = _time({*parameters, *(s.name for s in (*q, *v))})
-    moved = {model.coordinate_names.index(p.joint): law(kin, p, t) for p in model.prescribed}
+    moved = {model.layout.v[p.joint].start: law(kin, p, t) for p in model.prescribed}
     rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]
     rows += [(x.name, coupled(kin, x)) for x in model.couplers]
     touching = [(x.name, *rolling(kin, x)) for x in model.no_slip]
     rows += [(name, row) for name, held, _ in touching for row in held]
     moving = [row for _, _, found in touching for row in found]
     if drives:
-        rows += [(model.coordinate_names[i], q[i] - x) for i, x in moved.items()]
+        rows += [(q[i].name, q[i] - x) for i, x in moved.items()]
         moved = {}
     put = {q[i]: x for i, x in moved.items()} | {v[i]: sp.diff(x, t) for i, x in moved.items()}
     stored, pushed = acting(kin, t)
@@ -145,20 +152,22 @@ def from_model(
     R = R if R.free_symbols & {v[i] for i in kept} else sp.Integer(0)
     _check_kept(model, {q[i] for i in kept}, zip((name for name, _ in rows), constraints, strict=True))
     used = set().union(*(x.free_symbols for x in (T, V, R, *constraints, *moving, *pushed)))
-    return Lagrangian(
-        T,
-        V,
-        [q[i] for i in kept],
-        [v[i] for i in kept],
-        time=t,
-        forces={q[i]: pushed[i] for i in kept if pushed[i] != 0},
-        dissipation=R,
-        constraints=constraints,
-        velocity_constraints=moving,
+    arguments = {
+        "T": T,
+        "V": V,
+        "coordinates": [q[i] for i in kept],
+        "velocities": [v[i] for i in kept],
+        "time": t,
+        "forces": {q[i]: pushed[i] for i in kept if pushed[i] != 0},
+        "dissipation": R,
+        "constraints": constraints,
+        "velocity_constraints": moving,
         # What only a frame needs is no part of the equation; a name of the user's own is kept all the same.
-        parameters={s: source.parameters[n] for n, s in parameters.items() if named is None or s in used} | g,
-        name=model.name,
-    )
+        "parameters": {s: source.parameters[n] for n, s in parameters.items() if named is None or s in used} | g,
+        "name": model.name,
+    }
+    quasi = kin.quasi_velocities(kept)
+    return Lagrangian(**arguments) if quasi is None else QuasiLagrangian.of_energies(quasi, **arguments)
 
 
 def _with_points(model: Model) -> Model:
@@ -202,10 +211,11 @@ def _weight(kin: SymbolicKinematics, used: set[str]) -> tuple[sp.Expr, dict[sp.S
 
 def _check(model: Model) -> None:
     turning = [j.name for j in model.independent_joints if not j.type.coordinate_velocities]
-    if turning:
+    bound = [f for f in CONSTRAINT_FEATURES if f != "prescribed" and getattr(model, f)]
+    if turning and bound:
         raise UnsupportedError(
-            f"{model.name}: joint {turning[0]!r} has velocities that are no coordinate's rate; write it in Euler "
-            "angles (mbkit.lagrangian.systems.heavy_top, or spherical_zyx joints), or use Lagrangian.quasi_velocities"
+            f"{model.name}: joint {turning[0]!r} has velocities that are no coordinate's rate, and is not written out "
+            f"beside {' and '.join(bound)}; write it as three joints of one coordinate each, or as spherical_zyx"
         )
     if not model.nv:
         raise UnsupportedError(f"{model.name}: no joint of it moves, so there is no equation")
@@ -240,7 +250,7 @@ def _check_kept(model: Model, kept: set[sp.Symbol], rows: Iterable[tuple[str, sp
 
 
 def _coordinates(model: Model, names: Sequence[str] | None) -> list[sp.Symbol]:
-    chosen = list(model.coordinate_names if names is None else names)
-    if len(chosen) != model.nq or not all(isinstance(n, str) and n for n in chosen) or len(set(chosen)) != len(chosen):
-        raise InputError(f"coordinates: expected {model.nq} different names, got {names!r}")
+    chosen = list(chart_names(model) if names is None else names)
+    if len(chosen) != model.nv or not all(isinstance(n, str) and n for n in chosen) or len(set(chosen)) != len(chosen):
+        raise InputError(f"coordinates: expected {model.nv} different names, got {names!r}")
     return [sp.Symbol(n) for n in chosen]

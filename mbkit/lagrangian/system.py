@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,12 @@ from mbkit._escape import one_line
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.constraint_manifold import Manifold, manifold_of, projected, require_independent
 from mbkit.errors import NumericalError, UnsupportedError
-from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities, parameter_values
+from mbkit.lagrangian.energies.energy_form import (
+    EnergyForm,
+    QuasiVelocities,
+    parameter_values,
+    timed_parameters,
+)
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion
 from mbkit.lagrangian.energies.symbols import name_of
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
@@ -164,24 +169,41 @@ class Lagrangian(EnergyForm):
     def _hamiltonian(self) -> Hamiltonian:
         return hamiltonian(self)
 
-    def quasi_velocities(self, D: sp.Matrix, names: str | Sequence[str | sp.Symbol] | None = None) -> QuasiLagrangian:
-        """Return the same system in velocities w that are no coordinates' rates: q̇ = D(q) w.
+    def quasi_velocities(
+        self, D: sp.Matrix, names: str | Sequence[str | sp.Symbol] | None = None, *, drift: sp.Matrix | None = None
+    ) -> QuasiLagrangian:
+        """Return the same system in velocities w that are no coordinates' rates: q̇ = D(q, t) w + e(q, t).
 
         Parameters
         ----------
         D : (n, n) sympy.Matrix
-            Of coordinates (and parameters), one row per coordinate.
+            Of coordinates, time and parameters, one row per coordinate.
         names : str or sequence of str or sympy.Symbol, optional
             Of w; ``w1``, ``w2``, ... by default.
+        drift : (n, 1) sympy.Matrix, optional
+            e, the coordinates' rates where w is zero; none by default. Of u = A(q, t) q̇ + a(q, t) it is -A⁻¹ a.
 
         Raises
         ------
         InputError
-            D of another shape, with other symbols, or singular everywhere.
+            D or e of another shape or with other symbols, or D singular everywhere.
         UnsupportedError
-            Constraints act on the system.
+            Holonomic constraints act on the system. One with a time in D, or with e, runs in `system` only.
+
+        Examples
+        --------
+        A point in a plane in the velocities that a turning table's axes show, with the terms of Coriolis:
+
+        >>> import sympy as sp
+        >>> import mbkit as mb
+        >>> m, x, y, xdot, ydot, Omega, t = sp.symbols("m x y xdot ydot Omega t")
+        >>> point = mb.lagrangian.Lagrangian(m * (xdot**2 + ydot**2) / 2, 0, [x, y], time=t, parameters=[m, Omega])
+        >>> c, s = sp.cos(Omega * t), sp.sin(Omega * t)
+        >>> print(point.quasi_velocities([[c, -s], [s, c]], "u w").equations())
+        m*udot - Omega*m*w = 0
+        m*wdot + Omega*m*u = 0
         """
-        return QuasiLagrangian(self, D, names)
+        return QuasiLagrangian(self, D, names, drift)
 
     # Constraints, eliminated
 
@@ -367,7 +389,7 @@ class Lagrangian(EnergyForm):
 
 
 class QuasiLagrangian(Lagrangian):
-    """A system in quasi-velocities, the result of `Lagrangian.quasi_velocities`.
+    """A system in quasi-velocities, the result of `Lagrangian.quasi_velocities`, or of `from_model` with ball joints.
 
     States are (q, w), and ``tau`` is the force on each w, Dᵀ times that on each coordinate (`to_force`). Routh's and
     Hamilton's functions need the coordinates' rates and are those of `system`.
@@ -377,17 +399,53 @@ class QuasiLagrangian(Lagrangian):
     system : Lagrangian
         The same in its coordinates' rates.
     D, W : (n, n) sympy.Matrix
-        q̇ = D w and w = W q̇.
+        q̇ = D w + e and w = W (q̇ - e).
+    drift : (n, 1) sympy.Matrix
+        e.
     """
 
-    def __init__(self, system: Lagrangian, D: Any, names: Any = None) -> None:
-        self.system = system
+    def __init__(self, system: Lagrangian, D: Any, names: Any = None, drift: Any = None) -> None:
+        self.__dict__["system"] = self._given = system
         # The parts of T are known, and need not be separated again.
-        arguments, self.__dict__["kinetic"], self.quasi = in_quasi_velocities(system, D, names)
-        self.D, self.W = self.quasi.D, self.quasi.W
+        arguments, self.__dict__["kinetic"], self.quasi = in_quasi_velocities(system, D, names, drift)
         super().__init__(**arguments)
+        self.time = self.time or self.quasi.time
 
     quasi: QuasiVelocities
+    _given: Lagrangian | None = None
+
+    @classmethod
+    def of_energies(cls, quasi: QuasiVelocities, **arguments: Any) -> QuasiLagrangian:
+        """Return a system of which T and the others, arguments of `Lagrangian`, are written in the quasi-velocities."""
+        out = cls.__new__(cls)
+        out.quasi = quasi
+        Lagrangian.__init__(out, **arguments)
+        return out
+
+    @cached_property
+    def system(self) -> Lagrangian:
+        """The same in its coordinates' rates."""
+        quasi, arguments = self.quasi, self._arguments()
+        w = dict(zip(self.velocities, quasi.W * sp.Matrix(quasi.rates), strict=True))
+        forces = quasi.W.T * self.forces.subs(w, simultaneous=True)
+        arguments |= {name: arguments[name].subs(w, simultaneous=True) for name in ("T", "dissipation")}
+        arguments |= {"velocities": quasi.rates, "forces": dict(zip(self.coordinates, forces, strict=True))}
+        return Lagrangian(**arguments)
+
+    @property
+    def D(self) -> sp.ImmutableMatrix:  # noqa: N802
+        """D, (n, n), of q̇ = D w + e."""
+        return self.quasi.D
+
+    @property
+    def W(self) -> sp.ImmutableMatrix:  # noqa: N802
+        """D⁻¹, (n, n)."""
+        return self.quasi.W
+
+    @property
+    def drift(self) -> sp.ImmutableMatrix:
+        """The coordinates' rates where w is zero, e, (n, 1)."""
+        return self.quasi.drift
 
     @property
     def hamel_coefficients(self) -> sp.ImmutableDenseNDimArray:
@@ -406,23 +464,30 @@ class QuasiLagrangian(Lagrangian):
     # Variants
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return QuasiLagrangian, (self.system, self.D, self.velocities)
+        if self._given is None:
+            return partial(QuasiLagrangian.of_energies, self.quasi, **self._arguments()), ()
+        return QuasiLagrangian, (self._given, self.D, self.velocities, self.drift)
 
-    def _of(self, system: Lagrangian, D: Any) -> QuasiLagrangian:
-        return QuasiLagrangian(system, D, self.velocities)
+    def _like(self, arguments: dict[str, Any]) -> QuasiLagrangian:
+        return QuasiLagrangian.of_energies(self.quasi, **arguments)
 
     def substituted(self, values: Mapping[sp.Symbol, Any]) -> QuasiLagrangian:
         """Return the same system with numbers for some parameters."""
-        system = self.system.substituted(values)
-        return self._of(system, self.D.subs({s: sp.sympify(x) for s, x in values.items()}))
+        if self._given is None:
+            return super().substituted(values)
+        numbers = {s: sp.sympify(x) for s, x in values.items()}
+        D, drift = self.D.subs(numbers), self.drift.subs(numbers)
+        return QuasiLagrangian(self._given.substituted(values), D, self.velocities, drift)
 
     def conservative(self) -> QuasiLagrangian:
         """Return the same system without dissipation and forces; inputs stay."""
-        return self._of(self.system.conservative(), self.D)
+        if self._given is None:
+            return super().conservative()
+        return QuasiLagrangian(self._given.conservative(), self.D, self.velocities, self.drift)
 
-    def quasi_velocities(self, D: Any, names: Any = None) -> QuasiLagrangian:
-        """Return the system in other quasi-velocities u, with q̇ = D u again."""
-        return QuasiLagrangian(self.system, D, names)
+    def quasi_velocities(self, D: Any, names: Any = None, *, drift: Any = None) -> QuasiLagrangian:
+        """Return the system in other quasi-velocities u, with q̇ = D u + drift again."""
+        return QuasiLagrangian(self.system, D, names, drift)
 
     # Reductions in coordinates' rates
 
@@ -439,30 +504,41 @@ class QuasiLagrangian(Lagrangian):
         p, kept = self.W.T * self.momenta, self.system.cyclic_coordinates()
         return {q: tidy(x) for q, x in zip(self.coordinates, p, strict=True) if q in kept}
 
+    @property
+    def energy_function(self) -> sp.Expr:
+        """h of the coordinates' rates, in quasi-velocities."""
+        if not any(self.drift):
+            return super().energy_function
+        rates = self.D * sp.Matrix(self.velocities) + self.drift
+        return tidy(self.system.energy_function.subs(dict(zip(self.quasi.rates, rates, strict=True)), simultaneous=True))
+
     # Numbers
 
     @cached_property
     def _maps(self) -> dict[str, Numeric]:
-        arguments = self.coordinates, tuple(self.parameters)
-        return {name: Numeric(A, *arguments) for name, A in (("w", self.D), ("v", self.W), ("tau", self.D.T))}
+        arguments = self.coordinates, timed_parameters(self)
+        maps = {"w": self.D.row_join(self.drift), "v": self.W.row_join(-self.W * self.drift), "tau": self.D.T}
+        return {name: Numeric(A, *arguments) for name, A in maps.items()}
 
-    def _mapped(self, name: str, q: ArrayLike, x: ArrayLike, values: dict[str, float]) -> Array:
-        n, held = len(self.coordinates), self.D.free_symbols & set(self.parameters)
+    def _mapped(self, name: str, q: ArrayLike, x: ArrayLike, t: float, values: dict[str, float]) -> Array:
+        n, held = len(self.coordinates), (self.D.free_symbols | self.drift.free_symbols) & set(self.parameters)
         q, x = rows("q", q, n, self.name, "nq"), rows(name, x, n, self.name, "nv")
         numbers = parameter_values(self, values, name) if held else np.zeros(len(self.parameters))
-        return np.asarray(np.einsum("...ij,...j->...i", self._maps[name](q, numbers), x))
+        timed = numbers if self.time is None else np.array([real("t", t), *numbers])
+        A = self._maps[name](q, timed)
+        return np.asarray(np.einsum("...ij,...j->...i", A[..., :n], x) + A[..., n:].sum(axis=-1))
 
-    def to_velocity(self, q: ArrayLike, w: ArrayLike, **values: float) -> Array:
-        """Return the coordinates' rates D w in numbers, (n,) or (N, n)."""
-        return self._mapped("w", q, w, values)
+    def to_velocity(self, q: ArrayLike, w: ArrayLike, *, t: float = 0.0, **values: float) -> Array:
+        """Return the coordinates' rates D w + e in numbers, (n,) or (N, n), t in s."""
+        return self._mapped("w", q, w, t, values)
 
-    def to_quasi_velocity(self, q: ArrayLike, v: ArrayLike, **values: float) -> Array:
-        """Return w = D⁻¹ v of the coordinates' rates in numbers, (n,) or (N, n)."""
-        return self._mapped("v", q, v, values)
+    def to_quasi_velocity(self, q: ArrayLike, v: ArrayLike, *, t: float = 0.0, **values: float) -> Array:
+        """Return w = D⁻¹ (v - e) of the coordinates' rates in numbers, (n,) or (N, n), t in s."""
+        return self._mapped("v", q, v, t, values)
 
-    def to_force(self, q: ArrayLike, tau: ArrayLike, **values: float) -> Array:
-        """Return the forces Dᵀ τ on w of those on the coordinates in numbers, (n,) or (N, n)."""
-        return self._mapped("tau", q, tau, values)
+    def to_force(self, q: ArrayLike, tau: ArrayLike, *, t: float = 0.0, **values: float) -> Array:
+        """Return the forces Dᵀ τ on w of those on the coordinates in numbers, (n,) or (N, n), t in s."""
+        return self._mapped("tau", q, tau, t, values)
 
     def __repr__(self) -> str:
         return one_line(f"<QuasiLagrangian {self.name!r}: quasi-velocities {', '.join(map(str, self.velocities))}>")

@@ -34,13 +34,34 @@ from mbkit.lagrangian.trig.simplify import is_zero, tidy, tidy_matrix
 
 @dataclass(frozen=True, eq=False)
 class QuasiVelocities:
-    """q̇ = D w in symbols, with W = D⁻¹; `input_forces` are Dᵀ u of the coordinates' inputs u."""
+    """q̇ = D w + e in symbols, with W = D⁻¹; `input_forces` are Dᵀ u of the coordinates' inputs u.
+
+    `drift` is e, and `time` the symbol of the time where D or e holds it.
+    """
 
     D: sp.ImmutableMatrix
     W: sp.ImmutableMatrix
     coordinates: tuple[sp.Symbol, ...]
     rates: tuple[sp.Symbol, ...]
     input_forces: sp.ImmutableMatrix
+    drift: sp.ImmutableMatrix
+    time: sp.Symbol | None = None
+
+    @property
+    def moves(self) -> bool:
+        """Whether time transports the frame: D or e depends on it, or e is not zero."""
+        return self.time is not None or any(self.drift)
+
+    def transported(self, x: Any) -> Any:
+        """Return ∂x/∂t + Σ ∂x/∂q_r e_r: the rate of an expression or a matrix where w is zero."""
+        out = sum((sp.diff(x, q) * e for q, e in zip(self.coordinates, self.drift, strict=True) if e != 0), 0 * x)
+        return out if self.time is None else out + sp.diff(x, self.time)
+
+    @cached_property
+    def transport_coefficients(self) -> sp.ImmutableMatrix:
+        """γ⁰, (n, n), of `mbkit.lagrangian.reduction.quasi_equations`; ``transport_coefficients[k, i]`` = γ^k_i0."""
+        slope = sp.Matrix(self.drift).jacobian(self.coordinates)
+        return tidy_matrix(self.W * (slope * self.D - self.transported(self.D)))
 
     @cached_property
     def hamel_coefficients(self) -> sp.ImmutableDenseNDimArray:
@@ -85,7 +106,7 @@ class EnergyForm:
         acting = _forces(into, forces or {})
         self.constraints = _rows(into, "constraints", constraints)
         self.velocity_constraints = _rows(into, "velocity_constraints", velocity_constraints)
-        self.coordinates, self.velocities = into.coordinates, into.velocities
+        self.coordinates, self.velocities, self.clock = into.coordinates, into.velocities, into.time
         others = (self.T, self.V, self.dissipation, *self.constraints, *self.velocity_constraints)
         # The time of dynamicsymbols need not enter by itself.
         self.time = into.time if any(into.time in x.free_symbols for x in (*others, *acting.values())) else None
@@ -179,10 +200,11 @@ class EnergyForm:
         return partial(type(self), **self._arguments()), ()
 
     def _arguments(self) -> dict[str, Any]:
-        energies = ("T", "V", "coordinates", "velocities", "time", "dissipation", "name")
+        energies = ("T", "V", "coordinates", "velocities", "dissipation", "name")
         names = (*energies, "constraints", "velocity_constraints")
         forces = {q: self.inputs.get(q, x) for q, x in zip(self.coordinates, self.forces, strict=True)}
-        return {n: getattr(self, n) for n in names} | {"forces": forces, "parameters": dict(self.parameters)}
+        others = {"time": self.clock, "forces": forces, "parameters": dict(self.parameters)}
+        return {n: getattr(self, n) for n in names} | others
 
     def substituted(self, values: Mapping[sp.Symbol, Any]) -> Self:
         """Return the same system with numbers for some parameters, and expressions for functions such as J(theta)."""
@@ -211,11 +233,14 @@ class EnergyForm:
         out["forces"] = {q: x if q in self.inputs else replaced(x) for q, x in out["forces"].items()}
         out |= {name: [replaced(c) for c in out[name]] for name in ("constraints", "velocity_constraints")}
         out["parameters"] = {s: x for s, x in self.parameters.items() if s not in numbers}
-        return type(self)(**out)
+        return self._like(out)
+
+    def _like(self, arguments: dict[str, Any]) -> Self:
+        return type(self)(**arguments)
 
     def conservative(self) -> Self:
         """Return the same system without dissipation and forces; inputs stay."""
-        return type(self)(**{**self._arguments(), "dissipation": 0, "forces": dict(self.inputs)})
+        return self._like({**self._arguments(), "dissipation": 0, "forces": dict(self.inputs)})
 
 
 def _as_function(key: Any, forms: list[Any], value: sp.Expr, known: Mapping[str, sp.Symbol]) -> sp.Lambda:
@@ -417,7 +442,8 @@ def _check_declared(d: EnergyForm) -> None:
 def _warn_of_mass_in_time(d: EnergyForm) -> None:
     """Warn of T = ½ m(t) v²: the rocket's equation is another one. A length that is driven leaves terms of ṫ in T."""
     k, t = d.kinetic, d.time
-    if t is None or any(k.b) or k.T0 != 0:
+    # Quasi-velocities may move while masses do not.
+    if t is None or d.quasi is not None or any(k.b) or k.T0 != 0:
         return
     held = [w.name for i, w in enumerate(d.velocities) if t in k.M[i, i].free_symbols and d.forces[i] == 0]
     if not held:

@@ -156,6 +156,12 @@ class TrigPolynomial:
 
     __rmul__ = __mul__
 
+    def coefficient(self, i: int) -> TrigPolynomial:
+        """Return what stands with the first power of a generator, by its place."""
+        parts = ((kind, turns, powers, value) for (kind, turns, powers), value in self.terms.items() if powers[i] == 1)
+        terms = {(kind, turns, (*p[:i], 0, *p[i + 1 :])): value for kind, turns, p, value in parts}
+        return TrigPolynomial(self.space, terms)
+
     @property
     def expression(self) -> sp.Expr:
         """The sum of a polynomial that has neither cosine nor sine."""
