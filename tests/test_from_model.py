@@ -24,8 +24,8 @@ ONE = ("revolute", "continuous", "prismatic", "helical")
 # Sums of some hundred rounded terms, in another order than the derivation's.
 CLOSE = 1e-13
 SMALL = {"chain": {"n": 3}, "clamped_beam": {"segments": 3}, "flexible_spacecraft": {"segments": 2}}
-# The system with a loop is in test_loops.py; those that roll are refused.
-READ = [n for n, f in mb.catalog.systems().items() if not f().quaternions and not f().constrained]
+# The system with a loop is in test_loops.py, those that roll in test_rolling.py.
+READ = [n for n, f in mb.catalog.systems().items() if not f().constrained]
 
 
 def in_chart(model, q):
@@ -67,7 +67,8 @@ def test_catalog_systems_move_as_they_do(name):
     model = mb.catalog.get(name)(**SMALL.get(name, {}))
     lag = from_model(model)
     assert lag.parameters
-    assert [s.name for s in lag.coordinates] == list(model.coordinate_names)
+    if not model.quaternions:
+        assert [s.name for s in lag.coordinates] == list(model.coordinate_names)
     assert_same(model, lag)
 
 
@@ -190,8 +191,6 @@ def test_the_remedy_for_a_model_that_is_too_large_works():
 
 
 def test_what_cannot_be_written_is_refused_with_the_reason():
-    with pytest.raises(UnsupportedError, match=r"'spin'.*Euler angles"):
-        from_model(mb.catalog.heavy_top())
     with pytest.raises(UnsupportedError, match=r"too many terms.*dynamics\(model, "):
         from_model(mb.load("panda"))
     with pytest.raises(UnsupportedError, match="32 coordinates"):

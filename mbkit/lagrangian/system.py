@@ -18,8 +18,10 @@ from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import (
     EnergyForm,
     QuasiVelocities,
+    acting_forces,
     parameter_values,
     timed_parameters,
+    vanish,
 )
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion
 from mbkit.lagrangian.energies.symbols import name_of
@@ -111,6 +113,11 @@ class Lagrangian(EnergyForm):
         """The system in its coordinates' rates."""
         return self
 
+    @property
+    def _given(self) -> Lagrangian:
+        """The system as it was written."""
+        return self
+
     def kinetic_split(self) -> tuple[sp.Expr, sp.Expr, sp.Expr]:
         """Return T2, T1 and T0: T's parts of second, first and zeroth degree in the velocities."""
         k = self.kinetic
@@ -136,7 +143,7 @@ class Lagrangian(EnergyForm):
         Of constraints' reactions on cyclic coordinates, momenta along sums of these on which none acts are added.
         """
         found = hamilton.conserved_quantities(
-            self._in_rates, self.conserved_momenta(), self.energy_function, self.velocities
+            self._given, self.conserved_momenta(), self.energy_function, self.velocities
         )
         return found if self.quasi is not None or not self.multiplier_symbols else (*found, *symmetry_momenta(self))
 
@@ -405,20 +412,21 @@ class QuasiLagrangian(Lagrangian):
     """
 
     def __init__(self, system: Lagrangian, D: Any, names: Any = None, drift: Any = None) -> None:
-        self.__dict__["system"] = self._given = system
+        self.__dict__["system"] = system
         # The parts of T are known, and need not be separated again.
         arguments, self.__dict__["kinetic"], self.quasi = in_quasi_velocities(system, D, names, drift)
         super().__init__(**arguments)
         self.time = self.time or self.quasi.time
 
     quasi: QuasiVelocities
-    _given: Lagrangian | None = None
+    #: Whether its energies were written in w, and not in the coordinates' rates.
+    _native = False
 
     @classmethod
     def of_energies(cls, quasi: QuasiVelocities, **arguments: Any) -> QuasiLagrangian:
         """Return a system of which T and the others, arguments of `Lagrangian`, are written in the quasi-velocities."""
         out = cls.__new__(cls)
-        out.quasi = quasi
+        out.quasi, out._native = quasi, True
         Lagrangian.__init__(out, **arguments)
         return out
 
@@ -464,26 +472,26 @@ class QuasiLagrangian(Lagrangian):
     # Variants
 
     def __reduce__(self) -> tuple[Any, ...]:
-        if self._given is None:
+        if self._native:
             return partial(QuasiLagrangian.of_energies, self.quasi, **self._arguments()), ()
-        return QuasiLagrangian, (self._given, self.D, self.velocities, self.drift)
+        return QuasiLagrangian, (self.system, self.D, self.velocities, self.drift)
 
     def _like(self, arguments: dict[str, Any]) -> QuasiLagrangian:
         return QuasiLagrangian.of_energies(self.quasi, **arguments)
 
     def substituted(self, values: Mapping[sp.Symbol, Any]) -> QuasiLagrangian:
         """Return the same system with numbers for some parameters."""
-        if self._given is None:
+        if self._native:
             return super().substituted(values)
         numbers = {s: sp.sympify(x) for s, x in values.items()}
         D, drift = self.D.subs(numbers), self.drift.subs(numbers)
-        return QuasiLagrangian(self._given.substituted(values), D, self.velocities, drift)
+        return QuasiLagrangian(self.system.substituted(values), D, self.velocities, drift)
 
     def conservative(self) -> QuasiLagrangian:
         """Return the same system without dissipation and forces; inputs stay."""
-        if self._given is None:
+        if self._native:
             return super().conservative()
-        return QuasiLagrangian(self._given.conservative(), self.D, self.velocities, self.drift)
+        return QuasiLagrangian(self.system.conservative(), self.D, self.velocities, self.drift)
 
     def quasi_velocities(self, D: Any, names: Any = None, *, drift: Any = None) -> QuasiLagrangian:
         """Return the system in other quasi-velocities u, with q̇ = D u + drift again."""
@@ -495,13 +503,24 @@ class QuasiLagrangian(Lagrangian):
     def _in_rates(self) -> Lagrangian:
         return self.system
 
+    @property
+    def _given(self) -> Lagrangian:
+        return self if self._native else self.system
+
     @cached_property
     def _ignorable(self) -> dict[sp.Symbol, sp.Expr]:
-        return self.system._ignorable
+        if not self._native:
+            return self.system._ignorable
+        p, rates = self.momenta, self.D * sp.Matrix(self.velocities)
+        forces = self.W.T * sp.Matrix(acting_forces(self))
+        # Of L where the coordinates' rates are held.
+        slopes = (sp.diff(self.L, q) + (p.T * sp.diff(self.W, q) * rates)[0] for q in self.coordinates)
+        found = zip(self.coordinates, slopes, forces, strict=True)
+        return {q: tidy(force) for q, slope, force in found if vanish([slope])}
 
     def conserved_momenta(self) -> dict[sp.Symbol, sp.Expr]:
         """Return the momentum Wᵀ p of each cyclic coordinate, in quasi-velocities."""
-        p, kept = self.W.T * self.momenta, self.system.cyclic_coordinates()
+        p, kept = self.W.T * self.momenta, self.cyclic_coordinates()
         return {q: tidy(x) for q, x in zip(self.coordinates, p, strict=True) if q in kept}
 
     @property

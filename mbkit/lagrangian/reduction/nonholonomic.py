@@ -9,7 +9,8 @@ The reactions Aᵀ λ do no work on N, and three ways lead to the same r equatio
 Nonholonomic Systems, ch. III; Greenwood 2003, Advanced Dynamics, ch. 4)::
 
     Maggi               Nᵀ (M q̈ + C q̇ + d + ∂V/∂q - Q) = 0          q̈ = N ẇ + d/dt(N) w - d/dt(E a)
-    Boltzmann, Hamel    the first r of Hamel's equations in the n quasi-velocities (w, A q̇), with A q̇ = 0 afterwards
+    Boltzmann, Hamel    the first r of Hamel's equations in the n quasi-velocities (w, A q̇ + a), with the last m zero
+                        afterwards
     Gibbs, Appell       ∂S/∂ẇ = Nᵀ (Q - ∂V/∂q)                      S = ½ q̈ᵀ M q̈ + q̈ᵀ (C q̇ + d)
 
 T holds all velocities while it is differentiated. If the rows are put into T before, the reactions' part of Σ γ p is
@@ -349,18 +350,14 @@ def _appell(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicE
 
 
 def _hamel(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEquations:
-    held = {*(frame.N.free_symbols | frame.E.free_symbols)} & {system.time}
-    if held or any(frame.drift):
-        raise UnsupportedError(
-            f"boltzmann_hamel: {system.name} has constraints that move; maggi() and appell() have them"
-        )
     r, used = len(frame.velocities), {s.name for s in (*symbols_of(system), *frame.velocities)}
     names = [free_name(f"{x}_", used) for x in (*frame.velocities, *(f"rate{k + 1}" for k in range(frame.E.cols)))]
     # In the first r equations no reaction stands.
     free = EnergyForm(**{**system._arguments(), "constraints": (), "velocity_constraints": ()})
-    arguments, kinetic, quasi = in_quasi_velocities(free, sp.Matrix.hstack(frame.N, frame.E), names)
-    form = EnergyForm(**arguments)
-    form.__dict__["kinetic"] = kinetic
+    arguments, kinetic, quasi = in_quasi_velocities(free, sp.Matrix.hstack(frame.N, frame.E), names, frame.drift)
+    form = EnergyForm.__new__(EnergyForm)
+    form.quasi, form.__dict__["kinetic"] = quasi, kinetic
+    EnergyForm.__init__(form, **arguments)
     whole = quasi_equations(form, quasi)
     w, held_rates = form.velocities[:r], form.velocities[r:]
     back = {**dict.fromkeys(held_rates, sp.Integer(0)), **dict(zip(w, frame.velocities, strict=True))}
