@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from tests.random_trees import off, random_tree, states
 from tests.scenes import mounted
 
 ONE = ("revolute", "continuous", "prismatic", "helical")
+_HERE = (np.eye(3), np.zeros(3))
 # Sums of some hundred rounded terms, in another order than the derivation's.
 CLOSE = 1e-13
 SMALL = {"chain": {"n": 3}, "clamped_beam": {"segments": 3}, "flexible_spacecraft": {"segments": 2}}
@@ -91,6 +93,111 @@ def test_ball_and_free_joints_move_as_they_do_in_their_own_velocities(seed, kind
     lag = from_model(model)
     assert isinstance(lag, QuasiLagrangian)
     assert_same(model, lag)
+
+
+def test_springs_dampers_and_forces_by_functions_act_on_what_ball_and_free_joints_carry():
+    b = mb.ModelBuilder("tug", gravity=(0, 0.5, -9.81))
+    for name, kind, parent in (("hub", "free", "world"), ("bob", "ball", "hub")):
+        b.add_body(name, mass=1.5, com=(0.1, 0.2, -0.3), inertia=(0.2, 0.3, 0.4))
+        b.add_joint(name, kind, parent=parent, child=name, translation=(0.2, 0, 0.1), damping=0.3)
+    b.add_spring("line", body_a="world", body_b="bob", point_a=(1, 2, 3), stiffness=30.0, rest_length=0.5, damping=3.0)
+    # Formulas read the quaternion, which has either sign.
+    q, v = sp.symbols("q_0:4"), sp.symbols("v_0:3")
+    b.add_joint_force("push", "bob", [-q[0] * q[3], 0.3 * q[1] ** 2 - 0.1 * v[1], v[0] * q[2] * q[3]], potential=q[0] * q[1])
+    assert_same(b.build(), from_model(b.build()))
+
+
+def satellite(links: int = 1, **arm: object) -> mb.Model:
+    """Return a hub that floats, with an arm of thin links."""
+    b = mb.ModelBuilder("satellite", gravity=(0, 0, 0))
+    values = {"m_0": 100.0, "I1": 10.0, "I2": 12.0, "I3": 9.0, "m_1": 5.0, "J": 1.0, "l": 1.0}
+    m_0, I1, I2, I3, m_1, J, length = (mb.Parameter(*x) for x in values.items())
+    b.add_body("hub", mass=m_0, inertia=(I1, I2, I3))
+    b.add_joint("base", "free", parent="world", child="hub")
+    for k in range(1, links + 1):
+        b.add_body(f"link{k}", mass=m_1, com=(length, 0, 0), inertia=(0, J, J))
+        carrier, at = (f"link{k - 1}", (2 * length, 0, 0)) if k > 1 else ("hub", (length, 0, 0))
+        b.add_joint(f"q{k}", "revolute", parent=carrier, child=f"link{k}", axis=(0, 0, 1), translation=at, **arm)
+    return b.build()
+
+
+def test_newton_and_euler_s_equations_come_out_of_a_free_body():
+    lag = from_model(satellite(0))
+    m_0, I1, I2, I3 = sp.symbols("m_0 I1 I2 I3")
+    assert [s.name for s in lag.coordinates] == ["x", "y", "z", "psi", "theta", "phi"]
+    v, w = sp.Matrix(lag.velocities[:3]), sp.Matrix(lag.velocities[3:])
+    vdot, wdot = sp.Matrix(sp.symbols("vdot1:4")), sp.Matrix(sp.symbols("omegadot1:4"))
+    inertia = sp.diag(I1, I2, I3)
+    expected = [*(m_0 * (vdot + w.cross(v))), *(inertia * wdot + w.cross(inertia * w))]
+    rows = lag.equations().equations()
+    assert all(sp.expand(row.lhs - x) == 0 and row.rhs == 0 for row, x in zip(rows, expected, strict=True))
+    # Momenta along x and y are as constant as those of z; of the angles the chart shows the first alone.
+    assert [c.name for c in lag.conserved_quantities()] == ["p_x", "p_y", "p_z", "p_psi", "E"]
+    again = pickle.loads(pickle.dumps(lag))
+    assert again.equations() == lag.equations()
+    assert again.model.digest == lag.model.digest
+
+
+def test_a_satellite_with_an_arm_moves_on_paper_as_it_does():
+    model = satellite(1, damping=0.2)
+    lag = from_model(model)
+    # The pose of the base stands in no term but the kinematics.
+    pose = {*lag.coordinates[:6]}
+    e = lag.equations()
+    assert not pose & (e.mass_matrix.free_symbols | e.coriolis_matrix.free_symbols)
+    q, v, *_ = states(model, 1, seed=3)
+    tau = np.array([0.1, -0.2, 0.3, 0.2, 0.1, -0.1, 0.5])
+    runs = [
+        mb.simulate(dyn, start, v[0], 0.5, "rk853", rtol=1e-12, torque=tau, save=[0.0, 0.5])
+        for dyn, start in (
+            (lag.dynamics(options={"compile": False}), in_chart(model, q[0])),
+            (mb.dynamics(model, "lagrangian", compile=False), q[0]),
+        )
+    ]
+    # Two adaptive runs of some tens of steps.
+    assert off(runs[0].v, runs[1].v) < 1e-10
+    # Angles may differ by whole turns.
+    assert np.abs(np.sin((runs[0].q - in_chart(model, runs[1].q)) / 2)).max() < 1e-10
+    # The momenta that the symbols call conserved are so, without a force.
+    free = from_model(satellite(1))
+    run = mb.simulate(
+        free.dynamics(options={"compile": False}), runs[0].q[0], v[0], 0.5, "rk853", rtol=1e-12, save=[0.0, 0.5]
+    )
+    symbols = (*free.coordinates, *free.velocities, *free.parameters)
+    for kept in free.conserved_quantities():
+        value = sp.lambdify(symbols, kept.expression)
+        first, last = (value(*a, *b, *free.parameters.values()) for a, b in zip(run.q, run.v, strict=True))
+        assert last == pytest.approx(first, abs=1e-9)
+    with pytest.raises(InputError, match="singular at"):
+        mb.simulate(free.dynamics(options={"compile": False}), [0, 0, 0, 0, np.pi / 2, 0, 0], v[0], 0.1, "rk4", dt=0.1)
+
+
+def test_an_arm_that_is_driven_turns_the_satellite():
+    """Against the tree's own equations, with the arm's acceleration given."""
+    model = satellite(1)
+    driven = replace(model, prescribed=(Prescribed("q1", rate=0.7, offset=0.2),))
+    lag = from_model(driven)
+    assert len(lag.coordinates) == 6
+    q, v, _, tau = states(model, 3)
+    q[:, -1], v[:, -1] = 0.2, 0.7
+    ref = mb.dynamics(model, "lagrangian", compile=False)
+    ours = lag.dynamics(options={"compile": False}).forward_dynamics(in_chart(model, q)[:, :6], v[:, :6], tau[:, :6])
+    a = np.hstack([ours, np.zeros((3, 1))])
+    assert off(ref.inverse_dynamics(q, v, a)[:, :6], tau[:, :6]) < 1e-12
+
+
+def test_names_of_several_free_bodies_differ():
+    b = mb.ModelBuilder("two", gravity=(0, 0, 0))
+    for name in ("a", "c"):
+        b.add_body(name, mass=1.0, inertia=(1, 2, 2.5))
+        b.add_joint(name, "free" if name == "a" else "ball", parent="world", child=name)
+    lag = from_model(b.build())
+    assert [s.name for s in lag.coordinates] == [
+        *(f"{x}_a" for x in ("x", "y", "z", "psi", "theta", "phi")),
+        *(f"{x}_c" for x in ("psi", "theta", "phi")),
+    ]
+    assert [s.name for s in lag.velocities][-3:] == ["omega_c1", "omega_c2", "omega_c3"]
+    assert r"\dot{\omega}" in lag.equations().latex()
 
 
 def test_a_robot_moves_as_it_does():
@@ -193,6 +300,9 @@ def test_the_remedy_for_a_model_that_is_too_large_works():
 def test_what_cannot_be_written_is_refused_with_the_reason():
     with pytest.raises(UnsupportedError, match=r"too many terms.*dynamics\(model, "):
         from_model(mb.load("panda"))
+    bound = replace(satellite(1), loops=(Loop("grip", "point", "link1", np.eye(3), np.zeros(3), "world", *_HERE),))
+    with pytest.raises(UnsupportedError, match="'base' has velocities .* beside loops"):
+        from_model(bound)
     with pytest.raises(UnsupportedError, match="32 coordinates"):
         from_model(mb.load("talos"))
     with pytest.raises(InputError, match="expected a Model, got str"):

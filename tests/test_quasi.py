@@ -191,6 +191,65 @@ def test_mass_matrix_rate_less_twice_coriolis_is_skew(curved):
     assert np.abs(S).max() > 0.1
 
 
+# Frames that move by themselves
+
+
+def along(A, system, rate):
+    return sum((sp.diff(A, q_) * r for q_, r in zip(system.coordinates, rate, strict=True)), sp.diff(A, t))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_quasi_velocities_that_depend_on_time_are_lagranges_equations_by_substitution(curved, seed):
+    """Dᵀ times Lagrange's left sides with q̇ = D w + e and its derivative in them."""
+    rng, system = np.random.default_rng(seed), curved.system
+    held = [1, x, y, t, x * t, sp.sin(t) * y]
+
+    def entry():
+        return sum(sp.Rational(int(rng.integers(-5, 6)), 10) * held[k] for k in rng.choice(6, 2, replace=False))
+
+    A = sp.Matrix(2, 2, lambda i, j: 2 * (i == j) + entry())
+    drift = sp.Matrix([entry(), entry()]) if seed else sp.zeros(2, 1)
+    quasi = system.quasi_velocities(A, "a b", drift=drift)
+    e, rates, of_rates = quasi.equations(), system.velocities, system.equations()
+    w, wdot = sp.Matrix(quasi.velocities), sp.Matrix(e.accelerations)
+    rate = A * w + drift
+    second = A * wdot + along(A, system, rate) * w + along(drift, system, rate)
+    put = dict(zip((*rates, *of_rates.accelerations), (*rate, *second), strict=True))
+    left = sp.Matrix([row.lhs - row.rhs for row in of_rates.equations()]).subs(put, simultaneous=True)
+    ours = sp.Matrix([row.lhs - row.rhs for row in e.equations()])
+    own = (x, y, t, tau, m, g, c, *w, *wdot)
+    at = rng.uniform(-1, 1, len(own))
+    expected, got = (np.array(sp.lambdify(own, B)(*at), dtype=float) for B in (A.T * left, ours))
+    assert np.abs(got - expected).max() < 1e-13 * max(1, np.abs(expected).max())
+    # What the time adds is no rounding.
+    still = sp.lambdify(own, e.drift - e.transport_coefficients.T * (quasi.kinetic.M * w + quasi.kinetic.b))(*at)
+    assert np.abs(np.array(sp.lambdify(own, e.drift)(*at)) - still).max() > 1e-3
+    now = float(at[2])
+    values, q_, w_ = {"m": at[4], "g": at[5], "c": at[6]}, at[:2], at[7:9]
+    v_ = quasi.to_velocity(q_, w_, t=now, **values)
+    assert v_ == pytest.approx(np.array(sp.lambdify(own, rate)(*at), dtype=float).ravel(), rel=1e-13)
+    assert quasi.to_quasi_velocity(q_, v_, t=now, **values) == pytest.approx(w_, rel=1e-12)
+    again = pickle.loads(pickle.dumps(quasi))
+    assert again.equations() == e
+
+
+def test_on_a_turning_table_coriolis_and_centrifugal_forces_come_out():
+    """Velocities relative to a table that turns with Ω, in its axes: m u̇ + 2 m Ω × u - m Ω² ρ = 0."""
+    Om, p, r = sp.symbols("Omega p r")
+    point = Lagrangian(m * (xdot**2 + ydot**2) / 2, 0, [x, y], time=t, parameters=[m, Om])
+    R = sp.Matrix([[sp.cos(Om * t), -sp.sin(Om * t)], [sp.sin(Om * t), sp.cos(Om * t)]])
+    table = point.quasi_velocities(R, [p, r], drift=[-Om * y, Om * x])
+    e, place = table.equations(), R.T * sp.Matrix([x, y])
+    acceleration = sp.Matrix(e.accelerations)
+    expected = m * (acceleration + 2 * Om * sp.Matrix([-r, p]) - Om**2 * place)
+    ours = sp.Matrix([row.lhs - row.rhs for row in e.equations()])
+    assert (ours - expected).applyfunc(sp.simplify).is_zero_matrix
+    # The energy is that of the rest frame.
+    assert [k.name for k in table.conserved_quantities()] == ["p_x", "p_y", "E"]
+    rates = R * sp.Matrix([p, r]) + sp.Matrix([-Om * y, Om * x])
+    assert sp.simplify(table.energy_function - m * rates.dot(rates) / 2) == 0
+
+
 # Running
 
 
@@ -336,7 +395,7 @@ def test_bad_input_says_what_is_wrong():
         (sp.eye(2), "expected shape"),
         (sp.Matrix([[1, 0, 0], [0, 1, 0], [1, 1, 0]]), "singular everywhere"),
         (sp.diag(1, 1, x), "parameters only, got x"),
-        (sp.diag(1, 1, u), "D of q alone"),
+        (sp.diag(1, 1, u), "drift of q and t alone"),
         (sp.diag(1, 1, sp.oo), "expected finite"),
         ("no matrix", "expected a SymPy matrix"),
     ):
@@ -348,9 +407,16 @@ def test_bad_input_says_what_is_wrong():
     bound = Lagrangian(m * (xdot**2 + ydot**2), 0, [x, y], parameters=[m], constraints=[x - y])
     with pytest.raises(UnsupportedError, match="has holonomic constraints"):
         bound.quasi_velocities(sp.eye(2))
-    moving = Lagrangian(m * xdot**2, t * x, [x], time=t, parameters=[m])
-    with pytest.raises(InputError, match="got the time t"):
-        moving.quasi_velocities([[t]])
+    with pytest.raises(InputError, match="got t; .*give the time to the system as time="):
+        Lagrangian(m * xdot**2, 0, [x], parameters=[m]).quasi_velocities([[t]])
+    with pytest.raises(InputError, match=r"drift: expected shape \(3, 1\)"):
+        whole.quasi_velocities(sp.eye(3), drift=[1, 2])
+    timed = Lagrangian(m * xdot**2, 0, [x], time=t, parameters={m: 1.0})
+    with pytest.raises(InputError, match="'t' stands for something else"):
+        timed.quasi_velocities([[1]], "t")
+    for moving in (timed.quasi_velocities([[1 + t**2]]), timed.quasi_velocities([[1]], drift=[[x]])):
+        with pytest.raises(UnsupportedError, match=r"run its \.system"):
+            moving.dynamics()
 
 
 def test_parameters_in_d_are_read_and_put_in_before_a_run():

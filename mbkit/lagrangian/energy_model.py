@@ -90,6 +90,11 @@ class EnergyModel(Model):
         return self.form.time.name if self.form.time is not None else None
 
     @property
+    def jumping_forces(self) -> tuple[str, ...]:
+        """Forces that jump where a velocity changes its sign."""
+        return self.form.jumps
+
+    @property
     def constrained(self) -> bool:
         """Whether constraints bind the coordinates to each other."""
         return bool(self.form.multiplier_symbols)

@@ -77,6 +77,11 @@ class Model(Description):
         return None
 
     @property
+    def jumping_forces(self) -> tuple[str, ...]:
+        """Forces that jump where a velocity changes its sign and are zero at rest; not those of joints' dry friction."""
+        return ()
+
+    @property
     def constrained(self) -> bool:
         """Whether constraints bind the coordinates to each other, so that not every (q, v) is a state."""
         return any(getattr(self, feature) for feature in CONSTRAINT_FEATURES)

@@ -82,6 +82,13 @@ def integrate(
     if any(map(callable, given)) and not chosen.callables:
         _refuse("torque functions", chosen, [m.name for m in METHODS.values() if m.callables])
     _warn_beyond_limits(model, q)
+    if model.jumping_forces:
+        warn(
+            f"{model.name}: {', '.join(model.jumping_forces)} jumps where a velocity changes its sign. There it holds "
+            "nothing, and a run that comes to rest is wrong or goes on in ever smaller steps. Dry friction of a "
+            "description's joints is exact: add_joint(..., friction=...); or write tanh(v/v_s) for sign(v)",
+            MbkitWarning,
+        )
     own = dyn._under(*acting) if acting else dyn
     bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
     started = time.perf_counter()

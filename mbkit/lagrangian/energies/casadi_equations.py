@@ -21,6 +21,8 @@ from mbkit.model import Model
 
 #: Characters of a constraint in a message: of a loop in space it has thousands.
 _SHOWN: Final = 100
+#: |D⁻¹| |D| from which on rates have less than four digits.
+_SINGULAR: Final = 1e12
 
 
 def _short(x: Any) -> str:
@@ -216,7 +218,9 @@ class VelocityMap:
     def check_start(self, q: Array, v: Array) -> None:
         """Raise `InputError` where D or its inverse has no value at a state to start from."""
         q, v = np.atleast_2d(q), np.atleast_2d(v)
-        bad = ~np.isfinite([self._column(name, q, v) for name in ("enter", "leave")]).all(axis=(0, 2))
+        _, D, W = self.linear(q, v)
+        # cos π/2 is 6e-17.
+        bad = ~(np.abs(W) @ np.abs(D) < _SINGULAR).all(axis=(1, 2))
         if bad.any():
             raise InputError(
                 f"q0: D(q) of q̇ = D v is singular at {q[int(np.argmax(bad))].tolist()}; start elsewhere, "

@@ -29,7 +29,7 @@ from mbkit.lagrangian.energies.symbols import (
     undefined,
     velocity_of,
 )
-from mbkit.lagrangian.trig.simplify import is_zero, tidy, tidy_matrix
+from mbkit.lagrangian.trig.simplify import gradient, is_zero, tidy, tidy_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +194,23 @@ class EnergyForm:
         """Return the other coordinates that L does not hold, each with the force that acts along it."""
         return {q: force for q, force in self._ignorable.items() if force != 0}
 
+    @cached_property
+    def jumps(self) -> tuple[str, ...]:
+        """Forces that jump where a velocity changes its sign, as dry friction does, by name."""
+        out = []
+        for name, x in _parts(self).items():
+            kind, at_zero = (sp.Abs, 0) if name == "dissipation" else (sp.sign, 1)
+            for a in sorted(x.atoms(kind), key=str) if name.startswith(("forces", "dissipation")) else ():
+                held = sorted(a.free_symbols & {*self.velocities}, key=str)
+                slopes = [(w, sp.diff(a.args[0], w)) for w in held]
+                solved = [(w, w - a.args[0] / slope) for w, slope in slopes if slope != 0 and not slope.has(w)]
+                size = sp.Dummy()
+                # What it multiplies, at the velocity where it jumps: v² sign(v) does not.
+                factor = sp.diff(x.xreplace({a: size}), size).subs(size, at_zero).subs(solved[:1])
+                if held and not is_zero(factor):
+                    out.append(f"{name} by {a}")
+        return tuple(out)
+
     # Variants
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -268,8 +285,8 @@ def vanish(parts: Iterable[sp.Expr]) -> bool:
 def acting_forces(form: EnergyForm) -> list[sp.Expr]:
     """Return the generalized forces beside V's: forces, inputs and dissipation, one a coordinate."""
     # Not from the equations of motion, whose Christoffel symbols are long.
-    named = zip(form.coordinates, form.velocities, form.forces, strict=True)
-    return [tidy(x + form.inputs.get(q, sp.Integer(0)) - sp.diff(form.dissipation, w)) for q, w, x in named]
+    named = zip(form.coordinates, gradient(form.dissipation, form.velocities), form.forces, strict=True)
+    return [tidy(x + form.inputs.get(q, sp.Integer(0)) - friction) for q, friction, x in named]
 
 
 def timed_parameters(form: EnergyForm) -> tuple[sp.Symbol, ...]:

@@ -195,7 +195,7 @@ def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> Equatio
         drift += (curl - curl.T) * v - sp.Matrix(gradient(k.T0, q))
     if t is not None:
         drift += sp.diff(k.M, t) * v + sp.diff(k.b, t)
-    friction = [sp.diff(system.dissipation, w) for w in system.velocities]
+    friction = gradient(system.dissipation, system.velocities)
     inputs = [system.inputs.get(x, sp.Integer(0)) for x in q]
     forces = sp.Matrix(system.forces) + sp.Matrix(inputs) - sp.Matrix(friction)
     return EquationsOfMotion(

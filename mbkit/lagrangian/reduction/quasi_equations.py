@@ -29,7 +29,7 @@ from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities, r
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, constraint_fields
 from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, inverse
 from mbkit.lagrangian.energies.symbols import fits
-from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
+from mbkit.lagrangian.trig.simplify import gradient, tidy, tidy_matrix
 
 
 @dataclass(frozen=True, repr=False)
@@ -79,7 +79,7 @@ def quasi_equations(system: EnergyForm, quasi: QuasiVelocities) -> QuasiEquation
         drift += transport.T * (k.M * v + k.b)
     if quasi.moves or system.time is not None:
         drift += quasi.transported(k.M) * v + quasi.transported(k.b)
-    friction = sp.Matrix([sp.diff(system.dissipation, x) for x in w])
+    friction = sp.Matrix(gradient(system.dissipation, w))
     return QuasiEquationsOfMotion(
         coordinates=system.coordinates,
         velocities=w,

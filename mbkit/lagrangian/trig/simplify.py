@@ -59,6 +59,10 @@ def slope(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
     A slider-crank's inertia m r² λ² sin² θ has the slope 2 m r² λ (λ cos θ + λ′ sin θ) sin θ, which is lost
     when it is multiplied out.
     """
+    if any(not s.is_real for a in x.atoms(sp.Abs) for s in a.free_symbols):
+        # SymPy takes |x| for the modulus of a complex number.
+        known = {s: sp.Dummy(s.name, real=True) for s in sorted(x.free_symbols | {q}, key=str)}
+        return slope(x.xreplace(known), known[q]).xreplace({real: s for s, real in known.items()})
     broken = [f for f in x.atoms(sp.Pow) if f.base.has(q) and (not f.exp.is_Integer or f.exp.is_negative)]
     if all(f.base.is_Symbol for f in broken):
         return tidy(sp.diff(x, q))
