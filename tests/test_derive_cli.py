@@ -218,7 +218,7 @@ def test_bad_input_is_one_message():
     out = derive("keplr", status=2)
     assert out.stderr.count("\n") == 1
     assert "'kepler'" in out.stderr
-    assert "Euler angles" in derive("free_body", status=2).stderr
+    assert "beside no_slip" in derive("rolling_ball", status=2).stderr
     assert "exclude each other" in derive("pendulum", "--json", "--latex", status=2).stderr
     assert "the function failed" in derive("json:dumps", status=2).stderr
 

@@ -12,8 +12,8 @@ import sympy as sp
 import mbkit as mb
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.from_description import from_model
-from mbkit.lagrangian.system import QuasiLagrangian
 from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters
+from mbkit.lagrangian.system import QuasiLagrangian
 from mbkit.lagrangian.trig.shortest_form import number
 from mbkit.lagrangian.trig.simplify import forms, tidy
 from mbkit.model.parts import Loop, Prescribed
@@ -103,7 +103,9 @@ def test_springs_dampers_and_forces_by_functions_act_on_what_ball_and_free_joint
     b.add_spring("line", body_a="world", body_b="bob", point_a=(1, 2, 3), stiffness=30.0, rest_length=0.5, damping=3.0)
     # Formulas read the quaternion, which has either sign.
     q, v = sp.symbols("q_0:4"), sp.symbols("v_0:3")
-    b.add_joint_force("push", "bob", [-q[0] * q[3], 0.3 * q[1] ** 2 - 0.1 * v[1], v[0] * q[2] * q[3]], potential=q[0] * q[1])
+    b.add_joint_force(
+        "push", "bob", [-q[0] * q[3], 0.3 * q[1] ** 2 - 0.1 * v[1], v[0] * q[2] * q[3]], potential=q[0] * q[1]
+    )
     assert_same(b.build(), from_model(b.build()))
 
 
@@ -301,7 +303,7 @@ def test_what_cannot_be_written_is_refused_with_the_reason():
     with pytest.raises(UnsupportedError, match=r"too many terms.*dynamics\(model, "):
         from_model(mb.load("panda"))
     bound = replace(satellite(1), loops=(Loop("grip", "point", "link1", np.eye(3), np.zeros(3), "world", *_HERE),))
-    with pytest.raises(UnsupportedError, match="'base' has velocities .* beside loops"):
+    with pytest.raises(UnsupportedError, match=r"'base' has velocities .* beside loops"):
         from_model(bound)
     with pytest.raises(UnsupportedError, match="32 coordinates"):
         from_model(mb.load("talos"))

@@ -724,3 +724,60 @@ def test_negative_masses_are_told(numbers):
         # Without numbers nothing is known, and a light mass is no negative one.
         Lagrangian(T, 0, [x, th], parameters=[m, k])
         Lagrangian(T, 0, [x, th], parameters={m: 1.0, k: 1e-9})
+
+
+# Forces that jump
+
+
+def sliding(force=0, **more) -> Lagrangian:
+    return Lagrangian(
+        m * u**2 / 2, k * x**2 / 2, [x], [u], forces={x: force}, parameters={m: 2.0, k: 50.0, c: 3.0}, **more
+    )
+
+
+@pytest.mark.parametrize(
+    "lag",
+    [
+        sliding(-c * sp.sign(u)),
+        sliding(-c * sp.sign(2 * u - k)),
+        sliding(dissipation=c * sp.Abs(u)),
+        sliding(-c * sp.sign(u)).quasi_velocities([[1 + x**2]]),
+    ],
+    ids=["sign", "belt", "dissipation", "quasi"],
+)
+def test_a_run_warns_of_a_force_that_jumps_and_terms_do_not(lag):
+    dyn = lag.dynamics(options={"compile": False})
+    with pytest.warns(MbkitWarning, match=r"jumps where a velocity.*friction="):
+        mb.simulate(dyn, [0.1], [5.0], 0.01, "rk4", dt=1e-3)
+
+
+@pytest.mark.parametrize("force", [-c * u**2 * sp.sign(u), -c * (u - k) * sp.sign(u - k), -c * sp.sign(x), -c * u])
+def test_a_force_that_is_continuous_in_the_velocity_is_not_warned_of(force):
+    assert not sliding(force).jumps
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        mb.simulate(sliding(force).dynamics(options={"compile": False}), [0.1], [5.0], 0.01, "rk4", dt=1e-3)
+
+
+def test_dry_friction_on_paper_at_speed_is_that_of_a_joint():
+    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
+    b.add_body("block", mass=2.0)
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), stiffness=50.0, friction=3.0)
+    exact = mb.dynamics(b.build(), "lagrangian", compile=False)
+    for lag in (sliding(-c * sp.sign(u)), sliding(dissipation=c * sp.Abs(u))):
+        dyn = lag.dynamics(options={"compile": False})
+        for v in (-2.0, 0.5):
+            assert dyn.forward_dynamics([0.3], [v], [0.1]) == pytest.approx(
+                exact.forward_dynamics([0.3], [v], [0.1]), rel=4 * EPS
+            )
+        # |ẋ| is that of a real number.
+        assert lag.equations().forces[0] == -c * sp.sign(u)
+
+
+def test_no_product_of_a_program_begins_with_1():
+    b = mb.ModelBuilder("rod")
+    b.add_body("rod", mass=mb.Parameter("m", 2.0) * 0.99999999, com=(mb.Parameter("r", 0.5), 0, 0), inertia=[0.1] * 3)
+    b.add_joint("j", "revolute", parent="world", child="rod", axis=(0, 0, 1))
+    text = mb.lagrangian.program(b.build(), "mass_matrix")
+    assert str(text).endswith("mass_matrix = 0.1 + m r²")
+    assert "0.9999999" in text.python()

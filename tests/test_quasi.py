@@ -407,7 +407,7 @@ def test_bad_input_says_what_is_wrong():
     bound = Lagrangian(m * (xdot**2 + ydot**2), 0, [x, y], parameters=[m], constraints=[x - y])
     with pytest.raises(UnsupportedError, match="has holonomic constraints"):
         bound.quasi_velocities(sp.eye(2))
-    with pytest.raises(InputError, match="got t; .*give the time to the system as time="):
+    with pytest.raises(InputError, match=r"got t; .*give the time to the system as time="):
         Lagrangian(m * xdot**2, 0, [x], parameters=[m]).quasi_velocities([[t]])
     with pytest.raises(InputError, match=r"drift: expected shape \(3, 1\)"):
         whole.quasi_velocities(sp.eye(3), drift=[1, 2])

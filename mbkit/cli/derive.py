@@ -77,6 +77,7 @@ def derive(
     if out is not None:
         check_writable(out)
     target = _model(system, options)
+    from mbkit.lagrangian.energies.charts import chart_names
     from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.from_description import from_model
     from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters, with_plain_turns
@@ -99,7 +100,8 @@ def derive(
         names = None if on_paper else letters(target)
         lag = from_model(target, coordinates=names, progress=lambda x, text: bar(0.1 * x, text))
         # Prescribed joints are no coordinates of the equation.
-        own = dict(zip(names or target.coordinate_names, target.coordinate_names, strict=True))
+        described = target.coordinate_names if on_paper else chart_names(target)
+        own = dict(zip(names or described, described, strict=True))
         text, ending = _text(lag, own, form, as_json, bar)
     if out is None:
         tell(text)

@@ -108,7 +108,9 @@ class SymbolicKinematics(Kinematics):
             model.name, [*halves, *dict.fromkeys(turns)], [*generators, *velocities], instead=instead_of_writing(model)
         )
         self._halved = len(halves)
-        self._written_in = TrigRing(model.name, [*(2 * x for x in halves), *space.angles[len(halves) :]], space.generators)
+        self._written_in = TrigRing(
+            model.name, [*(2 * x for x in halves), *space.angles[len(halves) :]], space.generators
+        )
         self.zero = space.number(0)
         numbers = {place: space.of(x) for place, x in self.bound.items()}
         self.values = _Numbers(model, numbers, lambda x: space.number(Fraction(repr(x))) if x else 0.0)
@@ -133,7 +135,9 @@ class SymbolicKinematics(Kinematics):
     def _exact_coordinates(self, joint: Joint) -> Vector:
         q, k, space = self.symbols_of[joint.name], joint.type.quaternion, self.formulas
         plain = [space.of(x) if _advances(joint, i) else SimpleNamespace(expression=x) for i, x in enumerate(q[:k])]
-        return plain if k is None else plain + quaternion(*([space.turned(f, {x / 2: 1}) for f in (0, 1)] for x in q[k:]))
+        return (
+            plain if k is None else plain + quaternion(*([space.turned(f, {x / 2: 1}) for f in (0, 1)] for x in q[k:]))
+        )
 
     def described(self, joint: Joint) -> list[sp.Expr]:
         """Return a joint's coordinates as its description has them, a quaternion by its angles."""

@@ -211,11 +211,11 @@ def _weight(kin: SymbolicKinematics, used: set[str]) -> tuple[sp.Expr, dict[sp.S
 
 def _check(model: Model) -> None:
     turning = [j.name for j in model.independent_joints if not j.type.coordinate_velocities]
-    bound = [f for f in CONSTRAINT_FEATURES if f != "prescribed" and getattr(model, f)]
-    if turning and bound:
+    held = [f for f in CONSTRAINT_FEATURES if f != "prescribed" and getattr(model, f)]
+    if turning and held:
         raise UnsupportedError(
             f"{model.name}: joint {turning[0]!r} has velocities that are no coordinate's rate, and is not written out "
-            f"beside {' and '.join(bound)}; write it as three joints of one coordinate each, or as spherical_zyx"
+            f"beside {' and '.join(held)}; write it as three joints of one coordinate each, or as spherical_zyx"
         )
     if not model.nv:
         raise UnsupportedError(f"{model.name}: no joint of it moves, so there is no equation")

@@ -441,12 +441,12 @@ class QuasiLagrangian(Lagrangian):
         return Lagrangian(**arguments)
 
     @property
-    def D(self) -> sp.ImmutableMatrix:  # noqa: N802
+    def D(self) -> sp.ImmutableMatrix:
         """D, (n, n), of q̇ = D w + e."""
         return self.quasi.D
 
     @property
-    def W(self) -> sp.ImmutableMatrix:  # noqa: N802
+    def W(self) -> sp.ImmutableMatrix:
         """D⁻¹, (n, n)."""
         return self.quasi.W
 
@@ -529,7 +529,9 @@ class QuasiLagrangian(Lagrangian):
         if not any(self.drift):
             return super().energy_function
         rates = self.D * sp.Matrix(self.velocities) + self.drift
-        return tidy(self.system.energy_function.subs(dict(zip(self.quasi.rates, rates, strict=True)), simultaneous=True))
+        return tidy(
+            self.system.energy_function.subs(dict(zip(self.quasi.rates, rates, strict=True)), simultaneous=True)
+        )
 
     # Numbers
 

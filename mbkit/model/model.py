@@ -78,7 +78,7 @@ class Model(Description):
 
     @property
     def jumping_forces(self) -> tuple[str, ...]:
-        """Forces that jump where a velocity changes its sign and are zero at rest; not those of joints' dry friction."""
+        """Forces by name that jump with a velocity's sign and hold nothing at rest; none of joints' dry friction."""
         return ()
 
     @property

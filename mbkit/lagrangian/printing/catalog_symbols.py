@@ -14,6 +14,7 @@ import numpy as np
 
 from mbkit import catalog
 from mbkit.errors import MbkitError
+from mbkit.lagrangian.energies.charts import chart_names
 from mbkit.load.urdf_reader import Snapper
 from mbkit.model import Expression, Model, Parameter
 
@@ -23,6 +24,7 @@ _SYMBOLS: Final = {
     "cart_pole": "cart_mass=m_c pole_mass=m_p",
     "clamped_beam": "length=L bending_stiffness=EI",
     "flexible_spacecraft": "length=L bending_stiffness=EI hub_mass=m_h hub_inertia=J_x,J_y,J hub_radius=r",
+    "free_body": "sides=a,b,c",
     "furuta_pendulum": "arm_length=L arm_mass=m_a arm_com=l_a arm_inertia=J_a "
     "pendulum_mass=m pendulum_com=l pendulum_inertia=J_x,J_y,J_z",
     "gyroscope": "rotor_mass=m rotor_axial=C rotor_across=A offset=l gimbal_mass=m_g "
@@ -70,12 +72,13 @@ def in_symbols(model: Model) -> Model | None:
 
 def letters(model: Model) -> list[str] | None:
     """Return names of coordinates that are short enough for equations; None where the model's own are."""
-    if all(_LETTER.fullmatch(n) for n in model.coordinate_names):
+    own = chart_names(model)
+    if all(_LETTER.fullmatch(n) for n in own):
         return None
-    if model.name in _LETTERS and len(_LETTERS[model.name]) == model.nq:
+    if model.name in _LETTERS and len(_LETTERS[model.name]) == len(own):
         return list(_LETTERS[model.name])
     # Of a joint with several coordinates, such as hub.x, the last part may be one.
-    tails = [n.rpartition(".")[2] for n in model.coordinate_names]
+    tails = [n.rpartition(".")[2] for n in own]
     known = {t for t in tails if _LETTER.fullmatch(t) and tails.count(t) == 1 and not t.startswith("q")}
     numbers = count(1)
     return [t if t in known else f"q{next(numbers)}" for t in tails]

@@ -112,7 +112,9 @@ class ProgramText(Printable):
 
 
 def _rounded(x: sp.Expr) -> sp.Expr:
-    return x.xreplace({f: sp.Float(f"{float(f):.{_DIGITS}g}") for f in x.atoms(sp.Float)})
+    short = {f: float(f"{float(f):.{_DIGITS}g}") for f in x.atoms(sp.Float)}
+    # A product keeps a factor 1.0, and drops 1.
+    return x.xreplace({f: sp.Integer(int(y)) if abs(y) == 1 else sp.Float(y) for f, y in short.items()})
 
 
 def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:

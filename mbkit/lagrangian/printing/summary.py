@@ -15,6 +15,7 @@ from mbkit._version import __version__
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion, printed_equations
 from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, folded, matrix, spread, written
+from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion
 from mbkit.lagrangian.system import Lagrangian
 
 #: Operations of T above which C and the equations are left out of a page.
@@ -86,6 +87,12 @@ class SystemSummary:
         out["Q"] = (e.forces, "forces")
         return {n: (A, meaning) for n, (A, meaning) in out.items() if n == "M" or any(x != 0 for x in A)}
 
+    @property
+    def _kinematics(self) -> list[sp.Eq]:
+        """q̇ = D w of velocities that are not the coordinates' rates."""
+        rows = self.equations.kinematics() if isinstance(self.equations, QuasiEquationsOfMotion) else ()
+        return [row for row in rows if row.lhs != row.rhs]
+
     @cached_property
     def _kept(self) -> list[tuple[str, sp.Expr, str]]:
         return [(c.name, c.expression, c.meaning) for c in self.system.conserved_quantities()]
@@ -120,6 +127,10 @@ class SystemSummary:
             out.append(f"Equation{'s' * (len(s.coordinates) > 1)} of motion:")
             for left, right in self._equations(self._short):
                 out += ["  " + line for line in folded(f"{left} = {right}", width - 2)]
+        if self._kinematics:
+            out += ["", "Kinematics:"]
+            for row in self._kinematics:
+                out += ["  " + line for line in folded(f"{board.text(row.lhs)} = {board.text(row.rhs)}", width - 2)]
         out += ["", *self._conserved(width)]
         return "\n".join(out)
 
@@ -160,6 +171,8 @@ class SystemSummary:
         out = [f"% {one_line(s.name)}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
         if not self.long:
             out.append(_aligned([f"{left} &= {right}" for left, right in self._equations(self._short, latex=True)]))
+        if self._kinematics:
+            out.append(_aligned([f"{board.latex(row.lhs)} &= {board.latex(row.rhs)}" for row in self._kinematics]))
         if self._kept:
             out.append(_aligned([f"{board.latex(sp.Symbol(n))} &= {board.latex(x)}" for n, x, _ in self._kept]))
         return "\n".join(out)
