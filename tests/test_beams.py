@@ -7,6 +7,7 @@ import pytest
 import sympy as sp
 from numpy.polynomial import Legendre, Polynomial
 from scipy.spatial.transform import Rotation
+from scipy.special import jn_zeros
 
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
@@ -325,6 +326,40 @@ def test_segments_come_to_the_beam_as_the_square_of_their_length(engine, stiffne
     assert np.log2(np.abs(errors[0]).max() / np.abs(errors[1]).max()) > 1.8
 
 
+def squares(model: mb.Model, engine: str, rate: float = 0.0) -> np.ndarray:
+    """Return the squares of a string's frequencies, rising; on a heavy hub that turns at this rate."""
+    dyn = mb.dynamics(model, engine, **({"compile": False} if engine == "lagrangian" else {}))
+    still, v, own = np.zeros(model.nv), np.zeros(model.nv), slice(int(rate != 0), None)
+    v[: own.start] = rate
+    M, K = dyn.mass_matrix(still), dyn.inverse_dynamics_derivatives(still, v, still)[0]
+    return np.sort(np.linalg.eigvals(np.linalg.solve(M[own, own], K[own, own])).real)
+
+
+def hanging(modes: int) -> mb.Model:
+    b = mb.ModelBuilder("hanging", gravity=(9.81, 0, 0))
+    b.add_beam("chain", parent="world", length=L, stiffness=0.0, density=RHO, modes=modes)
+    return b.build()
+
+
+def test_a_hanging_string_has_the_frequencies_of_bessels_function():
+    """ω = j₀ₖ √(g/L)/2 with the zeros of J₀ (Daniel Bernoulli)."""
+    exact = (jn_zeros(0, 2) / 2) ** 2 * 9.81 / L
+    found = squares(hanging(6), "lagrangian")[:2] / exact - 1
+    assert (np.abs(found) < [1e-13, 1e-8]).all()
+    errors = [squares(hanging(2).segmented(n), "pinocchio")[0] / exact[0] - 1 for n in (10, 20)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.05)
+
+
+@pytest.mark.parametrize(("across", "exact"), [(0.0, [0, 5, 14]), (np.pi / 2, [1, 6, 15])])
+def test_a_string_that_turns_has_the_frequencies_of_legendres_polynomials(across, exact):
+    """Across the plane ω² = k (2k - 1) Ω², in it Ω² less: of a string on a heavy hub's axis, at any length and mass."""
+    b = mb.ModelBuilder("rotor", gravity=(0, 0, 0))
+    b.add_body("hub", mass=1.0, inertia=(1e12, 1e12, 1e12))
+    b.add_joint("theta", "revolute", parent="world", child="hub", axis=(0, 0, 1))
+    b.add_beam("string", parent="hub", length=L, stiffness=0.0, density=RHO, modes=5, rpy=(across, 0, 0))
+    assert squares(b.build(), "lagrangian", 3.0)[:3] / 9 == pytest.approx(exact, abs=1e-9)
+
+
 def test_engines_agree_on_segments(flexible):
     assert_engines_agree(hub((0, -9.81, 0), damping=0.01).build().segmented(4))
     chain = flexible.segmented(4)
@@ -390,6 +425,7 @@ def test_file_formats_name_the_beam_alone(form):
         ({"modes": None, "shapes": []}, "shapes: expected 1 to 10"),
         ({"modes": None, "shapes": [lambda x: x]}, r"shapes\[0\]: expected a numpy.polynomial"),
         ({"modes": None, "shapes": [Polynomial([0, 1.0])]}, r"shapes\[0\]: expected zero with its slope"),
+        ({"stiffness": 0, "modes": None, "shapes": [Polynomial([1.0])]}, r"shapes\[0\]: expected zero at the root"),
         ({"modes": None, "shapes": [Polynomial([0.0])]}, r"shapes\[0\]: expected zero with its slope"),
         ({"modes": None, "shapes": [Polynomial([0, 0, np.inf])]}, r"shapes\[0\]: .*finite"),
         ({"modes": None, "shapes": [POWER, 2 * POWER]}, "shapes: one of them is a sum of the others"),

@@ -360,7 +360,8 @@ class Model(Description):
     def segmented(self, segments: int) -> Model:
         """Return the model with each beam of `ModelBuilder.add_beam` as a chain of rigid segments, for every engine.
 
-        Springs EI/h sit in hinges between segments of the length h, the first of them half a segment from the clamp:
+        Springs EI/h sit in hinges between segments of the length h, the first of them half a segment from the clamp, or
+        at the root of a string:
         frequencies and motions come to those of the beam as h². Deflections may be large. Bodies ``name.s0``,
         ``name.s1``, ... are the segments, and the body at the beam's end stays.
 

@@ -54,7 +54,9 @@ def _numbers(model: Model, joint: Joint, points: list[Joint]) -> tuple[list[Any]
     D = np.atleast_1d(entries(joint, "joints", "damping", model.bindings))
     masses = [entries(model.body(p.child), "bodies", "mass", model.bindings) for p in points]
     each = len(K) // len(beam.across)
-    EI = [K[k] / beam.squares[k] for k in range(0, len(K), each)]
+    # Straight shapes of a string bend nowhere.
+    bent = int(np.argmax(beam.squares[:each]))
+    EI = [K[k + bent] / beam.squares[k + bent] if beam.squares[bent] else 0.0 for k in range(0, len(K), each)]
     tau, rho = D[0] / K[0] if nominal(D[0]) else 0.0, masses[0] / beam.weights[0]
     for what, own, whole in (
         ("stiffness", K, [EI[k // each] * c for k, c in enumerate(beam.squares)]),
@@ -86,7 +88,7 @@ def _require_free(model: Model, joint: Joint, points: list[Joint]) -> None:
 
 
 def _add_chain(b: ModelBuilder, joint: Joint, n: int, EI: list[Any], tau: Any, rho: Any) -> None:
-    """Add segments between the clamp and the end; the first half of one belongs to the clamp."""
+    """Add segments between the clamp and the end; the first half of one belongs to the clamp, none of a string."""
     length, name = joint.type.length, joint.name  # type: ignore[attr-defined]  # of a beam
     h = length / n
     springs = [x / h for x in EI]
@@ -97,15 +99,16 @@ def _add_chain(b: ModelBuilder, joint: Joint, n: int, EI: list[Any], tau: Any, r
         J = rho * (long**3 / 12)
         b.add_body(body, mass=rho * long, com=(long / 2, 0.0, 0.0), inertia=[_ABOUT_AXIS * J, J, J])
 
-    half = f"{name}.s0"
-    segment(half, h / 2)
-    b.add_joint(half, FIXED.name, parent=joint.parent, child=half)
-    before, at = half, h / 2
+    before, at, last = joint.parent, 0.0, h
+    if any(nominal(x) for x in EI):
+        before, at, last = f"{name}.s0", h / 2, h / 2
+        segment(before, at)
+        b.add_joint(before, FIXED.name, parent=joint.parent, child=before)
     for k in range(1, n + 1):
-        own, long = f"{name}.s{k}", h if k < n else h / 2
+        own, long = f"{name}.s{k}", h if k < n else last
         segment(own, long)
         loss = [tau * x for x in springs] if tau else 0.0
         place = (at, 0.0, 0.0)
         b.add_joint(own, kind, parent=before, child=own, translation=place, **axes, stiffness=springs, damping=loss)
         before, at = own, h
-    b.add_joint(name, FIXED.name, parent=before, child=joint.child, translation=(h / 2, 0.0, 0.0))
+    b.add_joint(name, FIXED.name, parent=before, child=joint.child, translation=(last, 0.0, 0.0))

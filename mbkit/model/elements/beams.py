@@ -3,7 +3,8 @@
 An Euler-Bernoulli beam is clamped at its root and does not stretch. Its axis is at (s + u, v, w) in the root's frame,
 with v = Σ φ_i(s) a_i, w = Σ φ_i(s) b_i, and the shortening u = -½ ∫₀ˢ (v′² + w′²) ds, of second order in deflections,
 which stiffens a beam that turns (Kane, Ryan, Banerjee 1987). So each point is a polynomial of the amplitudes, and these
-are the coordinates of a joint. The mass lies at the points of Gauss's quadrature, which is exact to rounding.
+are the coordinates of a joint. The mass lies at the points of Gauss's quadrature, which is exact to rounding. A string
+is a beam without stiffness, whose slope at the root is free.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.polynomial import Polynomial
+from numpy.polynomial import Legendre, Polynomial
 
 from mbkit._check import Array, count, shown
 from mbkit.errors import InputError
@@ -28,6 +29,8 @@ _EPS: Final = float(np.finfo(float).eps)
 #: What the fine rule's rounding leaves between two rules that are both exact; one point more gains a factor of 20.
 _ROUNDING: Final = 500 * _EPS
 _IDENTITY: Final[Rows] = np.eye(3).tolist()
+#: The straight line from the root.
+_ROOTED: Final = Polynomial((0.0, 1.0))
 #: Of what a shape may move its clamp by, of its largest coefficient.
 _CLAMPED: Final = 1e-12
 
@@ -74,15 +77,22 @@ def clamped_free(n: int) -> Modes:
     return Modes(shapes, np.asarray(roots**4, dtype=np.float64))
 
 
-def modes_of(modes: Any, shapes: Any) -> Modes:
-    """Return the first exact modes, or those within the span of given shapes; `InputError` for other arguments."""
+def modes_of(modes: Any, shapes: Any, *, string: bool) -> Modes:
+    """Return the first exact modes, or those within the span of given shapes; `InputError` for other arguments.
+
+    Those of a string span the polynomials that vanish at its root, with which one that hangs or turns comes close.
+    """
     if (modes is None) == (shapes is None):
         raise InputError("expected modes or shapes, one of them")
     if shapes is None:
         n = count("modes", modes, least=1)
         if n > _MOST_MODES:
             raise InputError(f"modes: expected at most {_MOST_MODES}, got {n}")
-        return clamped_free(n)
+        return (
+            modes_within([_ROOTED * Legendre.basis(k, (0, 1)).convert(kind=Polynomial) for k in range(n)])
+            if string
+            else clamped_free(n)
+        )
     given = list(shapes) if isinstance(shapes, (list, tuple)) else [shapes]
     if not 0 < len(given) <= _MOST_MODES:
         raise InputError(f"shapes: expected 1 to {_MOST_MODES} shapes, got {len(given)}")
@@ -90,8 +100,10 @@ def modes_of(modes: Any, shapes: Any) -> Modes:
         if not isinstance(f, Polynomial) or not np.isfinite(f.coef).all() or f.degree() > _MOST_DEGREE:
             expected = f"numpy.polynomial.Polynomial of s/length with finite coefficients, degree <= {_MOST_DEGREE}"
             raise InputError(f"shapes[{i}]: expected a {expected}, got {shown(f)}")
-        if max(abs(f(0.0)), abs(f.deriv()(0.0))) > _CLAMPED * np.abs(f.coef).max() or not f.coef.any():
-            raise InputError(f"shapes[{i}]: expected zero with its slope at the clamp and not everywhere, got {f}")
+        held = abs(f(0.0)) if string else max(abs(f(0.0)), abs(f.deriv()(0.0)))
+        if held > _CLAMPED * np.abs(f.coef).max() or not f.coef.any():
+            where = "at the root" if string else "with its slope at the clamp"
+            raise InputError(f"shapes[{i}]: expected zero {where} and not everywhere, got {f}")
     return modes_within(given)
 
 

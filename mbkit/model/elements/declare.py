@@ -414,13 +414,14 @@ class ElementBuilder:
         rotation: ArrayLike | None = None,
         rpy: ArrayLike | None = None,
     ) -> None:
-        """Add an Euler-Bernoulli beam, clamped to a body, by assumed modes: small deflections on any motion.
+        """Add a beam clamped to a body, or a string, by assumed modes: small deflections on any motion.
 
-        Its axis is x of the root's frame; it deflects along y, and in space along z too. The coordinates are amplitudes
-        a of normal modes φ with ∫ φ_i φ_j ds = length δ_ij, as `mbkit.lagrangian.clamped_free` writes them: the end of
-        an exact mode deflects by ±2 a. It does not stretch: as it bends, its points move towards the root by
-        ½ ∫ (v′² + w′²) ds, without which a beam that turns would soften (Kane, Ryan, Banerjee 1987). Rotary inertia,
-        shear and torsion are left out, and terms beyond the second order in the deflections.
+        It is Euler and Bernoulli's. Its axis is x of the root's frame; it deflects along y, and in space along z too.
+        The coordinates are amplitudes a of normal modes φ with ∫ φ_i φ_j ds = length δ_ij, as
+        `mbkit.lagrangian.clamped_free` writes them: the end of an exact mode deflects by ±2 a. It does not stretch: as
+        it bends, its points move towards the root by ½ ∫ (v′² + w′²) ds, without which a beam that turns would soften
+        (Kane, Ryan, Banerjee 1987). Rotary inertia, shear and torsion are left out, and terms beyond the second order
+        in the deflections.
 
         A body of the beam's name is the frame at its end, which turns with the axis; bodies and joints may hang on it.
         ``name.root`` is the clamp, and ``name.1``, ``name.2``, ... are the points of Gauss's quadrature with the mass.
@@ -432,14 +433,15 @@ class ElementBuilder:
         length : float
             m.
         stiffness : float or (EI_v, EI_w)
-            EI against bending along y alone, or along y and along z, N m².
+            EI against bending along y alone, or along y and along z, N m². A string has zero: its slope is free at the
+            root, and what pulls it straight is gravity or the motion.
         density : float
             Mass a metre, kg/m.
         modes : int, optional
-            How many exact modes of a clamped and free beam, in each plane.
+            How many exact modes of a clamped and free beam in each plane; of a string, how many powers of s from 1 on.
         shapes : sequence of numpy.polynomial.Polynomial, optional
-            Instead: shapes of s/length, which are zero with their slopes at 0. The modes are those of the uniform beam
-            within their span, by Ritz's method.
+            Instead: shapes of s/length, which are zero with their slopes at 0; of a string the slopes are free. The
+            modes are those of the uniform beam within their span, by Ritz's method.
         damping : float
             Of the material (Kelvin and Voigt), s: on rates it is this times the stiffness on deflections.
         translation, rotation, rpy : array_like, optional
@@ -474,7 +476,8 @@ class ElementBuilder:
             value = nominal(x)
             if len(read.faults) == known and (value < 0 or (above and value == 0)):
                 read.faults.append(f"{item}: {what}: expected a number {'above' if above else 'from'} 0, got {value:g}")
-        good, found = self._asked(item, (modes, shapes), lambda: modes_of(modes, shapes))
+        string = all(map(_is_zero, EI))
+        good, found = self._asked(item, (modes, shapes), lambda: modes_of(modes, shapes, string=string))
         root = f"{name}.root"
         self.add_body(root)
         self.add_joint(
