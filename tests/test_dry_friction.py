@@ -390,7 +390,8 @@ def test_a_block_on_a_belt_sticks_and_slips_with_the_period_of_the_closed_form(m
 def test_what_lets_go_in_moreau_s_step_has_the_friction_of_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     from mbkit.simulate.solvers.friction import moreau
 
-    dyn, pull = mb.dynamics(slider(friction=3.0, stiction=5.0), "lagrangian"), np.linspace(0, 20, 101)[:-1, None]
+    dyn = mb.dynamics(slider(friction=3.0, stiction=5.0), "lagrangian", compile=True)
+    pull = np.linspace(0, 20, 101)[:-1, None]
     fast = mb.simulate(dyn, [0.0], [0.0], 1.0, "moreau", dt=1e-2, torque=pull)
     monkeypatch.setattr(moreau, "_Compiled", moreau._InPython)
     slow = mb.simulate(dyn, [0.0], [0.0], 1.0, "moreau", dt=1e-2, torque=pull)
@@ -402,17 +403,18 @@ def test_what_lets_go_in_moreau_s_step_has_the_friction_of_motion(monkeypatch: p
 def test_moreau_s_step_in_machine_code_is_that_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
     from mbkit.simulate.solvers.friction import moreau
 
-    model = rubbed(2, 4, ("revolute", "universal", "prismatic", "spherical_zyx"), mimic=True)
+    model = rubbed(3, 4, ("revolute", "universal", "prismatic", "spherical_zyx"), mimic=True)
     q, v, tau = mostly_at_rest(model, 2)
-    dyn = mb.dynamics(model, "lagrangian")
+    dyn = mb.dynamics(model, "lagrangian", compile=True)
+    assert dyn.compiles_steps
     pulls = np.repeat(tau[:, None], 100, axis=1)
-    fast = mb.simulate(dyn, q, v, 0.5, "moreau", dt=5e-3, torque=pulls)
+    fast = mb.simulate(dyn, q, v, 0.1, "moreau", dt=1e-3, torque=pulls)
     monkeypatch.setattr(moreau, "_Compiled", moreau._InPython)
-    slow = mb.simulate(dyn, q, v, 0.5, "moreau", dt=5e-3, torque=pulls)
+    slow = mb.simulate(dyn, q, v, 0.1, "moreau", dt=1e-3, torque=pulls)
     assert off(fast.q, slow.q) < 1e-11
     assert ((fast.v == 0) == (slow.v == 0)).all()
     assert (fast.v[:, 1:] == 0).any()
-    own = mb.simulate(mb.dynamics(model, "mujoco"), q[0], v[0], 0.5, "moreau", dt=5e-3, torque=tau[0])
+    own = mb.simulate(mb.dynamics(model, "mujoco"), q[0], v[0], 0.1, "moreau", dt=1e-3, torque=tau[0])
     assert off(own.q, fast.q[0]) < 1e-9
 
 
