@@ -11,7 +11,7 @@ from validation.importers import trained
 
 def main() -> None:
     """Measure, and write after each robot."""
-    trained(["newton", "mujoco-warp"])
+    trained(["newton", "mujoco-warp", "mjx"])
 
 
 if __name__ == "__main__":
