@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -37,11 +38,45 @@ PROCESSORS = {
 }
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests of a processor's arithmetic."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--thorough", action="store_true", help="run the cases marked thorough too")
+
+
+def is_thorough(item: pytest.Item, place: int) -> bool:
+    """Return whether an item, the ``place``-th case of its function, is left to thorough runs.
+
+    ``@pytest.mark.thorough`` leaves a whole function to them, ``thorough("a", "b")`` the cases with these ids, and
+    ``thorough(every=4)`` all but one of four.
+    """
+    mark = item.get_closest_marker("thorough")
+    if mark is None:
+        return False
+    if every := mark.kwargs.get("every"):
+        # The first of the first four, the second of the next: of a product of parameters no value is left out for good.
+        return place % every != place // every % every
+    return not mark.args or item.name.partition("[")[2][:-1] in mark.args
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the tests of a processor's arithmetic; leave out the thorough ones, unless all or this one are asked for."""
+    places: Counter[str] = Counter()
+    named: set[tuple[str, str]] = set()
+    chosen: dict[bool, list[pytest.Item]] = {True: [], False: []}
     for item in items:
         if item.path.stem in PROCESSORS:
             item.add_marker(pytest.mark.processors)
+        function = item.nodeid.partition("[")[0]
+        chosen[is_thorough(item, places[function])].append(item)
+        places[function] += 1
+        named |= {(function, x) for mark in item.iter_markers("thorough") for x in mark.args}
+    if any("::" in x for x in config.args):
+        return
+    if lost := named - {(x.nodeid.partition("[")[0], x.name.partition("[")[2][:-1]) for x in chosen[True]}:
+        raise pytest.UsageError(f"thorough names cases that do not exist: {sorted(lost)}")
+    if not config.getoption("--thorough"):
+        config.hook.pytest_deselected(items=chosen[True])
+        items[:] = chosen[False]
 
 
 def pytest_collection_finish() -> None:

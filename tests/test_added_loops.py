@@ -152,6 +152,7 @@ def test_faults_of_a_file_of_loops_are_named(file: Path, table: Path, content: s
         load(file, table)
 
 
+@pytest.mark.thorough
 def test_the_command_line_adds_loops(file: Path, table: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ["check", str(file), "--loops", str(table), "--no-rollouts", "--samples", "2", "--json"]

@@ -177,6 +177,7 @@ def test_no_tolerance_is_tighter_than_rounding_allows_and_none_looser_than_that(
     assert swing.q[-1, 0] == pytest.approx(np.cos(1e3), abs=1.5e-12)
 
 
+@pytest.mark.thorough("damped_point_spring-10000.0-pinocchio-1e-08-methods2-400")
 @pytest.mark.parametrize(
     ("case", "value", "engine", "rtol", "methods", "steps"),
     [
@@ -288,6 +289,7 @@ def test_each_of_a_batch_is_decided_on_by_itself() -> None:
         simulate(COMPILED, np.zeros((2, 2)), [0.0, 0.0], 1.0, "auto")
 
 
+@pytest.mark.thorough
 def test_every_joint_kind_moves_as_with_rk853() -> None:
     model = random_tree(5, 8, SOUND)
     q, v = model.random_state(np.random.default_rng(1))
@@ -338,6 +340,7 @@ def test_accelerations_of_few_digits_are_passed_and_told() -> None:
     assert told >= 6
 
 
+@pytest.mark.thorough
 def test_where_rounding_allows_no_more_the_tolerance_is_loosened_and_the_run_passes() -> None:
     """Without loosening the run ends at t = 0.45 s after 486,000 evaluations, with steps too small.
 

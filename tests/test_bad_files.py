@@ -213,6 +213,7 @@ URDFS = {
 }
 
 
+@pytest.mark.thorough("thousands_of_joints")
 @pytest.mark.parametrize("case", URDFS)
 def test_urdfs_with_a_fault(case, tmp_path, capfd):
     text, expected = URDFS[case]

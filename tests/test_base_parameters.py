@@ -75,6 +75,7 @@ def test_base_parameters_give_the_energies(seed):
     assert np.abs(lost).max() <= 1e-11 * max(np.abs(potential).max(), 1.0)
 
 
+@pytest.mark.thorough("2", "3")
 @pytest.mark.parametrize("seed", range(4))
 def test_what_the_matrix_does_not_show_moves_nothing(seed):
     model = tree_of(seed, 6) if seed else behind_a_floating_base("cylindrical")
@@ -86,6 +87,7 @@ def test_what_the_matrix_does_not_show_moves_nothing(seed):
     np.testing.assert_allclose(other.base_parameters().values, base.values, rtol=0, atol=1e-12)
 
 
+@pytest.mark.thorough("1")
 @pytest.mark.parametrize("seed", range(2))
 def test_torques_tell_all_base_parameters_apart(seed):
     """The torques' regressor, by differences of the engine's torques, has full rank: none can be dropped."""
@@ -130,6 +132,7 @@ def chain(axes: str, *, gravity: tuple[float, float, float] = (0, 0, -9.81), see
     return b.build()
 
 
+@pytest.mark.thorough("6", "7")
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 6, 7])
 def test_revolute_chains_have_seven_a_joint_less_four(n):
     """Mayeda, Yoshida and Osuka 1990: 7N - 4β, two less with the first axis upright; β axes parallel to the first."""

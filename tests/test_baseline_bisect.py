@@ -87,6 +87,7 @@ def heavier(mass: float, friction: float = 0.1) -> str:
     return ARM.replace(GRIPPER, f'mass value="{mass}"').replace('damping="0.1"', f'damping="{friction}"')
 
 
+@pytest.mark.thorough("1-True", "4-False", "5-True")
 @pytest.mark.parametrize(("bad", "committed"), [(1, True), (4, False), (5, True), (7, True)])
 def test_the_commit_that_changed_a_mass_is_found(repository, committed, bad):
     repository.commit("A comment", ARM + "<!-- before -->")
@@ -308,6 +309,7 @@ def numbers(tmp_path, monkeypatch):
     return recorded
 
 
+@pytest.mark.thorough("1-True", "4-False")
 @pytest.mark.parametrize(("bad", "newer"), [(1, True), (4, False), (9, True)])
 def test_the_first_version_that_fails_is_found_in_either_direction(numbers, bad, newer):
     known = [made(f"1.{k}", wrong(1.001) if (k >= bad) == newer else "") for k in range(10)]
@@ -327,6 +329,7 @@ def test_the_first_version_that_fails_is_found_in_either_direction(numbers, bad,
     assert len(result.examined) <= 6
 
 
+@pytest.mark.thorough
 def test_a_number_that_is_right_since_went_towards_the_truth(numbers):
     known = [made("1.0", wrong(1.01)), made("1.1", wrong(1.01)), made("1.2")]
     path = numbers("1.0", "1.2", known, factor=1.0, then=1.01)
@@ -334,6 +337,7 @@ def test_a_number_that_is_right_since_went_towards_the_truth(numbers):
     assert (onset.first_bad, onset.direction) == ("1.2", TOWARDS)
 
 
+@pytest.mark.thorough
 def test_versions_that_do_not_install_or_refuse_are_between(numbers, tmp_path, monkeypatch, capsys):
     script(tmp_path / "bin" / "uv", 'echo "ERROR: no wheel for this system" >&2; exit 1')
     monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
@@ -349,6 +353,7 @@ def test_versions_that_do_not_install_or_refuse_are_between(numbers, tmp_path, m
     assert "1 environments are made, some 11 s and 120 MB of disk" in said
 
 
+@pytest.mark.thorough
 def test_what_is_not_the_engines_version_is_not_blamed_on_it(numbers):
     path = numbers("1.0", "1.1", [made("1.0"), made("1.1")])
     model = mb.catalog.double_pendulum()
@@ -361,6 +366,7 @@ def test_what_is_not_the_engines_version_is_not_blamed_on_it(numbers):
     assert "its version did not do it" in mb.baseline.bisect(model, path).notes[0]
 
 
+@pytest.mark.thorough
 def test_without_pip_the_versions_with_an_environment_are_examined(numbers, monkeypatch):
     for k in range(4):
         made(f"1.{k}", wrong(1.001) if k >= 2 else "")

@@ -63,6 +63,7 @@ def same(a: sp.Expr, b: sp.Expr, symbols: list[sp.Symbol], seed: int = 5) -> boo
     return bool(np.abs(pairs[:, 0] - pairs[:, 1]).max() < 1e-12 * np.abs(pairs).max())
 
 
+@pytest.mark.thorough("0.0-3", "0.4-3")
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("tip", [0.0, 0.4])
 def test_energies_are_those_of_the_paper_to_second_order(count, tip):
@@ -142,6 +143,7 @@ def test_exact_modes_are_those_of_the_paper():
     assert np.abs(np.abs(dyn.model.joint("a").type.across) - 2).max() < 1e-13
 
 
+@pytest.mark.thorough
 def test_the_mass_matrix_stays_positive_where_the_paper_loses_it():
     """Terms beyond second order in the kinetic energy of points keep it a sum of squares."""
     th = sp.Symbol("theta")
@@ -162,6 +164,7 @@ def test_the_mass_matrix_stays_positive_where_the_paper_loses_it():
     assert paper[0] < 0 < element[0]
 
 
+@pytest.mark.thorough
 def test_spin_up_stiffens():
     """Kane, Ryan and Banerjee's test: the element comes to their equations where deflections are small."""
     errors = []
@@ -213,6 +216,7 @@ def flexible() -> mb.Model:
     return satellite()
 
 
+@pytest.mark.thorough("None", "links")
 @pytest.mark.parametrize("elimination", [None, "links", "mass matrix", "least constraint"])
 def test_the_engine_is_right_to_rounding(flexible, elimination):
     own, oracle = mb.dynamics(flexible, "lagrangian", elimination=elimination), mb.dynamics(flexible, "oracle")
@@ -231,6 +235,7 @@ def test_the_engine_is_right_to_rounding(flexible, elimination):
         assert np.abs(own.forward_dynamics(q[k], v[k], a[k]) - one[k]).max() < 1e-12 * np.abs(other).max()
 
 
+@pytest.mark.thorough
 def test_momentum_and_energy_are_kept(flexible):
     model = flexible.without("gravity", "damping")
     dyn = mb.dynamics(model, "lagrangian")
@@ -241,6 +246,7 @@ def test_momentum_and_energy_are_kept(flexible):
     assert np.ptp(momentum, axis=0).max() < 1e-9 * np.abs(momentum).max()
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("method", [m.name for m in METHODS.values() if {*m.engines} <= {"lagrangian"}])
 def test_every_method_runs_a_beam(method):
     model = hub((0, -9.81, 0), damping=1e-3).build()
@@ -268,6 +274,7 @@ def test_the_material_damps():
     assert not model.needs.damping
 
 
+@pytest.mark.thorough
 def test_a_loop_between_beams():
     """A rod joins the ends of two beams: multipliers are those of the oracle, and the loop stays closed."""
     b = mb.ModelBuilder("tongs", gravity=(0, -9.81, 0))
@@ -302,6 +309,7 @@ def test_stiffness_and_density_may_be_parameters():
 # Rigid segments
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco", "drake"])
 @pytest.mark.parametrize("stiffness", [EI, (EI, EI2)])
 def test_segments_come_to_the_beam_as_the_square_of_their_length(engine, stiffness):
@@ -350,6 +358,7 @@ def test_a_hanging_string_has_the_frequencies_of_bessels_function():
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.05)
 
 
+@pytest.mark.thorough("0.0-exact0")
 @pytest.mark.parametrize(("across", "exact"), [(0.0, [0, 5, 14]), (np.pi / 2, [1, 6, 15])])
 def test_a_string_that_turns_has_the_frequencies_of_legendres_polynomials(across, exact):
     """Across the plane ω² = k (2k - 1) Ω², in it Ω² less: of a string on a heavy hub's axis, at any length and mass."""
@@ -373,6 +382,7 @@ def test_engines_agree_on_segments(flexible):
     assert rigid.segmented(3) is rigid
 
 
+@pytest.mark.thorough
 def test_segments_bend_where_the_beam_bends():
     """A weight at the end: both sag alike, and by F L³/3 EI where it is small."""
     b = mb.ModelBuilder("wall", gravity=(0, 0, -9.81))

@@ -87,6 +87,7 @@ def test_json_and_csv_hold_the_same_points(pendulum):
     assert {r["front"] for r in rows} == {"0", "1"}
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("here")
 def test_json_is_all_there_is_on_stdout():
     result = call("bench", "pendulum", *SHORT, "--json", "--out", "out")
@@ -95,6 +96,7 @@ def test_json_is_all_there_is_on_stdout():
     assert "pendulum-bench.html" in result.stderr
 
 
+@pytest.mark.thorough
 def test_processes_measure_too(here):
     result = call("bench", "pendulum", *SHORT, "--jobs", "1")
     assert result.exit_code == 0, result.output

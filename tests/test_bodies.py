@@ -87,6 +87,10 @@ def right(name: str) -> list[np.ndarray]:
     return [getattr(oracle, method)(*given, **more) for _, method, given, more in calls(tree(name), at(name))]
 
 
+@pytest.mark.thorough(
+    *("pinocchio-all joint types", "pinocchio-without springs", "pinocchio-sound"),
+    *("lagrangian-fixed to the world", "lagrangian-floating", "lagrangian-sound"),
+)
 @pytest.mark.parametrize("name", TREES)
 @pytest.mark.parametrize("engine", [x for x, info in ENGINES.items() if not info.reference])
 def test_engines_have_the_values_of_34_digits(engine, name):
@@ -186,6 +190,7 @@ def test_momentum_changes_by_weight_wrenches_and_the_loads_of_the_ground(name):
     assert off(change, out) < CLOSE
 
 
+@pytest.mark.thorough("all joint types", "floating", "sound")
 @pytest.mark.parametrize("name", TREES)
 def test_the_whole_has_the_mass_weight_and_momentum_of_its_parts(name):
     model, (q, v, _, _) = tree(name), at(name).values()
@@ -213,6 +218,7 @@ def test_wrenches_do_the_work_of_their_generalized_force(name):
         assert off(np.sum(dyn.generalized_force(q, on, axes) * v, axis=1), power) < CLOSE
 
 
+@pytest.mark.thorough("lagrangian")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.filterwarnings("ignore::mbkit.errors.KnownDefectWarning")
 def test_wrenches_and_jacobians_have_one_default(engine):
@@ -247,6 +253,7 @@ def test_a_load_along_the_joint_is_its_force():
             assert off(np.einsum("nij,ni->nj", along, load), expected) < CLOSE, joint.name
 
 
+@pytest.mark.thorough("floating-lagrangian", "floating-mujoco", "floating-drake")
 @pytest.mark.parametrize("engine", [x for x in LOADED if x != "oracle"])
 @pytest.mark.parametrize("name", ["fixed to the world", "floating"])
 @pytest.mark.filterwarnings("ignore::mbkit.errors.KnownDefectWarning")

@@ -182,6 +182,7 @@ def test_many_writers_of_one_entry_leave_a_whole_one(folder):
     assert [p.name for p in folder.iterdir()] == ["a" * 64]
 
 
+@pytest.mark.thorough
 def test_processes_that_start_at_once_agree(folder):
     code = (
         "import json, numpy as np, mbkit as mb\n"

@@ -71,6 +71,7 @@ def test_closed_forms_agree_with_themselves(case: str) -> None:
             assert form.gravity(q)[i] == pytest.approx(slope / (2 * h), abs=1e-8 * scale)
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("name", ENGINES)
 @pytest.mark.parametrize("case", CASES)
 def test_engines_agree_with_closed_forms(case: str, name: str) -> None:
@@ -113,6 +114,7 @@ def test_angles_grow_from_down_towards_x(name: str, q: list[float], tip: tuple[f
     assert dyn.pose(q, "tip")[:3, 3] == pytest.approx(np.array(tip), abs=1e-15)
 
 
+@pytest.mark.thorough("128")
 @pytest.mark.parametrize("n", closed_forms.published()["chain_conditioning"]["cond"])
 def test_chain_is_as_ill_conditioned_as_published(n: str) -> None:
     wanted = closed_forms.published()["chain_conditioning"]["cond"][n]["cond"]
@@ -207,6 +209,7 @@ def test_engines_take_a_system_with_a_loop_or_refuse_it_by_its_name(engine: str)
     assert np.isfinite(dyn.forward_dynamics(q, v, np.zeros(3))).all()
 
 
+@pytest.mark.thorough("pinocchio-bicycle", "lagrangian-bicycle", "oracle-bicycle")
 @pytest.mark.parametrize("name", ["rolling_disc", "chaplygin_sleigh", "bicycle"])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_engines_take_a_system_that_rolls_or_refuse_it_by_its_name(engine: str, name: str) -> None:

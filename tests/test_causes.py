@@ -170,6 +170,7 @@ PLANTS |= {kind: in_one_part(kind) for kind in IN_ONE_PART}
 SILENT = {"limits", "joint order"}
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(
     ("plant", "name"),
     # Each mistake in two robots, each robot with eight mistakes.
@@ -279,6 +280,7 @@ def moved(a: Model, b: Model) -> bool:
     return any(np.abs(x - y).max() > 1e-8 * np.abs(x).max() for x, y in zip(*values, strict=True))
 
 
+@pytest.mark.thorough("1", "2", "3")
 @pytest.mark.parametrize("seed", range(4))
 def test_differences_together_are_named_each_and_silent_only_where_none_alone_changes_a_term(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -302,6 +304,7 @@ def test_differences_together_are_named_each_and_silent_only_where_none_alone_ch
         assert cause.acts == (moved(a, planted[key](a)) or moved(rest, b)), cause
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("one", "two", "read"),
     [("ur5", "ur10", written), ("ur3", "ur5", mb.load), ("a1", "go1", mb.load), ("go1", "go2", written)],
@@ -418,6 +421,7 @@ def arm() -> Model:
     return chain(*links, name="arm").build()
 
 
+@pytest.mark.thorough("armature", "axis sign")
 @pytest.mark.parametrize("plant", ["armature", "damping", "gravity", "axis sign", "centre of mass"])
 def test_an_engine_that_was_told_something_else(plant: str) -> None:
     _, kind, where = PLANTS[plant](arm())
@@ -615,6 +619,7 @@ def test_a_joint_that_the_other_side_has_not_is_not_held_still() -> None:
         assert (cause.kind, says in cause.says) == (kind, True)
 
 
+@pytest.mark.thorough
 def test_two_that_cannot_move_are_not_said_to_move_alike() -> None:
     """A loop whose hinge is turned out of the plane of a four-bar is never closed."""
     (loop,) = mb.catalog.four_bar().loops
@@ -627,6 +632,7 @@ def test_two_that_cannot_move_are_not_said_to_move_alike() -> None:
     assert "moves as" not in found.verdict
 
 
+@pytest.mark.thorough("1.0-xzy", "1.3-xzy", "1.3-yzx")
 @pytest.mark.parametrize("order", ["xzy", "zxy", "yzx"])
 @pytest.mark.parametrize("heavier", [1.0, 1.3])
 def test_slides_that_follow_each_other_in_another_order_are_an_order_and_no_exchange_of_names(order, heavier):

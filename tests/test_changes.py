@@ -56,6 +56,7 @@ def test_a_builder_of_a_model_builds_the_same_model(seed):
     assert again.nonphysical == model.nonphysical
 
 
+@pytest.mark.thorough("talos", "romeo_small")
 @pytest.mark.parametrize("name", ["ur5", "panda", "anymal", "talos", "romeo_small"])
 def test_a_builder_of_a_robot_builds_the_same_robot(name):
     robot = mb.load(name)
@@ -124,6 +125,7 @@ def test_a_parameter_takes_the_place_of_a_number_and_a_number_that_of_a_paramete
     assert model.mass == 5.0
 
 
+@pytest.mark.thorough
 @settings(max_examples=15, deadline=None)
 @given(SEEDS)
 def test_a_payload_adds_its_inertia_by_the_jacobian_of_its_frame(seed):
@@ -168,6 +170,7 @@ def test_a_removed_joint_takes_all_that_it_carries():
     assert all(x in left.notes[-1] for x in ("more0", "more1", "spring 'spring'", "coupling 'tendon'", "force 'motor'"))
 
 
+@pytest.mark.thorough
 @settings(max_examples=10, deadline=None)
 @given(SEEDS)
 def test_a_prefix_changes_names_alone(seed):
@@ -290,6 +293,7 @@ def test_a_locked_model_has_the_rows_and_columns_that_are_left(seed, data):
     assert a.shape == v.shape
 
 
+@pytest.mark.thorough("talos", "g1")
 @pytest.mark.parametrize("name", ["ur5", "anymal", "talos", "g1", "solo8"])
 def test_a_locked_robot_is_that_of_pinocchio(name):
     robot = mb.load(name)
@@ -398,6 +402,7 @@ def test_what_cannot_be_locked_is_refused(ask, words):
 # Join and mount
 
 
+@pytest.mark.thorough
 @settings(max_examples=15, deadline=None)
 @given(SEEDS)
 def test_two_trees_joined_have_the_arm_s_terms_in_their_block(seed):
@@ -492,6 +497,7 @@ def test_what_cannot_be_joined_is_refused(ask, words):
 # Free numbers and variants
 
 
+@pytest.mark.thorough
 @settings(max_examples=10, deadline=None)
 @given(SEEDS)
 def test_free_numbers_have_their_values_until_others_are_given(seed):

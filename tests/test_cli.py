@@ -45,6 +45,7 @@ def module(folder: Path, name: str, text: str) -> None:
     (folder / f"{name}.py").write_text(textwrap.dedent(text))
 
 
+@pytest.mark.thorough
 def test_a_reader_that_stops_early_does_not_change_the_verdict(tmp_path):
     check = f"{sys.executable} -m mbkit check pendulum --no-rollouts --samples 4 --out {tmp_path}"
     piped = f"{check} | head -n 1; exit ${{PIPESTATUS[0]}}"
@@ -80,6 +81,7 @@ def test_a_robot_agrees_and_is_written(here):
     assert "mbkit-report/ur5.html" in result.stdout
 
 
+@pytest.mark.thorough
 def test_everything_from_a_cold_start(tmp_path):
     made = subprocess.run(
         [sys.executable, "-m", "mbkit", "check", "pendulum", "--full", "--out", "out"],
@@ -105,6 +107,7 @@ def test_import_of_the_command_is_light():
     assert subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True).stdout == "set()\n"
 
 
+@pytest.mark.thorough("command0-files0", "command2-files2")
 @pytest.mark.parametrize(
     ("command", "files"),
     [
@@ -121,6 +124,7 @@ def test_files_have_the_robots_own_name_whatever_its_case_was(here, command, fil
     assert {p.name for p in (here / "o").iterdir()} == files
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("here")
 def test_no_name_of_a_robot_is_cut(monkeypatch):
     monkeypatch.setenv("COLUMNS", "40")
@@ -157,6 +161,7 @@ def test_json_is_all_there_is_on_stdout(here):
     assert "pendulum.html" in result.stderr
 
 
+@pytest.mark.thorough
 def test_a_catalog_system_a_file_and_a_model_itself(here):
     assert call("check", "cart_pole", *QUICK).exit_code == 0
     module(here, "ready", "import mbkit\nmodel = mbkit.catalog.pendulum()")
@@ -350,6 +355,7 @@ def test_a_result_that_cannot_be_written_is_still_printed(monkeypatch):
     assert json.loads(result.stdout)["passed"]
 
 
+@pytest.mark.thorough
 def test_robots_lists_all_and_says_why_some_do_not_load():
     listed = json.loads(call("robots", "--json").stdout)
     assert len(listed) == 69
@@ -408,6 +414,7 @@ def test_interrupting_all_shows_and_writes_what_is_finished(here, monkeypatch):
 # Many robots.
 
 
+@pytest.mark.thorough
 def test_robots_end_in_agreement_or_a_named_reason_in_any_executor(monkeypatch):
     # The terms of bodies are compared by tests/test_all_robots.py.
     monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "BODY_TERMS", ())
@@ -450,6 +457,7 @@ def test_an_executor_that_takes_no_more_leaves_a_reason():
     assert isinstance(found["a"], WorkerDiedError)
 
 
+@pytest.mark.thorough
 def test_leaving_the_loop_ends_the_processes(tmp_path):
     noted = tmp_path / "pid"
     slow = f"import os, time; open({str(noted)!r}, 'w').write(str(os.getpid()) + '.'); time.sleep(600)"
@@ -485,6 +493,7 @@ COMMANDS = {
 }
 
 
+@pytest.mark.thorough("bench pendulum --engines lagrangian --methods rk4 --duration 0.01 --repeats 1 --seconds 1")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_file_of_somebody_else_is_not_replaced(here, command):
     for k, name in enumerate(COMMANDS[command]):

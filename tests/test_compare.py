@@ -65,6 +65,7 @@ def terms(model, **kwargs):
     return mb.compare(model, samples=16, terms_only=True, **kwargs)
 
 
+@pytest.mark.thorough("human", "tiago_no_hand")
 @pytest.mark.parametrize("robot", ["double_pendulum", "human", "tiago_no_hand", "solo12"])
 def test_robots_agree(robot):
     result = terms(mb.load(robot, floating_base=robot == "solo12"))
@@ -81,6 +82,7 @@ def test_robots_agree(robot):
         assert row.samples > 16
 
 
+@pytest.mark.thorough("1")
 @pytest.mark.parametrize("seed", range(2))
 def test_random_trees_agree_with_everything_that_acts(seed):
     model = random_tree(seed, len(SOUND_IN_BOTH), SOUND_IN_BOTH)
@@ -91,6 +93,7 @@ def test_random_trees_agree_with_everything_that_acts(seed):
     assert result.facts["needs"]["damping"]
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("brief")
 def test_armature_damping_and_both_kinds_of_spring_agree():
     rod = {"mass": 1.0, "com": (0, 0, -0.5), "inertia": (0.1, 0.1, 0.02)}
@@ -106,6 +109,7 @@ def test_armature_damping_and_both_kinds_of_spring_agree():
         assert all(r.relative <= 1e-12 for r in result.rows)
 
 
+@pytest.mark.thorough("MujocoDynamics-_nle-nle", "LagrangianDynamics-_forward_dynamics-forward dynamics")
 @pytest.mark.usefixtures("of_motion")
 @pytest.mark.parametrize(
     ("engine", "method", "term"),
@@ -206,6 +210,7 @@ def test_where_the_oracle_has_no_value_an_engine_stands_in(monkeypatch):
     assert {r.engine for r in rows} == {"pinocchio", "lagrangian", "mujoco"}
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("brief")
 def test_a_failing_study_loses_no_terms():
     """A spring with a rest length whose ends meet has no direction there, and every engine says so."""
@@ -218,6 +223,7 @@ def test_a_failing_study_loses_no_terms():
     assert "not compared: passive" in result.verdict
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("brief")
 def test_a_stiff_scene_ends_and_is_not_judged_by_what_it_cannot_show():
     rod = HINGE | {"mass": 1.0, "com": (0, 0, -0.5), "inertia": (0.1, 0.1, 0.1), "stiffness": 1e13}
@@ -239,6 +245,7 @@ def planted(monkeypatch, engine, method, change):
     monkeypatch.setattr(engine, method, lambda self, *a: change(original(self, *a)))
 
 
+@pytest.mark.thorough("_gravity-1e-11", "_nle-1.0", "_inverse_dynamics-1e-11", "_passive-1e-11")
 @pytest.mark.usefixtures("of_motion")
 @pytest.mark.parametrize(
     ("method", "size"),
@@ -261,6 +268,7 @@ def test_a_planted_error_in_one_joint_is_found_and_named(monkeypatch, method, si
     assert not result.worst.passed
 
 
+@pytest.mark.thorough("_regressor-regressor-entry0")
 @pytest.mark.parametrize(
     ("method", "term", "entry"),
     [("_regressor", WITHOUT_MUJOCO[0], (2, 35))]
@@ -334,6 +342,7 @@ def test_a_wrong_integrator_is_found(monkeypatch):
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4, 0.02, 0.02])
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])
 @pytest.mark.parametrize(("method", "native"), [("rk4", "mujoco_rk4"), ("semi_implicit_euler", "mujoco_euler")])
 @pytest.mark.parametrize("robot", ["double_pendulum", "panda", "anymal_b"])
@@ -470,6 +479,7 @@ def test_one_engine_alone_agrees_with_the_reference():
     assert f"lagrangian agrees with the {result.reference}" in result.verdict
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("of_motion")
 def test_a_refused_body_is_named_and_the_others_are_compared():
     with pytest.warns(mb.errors.NonPhysicalWarning):
@@ -571,6 +581,7 @@ def test_a_vanishing_term_is_measured_by_the_forces_at_play():
     assert force_errors(e, none, heavy).relative == pytest.approx([1e-15 / 25])
 
 
+@pytest.mark.thorough("pendulum", "cart_pole", "double_pendulum", "chain")
 @pytest.mark.parametrize("system", ["pendulum", "cart_pole", "double_pendulum", "heavy_top", "free_body", "chain"])
 def test_small_systems_agree_at_very_many_states(system):
     """A lone joint meets every cancellation there is: at rest, straight down, at zero energy."""
@@ -640,6 +651,7 @@ def far_from_its_joint(far: float) -> mb.Model:
     return chain(*(link | {"translation": (0, 0, 0.3)} for link in links), name="blade").build()
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("far", [8.0, 40.0])
 def test_what_the_formulas_of_far_masses_must_lose_is_no_disagreement(far):
@@ -662,6 +674,7 @@ def test_what_an_engine_may_lose_is_small_on_a_robot_and_grows_with_the_distance
     assert 50 < far / near < 200
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("brief")
 def test_mujoco_is_named_where_its_own_run_is_off(monkeypatch):
     """The others differ from it and not from each other."""

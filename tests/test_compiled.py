@@ -226,6 +226,7 @@ def test_a_forked_child_computes_the_same(code):
     child.join(60)
 
 
+@pytest.mark.thorough
 def test_memory_stays_flat_over_thousands_of_batches():
     model = mb.catalog.double_pendulum()
     dyn = mb.dynamics(model, "lagrangian", compile=True)
@@ -248,6 +249,7 @@ def times(k: int) -> ca.Function:
     return ca.Function("times", [x], [ca.sin(x) * (k + 0.5)])
 
 
+@pytest.mark.thorough
 def test_compiling_leaves_no_memory_behind(monkeypatch):
     """`validation/memory.py` measures each stage over 2,000 models; here one pass builder a function would show."""
     monkeypatch.setenv("MBKIT_CACHE_DIR", "")
@@ -264,6 +266,7 @@ def test_compiling_leaves_no_memory_behind(monkeypatch):
     assert use(20, 80) - before < 80 * 0.5  # kB; a pass builder alone leaves 1.5 kB for each
 
 
+@pytest.mark.thorough
 def test_machine_code_lives_as_long_as_a_call_of_it(monkeypatch):
     monkeypatch.setenv("MBKIT_CACHE_DIR", "")
     x, out = np.array([[0.3]]), np.empty((12, 1, 1))
@@ -296,6 +299,7 @@ def test_vectors_put_aside_lie_within_cache_lines():
     assert aligned in code
 
 
+@pytest.mark.thorough("rk853", "rodas5", "implicit_midpoint", "taylor")
 @pytest.mark.parametrize("method", ["rk4", "rk853", "rodas5", "implicit_midpoint", "taylor"])
 def test_equations_are_released_after_a_run(method):
     if method == "taylor":
@@ -427,6 +431,7 @@ def _compile_anew() -> None:
     built(_sums())
 
 
+@pytest.mark.thorough("compiling", "compiled", "mujoco", "mujoco's text", "drake's reading")
 @pytest.mark.parametrize(
     "work", ["compiling", "compiled", "interpreted", "mujoco", "drake", "mujoco's text", "drake's reading"]
 )
@@ -522,6 +527,7 @@ def test_more_arrays_than_the_loop_has_room_for_are_refused():
 # A level that many processors share
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="levels are those of x86-64")
 def test_code_for_any_x86_64_has_the_same_numbers() -> None:
     """In a process of its own: a process has one level."""
@@ -542,6 +548,7 @@ print(jit.host().cpu, jit.host().width, np.abs(a - b).max() / np.abs(b).max())
     assert float(apart) < 1e3 * EPS
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="levels are those of x86-64")
 def test_processors_that_fuse_have_the_same_bits() -> None:
     """Whatever the width of their registers: which products are fused is decided before any compiler sees them."""

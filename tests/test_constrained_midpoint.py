@@ -53,6 +53,7 @@ def cases() -> dict:
     }
 
 
+@pytest.mark.thorough("Bricard", "no mass", "tree of many joints", "driven", "ball and free joints")
 @pytest.mark.parametrize("case", cases())
 def test_order_is_two_and_time_can_be_turned_back(case: str) -> None:
     model, q = cases()[case]
@@ -95,6 +96,7 @@ def constrained_step(dyn: mb.Dynamics, q: np.ndarray, v: np.ndarray, h: float) -
     return out_z - out_w @ np.linalg.solve(by_w, by_z), null_space(tangent)
 
 
+@pytest.mark.thorough("four-bar", "Bricard")
 @pytest.mark.parametrize("case", ["four-bar", "slider-crank", "Bricard"])
 def test_a_step_keeps_the_symplectic_form_of_the_constrained_phase_space(case: str) -> None:
     """(D T)ᵀ Ω (D T) = Tᵀ Ω T with D the exact derivative of the step and T a basis of the tangent space."""
@@ -111,6 +113,7 @@ def test_a_step_keeps_the_symplectic_form_of_the_constrained_phase_space(case: s
     assert np.abs(D @ T - T).max() > 1e-3
 
 
+@pytest.mark.thorough("slider_crank")
 @pytest.mark.parametrize("name", ["four_bar", "slider_crank"])
 def test_energy_does_not_drift(name: str) -> None:
     model = mb.catalog.get(name)()

@@ -124,6 +124,7 @@ def test_derivatives_are_those_of_the_constrained_acceleration(rod):
 # Drift
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("method", [n for n, k in METHODS.items() if not k.engines or "lagrangian" in k.engines])
 def test_every_method_stays_on_the_constraints(rod, method):
     if method == "taylor":
@@ -148,6 +149,7 @@ def test_every_method_stays_on_the_constraints(rod, method):
     }.get(method, 1e-6)
 
 
+@pytest.mark.thorough
 def test_thousands_of_steps_of_the_coarsest_method_stay_on_the_constraints(rod):
     q, v = on_circle(1.0, 0.3)
     run = mb.simulate(rod.dynamics(options=OWN), q, v, 4.0, "semi_implicit_euler", dt=1e-3, save=1000)
@@ -331,6 +333,7 @@ def test_embedded_is_the_same_motion_and_the_closed_form(rod):
     assert np.ptp(own.energy()) < 1e-10
 
 
+@pytest.mark.thorough
 def test_embedded_with_fixed_steps(rod):
     q, v = on_circle(0.1, 8.0 / 1.5)
     fine = mb.simulate(rod.dynamics(options=OWN), q, v, 0.5, "rk853", rtol=1e-13, save=[0.5])
@@ -531,6 +534,7 @@ def one_degree_slider_crank() -> Lagrangian:
     return Lagrangian(J * w**2 / 2, 0, [th], [w], forces={th: M0}, parameters=slider_crank_numbers()[1])
 
 
+@pytest.mark.thorough
 def test_slider_crank_with_massive_links_reaches_the_printed_digits():
     told, _ = slider_crank_numbers()
     exact = np.array([float(s) for s in told["exact_t3_theta_thetadot"]])
@@ -671,6 +675,7 @@ def test_four_bar_conserves_energy_on_both_forms():
     assert np.abs(own.q - other.q).max() < 1e-9
 
 
+@pytest.mark.thorough("dynamics-gauss4", "embedded-rk4", "embedded-rk853")
 @pytest.mark.parametrize(
     ("form", "method"),
     [("dynamics", method) for method in ("rk4", "gauss4", "dop853")] + [("embedded", "rk4"), ("embedded", "rk853")],

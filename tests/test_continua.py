@@ -70,6 +70,7 @@ def test_nothing_is_passed_on_at_the_free_end_of_a_turning_string():
     assert np.abs(squares / [1, 6, 15, 28] - 1).max() < 1e-13
 
 
+@pytest.mark.thorough("shear", "rotating")
 @pytest.mark.parametrize("system", [CANTILEVER, TIMOSHENKO, ROTATING], ids=["beam", "shear", "rotating"])
 def test_modes_satisfy_the_equations_and_every_boundary_condition(system):
     values = {rho: 1.3, EI: 2.1, L: 1.7, m: 0.8, J: 0.3, kGA: 40.0, RI: 0.02, Om: 3.0}
@@ -96,6 +97,7 @@ def test_modes_satisfy_the_equations_and_every_boundary_condition(system):
 # Frequencies
 
 
+@pytest.mark.thorough
 def test_frequencies_are_those_of_closed_forms():
     assert max(flexible.strings_and_beams().values()) < 1e-12
 
@@ -171,6 +173,7 @@ def second_order(root, R, shapes):
     return sp.integrate(sp.expand(T.doit()), (s, 0, L)), a
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("space", [False, True], ids=["plane", "space"])
 def test_the_energy_of_a_beam_is_that_of_its_points_to_second_order(space):
     names = "X Y Z theta phi"
@@ -209,6 +212,7 @@ def test_without_stiffening_the_energy_is_that_of_points_that_move_across_only()
     assert sp.expand(found.T.coeff(turn**2)).coeff(sp.Symbol("a1") ** 2) == L * rho / 10
 
 
+@pytest.mark.thorough
 def test_the_spin_up_of_kane_ryan_and_banerjee():
     times = np.linspace(0, beams.RISE, 31)
     lag, a = flexible.paper(3)

@@ -65,6 +65,7 @@ def test_a_hand_built_model_survives_urdf(tmp_path: Path) -> None:
 _PLAIN = {"springs": False, "damping": False, "armature": False}
 
 
+@pytest.mark.thorough
 def test_every_catalog_system_is_written_or_told_why_not() -> None:
     told: dict[str, str] = {}
     for name, system in mb.catalog.systems().items():

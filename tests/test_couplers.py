@@ -66,6 +66,7 @@ def state(model: mb.Model, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 # Random trees
 
 
+@pytest.mark.thorough("0", "1", "2", "3", "4")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_every_engine_moves_a_random_tree_as_elimination_does(seed: int) -> None:
     model = coupled(tree_of(seed), seed)
@@ -89,6 +90,7 @@ def test_every_engine_moves_a_random_tree_as_elimination_does(seed: int) -> None
     against_34_digits(model, q, seed, "LAPACK")
 
 
+@pytest.mark.thorough("1", "3", "4")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_mujoco_follows_its_written_law_and_the_file_says_the_same(seed: int, tmp_path: Path) -> None:
     model = coupled(tree_of(seed), seed)
@@ -112,6 +114,7 @@ def test_mujoco_follows_its_written_law_and_the_file_says_the_same(seed: int, tm
     assert all(stage.same for stage in found.stages if stage.name == "couplers")
 
 
+@pytest.mark.thorough("0", "1", "3", "4")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_locked_joints_leave_the_rest_of_the_sum(seed: int) -> None:
     model = coupled(tree_of(seed), seed, 3)
@@ -134,6 +137,7 @@ def test_locked_joints_leave_the_rest_of_the_sum(seed: int) -> None:
     assert np.linalg.matrix_rank(held) == len(left) + np.linalg.matrix_rank(rows_of(reduced))
 
 
+@pytest.mark.thorough("0", "1", "2", "3", "4")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_other_names_copies_and_parameters_keep_the_motion(seed: int) -> None:
     model = coupled(tree_of(seed), seed)
@@ -201,6 +205,7 @@ def train(planets: int = 0) -> mb.Model:
     return b.build()
 
 
+@pytest.mark.thorough("torque0-0", "torque0-1", "torque0-3", "torque1-3", "torque2-3")
 @pytest.mark.parametrize("planets", [0, 1, 3])
 @pytest.mark.parametrize("torque", [(1.0, 0.5, 0.0), (0.0, -2.0, 0.7), (1.5, 0.0, 0.2)])
 def test_an_epicyclic_train_has_the_accelerations_of_the_closed_form(planets: int, torque: Any) -> None:
@@ -259,6 +264,7 @@ def test_a_differential_shares_the_torque() -> None:
     assert (held.couplers[0].joint, held.couplers[0].leader, held.couplers[0].ratio) == ("left", "right", -1.0)
 
 
+@pytest.mark.thorough("constraints")
 @pytest.mark.parametrize("rows", ["constraints", "velocity_constraints", "model"])
 def test_an_epicyclic_train_on_paper(rows: str) -> None:
     q, v, torque = sp.symbols("sun carrier ring"), sp.symbols("w_s w_c w_r"), np.array([1.0, 0.5, 0.0])

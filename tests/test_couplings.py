@@ -281,6 +281,7 @@ def assert_near(actual: Any, expected: Any, factor: float = 1e4) -> None:
     )
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(
     ("engine", "kinds", "deep", "mimic"),
     [

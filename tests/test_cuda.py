@@ -58,6 +58,7 @@ MODELS = {
 }
 
 
+@pytest.mark.thorough("a floating tree")
 @pytest.mark.parametrize("name", [name for name in MODELS if name != "panda"])
 def test_every_quantity_has_the_bits_of_the_cpu(name: str) -> None:
     model = MODELS[name]()
@@ -140,6 +141,9 @@ TORQUES = {
 }
 
 
+@pytest.mark.thorough(
+    "a floating tree-semi_implicit_euler-feedback", "panda-rk4-feedback", "panda-rk4-each step's of each run"
+)
 @pytest.mark.parametrize(
     ("name", "method", "torque"),
     [
@@ -209,6 +213,7 @@ def test_each_sample_may_have_parameters_of_its_own(monkeypatch: pytest.MonkeyPa
     assert np.array_equal(mb.simulate(gpu, q, v, **run).q, want.q)
 
 
+@pytest.mark.thorough
 def test_a_run_that_diverges_ends_as_on_the_cpu() -> None:
     model = random_tree(5, 4, ("free", "revolute", "ball"))
     q, v, _ = study.states(model, 4).values()
@@ -378,6 +383,7 @@ def test_machine_code_is_kept_on_disk(fake: FakeDriver, monkeypatch: pytest.Monk
         equations_of(model).kept.pop("device", None)
 
 
+@pytest.mark.thorough
 def test_machine_code_is_dropped_with_what_it_is_of(fake: FakeDriver) -> None:  # noqa: F811
     model = random_tree(18, 2, ("revolute",))
     _, dyn = both(model)
@@ -456,6 +462,7 @@ def test_functions_without_a_counterpart_are_named() -> None:
         kernel_code(program(ca.Function("f", [x], [ca.exp(x) + ca.tan(x)])))
 
 
+@pytest.mark.thorough("sm_90")
 @pytest.mark.skipif(study.ptxas_path() is None, reason="ptxas of nvidia-cuda-nvcc is not installed")
 @pytest.mark.parametrize("target", ["sm_80", "sm_90"])
 def test_ptx_is_assembled_for_real_gpus(target: str) -> None:

@@ -127,6 +127,7 @@ def test_own_answers_are_right_where_pinocchios_are_not():
     assert off(own.kinetic_energy(q, v), half) < 1e-14
 
 
+@pytest.mark.thorough
 @in_this_version
 @pytest.mark.parametrize(
     ("model", "terms", "word"),

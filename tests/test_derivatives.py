@@ -99,6 +99,7 @@ def close(x, reference, k=K):
     assert error <= k * EPS * scale, f"{error / scale / EPS:.3g} eps"
 
 
+@pytest.mark.thorough("shallow", "deep", "mimic", "free and balls")
 def test_inverse_dynamics_derivatives_are_differences_along_the_manifold(tree):
     _, dyn, (q, v, a, _) = tree
     differences = Differences(dyn, "inverse_dynamics")
@@ -107,6 +108,7 @@ def test_inverse_dynamics_derivatives_are_differences_along_the_manifold(tree):
         close(x, differences.along(which, q, v, a))
 
 
+@pytest.mark.thorough("deep", "mimic", "free and balls", "no passive forces", "no gravity")
 def test_forward_dynamics_derivatives_are_differences_along_the_manifold(tree):
     _, dyn, (q, v, _, tau) = tree
     differences = Differences(dyn, "forward_dynamics")
@@ -122,6 +124,7 @@ def test_gravity_and_springs_are_the_slope_of_the_potential(tree):
     close(dyn.gravity(q) - dyn.passive(q, 0 * v), slope)
 
 
+@pytest.mark.thorough("deep", "mimic", "free and balls")
 def test_the_tangent_is_that_of_the_models_integrate(tree):
     model, dyn, (q, v, a, _) = tree
     h = 1e-3
@@ -131,6 +134,7 @@ def test_the_tangent_is_that_of_the_models_integrate(tree):
     assert off(numeric.ravel(), dyn.inverse_dynamics_derivatives(q, v, a).q.ravel()) < 1e3 * h**4
 
 
+@pytest.mark.thorough("anymal_b-True")
 @pytest.mark.parametrize(("robot", "floating"), [("ur5", False), ("panda", False), ("anymal_b", True)])
 def test_pinocchio_gives_the_same(robot, floating):
     """Pinocchio's knows neither damping nor mimic joints: both are put around it here."""
@@ -172,6 +176,7 @@ def test_at_rest_only_damping_and_gravity_are_left():
     assert np.abs(free.q).max() == 0.0
 
 
+@pytest.mark.thorough("deep", "mimic", "free and balls")
 def test_a_batch_is_its_states_one_by_one(tree):
     model, dyn, _ = tree
     q, v, a, tau = states(model, 3)

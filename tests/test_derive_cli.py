@@ -176,6 +176,7 @@ def test_latex_has_what_a_document_needs():
     assert r"T &= \tfrac{1}{2} \left(m_{c} + m_{p}\right) \dot{x}^{2} + m_{p} l \dot{x} \dot{\theta}" in text
 
 
+@pytest.mark.thorough("slider_crank", "a robot")
 @pytest.mark.parametrize("name", ["double_pendulum", "driven_pendulum", "slider_crank", "sliding_block", "a robot"])
 def test_python_runs_by_itself(name, tmp_path):
     if name == "a robot":

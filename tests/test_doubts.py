@@ -64,6 +64,7 @@ def test_no_fixed_step_method_passes_a_spring_in_silence(method, omega):
         assert told or not run.stats.finished
 
 
+@pytest.mark.thorough("rk4-2.785")
 @pytest.mark.parametrize(("method", "stable"), [("rk4", 2.785), ("semi_implicit_euler", 2.0), ("mujoco_rk4", 2.785)])
 def test_explicit_methods_meet_a_damper_at_their_limit(method, stable):
     """Beyond the real end of the stability region, told with the step that would do; within, no word."""
@@ -91,6 +92,7 @@ def test_energy_that_comes_from_nowhere_is_told():
     assert any("with nothing that drives it" in x for x in told), run.stats
 
 
+@pytest.mark.thorough("semi_implicit_euler", "implicit_midpoint", "mujoco_euler")
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "implicit_midpoint", "mujoco_euler"])
 def test_ordinary_runs_are_not_doubted(method):
     """A double pendulum, high, and a robot in free fall of its joints, at one millisecond."""
@@ -237,6 +239,7 @@ def test_what_a_slow_drift_of_phase_loses():
 # What a sweep of all cases and methods found wrong by more than a hundredth, and unsaid.
 
 
+@pytest.mark.thorough("rk4")
 @pytest.mark.parametrize("method", ["rk4", "mujoco_rk4"])
 def test_a_phase_that_drifts_slowly_and_an_energy_that_falls_slowly_are_told(method):
     """The pole swings under next to no cart; 4 percent of it, and half a percent of its energy, are gone in 10 s."""
@@ -297,6 +300,7 @@ def test_digits_that_are_not_lost_are_not_doubted():
     assert not doubts(model, "rk853", [0, 0.0], [0, 1.0], **more)[1]
 
 
+@pytest.mark.thorough
 def test_errors_that_add_up_over_many_steps_are_told():
     """As of a box that tumbles for 300 flips, of which cvodes loses a hundredth at rtol = 1e-8."""
     told = doubts(hinge(1e6), "radau", [0.1], duration=1.0, rtol=1e-4, save=[0.0, 1.0])[1]

@@ -100,6 +100,7 @@ def test_derivatives_at_speed_are_those_of_the_curve(engine: str) -> None:
 # At rest
 
 
+@pytest.mark.thorough("0-lagrangian", "0-drake", "1-lagrangian", "2-lagrangian")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_at_rest_friction_is_what_the_least_constraint_needs(engine: str, seed: int) -> None:
@@ -118,6 +119,7 @@ def test_at_rest_friction_is_what_the_least_constraint_needs(engine: str, seed: 
     assert (rest & (a == 0)).any()
 
 
+@pytest.mark.thorough("0", "1", "3")
 @pytest.mark.parametrize("seed", range(4))
 def test_at_rest_accelerations_are_the_best_of_all_patterns(seed: int) -> None:
     model = rubbed(seed, 4, ("revolute", "prismatic", "universal"), curve=False)
@@ -144,6 +146,7 @@ def test_at_rest_accelerations_are_the_best_of_all_patterns(seed: int) -> None:
         assert off(got[i], best) < 1e-11
 
 
+@pytest.mark.thorough("5-kinds1", "2-kinds2")
 @pytest.mark.parametrize(("seed", "kinds"), [(0, IN_MUJOCO), (5, IN_MUJOCO), (2, ("revolute", "prismatic", "helical"))])
 def test_engines_agree_with_the_oracle_at_rest(seed: int, kinds: tuple[str, ...]) -> None:
     model = rubbed(seed, 6, kinds, mimic=True, springs="helical" not in kinds)
@@ -283,6 +286,7 @@ def slider(**friction: float) -> Model:
     return b.build()
 
 
+@pytest.mark.thorough("rk853-more0-pinocchio", "auto-more1-lagrangian", "auto-more1-pinocchio")
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
 @pytest.mark.parametrize(("method", "more"), [("rk853", {"rtol": 1e-13}), ("auto", {"rtol": 1e-13})])
 def test_an_oscillator_loses_the_same_in_each_half_swing_and_rests_in_its_dead_band(
@@ -310,6 +314,7 @@ def test_what_rests_stays_where_it_is_to_the_last_bit(method: str) -> None:
     assert moved.q[-1, 0] < 0.061
 
 
+@pytest.mark.thorough("pinocchio", "mujoco", "drake")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_step_is_a_run_of_one_step(engine: str) -> None:
     model = rubbed(2, 4, ("revolute", "universal", "prismatic", "spherical_zyx"))
@@ -369,6 +374,7 @@ def belt(speed: float) -> Model:
     return b.build()
 
 
+@pytest.mark.thorough("auto")
 @pytest.mark.parametrize("method", ["rk853", "auto"])
 def test_a_block_on_a_belt_sticks_and_slips_with_the_period_of_the_closed_form(method: str) -> None:
     """It lets go at s/k, and slips about f/k until it has the belt's speed again."""
@@ -418,6 +424,7 @@ def test_moreau_s_step_in_machine_code_is_that_in_python(monkeypatch: pytest.Mon
     assert off(own.q, fast.q[0]) < 1e-9
 
 
+@pytest.mark.thorough("moreau-1-steps0", "gauss6-6-steps3")
 @pytest.mark.parametrize(
     ("method", "order", "steps"),
     [
@@ -436,6 +443,7 @@ def test_methods_keep_their_order_across_turns(method: str, order: int, steps: t
     assert -np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(order, abs=0.35), errors
 
 
+@pytest.mark.thorough
 def test_samples_of_a_batch_have_their_own_parameters() -> None:
     b = mb.ModelBuilder("slider", gravity=np.zeros(3))
     b.add_body("block", mass=mb.Parameter("m", 2.0))
@@ -570,6 +578,7 @@ def test_friction_of_what_follows_by_a_ratio_of_zero_does_nothing():
     np.testing.assert_array_equal(*runs)
 
 
+@pytest.mark.thorough("rk4")
 @pytest.mark.parametrize("method", ["rk4", "rk853", "moreau"])
 def test_what_rests_keeps_its_place_to_the_bit(method):
     """Beside joints that move, at zero too, where an armature alone would let it creep by 1e-34."""

@@ -122,6 +122,7 @@ def fixed_steps(kind: str, dyn: Any, q: np.ndarray, v: np.ndarray, duration: flo
     return np.concatenate([q, w])
 
 
+@pytest.mark.thorough("floating_tree-lanes", "floating_tree-stages")
 @pytest.mark.parametrize("kind", ["lanes", "stages"])
 @pytest.mark.parametrize("case", list(CASES))
 def test_observed_order_is_eight(case: str, kind: str) -> None:
@@ -163,6 +164,7 @@ def test_each_step_is_scipys(kind: str) -> None:
         assert np.abs(np.concatenate([q1, w1]) - solver.y).max() < 1e3 * EPS
 
 
+@pytest.mark.thorough("floating_tree")
 @pytest.mark.parametrize("case", list(CASES))
 def test_lanes_and_stages_take_the_same_steps(case: str) -> None:
     model, q, v = CASES[case]
@@ -177,6 +179,7 @@ def test_lanes_and_stages_take_the_same_steps(case: str) -> None:
 # Runs
 
 
+@pytest.mark.thorough("free_box-stages", "floating_tree-stages")
 @pytest.mark.parametrize("kind", ["lanes", "stages"])
 @pytest.mark.parametrize("case", list(CASES))
 def test_tolerance_rules_the_error(case: str, kind: str) -> None:
@@ -221,6 +224,7 @@ def test_every_engine_has_it(engine: str) -> None:
     assert np.abs(run.q - exact.q).max() < 1e-11
 
 
+@pytest.mark.thorough
 def test_a_random_tree_moves_alike_in_lanes_and_stages() -> None:
     model = random_tree(2, 6, SOUND)
     q, v = model.random_state(2)

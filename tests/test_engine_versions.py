@@ -113,6 +113,7 @@ TERMS = {
 }
 
 
+@pytest.mark.thorough("springs")
 @pytest.mark.parametrize("name", ["springs", "turning"])
 def test_threads_that_share_a_version_get_the_poses_of_their_own_states(name):
     model = MODELS[name]()
@@ -129,6 +130,7 @@ def test_threads_that_share_a_version_get_the_poses_of_their_own_states(name):
         assert all(np.array_equal(x, y) for x, y in zip(mine, others, strict=True))
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("name", MODELS)
 def test_terms_are_those_of_the_oracle(engine, name):
@@ -404,6 +406,7 @@ def test_messages_hold_arrays_of_any_shape_and_no_pickles():
         serve.packed({}, [np.array([object()])])
 
 
+@pytest.mark.thorough
 def test_a_real_old_version(monkeypatch, tmp_path_factory):
     """The smallest download: MuJoCo 3.1.6, which has no MjSpec and another mj_fullM."""
     kept = os.environ.get("MBKIT_TEST_ENVIRONMENTS", str(tmp_path_factory.mktemp("environments")))
@@ -421,6 +424,7 @@ def test_a_real_old_version(monkeypatch, tmp_path_factory):
     assert "4.0.0" in versions_of("mujoco")
 
 
+@pytest.mark.thorough
 def test_versions_are_parameters_of_tests(tmp_path):
     present("mujoco", "4.0.0")
     (tmp_path / "test_mine.py").write_text(

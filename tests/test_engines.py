@@ -91,6 +91,9 @@ def arguments(letters, q, v, a, tau):
     return [{"q": q, "v": v, "a": a, "t": tau}[x] for x in letters]
 
 
+@pytest.mark.thorough(
+    "pinocchio-0-False", "pinocchio-0-True", "pinocchio-1-False", "pinocchio-1-True", "mujoco-1-False"
+)
 @pytest.mark.parametrize("mimic", [False, True])
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
@@ -107,6 +110,7 @@ def test_engines_agree_on_trees_of_every_joint_kind(engine, seed, mimic):
     assert off(other.coriolis_force(q, v), own.coriolis_force(q, v)) < CLOSE
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("feature", ["armature", "damping", "springs", "gravity"])
 @pytest.mark.parametrize("engine", list(ENGINES))
 def test_a_feature_acts_in_every_engine_and_can_be_taken_out(engine, feature):
@@ -124,6 +128,7 @@ def floating(robot, engine):
     return mb.dynamics(mb.load(robot, floating_base=True), engine)
 
 
+@pytest.mark.thorough("talos-pinocchio", "talos-oracle", "solo12-pinocchio")
 @pytest.mark.parametrize("engine", list(ENGINES))
 @pytest.mark.parametrize("robot", ["talos", "solo12"])
 def test_floating_robots_agree_accelerations_included(robot, engine):
@@ -189,6 +194,7 @@ def test_jacobians_and_poses_are_those_of_the_motion(engine):
     assert np.allclose(dyn.jacobian(q, "tip", "body") @ v, turned, atol=1e-8)
 
 
+@pytest.mark.thorough("False-lagrangian", "True-oracle")
 @pytest.mark.parametrize("engine", list(ENGINES))
 @pytest.mark.parametrize("floating", [False, True])
 def test_a_batch_is_its_states_one_by_one(engine, floating):
@@ -250,6 +256,7 @@ def test_results_are_not_views_of_the_next_call(engine):
         assert np.array_equal(first, kept), name
 
 
+@pytest.mark.thorough("compiled")
 @pytest.mark.parametrize("way", WAYS)
 def test_every_quantity_takes_its_documented_argument_names(way):
     dyn = small_tree(TURNING, way)
@@ -309,6 +316,7 @@ NO_NUMBERS = {
 }
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize(
     ("way", "batch", "kinds"),
     [
@@ -369,6 +377,7 @@ def with_hidden_entries():
         yield unit.build()
 
 
+@pytest.mark.thorough("lagrangian", "oracle", "compiled")
 @pytest.mark.parametrize("way", WAYS)
 def test_no_entry_that_is_not_finite_passes_unseen(way):
     rng = np.random.default_rng(0)
@@ -405,6 +414,7 @@ def test_overflow_is_an_error_in_every_quantity(way):
             assert isinstance(refusal(call, given), NumericalError), name
 
 
+@pytest.mark.thorough("free-0.9-compiled", "ball-0.9-compiled")
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("length", [0.9, 1 + 1e-6])
 @pytest.mark.parametrize("kind", ["free", "ball"])
@@ -502,6 +512,7 @@ SHARED = {
 }
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("engine", list(ENGINES))
 @pytest.mark.parametrize("name", SHARED)
 def test_threads_that_share_an_engine_get_the_values_of_their_own_states(name, engine):
@@ -564,6 +575,7 @@ def test_a_point_spring_of_no_length_pulls_and_does_not_divide_by_zero():
         assert dyn.potential_energy([0.5]) == pytest.approx(7 * 0.125)
 
 
+@pytest.mark.thorough("spring0-1-compiled", "spring0-3-compiled", "spring1-1-compiled", "spring1-3-compiled")
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("axes", [1, 3])
 @pytest.mark.parametrize("spring", [{"damping": 0.5}, {"stiffness": 7.0, "rest_length": 0.2}])

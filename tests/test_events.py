@@ -31,6 +31,7 @@ def limited() -> Model:
     return b.build()
 
 
+@pytest.mark.thorough("radau", "bdf")
 @pytest.mark.parametrize("method", SCIPY)
 def test_a_pendulum_crosses_the_bottom_as_the_elliptic_functions_say(method: str) -> None:
     model = catalog.pendulum()
@@ -69,6 +70,7 @@ def test_a_direction_leaves_the_other_crossings_out(direction: int, count: int) 
     assert all(np.sign(hit.v[0]) == direction for hit in run.events if direction)
 
 
+@pytest.mark.thorough("radau")
 @pytest.mark.parametrize("method", SCIPY)
 def test_a_run_ends_at_a_joint_limit(method: str) -> None:
     model = limited()

@@ -82,6 +82,7 @@ def arguments_of(quantity, model, n, seed=0):
     return [named[name] for name in FUNCTIONS[quantity]]
 
 
+@pytest.mark.thorough("panda", "solo12", "tree", "pair")
 def test_every_quantity_is_casadis_to_the_bit(compiled):
     dyn = mb.dynamics(compiled.model, "lagrangian")
     for quantity in compiled.functions:
@@ -92,6 +93,7 @@ def test_every_quantity_is_casadis_to_the_bit(compiled):
                 np.testing.assert_array_equal(got, want.full(), err_msg=quantity)
 
 
+@pytest.mark.thorough("panda", "panda_free")
 def test_every_quantity_is_the_engines(compiled):
     dyn = mb.dynamics(compiled.model, "lagrangian")
     for quantity, described in compiled.functions.items():
@@ -107,6 +109,7 @@ def test_every_quantity_is_the_engines(compiled):
                 assert off(g.reshape(np.shape(w)), w) < 256 * EPS * conditions[k], quantity
 
 
+@pytest.mark.thorough("panda")
 def test_threads_that_call_at_once_agree(compiled):
     quantity = next(iter(compiled.functions))
     rows = list(zip(*arguments_of(quantity, compiled.model, 256), strict=True))
@@ -246,6 +249,7 @@ def test_names_from_a_file_do_no_harm(tmp_path):
     subprocess.run([*C99, "-c", str(tmp_path / f"{made.name}.c"), "-o", str(tmp_path / "x.o")], check=True)
 
 
+@pytest.mark.thorough
 def test_bytes_are_the_same_in_another_process():
     script = (
         "import sys, mbkit as mb\n"
@@ -421,6 +425,9 @@ OF_BODIES = {
 }
 
 
+@pytest.mark.thorough(
+    "local_world_aligned-anymal_b-LF_FOOT-True", "local-anymal_b-LF_FOOT-True", "world-anymal_b-LF_FOOT-True"
+)
 @pytest.mark.parametrize(
     ("robot", "frame", "floating"), [("panda", "panda_hand", False), ("anymal_b", "LF_FOOT", True)]
 )

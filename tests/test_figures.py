@@ -111,6 +111,7 @@ STUDIES: dict[str, Any] = {
 }
 
 
+@pytest.mark.thorough("double pendulum", "panda", "anymal", "batch")
 @pytest.mark.parametrize("name", RUNS)
 def test_no_text_of_a_run_is_cut_or_lies_on_another(name: str) -> None:
     run = RUNS[name]()
@@ -119,6 +120,7 @@ def test_no_text_of_a_run_is_cut_or_lies_on_another(name: str) -> None:
         assert faults(run.picture(count)) == [], count
 
 
+@pytest.mark.thorough("precision", "a case", "many cases")
 @pytest.mark.parametrize("name", STUDIES)
 def test_no_text_of_a_study_is_cut_or_lies_on_another(name: str) -> None:
     assert faults(STUDIES[name]()) == []

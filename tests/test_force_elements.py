@@ -85,6 +85,7 @@ def oracle() -> Any:
     return mb.dynamics(MODEL, "oracle").at(t=TIME)
 
 
+@pytest.mark.thorough("lagrangian")
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco", "drake"])
 def test_every_engine_has_the_same_forces(engine: str, oracle: Any) -> None:
     if engine == "drake":
@@ -319,6 +320,7 @@ def closed_form(t0: float, t: float) -> tuple[float, float]:
     return -c / 5 * (math.cos(5 * t) - math.cos(5 * t0)) - c * math.sin(5 * t0) * (t - t0), v
 
 
+@pytest.mark.thorough("rk4", "implicit_midpoint", "gauss4", "gauss6", "radau")
 @pytest.mark.parametrize("name", [n for n, m in METHODS.items() if not m.engines or "lagrangian" in m.engines])
 def test_every_method_starts_at_t0_and_follows_the_time(name: str) -> None:
     method, t0, duration = METHODS[name], 0.4, 1.0

@@ -64,6 +64,7 @@ def assert_same(model, lag):
     return dyn, ref
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("name", READ)
 def test_catalog_systems_move_as_they_do(name):
     model = mb.catalog.get(name)(**SMALL.get(name, {}))
@@ -74,18 +75,21 @@ def test_catalog_systems_move_as_they_do(name):
     assert_same(model, lag)
 
 
+@pytest.mark.thorough("2", "3")
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_random_trees_move_as_they_do(seed):
     model = random_tree(seed, 3, ONE, mimic=seed == 2, nearest=None if seed < 2 else 1)
     assert_same(model, from_model(model))
 
 
+@pytest.mark.thorough("kinds1", "kinds2")
 @pytest.mark.parametrize("kinds", [("universal", "revolute"), ("spherical_zyx",), ("planar", "revolute")])
 def test_joints_of_several_velocities_move_as_they_do(kinds):
     model = random_tree(7, len(kinds), kinds, armature=False)
     assert_same(model, from_model(model))
 
 
+@pytest.mark.thorough("1-kinds1", "1-kinds2", "2-kinds1", "2-kinds2")
 @pytest.mark.parametrize("kinds", [("free",), ("ball", "revolute"), ("free", "prismatic")])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_ball_and_free_joints_move_as_they_do_in_their_own_velocities(seed, kinds):
@@ -95,6 +99,7 @@ def test_ball_and_free_joints_move_as_they_do_in_their_own_velocities(seed, kind
     assert_same(model, lag)
 
 
+@pytest.mark.thorough
 def test_springs_dampers_and_forces_by_functions_act_on_what_ball_and_free_joints_carry():
     b = mb.ModelBuilder("tug", gravity=(0, 0.5, -9.81))
     for name, kind, parent in (("hub", "free", "world"), ("bob", "ball", "hub")):
@@ -202,6 +207,7 @@ def test_names_of_several_free_bodies_differ():
     assert r"\dot{\omega}" in lag.equations().latex()
 
 
+@pytest.mark.thorough
 def test_a_robot_moves_as_it_does():
     model = mb.load("ur5")
     assert_same(model, from_model(model, coordinates=[f"q{i}" for i in range(1, 7)]))
@@ -288,6 +294,7 @@ def test_letters_for_coordinates_of_long_names():
     assert letters(mb.load("ur5"))[5] == "q6"
 
 
+@pytest.mark.thorough
 def test_the_remedy_for_a_model_that_is_too_large_works():
     panda = mb.load("panda")
     grip = Loop("grip", "point", panda.bodies[-1].name, np.eye(3), np.zeros(3), "world", np.eye(3), np.ones(3))
@@ -299,6 +306,7 @@ def test_the_remedy_for_a_model_that_is_too_large_works():
     assert mb.dynamics(model.without("loops", "prescribed"), "lagrangian", compile=False).model == panda
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_written_is_refused_with_the_reason():
     with pytest.raises(UnsupportedError, match=r"too many terms.*dynamics\(model, "):
         from_model(mb.load("panda"))
@@ -342,6 +350,7 @@ def test_short_forms(long, short):
     assert tidy(long).count_ops() <= sp.sympify(short).count_ops()
 
 
+@pytest.mark.thorough("0", "1", "3", "4")
 @pytest.mark.parametrize("seed", range(6))
 def test_short_forms_are_equal(seed):
     rng = np.random.default_rng(seed)
@@ -385,6 +394,7 @@ def test_a_damper_on_a_prescribed_joint_alone_acts_on_nothing():
     assert from_model(model, drives=True).dissipation != 0
 
 
+@pytest.mark.thorough
 def test_loops_are_written_out_beyond_what_anybody_reads():
     # The engines refuse loops, so that nothing else computes them.
     b = mb.ModelBuilder("row", gravity=(0, -9.81, 0))

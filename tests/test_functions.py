@@ -298,6 +298,7 @@ def test_no_choice_hides_what_is_no_number(hide: Any) -> None:
         assert np.isnan(extended.ravel()).tolist() == [True, False]
 
 
+@pytest.mark.thorough("inf", "-inf")
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_what_is_read_and_not_finite_is_found_whatever_a_function_makes_of_it(bad: float) -> None:
     """exp(-inf) is 0, atan(inf) a number, NaN to the power of 0 is 1."""
@@ -414,6 +415,7 @@ def equations(rates: Callable[[Any, Any], Any], n: int) -> Any:
     )
 
 
+@pytest.mark.thorough("53", "64")
 @pytest.mark.parametrize("bits", [53, 64, 113])
 def test_series_of_every_function_hold_its_integral(bits: int) -> None:
     """With q' = v = 1 and v' = 0 of the first, every other velocity is the integral of a function."""

@@ -61,6 +61,7 @@ QUICKER = dict.fromkeys([("heavy top", x) for x in GAUSS], 2) | {
 }
 
 
+@pytest.mark.thorough("gauss4-heavy top", "gauss4-random tree", "gauss6-random tree")
 @pytest.mark.parametrize("case", cases())
 @pytest.mark.parametrize("method", GAUSS)
 def test_observed_order(case: str, method: str) -> None:
@@ -77,6 +78,7 @@ def test_observed_order_with_a_torque_function(method: str) -> None:
     assert order == pytest.approx(METHODS[method].order, abs=0.2)
 
 
+@pytest.mark.thorough("Dzhanibekov box", "random tree")
 @pytest.mark.parametrize("case", cases())
 def test_every_engine_gives_the_same(case: str) -> None:
     model, q, v, duration = cases()[case]
@@ -133,6 +135,7 @@ def test_time_can_be_turned_back_without_quaternions(method: str) -> None:
     assert back.v[-1] == pytest.approx(-v, abs=1e-12)
 
 
+@pytest.mark.thorough
 def test_energy_does_not_drift_without_quaternions() -> None:
     model, q, v, _ = cases()["double pendulum"]
     run = simulate(mb.dynamics(model), q, v, 200.0, "gauss4", dt=0.05)
@@ -144,6 +147,7 @@ def test_energy_does_not_drift_without_quaternions() -> None:
 # Batches
 
 
+@pytest.mark.thorough("pinocchio")
 @pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])
 def test_a_batch_is_its_members(engine: str) -> None:
     model, _, _, _ = cases()["random tree"]
@@ -178,6 +182,7 @@ def both(model: Model, method: str, q: np.ndarray, v: np.ndarray, **more: object
     ]
 
 
+@pytest.mark.thorough("1")
 @pytest.mark.parametrize("seed", range(2))
 def test_compiled_steps_are_those_of_python(seed: int) -> None:
     """Springs, damping, armature, rotations; states and torques of their own in a batch."""
@@ -191,6 +196,7 @@ def test_compiled_steps_are_those_of_python(seed: int) -> None:
             assert np.abs(x - y).max() <= 1e4 * EPS * max(1.0, np.abs(y).max())
 
 
+@pytest.mark.thorough("0")
 @pytest.mark.parametrize("seed", [0, 5])
 def test_steps_that_are_long_lead_to_the_same_solution(seed: int) -> None:
     """At seed 5 Newton's iteration from a far guess would end at another solution of the stages' equations."""
@@ -214,6 +220,7 @@ def test_compiled_steps_take_wrenches_and_a_start() -> None:
     assert np.abs(compiled.q - free.q).max() > 1e-6
 
 
+@pytest.mark.thorough
 def test_a_large_loop_is_not_compiled_for_a_few_steps() -> None:
     """Compiling the delta robot's step takes ten seconds, as many as some twenty thousand steps in Python."""
     robot = catalog.delta_robot()

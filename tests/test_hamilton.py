@@ -163,6 +163,7 @@ def test_when_it_is_the_energy_and_when_it_is_kept():
 # The equations
 
 
+@pytest.mark.thorough("cart-pole", "driven")
 @pytest.mark.parametrize("case", CASES)
 def test_canonical_equations_move_as_lagranges_do(case):
     make, q, v = CASES[case]
@@ -180,6 +181,7 @@ def test_canonical_equations_move_as_lagranges_do(case):
     assert np.array(speeds) == pytest.approx(lagranges.v, abs=1e-9)
 
 
+@pytest.mark.thorough("cart-pole", "heavy top")
 @pytest.mark.parametrize("case", ["pendulum", "cart-pole", "heavy top"])
 def test_symplectic_integration_keeps_h_without_drift(case):
     make, q, v = CASES[case]

@@ -265,6 +265,7 @@ COMMANDS = [
 ]
 
 
+@pytest.mark.thorough
 def test_every_command(tmp_path, monkeypatch):
     source = Path(__file__)
     (tmp_path / "names.py").write_text(

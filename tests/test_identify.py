@@ -77,6 +77,7 @@ def torques(model: Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.nda
     return mb.dynamics(model, "pinocchio").inverse_dynamics(q, v, a)
 
 
+@pytest.mark.thorough("pinocchio-ur5", "pinocchio-panda", "mujoco-ur5")
 @pytest.mark.parametrize("name", ["ur5", "panda"])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_exact_from_exact_torques(name: str, engine: str) -> None:
@@ -92,6 +93,7 @@ def test_exact_from_exact_torques(name: str, engine: str) -> None:
         assert np.abs(values(found) - true).max() < 1e-8 * np.abs(true).max()
 
 
+@pytest.mark.thorough("panda")
 @pytest.mark.parametrize("name", ["ur5", "panda"])
 def test_errors_are_within_three_of_the_deviations_told(name: str) -> None:
     model, at, tau = exact(name)
@@ -238,6 +240,7 @@ def test_at_rest_only_gravity_is_told() -> None:
     assert np.isnan(none.condition)
 
 
+@pytest.mark.thorough("entropic")
 @pytest.mark.parametrize("prior", ["entropic", "euclidean"])
 def test_consistent_parameters_are_matter(prior: str) -> None:
     model, at, tau = exact("panda")
@@ -420,6 +423,7 @@ def worst(found: Identification, what: str = "error") -> float:
     return max(abs(offs[what](p)) / p.deviation for p in found.parameters if p.determined)
 
 
+@pytest.mark.thorough("500.0")
 @pytest.mark.parametrize("rate", [100.0, 500.0])
 def test_noise_of_encoders_is_told_and_a_filter_takes_it_out(rate):
     """Positions with 1e-4 rad of noise, differentiated twice: errors of ten deviations and more, in silence before."""

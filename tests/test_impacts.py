@@ -84,6 +84,7 @@ def test_symbols_of_a_blow_are_no_unknowns() -> None:
 # Engines
 
 
+@pytest.mark.thorough("lagrangian", "drake", "oracle")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_every_engine_agrees_with_the_equations_on_paper(engine) -> None:
     model = mb.catalog.double_pendulum()

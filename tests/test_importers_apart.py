@@ -69,6 +69,7 @@ def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         worker.end()
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(
     ("name", "why"),
     [
@@ -101,6 +102,7 @@ def test_one_that_hangs_is_stopped_and_the_next_file_read(told) -> None:
         told("sound", seconds=-1.0)
 
 
+@pytest.mark.thorough
 def test_in_a_script_without_a_guard_in_its_forks_and_after_its_end(tmp_path: Path) -> None:
     (tmp_path / "r.urdf").write_text(ROBOT.format("r"), encoding="utf-8")
     script = tmp_path / "script.py"

@@ -65,6 +65,7 @@ def value(dyn, quantity: str, at: dict[str, np.ndarray], axes: tuple[str, ...] =
     return np.stack([np.asarray(method(*given, **more, **x)) for x in options], axis=-1)
 
 
+@pytest.mark.thorough("revolute", "continuous", "prismatic", "spherical_zyx", "ball", "planar", "cylindrical")
 @pytest.mark.parametrize("kind", [*BUILT_IN, *OWN])
 def test_each_quantity_is_right_or_refused(kind):
     model = model_of(kind)
@@ -117,6 +118,7 @@ FEATURES = {
 }
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(
     ("engine", "feature"),
     [
@@ -150,6 +152,7 @@ def test_one_state_has_the_values_of_its_row_in_a_batch(engine, feature):
         assert off(rows, whole) < tolerance, quantity
 
 
+@pytest.mark.thorough("spherical_zyx", "ball", "planar", "free", "sliding_ball")
 @pytest.mark.parametrize("kind", [*BUILT_IN, *OWN])
 def test_coriolis_matrices_give_the_force_and_a_skew_difference(kind):
     model = model_of(kind)

@@ -24,6 +24,7 @@ def tree(request):
     return model, mb.dynamics(model, "lagrangian"), states(model, 4, request.param)
 
 
+@pytest.mark.thorough("1", "3", "4", "5")
 def test_mass_matrix_is_symmetric_positive_definite(tree):
     _, dyn, (q, _, _, _) = tree
     M = dyn.mass_matrix(q)
@@ -36,12 +37,14 @@ def test_kinetic_energy_is_half_v_m_v(tree):
     assert off(dyn.kinetic_energy(q, v), 0.5 * np.einsum("ni,nij,nj->n", v, dyn.mass_matrix(q), v)) < CLOSE
 
 
+@pytest.mark.thorough("0", "1", "4", "5")
 def test_mass_matrix_is_the_derivative_of_inverse_dynamics(tree):
     _, dyn, (q, v, a, _) = tree
     M, rest = dyn.mass_matrix(q), dyn.inverse_dynamics(q, v, 0 * a)
     assert off(dyn.inverse_dynamics(q, v, a) - rest, np.einsum("nij,nj->ni", M, a)) < CLOSE
 
 
+@pytest.mark.thorough("1", "3", "4", "5")
 def test_terms_add_up(tree):
     _, dyn, (q, v, a, _) = tree
     C = dyn.coriolis_matrix(q, v)
@@ -76,6 +79,7 @@ def test_gravity_and_springs_are_the_slope_of_the_potential(tree):
     assert np.allclose(numeric, np.sum(slope * v, axis=1), rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.thorough("3", "4", "5")
 def test_power_balances(tree):
     _, dyn, (q, v, _, tau) = tree
     a = dyn.forward_dynamics(q, v, tau)
@@ -84,12 +88,14 @@ def test_power_balances(tree):
     assert off(dyn.energy_rate(q, v, a), power) < 1e-12
 
 
+@pytest.mark.thorough("3", "5")
 def test_forward_dynamics_inverts_inverse_dynamics(tree):
     _, dyn, (q, v, a, _) = tree
     back = dyn.forward_dynamics(q, v, dyn.inverse_dynamics(q, v, a))
     assert off(back, a) < 1e-14 * np.linalg.cond(dyn.mass_matrix(q)).max()
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("elimination", ["links", "mass matrix", "least constraint"])
 def test_every_elimination_equals_lapack(tree, elimination):
     model, dyn, (q, v, _, tau) = tree

@@ -88,6 +88,7 @@ def test_free_and_ball_joints_have_the_adjoint_of_their_velocity():
         np.testing.assert_array_equal(A.A[:n, n:], np.eye(n))
 
 
+@pytest.mark.thorough("free and balls", "mimic")
 def test_it_is_the_generator_of_the_flow(tree):
     dyn, (q, v, _, tau) = tree
     n, A = dyn.model.nv, dyn.linearize(q, v, tau).A
@@ -98,6 +99,7 @@ def test_it_is_the_generator_of_the_flow(tree):
     assert np.abs(limit - A).max() < 1e-6 * np.abs(A).max() ** 2
 
 
+@pytest.mark.thorough("oracle")
 @pytest.mark.parametrize("engine", ["oracle", "pinocchio", "drake"])
 def test_engines_agree(engine):
     if engine == "drake":
@@ -124,6 +126,7 @@ def test_drake_differentiates_mimic_joints_and_reports_a_pole():
         mb.dynamics(ball, "drake").inverse_dynamics_derivatives(upright, np.ones(3), np.ones(3))
 
 
+@pytest.mark.thorough("free and balls", "mimic")
 def test_batches_are_their_samples(tree):
     dyn, _ = tree
     q, v, _, tau = states(dyn.model, 3, 2)
@@ -191,6 +194,7 @@ def test_an_unknown_hold_is_refused():
 METHODS = ("rk4", "semi_implicit_euler", "gauss4", "gauss6", "implicit_midpoint")
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("method", METHODS)
 def test_the_derivative_of_a_step_is_its_differences(tree, method):
     dyn, (q, v, _, tau) = tree
@@ -276,6 +280,7 @@ def test_methods_engines_and_models_without_derivatives_say_why():
 # Second derivatives and parameters
 
 
+@pytest.mark.thorough("free and balls", "mimic")
 def test_second_derivatives_are_differences_of_the_first(tree):
     dyn, (q, v, a, _) = tree
     model, n, first = dyn.model, dyn.model.nv, dyn.inverse_dynamics_derivatives

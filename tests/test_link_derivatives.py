@@ -93,6 +93,7 @@ def values(equations: Equations, name: str, *arguments: np.ndarray) -> list[np.n
     return [np.array(x) for x in equations.function(name).call([*arguments, *([parameters] if parameters else [])])]
 
 
+@pytest.mark.thorough(every=4)
 def test_they_are_those_of_the_energies(case):
     _, model = case
     links, energies = LinkEquations(model, elimination="links"), Equations(model)
@@ -157,6 +158,7 @@ def operations(equations: Equations, results: tuple[ca.SX, ...]) -> int:
     return program(ca.Function("f", given, [ca.densify(x) for x in results])).arithmetic
 
 
+@pytest.mark.thorough("all types")
 @pytest.mark.parametrize("kinds", [("revolute",), ALL], ids=["hinges", "all types"])
 def test_they_take_fewer_operations_than_the_forces_differentiated(kinds):
     model = random_tree(32, 12, kinds, nearest=2, springs=False, damping=False)
@@ -165,6 +167,7 @@ def test_they_take_fewer_operations_than_the_forces_differentiated(kinds):
     assert operations(own, own.inverse_dynamics_derivatives[:2]) < 0.6 * operations(other, by_casadi[:2])
 
 
+@pytest.mark.thorough
 def test_their_number_grows_with_the_pairs_of_joints_on_a_branch():
     counts = []
     for n in (6, 12, 24):
@@ -206,6 +209,7 @@ def test_branches_share_only_what_they_hang_on():
     assert products - operations(equations, (by_q, by_v, L, D)) < 0.75 * by_substitution
 
 
+@pytest.mark.thorough("all types", "a branch of all types", "mimic joints", "free and ball joints below others")
 @pytest.mark.parametrize("name", [name for name in MODELS if name not in MOVING])
 def test_the_links_give_inverse_factors_of_the_mass_matrix(name):
     equations = LinkEquations(MODELS[name], elimination="links")
@@ -221,6 +225,7 @@ def test_the_links_give_inverse_factors_of_the_mass_matrix(name):
     assert off(L @ (inverse * L.T) @ M, np.eye(n)) < 10 * np.linalg.cond(M) * EPS
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [1])
 def test_they_have_the_digits_of_the_accelerations(seed):
     """Factors of a formed mass matrix would lose up to a hundred times as many."""

@@ -44,6 +44,7 @@ def sample(model: mb.model.Model, n: int = 3, seed: int = 0) -> dict[str, np.nda
     return dict(zip("qvat", states(model, n, seed), strict=True))
 
 
+@pytest.mark.thorough("3", "4", "5", "6", "7")
 @pytest.mark.parametrize("seed", range(8))
 def test_every_term_is_that_of_the_energies(seed):
     model = model_of(seed)
@@ -54,6 +55,7 @@ def test_every_term_is_that_of_the_energies(seed):
         assert off(evaluated(links, name, at), evaluated(energies, name, at)) < 1e3 * EPS * loss, name
 
 
+@pytest.mark.thorough("panda", "solo12")
 @pytest.mark.parametrize("name", ["ur5", "panda", "solo12", "iris"])
 def test_robots_are_as_exact_as_before(name):
     """Against 34 digits, as rounding of the model's numbers moves the accelerations."""
@@ -66,6 +68,7 @@ def test_robots_are_as_exact_as_before(name):
         assert off(evaluated(links, term, at).reshape(exact.shape), exact) < bar, term
 
 
+@pytest.mark.thorough("3", "4")
 @pytest.mark.parametrize("seed", range(5))
 def test_any_velocities_may_be_carried_to_the_root(seed):
     model, rng = model_of(seed), np.random.default_rng(seed)
@@ -135,6 +138,7 @@ def error(equations: Equations, model: mb.model.Model, name: str) -> float:
     return off(evaluated(equations, name, at).reshape(exact.shape), exact)
 
 
+@pytest.mark.thorough("masses2", "masses3", "masses4")
 @pytest.mark.parametrize("masses", [(1, 1, 1e9), (1, 1, 1e6), (1, 1e6, 1), (1, 1, 1e-9), (1e-9, 1, 1), (1e-9, 1e-9, 1)])
 def test_heavy_and_light_links_cost_no_more_digits_than_the_factors_of_M(masses):
     model = arm(masses)
@@ -156,6 +160,7 @@ def test_short_forms_are_left_where_digits_would_go(name):
     assert ca.n_nodes(eq.forward_dynamics) < 0.8 * ca.n_nodes(eq._reduced(eq.plain, ()))
 
 
+@pytest.mark.thorough("0", "1", "3")
 @pytest.mark.parametrize("seed", range(4))
 def test_axes_that_lie_anyhow_take_the_short_form(seed):
     """The plain frames round as much, and say nothing against the short ones: trees took twice the operations."""
@@ -165,6 +170,7 @@ def test_axes_that_lie_anyhow_take_the_short_form(seed):
     assert error(eq, model, "forward_dynamics") < max(2 * error(factors, model, "forward_dynamics"), 8 * EPS)
 
 
+@pytest.mark.thorough("talos_reduced")
 @pytest.mark.parametrize("name", ["kinova", "so101", "talos_reduced"])
 def test_the_mass_matrix_keeps_its_digits_where_an_arm_lies_in_its_axis(name):
     """Composite bodies about origins lose a hundred eps there, of √(M_ii M_jj)."""
@@ -181,6 +187,7 @@ def operations(equations: Equations, expression: ca.SX) -> int:
     return ca.Function("f", [equations.q, equations.v, equations.tau], [expression], {"cse": True}).n_nodes()
 
 
+@pytest.mark.thorough("panda", "anymal")
 @pytest.mark.parametrize("name", ["ur5", "panda", "anymal"])
 def test_the_form_with_the_fewest_operations_is_taken(name):
     model = mb.load(name, mimic="free", floating_base=name == "anymal").without("damping")
@@ -190,6 +197,7 @@ def test_the_form_with_the_fewest_operations_is_taken(name):
         assert chosen <= 1.001 * operations(eq, eq._reduced(eq.mechanics, depth))
 
 
+@pytest.mark.thorough
 def test_work_grows_with_the_number_of_links():
     sizes, counts = (32, 64, 128), []
     for n in sizes:

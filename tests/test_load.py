@@ -226,6 +226,7 @@ def test_records_tell_size_or_reason(capfd):
     assert not told.err
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("name", SOUND)
 def test_a_robot_is_pinocchios_and_its_numbers_are_the_files(name):
     path = ROBOTS[name].path
@@ -480,6 +481,7 @@ def test_planar_and_floating_joints_of_a_urdf(tmp_path):
     assert_near(sample_mass_matrix(model), pinocchio_mass_matrix(raw, model, sample(model)))
 
 
+@pytest.mark.thorough('<axis xyz="0 1 0"/>', '<axis xyz="0 0 -2"/>', '<axis xyz="1 2 -3"/>')
 @pytest.mark.parametrize("axis", ["", '<axis xyz="0 1 0"/>', '<axis xyz="0 0 -2"/>', '<axis xyz="1 2 -3"/>'])
 def test_a_planar_joint_moves_across_its_normal_and_turns_about_it(axis, tmp_path):
     """URDF's default is x. The link moves as the specification says, whatever the coordinates along the plane."""
@@ -778,6 +780,7 @@ def test_mjcf_is_what_mujoco_makes_of_it(name, tmp_path):
     check_against_mujoco(model, mujoco.MjModel.from_xml_string(text))
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("seed", range(40))
 def test_random_mjcf_trees(seed, tmp_path):
     root = ET.fromstring(random_mjcf(seed))
@@ -998,6 +1001,7 @@ def motion(compiled):
 VALUES = ".7|true|.1 1|.1 .2 .3|.1 .2 .3 .4|1 2 3 4 5 6|disable|radian|zyx|slide|m|k|1 5"
 
 
+@pytest.mark.thorough
 def test_no_attribute_changes_the_motion_in_silence(tmp_path):
     """What MuJoCo's motion feels is as in MuJoCo, refused, or noted, for every attribute of its schema."""
     plain = load(written(tmp_path, all_attributes({}), "r.xml"))

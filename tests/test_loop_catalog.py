@@ -185,6 +185,7 @@ def test_the_neutral_pose_is_closed(name: str, values: dict[str, Any]) -> None:
     assert np.abs(m.gaps(m.model.neutral())).max() < 1e-14 * m.size
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("name", MOBILITY)
 def test_mobility_at_the_neutral_pose_and_near_it(name: str) -> None:
     m = mechanism(name)
@@ -322,6 +323,7 @@ def test_a_thick_rod_is_a_solid_cylinder() -> None:
 # Planar mechanisms
 
 
+@pytest.mark.thorough("-1.0-values1", "2.6-values0", "2.6-values1")
 @pytest.mark.parametrize("values", [{}, OTHER["four_bar"]])
 @pytest.mark.parametrize("theta", [0.7, -1.0, 2.6])
 def test_four_bar_obeys_freudensteins_equation(values: dict[str, float], theta: float) -> None:
@@ -347,6 +349,7 @@ def test_four_bar_has_the_accelerations_of_its_closed_form() -> None:
         assert dyn.forward_dynamics(q, v, np.zeros(3))[0] == pytest.approx(float(a), rel=1e-12)
 
 
+@pytest.mark.thorough("2", "3")
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_four_bars_move_as_one_pendulum(n: int) -> None:
     model = catalog.four_bars(n=n)
@@ -370,6 +373,7 @@ def test_four_bars_of_iftomm_a02_reach_the_exact_state() -> None:
     assert got == pytest.approx(published()["iftomm_A02_double_four_bar"]["exact_x_y_vx_vy_of_B0"]["1"], abs=1e-8)
 
 
+@pytest.mark.thorough("0.6-values0", "2.5-values0", "2.5-values1")
 @pytest.mark.parametrize("values", [{}, OTHER["inverted_slider_crank"]])
 @pytest.mark.parametrize("theta", [0.6, 2.5, -1.7])
 def test_inverted_slider_crank_has_the_law_of_cosines(values: dict[str, float], theta: float) -> None:
@@ -383,6 +387,7 @@ def test_inverted_slider_crank_has_the_law_of_cosines(values: dict[str, float], 
         assert mechanism("inverted_slider_crank").driven(theta=turn)[1] == pytest.approx(math.asin(c / g), abs=1e-13)
 
 
+@pytest.mark.thorough("2.5-values0", "2.5-values1", "-1.7-values1")
 @pytest.mark.parametrize("values", [{}, OTHER["slider_crank"]])
 @pytest.mark.parametrize("theta", [0.6, 2.5, -1.7])
 def test_slider_crank_has_the_pistons_way_of_the_textbook(values: dict[str, float], theta: float) -> None:
@@ -413,6 +418,7 @@ def test_pantographs_pen_draws_larger_by_the_ratio(values: dict[str, float]) -> 
         assert m.point(q, "pen") == pytest.approx(ratio * m.point(q, "tracer"), abs=1e-13)
 
 
+@pytest.mark.thorough("values1")
 @pytest.mark.parametrize("values", [{}, OTHER["peaucellier"]])
 def test_peaucelliers_pen_is_on_its_line(values: dict[str, float]) -> None:
     m = mechanism("peaucellier", **values)
@@ -457,6 +463,7 @@ def test_chebyshevs_pen_has_the_same_height_in_three_poses() -> None:
     assert 1e-5 < abs(between - 0.4) < 4e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("values", [{}, OTHER["hoecken"]])
 def test_hoeckens_pen_obeys_thales(values: dict[str, float]) -> None:
     m = mechanism("hoecken", **values)
@@ -476,6 +483,7 @@ def test_hoeckens_pen_obeys_thales(values: dict[str, float]) -> None:
         assert len(heights) >= 5
 
 
+@pytest.mark.thorough("values0")
 @pytest.mark.parametrize("values", [{}, OTHER["scissor"]])
 def test_scissors_height(values: dict[str, Any]) -> None:
     m = mechanism("scissor", **values)
@@ -583,6 +591,7 @@ def test_bricard_moves_though_its_rows_say_otherwise(values: dict[str, float]) -
     assert m.tree.potential_energy(m.model.neutral()) == pytest.approx(-29.43 * length, rel=1e-14)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("values", [{}, OTHER["flyball_governor"]])
 def test_governors_sleeve_and_speed(values: dict[str, float]) -> None:
     m = mechanism("flyball_governor", **values)
@@ -605,6 +614,7 @@ def test_governors_sleeve_and_speed(values: dict[str, float]) -> None:
         assert np.abs(dyn.forward_dynamics(q, v, np.zeros(6))).max() < 1e-10
 
 
+@pytest.mark.thorough("values1")
 @pytest.mark.parametrize("values", [{}, OTHER["double_cardan_shaft"]])
 def test_two_cardan_joints_take_back_what_one_does(values: dict[str, float]) -> None:
     m, bend = mechanism("double_cardan_shaft", **values), ({"angle": 0.5} | values)["angle"]
@@ -622,6 +632,7 @@ def test_two_cardan_joints_take_back_what_one_does(values: dict[str, float]) -> 
         assert math.remainder(turn - expected, math.tau) == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.thorough("0-values0", "0-values1", "2-values0", "2-values1")
 @pytest.mark.parametrize("values", [{}, OTHER["stewart_platform"]])
 @pytest.mark.parametrize("seed", range(3))
 def test_stewarts_legs_have_the_lengths_of_the_pose(values: dict[str, float], seed: int) -> None:
@@ -637,6 +648,7 @@ def test_stewarts_legs_have_the_lengths_of_the_pose(values: dict[str, float], se
         assert q[names.index(f"length{k}")] == pytest.approx(length, abs=1e-13)
 
 
+@pytest.mark.thorough("0-values0", "1-values1", "2-values1")
 @pytest.mark.parametrize("values", [{}, OTHER["delta_robot"]])
 @pytest.mark.parametrize("seed", range(3))
 def test_delta_never_turns_and_has_the_arms_angles_of_its_place(values: dict[str, float], seed: int) -> None:

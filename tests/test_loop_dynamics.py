@@ -69,6 +69,7 @@ def closed_tree(seed: int, kind: str = "point", *, drive: bool = False) -> tuple
     return model, q
 
 
+@pytest.mark.thorough("point-0", "frame-2", "revolute-0", "cylindrical-0", "prismatic-2")
 @pytest.mark.parametrize(("kind", "seed"), [(kind, (0, 2)[k % 2]) for k, kind in enumerate(LOOP_KINDS)])
 def test_equation_of_motion_holds_under_every_kind_of_loop(kind: str, seed: int) -> None:
     model, q = closed_tree(seed, kind, drive=seed == 2)
@@ -95,6 +96,7 @@ def test_equation_of_motion_holds_under_every_kind_of_loop(kind: str, seed: int)
     assert np.abs(oracle.constraint_residual(q) - dyn.constraint_residual(q)).max() < 1e-14
 
 
+@pytest.mark.thorough("0", "2")
 @pytest.mark.parametrize("seed", range(3))
 def test_bias_and_rate_are_derivatives_along_a_motion(seed: int) -> None:
     model, q = closed_tree(seed, "frame" if seed else "revolute", drive=True)
@@ -169,6 +171,7 @@ def test_bricard_is_redundant_and_moves() -> None:
     assert abs(U[:, -1] @ forces) < 1e-7 * np.linalg.norm(forces)
 
 
+@pytest.mark.thorough("False")
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_prescribed_motion_is_followed_and_its_drive_pays_for_the_energy(compiled: bool) -> None:
     arm = {"mass": 1.0, "com": (0, 0, -0.5), "inertia": (0.1, 0.1, 0.01), "axis": (0, 1, 0)}
@@ -191,6 +194,7 @@ def test_a_prescribed_motion_is_followed_and_its_drive_pays_for_the_energy(compi
     assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-9
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["semi_implicit_euler", "rk4"])
 def test_compiled_steps_are_those_of_python(method: str) -> None:
     model, q = closed_tree(1, "point", drive=True)
@@ -206,6 +210,7 @@ def test_compiled_steps_are_those_of_python(method: str) -> None:
     assert max(gap) < 1e-14
 
 
+@pytest.mark.thorough
 def test_gap_does_not_grow_and_orders_stay() -> None:
     model = four_bar()
     # 200,000 steps pay for compiling.
@@ -330,6 +335,7 @@ def test_a_singular_pose_is_passed_by_projected_stages_and_told() -> None:
     assert np.abs(dyn.constraint_residual(run.q)).max() < 1e-12
 
 
+@pytest.mark.thorough("0")
 @pytest.mark.parametrize("seed", range(2))
 def test_all_rows_are_closed_and_no_frame_is_half_a_turn_off(seed: int) -> None:
     model, _ = closed_tree(seed, "frame")
@@ -357,6 +363,7 @@ def test_a_start_half_a_turn_off_is_refused() -> None:
         mb.simulate(dyn, turned, np.zeros(4), 0.01, "rk4", dt=1e-3)
 
 
+@pytest.mark.thorough("bricard", "andrews_squeezer", "flyball_governor")
 @pytest.mark.parametrize("name", ["four_bar", "bricard", "andrews_squeezer", "flyball_governor"])
 def test_engines_agree_on_mechanisms_mujoco_by_its_own_law(name: str) -> None:
     result = mb.compare(mb.catalog.get(name)(), samples=4, terms_only=True)
@@ -380,6 +387,7 @@ def test_a_wrong_loop_is_found() -> None:
     assert np.abs(gap).max() > 1e-11
 
 
+@pytest.mark.thorough
 def test_power_of_drives_counts_in_the_balance() -> None:
     model, _ = closed_tree(1, "point", drive=True)
     result = mb.compare(model, ("pinocchio", "lagrangian"), samples=4, terms_only=True)
@@ -397,6 +405,7 @@ def test_what_would_be_the_trees_alone_is_refused() -> None:
         dyn.joint_wrenches(q, q, q)
 
 
+@pytest.mark.thorough
 def test_a_whole_comparison_of_a_mechanism_passes_with_its_loops_on(monkeypatch: pytest.MonkeyPatch) -> None:
     # Little time to error against run time, which tests/test_loops_in_studies.py has.
     monkeypatch.setattr(import_module("mbkit.studies.compare.study"), "_SECONDS", 0.5)

@@ -39,6 +39,7 @@ def condition(model: mb.Model, dyn: mb.Dynamics, q: np.ndarray) -> float:
     return float(s[0] / s[model.nv - dyn.mobility().degrees_of_freedom - 1])
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("name", MECHANISMS)
 def test_engines_agree_and_every_body_is_in_balance(name: str) -> None:
     model = mb.catalog.get(name)()
@@ -68,6 +69,7 @@ def test_engines_agree_and_every_body_is_in_balance(name: str) -> None:
         assert np.abs(left).max() < CLOSE * np.abs(exact[0]).max()
 
 
+@pytest.mark.thorough("point", "universal", "prismatic")
 @pytest.mark.parametrize("kind", ["point", "universal", "prismatic", "distance"])
 def test_random_trees_are_in_balance_with_every_kind_of_loop(kind: str) -> None:
     model, q = closed_tree(1, kind)
@@ -299,6 +301,7 @@ def test_a_comparison_of_mechanisms_has_joint_loads() -> None:
 # Held coordinates
 
 
+@pytest.mark.thorough("stewart_platform", "delta_robot")
 @pytest.mark.parametrize("name", ["four_bar", "bricard", "stewart_platform", "delta_robot"])
 def test_held_coordinates_stay_to_the_bit_and_the_others_follow(name: str) -> None:
     model = mb.catalog.get(name)()
@@ -404,6 +407,7 @@ def test_reduced_inertia_of_a_four_bar_is_that_of_its_geometry() -> None:
     assert GROUND == 1.0
 
 
+@pytest.mark.thorough("bricard-coordinates0", "andrews_squeezer-coordinates2")
 @pytest.mark.parametrize(
     ("name", "coordinates"), [("bricard", ["q1"]), ("five_bar", ["theta1", "theta2"]), ("andrews_squeezer", ["beta"])]
 )

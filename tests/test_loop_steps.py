@@ -29,6 +29,7 @@ def plans(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     return asked
 
 
+@pytest.mark.thorough("0.001-False")
 @pytest.mark.parametrize(("dt", "thorough"), [(1e-3, False), (4e-3, False), (1.6e-2, True), (3.2e-2, True)])
 def test_long_steps_are_taken_again_with_three_iterations(
     dt: float, thorough: bool, monkeypatch: pytest.MonkeyPatch
@@ -106,6 +107,7 @@ def test_constraints_enter_the_factors_only_where_they_hold_what_the_mass_does_n
     assert not mb.dynamics(light_cart(1.0), "lagrangian", compile=False).equations.constraint_factors.careful
 
 
+@pytest.mark.thorough("0.0001", "1e-12")
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8, 1e-12])
 def test_rk853_takes_the_same_steps_in_machine_code(rtol: float) -> None:
     model = mb.catalog.four_bar()
@@ -174,6 +176,7 @@ MODELS = {
 }
 
 
+@pytest.mark.thorough("stiff four-bar-rodas5", "flyball_governor-rodas5", "bricard-rodas5", "rolling_disc-rodas5")
 @pytest.mark.parametrize(
     ("name", "method"), [*((name, "rodas5") for name in MODELS), ("stiff four-bar", "auto"), ("rolling_disc", "auto")]
 )
@@ -195,6 +198,7 @@ def test_stiff_methods_take_the_same_steps_in_machine_code(name: str, method: st
         assert all("rodas5" in run.stats.chosen for run in runs)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("seed", "kind"), [(1, "revolute"), (2, "distance")])
 def test_rodas5_keeps_its_tolerance_on_random_loops(seed: int, kind: str) -> None:
     """Of random trees with free and ball joints; the linear system of a stage has all their derivatives."""

@@ -222,6 +222,7 @@ def test_a_loop_in_space_has_the_tree_s_terms(linkage):
     assert off(pin.inverse_dynamics(q, v, a) - tau, J.T @ lam) < CLOSE
 
 
+@pytest.mark.thorough
 def test_a_frame_closed_in_space_moves_as_the_point_does(linkage):
     lag, model, q, v = linkage
     weld, open_weld = from_model(ball_linkage("frame")), mb.dynamics(ball_linkage("frame").without("loops"))
@@ -242,6 +243,7 @@ def test_a_frame_closed_in_space_moves_as_the_point_does(linkage):
     assert np.abs(one.q - two.q[:, :4]).max() < 1e-10
 
 
+@pytest.mark.thorough
 def test_seven_joints_closed_in_space_are_judged_at_the_pose_that_is_given():
     E, links = np.eye(3), []
     for i, kind in enumerate("PRRRPRP"):
@@ -318,6 +320,7 @@ def test_the_multiplier_of_a_drive_is_its_force():
     assert driven.multipliers(q, v, t=0.03)[-1] == pytest.approx(expected[0] + 0.1, rel=1e-12)
 
 
+@pytest.mark.thorough("7-3-0")
 @pytest.mark.parametrize(("seed", "n", "which"), [(6, 2, 1), (7, 3, 0)])
 def test_a_tree_with_a_prescribed_joint_is_the_tree_along_its_motion(seed, n, which):
     # The last joint; and one that another mimics, with a damper to the ground.

@@ -129,6 +129,7 @@ def test_a_run_is_drake_s_own_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -
     assert run.stats.steps == 500
 
 
+@pytest.mark.thorough("1-point", "1-frame", "1-distance", "4-point", "4-frame")
 @pytest.mark.parametrize("kind", HELD)
 @pytest.mark.parametrize("seed", [1, 4])
 def test_runs_tend_to_the_rigid_motion_in_first_order(kind: str, seed: int) -> None:
@@ -195,6 +196,7 @@ def test_a_step_of_a_tree_is_semi_implicit_with_damping_at_its_end() -> None:
         assert run.q[k + 1, 0] == pytest.approx(x, rel=1e-12)
 
 
+@pytest.mark.thorough("revolute", "universal", "cylindrical")
 @pytest.mark.parametrize("kind", [kind for kind in LOOP_KINDS if kind not in HELD])
 def test_other_kinds_are_refused_by_name(kind: str) -> None:
     model, q, v = closed_tree(1, kind)

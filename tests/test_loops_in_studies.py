@@ -63,6 +63,7 @@ def test_the_reference_of_a_driven_loop_is_geometry() -> None:
     assert float(out.how.split("differ by ")[1].split(" ")[0]) < 1e-12
 
 
+@pytest.mark.thorough("free")
 @pytest.mark.parametrize("model", [bare.described(), driven()], ids=["free", "driven"])
 def test_its_start_and_its_way_are_closed_to_all_digits(model: Model) -> None:
     q, v = (np.asarray(x, dtype=float) for x in by_geometry(0.0))
@@ -75,6 +76,7 @@ def test_its_start_and_its_way_are_closed_to_all_digits(model: Model) -> None:
     assert motion.gap((out.q, out.q_low), TIMES).max() < 1e-29
 
 
+@pytest.mark.thorough
 def test_an_open_way_ends_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two runs that drift off alike agree all the same."""
 
@@ -86,6 +88,7 @@ def test_an_open_way_ends_the_reference(monkeypatch: pytest.MonkeyPatch) -> None
     assert out.horizon == 0.5
 
 
+@pytest.mark.thorough
 def test_two_engines_agree_on_a_loop_under_a_torque_that_is_a_function() -> None:
     def push(t: float, _q: np.ndarray, v: np.ndarray) -> np.ndarray:
         return np.array([np.sin(5 * t), 0.0, -0.1 * v[2]])
@@ -153,6 +156,7 @@ def test_work_precision_of_a_mechanism() -> None:
     assert any(note.startswith("mujoco and drake: holds loops by its own law") for note in result.facts["notes"])
 
 
+@pytest.mark.thorough
 def test_work_precision_of_driven_mechanisms() -> None:
     steps = [0.02, 0.01, 0.005]
     model = mb.catalog.five_bar()
@@ -171,6 +175,7 @@ def by_double(t: float) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(q, dtype=float), np.asarray(v, dtype=float)
 
 
+@pytest.mark.thorough
 def test_stress_finds_the_step_that_jumps_over_a_change_point() -> None:
     """A fixed step finds other speeds beyond it; error control holds to where doubles end."""
     result = mb.stress(
@@ -185,6 +190,7 @@ def test_stress_finds_the_step_that_jumps_over_a_change_point() -> None:
     assert "held" not in outcome["mujoco", "rk853"]
 
 
+@pytest.mark.thorough
 def test_stress_of_a_stiff_drive_is_measured_by_its_closed_form() -> None:
     result = mb.stress("stiff_drive", ("lagrangian",), ("rk4",), values=[1e2, 1e10], seconds=10.0)
     (row,) = result.cases[0].rows

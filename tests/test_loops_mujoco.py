@@ -50,6 +50,7 @@ def four_bar() -> tuple[Model, np.ndarray, np.ndarray]:
     return model, q, v
 
 
+@pytest.mark.thorough("0-frame", "1-point", "1-frame")
 @pytest.mark.parametrize("kind", ["point", "frame"])
 @pytest.mark.parametrize("seed", range(4))
 def test_accelerations_are_those_of_the_written_law(seed: int, kind: str) -> None:
@@ -75,6 +76,7 @@ def test_accelerations_are_those_of_the_written_law(seed: int, kind: str) -> Non
         assert off(dyn.inverse_dynamics(far, fast, said.acceleration), tau + force) < 1e-9
 
 
+@pytest.mark.thorough
 def test_terms_of_the_law_are_mujoco_s() -> None:
     model, q = closed_tree(1, "frame")
     rng = np.random.default_rng(0)
@@ -103,6 +105,7 @@ def test_stiffer_settings_keep_more_digits_and_never_more_than_the_cap_allows() 
     assert f"{digits[-1]:.1f} digits" in str(dyn.constraint_law(q, v, np.zeros(3)))
 
 
+@pytest.mark.thorough("0-frame", "1-point", "1-frame")
 @pytest.mark.parametrize("kind", ["point", "frame"])
 @pytest.mark.parametrize("seed", range(4))
 def test_rows_of_the_contract_from_mujoco_s_kinematics(seed: int, kind: str) -> None:
@@ -331,6 +334,7 @@ def test_softness_that_an_exact_loop_does_not_have_is_named(tmp_path: Path, attr
     assert mb.load(path).loops == model.loops
 
 
+@pytest.mark.thorough("1-frame")
 @pytest.mark.parametrize("kind", ["point", "frame"])
 @pytest.mark.parametrize("seed", range(2))
 def test_a_loop_survives_mjcf(tmp_path: Path, seed: int, kind: str) -> None:

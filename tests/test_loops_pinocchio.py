@@ -126,6 +126,7 @@ def against_34_digits(model: mb.Model, q: np.ndarray, seed: int, solver: str) ->
     assert (dyn._iterated(q, v, tau) is not None) is (solver == "constraintDynamics")
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("kinds", [*((kind,) for kind in LOOP_KINDS), ("point", "point"), ("point", "distance")])
 def test_a_random_tree_with_loops(kinds):
     seed = list(LOOP_KINDS).index(kinds[0]) + 23 * (len(kinds) - 1)
@@ -136,6 +137,7 @@ def test_a_random_tree_with_loops(kinds):
     against_34_digits(model, q, seed, "constraintDynamics" if {*kinds} <= {"point", "frame"} else "LAPACK")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kinds", [("frame",), ("point", "revolute")])
 def test_stacked_and_mimic_joints_in_loops(kinds):
     # Joints on each other as siblings, with couplings between joints that mimic others.
@@ -161,6 +163,7 @@ def planar(n: int, seed: int) -> tuple[mb.Model, np.ndarray]:
     return chain(*links, gravity=(0, -9.81, 0)).build(), rng.uniform(-1, 1, n)
 
 
+@pytest.mark.thorough("kinds1-6", "kinds2-6")
 @pytest.mark.parametrize(
     ("kinds", "n"), [(("point",), 4), (("frame",), 6), (("point", "point"), 6), (("revolute",), 5)]
 )
@@ -174,6 +177,7 @@ def test_a_mechanism_in_a_plane_has_rows_that_say_nothing(kinds, n):
     against_34_digits(model, q, n, "LAPACK" if "revolute" in kinds else "constraintDynamics")
 
 
+@pytest.mark.thorough("kinds1", "kinds2")
 @pytest.mark.parametrize("kinds", [(), ("point",), ("prismatic",)])
 def test_prescribed_motions(kinds):
     tree = random_tree(5, 7, ("revolute", "prismatic", "ball", "free", "helical"), nearest=2)

@@ -54,6 +54,7 @@ def arm(held: str = 'gravcomp="0.7"', joint: str = "", more: str = "", option: s
       </body></worldbody>{more}</mujoco>"""
 
 
+@pytest.mark.thorough("", '<flag spring="disable"/>')
 @pytest.mark.parametrize("option", ["", '<flag gravity="disable"/>', '<flag spring="disable"/>'])
 def test_gravity_compensation_is_that_of_mujoco(option: str, tmp_path: Path) -> None:
     model, passive = check(written(arm(option=option), tmp_path))
@@ -66,6 +67,7 @@ def test_gravity_compensation_is_that_of_mujoco(option: str, tmp_path: Path) -> 
     assert not model.forces
 
 
+@pytest.mark.thorough("1", "2", "6", "7")
 @pytest.mark.parametrize("seed", range(8))
 def test_gravity_compensation_of_random_files_is_that_of_mujoco(seed: int, tmp_path: Path) -> None:
     numbers = iter(np.random.default_rng(seed).uniform(-1, 2, 100))
@@ -80,6 +82,7 @@ def test_gravity_compensation_of_random_files_is_that_of_mujoco(seed: int, tmp_p
 MOTOR = '<actuator><motor joint="k"/></actuator>'
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(
     ("lifted", "more", "actuators"), [("jk", MOTOR, True), ("k", MOTOR, True), ("jk", MOTOR, False), ("k", "", True)]
 )
@@ -252,6 +255,7 @@ NONLINEAR = """<mujoco model="bent"><option>{option}</option><worldbody>
       <geom size=".1 .2" type="capsule" pos="0 0 .3"/></body></body></body></worldbody></mujoco>"""
 
 
+@pytest.mark.thorough("2 0 3-0 0 1-", '2-1-<flag spring="disable"/>', '2-1-<flag damper="disable"/>')
 @pytest.mark.parametrize(
     ("free", "ball", "option"),
     [
@@ -331,6 +335,7 @@ LEFT_OUT = """<fixed name="sum" stiffness="2 1"><joint joint="j" coef="1"/><join
   <spatial name="no" stiffness="1 1"><site site="o"/><site site="b"/></spatial>"""
 
 
+@pytest.mark.thorough("False")
 @pytest.mark.parametrize("off", [False, True])
 def test_springs_of_tendons_that_rest_between_two_lengths(off: bool, tmp_path: Path) -> None:
     text = RESTING.split("<tendon>")[0] + BANDS

@@ -218,6 +218,7 @@ def test_a_table_is_written_out_in_symbols() -> None:
 # Outside of the table
 
 
+@pytest.mark.thorough
 def test_times_beyond_a_table_are_refused_with_the_joint_and_the_time() -> None:
     model = pendulum(([1.0, 2.0, 3.0], [0.0, 1.0, 0.5]))
     assert model.time == 1.0
@@ -314,6 +315,7 @@ def test_coordinates_that_follow_a_table_are_filled_in_where_it_is_drawn() -> No
     assert np.abs(q[:, 0] - SPLINES["natural"](run.t)).max() < 1e-13
 
 
+@pytest.mark.thorough
 def test_the_command_simulates_from_a_time(tmp_path: Any, monkeypatch: Any) -> None:
     (tmp_path / "late_model.py").write_text(
         "import mbkit as mb\n\n\ndef late():\n    b = mb.ModelBuilder('late')\n"

@@ -40,6 +40,7 @@ def test_there_are_all_of_mujocos() -> None:
     assert [f"mujoco_{name}" for name in INTEGRATORS] == list(NATIVE)
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("case", cases())
 @pytest.mark.parametrize("method", NATIVE)
 def test_observed_order(case: str, method: str) -> None:
@@ -48,6 +49,7 @@ def test_observed_order(case: str, method: str) -> None:
     assert order == pytest.approx(METHODS[method].order, abs=0.2)
 
 
+@pytest.mark.thorough("mujoco_rk4-rk4")
 @pytest.mark.parametrize(("native", "own"), [("mujoco_euler", "semi_implicit_euler"), ("mujoco_rk4", "rk4")])
 def test_a_tumbling_base_runs_as_with_the_own_method(native: str, own: str) -> None:
     """The same model, step and formula in the limit of small steps: q and v, all along, for one state and a batch."""

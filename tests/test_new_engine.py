@@ -69,6 +69,7 @@ def test_it_is_measured_and_drawn(engine):
     result.plot()
 
 
+@pytest.mark.thorough
 def test_it_breaks_like_others_in_a_worker_process(engine):
     result = mb.stress("joint_spring", [engine], ["rk4"], values=[1.0], jobs=1)
     (row,) = result.cases[0].rows
@@ -93,6 +94,7 @@ def test_what_it_cannot_hold_is_refused_by_name(engine):
         mb.dynamics(mb.catalog.double_pendulum(), engine)
 
 
+@pytest.mark.thorough
 def test_the_command_knows_it_by_its_entry_point(monkeypatch):
     point = EntryPoint(INFO.name, "tests.engine_of_ones_own:INFO", registry.ENTRY_POINTS)
     monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == registry.ENTRY_POINTS else [])

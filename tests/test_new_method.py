@@ -36,6 +36,7 @@ def methods() -> Iterator[None]:
 BUILT_IN = frozenset(METHODS)
 
 
+@pytest.mark.thorough
 def test_heun_reaches_its_order_on_every_engine() -> None:
     model = mb.catalog.double_pendulum()
     truth = simulate(mb.dynamics(model), *START, 1.0, "dop853", rtol=1e-12, save=[0.0, 1.0])
@@ -112,6 +113,7 @@ def test_studies_and_the_command_take_it(tmp_path: object) -> None:
     assert "heun" in result.output
 
 
+@pytest.mark.thorough
 def test_it_breaks_like_others_in_a_worker_process() -> None:
     register_method(Method("heun2", "fixed", 2, 2, "", solver="fixed_step:run_fixed", formula_source=lambda: HEUN))
     result = mb.stress("joint_spring", ["pinocchio"], ["heun", "heun2", "trapezoid"], values=[1.0], jobs=1)

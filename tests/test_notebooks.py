@@ -90,6 +90,7 @@ def same(ours: str, theirs: str) -> bool:
     return True
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebook_runs_and_its_outputs_are_current(path: Path, run: Run) -> None:
     notebook = nbformat.read(path, as_version=4)

@@ -14,6 +14,7 @@ from tests.random_trees import random_tree, states
 EPS = np.finfo(float).eps
 
 
+@pytest.mark.thorough("local-0", "local-2", "local-3")
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("axes", ["local", "world", "local_world_aligned"])
 def test_identities_hold_at_regular_poses(seed, axes):

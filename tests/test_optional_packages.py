@@ -54,6 +54,7 @@ assert run.stats.finished
 """
 
 
+@pytest.mark.thorough("llvmlite")
 @pytest.mark.parametrize("packages", OPTIONAL, ids=" ".join)
 def test_everything_else_works_without(packages: tuple[str, ...]) -> None:
     # Files of engines in environments of their own import these.
@@ -62,6 +63,7 @@ def test_everything_else_works_without(packages: tuple[str, ...]) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.thorough("matplotlib", "sympy", "mpmath", "heyoka")
 @pytest.mark.parametrize("package", NEEDED)
 def test_a_missing_package_is_named_with_the_command_that_installs_it(package: str) -> None:
     script = WITHOUT.format(package=package, lines=NEEDED[package])
@@ -69,6 +71,7 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(package: s
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.thorough("matplotlib", "rich")
 @pytest.mark.parametrize("package", ["jinja2", "matplotlib", "rich"])
 def test_the_command_names_a_missing_package(package: str, tmp_path: Path) -> None:
     script = f"import sys; sys.modules[{package!r}] = None; from mbkit.__main__ import main; main()"

@@ -83,6 +83,7 @@ def off(x, y):
     return float(size([newton_euler.mp.mpf(a) - b for a, b in zip(x.flat, y.flat, strict=True)]) / size(y))
 
 
+@pytest.mark.thorough("1-True")
 @pytest.mark.parametrize(("seed", "mimic"), [(0, False), (1, True)])
 def test_newton_and_euler_agree_on_trees_of_every_joint_kind(seed, mimic):
     model = random_tree(seed, 12, mimic=mimic)
@@ -91,12 +92,14 @@ def test_newton_and_euler_agree_on_trees_of_every_joint_kind(seed, mimic):
         assert off(ours, theirs) < 1e-30, term
 
 
+@pytest.mark.thorough("universal", "spherical_zyx", "ball", "planar", "free")
 @pytest.mark.parametrize("kind", [k for k in ALL if k != "fixed"])
 def test_newton_and_euler_agree_on_each_joint_kind_alone(kind):
     for term, ours, theirs in witnessed(random_tree(5, 2, (kind,))):
         assert off(ours, theirs) < 1e-30, term
 
 
+@pytest.mark.thorough("panda-False", "solo12-True", "anymal_b-True")
 @pytest.mark.parametrize(
     ("robot", "floating"), [("panda", False), ("talos_arm", False), ("solo12", True), ("anymal_b", True)]
 )
@@ -105,6 +108,7 @@ def test_newton_and_euler_agree_on_robots(robot, floating):
         assert off(ours, theirs) < 1e-30, term
 
 
+@pytest.mark.thorough("0-False", "0-True", "1-True")
 @pytest.mark.parametrize("mimic", [False, True])
 @pytest.mark.parametrize("seed", range(2))
 def test_newton_and_euler_witness_bodies_and_loads(seed, mimic):
@@ -135,6 +139,7 @@ def test_newton_and_euler_see_an_eps():
     assert 1e-18 < off(given, newton_euler.nle(reading, q, v)) < 1e-14
 
 
+@pytest.mark.thorough("1-coriolis_matrix", "1-inverse_dynamics_derivatives", "1-forward_dynamics_derivatives")
 @pytest.mark.skipif("real128" not in BACKENDS, reason="heyoka is not installed")
 @pytest.mark.parametrize("quantity", CALLS)
 @pytest.mark.parametrize("seed", [1])
@@ -146,6 +151,7 @@ def test_both_backends_agree(quantity, seed):
     assert size(ours - theirs) <= 1000 * EPS_113 * condition * size(ours)
 
 
+@pytest.mark.thorough("mpmath")
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_laws_of_mechanics_hold_to_thirty_digits(backend):
     model = random_tree(1, 10)
@@ -179,6 +185,7 @@ def test_the_laws_of_mechanics_hold_to_thirty_digits(backend):
 TERMS = ("mass_matrix", "coriolis_matrix", "gravity", "nle")
 
 
+@pytest.mark.thorough("coriolis_matrix", "inverse_dynamics_derivatives", "forward_dynamics_derivatives")
 @pytest.mark.parametrize("quantity", CALLS)
 def test_methods_give_the_rounded_value_and_pairs_the_rest(quantity):
     model = random_tree(2, 6)

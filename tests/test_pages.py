@@ -55,6 +55,7 @@ SENTENCES = {
 }
 
 
+@pytest.mark.thorough("check", "differing", "bench")
 @pytest.mark.parametrize("kind", SENTENCES)
 def test_a_page_begins_with_one_sentence_of_what_was_compared_on_how_many_states(kind: str) -> None:
     verdict = re.findall(r'<p class="verdict[^>]*>(.*?)</p>', PAGES[kind]())
@@ -73,6 +74,7 @@ def test_a_long_list_of_what_is_missing_is_a_number_in_the_sentence() -> None:
     assert "; error against run time: 9 curves left out; " in compare_view.view(whole).sentence
 
 
+@pytest.mark.thorough("hostile")
 @pytest.mark.parametrize("kind", PAGES)
 def test_only_the_pages_own_script_may_run(kind: str) -> None:
     page = PAGES[kind]()
@@ -82,6 +84,7 @@ def test_only_the_pages_own_script_may_run(kind: str) -> None:
     assert not re.search(r"https?://|import|fetch|eval|innerHTML", script)
 
 
+@pytest.mark.thorough("hostile")
 @pytest.mark.parametrize("kind", PAGES)
 def test_no_page_shows_a_value_as_python_writes_it(kind: str) -> None:
     text = examples.Tags(re.sub(r"<(style|script)>.*?</\1>", "", PAGES[kind](), flags=re.DOTALL)).text

@@ -122,6 +122,7 @@ def open_machine():
 # The lagrangian engine: parameters are arguments of what was derived once
 
 
+@pytest.mark.thorough("0", "2")
 @pytest.mark.parametrize("seed", range(3))
 def test_every_quantity_is_that_of_the_plain_model(open_machine, seed):
     model, dyn = open_machine
@@ -535,6 +536,7 @@ def test_parameters_have_finite_values(value):
 # The model's numbers as symbols
 
 
+@pytest.mark.thorough("panda", "tree")
 @pytest.mark.parametrize(
     "build",
     [

@@ -41,6 +41,7 @@ def loops(result: ParserComparison) -> dict[str, Stage]:
     return {p.engine: next(s for s in p.stages if s.name == "loops") for p in result.importers}
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize(
     "equalities", [CONNECT, WELD, CONNECT + WELD, '<connect body1="b" body2="tool" anchor="0 0 0"/>']
 )
@@ -84,6 +85,7 @@ def test_an_inactive_loop_that_is_read_as_active(equality: str, tmp_path: Path) 
     assert [x["same"] for x in rows if x["name"] == "loops"] == [False]
 
 
+@pytest.mark.thorough("connect")
 @pytest.mark.parametrize("tag", ["connect", "weld"])
 def test_mujoco_s_sites(tag: str, tmp_path: Path) -> None:
     found = loops(compared(tmp_path, "0 .2 .1", TURNED, f'<{tag} site1="g" site2="s"/>'))

@@ -111,6 +111,7 @@ def test_massless_inertia_and_impossible_inertia_as_each_importer_takes_them(tmp
     assert M.get_unit_inertia().get_moments()[0] - 0.01**2 - 0.1**2 == pytest.approx(0.4 * radius**2, rel=1e-12)
 
 
+@pytest.mark.thorough
 def test_real_robots_differ_as_the_table_says() -> None:
     table = json.loads((VALIDATION / "importers.json").read_text(encoding="utf-8"))["robots"]
     result = mb.compare_parsers("bolt", samples=1)
@@ -148,6 +149,7 @@ MJCF = """<mujoco model="arm">
 </mujoco>"""
 
 
+@pytest.mark.thorough
 def test_an_mjcf_through_three_importers(tmp_path: Path) -> None:
     result = mb.compare_parsers(write(tmp_path, MJCF, "arm.xml"))
     pinocchio, mujoco, drake = result.importers
@@ -198,6 +200,7 @@ def acting(case: str) -> str:
       </worldbody>{section}</mujoco>"""
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("case", ACTING)
 def test_the_verdict_on_mujoco_is_that_of_its_own_terms(case: str, tmp_path: Path) -> None:
     path = write(tmp_path, acting(case), "m.xml")
@@ -350,6 +353,7 @@ def test_no_other_file_is_opened_and_what_would_open_one_is_told(tmp_path: Path)
             mb.compare_parsers(write(tmp_path, bad, "bad.xml"))
 
 
+@pytest.mark.thorough
 def test_a_quadruped_and_a_humanoid_with_a_floating_base() -> None:
     # An inertia at the base that no body has: it moves nothing while the base stands, and does when it floats.
     anymal = mb.compare_parsers("anymal", floating_base=True, samples=1)
@@ -476,6 +480,7 @@ def test_what_is_not_installed_refuses_nothing(tmp_path: Path) -> None:
     assert "refuse" not in verdict
 
 
+@pytest.mark.thorough
 def test_mimic_joints_that_an_importer_holds_are_not_called_free(tmp_path):
     """Agreement leaves mimic joints out, and says so; no mark of a fault stands below a tick."""
     result = mb.compare_parsers("panda")

@@ -28,11 +28,13 @@ def assert_as_the_oracle(model, n: int = 4) -> None:
             assert np.abs(x - y).max() < 1000 * factor * EPS * max(1.0, np.abs(y).max())
 
 
+@pytest.mark.thorough("ball", "planar", "free")
 @pytest.mark.parametrize("kind", RIGHT)
 def test_each_joint_type_as_the_oracle(kind):
     assert_as_the_oracle(random_tree(3, 4, (kind,), springs=False, damping=False))
 
 
+@pytest.mark.thorough("1-True")
 @pytest.mark.parametrize(("seed", "mimic"), [(0, False), (1, True)])
 def test_trees_of_all_types_as_the_oracle(seed, mimic):
     model = random_tree(seed, 8, RIGHT, springs=False, damping=False, mimic=mimic)

@@ -88,6 +88,7 @@ def assert_same(got: dict[str, Any], expected: dict[str, Any]) -> None:
             assert np.abs(np.array(x) - y).max() < 1e5 * EPS * size, name
 
 
+@pytest.mark.thorough
 def test_a_seed_has_the_same_state_under_another_kernel() -> None:
     code = "import json; from tests.test_processors import states; print(json.dumps(states(3)))"
     env = {**os.environ, "OPENBLAS_CORETYPE": "Nehalem"}
@@ -163,6 +164,7 @@ def ways(own: Any, paper: Any, q: np.ndarray, v: np.ndarray, method: str, h: flo
 
 
 # The robot on three arms compiles longest; the platform on six legs has as many loops.
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("name", [*(m for m in MECHANISMS if m != "delta_robot"), PAPER, "driven_pendulum"])
 def test_a_method_is_one_formula_under_constraints(name: str) -> None:
     own, paper = mechanism(name, compiled=True), mechanism(name)

@@ -45,6 +45,7 @@ def run(code: str, quantity: str, *arguments: np.ndarray) -> np.ndarray:
     return np.asarray(names[quantity](*arguments))
 
 
+@pytest.mark.thorough(every=5)
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("name", ["ur5", "cart_pole", "tree"])
 def test_the_python_of_a_program_is_the_engine(name, quantity) -> None:

@@ -236,6 +236,7 @@ def violations(state: State) -> list[tuple[str, str]]:
     return out
 
 
+@pytest.mark.thorough("1", "2", "3")
 @pytest.mark.parametrize("chunk", range(CHUNKS))
 def test_the_equations_have_their_structure(chunk):
     found = {}

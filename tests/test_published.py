@@ -125,6 +125,7 @@ def test_free_body_keeps_its_momentum_in_space_and_turns_at_its_own_rate(
     assert spin.period == pytest.approx(period, rel=1e-12)
 
 
+@pytest.mark.thorough("inertia1-com1-w01", "inertia2-com2-w02")
 @pytest.mark.parametrize(
     ("inertia", "com", "w0"),
     [
@@ -177,6 +178,7 @@ def test_scenes_are_ten_and_valid() -> None:
         assert np.isfinite(dynamics(model).forward_dynamics(scene.q0, scene.v0, np.zeros(model.nv))).all()
 
 
+@pytest.mark.thorough("spherical_pendulum", "heavy_top")
 @pytest.mark.parametrize("scene", EXACT, ids=lambda scene: scene.name)
 def test_exact_motions_start_where_their_scenes_do(scene: Scene) -> None:
     assert scene.exact is not None
@@ -195,6 +197,7 @@ def test_exact_motions_start_where_their_scenes_do(scene: Scene) -> None:
 # Simulations
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("way", [TAYLOR, COMPILED, PINOCCHIO, MUJOCO, ORACLE], ids=str)
 @pytest.mark.parametrize("problem", ["pendulum (IFToMM A01)", "heavy top", "spherical pendulum"])
 def test_published_problems_on_every_engine(problem: str, way: Way) -> None:
@@ -205,6 +208,7 @@ def test_published_problems_on_every_engine(problem: str, way: Way) -> None:
 # Where the pole hangs down, a mass matrix holds the cart's millionth as a difference of ones, which costs
 # six digits of sixteen and the score: MuJoCo's comes to 1e-8. Pinocchio's articulated bodies and the own derivation's
 # least constraint add the cart to nothing there.
+@pytest.mark.thorough("dop853 on pinocchio", "taylor on oracle")
 @pytest.mark.parametrize("way", [TAYLOR, PINOCCHIO, ORACLE], ids=str)
 def test_light_cart_pole_scores(way: Way) -> None:
     figures, _ = checks.light_cart_pole(runs(way), every=10)
@@ -213,6 +217,7 @@ def test_light_cart_pole_scores(way: Way) -> None:
 
 # What turns over all along the last of a thousand periods, double holds to 1e-6 only: `validation.published`
 # tells, and shows that 34 digits hold it.
+@pytest.mark.thorough
 @pytest.mark.parametrize("way", [TAYLOR, COMPILED], ids=str)
 def test_dzhanibekov_box_returns_after_a_thousand_periods(way: Way) -> None:
     figures, _ = checks.dzhanibekov_box(runs(way), periods=1000)
@@ -221,6 +226,7 @@ def test_dzhanibekov_box_returns_after_a_thousand_periods(way: Way) -> None:
     assert returned.reached, returned
 
 
+@pytest.mark.thorough
 def test_dzhanibekov_box_with_34_digits() -> None:
     figures, _ = checks.dzhanibekov_box(runs(ORACLE), periods=10)
     assert [f for f in figures if f.error > 4 * EPS] == []

@@ -25,6 +25,7 @@ def off(a, b) -> float:
     return float(np.abs(np.angle(np.exp(1j * (a - b)))).max())
 
 
+@pytest.mark.thorough
 def test_one_coordinate_reaches_the_printed_solution(truth) -> None:
     turn, rate = truth
     end = TOLD["reference_t_0p03"]
@@ -36,6 +37,7 @@ def test_one_coordinate_reaches_the_printed_solution(truth) -> None:
     assert off(iftomm.turns(START), np.array([float(np.arctan2(u[1].f, u[0].f)) for u in axes])) < 1e-15
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("method", "setting", "close"),
     [
@@ -58,6 +60,7 @@ def test_the_squeezer_reaches_it(truth, method, setting, close) -> None:
     assert np.abs(iftomm.turns(run.v[-1]) - rate).max() < close * np.abs(rate).max()
 
 
+@pytest.mark.thorough
 def test_the_stiff_governor_is_that_of_two_coordinates() -> None:
     t = np.array([0.5, 1.0])
     s, angle, known = iftomm.governor_truth(t)

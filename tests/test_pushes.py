@@ -149,6 +149,7 @@ ERRORS = {
 }
 
 
+@pytest.mark.thorough("implicit_midpoint", "gauss4", "gauss6", "rk853", "rodas5")
 @pytest.mark.parametrize("method", [m.name for m in METHODS.values() if not m.engines or "lagrangian" in m.engines])
 def test_every_method_meets_34_digits(exact: Any, method: str) -> None:
     model, reference = exact
@@ -158,6 +159,7 @@ def test_every_method_meets_34_digits(exact: Any, method: str) -> None:
     close(run, reference, ERRORS.get(method, 1e-7))
 
 
+@pytest.mark.thorough("rodas5")
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "rk853", "rodas5", "implicit_midpoint"])
 def test_machine_code_is_the_general_way(method: str, own: Dynamics, start: Any) -> None:
     interpreted = mb.dynamics(own.model, "lagrangian", compile=False)
@@ -251,6 +253,7 @@ def test_a_step_is_a_run_of_one_step(engine: str, method: str, start: Any, own: 
 # Work
 
 
+@pytest.mark.thorough("local_world_aligned", "world")
 @pytest.mark.parametrize("axes", AXES)
 def test_the_work_of_wrenches_is_the_change_of_the_energy(axes: str) -> None:
     # On a body with a free joint, with dampers and springs beside it; of fourth order in the step.

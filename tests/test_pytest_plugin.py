@@ -127,6 +127,7 @@ def test_the_examples_of_the_documentation_record_and_check(project):
         assert len(list((project / "baselines" / f"test_{Path(page).stem}").iterdir())) == count
 
 
+@pytest.mark.thorough
 def test_a_project_records_under_xdist_and_is_told_what_changed(project):
     status, out = run(project, "-n", "1", "--mbkit-regen", "-k", "recorded and arm")
     assert status == 0, out

@@ -198,6 +198,7 @@ def along(A, system, rate):
     return sum((sp.diff(A, q_) * r for q_, r in zip(system.coordinates, rate, strict=True)), sp.diff(A, t))
 
 
+@pytest.mark.thorough("0")
 @pytest.mark.parametrize("seed", range(2))
 def test_quasi_velocities_that_depend_on_time_are_lagranges_equations_by_substitution(curved, seed):
     """Dᵀ times Lagrange's left sides with q̇ = D w + e and its derivative in them."""
@@ -253,6 +254,7 @@ def test_on_a_turning_table_coriolis_and_centrifugal_forces_come_out():
 # Running
 
 
+@pytest.mark.thorough("compiled")
 @pytest.mark.parametrize("compiled", [False, True], ids=["interpreted", "compiled"])
 def test_body_turns_the_same_way_in_all_forms(pair, compiled):
     """From Euler angles, from body rates, and with quaternions: one motion."""
@@ -287,6 +289,7 @@ METHODS = {
 
 
 # The others call the same functions either way.
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize(
     ("method", "compiled"),
     [(x, False) for x in METHODS]
@@ -317,6 +320,7 @@ def test_every_method_knows_that_qdot_is_d_w(pair, method, compiled):
         assert lag.q[-1] == pytest.approx(run.q[-1], abs=1e-10)
 
 
+@pytest.mark.thorough("radau", "gauss6")
 @pytest.mark.parametrize("method", ["rk853", "radau", "gauss6", "rk4"])
 def test_time_damping_and_forces_in_quasi_velocities(curved, method):
     q, v = np.array([0.4, -0.7]), np.array([0.3, 0.6])

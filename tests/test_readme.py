@@ -55,6 +55,7 @@ ARM = """<robot name="arm">
 """
 
 
+@pytest.mark.thorough("check arm.urdf")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_end_well(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -153,6 +153,7 @@ def test_gap_measures_angles() -> None:
 # Where it ends
 
 
+@pytest.mark.thorough
 def test_chaos_cuts_the_horizon(monkeypatch: pytest.MonkeyPatch) -> None:
     """A double pendulum that tumbles forgets a digit every second or so: in double it ends first."""
     model = catalog.double_pendulum()

@@ -40,6 +40,7 @@ def close(a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> bool:
     return bool((np.abs(a - b) <= ROUNDINGS * EPS * scale.max(initial=1e-300)).all())
 
 
+@pytest.mark.thorough("0", "1", "2", "3")
 @pytest.mark.parametrize("seed", range(8))
 def test_torques_are_linear_in_the_parameters(seed: int) -> None:
     model = tree_of(seed, springs=False)
@@ -61,6 +62,7 @@ def names(model: Model) -> tuple[str, ...]:
     return model.regressor_columns(armature=True)
 
 
+@pytest.mark.thorough("2", "4", "6", "7")
 @pytest.mark.parametrize("seed", range(8))
 def test_momenta_and_energies_are_linear_in_the_parameters(seed: int) -> None:
     model = tree_of(seed, springs=False, armature=False)

@@ -122,12 +122,14 @@ def one_of_ones_own(tmp_path, monkeypatch):
         del PACKAGES[name]
 
 
+@pytest.mark.thorough
 def test_an_importer_that_hangs_is_ended_after_its_time(tmp_path, one_of_ones_own) -> None:
     version = one_of_ones_own("hanging", HANGS, "on_hanging")
     (one,) = mb.compare_parsers(write(tmp_path, arm()), [version]).importers
     assert "ended after 2 s" in one.refused
 
 
+@pytest.mark.thorough
 def test_what_put_model_drops_is_named(tmp_path, one_of_ones_own) -> None:
     servo = '<actuator><position name="servo" joint="elbow" kp="3" kv="0.2"/></actuator></mujoco>'
     path = write(tmp_path, MJCF.replace("</mujoco>", servo), "arm.xml")

@@ -437,6 +437,7 @@ PAGES = {
 }
 
 
+@pytest.mark.thorough("check")
 @pytest.mark.parametrize("kind", PAGES)
 def test_a_page_needs_nothing_from_elsewhere(kind):
     page = PAGES[kind]()
@@ -496,6 +497,7 @@ def test_figures_are_the_same_every_time_and_scale():
     assert "var(--bad)" not in figures.digits(AGREEING)
 
 
+@pytest.mark.thorough("result1", "result2")
 @pytest.mark.parametrize("result", [STUDY, NASTY_STUDY, replace(STUDY, curves=STUDY.curves[:1], floor=0.0)])
 def test_the_figure_is_valid_svg_with_every_panel_named(result):
     drawn = work_precision_view.error_against_time(result)
@@ -567,6 +569,7 @@ def test_an_order_that_is_off_is_flagged_and_one_that_was_not_seen_is_not():
     assert line.best is STUDY.curves[0].points[2]
 
 
+@pytest.mark.thorough("names1", "names2")
 @pytest.mark.parametrize(
     "names", [["pinocchio"], ["pinocchio", "lagrangian", "mujoco", "drake"], ["an_engine_with_a_name"] * 5]
 )

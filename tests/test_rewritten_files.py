@@ -36,6 +36,7 @@ def apart(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> float:
     return max(float(np.abs(one[x] - other[x]).max() / np.abs(other[x]).max()) for x in other)
 
 
+@pytest.mark.thorough("mujoco", "drake")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_every_parser_reads_all_ways_alike(engine, tmp_path):
     (first, elements), *rest = arms().items()
@@ -44,6 +45,7 @@ def test_every_parser_reads_all_ways_alike(engine, tmp_path):
         assert apart(terms(engine, name, other, tmp_path), plain) < 1e-13, name
 
 
+@pytest.mark.thorough("mujoco", "drake")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_what_is_not_scaled_is_seen(engine, tmp_path):
     ways = arms()

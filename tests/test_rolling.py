@@ -52,6 +52,7 @@ def states(model: Model, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(q, v), (model.integrate(q, 0.1 * rng.standard_normal(model.nv)), rng.standard_normal(model.nv))]
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("ground", GROUNDS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_engines_agree_on_every_quantity(kind: str, ground: str) -> None:
@@ -75,6 +76,7 @@ def test_engines_agree_on_every_quantity(kind: str, ground: str) -> None:
                 assert error < 1e-12 * max(1.0, np.abs(exact).max(initial=0.0)), (name, engine.engine)
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("ground", GROUNDS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_rows_are_the_velocities_of_points_that_poses_give(kind: str, ground: str) -> None:
@@ -112,6 +114,7 @@ def test_rows_are_the_velocities_of_points_that_poses_give(kind: str, ground: st
         assert abs(height) < 1e-8
 
 
+@pytest.mark.thorough("disc", "sphere")
 @pytest.mark.parametrize("kind", KINDS)
 def test_bias_and_gradient_are_derivatives_along_a_motion(kind: str) -> None:
     model = machine(kind, "plate", 2)
@@ -132,6 +135,7 @@ def test_bias_and_gradient_are_derivatives_along_a_motion(kind: str) -> None:
     assert np.abs(along - gradient @ a).max() < 1e-7
 
 
+@pytest.mark.thorough("rolling_disc", "bicycle")
 @pytest.mark.parametrize("name", ["rolling_disc", "chaplygin_sleigh", "bicycle"])
 def test_forces_do_no_work_and_rows_stay_zero(name: str) -> None:
     model = mb.catalog.get(name)()
@@ -154,6 +158,7 @@ def test_forces_do_no_work_and_rows_stay_zero(name: str) -> None:
     assert (np.abs(a - exact).max(axis=1) < 1e-11 * np.abs(exact).max(axis=1)).all()
 
 
+@pytest.mark.thorough("rk4-options0-1e-08", "gauss4-options1-1e-08", "taylor-options4-1e-11")
 @pytest.mark.parametrize(("method", "options", "drift"), [
     ("rk4", {"dt": 1e-3}, 1e-8),
     ("gauss4", {"dt": 2e-3}, 1e-8),
@@ -211,6 +216,7 @@ def test_sleigh_turns_until_its_mass_leads(values: dict[str, float]) -> None:
 DISCS = [{}, {"radius": 0.3, "mass": 2.0, "axial": 0.18, "across": 0.09, "gravity": 3.7}]
 
 
+@pytest.mark.thorough("0.4--2.0-values1", "-0.3-0.5-values0", "-0.3-0.5-values1")
 @pytest.mark.parametrize("values", DISCS)
 @pytest.mark.parametrize(("lean", "yaw_rate"), [(0.4, -2.0), (1.1, 3.0), (-0.3, 0.5)])
 def test_disc_rolls_on_a_circle_where_its_moments_balance(
@@ -298,6 +304,7 @@ def test_matrices_of_the_paper_are_those_that_it_prints() -> None:
     assert max(off.values()) <= 0.5
 
 
+@pytest.mark.thorough("0", "5")
 @pytest.mark.parametrize("v", [0, 3, 5, 6, 7, 10])
 def test_bicycle_has_the_eigenvalues_of_the_benchmark(v: int) -> None:
     with mp.workdps(50):

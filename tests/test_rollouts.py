@@ -105,6 +105,7 @@ def one_step(model: Model, method: str, q: np.ndarray, v: np.ndarray, tau: np.nd
     return simulate(dynamics(model, "lagrangian", compile=False), q, v, h, method, dt=h, torque=tau, save=[h])
 
 
+@pytest.mark.thorough("0-rk4", "1-rk4", "3-rk4", "4-rk4")
 @pytest.mark.parametrize("method", FIXED)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_step_is_the_stepwise_one_on_random_trees(seed: int, method: str) -> None:
@@ -180,6 +181,7 @@ def test_steps_name_their_methods() -> None:
 # Rollouts
 
 
+@pytest.mark.thorough("floating-rk4", "floating-semi_implicit_euler")
 @pytest.mark.parametrize("method", FIXED)
 @pytest.mark.parametrize("which", ["floating", "planar"])
 def test_rollouts_are_the_stepwise_runs(which: str, method: str, request: pytest.FixtureRequest) -> None:
@@ -217,6 +219,7 @@ def test_torques_of_every_shape_are_held(planar: LagrangianDynamics) -> None:
     assert np.array_equal(run.q, simulate(planar, q, v, 0.04, torque=tau).q[2])
 
 
+@pytest.mark.thorough("1", "3", "save7", "save8", "save9")
 @pytest.mark.parametrize("save", [None, 1, 2, 3, 17, 50, [0.0], [0.0355], [0.0, 0.001, 0.016, 0.0355], [0.016, 0.017]])
 def test_what_is_kept_is_the_same_whatever_else_is(save: Any, floating: LagrangianDynamics) -> None:
     q, v = start(floating, 9)
@@ -410,6 +413,7 @@ def in_a_child(dyn: LagrangianDynamics, q: np.ndarray, v: np.ndarray) -> np.ndar
     return simulate(dyn, q, v, 0.02).q
 
 
+@pytest.mark.thorough("spawn")
 @pytest.mark.parametrize("way", ["fork", "spawn"])
 def test_other_processes_find_the_same(way: str, planar: LagrangianDynamics) -> None:
     if way not in multiprocessing.get_all_start_methods():

@@ -154,6 +154,7 @@ def test_momenta_of_numbered_angles_are_set_below_the_line():
     assert r"\dot{p}_{\theta_{2}}" in free.hamiltonian().equations().latex()
 
 
+@pytest.mark.thorough("spherical pendulum", "driven pivot")
 @pytest.mark.parametrize("case", CASES)
 def test_reduced_motion_is_the_whole_one(case):
     make, q, v = CASES[case]
@@ -206,6 +207,7 @@ def test_keplers_ellipse_closes():
     assert motion.q[:, 0] == pytest.approx(ellipse, abs=1e-11)
 
 
+@pytest.mark.thorough("spherical pendulum", "Kepler")
 @pytest.mark.parametrize("case", ["spherical pendulum", "heavy top", "Kepler"])
 def test_momenta_are_constant_to_rounding(case):
     make, q, v = CASES[case]

@@ -77,6 +77,7 @@ def two_texts(seed, n=4):
     )
 
 
+@pytest.mark.thorough(every=4)
 @drake
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("floating", [False, True])

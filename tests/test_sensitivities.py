@@ -45,6 +45,7 @@ def test_a_pendulum_by_elliptic_functions():
     close(out.parameters[-1, :, 0], np.array([float(by_length), float(rates[1])]), 1e-11)
 
 
+@pytest.mark.thorough("gauss4", "implicit_midpoint")
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4", "implicit_midpoint"])
 def test_they_are_differences_of_runs(arm, method):
     model, torque = arm.model, np.random.default_rng(0).standard_normal((20, 2))

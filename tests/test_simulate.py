@@ -223,6 +223,7 @@ def test_space_round_trip_and_parent_axes() -> None:
 # Order of convergence
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("case", orders.cases())
 @pytest.mark.parametrize("method", FIXED)
 def test_observed_order(case: str, method: str) -> None:
@@ -262,6 +263,7 @@ def kinds() -> Model:
     return chain(*(body | place | link for link in links)).build()
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("name", [*(n for n, f in catalog.systems().items() if not f().constrained), "kinds"])
 def test_rollouts_of_the_catalog_and_of_every_joint_are_mujocos(name: str) -> None:
     model = kinds() if name == "kinds" else catalog.get(name)()
@@ -276,6 +278,7 @@ def test_rollouts_of_every_rotation_and_with_dampers_and_springs_are_mujocos() -
     assert_as_mujoco(damped_arm(), np.array([1.0, -0.5]), np.array([2.0, 1.0]))
 
 
+@pytest.mark.thorough("ur5-options0", "anymal_b-options2")
 @pytest.mark.parametrize(
     ("robot", "options"),
     [("ur5", {}), ("panda", {"mimic": "free"}), ("anymal_b", {"floating_base": True})],
@@ -323,6 +326,7 @@ def test_a_method_that_only_some_engines_have_says_why(engine: str, method: str,
             simulate(dyn, [0.1], [0.0], 1.0, "mujoco_rk4", torque=lambda t, q, v: -v)
 
 
+@pytest.mark.thorough("pinocchio-rk4", "pinocchio-rk853", "mujoco-mujoco_rk4")
 @pytest.mark.parametrize(
     ("engine", "method"),
     [("pinocchio", "rk4"), ("pinocchio", "gauss4"), ("pinocchio", "rk853"), ("mujoco", "mujoco_rk4")],
@@ -438,6 +442,7 @@ def test_save_keeps_the_same_states() -> None:
 # Batches
 
 
+@pytest.mark.thorough("rk4-pinocchio", "rk4-lagrangian", "rk4-mujoco")
 @pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "mujoco"])
 @pytest.mark.parametrize("method", FIXED)
 def test_a_batch_is_its_states_one_by_one(engine: str, method: str) -> None:

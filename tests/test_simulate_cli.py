@@ -74,6 +74,7 @@ def test_json_has_the_cost_and_the_final_state() -> None:
     assert "cart_pole-trajectory.csv" in result.stderr
 
 
+@pytest.mark.thorough("slider_crank-lagrangian", "pendulum-pinocchio")
 @pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(
     ("target", "engine"),
@@ -143,6 +144,7 @@ def test_bad_input_is_one_message_and_exit_2(here: Path, arguments: list[str], t
 # mbkit plot
 
 
+@pytest.mark.thorough
 def test_every_result_becomes_a_figure(here: Path) -> None:
     for name, result in (("check", AGREEING), ("bench", STUDY), ("stress", RESULT)):
         result.to_json(here / f"{name}.json")

@@ -251,6 +251,7 @@ FAILURES += [
 ]
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(("method", "states", "t0", "wrong", "message"), FAILURES)
 def test_a_torque_that_fails_leaves_the_run_up_to_then(
     method: str, states: Any, t0: float, wrong: Any, message: str
@@ -293,6 +294,7 @@ def test_interruption_gets_through(method: str) -> None:
             simulate(dynamics_for(method), states, [0.2], END, method, torque=after(0.03, interrupt), **saved(method))
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("method", ASKING)
 def test_what_a_torque_does_to_its_arguments_does_not_matter(method: str) -> None:
     kept = np.zeros(1)
@@ -317,6 +319,7 @@ def test_what_a_torque_does_to_its_arguments_does_not_matter(method: str) -> Non
 # Same input, same bits
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("method", METHODS)
 def test_same_input_same_bits(method: str) -> None:
     model = catalog.pendulum() if method == "mujoco_discrete" or method.startswith("drake") else catalog.heavy_top()
@@ -331,6 +334,7 @@ def test_same_input_same_bits(method: str) -> None:
 # Divergence
 
 
+@pytest.mark.thorough("auto", "rodas5", "radau", "bdf")
 @pytest.mark.parametrize("method", METHODS)
 def test_a_run_away_keeps_what_it_has_and_says_when(
     method: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
@@ -356,6 +360,7 @@ def test_a_run_away_keeps_what_it_has_and_says_when(
     assert np.isfinite(run.v).all()
 
 
+@pytest.mark.thorough("auto", "rodas5", "radau", "bdf")
 @pytest.mark.parametrize("method", [m for m in ASKING if not METHODS[m].engines])
 def test_a_run_away_is_not_blamed_on_the_torque(method: str) -> None:
     """τ = 3 v |v| grows without bounds in finite time; squared, a stage's velocity overflows."""

@@ -68,6 +68,7 @@ def skip_without(method: str, engine: str) -> None:
         pytest.skip("this engine has no derivatives or expressions")
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
 @pytest.mark.parametrize(("method", "setting", "close"), METHODS)
 def test_rows_of_four_bars_go_on_as_parallelograms(engine, method, setting, close) -> None:
@@ -91,6 +92,7 @@ def _level(n: int, theta: float, rate: float) -> float:
     return low
 
 
+@pytest.mark.thorough("rk853-6", "rodas5-3", "taylor-1")
 @pytest.mark.parametrize(("method", "n"), [("rk853", 1), ("rk853", 6), ("rodas5", 3), ("taylor", 1)])
 def test_tighter_tolerances_are_no_worse(method, n) -> None:
     skip_without(method, "lagrangian")
@@ -110,6 +112,7 @@ def test_tighter_tolerances_are_no_worse(method, n) -> None:
     assert drifts[-1] < 1e-8
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(("method", "setting", "close", "engine"), SOME)
 def test_a_run_starts_in_a_singular_pose_with_a_velocity(method, setting, close, engine) -> None:
     skip_without(method, engine)
@@ -122,6 +125,7 @@ def test_a_run_starts_in_a_singular_pose_with_a_velocity(method, setting, close,
     assert "loop 'pin1' x and loop 'pin2' x" in told
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(("method", "setting", "close"), METHODS)
 def test_the_velocity_says_on_which_branch_a_run_goes_on(method, setting, close) -> None:
     """Where a rod's end lies on the next pivot, coupler and next rod turn about it as one, and the rod stays."""
@@ -155,6 +159,7 @@ def test_a_motion_that_is_not_determined_is_refused_by_name(engine) -> None:
         mb.simulate(dyn, q, v, 0.1, "rk4")
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize(("method", "setting", "close", "engine"), SOME)
 def test_one_of_a_batch_does_not_stop_the_others(method, setting, close, engine) -> None:
     skip_without(method, engine)
@@ -168,6 +173,7 @@ def test_one_of_a_batch_does_not_stop_the_others(method, setting, close, engine)
         assert run.q[k, -1, 0] == pytest.approx(motion(2, [0.5], *start)[0], abs=close)
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("aside", [1e-2, 1e-4, 1e-5, 1e-6, 1e-7, 1e-9, 0.0])
 @pytest.mark.parametrize(("method", "setting"), [("rk4", {"dt": 1e-3}), ("rk853", {"rtol": 1e-10})])
 def test_any_distance_from_the_pose_is_good_enough(aside, method, setting) -> None:
@@ -178,7 +184,7 @@ def test_any_distance_from_the_pose_is_good_enough(aside, method, setting) -> No
 
 
 def test_two_runs_of_a_compiled_batch_are_those_alone() -> None:
-    dyn = row(2)
+    dyn = mb.dynamics(row(2).model, "lagrangian", compile=True)
     starts = [(math.pi - 0.3, 0.0), (-0.5, -4.0), (math.pi - 0.2, 0.1)]
     q, v = (np.array(x) for x in zip(*(parallel(dyn, *start) for start in starts), strict=True))
     together, _ = simulated(dyn, q, v, 0.5, "rk4", dt=1e-3)
@@ -187,6 +193,7 @@ def test_two_runs_of_a_compiled_batch_are_those_alone() -> None:
         assert np.abs(together.q[k] - alone.q).max() < 1e-12
 
 
+@pytest.mark.thorough("rodas5")
 @pytest.mark.parametrize("method", ["rk853", "rodas5"])
 def test_only_steps_near_the_pose_leave_machine_code(method, monkeypatch) -> None:
     from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
@@ -274,6 +281,7 @@ def test_forces_of_a_massless_rod_go_along_it(crank_mass, rod_mass, theta) -> No
     assert dyn.constraint_forces(q, v, tau) == pytest.approx([-x, -x * math.tan(rod)], rel=1e-11)
 
 
+@pytest.mark.thorough("rk4-setting0-1e-09", "rodas5-setting3-1e-07", "radau-setting5-1e-06", "taylor-setting6-1e-11")
 @pytest.mark.parametrize(("method", "setting", "close"), [m for m in METHODS if m[0] != "semi_implicit_euler"])
 def test_runs_with_massless_links_have_the_work_of_their_torque(method, setting, close) -> None:
     skip_without(method, "lagrangian")
@@ -295,6 +303,7 @@ def test_runs_with_massless_links_have_the_work_of_their_torque(method, setting,
     assert theta > 1.0
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(
     ("method", "setting"),
     [
@@ -319,6 +328,7 @@ def test_a_batch_tells_how_many_passed_a_pose_and_when_the_first_did(method, set
     assert text.endswith(one.partition("passed")[2])
 
 
+@pytest.mark.thorough("1e-12-2", "1e-15-1", "1e-15-2")
 @pytest.mark.parametrize("n", [1, 2])
 @pytest.mark.parametrize("rtol", [1e-12, 1e-15])
 def test_a_series_of_any_tolerance_passes_the_poses_of_parallel_four_bars(n, rtol) -> None:

@@ -147,6 +147,7 @@ def test_exact_friction_is_no_motion_of_own_integrators() -> None:
 # Studies
 
 
+@pytest.mark.thorough("True")
 @pytest.mark.filterwarnings("ignore::mbkit.errors.MbkitWarning")
 @pytest.mark.parametrize("floating", [False, True])
 def test_a_comparison_judges_friction_at_speed_at_rest_and_by_the_soft_law(floating: bool) -> None:
@@ -159,6 +160,7 @@ def test_a_comparison_judges_friction_at_speed_at_rest_and_by_the_soft_law(float
     assert result.softness["mujoco"] < 3
 
 
+@pytest.mark.thorough("slider_crank")
 @pytest.mark.filterwarnings("ignore::mbkit.errors.MbkitWarning")
 @pytest.mark.parametrize("name", ["slider_crank", "double_pendulum"])
 def test_a_comparison_says_where_exact_friction_stands_in(name: str) -> None:
@@ -169,6 +171,7 @@ def test_a_comparison_says_where_exact_friction_stands_in(name: str) -> None:
     assert "not compared: dry friction as mujoco holds it" in result.verdict
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore::mbkit.errors.MbkitWarning")
 def test_rollouts_and_run_times_of_a_robot_with_friction() -> None:
     model = rubbing(mb.catalog.double_pendulum())
@@ -200,6 +203,7 @@ def test_loads_of_a_mechanism_with_friction_at_rest_are_refused() -> None:
 # Identification
 
 
+@pytest.mark.thorough
 def test_coulomb_friction_is_found_across_reversals_under_noise() -> None:
     """With rows near rest, where joints stick and noise has the sign, dry friction was off by a third and more."""
     bare = mb.catalog.double_pendulum()

@@ -33,6 +33,7 @@ TREES = {
 TREES = {name: make for name, make in TREES.items() if make is not None}
 
 
+@pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("in_pieces", [False, True])
 @pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler"])
 @pytest.mark.parametrize("name", TREES)

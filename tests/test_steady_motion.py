@@ -60,6 +60,7 @@ def test_axes_that_turn_change_nothing() -> None:
     assert steady.rates["phi"] == pytest.approx(1.0, rel=1e-12)
 
 
+@pytest.mark.thorough("momentum-1000.0", "rate-1000.0")
 @pytest.mark.parametrize("start", [3.0, 10.0, 1e3])
 @pytest.mark.parametrize("given", [{"momenta": {"p_phi": 1.0}}, {"rates": {"phi": 1.0}}], ids=["momentum", "rate"])
 def test_an_orbit_is_found_from_far_out(start, given) -> None:

@@ -71,6 +71,7 @@ def assert_simulated(dyn: Dynamics, method: str, *, rounding: bool = False, seed
     )
 
 
+@pytest.mark.thorough("1-rk4", "2-rk4", "2-semi_implicit_euler", "3-rk4")
 @pytest.mark.parametrize("method", FIXED)
 @pytest.mark.parametrize("seed", range(4))
 def test_a_step_has_the_bits_of_simulate_on_random_trees(seed: int, method: str) -> None:
@@ -83,6 +84,7 @@ def test_with_a_free_joint_it_is_simulate_to_rounding(method: str) -> None:
     assert_simulated(own(tumbling()), method, rounding=True)
 
 
+@pytest.mark.thorough("kinds1")
 @pytest.mark.parametrize("kinds", [SAME_VELOCITY[:3], ("free", "ball", "revolute")])
 def test_a_step_in_parts_too(kinds: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
@@ -91,6 +93,7 @@ def test_a_step_in_parts_too(kinds: tuple[str, ...], monkeypatch: pytest.MonkeyP
     assert len(dyn.step_plan("rk4").parts) > 1
 
 
+@pytest.mark.thorough("rk4-lagrangian", "rk4-oracle")
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco", "oracle"])
 @pytest.mark.parametrize("method", FIXED)
 def test_stage_by_stage_it_has_the_bits_of_simulate_on_any_engine(engine: str, method: str) -> None:
@@ -106,6 +109,7 @@ def test_engines_agree() -> None:
     assert_equal(a, b, rounding=True)
 
 
+@pytest.mark.thorough("panda")
 @pytest.mark.parametrize("name", ["panda", "ur5"])
 def test_robots_with_and_without_a_mimic_joint(name: str) -> None:
     assert_simulated(own(mb.load(name)), "rk4")
@@ -231,6 +235,7 @@ def ready(request: Any) -> Dynamics:
     return dyn
 
 
+@pytest.mark.thorough("compiled-0.0-dt: expected a number above 0")
 @pytest.mark.parametrize(
     ("dt", "text"),
     [

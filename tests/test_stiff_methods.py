@@ -81,6 +81,7 @@ def close(J: np.ndarray, numeric: np.ndarray, good: float) -> None:
     assert np.linalg.norm(J - numeric) <= good * np.linalg.norm(numeric)
 
 
+@pytest.mark.thorough("0-pinocchio", "0-mujoco", "1-lagrangian", "1-mujoco")
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_jacobian_is_that_of_the_rates(seed: int, engine: str) -> None:
@@ -130,6 +131,7 @@ def test_where_there_is_no_jacobian_the_last_one_stays() -> None:
 # Accuracy
 
 
+@pytest.mark.thorough("radau", "bdf")
 @pytest.mark.parametrize("method", STIFF)
 def test_tolerance_rules_the_error(method: str) -> None:
     dyn = dynamics(catalog.pendulum(), "lagrangian")
@@ -155,6 +157,7 @@ def every_kind() -> tuple[Any, ...]:
     return model, given, save, simulate(*given, "dop853", rtol=1e-12, save=save)
 
 
+@pytest.mark.thorough("radau")
 @pytest.mark.parametrize("method", STIFF)
 def test_every_joint_kind_moves_as_with_dop853(method: str, every_kind: tuple[Any, ...]) -> None:
     model, given, save, truth = every_kind
@@ -176,6 +179,7 @@ def test_scipys_run_on_every_engine(engine: str, method: str) -> None:
     assert len(run.t) == run.stats.steps + 1
 
 
+@pytest.mark.thorough("radau")
 @pytest.mark.parametrize("method", SCIPY)
 def test_a_dense_grid_costs_little_and_loses_nothing(method: str) -> None:
     """Saved times between the steps: interpolated, or ended on without starting over."""
@@ -195,6 +199,7 @@ def test_a_dense_grid_costs_little_and_loses_nothing(method: str) -> None:
 # Stiffness, counted in evaluations
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("scene", [elastic_pendulum, bent_pendulum])
 @pytest.mark.parametrize(("stiffness", "damping"), [(1e6, 1e4), (1e9, 1e6)])
 def test_stiff_scenes_are_reached_with_few_evaluations(scene: Any, stiffness: float, damping: float) -> None:
@@ -211,6 +216,7 @@ def test_stiff_scenes_are_reached_with_few_evaluations(scene: Any, stiffness: fl
         assert 0 < run.stats.jacobians < 100, method
 
 
+@pytest.mark.thorough
 def test_an_explicit_method_needs_far_more() -> None:
     model = elastic_pendulum(1e6, 1e4)
     dyn = dynamics(model, "lagrangian")
@@ -240,6 +246,7 @@ def test_a_stiff_linear_oscillator_follows_its_closed_form() -> None:
 # Torques, batches, parameters
 
 
+@pytest.mark.thorough("radau", "bdf")
 @pytest.mark.parametrize("method", STIFF)
 def test_held_torques_start_the_method_anew(method: str) -> None:
     model = catalog.double_pendulum()
@@ -261,6 +268,7 @@ def test_held_torques_start_the_method_anew(method: str) -> None:
     assert constant.q == pytest.approx(same.q, abs=1e-7)
 
 
+@pytest.mark.thorough("radau", "bdf")
 @pytest.mark.parametrize("method", STIFF)
 def test_parameters_of_each_of_a_batch(method: str) -> None:
     dyn = dynamics(catalog.pendulum(length=mb.Parameter("l", 1.0)), "lagrangian")
@@ -334,6 +342,7 @@ def pushed(t: float) -> float:
     return 1.0 / (0.7 - t) ** 2
 
 
+@pytest.mark.thorough("dop853", "radau")
 @pytest.mark.parametrize("method", SCIPY)
 def test_a_step_below_rounding_is_told(method: str) -> None:
     dyn = dynamics(catalog.pendulum())
@@ -345,6 +354,7 @@ def test_a_step_below_rounding_is_told(method: str) -> None:
     assert np.array_equal(run.t, save[:7])
 
 
+@pytest.mark.thorough("states0-radau", "states1-radau", "states1-bdf")
 @pytest.mark.parametrize("method", SCIPY)
 @pytest.mark.parametrize("states", [[0.1], [[0.1], [0.2], [0.3]]])
 def test_a_torque_that_fails_leaves_the_run_up_to_then(method: str, states: Any) -> None:

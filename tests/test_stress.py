@@ -367,6 +367,7 @@ def test_ctrl_c_keeps_what_was_finished(tmp_path):
     assert ("interrupted" in result.to_markdown()) is not result.complete
 
 
+@pytest.mark.thorough
 def test_a_case_of_a_script_is_found_there(tmp_path):
     script = tmp_path / "mine.py"
     script.write_text(

@@ -70,6 +70,7 @@ def test_a_case_is_told_and_sent_to_other_processes(case: Case) -> None:
     assert pickle.loads(pickle.dumps(case)).facts() == case.facts()
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("case", ALL, ids=ids)
 def test_every_value_makes_a_problem(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
     # Making a problem integrates nothing.
@@ -91,6 +92,7 @@ def test_every_value_makes_a_problem(case: Case, monkeypatch: pytest.MonkeyPatch
             assert times_of(problem, case.measure)[-1] == pytest.approx(problem.duration)
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("case", MOTIONS, ids=ids)
 def test_the_mildest_motion_is_the_models_own(case: Case) -> None:
     problem = problem_of(case, case.values[0])

@@ -46,6 +46,7 @@ def torque_on(model: Model) -> np.ndarray:
     return np.linspace(-1.0, 1.0, model.nv) if model.name.startswith("tree") else np.zeros(model.nv)
 
 
+@pytest.mark.thorough("Dzhanibekov box", "random tree")
 @pytest.mark.parametrize("case", cases())
 def test_observed_order_is_two(case: str) -> None:
     model, q, v, duration = cases()[case]
@@ -126,6 +127,7 @@ def root(residual: ca.Function, guess: np.ndarray, p0: np.ndarray, nv: int) -> n
     return w
 
 
+@pytest.mark.thorough("random tree")
 @pytest.mark.parametrize("case", cases())
 def test_a_step_is_symplectic(case: str) -> None:
     """Jᵀ Ω J = Ω to rounding, on plain coordinates and on rotations; springs are in, damping is not symplectic."""
@@ -165,6 +167,7 @@ def test_momentum_about_the_vertical_of_a_heavy_top_is_kept_to_rounding() -> Non
     assert np.abs(L[:, 0] - L[0, 0]).max() > 1e-3 * np.linalg.norm(L[0])
 
 
+@pytest.mark.thorough("linear0")
 @pytest.mark.parametrize("linear", [(0.0, 0.0, 0.0), (1.0, 2.0, 3.0)])
 def test_momenta_of_a_free_box_are_kept_to_rounding(linear: tuple[float, ...]) -> None:
     box = catalog.free_body()
@@ -180,6 +183,7 @@ def test_momenta_of_a_free_box_are_kept_to_rounding(linear: tuple[float, ...]) -
     assert np.abs(L - L[0]).max() <= 32 * EPS * np.linalg.norm(L[0]) + flown
 
 
+@pytest.mark.thorough("double pendulum", "Dzhanibekov box")
 @pytest.mark.parametrize("case", ["double pendulum", "heavy top", "Dzhanibekov box"])
 def test_energy_does_not_drift(case: str) -> None:
     model, q, v, duration = cases()[case]
@@ -215,6 +219,7 @@ def test_damping_takes_energy() -> None:
 # One state, a batch, machine code, torques
 
 
+@pytest.mark.thorough("random tree")
 @pytest.mark.parametrize("case", cases())
 def test_every_way_to_run_gives_the_same(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model, q, v, duration = cases()[case]

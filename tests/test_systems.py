@@ -26,6 +26,7 @@ def off(x, y, scale=0.0):
     return float(np.linalg.norm(np.asarray(x) - y) / max(np.linalg.norm(y), scale, 1e-300))
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
 @pytest.mark.parametrize("name", [name for name in TWINS if not name.startswith("weightless")])
 def test_paper_is_the_model_in_every_engine(name, engine):
@@ -137,6 +138,7 @@ def test_friction_and_drag():
     assert body.forward_dynamics([0.0], [1.0], [0.0]) == pytest.approx([-9.81 - 0.25], rel=1e-14)
 
 
+@pytest.mark.thorough("acrobot", "rigid_slider_crank", "heavy_top", "rigid_body")
 @pytest.mark.parametrize("name", systems.names())
 def test_every_system_reads_and_says_where_it_is_from(name):
     function = systems.get(name)

@@ -110,6 +110,7 @@ def test_energy_is_kept_to_rounding(double: Any) -> None:
     assert np.abs(energy - energy[0]).max() < 200 * EPS * np.abs(energy).max()
 
 
+@pytest.mark.thorough("1-kinds0", "4-kinds1")
 @pytest.mark.parametrize(("seed", "kinds"), [(1, ("ball",)), (4, ("free",)), (5, ("helical", "prismatic"))])
 def test_a_tree_with_springs_and_dampers_moves_as_with_dop853(seed: int, kinds: tuple[str, ...]) -> None:
     """Rotations, quasi-velocities, passive forces and a torque, on two engines."""

@@ -131,6 +131,7 @@ def test_a_held_torque_does_tau_times_distance() -> None:
     assert swing(torque=same, save=5).work()[-1] == pytest.approx(swing(torque=same).work()[-1], abs=1e-14)
 
 
+@pytest.mark.thorough("True")
 @pytest.mark.parametrize("held", [False, True])
 def test_power_balance_shrinks_with_the_distance_of_the_states(held: bool) -> None:
     """Quaternions, dampers of both sorts, springs, and a force; the runs are exact to 1e-12."""
@@ -164,6 +165,7 @@ def test_the_quadrature_is_exact_for_cubics() -> None:
 # Momenta
 
 
+@pytest.mark.thorough("1", "2", "3")
 @pytest.mark.parametrize("seed", range(4))
 def test_momentum_of_what_floats_is_kept(seed: int) -> None:
     model = free_tree(seed)
@@ -366,12 +368,14 @@ def test_plot_says_what_it_cannot_draw() -> None:
     assert "save=None" in run.plot().axes[-1].texts[0].get_text().replace("\n", " ")
 
 
+@pytest.mark.thorough("8", "13")
 @pytest.mark.parametrize("count", [1, 2, 5, 8, 13])
 def test_a_picture_has_as_many_figures_as_asked(count: int) -> None:
     assert len(times(swing().picture(count))) == count
     assert len(times(swing(method="dop853", rtol=1e-3).picture(count))) == count, "also between the states"
 
 
+@pytest.mark.thorough
 def test_pictures_of_everything(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     models = [

@@ -93,6 +93,7 @@ def run(lag: Lagrangian, q, v, duration: float, **options):
 # Closed forms
 
 
+@pytest.mark.thorough("rodas5")
 @pytest.mark.parametrize("method", ["rk853", "rodas5", "dop853"])
 def test_the_sleigh_follows_its_closed_form(method) -> None:
     lag, q = sleigh(), np.array([0.1, 0.2, 0.3])
@@ -186,6 +187,7 @@ def made(seed: int, moving: bool) -> Lagrangian:
     )
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("moving", [False, True])
@@ -295,6 +297,7 @@ def test_a_row_that_only_the_first_brackets_keep_is_not_integrable() -> None:
     assert (told.growth, told.integrals, told.integrable) == ((2, 3, 4), 0, (False, False))
 
 
+@pytest.mark.thorough
 def test_many_rows_of_the_last_of_many_coordinates_are_solved() -> None:
     # The first 200 choices of five columns of twelve hold the first, which is zero.
     q, v = sp.symbols("q1:13"), sp.symbols("qdot1:13")
@@ -320,6 +323,7 @@ def test_a_knife_edge_on_a_slope_rests_across_it() -> None:
     assert abs(rest.multipliers[0]) == pytest.approx(0.7 * 9.81 * np.sin(0.4), rel=CLOSE)
 
 
+@pytest.mark.thorough
 def test_engines_are_compared_on_a_sleigh() -> None:
     assert mb.compare(sleigh().model, samples=4).digits > 14
 
@@ -445,6 +449,7 @@ def sphere() -> mb.Model:
     return b.build()
 
 
+@pytest.mark.thorough("rolling_disc", "sphere")
 @pytest.mark.parametrize("make", [mb.catalog.rolling_disc, mb.catalog.chaplygin_sleigh, sphere])
 def test_what_rolls_in_a_description_rolls_on_paper(make) -> None:
     model = make()
@@ -459,6 +464,7 @@ def test_what_rolls_in_a_description_rolls_on_paper(make) -> None:
     assert len(lag.velocity_constraints) == len(own.velocity_constraint_names)
 
 
+@pytest.mark.thorough("slider_crank-appell", "slider_crank-boltzmann_hamel")
 @pytest.mark.parametrize(
     ("make", "way"),
     [(mb.catalog.rolling_disc, "maggi"), (mb.catalog.slider_crank, "appell"), (mb.catalog.slider_crank, WAYS[1])],

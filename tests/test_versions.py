@@ -153,6 +153,7 @@ def test_times_are_ratios_to_the_last_version():
     assert result.row("double_pendulum", "1.1", "M").time_ratio == 1.0
 
 
+@pytest.mark.thorough
 def test_as_many_environments_stay_as_are_to_be_kept(tmp_path, monkeypatch, capsys):
     place = 'for last; do :; done; mkdir -p "$last/bin"'
     fake = f'{place}; cp "{tmp_path / "python"}" "$last/bin/python"'
@@ -172,6 +173,7 @@ def test_as_many_environments_stay_as_are_to_be_kept(tmp_path, monkeypatch, caps
     assert [v for v in (*names, "1.6") if environment.exists("mujoco", v)] == left
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "executor",
     [partial(ThreadPoolExecutor, 2), partial(ProcessPoolExecutor, 1, get_context("spawn"))],

@@ -111,6 +111,7 @@ def test_bad_particles_and_forces(make, message):
 # Rest
 
 
+@pytest.mark.thorough("mujoco", "oracle")
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco", "oracle"])
 def test_pendulum_hangs_stably_and_stands_unstably(engine):
     dyn = mb.dynamics(mb.catalog.pendulum(), engine)

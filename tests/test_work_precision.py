@@ -74,6 +74,7 @@ def few():
 # What a study shows
 
 
+@pytest.mark.thorough("lagrangian", "mujoco")
 @pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "mujoco"])
 def test_every_fixed_step_method_shows_its_order(engine):
     methods = [m for m in FIXED if not METHODS[m].engines or engine in METHODS[m].engines]
@@ -137,6 +138,7 @@ def test_the_grids_of_our_own_end_where_finer_ones_bring_nothing():
     assert not result.shortened
 
 
+@pytest.mark.thorough
 def test_a_grid_ends_where_an_engines_own_law_keeps_the_error():
     result = work_precision(mb.catalog.four_bar(), ["mujoco"], ["dop853"], repeats=1)
     (curve,) = result.curves
@@ -163,6 +165,7 @@ def test_coarse_tolerances_that_bind_no_step_do_not_end_a_grid():
         assert (a.steps, a.evaluations) != (b.steps, b.evaluations)
 
 
+@pytest.mark.thorough
 def test_a_slow_machine_measures_the_same_points(monkeypatch):
     def few_runs():
         return study(("pinocchio", "mujoco"), ("rk4", "rk853", "mujoco_rk4"), steps=None, tolerances=None, work=4000)
@@ -221,6 +224,7 @@ def test_what_is_compiled_once_is_no_run_time_and_is_compiled_again_each_time(mo
     assert len(in_runs) >= 4
 
 
+@pytest.mark.thorough("gauss4")
 @pytest.mark.parametrize("method", ["rk853", "dop853", "gauss4"])
 def test_nothing_that_is_kept_shortens_a_first_run(method, compiled):
     model = mb.catalog.double_pendulum()
@@ -481,6 +485,7 @@ def spawning(workers):
     return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
 
+@pytest.mark.thorough("processes")
 @pytest.mark.parametrize("make", [lambda: ThreadPoolExecutor(2), lambda: spawning(2)], ids=["threads", "processes"])
 def test_executors_find_the_same_errors(make, few):
     with make() as executor:
@@ -491,6 +496,7 @@ def test_executors_find_the_same_errors(make, few):
     assert "share the cores" in result.settings["timing"]
 
 
+@pytest.mark.thorough
 def test_dasks_executor_finds_the_same_errors(few, tmp_path):
     distributed = pytest.importorskip("distributed")
     import dask
@@ -513,6 +519,7 @@ def die_elsewhere(_t, _q, _v):
     return [0.0]
 
 
+@pytest.mark.thorough
 def test_threads_leave_warnings_and_caches_as_they_were():
     filters = list(warnings.filters)
     with ThreadPoolExecutor(4) as pool:

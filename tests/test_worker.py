@@ -83,6 +83,7 @@ def test_a_crash_is_named_and_the_next_call_has_a_new_process(worker):
     assert worker.call(os.getpid) != first
 
 
+@pytest.mark.thorough("hang")
 @pytest.mark.parametrize("function", [hang, wait_for_ever])
 def test_what_computes_too_long_or_not_at_all_is_ended(worker, function):
     with pytest.raises(WorkerTimeoutError, match="stopped after"):
@@ -139,6 +140,7 @@ threading.Event().wait()
 _IN_A_LIBRARY = "import re; re.match('(a+)+$', 'a' * 99 + 'b')"
 
 
+@pytest.mark.thorough("-False", "import re; re.match('(a+)+$', 'a' * 99 + 'b')-False")
 @pytest.mark.parametrize(("hang", "own_home"), [("", False), ("while True: pass", True), (_IN_A_LIBRARY, False)])
 def test_a_worker_whose_parent_is_killed_ends_and_removes_its_folder(hang, own_home, tmp_path):
     home = tmp_path / "home"

@@ -99,7 +99,7 @@ def beam(
     Raises
     ------
     InputError
-        Vectors and matrices of other shapes, a rotation that is none.
+        Vectors and matrices of other shapes, a matrix that is no rotation.
 
     References
     ----------

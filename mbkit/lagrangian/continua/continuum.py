@@ -90,8 +90,7 @@ class Continuum(Densities):
     Raises
     ------
     InputError
-        Fields of other arguments, an end that is none, an end's energy of a derivative that the continuum does not pass
-        on.
+        Fields of other arguments, an unknown end, an end's energy of a derivative that the continuum does not pass on.
 
     References
     ----------
