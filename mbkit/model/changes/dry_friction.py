@@ -60,8 +60,9 @@ class DryFrictionLaw:
         sizes = np.abs(self._G.T) if self._G is not None else np.eye(len(self._numbers.bound))
         #: The largest force at rest, (nv,); zero where a joint has no friction.
         self.bound: Array = sizes @ self._numbers.bound
-        #: That of a joint that has just let go, (nv,).
-        self.just_moving: Array = sizes @ self._numbers.at(np.zeros(len(self._numbers.bound)))
+        moving = sizes @ self._numbers.at(np.zeros(len(self._numbers.bound)))
+        #: That of a joint that has just let go, (nv,); its sign tells the side, and so it is zero nowhere else.
+        self.just_moving: Array = np.where(self.bound > 0, np.maximum(moving, np.finfo(float).tiny), 0.0)
 
     def force(self, v: Array) -> Array:
         """Return the force at speed, zero at rest; (nv,) or (N, nv)."""
