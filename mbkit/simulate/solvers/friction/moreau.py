@@ -49,7 +49,8 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
         evaluations += attempts
         if run.error is not None:
             return record.result(lambda i: reasons[i], evaluations, error=run.error)
-        problem.report(i)(problem.end)
+        if problem.grid.steps:
+            problem.report(i)(problem.end)
     return record.result(lambda i: reasons[i], evaluations)
 
 
