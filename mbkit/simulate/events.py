@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
+from typing import Final
 
 import numpy as np
 
@@ -20,6 +22,10 @@ from mbkit.model import Model
 
 #: state(t) -> (q, v) within a step
 State = Callable[[float], tuple[Array, Array]]
+#: Parabolas that are off by less, of a function's values, have its sign.
+_BEND: Final = 1e-4
+#: A time and the value of a function there.
+Sample = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,23 @@ class Event:
         return value
 
 
+@dataclass(frozen=True)
+class Followed(Event):
+    """A fall below zero that is looked for within each step, too: parabolas follow the function from above zero.
+
+    Attributes
+    ----------
+    parts : int
+        Of a step, looked at on their own at least.
+    noise : float
+        What does not count, of the function's values.
+    """
+
+    direction: int = -1
+    parts: int = 1
+    noise: float = 1e-9
+
+
 @dataclass(frozen=True, eq=False)
 class Hit:
     """An event that happened.
@@ -108,9 +131,12 @@ class Watch:
         values = [self._value(event, t1, there) for event in self._events]
         crossings: list[tuple[float, int]] = []
         for k, (event, before, after) in enumerate(zip(self._events, self._values, values, strict=True)):
-            rises, falls = before < 0 <= after, before > 0 >= after
+            ends = (self._t, before), (t1, after)
+            if isinstance(event, Followed):
+                ends = self._first_fall(event, state, *ends)
+            rises, falls = ends[0][1] < 0 <= ends[1][1], ends[0][1] > 0 >= ends[1][1]
             if (rises and event.direction >= 0) or (falls and event.direction <= 0):
-                crossings.append((self._root(event, state, t1, before, after), k))
+                crossings.append((self._root(event, state, *ends), k))
         hits: list[Hit] = []
         for t, k in sorted(crossings):
             hits.append(Hit(self._events[k].name, t, *state(t), self._member))
@@ -126,20 +152,43 @@ class Watch:
             error.member = self._member
             raise
 
-    def _root(self, event: Event, state: State, t1: float, before: float, after: float) -> float:
-        if after == 0.0:
-            return t1
+    def _first_fall(self, event: Followed, state: State, first: Sample, last: Sample) -> tuple[Sample, Sample]:
+        """Return the ends of the first part of a step in which the function falls below zero, or those of the step."""
+        times = np.linspace(first[0], last[0], 4 * event.parts + 1).tolist()
+        all_of_it = [first, *((t, self._value(event, t, state(t))) for t in times[1:-1]), last]
+        size = max(abs(x) for _, x in all_of_it)
+        parts, above = [all_of_it[i : i + 5] for i in range(4 * event.parts - 4, -1, -4)], first
+        while parts:
+            part = parts.pop()
+            x = [value for _, value in part]
+            # What the parabola through the ends and the middle leaves of the two samples in between.
+            bend = max(abs(3 * a + 6 * x[2] - b - 8 * c) / 8 for a, b, c in ((x[0], x[4], x[1]), (x[4], x[0], x[3])))
+            room = part[4][0] - part[0][0] > 1e-9 * (last[0] - first[0])
+            if room and bend > max(min(x) / 2, _BEND * size):
+                middles = [(a[0] + b[0]) / 2 for a, b in pairwise(part)]
+                finer = sorted([*part, *((t, self._value(event, t, state(t))) for t in middles)])
+                parts += [finer[4:], finer[:5]]
+                continue
+            for sample in part:
+                if sample[1] < -event.noise * size:
+                    return above, sample
+                above = sample if sample[1] > 0 else above
+        return first, last
+
+    def _root(self, event: Event, state: State, first: Sample, last: Sample) -> float:
+        if last[1] == 0.0:
+            return last[0]
         from scipy.optimize import brentq
 
         # An interpolant may round to another sign at the ends.
-        known = {self._t: before, t1: after}
+        known = dict((first, last))
         eps = float(np.finfo(float).eps)
-        xtol = 4 * eps * max(abs(self._t), abs(t1))
+        xtol = 4 * eps * max(abs(first[0]), abs(last[0]))
 
         def value(t: float) -> float:
             return known[t] if t in known else self._value(event, t, state(t))
 
-        return float(brentq(value, self._t, t1, xtol=xtol, rtol=4 * eps))
+        return float(brentq(value, first[0], last[0], xtol=xtol, rtol=4 * eps))
 
 
 def as_events(events: object) -> tuple[Event, ...]:

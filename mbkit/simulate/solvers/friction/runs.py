@@ -18,7 +18,7 @@ from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, NumericalError, UnsupportedError
 from mbkit.methods.registry import method_of
 from mbkit.model.changes.dry_friction import names_of
-from mbkit.simulate.events import Event, Hit
+from mbkit.simulate.events import Followed, Hit
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
 from mbkit.simulate.solvers.friction.phases import Friction, Phase
@@ -132,8 +132,13 @@ class _Member:
         q, v = self.friction.held(phase, self.q, result.q, result.v)
         return replace(result, q=q, v=v)
 
-    def next(self, phase: Phase, k: int, t: float, q: Array, v: Array, *, moved: bool) -> Phase | None:
-        """Go to the end of a phase, and return the next one; None where it cannot be decided."""
+    def next(
+        self, phase: Phase, k: int, t: float, q: Array, v: Array, *, moved: bool, pushed: bool = False
+    ) -> Phase | None:
+        """Go to the end of a phase, and return the next one; None where it cannot be decided.
+
+        `moved` tells that time has passed, `pushed` that it has at least begun to.
+        """
         q, v = self.friction.held(phase, self.q, q, v)
         v, leaving = self.friction.after(phase, t, q, v, self.force(k))
         self._stuck = 0 if moved else self._stuck + 1
@@ -143,7 +148,7 @@ class _Member:
             return None
         self.q, self.v = q, v
         # What let go and came to rest at once did not let go.
-        out = self.begin(k, t, leaving if moved else None)
+        out = self.begin(k, t, leaving if moved or pushed else None)
         self._tell(phase, out, t)
         return out
 
@@ -246,9 +251,14 @@ class _PartOfStep:
     def end(self, length: float) -> float:
         """Return after how many seconds the phase ends, before `length`; 0 where it ends at once."""
         first, noise = _FROM * length, _EPS * (1 + float(np.abs(self._run.v).max()))
-        if self.least(first) <= -noise:
-            return 0.0
         known = {first: noise}
+        if (soon := self.least(first)) <= -noise:
+            run = self._run
+            now = float(run.friction.margins(self._phase, self._t, run.q, run.v, self._force).min())
+            if not now > 0:
+                return 0.0
+            # What rests at its bound to the last bits, and is pulled more and more, lets go in the next instant.
+            known, first, length = {0.0: now, first: soon}, 0.0, first
 
         def least(s: float) -> float:
             return known.get(s) or self.least(s)
@@ -269,7 +279,7 @@ def _across(run: _Member, phase: Phase, k: int) -> Phase | None:
         q, v = rest.state(s) if s else (run.q, run.v)
         done += s
         run.part.steps += 1
-        following = run.next(current, k, start + done, q, v, moved=s > 0)
+        following = run.next(current, k, start + done, q, v, moved=s >= _FROM * (h - done + s), pushed=s > 0)
         if following is None:
             return None
         current = following
@@ -280,6 +290,9 @@ def _adaptive(run: _Member) -> None:
     t, k, rows = problem.start, 0, problem.save
     stops = np.array(problem.stops)
     part.reached = t
+    # Steps of what rests do not feel a force that changes with time.
+    timed = callable(run.force(0)) or problem.dyn.model.time_parameter is not None
+    noise = max(1e-9, problem.tolerances.rtol)
     if rows is None or (len(rows) and rows[0] == t):
         part.keep(np.array([t]), run.q[None], run.v[None])
     phase: Phase | None = run.begin(0, t) if problem.duration else None
@@ -292,7 +305,7 @@ def _adaptive(run: _Member) -> None:
             return max(out, _EPS) if s == begun else out
 
         save = None if rows is None else np.append(rows[(rows > t) & (rows < problem.end)], problem.end)
-        events = (*problem.events, Event(end, _END, -1))
+        events = (*problem.events, Followed(end, _END, parts=2 if timed and own.still.any() else 1, noise=noise))
         result = run.solve(own, k, None, start=t, duration=problem.end - t, save=save, events=events)
         part.count(result)
         part.hits += [replace(x, member=run.member) for x in result.events if x.name != _END]
