@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy.optimize import lsq_linear
+from scipy.optimize import brentq, lsq_linear
 
 import mbkit as mb
 from mbkit.engines.elements.dry_friction import forces_at_rest
@@ -391,6 +391,62 @@ def test_a_block_on_a_belt_sticks_and_slips_with_the_period_of_the_closed_form(m
     assert [e.t for e in run.events] == pytest.approx(exact.tolist(), rel=1e-11)
     places = [e.q[0] + speed * e.t for e in run.events]
     assert places == pytest.approx([s / k, start] * 4, abs=1e-12)
+
+
+@pytest.mark.parametrize("method", ["rk853", "auto", "dop853"])
+@pytest.mark.parametrize("clock", [False, True])
+def test_a_force_that_passes_the_bound_for_a_while_is_not_stepped_over(method: str, clock: bool) -> None:
+    """What rests takes steps of any length: a force over the bound and below again within one moved nothing."""
+    pull, omega, f = 3.5, 5.0, 3.0
+    b = mb.ModelBuilder("block", gravity=np.zeros(3))
+    b.add_body("block", mass=2.0)
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), friction=f)
+    torque = None if clock else lambda t, q, v: [pull * np.sin(omega * t)]  # noqa: ARG005
+    if clock:
+        b.add_joint_force("pull", "x", lambda t, q, v: pull * np.sin(omega * t))  # noqa: ARG005
+    run = mb.simulate(mb.dynamics(b.build(), "lagrangian"), [0.0], [0.0], 3.9, method, torque=torque)
+    begins = np.arcsin(f / pull) / omega + np.pi / omega * np.arange(6)
+
+    def speed(t: float) -> float:
+        return pull / omega * (np.cos(omega * begins[0]) - np.cos(omega * t)) - f * (t - begins[0])
+
+    stops = brentq(speed, begins[0] + 0.1, begins[1]) - begins[0] + begins
+    exact = np.stack([begins, stops], axis=1).ravel()
+    assert [e.name for e in run.events] == ["x lets go", "x stops"] * 6
+    assert [e.t for e in run.events] == pytest.approx(exact.tolist(), rel=1e-9)
+
+
+@pytest.mark.parametrize("method", ["rk853", "auto", "rk4"])
+def test_what_has_friction_at_rest_alone_swings_and_sticks_where_it_turns(method: str) -> None:
+    """Without friction of motion the side of what let go was zero: it came to rest at once, or never again."""
+    more = {"dt": 1e-3} if method == "rk4" else {}
+    swings = mb.dynamics(slider(friction=0.0, stiction=5.0), "lagrangian")
+    run = mb.simulate(swings, [0.2], [0.0], 2.0, method, **more)
+    assert run.q[-1, 0] == pytest.approx(0.2 * np.cos(10.0), rel=1e-8)
+    assert [e.name for e in run.events] == ["x turns"] * 3
+    # Amplitudes fall by exp(-π ζ / √(1 - ζ²)), ζ = 0.1: the third half swing ends below the 0.1 m that 5 N hold.
+    damped = mb.dynamics(slider(friction=0.0, stiction=5.0, damping=2.0), "lagrangian")
+    run = mb.simulate(damped, [0.2], [0.0], 4.0, method, **more)
+    ratio = np.exp(-np.pi * 0.1 / np.sqrt(0.99))
+    assert run.q[-1, 0] == pytest.approx(-0.2 * ratio**3, rel=1e-8)
+    assert run.v[-1, 0] == 0.0
+
+
+@pytest.mark.parametrize("method", ["rk4", "gauss6", "semi_implicit_euler"])
+def test_what_lets_go_at_a_time_of_the_grid_lets_go(method: str) -> None:
+    """At its bound to the bit it was held, and over it in the next instant: the run stopped as undecided."""
+    dyn = mb.dynamics(joint_with("prismatic", axis=(1, 0, 0), friction=3.0, stiction=4.0), "lagrangian")
+    run = mb.simulate(dyn, [0.0], [0.0], 2.0, method, 1e-2, torque=lambda t, q, v: [5 * t])  # noqa: ARG005
+    (event,) = run.events
+    assert (event.name, event.t) == ("hinge lets go", pytest.approx(0.8, rel=1e-12))
+    exact = 5 * (8 - 0.512) / 6 - 3 * (4 - 0.64) / 2 - 1.2 * (5 * 0.32 - 3 * 0.8)
+    assert run.q[-1, 0] == pytest.approx(exact, rel=1e-2 if method == "semi_implicit_euler" else 1e-9)
+
+
+@pytest.mark.parametrize("method", ["rk853", "rk4", "moreau"])
+def test_a_run_of_no_time_is_its_start(method: str) -> None:
+    run = mb.simulate(mb.dynamics(slider(friction=3.0), "lagrangian"), [0.5], [1.0], 0.0, method)
+    assert (run.q.tolist(), run.v.tolist()) == ([[0.5]], [[1.0]])
 
 
 def test_what_lets_go_in_moreau_s_step_has_the_friction_of_motion(monkeypatch: pytest.MonkeyPatch) -> None:
