@@ -104,7 +104,8 @@ class Passage:
 
         U, sizes, Vt = np.linalg.svd(manifold.jacobian(q))
         rank = min(int(np.count_nonzero(sizes > AT_POSE * sizes[0])), len(U) - singular)
-        self._size = float(sizes[0])
+        # Rows that are all zero have no size of their own.
+        self._size = float(sizes[0]) or 1.0
         #: Whether rows depend on each other.
         self.singular = rank < len(U)
         self._lost, self._kept = U[:, rank:], U[:, :rank]
