@@ -11,7 +11,7 @@ import sympy as sp
 from scipy.integrate import solve_ivp
 
 import mbkit as mb
-from mbkit.errors import InputError, UnsupportedError
+from mbkit.errors import DoubtfulRunWarning, InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian import Lagrangian, NonholonomicEquations
 
 EPS = float(np.finfo(float).eps)
@@ -400,6 +400,34 @@ def test_what_velocity_constraints_cannot_have_is_refused() -> None:
         Lagrangian(m * xdot**2, 0, [x], parameters=[m]).maggi()
     with pytest.raises(InputError, match="nearest consistent state"):
         mb.simulate(lag.dynamics(), [0, 0, 0], [0, 1, 0], dt=0.1, duration=1)
+
+
+def central(**rows) -> Lagrangian:
+    T = m * (xdot**2 + ydot**2) / 2 + J * w**2 / 2
+    return Lagrangian(T, 0, [x, y, theta], parameters={m: 1.0, J: 0.5}, **rows)
+
+
+def test_where_quasi_velocities_say_nothing_of_a_velocity_there_are_no_numbers() -> None:
+    lag = central(velocity_constraints=[x * ydot - y * xdot])
+    equations = lag.maggi(["x", "theta"])
+    for q in ([0.0, 1.0, 0.0], [0.0, 0.0, 0.0]):
+        with pytest.raises(NumericalError, match="not finite at q = .* where -x is zero"):
+            equations.field()(0.0, [*q, 1.0, 1.0])
+        with pytest.raises(NumericalError, match="not finite at q = .* where -x is zero"):
+            equations.to_velocity([[1.0, 1.0, 0.0], q], [1.0, 1.0])
+    turned = central().quasi_velocities(sp.diag(1, 1 / x, 1))
+    with pytest.raises(NumericalError, match="not finite at q = "):
+        turned.to_velocity([0.0, 1.0, 0.0], [1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    "rows", [{"velocity_constraints": [x * ydot - y * xdot]}, {"constraints": [(x - y) * (x + y)]}]
+)
+def test_a_run_goes_through_a_pose_where_a_row_is_zero(rows) -> None:
+    lag = central(**rows)
+    with pytest.warns(DoubtfulRunWarning, match="passed a singular pose"):
+        out = run(lag, [0.0, 0.0, 0.0], [1.0, 1.0, 1.0], 0.5, rtol=1e-8, atol=1e-8)
+    assert out.q[-1] == pytest.approx([0.5, 0.5, 0.5], abs=1e-7)
 
 
 def test_a_coordinate_that_a_row_holds_cannot_be_ignored() -> None:

@@ -36,6 +36,7 @@ from mbkit.lagrangian.reduction.nonholonomic import (
     NonholonomicEquations,
     integrability,
     nonholonomic_equations,
+    require_value,
     symmetry_momenta,
 )
 from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
@@ -546,7 +547,7 @@ class QuasiLagrangian(Lagrangian):
         q, x = rows("q", q, n, self.name, "nq"), rows(name, x, n, self.name, "nv")
         numbers = parameter_values(self, values, name) if held else np.zeros(len(self.parameters))
         timed = numbers if self.time is None else np.array([real("t", t), *numbers])
-        A = self._maps[name](q, timed)
+        A = require_value(self._maps[name](q, timed), self.name, q, "1/det D, or det D,")
         return np.asarray(np.einsum("...ij,...j->...i", A[..., :n], x) + A[..., n:].sum(axis=-1))
 
     def to_velocity(self, q: ArrayLike, w: ArrayLike, *, t: float = 0.0, **values: float) -> Array:

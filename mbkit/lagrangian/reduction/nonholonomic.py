@@ -118,7 +118,8 @@ class NonholonomicEquations(EquationsOfMotion):
         name, size = (("w", len(self.velocities)), ("v", len(self.rates)))[which]
         q = rows("q", q, len(self.coordinates), self.system.name, "nq")
         x = rows(name, x, size, self.system.name, f"n{name}")
-        return self._maps[which](q, x, numbers_at(self.system, t, values, name))[..., 0]
+        out = self._maps[which](q, x, numbers_at(self.system, t, values, name))[..., 0]
+        return require_value(out, self.system.name, q, self.determinant)
 
     def to_velocity(self, q: ArrayLike, w: ArrayLike, *, t: float = 0.0, **values: float) -> Array:
         """Return q̇ = N w - E a in numbers, (n,) or (N, n); t in s, and values of parameters by name."""
@@ -142,15 +143,26 @@ class NonholonomicEquations(EquationsOfMotion):
             y = rows("y", y, n + r, s.name, "nq + nw")
             q, w = y[..., :n], y[..., n:]
             behind = np.concatenate([[real("t", t)] if timed else [], numbers])
-            both = self._motion(q, w, behind)
+            both = require_value(self._motion(q, w, behind), s.name, q, self.determinant)
             M, right = both[..., :r], both[..., r] + both[..., r + 1 :] @ force
             try:
                 wdot = np.linalg.solve(M, right[..., None])[..., 0]
             except np.linalg.LinAlgError:
                 raise NumericalError(f"{s.name}: the mass matrix of w is singular at q = {q.tolist()}") from None
-            return np.concatenate([self._maps[0](q, w, behind)[..., 0], wdot], axis=-1)
+            qdot = require_value(self._maps[0](q, w, behind)[..., 0], s.name, q, self.determinant)
+            return np.concatenate([qdot, wdot], axis=-1)
 
         return f
+
+
+def require_value(x: Array, name: str, q: Array, determinant: Any) -> Array:
+    """Return x; refuse numbers that are not finite, as where quasi-velocities say nothing of some velocity."""
+    if not np.isfinite(x).all():
+        raise NumericalError(
+            f"{name}: not finite at q = {q.tolist()}; where {determinant} is zero, the quasi-velocities say nothing of "
+            "some velocity; take others, or a pose beside it"
+        )
+    return x
 
 
 def nonholonomic_equations(system: EnergyForm, quasi_velocities: Any, form: str) -> NonholonomicEquations:
