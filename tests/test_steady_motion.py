@@ -80,6 +80,15 @@ def test_a_sleeping_top_has_no_verdict_in_eulers_angles() -> None:
         mb.steady_motion(top, [0.0, 0.3, 0.0], momenta={"p_phi": 0.05, "p_psi": 0.05})
 
 
+def test_a_rate_that_turns_nothing_is_no_steady_motion() -> None:
+    # Below sqrt(g/l) no cone is steady: the search ends in the pole, where sqrt(g/l + 3 ω²) came out.
+    pendulum = systems.spherical_pendulum()
+    with pytest.raises(NumericalError, match="phi turns nothing at"):
+        mb.steady_motion(pendulum, [1.0], rates={"phi": 1.0})
+    hanging = mb.steady_motion(pendulum, [1.0], momenta={"p_phi": 0.0})
+    assert hanging.frequencies == pytest.approx([np.sqrt(9.81)], rel=1e-9)
+
+
 def test_constraints_hold_at_given_rates() -> None:
     # A bead in the trough z = x², pushed along it: ω² = 2 g across.
     x, y, z, xdot, ydot, zdot, g = sp.symbols("x y z xdot ydot zdot g")

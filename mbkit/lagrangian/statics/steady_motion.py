@@ -26,6 +26,8 @@ from mbkit.lagrangian.system import Lagrangian
 
 #: Condition of the scaled mass matrix of cyclic coordinates; its square times eps is the error of the stiffness.
 _POLE: Final = 1e5
+#: From a place to those beside it, of a coordinate's size.
+_BESIDE: Final = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +136,9 @@ def steady_motion(
     turning = reduced._rates(np.zeros(1), rest.q[None], still, _numbers(reduced, {**values, **numbers}))[0]
     q, v = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     q[kept], v[cyclic] = rest.q, turning
-    _refuse_pole(_at(system, values).mass_matrix(q)[np.ix_(cyclic, cyclic)], reduced, rest.q)
+    if turning.any():
+        beside = np.concatenate([[q], *(q + sign * _BESIDE * np.diag(np.maximum(1.0, abs(q)))[kept] for sign in (1, -1))])
+        _refuse_pole(_at(system, values).mass_matrix(beside)[:, cyclic][:, :, cyclic], reduced, rest.q)
     told = {s.name: float(x) for s, x in zip(reduced.cyclic, turning, strict=True)}
     return SteadyMotion(rest, told, numbers, q, v)
 
@@ -144,8 +148,18 @@ def _at(system: Lagrangian, values: dict[str, float]) -> Dynamics:
     return dyn.at(**values) if values else dyn
 
 
-def _refuse_pole(M: Array, reduced: Routhian[Any], q: Array) -> None:
-    """Refuse a place where cyclic coordinates turn about one axis (NumericalError)."""
+def _refuse_pole(beside: Array, reduced: Routhian[Any], q: Array) -> None:
+    """Refuse a place where cyclic coordinates turn about one axis, or one turns nothing (NumericalError).
+
+    `beside` are the mass matrices of cyclic coordinates there, first, and at places beside it.
+    """
+    M, around = beside[0], np.diagonal(beside, axis1=1, axis2=2).max(axis=0)
+    still = [x.name for x, own, most in zip(reduced.cyclic, np.diag(M), around, strict=True) if own * _POLE**2 < most]
+    if still:
+        raise NumericalError(
+            f"{reduced.system.name}: {', '.join(still)} turns nothing at {np.array2string(q, precision=4)}, where the "
+            "coordinates are singular and a rate says nothing; take other coordinates, or another q0"
+        )
     scale = 1 / np.sqrt(np.diag(M))
     if np.linalg.cond(scale[:, None] * M * scale) > _POLE:
         names = ", ".join(x.name for x in reduced.cyclic)
