@@ -35,6 +35,10 @@ _ROOTED: Final = Polynomial((0.0, 1.0))
 _CLAMPED: Final = 1e-12
 
 
+#: Lengths, m, of which the third power keeps its digits beside 1.
+SHORTEST, LONGEST = 1e-30, 1e30
+
+
 def _unit_rule(points: Any, weights: Any) -> tuple[Array, Array]:
     """Return a rule on [0, 1] of one on [-1, 1]."""
     return (points + 1) / 2, weights / 2
@@ -97,8 +101,10 @@ def modes_of(modes: Any, shapes: Any, *, string: bool) -> Modes:
     if not 0 < len(given) <= _MOST_MODES:
         raise InputError(f"shapes: expected 1 to {_MOST_MODES} shapes, got {len(given)}")
     for i, f in enumerate(given):
-        if not isinstance(f, Polynomial) or not np.isfinite(f.coef).all() or f.degree() > _MOST_DEGREE:
-            expected = f"numpy.polynomial.Polynomial of s/length with finite coefficients, degree <= {_MOST_DEGREE}"
+        # Of NumPy's kinds floats alone: complex numbers and objects are none.
+        real = isinstance(f, Polynomial) and f.coef.dtype.kind == "f" and np.isfinite(f.coef).all()
+        if not real or f.degree() > _MOST_DEGREE:
+            expected = f"numpy.polynomial.Polynomial of s/length with finite real coefficients, degree <= {_MOST_DEGREE}"
             raise InputError(f"shapes[{i}]: expected a {expected}, got {shown(f)}")
         held = abs(f(0.0)) if string else max(abs(f(0.0)), abs(f.deriv()(0.0)))
         if held > _CLAMPED * np.abs(f.coef).max() or not f.coef.any():

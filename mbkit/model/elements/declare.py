@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, shown
 from mbkit.errors import MbkitError
-from mbkit.model.elements.beams import beam_types, modes_of
+from mbkit.model.elements.beams import LONGEST, SHORTEST, beam_types, modes_of
 from mbkit.model.elements.forces import (
     DISPLACEMENT,
     POINT,
@@ -476,6 +476,8 @@ class ElementBuilder:
             value = nominal(x)
             if len(read.faults) == known and (value < 0 or (above and value == 0)):
                 read.faults.append(f"{item}: {what}: expected a number {'above' if above else 'from'} 0, got {value:g}")
+        if len(read.faults) == known and not SHORTEST <= long <= LONGEST:
+            read.faults.append(f"{item}: length: expected a number from {SHORTEST:g} to {LONGEST:g}, got {long:g}")
         string = all(map(_is_zero, EI))
         good, found = self._asked(item, (modes, shapes), lambda: modes_of(modes, shapes, string=string))
         root = f"{name}.root"
