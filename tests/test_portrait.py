@@ -43,6 +43,13 @@ def test_a_reduced_system_and_one_with_friction():
     plt.close(fig)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_free_body_has_lines_without_a_state_of_rest():
+    q, v, m = sp.symbols("q qdot m")
+    fig = portrait(mb.lagrangian.Lagrangian(m * v**2 / 2, 0, [q], parameters={m: 1.0}), (-1, 1), (-1, 1))
+    assert [len(x) for x in dots(fig)] == [0, 0]
+
+
 def test_what_is_refused():
     with pytest.raises(UnsupportedError, match="theta1, theta2"):
         portrait(systems.double_pendulum(), (0, 1), (0, 1))
@@ -54,6 +61,11 @@ def test_what_is_refused():
         portrait(systems.pendulum(), (1, 1), (0, 1))
     with pytest.raises(InputError, match="no value for parameter"):
         portrait(systems.pendulum(length=None), (0, 1), (0, 1))
-    x = sp.Symbol("x")
+    with pytest.raises(InputError, match="ax: expected axes of Matplotlib, got 3"):
+        portrait(systems.pendulum(), (-1, 1), (0, 1), ax=3)
+    x, xdot = sp.symbols("x xdot")
+    falling = mb.lagrangian.Lagrangian(xdot**2 / 2, sp.log(x), [x])
+    with pytest.raises(InputError, match="no finite energy or acceleration from -2 to -1"):
+        portrait(falling, (-2, -1), (0, 1))
     with pytest.raises(UnsupportedError, match="constraints"):
         portrait(mb.lagrangian.Lagrangian(sp.Symbol("xdot") ** 2, 0, [x], constraints=[x - 1]), (0, 1), (0, 1))

@@ -77,16 +77,22 @@ def portrait(
     rests = _rests(Q[0], on(rate, Q[0], np.zeros(_POINTS)))
     slopes = on(sp.diff(rate, form.coordinates[0]), rests, np.zeros(len(rests)))
     conserved = not any(x.free_symbols - set(form.inputs.values()) for x in acting_forces(form))
+    if ax is not None and not hasattr(ax, "contour"):
+        raise InputError(f"ax: expected axes of Matplotlib, got {ax!r}")
+    drawn = on(form.energy_function if conserved else rate, Q, W)
+    if not np.isfinite(drawn).any():
+        low, high = bounds[0]
+        raise InputError(f"q: {form.name} has no finite energy or acceleration from {low:g} to {high:g}")
     ax = ax or _axes()
     if conserved:
-        h = on(form.energy_function, Q, W)
+        h = drawn
         levels = np.unique(np.quantile(h[np.isfinite(h)], np.linspace(0.0, 0.97, _CURVES)))
         ax.contour(Q, W, h, levels, colors="C0", linewidths=0.9, linestyles="solid")
         saddles = np.unique(on(form.energy_function, rests[slopes > 0], np.zeros(int((slopes > 0).sum()))))
         if len(saddles):
             ax.contour(Q, W, h, saddles, colors="C3", linewidths=1.2, linestyles="dashed")
     else:
-        ax.streamplot(Q[0], W[:, 0], W, on(rate, Q, W), density=_DENSITY, color="C0", linewidth=0.9, arrowsize=0.8)
+        ax.streamplot(Q[0], W[:, 0], W, drawn, density=_DENSITY, color="C0", linewidth=0.9, arrowsize=0.8)
     for stable, filled in ((True, "C0"), (False, "none")):
         there = rests[(slopes < 0) == stable]
         ax.plot(there, 0 * there, "o", markerfacecolor=filled, markeredgecolor="C0" if stable else "C3")
@@ -99,7 +105,7 @@ def _rests(q: Array, rate: Array) -> Array:
     """Return where the acceleration at rest changes its sign, by a straight line between places of the grid."""
     a, b = rate[:-1], rate[1:]
     crosses = np.isfinite(a) & np.isfinite(b) & ((a * b < 0) | ((a == 0) & (b != 0)))
-    return np.asarray(q[:-1][crosses] + (a / (a - b) * np.diff(q))[crosses])
+    return np.asarray(q[:-1][crosses] + (a[crosses] / (a - b)[crosses]) * np.diff(q)[crosses])
 
 
 def _axes() -> Axes:
