@@ -42,7 +42,7 @@ def clamped_free(count: int, x: sp.Symbol, length: Any) -> tuple[sp.Expr, ...]:
         raise UnsupportedError(f"count: expected at most {_MOST} modes, got {count}; take Continuum.normal_modes")
     if not isinstance(x, sp.Symbol):
         raise InputError(f"x: expected a SymPy symbol, got {x!r}")
-    place, out = x / expression("length", length), []
+    place, out = x / _above_zero(expression("length", length)), []
     with mpmath.workdps(_DIGITS):
         for k in range(count):
             root = mpmath.findroot(lambda y: mpmath.cos(y) + 1 / mpmath.cosh(y), (k + mpmath.mpf(1) / 2) * mpmath.pi)
@@ -142,7 +142,7 @@ def beam(
 
     r = sp.Matrix([read(f"position[{k}]", x) for k, x in enumerate(place)])
     R = _rotation(rotation, read, space=space)
-    L, rho, m = read("length", length), read("density", density), read("tip_mass", tip_mass)
+    L, rho, m = _above_zero(read("length", length)), read("density", density), read("tip_mass", tip_mass)
     # Everything in the beam's axes: the root's velocity, the turn of the axes, the point at s without u.
     u0, turn = (A.applyfunc(tidy) for A in (R.T * rate(r), R.T * rate(R)))
     point = sp.Matrix([s, *bent])
@@ -181,6 +181,12 @@ def beam(
         coordinates=q,
         velocities=rates or None,
     )
+
+
+def _above_zero(length: sp.Expr) -> sp.Expr:
+    if length.is_nonpositive:
+        raise InputError(f"length: expected a length above zero, got {length}")
+    return length
 
 
 def _rotation(source: Any, read: Callable[[str, Any], sp.Expr], *, space: bool) -> sp.Matrix:

@@ -35,8 +35,9 @@ class Densities:
         if not isinstance(ends, (tuple, list, sp.Tuple)) or len(ends) != 2:
             raise InputError(f"ends: expected two places, such as (0, L), got {ends!r}")
         self.ends = tuple(expression("ends", e) for e in ends)
-        if self.ends[0] == self.ends[1] or any(e.has(jets.x, jets.t) for e in self.ends):
-            raise InputError(f"ends: expected two places that differ and do not hold {jets.x} or {jets.t}, got {ends}")
+        if (self.ends[1] - self.ends[0]).is_nonpositive or any(e.has(jets.x, jets.t) for e in self.ends):
+            wanted = "a lower and an upper place, two places that differ"
+            raise InputError(f"ends: expected {wanted} and do not hold {jets.x} or {jets.t}, got {ends}")
         self.T_ends = {e: jets(f"T_ends[{e}]", x) for e, x in self._at_ends("T_ends", T_ends)}
         self.V_ends = {e: jets(f"V_ends[{e}]", x) for e, x in self._at_ends("V_ends", V_ends)}
         self.forces = {}
