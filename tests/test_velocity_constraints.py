@@ -411,9 +411,9 @@ def test_where_quasi_velocities_say_nothing_of_a_velocity_there_are_no_numbers()
     lag = central(velocity_constraints=[x * ydot - y * xdot])
     equations = lag.maggi(["x", "theta"])
     for q in ([0.0, 1.0, 0.0], [0.0, 0.0, 0.0]):
-        with pytest.raises(NumericalError, match="not finite at q = .* where -x is zero"):
+        with pytest.raises(NumericalError, match=r"not finite at q = .* where -x is zero"):
             equations.field()(0.0, [*q, 1.0, 1.0])
-        with pytest.raises(NumericalError, match="not finite at q = .* where -x is zero"):
+        with pytest.raises(NumericalError, match=r"not finite at q = .* where -x is zero"):
             equations.to_velocity([[1.0, 1.0, 0.0], q], [1.0, 1.0])
     turned = central().quasi_velocities(sp.diag(1, 1 / x, 1))
     with pytest.raises(NumericalError, match="not finite at q = "):

@@ -137,7 +137,8 @@ def steady_motion(
     q, v = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     q[kept], v[cyclic] = rest.q, turning
     if turning.any():
-        beside = np.concatenate([[q], *(q + sign * _BESIDE * np.diag(np.maximum(1.0, abs(q)))[kept] for sign in (1, -1))])
+        steps = _BESIDE * np.diag(np.maximum(1.0, abs(q)))[kept]
+        beside = np.concatenate([[q], q + steps, q - steps])
         _refuse_pole(_at(system, values).mass_matrix(beside)[:, cyclic][:, :, cyclic], reduced, rest.q)
     told = {s.name: float(x) for s, x in zip(reduced.cyclic, turning, strict=True)}
     return SteadyMotion(rest, told, numbers, q, v)

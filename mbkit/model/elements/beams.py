@@ -104,7 +104,7 @@ def modes_of(modes: Any, shapes: Any, *, string: bool) -> Modes:
         # Of NumPy's kinds floats alone: complex numbers and objects are none.
         real = isinstance(f, Polynomial) and f.coef.dtype.kind == "f" and np.isfinite(f.coef).all()
         if not real or f.degree() > _MOST_DEGREE:
-            expected = f"numpy.polynomial.Polynomial of s/length with finite real coefficients, degree <= {_MOST_DEGREE}"
+            expected = f"numpy.polynomial.Polynomial of s/length, real and finite, of degree <= {_MOST_DEGREE}"
             raise InputError(f"shapes[{i}]: expected a {expected}, got {shown(f)}")
         held = abs(f(0.0)) if string else max(abs(f(0.0)), abs(f.deriv()(0.0)))
         if held > _CLAMPED * np.abs(f.coef).max() or not f.coef.any():
