@@ -405,7 +405,13 @@ def test_bad_input_says_what_is_wrong():
     ):
         with pytest.raises(InputError, match=told):
             whole.quasi_velocities(given)
-    for names, told in ((["a", "b"], "expected 3"), (["I1", "a", "b"], "'I1' stands"), ([1, 2, 3], "expected names")):
+    for names, told in (
+        (["a", "b"], "expected 3"),
+        (["I1", "a", "b"], "'I1' stands"),
+        ([1, 2, 3], "expected names"),
+        (3, "names: expected a list"),
+        (["v", "vdot", "b"], "'vdot' stands"),
+    ):
         with pytest.raises(InputError, match=told):
             whole.quasi_velocities(sp.eye(3), names)
     bound = Lagrangian(m * (xdot**2 + ydot**2), 0, [x, y], parameters=[m], constraints=[x - y])

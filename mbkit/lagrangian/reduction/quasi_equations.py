@@ -28,7 +28,7 @@ from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities, read_expression, symbols_of
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, constraint_fields
 from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, inverse
-from mbkit.lagrangian.energies.symbols import fits
+from mbkit.lagrangian.energies.symbols import fits, listed, velocity_of
 from mbkit.lagrangian.trig.simplify import gradient, tidy, tidy_matrix
 
 
@@ -200,7 +200,7 @@ def _named(system: EnergyForm, names: Any) -> list[sp.Symbol]:
     n = len(system.coordinates)
     if isinstance(names, str):
         names = names.replace(",", " ").split()
-    symbols: Sequence[Any] = [f"w{i + 1}" for i in range(n)] if names is None else list(names)
+    symbols: Sequence[Any] = [f"w{i + 1}" for i in range(n)] if names is None else listed("names", names)
     if len(symbols) != n:
         raise InputError(f"names: expected {n}, one for each column of D, got {len(symbols)}")
     out: list[sp.Symbol] = []
@@ -210,7 +210,8 @@ def _named(system: EnergyForm, names: Any) -> list[sp.Symbol]:
             raise InputError(f"names: expected names or symbols, got {x!r}")
         out.append(sp.Symbol(x) if isinstance(x, str) else x)
         fits("velocities", out[-1])
-        if out[-1].name in used:
-            raise InputError(f"names: {out[-1].name!r} stands for something else already")
-        used.add(out[-1].name)
+        own = {out[-1].name, velocity_of(out[-1]).name}
+        if own & used:
+            raise InputError(f"names: {min(own & used)!r} stands for something else already")
+        used |= own
     return out
