@@ -141,6 +141,8 @@ def test_given_forces_moments_and_time_stand_in_the_rows() -> None:
     ("change", "message"),
     [
         ({"masses": [m]}, "masses: 1 of them for 2 positions"),
+        ({"masses": None}, "masses: expected a list"),
+        ({"masses": [], "positions": []}, "masses|positions: expected"),
         ({"inertias": [m]}, "inertias: 1 of them for 2"),
         ({"inertias": [None, m]}, "expected an inertia and an angular velocity"),
         ({"inertias": [(k, k, k), k]}, "expected 1 number with 1 angular velocity"),

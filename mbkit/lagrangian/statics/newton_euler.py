@@ -16,7 +16,7 @@ import sympy as sp
 
 from mbkit._escape import terminal
 from mbkit.errors import InputError
-from mbkit.lagrangian.energies.symbols import PlainSymbols, acceleration_of, free_name, velocity_of
+from mbkit.lagrangian.energies.symbols import PlainSymbols, acceleration_of, free_name, listed, velocity_of
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.statics.virtual_work import check_places, turning, vectors
 from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
@@ -124,7 +124,7 @@ def newton_euler(
     into = PlainSymbols(coordinates, velocities, time)
     R = vectors("positions", positions, into)
     check_places("positions", R, into)
-    m = [into("masses", x) for x in ([masses] if isinstance(masses, (sp.Basic, int, float)) else masses)]
+    m = [into("masses", x) for x in listed("masses", [masses] if isinstance(masses, (int, float)) else masses)]
     if len(m) != len(R):
         raise InputError(f"masses: {len(m)} of them for {len(R)} positions; give one for each")
     turns = turning(into, len(m), inertias, angular_velocities)

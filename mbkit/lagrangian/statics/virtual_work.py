@@ -175,7 +175,7 @@ def from_particles(
     R = vectors("positions", positions, into)
     check_places("positions", R, into)
     # A single vector stands for one particle, of which the mass may stand alone.
-    m = [into("masses", x) for x in ([masses] if isinstance(masses, (sp.Basic, int, float)) else masses)]
+    m = [into("masses", x) for x in listed("masses", [masses] if isinstance(masses, (int, float)) else masses)]
     _pairs("masses", m, "positions", R)
     T = [mass * sp.Add(*(_rate(x, into) ** 2 for x in place)) / 2 for mass, place in zip(m, R, strict=True)]
     T += [
