@@ -393,6 +393,7 @@ def test_a_block_on_a_belt_sticks_and_slips_with_the_period_of_the_closed_form(m
     assert places == pytest.approx([s / k, start] * 4, abs=1e-12)
 
 
+@pytest.mark.thorough("True-auto", "True-dop853", "False-rk853", "False-dop853")
 @pytest.mark.parametrize("method", ["rk853", "auto", "dop853"])
 @pytest.mark.parametrize("clock", [False, True])
 def test_a_force_that_passes_the_bound_for_a_while_is_not_stepped_over(method: str, clock: bool) -> None:
@@ -447,6 +448,31 @@ def test_what_lets_go_at_a_time_of_the_grid_lets_go(method: str) -> None:
 def test_a_run_of_no_time_is_its_start(method: str) -> None:
     run = mb.simulate(mb.dynamics(slider(friction=3.0), "lagrangian"), [0.5], [1.0], 0.0, method)
     assert (run.q.tolist(), run.v.tolist()) == ([[0.5]], [[1.0]])
+
+
+@pytest.mark.parametrize("numbers", [(0.0, 5.0, 2.0), (1.0, 5.5, 0.0)])
+def test_what_turns_in_moreau_s_step_is_held_by_its_stiction(
+    numbers: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It once turned wherever the force at the turn was above the friction of motion."""
+    from mbkit.simulate.solvers.friction import moreau
+
+    friction, stiction, damping = numbers
+    model = slider(friction=friction, stiction=stiction, damping=damping)
+    dyn, start = mb.dynamics(model, "lagrangian", compile=True), ([0.34], [0.0], 4.0)
+    exact = mb.simulate(dyn, *start, "rk853", rtol=1e-11, save=[4.0])
+    assert exact.v[-1, 0] == 0.0
+    assert 50.0 * abs(exact.q[-1, 0]) > friction
+    coarse, fine = (mb.simulate(dyn, *start, "moreau", dt=dt, save=[4.0]) for dt in (4e-3, 2e-3))
+    errors = [abs(run.q[-1, 0] - exact.q[-1, 0]) for run in (coarse, fine)]
+    # Of first order.
+    assert errors[1] < 2e-3
+    assert errors[1] < 0.6 * errors[0]
+    other = mb.simulate(mb.dynamics(model, "pinocchio"), *start, "moreau", dt=4e-3, save=[4.0])
+    monkeypatch.setattr(moreau, "_Compiled", moreau._InPython)
+    slow = mb.simulate(dyn, *start, "moreau", dt=4e-3, save=[4.0])
+    assert coarse.q[-1] == pytest.approx(slow.q[-1], abs=1e-12)
+    assert coarse.q[-1] == pytest.approx(other.q[-1], abs=1e-12)
 
 
 def test_what_lets_go_in_moreau_s_step_has_the_friction_of_motion(monkeypatch: pytest.MonkeyPatch) -> None:

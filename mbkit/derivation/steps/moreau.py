@@ -1,10 +1,10 @@
 """Moreau and Jean's step as parts: one round of the parts is one attempt, with what slides and what rests given.
 
 The new velocity solves M (v⁺ - v) = h (τ + τ_passive - nle) + P at the step's start, with the impulse P_j = -h f_j of a
-velocity that slides along its side, and any |P_j| <= h f_j of one that is to have none (Moreau 1988, Unilateral contact
-and dry friction in finite freedom dynamics; Jean 1999, Computer Methods in Applied Mechanics and Engineering 177). The
-position moves with the new velocity. Where a velocity turns against its side, or an impulse passes its bound, the
-sides are changed and the attempt is repeated: all at once as long as fewer of them fail than before, then the last one
+velocity that slides along its side, and any |P_j| <= h s_j of one that is to have none, with the stiction s_j (Moreau
+1988, Unilateral contact and dry friction in finite freedom dynamics; Jean 1999, Computer Methods in Applied Mechanics
+and Engineering 177). The position moves with the new velocity. What slides is to have none where it would turn. Where
+a velocity turns against its side, or an impulse passes its bound, the sides are changed and the attempt is repeated: all at once as long as fewer of them fail than before, then the last one
 alone (Murty 1974), so that the exact solution is found after finitely many.
 """
 
@@ -69,18 +69,13 @@ def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks
         a = forward(s["q"], v, force, parameters(side * (1 - still), RESTING * still))
         a = (1 - spread(still)) * a + spread(still * target)
         inverse = equations.function("inverse_dynamics")
-        free = ca.SX(n, 1)
-        needed = inverse(s["q"], v, a, parameters(side * (1 - still), free)) - s["tau"][:nv]
-        # Friction at this speed is what the sides make of the passive force; at rest its bound may be larger.
-        passive = equations.function("passive")
-        slid = passive(s["q"], v, parameters(free, free)) - passive(s["q"], v, parameters(free + 1, free))
-        most = choose(ca.mtimes(pick, v) == 0, s["bound"], ca.mtimes(pick, slid))
+        needed = inverse(s["q"], v, a, parameters(side * (1 - still), ca.SX(n, 1))) - s["tau"][:nv]
         given = {name: s[name] for name in first[: -len(extra) or None]} | extra
-        return function_of("moreau_solve", given, {"a": a, "needed": ca.mtimes(pick, needed), "most": most})
+        return function_of("moreau_solve", given, {"a": a, "needed": ca.mtimes(pick, needed)})
 
     extra = {"parameters": others} if others.numel() else {}
-    first = ("q", "w", "side", "still", "k", "tau", "dt", "bound", *extra)
-    a, needed, most = ca.SX.sym("a", nv), ca.SX.sym("needed", n), ca.SX.sym("most", n)
+    first = ("q", "w", "side", "still", "k", "tau", "dt", *extra)
+    a, needed = ca.SX.sym("a", nv), ca.SX.sym("needed", n)
 
     def decide() -> ca.Function:
         after = v + h * a
@@ -88,7 +83,7 @@ def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks
         along = ca.mtimes(pick, after)
         back = (1 - still) * (side * along < 0)
         # A velocity of zero that is to slide, and does not, rests.
-        loose = still * (ca.fabs(needed) > most * (1 + ROUNDING))
+        loose = still * (ca.fabs(needed) > s["bound"] * (1 + ROUNDING))
         wrong = back + loose
         count = ca.sum1(wrong)
         fewer = count < s["best"]
@@ -116,11 +111,11 @@ def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks
             "left1": choose(good, PATIENCE, left),
             "go1": k < s["end"],
         }
-        given = {name: s[name] for name in (*STATE[:-1], "dt")} | {"a": a, "needed": needed, "most": most}
+        given = {name: s[name] for name in (*STATE[:-1], "dt", "bound")} | {"a": a, "needed": needed}
         return function_of("moreau_decide", given, state)
 
-    second = (*STATE[:-1], "dt", "a", "needed", "most")
+    second = (*STATE[:-1], "dt", "bound", "a", "needed")
     return [
-        Part("moreau_solve", first, ("a", "needed", "most"), solve),
+        Part("moreau_solve", first, ("a", "needed"), solve),
         Part("moreau_decide", second, tuple(f"{name}1" for name in STATE), decide),
     ]

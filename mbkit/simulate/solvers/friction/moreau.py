@@ -95,10 +95,15 @@ class _InPython:
         if len(which):
             inverse, rubs = np.linalg.inv(dyn.mass_matrix(q)), self._law.bound > 0
             slides = np.abs(self._law.force_at(v))
-            bound = np.where(v == 0, self._law.bound, slides)
-            most, less, none = h * bound[None], h * slides[None], np.zeros((1, len(v)))
-            (impulse,), (holds,) = friction_forces(inverse[None], free[None], most, less, rubs[None], none)
-            free = np.where(holds, 0.0, free + inverse @ impulse)
+            less, none, rests, smooth = h * slides[None], np.zeros((1, len(v))), v == 0, free
+            # What stops or turns may be held by its stiction.
+            while True:
+                most = h * np.where(rests, self._law.bound, slides)[None]
+                (impulse,), (holds,) = friction_forces(inverse[None], smooth[None], most, less, rubs[None], none)
+                free = np.where(holds, 0.0, smooth + inverse @ impulse)
+                if not (turns := rubs & ~rests & (v * free <= 0) & (slides < self._law.bound)).any():
+                    break
+                rests = rests | turns
         q1 = space.retract(q, h * space.to_integrator_velocity(q, free))
         return q1, free
 
