@@ -3,9 +3,10 @@
 The new velocity solves M (v⁺ - v) = h (τ + τ_passive - nle) + P at the step's start, with the impulse P_j = -h f_j of a
 velocity that slides along its side, and any |P_j| <= h s_j of one that is to have none, with the stiction s_j (Moreau
 1988, Unilateral contact and dry friction in finite freedom dynamics; Jean 1999, Computer Methods in Applied Mechanics
-and Engineering 177). The position moves with the new velocity. What slides is to have none where it would turn. Where
-a velocity turns against its side, or an impulse passes its bound, the sides are changed and the attempt is repeated: all at once as long as fewer of them fail than before, then the last one
-alone (Murty 1974), so that the exact solution is found after finitely many.
+and Engineering 177). The position moves with the new velocity. What slides is to have none where it would turn. Where a
+velocity turns against its side, or an impulse passes its bound, the sides are changed and the attempt is repeated: all
+at once as long as fewer of them fail than before, then the last one alone (Murty 1974), so that the exact solution is
+found after finitely many.
 """
 
 from __future__ import annotations
