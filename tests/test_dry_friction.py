@@ -475,6 +475,16 @@ def test_what_turns_in_moreau_s_step_is_held_by_its_stiction(
     assert coarse.q[-1] == pytest.approx(other.q[-1], abs=1e-12)
 
 
+def test_a_last_step_of_moreau_that_is_shorter_is_so_in_machine_code() -> None:
+    model = slider(friction=1.0)
+    fast, slow = (
+        mb.simulate(dyn, [0.34], [0.0], 0.0105, "moreau", dt=1e-3)
+        for dyn in (mb.dynamics(model, "lagrangian", compile=True), mb.dynamics(model, "pinocchio"))
+    )
+    assert fast.t[-1] == slow.t[-1] == 0.0105
+    assert fast.q[-1] == pytest.approx(slow.q[-1], abs=1e-14)
+
+
 def test_what_lets_go_in_moreau_s_step_has_the_friction_of_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     from mbkit.simulate.solvers.friction import moreau
 
