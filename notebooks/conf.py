@@ -107,6 +107,10 @@ def setup(app: Sphinx) -> None:
             field.typerolename = ""
     # Pages are read side by side, and each process would make the cache of their cells.
     get_cache(Path(app.outdir).parent / ".jupyter_cache").list_cache_records()
+    sys.path.insert(0, os.environ["MBKIT_TOP"])
+    from validation import page_kernels
+
+    page_kernels.use()
     app.add_html_math_renderer(
         "mathml",
         (lambda self, node: _mathml(self, node, block=False), None),

@@ -38,6 +38,12 @@ PROCESSORS = {
 }
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files without a test of a processor's arithmetic where these alone are asked for."""
+    others = config.getoption("markexpr") == "processors" and collection_path.match("test_*.py")
+    return True if others and collection_path.stem not in PROCESSORS else None
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--thorough", action="store_true", help="run the cases marked thorough too")
 

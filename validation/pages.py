@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +31,19 @@ def origin(data: dict[str, Any], part: str) -> Markdown:
     found = data.get("versions", {})
     told += [", ".join(f"{name} {found[name]}" for name in NAMED if name in found and found[name] != "not installed")]
     return Markdown(f"*{'; '.join(x for x in told if x)}. Again: `python -m validation --only {part}`.*")
+
+
+def command(*words: str, columns: int = 80) -> int:
+    """Print what mbkit's command says in a terminal of so many columns, and return its exit status."""
+    # A process of its own: in a kernel it writes for notebooks.
+    told = subprocess.run(
+        [sys.executable, "-m", "mbkit", *words],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"COLUMNS": str(columns)},
+    )
+    print((told.stdout + told.stderr).strip())
+    return told.returncode
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]], align: str = "") -> Markdown:
