@@ -76,7 +76,7 @@ def planted(defect: Defect, copy: Path) -> tuple[str, float]:
         raise ValueError(f"{defect.path}: expected {defect.text!r} once, found it {sound.count(defect.text)} times")
     path.write_text(sound.replace(defect.text, defect.wrong), encoding="utf-8")
     tests = [f"tests/{name}.py" for name in defect.tests]
-    options = ["-x", "-q", "-n0", "-p", "no:cacheprovider", "-o", "addopts=", "--import-mode=importlib"]
+    options = ["-x", "-q", "-n0", "-p", "no:cacheprovider"]
     begun = time.perf_counter()
     try:
         run = subprocess.run(
