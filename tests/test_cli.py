@@ -68,17 +68,17 @@ def test_a_fault_of_the_library_has_a_status_of_its_own(monkeypatch, tmp_path):
 
 
 def test_a_robot_agrees_and_is_written(here):
-    result = call("check", "ur5", *QUICK)
+    result = call("check", "double_pendulum", *QUICK)
     assert result.exit_code == 0, result.output
     assert "agree to" in result.stdout.splitlines()[0]
     assert len(result.stdout.splitlines()) <= 24
     assert "limits: no engine applies them" in " ".join(result.stdout.split())
     assert "forward dynamics" not in result.stdout
-    assert "forward dynamics" in call("check", "ur5", "--full", *QUICK).stdout
-    data = json.loads((here / "mbkit-report" / "ur5.json").read_text())
+    assert "forward dynamics" in call("check", "double_pendulum", "--full", *QUICK).stdout
+    data = json.loads((here / "mbkit-report" / "double_pendulum.json").read_text())
     assert data["passed"]
-    assert "<svg" in (here / "mbkit-report" / "ur5.html").read_text()
-    assert "mbkit-report/ur5.html" in result.stdout
+    assert "<svg" in (here / "mbkit-report" / "double_pendulum.html").read_text()
+    assert "mbkit-report/double_pendulum.html" in result.stdout
 
 
 @pytest.mark.thorough

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 
@@ -37,7 +39,7 @@ def test_it_evaluates_and_simulates(engine):
 
 
 def test_it_is_compared_and_shown(engine, monkeypatch):
-    monkeypatch.setenv("MBKIT_COMPILE", "1")
+    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_WORK", 1_000)
     result = mb.compare(PENDULUM, ("lagrangian", engine), 2)
     assert result.passed
     assert {r.engine for r in result.rows} >= {engine}

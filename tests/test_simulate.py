@@ -268,7 +268,7 @@ def kinds() -> Model:
 def test_rollouts_of_the_catalog_and_of_every_joint_are_mujocos(name: str) -> None:
     model = kinds() if name == "kinds" else catalog.get(name)()
     q, v = model.random_state(np.random.default_rng(name != "kinds"))
-    assert_as_mujoco(model, q, v, duration=0.2 if name == "kinds" else 1.0)
+    assert_as_mujoco(model, q, v, duration=0.2)
 
 
 def test_rollouts_of_every_rotation_and_with_dampers_and_springs_are_mujocos() -> None:

@@ -26,7 +26,7 @@ def law(model: mb.Model, seed: int = 0) -> StateFeedback:
 
 TREES = {
     "flat": lambda: random_tree(1, 4, ("revolute", "prismatic")),
-    "with quaternions": lambda: random_tree(2, 4, ("free", "ball", "revolute")),
+    "with quaternions": lambda: random_tree(2, 2, ("free", "ball")),
     "with time": mb.catalog.pendulum_on_moving_support if hasattr(mb.catalog, "pendulum_on_moving_support") else None,
     "a loop": mb.catalog.four_bar,
 }

@@ -72,8 +72,7 @@ def single():
 
 
 def compared(**more):
-    model = mb.load("panda")
-    return mb.compare(model, ("pinocchio", "single"), samples=8, terms_only=True, **more)
+    return mb.compare(mb.load("double_pendulum"), ("pinocchio", "single"), samples=8, terms_only=True, **more)
 
 
 @pytest.mark.usefixtures("single")
