@@ -623,7 +623,7 @@ def loaded_or_refused(path):
                     load(path, nonphysical=policy, floating_base=floating)
 
 
-@settings(max_examples=100, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(original=st.sampled_from([URDF, MJCF]), edits=EDITS)
 def test_damaged_files_never_crash(tmp_path, original, edits):
     text = original
@@ -633,7 +633,7 @@ def test_damaged_files_never_crash(tmp_path, original, edits):
     loaded_or_refused(written(tmp_path, text))
 
 
-@settings(max_examples=100, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_values_never_crash(tmp_path, data):
     """As above, but the file stays XML, so that the checks behind the parser are reached."""

@@ -27,10 +27,10 @@ from tests.test_stress_report import NASTY, RESULT
 
 def texts(figure: Figure) -> dict[str, Any]:
     """Return the boxes of all texts that are drawn, in pixels, by text."""
-    canvas = FigureCanvasAgg(figure)
+    FigureCanvasAgg(figure)
     # As savefig does: the layout first, by what a first drawing measures.
     figure.draw_without_rendering()
-    canvas.draw()
+    figure.draw_without_rendering()
     shown = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip()]
     # Ticks outside of the limits exist, and are not drawn.
     hidden = set()

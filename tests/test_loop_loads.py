@@ -39,7 +39,7 @@ def condition(model: mb.Model, dyn: mb.Dynamics, q: np.ndarray) -> float:
     return float(s[0] / s[model.nv - dyn.mobility().degrees_of_freedom - 1])
 
 
-@pytest.mark.thorough(every=4)
+@pytest.mark.thorough(every=6)
 @pytest.mark.parametrize("name", MECHANISMS)
 def test_engines_agree_and_every_body_is_in_balance(name: str) -> None:
     model = mb.catalog.get(name)()

@@ -92,6 +92,7 @@ def test_rotors_have_momentum_and_energy() -> None:
     assert (kinetic, potential) == pytest.approx((dyn.kinetic_energy([0.3], [2.0]), dyn.potential_energy([0.3])))
 
 
+@pytest.mark.thorough(every=2)
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("parameters", ["standard", "base"])
 def test_pinocchio_has_the_same(seed: int, parameters: str) -> None:

@@ -287,7 +287,7 @@ def test_sphere_on_a_turntable_moves_on_a_circle() -> None:
     turns, rest = [4, 5], [0, 1, 2, 3, 6]
     v[turns] = np.linalg.solve(J[2:, turns], -J[2:, rest] @ v[rest])
     assert np.abs(dyn.constraint_rate(q, v)).max() < 1e-14
-    run = mb.simulate(dyn, q, v, 5.0, "rk853", rtol=1e-11, atol=1e-11)
+    run = mb.simulate(dyn, q, v, 2.0, "rk853", rtol=1e-11, atol=1e-11)
     rate = 2 / 7 * 3.0
     centre = q[1:3] + np.array([-v[2], v[1]]) / rate
     from_centre = run.q[:, 1:3] - centre

@@ -341,30 +341,28 @@ def _pivots(B: Array) -> Array:
 def _rows(model: Model, q: Array) -> dict[str, Array]:
     """Return the rows of B at poses (N, nq): of each joint those of its body and rotors, (N, rows, nv)."""
     layout, n = model.layout, len(q)
-    full, columns = layout.expand_q(q), layout.sizes[3]
-    jacobians = {"world": (np.zeros((n, 3, columns)), np.zeros((n, 3, columns)))}
+    full, still = layout.expand_q(q), np.zeros((n, 3, model.nv))
+    jacobians = {"world": (still, still)}
     out: dict[str, Array] = {}
     for joint in model.tree:
-        at, part = list(full[:, layout.full_q[joint.name]].T), layout.full_v[joint.name]
+        at, G = list(full[:, layout.full_q[joint.name]].T), layout.G[layout.full_v[joint.name]]
         linear, angular = jacobians[joint.parent]
         R_JC, p_JC = joint.type.placement(np, joint, at)
         R = joint.rotation @ np.stack([_columns(row, n) for row in R_JC], axis=1)
         p = joint.translation + _columns(p_JC, n) @ joint.rotation.T
         across = R.transpose(0, 2, 1)
         linear = across @ (linear - np.cross(p[:, :, None], angular, axis=1))
-        angular = across @ angular
-        for k, unit in enumerate(np.eye(joint.type.nv).tolist()):
-            own = joint.type.twist(np, joint, at, unit)
-            linear[:, :, part.start + k] += _columns(own[0], n)
-            angular[:, :, part.start + k] += _columns(own[1], n)
+        # The joint's own velocity, of all unit velocities at once: a row each.
+        own = joint.type.twist(np, joint, at, list(np.eye(joint.type.nv)[:, :, None]))
+        columns = (np.stack([np.broadcast_to(x, (joint.type.nv, n)).T for x in entries], axis=1) for entries in own)
+        linear, angular = (J + new @ G for J, new in zip((linear, across @ angular), columns, strict=True))
         jacobians[joint.child] = linear, angular
         body = model.body(joint.child)
         moments, axes = np.linalg.eigh(body.inertia)
-        rotors = np.zeros((n, joint.type.nv, columns))
-        rotors[:, range(joint.type.nv), range(part.start, part.stop)] = np.sqrt(joint.armature)
+        rotors = np.broadcast_to(np.sqrt(joint.armature)[:, None] * G, (n, *G.shape))
         moving = np.sqrt(body.mass) * (linear - skew(body.com) @ angular)
         turning = (np.sqrt(moments.clip(0.0)) * axes).T @ angular
-        out[joint.name] = np.concatenate([moving, turning, rotors], axis=1) @ layout.G
+        out[joint.name] = np.concatenate([moving, turning, rotors], axis=1)
     for coupling in model.couplings:
         row = np.sqrt(coupling.armature) * layout.coupling_row(coupling) @ layout.G
         first = coupling.joints[0]
