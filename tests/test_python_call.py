@@ -267,8 +267,8 @@ ASKED: dict[str, tuple[int, tuple[str, ...]]] = {
     "forward_dynamics": (3, ()),
     "inverse_dynamics_derivatives": (3, ()),
     "forward_dynamics_derivatives": (3, ()),
-    "pose": (1, ("link2",)),
-    "jacobian": (1, ("link2", "body")),
+    "pose": (1, ("tip",)),
+    "jacobian": (1, ("tip", "body")),
 }
 
 
