@@ -377,7 +377,7 @@ def gripper() -> mb.Model:
 
 
 def test_a_whole_comparison_has_rollouts_run_times_and_omissions(monkeypatch):
-    # As users have it; interpreted, thousands of steps take three times as long.
+    # Interpreted, thousands of steps take three times as long.
     monkeypatch.setenv("MBKIT_COMPILE", "1")
     monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_REPEATS", 1)
     monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_WORK", 8_000)
