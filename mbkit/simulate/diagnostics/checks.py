@@ -255,14 +255,18 @@ def lost(steps: Any, h: float, rates: Any, duration: float) -> tuple[float, comp
     factor exp(n (ln μ - h λ)). It counts as long as the mode lasts; one that is soon gone is passed over (Hairer,
     Wanner 1996, IV.2).
     """
-    from scipy.optimize import linear_sum_assignment
-
     # Zero has no logarithm.
     steps = np.log(np.where(np.abs(steps) > 1e-300, steps, 1e-300).astype(complex))
     gap = steps[None, :] - h * rates[:, None]
     gap.imag = (gap.imag + np.pi) % (2 * np.pi) - np.pi
-    modes, partners = linear_sum_assignment(np.abs(gap))
-    off = np.abs(gap[modes, partners])
+    distances = np.abs(gap)
+    modes, partners = np.arange(len(rates)), distances.argmin(axis=1)
+    if len(set(partners)) < len(partners):
+        # The nearest of some is the same. Its import would take longer than most runs.
+        from scipy.optimize import linear_sum_assignment
+
+        modes, partners = linear_sum_assignment(distances)
+    off = distances[modes, partners]
     dies = np.minimum(-rates.real[modes], -steps.real[partners] / h)
     lasting = np.minimum(duration, 1 / np.maximum(dies, 1e-300))
     part = np.where(lasting < _BRIEF * duration, 0.0, off * lasting / h)
