@@ -271,10 +271,10 @@ def assert_same_as(raw: pin.Model, dyn: mb.Dynamics, q: np.ndarray, v: np.ndarra
     assert off(dyn.nle(q, v), pin.nonLinearEffects(raw, data, pin_q, pin_v)[order]) < CLOSE
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(SEEDS, st.data())
 def test_a_locked_model_has_the_rows_and_columns_that_are_left(seed, data):
-    tree = random_tree(seed, 8, mimic=True)
+    tree = random_tree(seed, 6, mimic=True)
     names = data.draw(st.lists(st.sampled_from(tree.joint_names), min_size=1, unique=True))
     q0, _ = tree.random_state(seed + 1)
     reduced = tree.lock(names, q0) if len(names) < len(tree.joint_names) else tree.lock(names[1:], q0)
@@ -570,7 +570,7 @@ def test_the_same_seed_draws_the_same_whatever_else_varies(tmp_path):
     assert pickle.loads(pickle.dumps(two))[3] == two[3]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(SEEDS, st.floats(0.01, 2.0))
 def test_every_drawn_body_can_be(seed, spread):
     tree = random_tree(seed, 3)

@@ -193,7 +193,7 @@ def test_a_mechanism_follows_a_table_on_every_engine() -> None:
             x, y = (getattr(d, quantity)(q, v, [0.0, 1.0, 2.0]) for d in (dyn, exact))
             assert np.abs(x - y).max() < 1e-12 * np.abs(y).max()
     runs = [
-        mb.simulate(own, q, v, 2.0, "rk4", 1e-3, t0=0.2),
+        mb.simulate(own, q, v, 2.0, "rk4", 1e-2, t0=0.2),
         mb.simulate(own, q, v, 2.0, "rk853", rtol=1e-10, t0=0.2),
         mb.simulate(mb.dynamics(model, "pinocchio"), q, v, 0.1, "rk4", 1e-2, t0=0.2),
     ]
@@ -203,7 +203,7 @@ def test_a_mechanism_follows_a_table_on_every_engine() -> None:
         assert np.abs(run.v[:, 0] - spline(run.t, 1)).max() < 1e-12
     # The mechanism has no other freedom: where it is follows from the table.
     assert np.abs(runs[1].q[-1] - runs[0].q[-1]).max() < 1e-12
-    assert np.abs(runs[2].q[-1] - runs[0].q[100]).max() < 1e-12
+    assert np.abs(runs[2].q[-1] - runs[0].q[10]).max() < 1e-12
 
 
 def test_a_table_is_written_out_in_symbols() -> None:
