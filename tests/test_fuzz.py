@@ -16,7 +16,7 @@ from mbkit.engines.mujoco import importer
 from tests.random_files import errors, mujoco_terms, mutant, random_mjcf
 from validation import fuzz
 
-MUTANTS, MJCFS = 130, 50
+MUTANTS, MJCFS = 80, 25
 
 
 def test_damaged_files_are_refused_or_read_as_by_the_engine_of_their_format(
