@@ -415,22 +415,22 @@ def windows(pull: float, omega: float, method: str, clock: bool) -> None:
     torque = None if clock else lambda t, q, v: [pull * np.sin(omega * t)]  # noqa: ARG005
     if clock:
         b.add_joint_force("pull", "x", lambda t, q, v: pull * np.sin(omega * t))  # noqa: ARG005
-    run = mb.simulate(mb.dynamics(b.build(), "lagrangian"), [0.0], [0.0], 6.2 * np.pi / omega, method, torque=torque)
-    begins = np.arcsin(f / pull) / omega + np.pi / omega * np.arange(6)
+    run = mb.simulate(mb.dynamics(b.build(), "lagrangian"), [0.0], [0.0], 4.2 * np.pi / omega, method, torque=torque)
+    begins = np.arcsin(f / pull) / omega + np.pi / omega * np.arange(4)
 
     def speed(t: float) -> float:
         return pull / omega * (np.cos(omega * begins[0]) - np.cos(omega * t)) - f * (t - begins[0])
 
     stops = brentq(speed, np.pi / omega - begins[0], begins[1]) - begins[0] + begins
     exact = np.stack([begins, stops], axis=1).ravel()
-    assert [e.name for e in run.events] == ["x lets go", "x stops"] * 6
+    assert [e.name for e in run.events] == ["x lets go", "x stops"] * 4
     assert [e.t for e in run.events] == pytest.approx(exact.tolist(), rel=1e-9)
 
 
 @pytest.mark.parametrize("method", ["rk853", "auto", "rk4"])
 def test_what_has_friction_at_rest_alone_swings_and_sticks_where_it_turns(method: str) -> None:
     """Without friction of motion the side of what let go was zero: it came to rest at once, or never again."""
-    more = {"dt": 1e-3} if method == "rk4" else {}
+    more = {"dt": 2e-3} if method == "rk4" else {}
     swings = mb.dynamics(slider(friction=0.0, stiction=5.0), "lagrangian")
     run = mb.simulate(swings, [0.2], [0.0], 2.0, method, **more)
     assert run.q[-1, 0] == pytest.approx(0.2 * np.cos(10.0), rel=1e-8)
