@@ -206,7 +206,7 @@ def test_quasi_velocities_that_depend_on_time_are_lagranges_equations_by_substit
     held = [1, x, y, t, x * t, sp.sin(t) * y]
 
     def entry():
-        return sum(sp.Rational(int(rng.integers(-5, 6)), 10) * held[k] for k in rng.choice(6, 2, replace=False))
+        return sum(sp.Rational(int(rng.integers(-5, 6)), 10) * held[k] for k in rng.choice(6, 1, replace=False))
 
     A = sp.Matrix(2, 2, lambda i, j: 2 * (i == j) + entry())
     drift = sp.Matrix([entry(), entry()]) if seed else sp.zeros(2, 1)
@@ -284,7 +284,7 @@ def test_body_turns_the_same_way_in_all_forms(pair, compiled):
 #: What each method leaves behind after a second at 2 ms, or at 1e-11 a step.
 METHODS = {
     "rk853": 1e-10, "taylor": 1e-10, "dop853": 1e-10, "lsoda": 1e-9, "radau": 1e-8, "bdf": 1e-6, "cvodes": 1e-7,
-    "rk4": 1e-9, "gauss4": 1e-10, "gauss6": 1e-12, "semi_implicit_euler": 2e-2, "implicit_midpoint": 1e-5,
+    "rk4": 1e-9, "semi_implicit_euler": 2e-2, "gauss6": 1e-12, "gauss4": 1e-10, "implicit_midpoint": 1e-5,
 }  # fmt: skip
 
 
