@@ -198,7 +198,7 @@ def test_exact_motions_start_where_their_scenes_do(scene: Scene) -> None:
 
 
 @pytest.mark.thorough(every=3)
-@pytest.mark.parametrize("way", [TAYLOR, COMPILED, PINOCCHIO, MUJOCO, ORACLE], ids=str)
+@pytest.mark.parametrize("way", [MUJOCO, PINOCCHIO, TAYLOR, COMPILED, ORACLE], ids=str)
 @pytest.mark.parametrize("problem", ["pendulum (IFToMM A01)", "heavy top", "spherical pendulum"])
 def test_published_problems_on_every_engine(problem: str, way: Way) -> None:
     figures, _ = checks.CHECKS[problem](runs(way))

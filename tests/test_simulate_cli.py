@@ -15,6 +15,7 @@ from click.testing import CliRunner, Result
 
 from mbkit import catalog, dynamics, simulate
 from mbkit.cli import cli
+from mbkit.report import figures
 from tests.test_report import AGREEING, STUDY
 from tests.test_stress_report import RESULT
 
@@ -26,6 +27,12 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def undrawn(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: ARG001
+    """What a test does not look at is not drawn: that would be most of its time."""
+    monkeypatch.setattr(figures, "image", lambda _: b"")
+
+
 def call(*arguments: str) -> Result:
     return CliRunner().invoke(cli, arguments)
 
@@ -33,7 +40,7 @@ def call(*arguments: str) -> Result:
 # mbkit simulate
 
 
-def test_a_run_is_the_librarys_and_is_written_whole(here: Path) -> None:
+def test_a_run_is_the_librarys_and_is_written_whole(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = call("simulate", "cart_pole", "--q0", "-0.5,1", "--v0", "0.1,0", "--duration", "0.2", "--dt", "2e-3")
     assert result.exit_code == 0, result.output
     run = simulate(dynamics(catalog.cart_pole()), [-0.5, 1.0], [0.1, 0.0], 0.2, dt=2e-3)
@@ -47,6 +54,7 @@ def test_a_run_is_the_librarys_and_is_written_whole(here: Path) -> None:
     assert (folder / "cart_pole-plot.png").read_bytes().startswith(b"\x89PNG")
     assert f"{run.q[-1, 1]:.6g}" in result.stdout
     assert "cart_pole-picture.png" in result.stdout
+    monkeypatch.setattr(figures, "image", lambda _: b"")
     # What mbkit wrote, it replaces; what somebody else wrote, it does not.
     assert call("simulate", "cart_pole", "--duration", "0.01").exit_code == 0
     (folder / "cart_pole-trajectory.csv").write_text("mine")
@@ -56,7 +64,7 @@ def test_a_run_is_the_librarys_and_is_written_whole(here: Path) -> None:
     assert call("simulate", "cart_pole", "--duration", "0.01", "--force").exit_code == 0
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("undrawn")
 def test_json_has_the_cost_and_the_final_state() -> None:
     start = "--q0", "random:3", "--v0", "random:3"
     result = call("simulate", "cart_pole", *start, "--method", "rk853", "--rtol", "1e-8", "--save", "10", "--json")
@@ -75,7 +83,7 @@ def test_json_has_the_cost_and_the_final_state() -> None:
 
 
 @pytest.mark.thorough("slider_crank-lagrangian", "pendulum-pinocchio")
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("target", "engine"),
     [("mbkit.lagrangian.systems:kepler", "lagrangian"), ("slider_crank", "lagrangian"), ("pendulum", "pinocchio")],
@@ -87,7 +95,7 @@ def test_the_engine_is_one_that_holds_the_system(target: str, engine: str) -> No
     assert json.loads(result.stdout)["engine"] == engine
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_that_diverges_or_is_doubtful_has_status_1() -> None:
     wild = ("simulate", "double_pendulum", "--q0", "1.5,1", "--v0", "30,3", "--duration", "20", "--dt", "0.05")
     result = call(*wild, "--method", "semi_implicit_euler", "--json")
