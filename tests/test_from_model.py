@@ -14,7 +14,7 @@ from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.from_description import from_model
 from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters
 from mbkit.lagrangian.system import QuasiLagrangian
-from mbkit.lagrangian.trig.shortest_form import number, operations
+from mbkit.lagrangian.trig.shortest_form import number
 from mbkit.lagrangian.trig.simplify import forms, tidy
 from mbkit.model.parts import Loop, Prescribed
 from mbkit.spatial import matrix_from_quaternion
@@ -346,8 +346,6 @@ a, b, c, x, y = sp.symbols("a b c x y")
 def test_short_forms(long, short):
     assert tidy(long).equals(short)
     assert tidy(long).count_ops() <= sp.sympify(short).count_ops()
-    for form in (long, -long, 1 / (long + x), -x / (3 * y) - long):
-        assert operations(form) == form.count_ops()
 
 
 @pytest.mark.thorough("0", "1", "3", "4")

@@ -8,14 +8,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from fractions import Fraction
-from functools import lru_cache
 from itertools import combinations
 from math import comb, gcd, lcm, prod
 from random import Random
 from typing import Any, Final
 
 import sympy as sp
-from sympy.core.function import _coeff_isneg
 
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing, gather
 
@@ -28,25 +26,7 @@ _FACTORED: Final = 10
 
 def complexity(x: sp.Expr) -> int:
     """Return the operations of an expression, more for a sum that is nested deep."""
-    return operations(x) + 2 * max(_depth(x) - 2, 0)
-
-
-@lru_cache(20_000)
-def operations(x: sp.Expr) -> int:
-    """Return `x.count_ops()` from the counts of the parts, which are kept: the same ones stand in many forms."""
-    if not (x.is_Add or x.is_Mul or x.is_Pow or isinstance(x, (sp.sin, sp.cos))):
-        return int(x.count_ops())
-    if x.is_Add:
-        minus = [_coeff_isneg(a) for a in x.args]
-        return sum(operations(-a if m else a) for a, m in zip(x.args, minus, strict=True)) + len(minus) - 1 + all(minus)
-    if x.is_Mul and _coeff_isneg(x):
-        x = x.as_two_terms()[1] if x.args[0] == -1 else -x
-        # SymPy counts the terms of -(a + b) alone.
-        return 1 + (sum(map(operations, x.args)) if x.is_Add else operations(x))
-    above, below = sp.fraction(x) if x.is_Mul or (x.is_Pow and x.exp == -1) else (x, sp.S.One)
-    if below != 1:
-        return 1 + sum(operations(part) for part in (above, below) if not part.is_Integer)
-    return (len(x.args) - 1 if x.is_Mul else 1) + sum(map(operations, x.args))
+    return int(x.count_ops()) + 2 * max(_depth(x) - 2, 0)
 
 
 def _depth(x: sp.Expr) -> int:
