@@ -159,6 +159,19 @@ def test_a_motion_that_is_not_determined_is_refused_by_name(engine) -> None:
         mb.simulate(dyn, q, v, 0.1, "rk4")
 
 
+@pytest.mark.parametrize("speed", [3.0, 3e-4])
+def test_a_velocity_of_eight_digits_is_on_its_branch_and_one_of_three_is_not(speed) -> None:
+    """However slow it is."""
+    dyn = row(2)
+    q, v = parallel(dyn, FLAT, -speed)
+    names = dyn.model.coordinate_names
+    aside = np.array([{"theta0": -1.0, "phi1": 0.0, "theta1": -2.0, "phi2": 2.0, "theta2": -2.0}[n] for n in names])
+    run, _ = simulated(dyn, q, v + 1e-8 * speed * aside, 0.01, "rk4", dt=1e-3)
+    assert run.q[-1] == pytest.approx(parallel(dyn, motion(2, [0.01], FLAT, -speed)[0], 0.0)[0], abs=1e-9)
+    with pytest.raises(NumericalError, match=r"off each branch by 0.00\d+ of its size"):
+        mb.simulate(dyn, q, v + 1e-3 * speed * aside, 0.01, "rk4", dt=1e-3)
+
+
 @pytest.mark.thorough(every=3)
 @pytest.mark.parametrize(("method", "setting", "close", "engine"), SOME)
 def test_one_of_a_batch_does_not_stop_the_others(method, setting, close, engine) -> None:

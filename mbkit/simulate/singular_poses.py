@@ -28,15 +28,13 @@ if TYPE_CHECKING:
 LOOSEST: Final = 1e-9
 #: Steps ahead in which a pose would be singular at the present pace.
 _AHEAD: Final = 4
-#: A sign change of the smallest singular value makes it bend less than this part of how much it bends without.
-_SMOOTHER: Final = 0.5
 #: Steps' ends that decide on one interval.
 _WINDOW: Final = 4
 #: Of a unit vector: the entries of the constraints that depend on each other.
 _TAKES_PART: Final = 0.1
 #: Of the rows' size, 1/s: what typed digits leave of a velocity that is zero, as in `independent_rows`.
 _STILL: Final = 1e-7
-#: Of γ: its rest at a velocity of rounded digits that stays on a branch.
+#: Of what γ can be at velocities of this size: its rest at one of rounded digits that stays on a branch.
 _ON_BRANCH: Final = 1e-6
 #: Of J's largest singular value, the smallest one below which a step is one across the pose. v̇ from the equation of
 #: motion loses eps/σ² of itself, `LOOSEST` at a tenth of this; begun there, the step's own stages would be in the pose.
@@ -133,10 +131,10 @@ class Passage:
         turning = self._turned(x.J_rate) @ self._free
         if not np.linalg.svd(turning, compute_uv=False)[-1] > _STILL:
             return "its velocity does not say on which branch it goes on"
+        # γ is quadratic in v, and zero in these rows on a branch.
         rest = float(np.abs(self._turned(x.gamma)).max())
-        if not rest <= _ON_BRANCH * max(1.0, float(np.abs(x.gamma).max()) / self._size):
-            # γ is quadratic in v, and zero in these rows on a branch.
-            most = float(np.abs(self._turned(x.by_velocity)).sum(axis=1).max()) * float(np.abs(x.v).max())
+        most = float(np.abs(self._turned(x.by_velocity)).sum(axis=1).max()) * float(np.abs(x.v).max())
+        if not rest <= _ON_BRANCH * most:
             return f"its velocity is off each branch by {rest / most:.1g} of its size"
         return ""
 
@@ -226,11 +224,8 @@ class Approach:
 
         It is up to h, or that many times longer across the pose.
         """
-        d, most = self.ahead, longer * h
-        if not 0.02 * h < d < 1.45 * most:
-            return h
-        # A little longer is better than a short step before it.
-        return d / _BETWEEN if d <= 1.05 * _BETWEEN * most else min(h, d - 0.45 * most)
+        # A little longer is better than a short step before it; one that has passed it is behind.
+        return self.ahead / _BETWEEN if 0.02 * h < self.ahead <= 1.05 * _BETWEEN * longer * h else h
 
     def crosses(self, h: float) -> bool:
         """Return whether a pose is as near as a step of length h, ahead or behind; then it is `near`."""
@@ -285,11 +280,11 @@ class SingularPoses:
             return
         times = [t for t, *_ in self._seen]
         plain, turned = _bend(times, [s0, s1, s2, s3]), _bend(times, [s0, s1, -s2, -s3])
-        if not turned < _SMOOTHER * plain:
+        if not turned < plain:
             return
         middle = np.array(times) - times[1]
         roots = np.roots(np.polyfit(middle, [s0, s1, -s2, -s3], 3))
-        within = roots[(abs(roots.imag) < 1e-12) & (roots.real >= 0) & (roots.real <= middle[2])].real
+        within = roots[np.isreal(roots) & (roots.real >= 0) & (roots.real <= middle[2])].real
         if len(within):
             nearest = 1 if s1 < s2 else 2
             self._rows = np.flatnonzero(np.abs(np.linalg.svd(self._seen[nearest][2])[0][:, -1]) > _TAKES_PART).tolist()
