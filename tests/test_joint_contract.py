@@ -10,7 +10,7 @@ import pytest
 
 import mbkit as mb
 from mbkit.engines import ENGINES, QUANTITIES, closed_loops, constrained
-from mbkit.engines.frames_and_momenta import CLASSICAL, SPATIAL
+from mbkit.engines.frames_and_momenta import AXES, CLASSICAL, SPATIAL
 from mbkit.errors import KnownDefectWarning, UnsupportedError
 from mbkit.model import KINDS, Model, kind_of
 from tests.joint_of_ones_own import OWN
@@ -53,13 +53,14 @@ def state(model: Model) -> dict[str, np.ndarray]:
 WRENCH = (1.0, -2.0, 3.0, 0.5, 0.1, -0.4)
 
 
-def value(dyn, quantity: str, at: dict[str, np.ndarray]) -> np.ndarray:
-    """Return a quantity of the last body, of all kinds on a last axis; test_bodies has all axes."""
+def value(dyn, quantity: str, at: dict[str, np.ndarray], axes: tuple[str, ...] = AXES) -> np.ndarray:
+    """Return a quantity of the last body in these axes and of all kinds, on a last axis."""
     method, frame = getattr(dyn, quantity), dyn.model.bodies[-1].name
     takes = inspect.signature(method).parameters
     more = {"frame": frame} if "frame" in takes else {}
     more |= {"wrenches": {frame: WRENCH}} if "wrenches" in takes else {}
-    options = [{"kind": kind} for kind in (SPATIAL, CLASSICAL)] if "kind" in takes else [{}]
+    options = [{"axes": x} for x in axes] if "axes" in takes else [{}]
+    options = [x | {"kind": kind} for x in options for kind in (SPATIAL, CLASSICAL)] if "kind" in takes else options
     given = [at[name[0]] for name, x in takes.items() if name in ("q", "v", "a", "tau") and x.default is x.empty]
     return np.stack([np.asarray(method(*given, **more, **x)) for x in options], axis=-1)
 
@@ -123,7 +124,7 @@ FEATURES = {
     [
         *((engine, feature) for engine in ENGINES for feature in FEATURES if engine != "oracle"),
         # To the oracle one state is a batch of one.
-        ("oracle", "dampers"),
+        ("oracle", "all"),
         # What a feature adds is derived as for interpreting; code differs where a quantity is constant, or lacks v.
         *(("compiled", feature) for feature in ("nothing", "dampers", "joint springs", "all")),
     ],
@@ -141,10 +142,10 @@ def test_one_state_has_the_values_of_its_row_in_a_batch(engine, feature):
         if quantity in ("function", *closed_loops.QUANTITIES):
             continue
         try:
-            whole = value(dyn, quantity, batch)
+            whole = value(dyn, quantity, batch, AXES[:1])
         except UnsupportedError:
             continue
-        rows = [value(dyn, quantity, {name: x[i] for name, x in batch.items()}) for i in range(3)]
+        rows = [value(dyn, quantity, {name: x[i] for name, x in batch.items()}, AXES[:1]) for i in range(3)]
         if quantity in DERIVATIVES:
             whole = np.moveaxis(whole, 1, 0)
         tolerance = 1e-13 * (np.linalg.cond(M).max() if quantity.startswith("forward") else 1.0)
