@@ -34,8 +34,8 @@ _WINDOW: Final = 4
 _TAKES_PART: Final = 0.1
 #: Of the rows' size, 1/s: what typed digits leave of a velocity that is zero, as in `independent_rows`.
 _STILL: Final = 1e-7
-#: Of what γ can be at velocities of this size: its rest at one of rounded digits that stays on a branch.
-_ON_BRANCH: Final = 1e-6
+#: Of what γ can be at velocities of this size: its rest at one that stays on a branch to the digits of a loose run.
+_ON_BRANCH: Final = 1e-5
 #: Of J's largest singular value, the smallest one below which a step is one across the pose. v̇ from the equation of
 #: motion loses eps/σ² of itself, `LOOSEST` at a tenth of this; begun there, the step's own stages would be in the pose.
 _WORSE: Final = 10 * float(np.sqrt(np.finfo(float).eps / LOOSEST))
@@ -224,8 +224,11 @@ class Approach:
 
         It is up to h, or that many times longer across the pose.
         """
-        # A little longer is better than a short step before it; one that has passed it is behind.
-        return self.ahead / _BETWEEN if 0.02 * h < self.ahead <= 1.05 * _BETWEEN * longer * h else h
+        d, most = self.ahead, longer * h
+        if not 0.02 * h < d < 1.45 * most:
+            return h
+        # A little longer is better than a short step before it.
+        return d / _BETWEEN if d <= 1.05 * _BETWEEN * most else min(h, d - 0.45 * most)
 
     def crosses(self, h: float) -> bool:
         """Return whether a pose is as near as a step of length h, ahead or behind; then it is `near`."""
