@@ -255,7 +255,7 @@ def test_every_method_runs_a_beam(method):
     # The second mode turns by 0.02 rad in a step.
     setting = {"dt": 1e-4} if METHODS[method].kind == "fixed" else {"rtol": 1e-8, "atol": 1e-10}
     end, exact = (
-        mb.simulate(dyn, *start, 0.05, name, save=[0.0, 0.05], **how).q[-1]
+        mb.simulate(dyn, *start, 0.1, name, save=[0.0, 0.1], **how).q[-1]
         for name, how in ((method, setting), ("rk853", {"rtol": 1e-12, "atol": 1e-13}))
     )
     assert np.abs(end - exact).max() < (5e-3 if METHODS[method].order == 1 else 1e-5)

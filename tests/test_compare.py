@@ -52,7 +52,7 @@ def untimed(monkeypatch):
 @pytest.fixture
 def brief(monkeypatch):
     """Leave little time to error against run time, where a test asks for something else."""
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_SECONDS", 0.1)
+    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_SECONDS", 0.5)
 
 
 @pytest.fixture
@@ -65,10 +65,10 @@ def terms(model, **kwargs):
     return mb.compare(model, samples=16, terms_only=True, **kwargs)
 
 
-@pytest.mark.thorough("human", "tiago_no_hand", "solo12")
-@pytest.mark.parametrize("robot", ["double_pendulum", "human", "tiago_no_hand", "finger_edu", "solo12"])
+@pytest.mark.thorough("human", "tiago_no_hand")
+@pytest.mark.parametrize("robot", ["double_pendulum", "human", "tiago_no_hand", "solo12"])
 def test_robots_agree(robot):
-    result = terms(mb.load(robot, floating_base=robot in ("finger_edu", "solo12")))
+    result = terms(mb.load(robot, floating_base=robot == "solo12"))
     assert result.passed, result.verdict
     assert result.engines == ("pinocchio", "lagrangian", "mujoco")
     assert {r.term for r in result.rows} == TERM_NAMES
@@ -377,10 +377,8 @@ def gripper() -> mb.Model:
 
 
 def test_a_whole_comparison_has_rollouts_run_times_and_omissions(monkeypatch):
-    # Interpreted, thousands of steps take three times as long.
+    # As users have it; interpreted, thousands of steps take three times as long.
     monkeypatch.setenv("MBKIT_COMPILE", "1")
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_REPEATS", 1)
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_WORK", 8_000)
     result = mb.compare(gripper(), samples=4)
     assert result.passed, result.verdict
     assert all("mimic joints free" in r.note for r in result.rollouts if "explicit" not in r.method)

@@ -32,7 +32,7 @@ def dynamics(model: mb.Model, engine: str, **options: Any) -> mb.Dynamics:
 
 
 def tree_of(seed: int) -> mb.Model:
-    return random_tree(seed, 9, IN_MUJOCO, nearest=3)
+    return random_tree(seed, 12, IN_MUJOCO, nearest=3)
 
 
 def rows_of(model: mb.Model) -> np.ndarray:
@@ -168,7 +168,7 @@ def test_other_names_copies_and_parameters_keep_the_motion(seed: int) -> None:
 
 
 def test_runs_stay_on_the_couplers() -> None:
-    model = coupled(random_tree(2, 5, ("revolute", "prismatic"), armature=False, nearest=3), 2)
+    model = coupled(random_tree(2, 8, ("revolute", "prismatic"), armature=False, nearest=3), 2)
     q, v, _ = state(model, 2)
     run = mb.simulate(mb.dynamics(model, "lagrangian"), q, v, 0.1, dt=1e-3)
     other = mb.simulate(mb.dynamics(model, "pinocchio"), q, v, 0.1, dt=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pickle
 import re
 import warnings
@@ -234,6 +235,21 @@ def test_what_a_slow_drift_of_phase_loses():
     part, rate = lost(steps, 0.01, rates, duration=24.0)
     assert part == pytest.approx(10.0**3 * 0.01**2, abs=1e-3)
     assert abs(rate.imag) == 10.0
+
+
+@pytest.mark.parametrize("crowded", [False, True])
+@pytest.mark.parametrize("seed", range(5))
+def test_modes_are_paired_with_steps_so_that_all_together_are_nearest(seed: int, crowded: bool) -> None:
+    """Crowded, several modes have the same nearest step."""
+    rng = np.random.default_rng(seed)
+    rates = 1j * (rng.uniform(1.0, 1.1, 4) if crowded else np.array([1.0, 5.0, 9.0, 13.0]))
+    h, off = 0.1, rng.uniform(-0.02, 0.02, (2, 4))
+    steps = np.exp(h * rates + off[0] + 1j * off[1])
+    gaps = np.abs(np.log(steps)[None, :] - h * rates[:, None])
+    best = min(itertools.permutations(range(4)), key=lambda places: gaps[range(4), places].sum())
+    assert (len(set(gaps.argmin(axis=1))) < 4) == crowded
+    part, _ = lost(rng.permutation(steps), h, rates, duration=1.0)
+    assert part * h == pytest.approx(gaps[range(4), best].max(), rel=1e-9)
 
 
 # What a sweep of all cases and methods found wrong by more than a hundredth, and unsaid.

@@ -2,9 +2,7 @@
 
 import json
 import math
-import pickle
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
@@ -195,37 +193,16 @@ ALL = Sweep(
 )
 
 
-DRAWN: dict[tuple[str, bytes], str] = {}
-
-
-def once(draw: Callable[..., str]) -> Callable[..., str]:
-    """Return a figure's function that draws the same result no second time."""
-
-    def drawn(result: object) -> str:
-        key = draw.__name__, pickle.dumps(result)
-        return DRAWN[key] if key in DRAWN else DRAWN.setdefault(key, draw(result))
-
-    return drawn
-
-
-def rendered(document: object, **names: str) -> str:
-    """Return a page; most of its time is drawing, and tests look at many pages of the same results."""
-    with pytest.MonkeyPatch.context() as patch:
-        for place, name in ((figures, "digits"), (figures, "term_costs"), (work_precision_view, "error_against_time")):
-            patch.setattr(place, name, once(getattr(place, name)))
-        return pages.render(document, **names)
-
-
 def check_page(result: Comparison, asked: str = "", data: str = "") -> str:
-    return rendered(compare_view.view(result, asked), data=data)
+    return pages.render(compare_view.view(result, asked), data=data)
 
 
 def bench_page(result: WorkPrecision, asked: str = "", data: str = "", table: str = "") -> str:
-    return rendered(work_precision_view.view(result, asked), data=data, table=table)
+    return pages.render(work_precision_view.view(result, asked), data=data, table=table)
 
 
 def sweep_page(result: Sweep, data: str = "") -> str:
-    return rendered(compare_view.robots_view(result), data=data)
+    return pages.render(compare_view.robots_view(result), data=data)
 
 
 def check_table(result: Comparison, asked: str = "", *, full: bool = True) -> object:
@@ -515,10 +492,9 @@ def test_figures_are_the_same_every_time_and_scale():
         assert "viewBox" in one
         assert not re.match(r"<svg[^>]* width=", one)
         assert "var(--series1)" in one
-    digits = figures.digits(AGREEING)
-    assert "mujoco against oracle" in digits
-    assert "var(--bad)" not in digits
+    assert "mujoco against oracle" in figures.digits(AGREEING)
     assert "var(--bad)" in figures.digits(DIFFERING)
+    assert "var(--bad)" not in figures.digits(AGREEING)
 
 
 @pytest.mark.thorough("result1", "result2")
@@ -655,11 +631,10 @@ def test_the_table_of_a_study_fits_the_terminal(width):
 def test_terms_that_were_not_timed_are_not_drawn():
     untimed = replace(AGREEING, rows=tuple(replace(r, ns=NAN) for r in AGREEING.rows))
     assert term_costs(untimed) == ""
-    drawn = term_costs(AGREEING)
-    assert "nle" not in drawn
-    assert "var(--bad)" not in drawn
+    assert "nle" not in term_costs(AGREEING)
     ElementTree.fromstring(term_costs(NASTY))
     assert "var(--bad)" in term_costs(DIFFERING)
+    assert "var(--bad)" not in term_costs(AGREEING)
 
 
 def test_a_sweep_counts_and_passes_only_when_all_agree_or_are_refused():

@@ -58,7 +58,7 @@ def study(told, tmp_path_factory) -> StressResult:
         [own.ENDING, own.FAULTY, own.MASSES, own.GLIDING],
         ["pinocchio"],
         METHODS,
-        seconds=0.5,
+        seconds=1.5,
         memory=2**30,
         budget=300,
         jobs=2,

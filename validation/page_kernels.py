@@ -1,7 +1,7 @@
 """Kernels of the book's pages: forks of one process that has imported what most pages import.
 
-A kernel of its own starts for some three seconds of a processor before its first cell. `conf.py` calls `use`; then
-Jupyter starts ``python -m validation.page_kernels FILE``, which asks the one process for a fork and ends with it.
+A kernel that imports for itself takes some two seconds longer to its first result. `conf.py` calls `use`; then Jupyter
+starts ``python -m validation.page_kernels FILE``, which asks the one process for a fork and ends with it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,12 @@ _IMPORTED: Final = (
 
 
 def use() -> None:
-    """Start the process, and make it the kernel of pages; sockets are files, as two kernels may draw one port."""
+    """Start the process, and make its forks the kernels of pages; on Linux alone, elsewhere forks are not safe.
+
+    Sockets are files: two kernels that start at once may draw one port.
+    """
+    if sys.platform != "linux":
+        return
     import jupyter_client
     from traitlets import default
 
@@ -57,9 +62,10 @@ def use() -> None:
     os.environ.update({"JUPYTER_PATH": folder.name, _SOCKET: address})
     # It ends when this end of its input closes, however this process ends.
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=os.environ["MBKIT_TOP"])
-    assert process.stdout is not None
-    process.stdout.readline()
     atexit.register(process.kill)
+    assert process.stdout is not None
+    if not process.stdout.readline():
+        raise RuntimeError("the process that kernels of pages are forked from has ended: see its message above")
 
 
 def _serve() -> None:
