@@ -165,6 +165,22 @@ URDFS = {
     "negative_damping": (with_joint(LIMIT + '<dynamics damping="-1"/>'), ["joint 'j': damping", "negative"]),
     "zero_axis": (with_joint('<axis xyz="0 0 0"/>' + LIMIT), ["joint 'j': axis is zero"]),
     "short_axis": (with_joint('<axis xyz="0 1"/>' + LIMIT), ["joint 'j': axis xyz: expected 3 numbers, got '0 1'"]),
+    "negative_spring": (
+        with_joint(LIMIT + '<dynamics spring_stiffness="-1"/>'),
+        ["joint 'j': stiffness -1 is negative"],
+    ),
+    "sprung_floating": (
+        with_joint('<dynamics spring_stiffness="1"/>', "floating"),
+        ["joint 'j': a spring on a floating"],
+    ),
+    "unknown_dynamics": (
+        with_joint(LIMIT + '<dynamics spring_rate="2"/>'),
+        ["unknown attribute 'spring_rate'", "spring_stiffness"],
+    ),
+    "no_inertia_element": (
+        robot('<link name="a"/>', links("b", inertial='<inertial><mass value="1"/></inertial>'), JOINT),
+        ["link 'b': <inertial> has no <inertia>", 'nonphysical="warn"'],
+    ),
     "damped_floating": (with_joint('<dynamics damping="1"/>', "floating"), ["joint 'j': damping or friction"]),
     "two_limits": (with_joint(LIMIT + LIMIT.replace('"1"', '"2"')), ["joint 'j': 2 <limit> elements"]),
     "mimic_unknown": (

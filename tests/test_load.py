@@ -30,11 +30,11 @@ from mbkit.errors import (
     NonPhysicalWarning,
     UnknownNameError,
 )
-from mbkit.load import load, robots
+from mbkit.load import load, robots, xml_reader
 from mbkit.load.loader import find
 from mbkit.load.mjcf_attributes import rules as mjcf_rules
 from mbkit.load.sanitized_text import strip
-from mbkit.load.urdf_reader import Snapper
+from mbkit.load.urdf_reader import Snapper, urdf_links
 from mbkit.model import Mimic
 from mbkit.model.validation import sample_mass_matrix
 from mbkit.studies import compare
@@ -393,6 +393,66 @@ def arm(mass=1.0, length=1.0, com=1.0, axis="0 0 1"):
         f'<robot name="r">{link("a", 1, 0.1)}{link("b", 1, 0.1)}{link("c", mass, 0.1 * com)}'
         f"{joint('j', 'a', 'b', 1, '0 1 0')}{joint('k', 'b', 'c', length, axis)}</robot>"
     )
+
+
+def swinging(kind: str, dynamics: str = "", moments: str | None = "1 1 1", com: float = 0.3) -> str:
+    """Return a link of 2 kg whose centre stands off along x from a joint about or along z."""
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    numbers = " ".join(f'{n}="{x}"' for n, x in zip(names, f"{moments} 0 0 0".split(), strict=True)) if moments else ""
+    inertia = f"<inertia {numbers}/>" if moments else ""
+    link = links("b", inertial=f'<inertial><origin xyz="{com} 0 0"/><mass value="2"/>{inertia}</inertial>')
+    inside = f'<axis xyz="0 0 1"/><limit lower="-9" upper="9" effort="1" velocity="1"/>{dynamics}'
+    return robot(links("a"), link, urdf_joint("j", "a", "b", inside, kind))
+
+
+@pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
+def test_a_spring_in_the_dynamics_of_a_urdf_joint_acts(kind: str) -> None:
+    model = mb.load(swinging(kind, '<dynamics spring_stiffness="3" spring_reference="0.2"/>'), gravity=(0, 0, 0))
+    assert any("spring_stiffness 3 about 0.2" in note for note in model.notes)
+    inertia = 2.0 if kind == "prismatic" else 1 + 2 * 0.3**2
+    for engine in ("pinocchio", "lagrangian", "mujoco", "drake"):
+        dyn = mb.dynamics(model, engine)
+        assert dyn.passive([0.7], [0.0]) == pytest.approx([-3 * 0.5], rel=1e-14)
+        assert dyn.forward_dynamics([0.7], [0.0], [0.0]) == pytest.approx([-3 * 0.5 / inertia], rel=1e-13)
+    assert mb.dynamics(model).potential_energy([0.7]) == pytest.approx(3 * 0.5**2 / 2, rel=1e-14)
+    # Link by link too, as importers and lint have it.
+    linked = urdf_links(xml_reader.parse(swinging(kind, '<dynamics spring_stiffness="3"/>').encode(), ""), "")
+    assert [*linked.joints[-1].stiffness] == [3.0]
+
+
+@pytest.mark.parametrize("kind", ["revolute", "floating", "fixed"])
+def test_numbers_of_dynamics_that_are_zero_pass(kind: str) -> None:
+    zeros = '<dynamics damping="0" spring_stiffness="0" spring_reference="0.0" coulomb="+0.000" viscous="-0"/>'
+    there, without = (mb.load(swinging(kind, x), floating_base=True) for x in (zeros, ""))
+    assert there == without
+    assert not any("spring" in note for note in there.notes)
+
+
+def test_the_spring_of_a_fixed_joint_is_left_out_with_a_note() -> None:
+    model = mb.load(swinging("fixed", '<dynamics spring_stiffness="3"/>'), floating_base=True)
+    assert not model.needs.springs
+    assert any("spring_stiffness 3" in note and "fixed joint leaves idle" in note for note in model.notes)
+
+
+def test_mass_without_an_inertia_element_is_a_point() -> None:
+    model = mb.load(swinging("revolute", "", None), nonphysical="warn", gravity=(0, 0, 0))
+    assert any("read as point masses: b" in note for note in model.notes)
+    for engine in ("pinocchio", "lagrangian", "mujoco", "drake"):
+        assert mb.dynamics(model, engine).mass_matrix([0.4]) == pytest.approx(2 * 0.3**2, rel=1e-14)
+
+
+def test_a_thin_rod_is_matter_in_files_and_by_hand() -> None:
+    b = mb.ModelBuilder("rod", gravity=(0, 0, 0))
+    b.add_body("b", mass=2.0, com=(0.3, 0, 0), inertia=(0.0, 0.2, 0.2))
+    b.add_joint("j", "revolute", parent="world", child="b", axis=(0, 0, 1))
+    inertial = '<inertial pos="0.3 0 0" mass="2" diaginertia="0 0.2 0.2"/>'
+    mjcf = f'<mujoco><worldbody><body name="b">{inertial}<joint axis="0 0 1"/></body></worldbody></mujoco>'
+    for model in (b.build(), mb.load(swinging("revolute", "", "0 0.2 0.2")), mb.load(mjcf)):
+        assert not model.nonphysical
+        for engine in ("pinocchio", "lagrangian", "mujoco", "drake"):
+            assert mb.dynamics(model, engine).mass_matrix([0.4]) == pytest.approx(0.2 + 2 * 0.3**2, rel=1e-14)
+    with pytest.raises(ModelError, match="no mass moves with joint 'j'"):
+        mb.load(swinging("revolute", "", "0.2 0.2 0", com=0.0))
 
 
 @pytest.mark.parametrize("numbers", [{"mass": 1e-14}, {"length": 1e8}, {"length": -1e6}])
@@ -1059,8 +1119,14 @@ def test_a_body_that_never_moves_may_have_any_inertia(tmp_path, mass, moments):
         ours, sound = (mb.dynamics(m, engine) for m in (odd, model("1 1 1") if mass != "0" else model("0 0 0")))
         np.testing.assert_array_equal(ours.mass_matrix([0.3]), sound.mass_matrix([0.3]))
         np.testing.assert_array_equal(ours.gravity([0.3]), sound.gravity([0.3]))
-    with pytest.raises(ModelError, match="'a'"):
-        model(moments, '<freejoint name="f"/>')
+    if moments == "0 0 0":
+        # Two points that are welded to each other are a thin rod.
+        rod = model(moments, '<freejoint name="f"/>').body("a")
+        assert rod.mass == 4
+        assert np.linalg.eigvalsh(rod.inertia)[0] == pytest.approx(0.0, abs=1e-16)
+    else:
+        with pytest.raises(ModelError, match="'a'"):
+            model(moments, '<freejoint name="f"/>')
     x, y, z = moments.split()
     inertia = f'<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/>'
     base = links("a", inertial=f'<inertial><mass value="{mass}"/>{inertia}</inertial>')

@@ -200,7 +200,15 @@ def changed(old, new):
             changed('<link name="arm">', '<include><uri>model://no</uri></include><link name="arm">'),
             "<include>.*gz sdf -p",
         ),
-        (changed('<link name="arm">', '<link name="lost"/><link name="arm">'), "there are: 'lost', 'inside::base'"),
+        (changed('version="1.9"', 'version="two"'), "<sdf> has the version 'two'; expected one such as 1.9"),
+        (
+            changed(
+                '<link name="arm">',
+                '<link name="c"><inertial auto="true"/><collision name="c"><geometry><mesh><uri>c.obj</uri></mesh>'
+                '</geometry></collision></link><link name="arm">',
+            ),
+            r"link 'c' \(line \d+\) takes its inertia from a mesh",
+        ),
         (
             changed("</joint>", '</joint><joint name="k" type="ball"><parent>world</parent><child>arm</child></joint>'),
             "loops",
@@ -238,6 +246,28 @@ def test_a_base_that_the_file_holds_does_not_float():
     assert mb.load(held).nv == 1
     with pytest.raises(LoadError, match="there are: none"):
         mb.load(held, floating_base=True)
+
+
+@drake
+def test_several_bases_are_held_at_their_poses_or_all_float():
+    other = '<link name="other"><pose>0 3 0 0 0 0.5</pose><inertial><mass>4</mass></inertial></link>'
+    ends = "<parent>other</parent><child>wing</child><axis><xyz>0 0 1</xyz></axis>"
+    hinge = f'<joint name="turn" type="revolute">{ends}</joint>'
+    wing = '<link name="wing"><pose relative_to="other">1 0 0 0 0 0</pose><inertial><mass>2</mass></inertial></link>'
+    both, alone = changed('<link name="arm">', f'{other}{wing}{hinge}<link name="arm">'), mb.load(changed("", ""))
+    held = mb.load(both)
+    assert any("bases 'other', 'inside::base' float in SDF, and are held" in note for note in held.notes)
+    dyn, q = mb.dynamics(held), np.array([0.7, 0.4])[[held.joint_names.index(x) for x in ("hinge", "turn")]]
+    # The arms do not know each other; sdformat's inertia is 1 kg m² where none stands.
+    M, first = dyn.mass_matrix(q), held.joint_names.index("hinge")
+    assert M[first, first] == pytest.approx(mb.dynamics(alone).mass_matrix([0.7])[0, 0], rel=1e-14)
+    assert M[1 - first, 1 - first] == pytest.approx(1.0, rel=1e-14)
+    assert M[0, 1] == 0
+    c, s = np.cos(0.5), np.sin(0.5)
+    assert np.abs(dyn.pose(q, "wing")[:3, 3] - [c, 3 + s, 2]).max() < CLOSE
+    free = mb.load(both, floating_base=True)
+    assert {x for x in free.joint_names if "root" in x} == {"root_joint_other", "root_joint_inside::base"}
+    assert free.nv == 14
 
 
 def test_without_drake_the_extra_is_named(monkeypatch, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -163,7 +164,9 @@ def model_of_sdf(
     root: Element, text: str, path: str, floating_base: bool, nonphysical: Literal["error", "warn"], gravity: Any
 ) -> Model:
     """Return the model of an <sdf> element; for the arguments see `mbkit.load`."""
-    models = root.all("model")
+    models, version = root.all("model"), root.attributes.get("version", "")
+    if not re.fullmatch(r"\s*1\.\d+\s*", version):
+        raise LoadError(f"{path}: <sdf> has the version {version[:60]!r}; expected one such as 1.9")
     if len(models) != 1 or len(root.children) != 1:
         there = ", ".join(f"<{x.tag[:60]}>" for x in root.children[:10]) or "nothing"
         raise LoadError(f"{path}: expected an SDF of one <model> and nothing beside it, got {there}")

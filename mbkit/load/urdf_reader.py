@@ -35,6 +35,9 @@ BASE_JOINT: Final = "root_joint"
 _OPEN: Final = "1.7976931348623157e308"
 _MAX_LISTED: Final = 40
 _KINDS: Final = {k: k for k in ("fixed", "revolute", "continuous", "prismatic", "planar")} | {"floating": "free"}
+# Numbers of <dynamics> and the builder's names for them; URDF has the first two, published files the others too.
+_SPRING: Final = {"spring_stiffness": "stiffness", "spring_reference": "rest"}
+_DYNAMICS: Final = {"damping": "damping", "friction": "friction"} | _SPRING
 _MOMENTS: Final = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 # The elements of URDF's dynamics, with the elements in each and its attributes.
 _SCHEMA: Final[Mapping[str, tuple[frozenset[str], frozenset[str]]]] = {
@@ -51,7 +54,7 @@ _SCHEMA: Final[Mapping[str, tuple[frozenset[str], frozenset[str]]]] = {
         ("child", "", "link"),
         ("axis", "", "xyz"),
         ("limit", "", "lower upper effort velocity"),
-        ("dynamics", "", "damping friction"),
+        ("dynamics", "", " ".join(_DYNAMICS)),
         ("mimic", "", "joint multiplier offset"),
     )
 }
@@ -117,7 +120,7 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
         read.fault(f"{len(macros)} xacro elements, such as <{macros[0].tag}>; run xacro on the file first", macros[0])
     robot = _with_planes_turned(robot, read)
     odd: dict[str, str] = {}
-    links = [_link(e, read, odd) for e in robot.all("link")]
+    links = [_link(e, read, odd, lenient) for e in robot.all("link")]
     joints = [_joint(e, read) for e in robot.all("joint")]
     texts = "".join(text for _, text in (*links, *joints))
     root = _check_tree([link.name for link, _ in links], [j for j, _ in joints], floating_base, read)
@@ -126,6 +129,8 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
         read.fault(f"joint {BASE_JOINT!r}: floating_base=True adds a joint of that name; rename yours")
     if read.faults:
         raise ModelError(source, read.faults)
+    if lenient and (points := [x.name for x, _ in links if x.mass and x.inertia is not None and not x.inertia.any()]):
+        read.notes.append(f"links of mass without inertia, read as point masses: {listing(points, _MAX_LISTED)}")
     return UrdfFile(
         name,
         element_text("robot", {"name": name}, texts),
@@ -242,7 +247,7 @@ def _origin(owner: Element, item: str, read: Reader) -> tuple[_Numbers, _Numbers
     return xyz, rpy, _copy(origin, "xyz", "rpy")
 
 
-def _link(link: Element, read: Reader, odd: dict[str, str]) -> tuple[UrdfLink, str]:
+def _link(link: Element, read: Reader, odd: dict[str, str], lenient: bool) -> tuple[UrdfLink, str]:
     name = read.name(link, "name", "a link")
     item = f"link {name!r}"
     inertial = read.only(link, "inertial", item)
@@ -251,9 +256,13 @@ def _link(link: Element, read: Reader, odd: dict[str, str]) -> tuple[UrdfLink, s
     before = len(read.faults)
     com, rpy, text = _origin(inertial, item, read)
     mass, moments = (read.only(inertial, tag, item) for tag in ("mass", "inertia"))
-    for tag, element in (("mass", mass), ("inertia", moments)):
-        if element is None:
-            read.fault(f"{item}: <inertial> has no <{tag}>; add it, or remove <inertial>", inertial)
+    if mass is None:
+        read.fault(f"{item}: <inertial> has no <mass>; add it, or remove <inertial>", inertial)
+    if moments is None and lenient:
+        moments = Element("inertia", dict.fromkeys(_MOMENTS, "0"), inertial.line)
+    elif moments is None:
+        remedy = 'add it, or take a point mass with nonphysical="warn"'
+        read.fault(f"{item}: <inertial> has no <inertia>; {remedy}", inertial)
     if mass is None or moments is None:
         return UrdfLink(name), ""
     kg = read.number(mass, "value", item)
@@ -262,7 +271,7 @@ def _link(link: Element, read: Reader, odd: dict[str, str]) -> tuple[UrdfLink, s
     if kg < 0:
         read.fault(f"{item}: mass {kg:g} kg is negative; expected 0 or more", mass)
     if len(read.faults) == before:
-        why = body_fault(Body(name, kg, np.zeros(3), inertia), point_masses=False)
+        why = body_fault(Body(name, kg, np.zeros(3), inertia), point_masses=lenient)
         odd |= {name: why} if why else {}
     text = element_text("inertial", {}, text + _copy(mass, "value") + _copy(moments, *_MOMENTS))
     return UrdfLink(name, kg, com, rpy, inertia), element_text("link", {"name": name}, text)
@@ -343,15 +352,26 @@ def _dynamics(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[
     dynamics = read.only(joint, "dynamics", item)
     if dynamics is None:
         return {}, ""
-    numbers = {name: read.number(dynamics, name, item, 0.0) for name in ("damping", "friction")}
-    if numbers["friction"] < 0:
-        read.fault(f"{item}: friction {numbers['friction']:g} is negative; expected 0 or more", dynamics)
+    numbers = {own: read.number(dynamics, name, item, 0.0) for name, own in _DYNAMICS.items()}
+    for name in ("friction", "stiffness"):
+        if numbers[name] < 0:
+            read.fault(f"{item}: {name} {numbers[name]:g} is negative; expected 0 or more", dynamics)
+    stiffness, rest = numbers["stiffness"], numbers["rest"]
+    if not stiffness:
+        # A rest alone says nothing.
+        numbers = {name: numbers[name] for name in ("damping", "friction")}
     if kind in ("free", "planar") and any(numbers.values()):
-        type_ = joint.attributes["type"]
-        read.fault(f"{item}: damping or friction on a {type_} joint, which URDF parsers drop; remove it", dynamics)
-    if kind in ("", "fixed", "free", "planar") or not numbers.keys() & dynamics.attributes.keys():
+        what, type_ = "a spring" if stiffness else "damping or friction", joint.attributes["type"]
+        read.fault(f"{item}: {what} on a {type_} joint, which URDF parsers drop; remove it", dynamics)
+    if stiffness:
+        unit = "which a fixed joint leaves idle" if kind == "fixed" else "read as N m/rad or N/m"
+        says = f"spring_stiffness {stiffness:g} about {rest:g}, which URDF does not define, {unit}"
+        read.notes.append(f"{item}: {says} ({dynamics.place})")
+    if kind in ("", "fixed", "free", "planar"):
         return {}, ""
-    return numbers, _copy(dynamics, *numbers)
+    # Parsers refuse the element without one of these.
+    given = {"damping", "friction"} & dynamics.attributes.keys()
+    return numbers, _copy(dynamics, "damping", "friction") if given else ""
 
 
 def unbounded(limit: ArrayLike) -> Array:
@@ -436,7 +456,9 @@ def _unread(robot: Element, read: Reader) -> list[str]:
         element = stack.pop()
         children, known = _SCHEMA[element.tag]
         for name in element.attributes.keys() - known:
-            if hint := _attribute_hint(element.tag, name, known):
+            # A damper or spring of any name is none where its number is zero.
+            idle = element.tag == "dynamics" and not element.attributes[name].strip(" +-.0")
+            if (hint := _attribute_hint(element.tag, name, known)) and not idle:
                 read.fault(f"<{element.tag}>: unknown attribute {name[:60]!r}; {hint}", element)
             elif not name.startswith("xmlns"):
                 attributes[f"{element.tag} {name}"[:40]] += 1
@@ -548,7 +570,7 @@ def urdf_links(root: Element, source: str, *, floating_base: bool = False) -> Mo
         b.add_joint(j.name, j.kind, parent=j.parent, child=j.child, translation=j.translation, rotation=R, **numbers)
     for note in urdf.notes:
         b.note(note)
-    return b.build(nonphysical="warn", point_masses=False)
+    return b.build(nonphysical="warn")
 
 
 def read_links(path: Path) -> Model:

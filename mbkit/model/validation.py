@@ -270,7 +270,7 @@ _FAR = 1e6
 def body_fault(body: Body, *, point_masses: bool) -> str | None:
     """Return why mass and inertia are inconsistent, or None; zero mass with zero inertia is a frame.
 
-    A positive mass without inertia is allowed where `point_masses`.
+    A thin rod and a disc of no thickness are limits of matter; mass without any inertia is one where `point_masses`.
     """
     eigenvalues = np.asarray(np.linalg.eigvalsh(body.inertia), dtype=np.float64)
     largest = float(np.max(np.abs(eigenvalues)))
@@ -281,7 +281,7 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     if largest == 0:
         return None if point_masses else "mass without inertia: give the inertia, however small"
     moments = f"principal moments {', '.join(f'{x:.4g}' for x in eigenvalues)} kg m²"
-    if eigenvalues[0] < -1e-12 * largest or (eigenvalues[0] <= 1e-12 * largest and not point_masses):
+    if eigenvalues[0] < -1e-12 * largest:
         return f"inertia is not positive: {moments}"
     if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
         return f"inertia violates A + B >= C: {moments}"

@@ -85,9 +85,15 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
 def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> ModelBuilder:
     """Return a builder that holds the one model of an SDF's text, as Drake reads it with sdformat, and notes.
 
-    The base floats in SDF; it is held at its pose unless it is to float.
+    Bases float in SDF; they are held at their poses unless they are to float.
     """
     for element in root.walk():
+        inferred = any(e.attributes.get("auto") in ("true", "1") for e in element.all("inertial"))
+        if inferred and any(e.tag == "mesh" for c in element.all("collision") for e in c.walk()):
+            name = element.attributes.get("name", "")
+            raise UnsupportedError(
+                f"link {name!r} ({element.place}) takes its inertia from a mesh (auto), and none is opened; state it"
+            )
         if element.tag == "include":
             raise UnsupportedError(f"<include> ({element.place}) is not followed; `gz sdf -p` writes out what it names")
         weightless = element.tag == "gravity" and element.text.strip().lower() in ("false", "0")
@@ -99,7 +105,8 @@ def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> M
         try:
             models = Parser(plant).AddModelsFromString(text, "sdf")
             loose = _loose(plant, models)
-            base = "" if floating_base or len(loose) != 1 else _weld(plant, loose)
+            if not floating_base:
+                _weld(plant, loose)
             plant.Finalize()
         except (Exception, SystemExit) as error:
             raise UnsupportedError(_text(_PLACE.sub("line ", str(error).replace(text, "")))) from None
@@ -107,9 +114,8 @@ def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> M
     # Drake goes on with other numbers, and does not give them.
     if impossible := [x for x in told if "inertia" in x]:
         raise UnsupportedError(impossible[0])
-    names = ", ".join(repr(_name(plant, x)) for x in loose) or "none"
-    if len(loose) > 1 or (floating_base and not loose):
-        raise UnsupportedError(f"expected one link that no joint carries, the base; there are: {names}")
+    if floating_base and not loose:
+        raise UnsupportedError("expected a link that no joint carries, the base; there are: none")
     if n := plant.num_constraints():
         raise UnsupportedError(f"{n} constraints, such as those of closed loops or mimic joints; pydrake tells none")
     model, maps, at = _described(plant, floating_base)
@@ -125,10 +131,13 @@ def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> M
         if frame.name() in frames if not frame.is_body_frame() else not X.IsNearlyEqualTo(RigidTransform(), 0.0):
             name = bodies[body] if frame.is_body_frame() else _name(plant, frame)
             b.add_frame(name, body=bodies[body], translation=X.translation(), rotation=snap(X.rotation().matrix()))
-    held = f"the base {base!r} floats in SDF, and is held here at its pose; floating_base=True lets it move"
+    bases = ", ".join(repr(_name(plant, x)) for x in loose)
+    held = f"the base {bases} floats in SDF, and is held here at its pose; floating_base=True lets it move"
+    if len(loose) > 1:
+        held = f"the bases {bases} float in SDF, and are held here at their poses; floating_base=True lets them move"
     dry = [x for e in root.walk() if e.tag == "friction" for x in [e.text.strip()] if x.strip("0.")]
     ignored = "dry friction of joints is not read" if dry else ""
-    for note in (held if base else "", ignored, *told, snap.note):
+    for note in (held if loose and not floating_base else "", ignored, *told, snap.note):
         if note:
             b.note(note)
     return b
@@ -203,7 +212,9 @@ def _described(plant: Any, floating_base: bool) -> tuple[Model, DrakeModel, dict
     at = {0: RigidTransform()}
     names = {0: "world"}
     theirs: dict[str, list[Any]] = {}
-    for joint in _in_order(plant):
+    ordered = _in_order(plant)
+    several = sum(_KINDS.get(j.type_name()) == "free" and not int(j.parent_body().index()) for j in ordered) > 1
+    for joint in ordered:
         kind = _KINDS.get(joint.type_name())
         if kind is None:
             raise UnsupportedError(
@@ -219,7 +230,7 @@ def _described(plant: Any, floating_base: bool) -> tuple[Model, DrakeModel, dict
             X = X @ joint.X_FM()
         if floating_base and kind == "free" and not parent:
             # Called after its body by itself.
-            name = BASE_JOINT
+            name = f"{BASE_JOINT}_{names[index]}" if several else BASE_JOINT
         kind, numbers = _numbers(joint, kind, *rotors.get(int(joint.index()), (np.inf, 0.0)))
         numbers |= springs.get(int(joint.index()), {})
         R, p = np.array(X.rotation().matrix()), np.array(X.translation())
