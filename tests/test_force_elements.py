@@ -345,8 +345,8 @@ def test_every_engine_starts_at_t0_and_follows_the_time(engine: str) -> None:
     x, v = closed_form(0.4, 0.6)
     # h⁴ of a twentieth of the frequency.
     assert np.abs([run.q[-1, 0] - x, run.v[-1, 0] - v]).max() < 1e-8
-    late = mb.dynamics(slider(), engine).at(t=0.4)
-    assert late.step([0.0], [0.0], [0.0], 0.01)[0][0] == pytest.approx(run.q[1, 0], rel=1e-12)
+    dyn = mb.dynamics(slider(), engine)
+    assert dyn.step([0.0], [0.0], [0.0], 0.01, t=0.4)[0][0] == pytest.approx(run.q[1, 0], rel=1e-12)
 
 
 def test_wrenches_of_a_run_stand_beside_a_force_of_the_time() -> None:

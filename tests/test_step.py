@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 import sympy as sp
@@ -343,3 +344,96 @@ def test_an_acceleration_that_is_not_finite_names_the_suspect() -> None:
         dyn = own(b.build(nonphysical="warn"), compiled=compiled)
         with pytest.raises(NumericalError, match="no mass moves"):
             dyn.step([0.0], [0.0], [1.0], H)
+
+
+# Models in which time enters
+
+
+def _shaken(friction: float = 0.0) -> Model:
+    """A block of 2 kg under 3 cos(50 t)."""
+    b = mounted("shaken", "block", "x", "prismatic", gravity=(0, 0, 0), mass=2.0, axis=(1, 0, 0), friction=friction)
+    b.add_joint_force("shake", "x", lambda t, q, v: 3.0 * ca.cos(50 * t))  # noqa: ARG005
+    return b.build(point_masses=True)
+
+
+def _carried() -> Model:
+    """A slide prescribed as 0.5 sin 3t that carries a pendulum."""
+    b = mounted("carried", "slide", "x", "prismatic", mass=1.0, axis=(1, 0, 0))
+    b.add_body("bob", mass=0.7, com=(0, 0, -0.5))
+    b.add_joint("swing", "revolute", parent="slide", child="bob", axis=(0, 1, 0))
+    b.prescribe("x", amplitude=0.5, frequency=3.0)
+    return b.build(point_masses=True)
+
+
+TIMED = [
+    *(("lagrangian", {"compile": x}) for x in (True, False)),
+    *((engine, {}) for engine in ("pinocchio", "mujoco", "drake", "oracle")),
+]
+
+
+@pytest.mark.parametrize(("engine", "options"), TIMED, ids=lambda x: str(x))
+def test_a_force_of_time_acts_at_the_times_of_a_loop(engine: str, options: dict[str, bool]) -> None:
+    if engine == "drake":
+        pytest.importorskip("pydrake")
+    dyn = mb.dynamics(_shaken(), engine, **options)
+    q, v, h = np.zeros(1), np.zeros(1), 1e-3
+    for k in range(20 if engine == "oracle" else 400):
+        q, v = dyn.step(q, v, [0.0], h, t=k * h)
+    end = (k + 1) * h
+    # ∫∫ 3/2 cos 50t; Simpson's rule in each step is off by (50 h)⁴/2880 of it.
+    np.testing.assert_allclose(v, 0.03 * np.sin(50 * end), atol=1e-9)
+    np.testing.assert_allclose(q, 6e-4 * (1 - np.cos(50 * end)), atol=1e-11)
+
+
+@pytest.mark.parametrize("model", [_shaken, lambda: _shaken(friction=0.4), _carried])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_each_state_of_a_batch_has_its_time(model: Any, compiled: bool) -> None:
+    dyn = own(model(), compiled=compiled)
+    times = np.array([0.3, 1.0, -0.4])
+    q, v = dyn.model.random_state(np.random.default_rng(0), 3)
+    v[0, -1] = 0.0
+    v[:, 0] = v[:, 0] if dyn.model.nv == 1 else 1.5 * np.cos(3 * times)
+    q[:, 0] = q[:, 0] if dyn.model.nv == 1 else 0.5 * np.sin(3 * times)
+    tau = np.full(v.shape, 0.2)
+    for _ in range(2):
+        got = dyn.step(q, v, tau, H, t=times)
+        for i, t in enumerate(times.tolist()):
+            run = simulate(dyn, q[i], v[i], H, dt=H, torque=tau[i], t0=t)
+            assert_equal([x[i] for x in got], (run.q[-1], run.v[-1]), rounding=True)
+            assert_equal(dyn.step(q[i], v[i], tau[i], H, t=t), (run.q[-1], run.v[-1]), rounding=True)
+    same = dyn.step(q[[0] * 3], v[[0] * 3], tau, H, t=0.3)
+    assert_equal(same, [np.tile(x[0], (3, 1)) for x in got], rounding=True)
+    if dyn.model.nv == 2:
+        np.testing.assert_allclose(got[0][:, 0], 0.5 * np.sin(3 * (times + H)), atol=1e-15)
+
+
+def test_with_a_wrench_and_parameters_of_each_state_too() -> None:
+    b = mounted("shaken", "block", "x", "prismatic", gravity=(0, 0, 0), mass=mb.Parameter("m"), axis=(1, 0, 0))
+    b.add_joint_force("shake", "x", lambda t, q, v: 3.0 * ca.cos(50 * t))  # noqa: ARG005
+    masses, times, h = np.array([2.0, 4.0]), np.array([0.1, 0.7]), 1e-3
+    dyn = own(b.build(point_masses=True)).at(m=masses)
+    push = {"block": [0.5, 0, 0, 0, 0, 0]}
+    gained = 0.06 * (np.sin(50 * (times + h)) - np.sin(50 * times)) + 0.5 * h
+    for _ in range(2):
+        _, v = dyn.step(np.zeros((2, 1)), np.zeros((2, 1)), np.zeros(1), h, wrenches=push, t=times)
+        np.testing.assert_allclose(v[:, 0], gained / masses, rtol=1e-8)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_a_model_that_needs_the_time_asks_for_it(engine: str) -> None:
+    for model in (_shaken(), _shaken(friction=0.1), _carried()):
+        dyn = mb.dynamics(model, engine)
+        q, v = dyn.model.neutral(), np.zeros(dyn.model.nv)
+        for _ in range(2):
+            for same in (dyn, dyn.at(**{str(model.time_parameter): 0.4})):
+                with pytest.raises(
+                    InputError, match=rf"t: expected the time .* on which {model.name} depends, got None"
+                ):
+                    same.step(q, v, v, H)
+            with pytest.raises(InputError, match=r"t: expected a number or shape \(2,\), got \(3,\)"):
+                dyn.step(np.tile(q, (2, 1)), v, v, H, t=[0.0, 1.0, 2.0])
+            with pytest.raises(InputError, match="t: nan at index"):
+                dyn.step(q, v, v, H, t=np.nan)
+            dyn.step(*dyn.at(**{str(model.time_parameter): 0.4}).project(q, v), v, H, t=0.4)
+    free = mb.dynamics(mb.catalog.pendulum(), engine)
+    assert_equal(free.step([0.3], [0.0], [0.0], H, t=7.0), free.step([0.3], [0.0], [0.0], H))

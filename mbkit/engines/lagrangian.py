@@ -532,6 +532,7 @@ class LagrangianDynamics(Dynamics):
         method: str = DEFAULT_METHOD,
         wrenches: Wrenches | None = None,
         axes: str = ALIGNED,
+        t: ArrayLike | None = None,
     ) -> tuple[Array, Array]:
         """Return (q, v) after one step, as `Dynamics.step` does; as machine code where `simulate` compiles the step."""
         try:
@@ -542,6 +543,12 @@ class LagrangianDynamics(Dynamics):
             known = False
         if known:
             single, behind = held[1].single, self._trailing(q) if self._parametric else ()
+            if t is not None or self.model.time_parameter is not None:
+                times = self._start_of_step(t, real("dt", dt, positive=True), *np.shape(behind)[1:-1])
+                if times is not None:
+                    # The time is the last parameter.
+                    last = np.arange(len(self.model.parameters)) == len(self.model.parameters) - 1
+                    behind = (np.where(last, times[..., None], behind[0]),)
             # A call with *arguments costs a tenth of a small step.
             out: tuple[Array, Array] | None = single(q, v, tau, dt, 0.0) if not behind else None
             if out is None and (dt := real("dt", dt)) > 0:
@@ -550,7 +557,7 @@ class LagrangianDynamics(Dynamics):
                     out = held[1].batch(q, v, tau, dt, *behind, threads=self.threads)
             if out is not None:
                 return out
-        return super().step(q, v, tau, dt, method, wrenches, axes)
+        return super().step(q, v, tau, dt, method, wrenches, axes, t)
 
     def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
         if not self.compiles_steps:

@@ -14,10 +14,10 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of, real
+from mbkit._check import Array, batch_of, real, real_array, require_finite
 from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.engines.loads import Wrenches
-from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method, explicit_method, method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
@@ -55,6 +55,7 @@ class Steps:
     _under: Callable[..., Any]
     _method: Callable[..., Any]
     _states: Callable[..., Any]
+    _of_sample: Callable[[int], Any]
     _onto_constraints: Callable[..., Any]
     _explicit_step: Callable[..., Any]
     _pulled: Callable[..., Any]
@@ -68,6 +69,7 @@ class Steps:
         method: str = DEFAULT_METHOD,
         wrenches: Wrenches | None = None,
         axes: str = ALIGNED,
+        t: ArrayLike | None = None,
     ) -> tuple[Array, Array]:
         """Return (q, v) after one step of length dt, with the force τ held: for control loops and environments.
 
@@ -89,17 +91,21 @@ class Steps:
             configuration from stage to stage.
         axes : {"local", "local_world_aligned", "world"}
             Axes of the wrenches, as in `generalized_force`.
+        t : float or (N,) array_like
+            Time at the start of the step, s: of each state of a batch, or of all. Required where time enters the
+            equation of motion, as by forces of t and motions prescribed in time; others do not use it.
 
         Returns
         -------
         q, v : (nq,) and (nv,), or (N, nq) and (N, nv) arrays
-            New ones. They are those of ``mbkit.simulate(dyn, q, v, dt, method, dt, torque=tau)``: the same bits; with
-            constraints, and on the lagrangian engine with a free joint or quasi-velocities, the same up to rounding.
+            New ones. They are those of ``mbkit.simulate(dyn, q, v, dt, method, dt, torque=tau, t0=t)``: the same bits;
+            with constraints, and on the lagrangian engine with a free joint or quasi-velocities, the same up to
+            rounding.
 
         Raises
         ------
         InputError
-            A wrong shape, state, force or step.
+            A wrong shape, state, force, time or step, or no time where the model depends on it.
         NumericalError
             The state after the step, or an acceleration on the way, is not finite.
         UnknownNameError
@@ -109,11 +115,10 @@ class Steps:
 
         Notes
         -----
-        The state that a step leads to is projected onto loops and prescribed motions, and these are taken at the time
-        that the dynamics hold: ``dyn.at(t=...)``. On the lagrangian engine the step is the same machine code as in
-        `mbkit.simulate`: microseconds for a state, and batches are shared among threads. The first step of a model
-        compiles it. Other engines and ``compile=False`` evaluate the forward dynamics stage by stage, by the same
-        formulas.
+        The state that a step leads to is projected onto loops and prescribed motions. On the lagrangian engine the
+        step is the same machine code as in `mbkit.simulate`: microseconds for a state, and batches are shared among
+        threads. The first step of a model compiles it. Other engines and ``compile=False`` evaluate the forward
+        dynamics stage by stage, by the same formulas.
 
         Examples
         --------
@@ -129,10 +134,47 @@ class Steps:
         if wrenches:
             frames, w = self._stacked_wrenches(wrenches)
             held: Steps = self._under(frames, axes_named(axes))
-            return held.step(q, v, _beside(self.model.check_v(tau, "tau"), w), dt, method)
+            return held.step(q, v, _beside(self.model.check_v(tau, "tau"), w), dt, method, t=t)
         chosen, h = explicit_method(method), real("dt", dt, positive=True)
         self._method("forward_dynamics")
-        states, _ = self._states({"q": q, "v": v, "tau": tau})
+        states, size = self._states({"q": q, "v": v, "tau": tau})
+        times = self._start_of_step(t, h, size)
+        if times is None:
+            return self._checked_step(chosen, h, states)
+        clock = str(self.model.time_parameter)
+        if not times.ndim:
+            own: Steps = self.at(**{clock: float(times)})
+            return own._checked_step(chosen, h, states)
+        rows = zip(*(np.broadcast_to(x, (len(times), x.shape[-1])) for x in states.values()), strict=True)
+        each = [
+            self._of_sample(i).at(**{clock: time})._checked_step(chosen, h, dict(zip(states, row, strict=True)))
+            for i, (time, row) in enumerate(zip(times.tolist(), rows, strict=True))
+        ]
+        n = self.model.nq, self.model.nv
+        return tuple(np.array([x[k] for x in each]).reshape(-1, n[k]) for k in (0, 1))  # type: ignore[return-value]
+
+    def _start_of_step(self, t: ArrayLike | None, h: float, size: int | None = None) -> Array | None:
+        """Return the time at which a step begins, () or (N,); None where the model does not depend on it."""
+        model = self.model
+        if t is None:
+            if model.time_parameter is None:
+                return None
+            raise InputError(
+                f"t: expected the time at the start of the step, s, on which {model.name} depends, got None; "
+                "give step(..., t=...)"
+            )
+        times = real_array("t", t)
+        if times.ndim and (times.ndim > 1 or size not in (None, len(times))):
+            raise InputError(f"t: expected a number or shape ({size or 'N'},), got {times.shape}")
+        require_finite("t", times)
+        if model.time_parameter is None:
+            return None
+        if times.size:
+            model.require_times("t", float(times.min()), float(times.max()) + h)
+        return times
+
+    def _checked_step(self, chosen: Method, h: float, states: dict[str, Array]) -> tuple[Array, Array]:
+        """Return the state after a step from checked states, or the error of a state that is not finite."""
         # An overflow is reported as an error.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             try:

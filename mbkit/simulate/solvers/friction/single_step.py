@@ -6,7 +6,6 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.engines.base import at_time
 from mbkit.methods.registry import Method
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
@@ -40,7 +39,7 @@ def _one(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: floa
     start = 0.0 if clock is None else float(dyn.model.parameters[clock] or 0.0)
     friction = Friction(dyn)
     phase = friction.phase(start, q, v, tau)
-    q1, v1 = friction.held(phase, q, *at_time(phase.dyn, start).step(q, v, tau, dt, method.name))
+    q1, v1 = friction.held(phase, q, *phase.dyn.step(q, v, tau, dt, method.name, t=start))
     if not (friction.margins(phase, start + dt, q1, v1, tau) < 0).any():
         return q1, v1
     grid = Grid(start, start + dt, dt, 1, dt)
