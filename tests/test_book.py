@@ -6,16 +6,19 @@ import importlib
 import inspect
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
 import click
+import numpy as np
 import pytest
 
+import mbkit as mb
 from mbkit.cli import cli
+from mbkit.codegen.c_source import export_c
 
 BOOK = Path(__file__).resolve().parent.parent / "notebooks"
 PAGES = sorted(p for p in BOOK.rglob("*.md") if not {"_build", ".ipynb_checkpoints"} & {*p.parts})
@@ -186,3 +189,112 @@ def test_each_figure_of_a_notebook_has_a_text_for_those_who_do_not_see_it():
         for cell in json.loads(path.read_text("utf-8"))["cells"]:
             if any("image/svg+xml" in output.get("data", {}) for output in cell.get("outputs", [])):
                 assert len(cell["metadata"]["mystnb"]["image"]["alt"]) > 20, path.name
+
+
+# Of what each path takes: a sentence of a page beside the code that does so.
+
+
+def arm(**joint: Any) -> mb.ModelBuilder:
+    """Return a swinging body, with more numbers of its joint."""
+    b = mb.ModelBuilder("arm")
+    b.add_body("rod", mass=2.0, com=(0, 0, -0.5), inertia=(0.2, 0.2, 0.01))
+    b.add_joint("pivot", **{"kind": "revolute", "parent": "world", "child": "rod", "axis": (0, 1, 0), **joint})
+    return b
+
+
+def driven() -> mb.Model:
+    b = arm()
+    b.add_joint_force("motor", "pivot", lambda t, q, v: -v * v)  # noqa: ARG005
+    return b.build()
+
+
+def refuses(call: Callable[[], Any], *words: str) -> bool:
+    """Return whether a call is refused with an error that has these words."""
+    with pytest.raises(mb.errors.MbkitError) as error:
+        call()
+    return all(word in str(error.value) for word in words)
+
+
+def loads_of_a_loop() -> bool:
+    dyn = mb.dynamics(mb.catalog.four_bar())
+    q, v = dyn.project([0.5, 0.0, 0.0], np.zeros(3))
+    tau = np.array([3.0, 0.0, 0.0])
+    a = dyn.forward_dynamics(q, v, tau)
+    loads = dyn.joint_wrenches(q, v, tau=tau)
+    assert np.array_equal(loads, dyn.joint_wrenches(q, v, a, tau=tau))
+    assert np.any(dyn.loop_wrenches(q, v, tau))
+    # Moments across its plane alone are open, and forces across it.
+    (first, *_) = dyn.undetermined_loads(q).joints
+    return not first.all() and refuses(lambda: dyn.joint_wrenches(q, v, a), "joint_wrenches(..., tau=tau)")
+
+
+def friction_acts() -> bool:
+    slow = [
+        mb.dynamics(arm(friction=3.0, lower=-0.1, upper=0.1).build(), engine).forward_dynamics([0.3], [1.0], [0.0])[0]
+        for engine in ("lagrangian", "pinocchio", "mujoco")
+    ]
+    # Beyond its limit, which is off: m g l sin q and the friction over the inertia about the pivot.
+    right = -(3.0 + 2.0 * 9.81 * 0.5 * np.sin(0.3)) / (0.2 + 2.0 * 0.25)
+    return slow == pytest.approx([right] * 3, rel=1e-12)
+
+
+def features_are_listed() -> bool:
+    (listed,) = re.findall(r"The features are (.*)\.", (BOOK / "howto/describe_a_system.md").read_text("utf-8"))
+    with pytest.raises(mb.errors.UnknownNameError) as error:
+        arm().build().without("nothing")
+    return {*re.findall(r"\w+", str(error.value).partition("there are:")[2])} == {*re.findall(r"\w+", listed)} - {"and"}
+
+
+def rolling_is_refused() -> bool:
+    model = mb.catalog.chaplygin_sleigh()
+    q, v = model.random_state(0)
+    return all(
+        refuses(lambda name=name: mb.dynamics(model, name).forward_dynamics(q, v, np.zeros_like(v)), "velocities")
+        for name in ("mujoco", "drake")
+    )
+
+
+def armature_has_one_number() -> bool:
+    for kind in ("free", "planar"):
+        assert refuses(arm(kind=kind, axis=None, armature=0.1).build, f"armature on a {kind} joint")
+    return bool(arm(kind="ball", axis=None, armature=0.1).build().needs.armature)
+
+
+def runs_with_friction_in_a_loop_are_refused() -> bool:
+    b = mb.ModelBuilder.of(mb.catalog.four_bar())
+    b.set_joint(b.build().joint_names[0], friction=1.0)
+    model = b.build()
+    return refuses(lambda: mb.simulate(mb.dynamics(model), model.neutral(), np.zeros(3), 0.1, dt=0.01), "dry friction")
+
+
+CLAIMS: dict[tuple[str, str], Callable[[], Any]] = {
+    ("howto/wrenches_and_loads.md", "loads of a mechanism with loops need the force τ too"): loads_of_a_loop,
+    ("howto/wrenches_and_loads.md", "Forces given by functions are refused here"): lambda: refuses(
+        lambda: mb.dynamics(driven()).joint_wrenches([0.1], [0.0], [0.0]), "joint_wrenches"
+    ),
+    ("howto/mechanisms.md", "Without accelerations it takes those of `forward_dynamics`"): loads_of_a_loop,
+    ("reference/engines.md", "Joint loads of a mechanism are those under a force"): loads_of_a_loop,
+    ("reference/engines.md", "Base parameters and `identify` refuse models with loops"): lambda: (
+        refuses(mb.catalog.four_bar().base_parameters, "loops")
+        and refuses(lambda: mb.identify(mb.catalog.four_bar(), *np.zeros((4, 50, 3))), "loops")
+    ),
+    ("howto/describe_a_system.md", "Dry `friction` and `stiction` of a joint act on every engine"): friction_acts,
+    ("howto/describe_a_system.md", "The features are"): features_are_listed,
+    ("howto/describe_a_system.md", "MuJoCo and Drake refuse them by name"): rolling_is_refused,
+    ("howto/describe_a_system.md", "Armature on a free or planar joint is refused"): armature_has_one_number,
+    ("howto/describe_a_system.md", "MJCF and URDF cannot hold forces by functions"): lambda: all(
+        refuses(lambda form=form: mb.convert(driven(), form), "motor") for form in ("mjcf", "urdf")
+    ),
+    ("howto/take_code_out.md", "Models with loops or motions prescribed in time have no C"): lambda: refuses(
+        lambda: export_c(mb.catalog.four_bar()), "loops"
+    ),
+    ("howto/dry_friction.md", "Runs beside loops or prescribed motions are refused"): (
+        runs_with_friction_in_a_loop_are_refused
+    ),
+}
+
+
+@pytest.mark.parametrize(("place", "sentence"), CLAIMS)
+def test_what_a_page_says_that_a_path_takes_is_so(place, sentence):
+    assert sentence in (BOOK / place).read_text("utf-8")
+    assert CLAIMS[place, sentence]()

@@ -72,7 +72,7 @@ def test_a_robot_agrees_and_is_written(here):
     assert result.exit_code == 0, result.output
     assert "agree to" in result.stdout.splitlines()[0]
     assert len(result.stdout.splitlines()) <= 24
-    assert "limits: no engine applies them" in " ".join(result.stdout.split())
+    assert "limits: off here in every engine" in " ".join(result.stdout.split())
     assert "forward dynamics" not in result.stdout
     assert "forward dynamics" in call("check", "double_pendulum", "--full", *QUICK).stdout
     data = json.loads((here / "mbkit-report" / "double_pendulum.json").read_text())

@@ -140,7 +140,7 @@ shown.letters = Math.min(...[...document.querySelectorAll("svg text")].map(t => 
   const svg = t.ownerSVGElement;
   return parseFloat(getComputedStyle(t).fontSize) * svg.getBoundingClientRect().width / svg.viewBox.baseVal.width;
 }));
-const button = [...document.querySelectorAll("th button")].find(b => b.textContent.startsWith("worst"));
+const button = [...document.querySelectorAll("th button")].find(b => b.textContent.trim() === "worst");
 if (button) {
   const head = button.parentNode, rows = () => [...head.closest("table").querySelectorAll("tbody tr")]
     .map(row => [0, 1, head.cellIndex].map(k => row.cells[k].textContent));

@@ -78,10 +78,11 @@ def test_links_and_pictures_lead_to_files():
     assert [link for link in links if not (TOP / link).is_file()] == []
 
 
-def test_every_page_for_beginners_is_linked():
-    assert {f"notebooks/start/{name}.md" for name in ("install", "robot_arm", "own_equations", "robot_ci")} <= set(
-        re.findall(r"\]\((.*?)\)", TEXT)
-    )
+def test_every_page_for_beginners_and_every_how_to_is_linked():
+    pages = [p for folder in ("start", "howto") for p in (TOP / "notebooks" / folder).glob("*.md")]
+    wanted = {p.relative_to(TOP).as_posix() for p in pages if p.stem != "index"}
+    assert len(wanted) > 30
+    assert wanted <= set(re.findall(r"\]\((.*?)\)", TEXT))
 
 
 def test_the_set_up_names_what_the_package_declares():

@@ -136,7 +136,7 @@ class Loads:
         self,
         q: ArrayLike,
         v: ArrayLike,
-        a: ArrayLike | None,
+        a: ArrayLike | None = None,
         wrenches: Wrenches | None = None,
         axes: str = ALIGNED,
         joints: Sequence[str] | None = None,

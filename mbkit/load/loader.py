@@ -90,8 +90,8 @@ def load(
 
     No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF
     its inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers where their
-    forces are linear, and the rotors of its actuators as armature. Limits are data: no engine applies
-    them.
+    forces are linear, and the rotors of its actuators as armature. Limits are data, off in every
+    engine.
 
     Parameters
     ----------

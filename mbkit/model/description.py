@@ -57,7 +57,7 @@ SERVOS: Final = "servos"
 class Needs:
     """One flag per feature; True where the description has it.
 
-    Limits are data, and no engine applies them. `forces` are those given by functions and what holds weights; their
+    Limits are data, off in every engine. `forces` are those given by functions and what holds weights; their
     parts do not count as springs and dampers.
     """
 

@@ -37,7 +37,7 @@ _FIELDS: Final = {
     "prescribed": ("offset", "rate", "amplitude", "frequency", "phase"),
     "no_slip": ("translation_a", "translation_b", "radius", "speed"),
 }
-#: What no engine applies, or none as a parameter.
+#: What is data alone, or a parameter of no engine.
 _DATA: Final = ("friction", "lower", "upper", "velocity_limit", "effort_limit")
 _Entry = tuple[str, str, str, tuple[int, ...]]
 #: The ten numbers of a log-Cholesky factor, and the end of their path.

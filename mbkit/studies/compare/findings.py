@@ -52,7 +52,7 @@ def _limits(model: Model) -> Finding | None:
     if not parts:
         return None
     every = tuple(dict.fromkeys(name for some in alike for name in some))
-    return Finding(LIMITS, f"no engine applies them: {'; '.join(parts)}", every)
+    return Finding(LIMITS, f"off here in every engine: {'; '.join(parts)}", every)
 
 
 def stiff_joints(model: Model, M: Array, J: Array | None = None, step: float = STEP) -> list[Finding]:
