@@ -305,6 +305,24 @@ def test_armature_of_a_free_joint_is_matter_without_weight(tmp_path: Path) -> No
         forces = dyn.nle(at.q, at.v) - dyn.passive(at.q, at.v)
         for x, exact in ((dyn.mass_matrix(at.q), at.M), (forces, at.nle - at.passive)):
             assert np.abs(x - exact).max() < 1e-12 * max(np.abs(exact).max(), 1.0), engine
+    # It is no mass: MuJoCo's centre of mass and momentum do not know it.
+    assert model.mass == pytest.approx(mujoco.MjModel.from_xml_string(text).body_subtreemass[0], rel=1e-14)
+    bare = mb.load(written(text.replace(' armature="0.3"', ""), tmp_path, "bare.xml"))
+    assert model.without("armature").mass == model.mass
+    for engine in (*ENGINES, "drake"):
+        dyn, without = mb.dynamics(model, engine), mb.dynamics(model.without("armature"), engine)
+        other, q, v = mb.dynamics(bare, engine), at.q[0], at.v[0]
+        for x in (dyn, without):
+            assert np.abs(x.center_of_mass(q) - other.center_of_mass(q)).max() < 1e-14, engine
+            assert np.abs(x.centroidal_momentum(q, v) - other.centroidal_momentum(q, v)).max() < 1e-13, engine
+        assert np.abs(without.mass_matrix(q) - other.mass_matrix(q)).max() < 1e-13, engine
+        # Without forces it still has no weight.
+        loose = [mb.dynamics(x.without("forces", "springs", "damping"), engine) for x in (model, bare)]
+        assert np.abs(np.subtract(*(x.nle(q, 0 * v) - x.passive(q, 0 * v) for x in loose))).max() < 1e-12, engine
+    com = mb.dynamics(model, "lagrangian").function("center_of_mass")(at.q[0])
+    assert np.abs(np.ravel(com) - mb.dynamics(bare).center_of_mass(at.q[0])).max() < 1e-14
+    assert not any("armature" in name for name in mb.variants(model, {"*.mass": 0.1}, size=2).values)
+    assert mb.lint(model).links == mb.lint(bare).links == 3
     # MuJoCo's own model has no such body to compare.
     (read,) = mb.compare_parsers(written(text, tmp_path), ("mujoco",), samples=1).importers
     assert read.refused.startswith("joint 'f' is free and has armature")

@@ -524,6 +524,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 
     def _method(self, quantity: str) -> Callable[..., Any]:
         """Return the method for a quantity, with dry friction; raise `UnsupportedError` where there is none."""
+        if quantity in frames_and_momenta.OF_THE_WHOLE and self.model.rotors:
+            return self._matter._without_friction(quantity)
         method = self._without_friction(quantity)
         exact = self.model.needs.friction and not (self.soft_friction and quantity in UNDER_FORCE)
         return self._friction.beside(quantity, method, self) if exact else method
@@ -539,6 +541,11 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     def _rounded(self, value: Any) -> Array:
         """Return what the adapter's methods return in double precision."""
         return np.asarray(value, dtype=np.float64)
+
+    @cached_property
+    def _matter(self) -> Dynamics:
+        """The dynamics without armature, which is no matter."""
+        return self._of_model(self.model.without("armature"), "without armature")
 
     @cached_property
     def _friction(self) -> DryFriction:

@@ -29,11 +29,12 @@ from mbkit.spatial import skew
 _OF_TWO_AXES: Final = ("pose", "jacobian")
 _EYE, _LAST_ROW = np.eye(3), np.eye(4)[3]
 #: Quantities of this part of the protocol.
-QUANTITIES: Final = (
-    *("pose", "jacobian", "velocity", "acceleration", "jacobian_dot_v"),
+#: What tells of all matter together.
+OF_THE_WHOLE: Final = (
     *("center_of_mass", "center_of_mass_velocity", "center_of_mass_acceleration", "center_of_mass_jacobian"),
     *("centroidal_momentum", "centroidal_momentum_matrix", "centroidal_momentum_bias", "locked_inertia"),
 )
+QUANTITIES: Final = (*("pose", "jacobian", "velocity", "acceleration", "jacobian_dot_v"), *OF_THE_WHOLE)
 
 
 def seen_from(R: Array, p: Array, linear: Array, angular: Array, axes: str) -> Array:
@@ -85,6 +86,7 @@ class FramesAndMomenta:
     _evaluate: Callable[..., Array]
     _method: Callable[[str], Callable[..., Any]]
     _frames_held: dict[Any, tuple[Frame, ...]]
+    _matter: Any
 
     def _frames(self, frame: str | Sequence[str]) -> tuple[tuple[Frame, ...], bool]:
         """Return the frames, and whether it is one alone."""
@@ -258,7 +260,8 @@ class FramesAndMomenta:
         >>> dyn.function("jacobian", frame="tip")
         Function(jacobian:(q)->(jacobian[6]) SXFunction)
         """
-        return self._method("function")(name, frame, axes_named(axes), kind)
+        dyn = self._matter if name in OF_THE_WHOLE and self.model.rotors else self
+        return dyn._method("function")(name, frame, axes_named(axes), kind)
 
     # The whole
 

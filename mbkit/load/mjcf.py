@@ -269,7 +269,7 @@ class _Tree:
         self.b.add_gravity_compensation(name, 1.0)
         self.b.note(
             f"the armature of free joint {joint.name!r} is a body without weight, of {armature:g} kg and {armature:g} "
-            "kg m²; unlike in MuJoCo it counts in the mass and in the centre of mass"
+            "kg m²; it counts in M, and neither in the mass nor in the centre of mass"
         )
 
     def _add_spring(

@@ -15,7 +15,7 @@ import numpy as np
 
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, ModelError, UnknownNameError
-from mbkit.model.elements.forces import Bushing, Force, drives, lost, needs_time
+from mbkit.model.elements.forces import Bushing, Force, GravityCompensation, drives, lost, needs_time
 from mbkit.model.elements.motion_laws import Motion, beyond, interval
 from mbkit.model.joint_types import KINDS
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
@@ -373,7 +373,17 @@ class Description:
         """Total mass, kg; `InputError` where it depends on a parameter without a value."""
         if any(np.isnan(b.mass) for b in self.bodies):
             self.require_values("mass")
-        return float(sum(b.mass for b in self.bodies))
+        return float(sum(b.mass for b in self.bodies if b.name not in self.rotors))
+
+    @cached_property
+    def rotors(self) -> frozenset[str]:
+        """Names of the bodies that stand for the armature of free joints, without weight and equal along all axes.
+
+        They have inertia alone, and count neither as mass nor in the centre of mass.
+        """
+        weightless = {f.body for f in self.forces if isinstance(f, GravityCompensation) and f.fraction == 1}
+        same = (b for b in self.bodies if b.name in weightless and np.array_equal(b.inertia, b.mass * np.eye(3)))
+        return frozenset(b.name for b in same if not b.com.any())
 
     @cached_property
     def parameters(self) -> Mapping[str, float | None]:

@@ -466,6 +466,8 @@ class Model(Description):
         if feature in ("gravity", "forces", *CONSTRAINT_FEATURES):
             gone = ("loops", "couplers") if feature == "loops" else (feature,)
             empty: Any = {name: np.zeros(3) if name == "gravity" else () for name in gone}
+            if feature == "forces" and self.rotors:
+                empty["forces"] = tuple(f for f in self.forces if getattr(f, "body", "") in self.rotors)
             return replace(self, bindings=tuple(b for b in self.bindings if b.where not in gone), **empty)
         if feature == "limits":
             return replace(self, joints=tuple(_unlimited(j) for j in self.joints))
@@ -474,6 +476,9 @@ class Model(Description):
         joints = tuple(replace(j, **{name: np.zeros(j.type.nv)} | more) for j in self.joints)
         bindings = tuple(b for b in self.bindings if b.field != name)
         changes: Any = {"joints": joints}
+        if name == "armature" and self.rotors:
+            massless: Any = {"mass": 0.0, "inertia": np.zeros((3, 3))}
+            changes["bodies"] = tuple(replace(b, **massless) if b.name in self.rotors else b for b in self.bodies)
         for where, acting in _ACTING.items():
             parts = getattr(self, where)
             if name in acting:

@@ -172,7 +172,7 @@ def chosen(model: Model, pattern: str) -> list[Number]:
 
 
 def _still(model: Model, every: list[Number]) -> set[str]:
-    static = static_bodies(model.joints)
+    static = static_bodies(model.joints) | model.rotors
     return {x.whole for x in every if x.where == "bodies" and x.part in static}
 
 

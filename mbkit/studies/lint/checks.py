@@ -79,7 +79,7 @@ class Judged:
     @cached_property
     def bodies(self) -> tuple[Body, ...]:
         """The links with mass."""
-        return tuple(body for body in self.links.bodies if body.mass > 0)
+        return tuple(body for body in self.links.bodies if body.mass > 0 and body.name not in self.links.rotors)
 
     def shaped(self) -> Iterator[tuple[Body, Geometry]]:
         """Yield the links with mass and shapes."""
