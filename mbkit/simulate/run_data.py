@@ -150,33 +150,50 @@ class RunData:
     def work(self, engine: str | Dynamics | None = None) -> Array:
         """Return ∫ (τ + τ_lost + Σ Jᵀ w)·v dt since the first state in J, shape (K,) or (N, K).
 
-        τ_lost are the forces of dampers, and those given by functions without a potential.
-
+        τ_lost are the forces of dampers and of dry friction, those given by functions without a potential, and those of
+        constraints that do work: drives of motions prescribed in time, blades with a speed, soft loops. Of a system
+        written as energies it holds what changes T + V beside its forces, as where a frame is moved.
 
         The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇; UnsupportedError
-        where its rows change between two saved states. On quasi-velocities, for dampers, wrenches and functions
-        it is a quadrature of fourth order in the distance of the saved states; a function that jumps makes it first
-        order, and so do rows that jump beside a function.
+        where its rows change between two saved states. So is that of dry friction, f |Δq| from one stop or turn in
+        `events` to the next. All else, also torque on quasi-velocities, is a quadrature of fourth order in the distance
+        of the saved states; a function that jumps makes it first order, and so do rows that jump beside a function.
         """
         dyn, force, t, q, v = self._by(engine), self._acted(), self.t, self.q, self.v
         if isinstance(force, SampledTorque):
             whole = _generalized(dyn, q, force.values, self._acting)
-            steps = _by_cubics(t, np.sum((whole + _damping(dyn, q, v)) * v, axis=-1))
+            lost = along(dyn, (), _lost_power, q, v, whole) + np.sum(whole * v, axis=-1)
+            steps = _by_cubics(t, lost)
         else:
             held = np.zeros(self._numbers) if force is None else force.between(t)
             steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
-        if self.model.forces:
-            steps = steps + _by_cubics(t, np.sum(along(dyn, v.shape[-1:], _lost, q, v) * v, axis=-1))
+        if self.model.needs.friction and not dyn.soft_friction:
+            steps = steps - self._rubbed(dyn)
         out = np.zeros(q.shape[:-1])
         np.cumsum(steps, axis=-1, out=out[..., 1:])
         return out
 
+    def _rubbed(self, dyn: Dynamics) -> Array:
+        """Return the energy that dry friction takes in each interval; states of events part them."""
+        t, q, v = self.t, *(x.reshape(-1, *x.shape[-2:]) for x in (self.q, self.v))
+        coordinates, plain = np.array(_plain(dyn.model), dtype=int).T
+        out = np.zeros((len(q), max(len(t) - 1, 0)))
+        for i in range(len(q)):
+            hits = [x for x in self.events if x.member in (None, i)]
+            times = np.append(t, [x.t for x in hits])
+            order = np.argsort(times, kind="stable")
+            speeds = np.concatenate([v[i], *(x.v[None] for x in hits)])[order]
+            moved = np.zeros((max(len(times) - 1, 0), v.shape[-1]))
+            moved[:, plain] = np.diff(np.concatenate([q[i], *(x.q[None] for x in hits)])[order][:, coordinates], axis=0)
+            taken = np.append(0.0, np.cumsum(dyn._friction.law.dissipated(np.diff(times[order]), moved, speeds)))
+            out[i] = np.diff(taken[np.argsort(order)[: len(t)]])
+        return out.reshape(*self.q.shape[:-2], -1)
+
     def power_balance(self, engine: str | Dynamics | None = None) -> Array:
         """Return E(t) - E(0) - work(t) in J: zero for a run without error, shape (K,) or (N, K).
 
-        It holds the error of the run and that of `work`: save every step to make the second small. Without torque or
-        with a constant or held one, on coordinates with v = q̇, no dampers and no wrenches, only the error of the run
-        is left.
+        It holds the error of the run and that of `work`: save every step to make the second small. Where `work` is
+        exact for the saved positions, only the error of the run is left.
         """
         energy = self.energy(engine)
         return np.asarray(energy - energy[..., :1] - self.work(engine))
@@ -260,8 +277,8 @@ def _quadratic(dyn: Dynamics, q: Array, v: Array) -> Array:
     return np.asarray(0.5 * np.einsum("ni,nij,nj->n", v, dyn.mass_matrix(q), v))
 
 
-# The work of a held force is τ·Δq over each interval, exactly, where v = q̇. On quasi-velocities and for dampers it is
-# the trapezoid's rule with its end correction, h/2 (p₀ + p₁) + h²/12 (ṗ₀ - ṗ₁), of fourth order. A force that is known
+# The work of a held force is τ·Δq over each interval, exactly, where v = q̇. Else, and for what is lost, it is the
+# trapezoid's rule with its end correction, h/2 (p₀ + p₁) + h²/12 (ṗ₀ - ṗ₁), of fourth order. A force that is known
 # at the states alone is integrated by the cubic through four of them.
 
 
@@ -271,11 +288,11 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
     held = np.broadcast_to(held, (*v.shape[:-2], len(h), held.shape[-1]))
     pushed, wrenches = held[..., :nv], held[..., nv:]
     coordinates, plain = np.array(_plain(dyn.model), dtype=int).reshape(-1, 2).T
-    damped, turned = dyn.model.needs.damping or wrenches.any(), len(plain) < nv and bool(pushed.any())
+    losing, turned = bool(_loses(dyn) or wrenches.any()), len(plain) < nv and bool(pushed.any())
     ends = [(q[..., i : len(h) + i, :], v[..., i : len(h) + i, :]) for i in (0, 1)]
     owns = [_at_end(dyn, v.shape[:-1], i) for i in (0, 1)]
     a = [np.zeros(0)] * 2
-    if damped or turned:
+    if losing or turned:
         forces = [_generalized(own, end[0], held, acting) for own, end in zip(owns, ends, strict=True)]
         a = [
             along(own, (nv,), lambda one, *at: one.forward_dynamics(*at), *end, force)
@@ -286,14 +303,14 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
         distance = _corrected(h[:, None], *((v, rate) for (_, v), rate in zip(ends, a, strict=True)))
     distance[..., plain] = np.diff(q, axis=-2)[..., coordinates]
     out = np.sum(pushed * distance, axis=-1)
-    if damped:
-        alone = np.concatenate([np.zeros(pushed.shape), wrenches], axis=-1)
+    if losing:
 
-        def acts(own: Dynamics) -> Callable[[Array, Array], Array]:
-            return lambda q, v: _damping(own, q, v) + _generalized(own, q, alone, acting)
+        def power(own: Dynamics, q: Array, v: Array) -> Array:
+            force = _generalized(own, q, held, acting)
+            return np.asarray(along(own, (), _lost_power, q, v, force) + np.sum((force - pushed) * v, axis=-1))
 
         each = zip(owns, ends, a, strict=True)
-        pairs = (_power(dyn.model, acts(own), h[:, None], *end, rate) for own, end, rate in each)
+        pairs = (_with_rate(own, power, h[:, None], *end, rate) for own, end, rate in each)
         out = out + _corrected(h, *pairs)
     return np.asarray(out)
 
@@ -323,31 +340,53 @@ def _generalized(dyn: Dynamics, q: Array, force: Array, acting: Acting | None) -
     return np.asarray(tau + along(dyn, tau.shape[-1:], of_wrenches, q, wrenches))
 
 
-def _power(
-    model: Model, force: Callable[[Array, Array], Array], h: Array, q: Array, v: Array, a: Array
+def _with_rate(
+    dyn: Dynamics, power: Callable[[Dynamics, Array, Array], Array], h: Array, q: Array, v: Array, a: Array
 ) -> tuple[Array, Array]:
-    """Return the power of a force of (q, v), and its rate along the motion."""
+    """Return a power of (q, v), and its rate along the motion."""
+    model, clock = dyn.model, dyn.model.time_parameter
+    of_samples: Any = dyn
 
-    def power(s: Array) -> Array:
-        there = (integrate_finite(model, q, s * v), v + s * a) if s.any() else (q, v)
-        return np.asarray(np.sum(force(*there) * there[1], axis=-1))
+    def after(s: Array) -> Array:
+        there = (integrate_finite(model, q, s * v), v + s * a)
+        if clock is None:
+            return power(dyn, *there)
+        # The time is the last parameter.
+        times = of_samples.parameter_values[:, -1] + np.broadcast_to(s[:, 0], q.shape[:-1]).ravel()
+        return power(dyn.at(**{clock: times}), *there)
 
     s = _NEAR * h
-    return power(np.zeros(1)), (power(s) - power(-s)) / (2 * s[:, 0])
+    return power(dyn, q, v), (after(s) - after(-s)) / (2 * s[:, 0])
 
 
-def _damping(dyn: Dynamics, q: Array, v: Array) -> Array:
-    if not dyn.model.needs.damping:
-        return np.zeros(v.shape)
-    if not dyn.model.has_bodies:
-        return along(dyn, v.shape[-1:], lambda own, q, v: own.passive(q, v), q, v)
-    # At rest the passive force is that of springs.
-    return along(dyn, v.shape[-1:], lambda own, q, v: _dampers(own, q, v) - _dampers(own, q, np.zeros_like(v)), q, v)
+def _loses(dyn: Dynamics) -> bool:
+    """Return whether something beside τ, wrenches and exact dry friction changes the energy."""
+    model = dyn.model
+    bound = model.constrained and (dyn.soft_constraints or model.constraints_do_work)
+    return bool(bound or dyn.soft_friction or model.needs.damping or model.forces or not model.has_bodies)
+
+
+def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
+    """Return the power under τ of all forces but τ itself, exact dry friction and those in the energy; (N,)."""
+    model = dyn.model
+    if not model.has_bodies:
+        rate = dyn._evaluate("energy_rate", q=q, v=v, a=dyn.forward_dynamics(q, v, tau))
+        return np.asarray(rate - np.sum(tau * v, axis=-1))
+    force = np.asarray(dyn._lost_force(q, v))
+    if model.needs.damping:
+        # At rest the passive force is that of springs; forces by functions are counted above.
+        force = force + _dampers(dyn, q, v) - _dampers(dyn, q, np.zeros_like(v))
+    if dyn.soft_friction:
+        force = force + dyn._friction.law.force(v) + dyn._friction_beside_passive(q, v, tau)
+    if model.constrained and (dyn.soft_constraints or model.constraints_do_work):
+        force = force + dyn.generalized_constraint_force(q, v, tau)
+    return np.asarray(np.sum(force * v, axis=-1))
 
 
 def _dampers(dyn: Dynamics, q: Array, v: Array) -> Array:
-    """Return the passive force without that of functions, whose work is counted apart."""
-    return np.asarray(dyn.passive(q, v) - dyn._lost_force(q, v))
+    """Return the passive force of springs and dampers alone."""
+    own = dyn.passive(q, v) - dyn._lost_force(q, v)
+    return np.asarray(own - dyn._friction.law.force(v) if dyn.model.needs.friction else own)
 
 
 def _plain(model: Model) -> list[tuple[int, int]]:
@@ -378,10 +417,6 @@ def _by_cubics(t: Array, p: Array) -> Array:
     moments = np.broadcast_to((1.0 / (powers + 1))[:, None], (n - 1, width, 1))
     weights = np.linalg.solve(V, moments)[..., 0] * h[:, None]
     return np.asarray(np.sum(weights * p[..., around], axis=-1))
-
-
-def _lost(dyn: Dynamics, q: Array, v: Array) -> Array:
-    return np.asarray(dyn._lost_force(q, v))
 
 
 # Momenta

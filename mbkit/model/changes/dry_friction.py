@@ -84,6 +84,21 @@ class DryFrictionLaw:
         out = np.where(own.stribeck > 0, (own.bound - own.sliding) * fall, 0.0)[..., None] * np.eye(full.shape[-1])
         return np.asarray(out if self._G is None else self._G.T @ out @ self._G)
 
+    def dissipated(self, h: Array, moved: Array, v: Array) -> Array:
+        """Return ∫ f(|v|) |v| dt over K intervals of h, (K,), that move by `moved`, (K, nv), between v, (K + 1, nv).
+
+        The part of f at high speed is exact where no velocity changes its sign in an interval; Simpson's rule, with
+        velocities of the cubic through the ends, has that of Stribeck's curve.
+        """
+        own, h = self._numbers, h[:, None]
+        d, v = (x if self._G is None else x @ self._G.T for x in (moved, v))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            turning = np.square(v[1:]) + np.square(v[:-1])
+            path = np.where(v[1:] * v[:-1] < 0, 0.5 * h * turning / np.abs(v[1:] - v[:-1]), np.abs(d))
+            middle = np.where(h > 0, 1.5 * d / h - 0.25 * (v[1:] + v[:-1]), 0.0)
+        ends, middle = ((own.at(x) - own.sliding) * np.abs(x) for x in (v, middle))
+        return np.asarray(np.sum(own.sliding * path + h / 6 * (ends[1:] + 4 * middle + ends[:-1]), axis=1))
+
     def at_rest(self, v: Array) -> NDArray[np.bool_]:
         """Return where joints with friction have no velocity, of the shape of v."""
         return np.asarray((v == 0) & (self.bound > 0), dtype=np.bool_)

@@ -91,7 +91,8 @@ def diagnostics(
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
         fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
         limit = _ENERGY if method.order in _LOW else _ENERGY_HIGH
-        checks.append(energy_drift([samples[i] for i in whole], fast, model.loses_energy, limit))
+        damped = model.loses_energy or dyn.soft_constraints
+        checks.append(energy_drift([samples[i] for i in whole], fast, damped, limit))
     # Neither the engine nor the method may solve with the mass matrix.
     matrices = [one.M for member in samples for one in member]
     if matrices and (method.mass_matrix or getattr(dyn, "elimination", "") != "least constraint"):
@@ -111,8 +112,10 @@ def diagnostics(
 
 def _smooth(dyn: Dynamics) -> Dynamics:
     """Return the dynamics between jumps of dry friction, which no step goes across."""
+    if not dyn.model.needs.friction:
+        return dyn
     bare = dyn.model.without("friction")
-    return dyn._of_model(bare, bare.form_digest) if dyn.model.needs.friction else dyn
+    return dyn._of_model(bare, bare.form_digest)
 
 
 class _Sample:

@@ -1,0 +1,147 @@
+"""Work and power balance of runs: with every part that acts in it, against closed forms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.lagrangian import systems
+from mbkit.model import Model
+from mbkit.simulate import Trajectory, simulate
+from tests.scenes import mounted
+
+
+def block(mass: float = 2.0, **joint: Any) -> mb.ModelBuilder:
+    return mounted("block", "m", "x", "prismatic", gravity=(0, 0, 0), mass=mass, axis=(1, 0, 0), **joint)
+
+
+def rubbing(**joint: Any) -> Model:
+    return block(friction=3.0, **joint).build(point_masses=True)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize(("method", "setting"), [("rk4", {"dt": 0.02}), ("rk853", {})])
+def test_friction_takes_f_times_the_way(engine: str, method: str, setting: dict[str, float]) -> None:
+    run = simulate(mb.dynamics(rubbing(), engine), [0.0], [0.5], 2.0, method, torque=[5.0], **setting)
+    # a = (5 - 3)/2, so that 3 m are gone along.
+    assert run.work()[-1] == pytest.approx((5.0 - 3.0) * 3.0, abs=1e-12)
+    assert np.abs(run.power_balance()).max() < 1e-12
+
+
+@pytest.mark.parametrize("save", [None, [0.0, 0.7, 1.5]])
+def test_the_way_back_and_forth_counts_between_saved_states_too(save: Any) -> None:
+    """From turn to turn the swing on a spring shrinks by 2 f/k, until the spring cannot pull the block."""
+    k, start = 100.0, np.array([0.2, -0.14])
+    run = simulate(mb.dynamics(rubbing(stiffness=k)), start[:, None], [[0.0], [0.0]], 1.5, "rk4", 2e-3, save=save)
+    assert not run.v[:, -1].any()
+    # To 0.02, which is below 3/100.
+    np.testing.assert_allclose(run.work()[:, -1], -k / 2 * (start**2 - 0.02**2), atol=1e-8)
+    assert np.abs(run.power_balance()).max() < 1e-8
+
+
+def conveyed(engine: str, h: float) -> Trajectory:
+    b = mb.ModelBuilder("skate", gravity=(0, 0, 0))
+    b.add_body("skate", mass=1.0, inertia=(0.1, 0.1, 0.1))
+    b.add_joint("glide", "planar", parent="world", child="skate")
+    b.add_blade("edge", body_a="skate", axis_a=(0, 1, 0), speed=0.3)
+    dyn = mb.dynamics(b.build(), engine)
+    pushed = np.repeat(np.cos(np.arange(150.0)).reshape(-1, 3), round(0.02 / h), axis=0)
+    return simulate(dyn, *dyn.project([0, 0, 0.2], [1.0, 0.2, 0.5]), 1.0, dt=h, torque=pushed)
+
+
+def soft_loop(h: float) -> Trajectory:
+    model = mb.catalog.four_bar()
+    q, v = mb.dynamics(model, "lagrangian").project([0.5, 0, 1.0], [1.0, 0, 0])
+    return simulate(mb.dynamics(model, "mujoco"), q, v, 0.2, dt=h / 10)
+
+
+def soft_friction(h: float) -> Trajectory:
+    dyn = mb.dynamics(rubbing(damping=0.2), "mujoco", soft_friction=True)
+    return simulate(dyn, [0.0], [3.0], 0.06, dt=h / 10, torque=[1.0])
+
+
+def prescribed(torque: Any, h: float) -> Trajectory:
+    b = block(1.0)
+    b.prescribe("x", amplitude=0.5, frequency=3.0)
+    dyn = mb.dynamics(b.build(point_masses=True), "lagrangian")
+    return simulate(dyn, [0.0], [1.5], 2.0, dt=h, torque=torque)
+
+
+def floating(h: float) -> Trajectory:
+    """A floating body on a bushing, with a link that rubs, dampers, gravity compensation and a force of t."""
+    b = mb.ModelBuilder("floating")
+    b.add_body("base", mass=1.0, com=(0.1, 0, 0), inertia=(0.15, 0.16, 0.17))
+    b.add_body("link", mass=1.0, com=(0.2, 0, 0), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("free", "free", parent="world", child="base")
+    more = {"translation": (0.3, 0, 0), "axis": (0, 1, 0)}
+    b.add_joint("hinge", "revolute", parent="base", child="link", friction=0.1, damping=0.1, **more)
+    b.add_bushing("mount", body_a="world", body_b="base", stiffness=[50.0] * 6, damping=[1.0] * 6)
+    b.add_spring("strut", body_a="world", body_b="link", point_a=(0, 0, 2), stiffness=5.0, rest_length=1, damping=0.3)
+    b.add_gravity_compensation("link", 0.5, without=["hinge"])
+    b.add_force("gust", "link", force=ca.vertcat(ca.cos(3 * ca.SX.sym("t")), 0, 1))
+    model = b.build()
+    v = np.array([0.3, 0.2, 0.1, -0.2, 0.3, 0.1, 4.0])
+    wrench = {"link": [0.5, 0.1, 0.2, 0, 0.1, 0]}
+    run = simulate(mb.dynamics(model, "lagrangian"), model.neutral(), v, 0.3, dt=h, torque=[0.2] * 7, wrenches=wrench)
+    assert (run.v[:, -1] > 0).all()
+    return run
+
+
+def written(system: Callable[[], Any], h: float) -> Trajectory:
+    return simulate(system().dynamics(), [1.0], [0.5], 0.5, dt=h / 10)
+
+
+@pytest.mark.parametrize(
+    "run",
+    [
+        *(lambda h, e=engine: conveyed(e, h) for engine in ("lagrangian", "pinocchio")),
+        *(lambda h, x=torque: prescribed(x, h) for torque in (None, [0.7], lambda t, q, v: [np.cos(2 * t)])),  # noqa: ARG005
+        soft_loop,
+        soft_friction,
+        floating,
+        lambda h: written(systems.bead_on_hoop, h),
+        lambda h: written(systems.driven_pendulum, h),
+    ],
+)
+def test_whatever_acts_is_in_the_balance(run: Callable[[float], Trajectory]) -> None:
+    """What is left falls with the fourth power of the distance of the states."""
+    coarse, fine = run(0.02), run(0.01)
+    left = [np.abs(x.power_balance()).max() for x in (coarse, fine)]
+    size = np.abs(fine.work()).max()
+    assert size > 1e-3
+    assert left[1] < 1e-4 * size
+    assert left[1] < left[0] / 8 or left[1] < 1e-9 * size
+
+
+def test_the_drive_of_a_prescribed_motion_does_the_work() -> None:
+    run = prescribed(None, 2e-3)
+    np.testing.assert_allclose(run.work(), 0.5 * 1.5**2 * (np.cos(3 * run.t) ** 2 - 1), atol=1e-9)
+    with pytest.raises(mb.errors.UnsupportedError, match="holds one time; evaluate along a run with the lagrangian"):
+        run.work("pinocchio")
+
+
+def test_a_hoop_that_turns_does_work_on_its_bead() -> None:
+    """T2 - T0 + V stays, so that T + V changes by 2 T0 = m R² Ω² sin² θ."""
+    run = written(systems.bead_on_hoop, 0.02)
+    np.testing.assert_allclose(run.work(), 16.0 * (np.sin(run.q[:, 0]) ** 2 - np.sin(1.0) ** 2), atol=1e-8)
+    assert run.check()
+
+
+def test_joints_that_mimic_and_stribeck_s_curve_take_their_part() -> None:
+    """A block that stops has lost what it had, and so has a pair of which one mimics the other."""
+    pair = block(1.0, stiction=3.5, friction=3.0, stribeck_velocity=0.1)
+    pair.add_body("other", mass=1.0)
+    more = {"axis": (0, 1, 0), "mimic": ("x", -2.0, 0.0), "friction": 0.5}
+    pair.add_joint("y", "prismatic", parent="world", child="other", **more)
+    for model, energy in (
+        (rubbing(stiction=3.5, stribeck_velocity=0.1), 0.25),
+        (pair.build(point_masses=True), 0.625),
+    ):
+        run = simulate(mb.dynamics(model), [0.0], [0.5], 1.0, "rk4", 1e-3)
+        assert run.v[-1] == 0.0
+        assert run.work()[-1] == pytest.approx(-energy, abs=1e-8)
