@@ -45,13 +45,14 @@ def urdf(*parts: str) -> str:
     return f'<?xml version="1.0"?><robot name="r">{"".join(parts)}</robot>'
 
 
-def arm(*beside: str, tool: str = LINK.format("tool", 0.3, 1e-3, 2e-3, 2e-3, "")) -> str:
+def arm(*beside: str, tool: str = LINK.format("tool", 0.3, 1e-3, 2e-3, 2e-3, ""), friction: float = 0.2) -> str:
+    """Return an arm with dry friction, which Drake drops."""
     return urdf(
         LINK.format("base", 1, 0.01, 0.01, 0.01, ""),
         LINK.format("upper", 2, 0.01, 0.02, 0.015, ""),
         LINK.format("lower", 1, 0.004, 0.003, 0.002, ""),
         tool,
-        JOINT.format("shoulder", "revolute", "base", "upper", '<dynamics damping="0.5" friction="0.2"/>'),
+        JOINT.format("shoulder", "revolute", "base", "upper", f'<dynamics damping="0.5" friction="{friction}"/>'),
         JOINT.format("elbow", "continuous", "upper", "lower", ""),
         JOINT.format("mount", "fixed", "lower", "tool", ""),
         *beside,
@@ -73,14 +74,15 @@ def causes(result: object, engine: str) -> dict[str, list[str]]:
 
 
 def test_three_importers_of_one_sound_file(tmp_path: Path) -> None:
-    result = mb.compare_parsers(write(tmp_path, arm()))
+    result = mb.compare_parsers(write(tmp_path, arm(friction=0.0)))
     assert result.agree
+    assert result.verdict == "pinocchio, mujoco and drake agree with the file as written, limits apart"
     assert [p.engine for p in result.importers] == ["pinocchio", "mujoco", "drake"]
     assert not causes(result, "pinocchio")
-    # What is known of each: MuJoCo drops the base and velocity limits, Drake dry friction and effort limits.
+    # What is known of each: MuJoCo drops the base and velocity limits, Drake effort limits.
     assert causes(result, "mujoco").keys() == {"base mass", "limits"}
     assert "1 kg" in causes(result, "mujoco")["base mass"][0]
-    assert causes(result, "drake").keys() == {"friction", "limits"}
+    assert causes(result, "drake").keys() == {"limits"}
     stages = {s.name: s for s in result.importers[1].stages}
     assert stages["total mass"].same is False
     assert stages["M"].worst < 1e-14
@@ -88,6 +90,32 @@ def test_three_importers_of_one_sound_file(tmp_path: Path) -> None:
     assert told["agree"]
     assert "| total mass | same |" in result.to_markdown()
     assert "total mass" in result._repr_html_()
+
+
+def test_dry_friction_that_an_importer_drops_is_another_motion(tmp_path: Path) -> None:
+    turning = '<dynamics damping="0.1" friction="5"/>'
+    hinge = JOINT.format("hinge", "continuous", "base", "rod", turning)
+    path = write(tmp_path, urdf('<link name="base"/>', LINK.format("rod", 2, 0.02, 0.03, 0.03, ""), hinge))
+    result = mb.compare_parsers(path)
+    read = {p.engine: p for p in result.importers}
+    assert [p.agrees for p in read.values()] == [True, True, False]
+    assert result.verdict == "pinocchio and mujoco agree with the file as written, limits apart; drake differs"
+    assert {"friction", "limits"} == causes(result, "drake").keys()
+    # The force that is lost, 5 N m, over the whole of 5 + 0.1 |v|, at the state of the least speed.
+    v = mb.load(path).random_state(np.random.default_rng(0), 3)[1]
+    (passive,) = (s for s in read["drake"].stages if s.name == "passive")
+    assert (passive.same, passive.where) == (False, "hinge")
+    assert passive.worst == pytest.approx(np.max(5 / (5 + 0.1 * np.abs(v))), rel=1e-12)
+    for p in result.importers:
+        assert p.explanation is not None
+        assert p.agrees == p.explanation.agree
+    told = json.loads(result.to_json())
+    assert (told["agree"], told["verdict"]) == (False, result.verdict)
+    page = importers_view(result)
+    assert (page.good, page.title) == (False, "r.urdf: importers differ")
+    shown = CliRunner().invoke(cli, ["check", str(path), "--own-parsers", "--out", str(tmp_path)])
+    assert shown.exit_code == 1
+    assert shown.output.startswith("✗ r.urdf: pinocchio and mujoco agree")
 
 
 def test_massless_inertia_and_impossible_inertia_as_each_importer_takes_them(tmp_path: Path) -> None:
@@ -335,6 +363,7 @@ def test_no_other_file_is_opened_and_what_would_open_one_is_told(tmp_path: Path)
         # Drake 1.51 ends the process over a transmission without a type.
         '<transmission name="t"><type/><joint name="elbow"/><actuator name="m"/></transmission>',
         '<gazebo><plugin filename="lib.so"/></gazebo>',
+        friction=0.0,
     )
     stripped = strip(write(tmp_path, text))
     assert not any(x in stripped.text for x in ("package", "filename", "mesh", "<type"))
@@ -378,7 +407,7 @@ def test_a_quadruped_and_a_humanoid_with_a_floating_base() -> None:
 def test_a_floating_base_is_the_one_of_load(tmp_path: Path) -> None:
     # A base link of the ground's name, and what hangs on it stands elsewhere and turned.
     mount = JOINT.format("mount_base", "fixed", "world", "base", "")
-    path = write(tmp_path, arm('<link name="world"/>', mount))
+    path = write(tmp_path, arm('<link name="world"/>', mount, friction=0.0))
     result = mb.compare_parsers(path, floating_base=True, samples=1)
     assert result.agree
     assert any("'world' is called 'world_link'" in note for note in result.notes)
@@ -485,7 +514,7 @@ def test_mimic_joints_that_an_importer_holds_are_not_called_free(tmp_path):
     """Agreement leaves mimic joints out, and says so; no mark of a fault stands below a tick."""
     result = mb.compare_parsers("panda")
     assert result.agree
-    assert result.verdict.endswith("with the file as written, mimic joints apart")
+    assert result.verdict.endswith("with the file as written, mimic joints and limits apart")
     ways = {"pinocchio": "left free", "mujoco": "held by soft equality constraints", "drake": "held by constraints"}
     for read in result.importers:
         mimic = next(s for s in read.stages if s.name == "mimic")
@@ -495,4 +524,4 @@ def test_mimic_joints_that_an_importer_holds_are_not_called_free(tmp_path):
     shown = CliRunner().invoke(cli, ["check", "panda", "--own-parsers", "--out", str(tmp_path)])
     assert shown.exit_code == 0
     assert "✗" not in shown.output
-    assert mb.compare_parsers("ur5").verdict.endswith("with the file as written")
+    assert mb.compare_parsers("ur5").verdict.endswith("with the file as written, limits apart")

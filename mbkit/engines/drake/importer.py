@@ -77,8 +77,9 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     held = "by constraints" if plant.num_constraints() else ""
     if held:
         notes.append(f"{plant.num_constraints()} constraints, outside M and nle")
-    # A plant counts its constraints.
-    loops = "pydrake does not give the bodies and points of constraints" if plant.num_constraints() else ()
+    # A plant counts its constraints, those of a URDF's mimic joints among them.
+    other = plant.num_constraints() > (text.count("<mimic") if format_ == "urdf" else 0)
+    loops = "pydrake does not give the bodies and points of constraints" if other else ()
     return Imported(model, dyn.terms, tuple(notes), loops=loops, holds_mimics=held)
 
 

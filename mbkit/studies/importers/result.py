@@ -16,6 +16,8 @@ TERMS: Final = ("M", "g", "nle", "passive")
 MISSING: Final = "not installed"
 #: The stages that say whether two readings move alike.
 DECIDING: Final = ("joints", "kinds", *TERMS)
+#: Stages that no term shows: an agreement leaves them out.
+_APART: Final = {"mimic": "mimic joints", "limits": "limits", "loops": "loops", "couplers": "couplers"}
 _MARK: Final = {True: "same", False: "differs", None: "not comparable"}
 
 
@@ -60,8 +62,10 @@ class Parsed:
 
     @property
     def agrees(self) -> bool:
-        """Whether it moves as the reference does, mimic joints left free and loops open."""
-        return bool(self.stages) and all(s.same for s in self.stages if s.name in DECIDING)
+        """Whether it moves as the reference does, mimic joints left free and loops open, and no cause acts."""
+        causes = self.explanation.acting if self.explanation else ()
+        same = bool(self.stages) and all(s.same for s in self.stages if s.name in DECIDING)
+        return same and all(c.kind in _APART for c in causes)
 
 
 @dataclass(frozen=True, repr=False)
@@ -102,9 +106,10 @@ class ParserComparison(ResultTable):
         refuse = [p.engine for p in self.importers if p.refused and p.engine not in missing]
         against = "" if self.reference == "file" else f" from the {self.against}"
         alone = [p.engine for p in self.importers if not p.stages and not p.refused]
-        apart = any(s.name == "mimic" and s.same is False for p in self.importers if p.agrees for s in p.stages)
+        other = {s.name for p in self.importers if p.agrees for s in p.stages if not s.same}
+        apart = [what for name, what in _APART.items() if name in other]
         parts = [f"{_listed(same)} agree{_s(same)} with the {self.against.split(',')[0]}"] if same else []
-        parts = [f"{x}, mimic joints apart" if apart else x for x in parts]
+        parts = [f"{x}, {_listed(apart)} apart" if apart else x for x in parts]
         parts += [f"{_listed(differ)} differ{_s(differ)}{against}"] if differ else []
         parts += [f"{_listed(refuse)} refuse{_s(refuse)}"] if refuse else []
         parts += [f"{_listed(missing)} {'is' if len(missing) == 1 else 'are'} not installed"] if missing else []

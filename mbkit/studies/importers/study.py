@@ -40,6 +40,7 @@ from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_reader import urdf_links
 from mbkit.model import Coupler, Loop, Model
+from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.model.elements.forces import by_functions
 from mbkit.model.joint_numbers import owners
 from mbkit.model.validation import listing
@@ -49,8 +50,7 @@ from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_s
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
-from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, states_of
-from mbkit.studies.explain.terms import model_terms as terms_with_friction
+from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
 from mbkit.studies.importers.loops import (
     WrittenLoops,
     activated,
@@ -209,7 +209,8 @@ def stages(
         ours = model_terms(one.model, at)
         source = reference if isinstance(reference, Imported) else None
         if source is None and whole.forces:
-            source = Imported(whole, lambda q, v, _: model_terms(whole, States(q, v)), ())
+            smooth = whole.without("friction")
+            source = Imported(whole, lambda q, v, _: model_terms(smooth, States(q, v)), ())
         if source is not None:
             ours = _own_terms_of(one.model, source, {j.name: j.name for j in one.model.joints}, at)
         theirs_ = _own_terms_of(one.model, imported, matching.to_b, at)
@@ -308,13 +309,14 @@ def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str]
     if q.shape != at.q.shape or v.shape != at.v.shape:
         return {}
     q[:, q_order], v[:, v_order] = at.q, at.v
-    terms = imported.terms(q, v, ())
+    terms = _terms(imported, States(q, v))
     return {k: x[:, v_order][:, :, v_order] if x.ndim == 3 else x[:, v_order] for k, x in terms.items()}
 
 
-def model_terms(model: Model, at: States) -> Values:
-    """Return a model's terms without dry friction, which is in no importer's own terms."""
-    return terms_with_friction(model.without("friction"), at)
+def _terms(imported: Imported, at: States, without: tuple[str, ...] = ()) -> Values:
+    """Return an importer's own terms with the dry friction that it read, which engines hold outside of their terms."""
+    terms = imported.terms(at.q, at.v, without)
+    return _with(terms, {"passive": DryFrictionLaw(imported.model).force(at.v)})
 
 
 def own_terms(
@@ -323,11 +325,11 @@ def own_terms(
     """Return what acts in an importer's model beside bodies and joints, what does not, and whether that is all."""
     at = states_of(imported.model, samples, seed)
     joints = owners(imported.model)
-    whole, described = imported.terms(at.q, at.v, ()), model_terms(imported.model, at)
-    bare = imported.terms(at.q, at.v, tuple(x.key for x in imported.beside)) if imported.beside else whole
+    whole, described = _terms(imported, at), model_terms(imported.model, at)
+    bare = _terms(imported, at, tuple(x.key for x in imported.beside)) if imported.beside else whole
     causes, idle = [], []
     for extra in imported.beside:
-        without = imported.terms(at.q, at.v, (extra.key,))
+        without = _terms(imported, at, (extra.key,))
         rest = {} if extra.without is None else model_terms(extra.without, at)
         part = {name: x - rest[name] for name, x in described.items() if name in rest}
         bare = _with(bare, part)
@@ -393,8 +395,9 @@ def compare_parsers(
     The readings are compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses, centres of
     mass, inertias, armature, damping, friction, limits, the loops and couplers of an MJCF, and M, g, nle and passive by
     joint name, by the engine itself on its own model, with all that it holds beside bodies and joints: flags, tendons,
-    actuators at zero control, fluid, gravity compensation. Links that an importer fuses are fused on the other side
-    too. Why one differs is in its ``explanation``. Loops and couplers are in no term, and decide nothing. Where mbkit
+    actuators at zero control, fluid, gravity compensation. Here passive holds the dry friction that was read. Links
+    that an importer fuses are fused on the other side too. Why one differs is in its ``explanation``. Mimic joints,
+    limits, loops and couplers are in no term: they decide nothing, and the verdict names those that differ. Where mbkit
     does not read the file, an MJCF is compared with MuJoCo's own reading, and any other file with nothing: the
     importers that read it are only listed.
 
