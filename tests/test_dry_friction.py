@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import pickle
+import re
 import warnings
 from pathlib import Path
 
@@ -16,7 +17,9 @@ from scipy.optimize import brentq, lsq_linear
 import mbkit as mb
 from mbkit.engines.elements.dry_friction import forces_at_rest
 from mbkit.errors import InputError, MbkitWarning, ModelError, TorqueError, UnsupportedError
+from mbkit.lagrangian.printing.summary import SystemSummary, python_code
 from mbkit.model import Model
+from mbkit.model.changes.dry_friction import held_at_rest
 from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
 
 EPS = float(np.finfo(float).eps)
@@ -95,6 +98,46 @@ def test_derivatives_at_speed_are_those_of_the_curve(engine: str) -> None:
         by_v = np.array([of(q, v + h * e, x) - of(q, v - h * e, x) for e in np.eye(len(v))]).T / (2 * h)
         # Differences lose half of the digits.
         assert off(derivatives(q, v, x).v, by_v) < 1e-7
+
+
+def test_equations_on_paper_programs_and_c_hold_the_friction_of_motion_and_tell_of_rest() -> None:
+    """A block, and a wheel that follows it by -2: f at the rate of each, and Stribeck's curve."""
+    b = mb.ModelBuilder("sled", gravity=(0, 0, 0))
+    b.add_body("block", mass=2.0)
+    b.add_body("wheel", mass=0.0, inertia=(0.1, 0.1, 0.1))
+    rubs = {"friction": 3.0, "stiction": 4.0, "stribeck_velocity": 0.5}
+    b.add_joint("slide", "prismatic", parent="world", child="block", axis=(1, 0, 0), **rubs)
+    follows = {"mimic": ("slide", -2.0, 0.1), "friction": 0.7}
+    b.add_joint("turn", "revolute", parent="block", child="wheel", axis=(0, 1, 0), **follows)
+    model = b.build(nonphysical="warn")
+    v, tau = -0.3, 1.0
+    expected = (tau + 3.0 + (4.0 - 3.0) * np.exp(-((v / 0.5) ** 2)) + 2 * 0.7) / (2.0 + 2.0**2 * 0.1)
+    told = r"f sign\(v\): zero at rest, where it can hold up to 5.4 at 'slide'"
+    with pytest.warns(MbkitWarning, match=told):
+        lag = mb.lagrangian.from_model(model)
+    assert lag.dynamics(options={"compile": False}).forward_dynamics([0.2], [v], [tau]) == pytest.approx(expected)
+    program, modules = mb.lagrangian.program(model, "forward_dynamics"), ({}, {})
+    exec(program.python(), modules[0])
+    exec(python_code(lag, held_at_rest(model)), modules[1])
+    for module in modules:
+        assert module["forward_dynamics"]([0.2], [v], [tau]) == pytest.approx(expected)
+    summary = SystemSummary(lag, note=held_at_rest(model))
+    texts = [str(program), program.latex(), program.python(), program.c(), summary.text(), summary.latex()]
+    texts += [python_code(lag, held_at_rest(model)), mb.lagrangian.export_c(model).header, summary.data()["note"]]
+    for text in texts:
+        assert re.search(told, " ".join(text.replace("\n *", " ").split()))
+    assert "left out" not in re.sub("Limits and contacts are left out", "", texts[-2])
+    assert "rest" not in str(mb.lagrangian.program(model, "mass_matrix"))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_on_paper_friction_at_speed_is_that_of_the_engine(seed: int) -> None:
+    model = rubbed(seed, 3, ("revolute", "prismatic", "continuous"), mimic=True)
+    q, v, _, tau = states(model, 3)
+    with pytest.warns(MbkitWarning, match="zero at rest"):
+        paper = mb.lagrangian.from_model(model).dynamics(options={"compile": False})
+    expected = mb.dynamics(model, "lagrangian", compile=False).forward_dynamics(q, v, tau)
+    assert off(paper.forward_dynamics(q, v, tau), expected) < 1e4 * EPS
 
 
 # At rest

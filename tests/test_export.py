@@ -412,7 +412,7 @@ def test_the_header_holds_what_the_functions_hold() -> None:
     b.add_joint("hinge", "revolute", parent="world", child="rod", axis=(0, 1, 0), damping=0.1, **limits)
     header = export_c(b.build(), ["mass_matrix"]).header
     (holds,) = re.findall(r"Holds +(.*)", header)
-    assert holds == "gravity, damping"
+    assert holds == "gravity, damping, friction"
 
 
 #: Of frames, their inputs; and of the whole.

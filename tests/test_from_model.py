@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -270,6 +271,43 @@ def test_numbers_are_the_description_s():
     assert not lag.parameters
     assert w**2 / 4 == lag.T
     assert -9.81 * sp.cos(th) == lag.V
+
+
+@pytest.mark.parametrize("part", ["couplers", "forces", "prescribed", "friction"])
+def test_a_system_of_the_catalog_keeps_the_parts_that_a_user_adds(part):
+    base = mb.catalog.cart_pole()
+    b = mb.ModelBuilder.of(base)
+    if part == "couplers":
+        b.add_coupler("belt", joint="theta", leader="x", ratio=2.0)
+    elif part == "forces":
+        b.add_joint_force("spring", "x", -3.0 * sp.Symbol("q") ** 3)
+    elif part == "prescribed":
+        b.prescribe("x", amplitude=0.2, frequency=2.0)
+    else:
+        b.set_joint("x", friction=0.3)
+    model = b.build()
+    named = in_symbols(model)
+    assert set(named.parameters) - {"t"} == {"g", "m_c", "m_p", "l"}
+    engines = [mb.dynamics(m, "lagrangian", compile=False) for m in (model, named)]
+    q, v = engines[0].project(*model.random_state(3)) if model.constrained else model.random_state(3)
+    expected, other = (dyn.forward_dynamics(q, v, np.ones(2)) for dyn in engines)
+    assert off(other, expected) < CLOSE
+    kept = [1] if part == "prescribed" else [0, 1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore" if part == "friction" else "error")
+        lag = from_model(model, symbols=True)
+    own = lag.dynamics(options={"compile": False}).forward_dynamics(q[kept], v[kept], np.ones(len(kept)))
+    assert off(own, expected[kept]) < CLOSE
+
+
+def test_the_needs_of_a_system_on_paper_name_its_time_and_constraints():
+    b = mounted("pendulum", "bob", "theta", "revolute", mass=1.0, com=(0.1, 0, -1.0), axis=(0, -1, 0))
+    b.add_joint_force("push", "theta", 3 * sp.cos(5 * sp.Symbol("t")))
+    assert from_model(b.build()).model.needs.time
+    assert not from_model(mb.catalog.pendulum()).model.needs.time
+    crank, sleigh = (from_model(f()).model.needs for f in (mb.catalog.slider_crank, mb.catalog.chaplygin_sleigh))
+    assert (crank.loops, crank.no_slip, crank.time) == (True, False, False)
+    assert (sleigh.loops, sleigh.no_slip) == (False, True)
 
 
 def test_a_system_of_other_form_keeps_its_numbers():

@@ -15,6 +15,7 @@ import mbkit as mb
 from mbkit.engines.constraint_manifold import manifold_of, refuse_unreachable
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.lagrangian import from_model, systems
+from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop, Prescribed
 from tests.random_trees import off, random_tree
 from tests.scenes import chain
@@ -241,6 +242,82 @@ def test_a_frame_closed_in_space_moves_as_the_point_does(linkage):
         for x, state in ((lag, (q, v)), (weld, (q_w, v_w)))
     )
     assert np.abs(one.q - two.q[:, :4]).max() < 1e-10
+
+
+def loose(kind: str, gravity=(0.3, 0.2, -9.81)) -> mb.Model:
+    """Return a body on three slides and three hinges, about z, y and x, whose origin a loop holds at the world's."""
+    slides, hinges = np.eye(3), np.eye(3)[::-1]
+    b, parent = mb.ModelBuilder("loose", gravity=gravity), "world"
+    for k, (joint, axis) in enumerate([*(("prismatic", x) for x in slides), *(("revolute", x) for x in hinges)]):
+        own = {"mass": 1.3, "com": (0.2, 0.1, -0.3), "inertia": (0.03, 0.02, 0.04)} if k == 5 else {"mass": 0.0}
+        b.add_body(f"b{k}", **own)
+        b.add_joint(f"j{k}", joint, parent=parent, child=f"b{k}", axis=axis)
+        parent = f"b{k}"
+    turned, across = Rotation.from_rotvec([0.7, -0.2, 0.4]), Rotation.from_rotvec([np.pi / 2, 0, 0])
+    more = {"rotation_a": turned.as_matrix(), "rotation_b": turned.as_matrix()}
+    if kind == "universal":
+        more["rotation_b"] = (turned * across).as_matrix()
+    if kind == "distance":
+        more |= {"translation_a": -0.7 * more["rotation_a"][:, 2], "length": 0.7}
+    b.add_loop("held", kind, body_a="world", body_b=parent, **more)
+    return b.build(nonphysical="warn")
+
+
+@pytest.mark.parametrize("kind", LOOP_KINDS)
+def test_a_body_that_a_loop_holds_begins_to_move_as_newton_and_euler_say(kind):
+    model = loose(kind)
+    (loop,) = model.loops
+    u, across = loop.rotation_a[:, 2], loop.rotation_a[:, :2]
+    turns, slides = np.vstack([np.zeros((3, 3)), np.eye(3)]), np.vstack([np.eye(3), np.zeros((3, 3))])
+    free = {
+        "point": turns,
+        "frame": turns[:, :0],
+        "revolute": turns @ u[:, None],
+        "universal": turns @ np.stack([u, loop.rotation_b[:, 2]], axis=1),
+        "cylindrical": np.hstack([slides @ u[:, None], turns @ u[:, None]]),
+        "prismatic": slides @ u[:, None],
+        "distance": np.hstack([slides @ across, turns]),
+    }[kind]
+    m, c = 1.3, np.array([[0, 0.3, 0.1], [-0.3, 0, -0.2], [-0.1, 0.2, 0]])
+    inertia = np.block([[m * np.eye(3), -m * c], [m * c, np.diag([0.03, 0.02, 0.04]) - m * c @ c]])
+    weight = m * np.concatenate([model.gravity, c @ model.gravity])
+    expected = free @ np.linalg.solve(free.T @ inertia @ free, free.T @ weight)
+    a = from_model(model).dynamics(options=OWN).forward_dynamics(*np.zeros((3, 6)))
+    # Hinges about z, y and x.
+    assert a == pytest.approx(expected[[0, 1, 2, 5, 4, 3]], abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", LOOP_KINDS)
+def test_every_kind_of_loop_has_the_rows_and_accelerations_of_the_engine(kind):
+    model = loose(kind)
+    engine, paper = mb.dynamics(model, "lagrangian", compile=False), from_model(model).dynamics(options=OWN)
+    q, v = engine.project(np.array([0.1, -0.1, 0.05, 0.2, -0.1, 0.1]), np.array([1.0, -2, 0.5, 2, 1, -1]))
+    tau = np.linspace(-1, 1, 6)
+    moved = q + 0.1
+    assert off(paper.constraint_residual(moved), engine.constraint_residual(moved)) < CLOSE
+    assert off(paper.constraint_jacobian(q), engine.constraint_jacobian(q)) < CLOSE
+    assert off(paper.forward_dynamics(q, v, tau), engine.forward_dynamics(q, v, tau)) < CLOSE
+
+
+TILTED = Rotation.from_rotvec([0.4, -0.9, 0.3]).as_matrix()
+
+
+@pytest.mark.parametrize(("kind", "turn", "rows"), [("revolute", 0, 2), ("cylindrical", 1, 2), ("prismatic", 1, 2)])
+def test_a_loop_in_a_tilted_plane_has_the_rows_that_the_plane_leaves(kind, turn, rows):
+    """Of named lengths too: what rounding leaves of directions is no row."""
+    n, (e, f) = TILTED[:, 2], TILTED[:, :2].T
+    b = mb.ModelBuilder("arm")
+    for k, parent in enumerate(("world", "b0", "b1", "b2")):
+        b.add_body(f"b{k}", mass=1.0, com=0.2 * e, inertia=(0.03, 0.02, 0.025))
+        b.add_joint(f"j{k}", "revolute", parent=parent, child=f"b{k}", axis=n, translation=[P("L", 0.5) * x for x in e])
+    frame = np.stack([[e, f, n], [f, n, e]][turn], axis=1)
+    b.add_loop("end", kind, body_a="world", body_b="b3", translation_a=0.6 * e, rotation_a=frame, rotation_b=frame)
+    model = b.build()
+    engine, lag = mb.dynamics(model, "lagrangian", compile=False), from_model(model)
+    q, v = engine.project(*model.random_state(1))
+    assert len(lag.constraints) == rows
+    paper = lag.dynamics(options=OWN)
+    assert off(paper.forward_dynamics(q, v, np.ones(4)), engine.forward_dynamics(q, v, np.ones(4))) < CLOSE
 
 
 @pytest.mark.thorough

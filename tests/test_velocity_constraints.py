@@ -492,6 +492,35 @@ def test_what_rolls_in_a_description_rolls_on_paper(make) -> None:
     assert len(lag.velocity_constraints) == len(own.velocity_constraint_names)
 
 
+def wheel(*slides: str) -> mb.Model:
+    """Return a wheel of 1 kg and 0.1 kg m² in a vertical plane, with an axle on these slides."""
+    b, parent = mb.ModelBuilder("wheel"), "world"
+    for name in slides:
+        b.add_body(f"axle_{name}", mass=0.0)
+        b.add_joint(name, "prismatic", parent=parent, child=f"axle_{name}", axis=np.eye(3)["xyz".index(name)])
+        parent = f"axle_{name}"
+    b.add_body("disc", mass=1.0, inertia=(0.1, 0.1, 0.1))
+    b.add_joint("turn", "revolute", parent=parent, child="disc", axis=(0, 1, 0), translation=(0, 0, 0.5))
+    b.add_rolling("floor", "disc", body_a="disc", radius=0.5, axis_a=(0, 1, 0))
+    return b.build(nonphysical="warn")
+
+
+def test_a_wheel_in_a_plane_has_the_rows_that_the_plane_leaves() -> None:
+    """A torque turns it as if its mass sat on the rim: M = (I + m r²) / r along the way."""
+    for slides in ("x", "xz"):
+        lag = mb.lagrangian.from_model(wheel(*slides))
+        assert (len(lag.constraints), len(lag.velocity_constraints)) == (len(slides) - 1, 1)
+        a = lag.dynamics(options={"compile": False}).forward_dynamics(
+            *np.zeros((2, len(slides) + 1)), [*[0] * len(slides), 1]
+        )
+        assert a[[0, -1]] == pytest.approx([0.5 / 0.35, 1 / 0.35], rel=1e-13)
+    b = mb.ModelBuilder.of(wheel("x"))
+    b.add_rolling("high", "disc", body_a="disc", radius=0.4, axis_a=(0, 1, 0))
+    model = b.build()
+    with pytest.raises(InputError, match=r"no slip 'high': 0\.1.* is left"):
+        mb.lagrangian.from_model(model)
+
+
 @pytest.mark.thorough("slider_crank-appell", "slider_crank-boltzmann_hamel")
 @pytest.mark.parametrize(
     ("make", "way"),

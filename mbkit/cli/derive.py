@@ -81,6 +81,7 @@ def derive(
     from mbkit.lagrangian.energy_model import EnergyModel
     from mbkit.lagrangian.from_description import from_model
     from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters, with_plain_turns
+    from mbkit.model.changes.dry_friction import held_at_rest
     from mbkit.simulate.progress import Bar
 
     on_paper = isinstance(target, EnergyModel)
@@ -102,7 +103,7 @@ def derive(
         # Prescribed joints are no coordinates of the equation.
         described = target.coordinate_names if on_paper else chart_names(target)
         own = dict(zip(names or described, described, strict=True))
-        text, ending = _text(lag, own, form, as_json, bar)
+        text, ending = _text(lag, own, form, as_json, bar, held_at_rest(target))
     if out is None:
         tell(text)
         return
@@ -169,15 +170,17 @@ def _program(model: Model, quantity: str, form: str | None, snap: float) -> tupl
     return written(text).rstrip(), ending
 
 
-def _text(lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any) -> tuple[str, str]:
+def _text(
+    lag: Lagrangian, names: dict[str, str], form: str | None, as_json: bool, bar: Any, note: str
+) -> tuple[str, str]:
     if form == "python":
         from mbkit.lagrangian.printing.summary import python_code
 
         bar(0.1, "equations")
-        return python_code(lag).rstrip("\n"), ".py"
+        return python_code(lag, note).rstrip("\n"), ".py"
     from mbkit.lagrangian.printing.summary import SystemSummary
 
-    summary = SystemSummary(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text))
+    summary = SystemSummary(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text), note=note)
     if as_json:
         return json_text(json.dumps(summary.data(), indent=1, ensure_ascii=False)), ".json"
     return (summary.latex(), ".tex") if form == "latex" else (summary.text(_WIDTH), ".txt")

@@ -74,10 +74,6 @@ def _dynamics(model: Model, engine: str | None) -> Dynamics:
     from mbkit.engines.registry import ENGINES, PINOCCHIO, dynamics
 
     derived = next(name for name, info in ENGINES.items() if info.derived)
-    if model.needs.loops and engine in (None, derived):
-        from mbkit.lagrangian.from_description import from_model
-
-        return from_model(model).dynamics()
     return dynamics(model, engine or (PINOCCHIO if model.has_bodies else derived))
 
 

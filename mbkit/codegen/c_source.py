@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import wrap
 from typing import Final
 
 import casadi as ca
@@ -23,6 +24,7 @@ from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.derivation.body_motion import OF_FRAME, OF_WHOLE
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
+from mbkit.model.changes.dry_friction import held_at_rest
 from mbkit.model.description import CONSTRAINT_FEATURES
 
 #: Quantity -> (name in C of its one output, its meaning).
@@ -32,7 +34,7 @@ _OUTPUTS: Final = {
     "gravity": ("g", "gravity g(q), without springs"),
     "nle": ("nle", "C(q, v) v + g(q)"),
     "coriolis_force": ("Cv", "C(q, v) v"),
-    "passive": ("tau_passive", "forces of springs and dampers"),
+    "passive": ("tau_passive", "forces of springs, dampers, dry friction and functions"),
     "inverse_dynamics": ("tau", "forces M a + C(q, v) v + g(q) - tau_passive(q, v)"),
     "forward_dynamics": ("a", "accelerations dv/dt = M^-1 (tau + tau_passive - C v - g)"),
     "kinetic_energy": ("T", "kinetic energy, J"),
@@ -70,7 +72,7 @@ _INPUTS: Final = {
 }
 
 #: Data of a description that no function holds.
-_LEFT_OUT: Final = ("friction", "limits", "effort_limits")
+_LEFT_OUT: Final = ("limits", "effort_limits")
 #: The comment at the head of the header.
 _DESCRIPTION: Final = Path(__file__).with_name("c_header.txt")
 
@@ -139,6 +141,7 @@ def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_lin
     for name, mimic in mimics:
         ratio, offset = ("(of the parameters)" if math.isnan(x) else repr(x) for x in (mimic.ratio, mimic.offset))
         followers += f"\n    {c_comment(name)} = {ratio} * {c_comment(mimic.joint)} + {offset}"
+    held = f"Note: {note}." if (note := held_at_rest(model)) else ""
     description = _DESCRIPTION.read_text(encoding="utf-8").format(
         first_line=first_line,
         model=model,
@@ -152,6 +155,7 @@ def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_lin
         macro=macro,
         parameters=parameters,
         followers=followers,
+        friction="".join(f"\n    {line}" for line in wrap(c_comment(held), 84)),
     )
     sizes = {"NQ": model.nq, "NV": model.nv} | ({"NP": len(model.parameters)} if model.parameters else {})
     blocks = [

@@ -6,15 +6,17 @@ description vanishes while the graph is built.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 from mbkit.derivation import model_values
 from mbkit.derivation.model_values import Constants, Values, is_zero, scalar
 from mbkit.model import GravityCompensation, Joint, JointCoupling, Model
+from mbkit.model.changes.dry_friction import FrictionNumbers
 from mbkit.model.joint_types import cross3
 from mbkit.model.parts import PointSpring
 
@@ -324,14 +326,17 @@ def damping_forces(kin: Kinematics) -> Any:
 def friction_forces(kin: Kinematics) -> Any:
     """Return -f(|v|) sign(v) of each joint, by the law of `mbkit.model.changes.dry_friction`; zero at rest."""
     total = ca.SX(kin.model.nv, 1)
-    for joint in kin.model.joints:
-        values = kin.values.joints[joint.name]
-        for k, rate in enumerate(kin.velocities(joint)):
-            size, bound = values.friction[k], getattr(values, "stiction", values.friction)[k]
-            if is_zero(size) and is_zero(bound):
-                continue
-            width = getattr(values, "stribeck_velocity", [0.0] * joint.type.nv)[k]
-            if not is_zero(width):
-                size += (bound - size) * ca.exp(-((rate / width) ** 2))
-            total -= ca.gradient(rate, kin.v) * (size * ca.sign(rate))
+    for rate, size in dry_friction(kin, ca.exp):
+        total -= ca.gradient(rate, kin.v) * (size * ca.sign(rate))
     return total
+
+
+def dry_friction(kin: Kinematics, exp: Callable[[Any], Any]) -> Iterator[tuple[Any, Any]]:
+    """Yield the rate of each velocity with dry friction, and its f(|v|)."""
+    for joint in kin.model.joints:
+        values, given = kin.values.joints[joint.name], FrictionNumbers.of([joint])
+        for k in np.flatnonzero(given.sliding + given.bound):
+            rate, size = kin.velocities(joint)[k], values.friction[k]
+            if given.stribeck[k]:
+                size += (values.stiction[k] - size) * exp(-((rate / values.stribeck_velocity[k]) ** 2))
+            yield rate, size

@@ -29,6 +29,7 @@ from mbkit.model import Joint, Model, NoSlip
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.joint_types import cross3
+from mbkit.model.loops import CROSSED, LOOP_ROWS, TURNING, WELDED, LoopEnds
 from mbkit.model.parts import Coupler, Loop, PointSpring, Prescribed
 from mbkit.model.rolling import contact
 
@@ -402,8 +403,15 @@ def rolling(kin: SymbolicKinematics, part: NoSlip) -> tuple[list[sp.Expr], list[
     at = [c + o for c, o in zip(centre, place.offset, strict=True)]
     speeds = [material(way, point, at) for way, point in zip(ways, (centre, ground), strict=True)]
     gap, velocity = ([c - d for c, d in zip(*two, strict=True)] for two in ((centre, ground), speeds))
-    held, moving = place.rows(gap, velocity, x.speed)
-    return [tidy(row) for row in held], [tidy(row) for row in moving]
+    held, moving = ([tidy(row) for row in rows] for rows in place.rows(gap, velocity, x.speed))
+    held, moving = ([x for x in rows if not (x.is_number and abs(x) < _MEETS)] for rows in (held, moving))
+    still = [row for row in (*held, *moving) if not row.free_symbols & {*kin.symbols, *kin.rates}]
+    if still or not (held or moving):
+        raise InputError(
+            f"{kin.model.name}: no slip {part.name!r}: "
+            + (f"{still[0]} is left, whatever the joints do" if still else "no joint moves it; leave it out")
+        )
+    return held, moving
 
 
 # Loop closures of a model as holonomic constraints, in SymPy.
@@ -420,43 +428,44 @@ _MEETS: Final = 1e-9
 def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
     """Return expressions that are zero where a loop is closed; InputError if its ends never meet or never move.
 
-    Points and frames' origins: r_a - r_b, with the force on body a as multipliers. Orientations with parallel axes:
-    2 sin(φ/2) of the angle φ from frame b to frame a, zero at whole turns only; its multiplier is the torque on body a
-    (its negative after an odd number of turns). Others: ½ Σ b_k x a_k of the frames' axes, the sine of their angle; it
-    is zero at half a turn too, where its rows depend on each other.
+    They are the rows of `mbkit.model.loops.LOOP_ROWS`: of points and frames' origins r_a - r_b, with the force on body
+    a as multipliers, and of frames that do not turn ½ Σ b_k x a_k of their axes, the sine of their angle; it is zero at
+    half a turn too, where its rows depend on each other. Where all axes in the loop are parallel, 2 sin(φ/2) of the
+    angle φ from frame b to frame a stands for these, zero at whole turns only; its multiplier is the torque on body a
+    (its negative after an odd number of turns).
     """
     a, b = ends = kin.way(loop.body_a), kin.way(loop.body_b)
     # Both ways end at the last body that they share.
     while a and b and a[-1] is b[-1]:
         a.pop()
         b.pop()
-    values = kin.values.loops[loop.name]
+    values, (names, rows_of) = kin.values.loops[loop.name], LOOP_ROWS[loop.kind]
     points = (kin.carried(a, values.translation_a, 1), kin.carried(b, values.translation_b, 1))
-    gap = [x - y for x, y in zip(*points, strict=True)]
-    rows = _independent(kin, gap, f"loop {loop.name!r}: its points never meet")
-    if loop.kind == "frame":
-        rows += _aligned(kin, loop, ends)
+    turned = any(name in TURNING for name in names)
+    frame_a, frame_b = (
+        [kin.carried(way, [row[k] for row in R], 0) for k in range(3)] if turned else []
+        for way, R in zip(ends, (values.rotation_a, values.rotation_b), strict=True)
+    )
+    held = LoopEnds([x - y for x, y in zip(*points, strict=True)], frame_a, frame_b, values.length)
+    apart = "its axes never cross at a right angle" if loop.kind == CROSSED else "its frames are never parallel"
+    told = ("its points never meet", apart)
+    messages = [f"loop {loop.name!r}: {told[name in TURNING]}" for name in names]
+    axes = [axis for way in ends for axis in _axes(way)] if loop.kind in WELDED else []
+    if loop.kind in WELDED and all(np.linalg.norm(np.cross(axis, axes[0])) < _DEPENDENT for axis in axes):
+        rows = _independent(kin, rows_of(held)[: -len(held.turn())], messages)
+        rows += _in_plane(kin, loop, ends, axes[0] if axes else None, messages[-1])
+    elif names == LOOP_ROWS["distance"][0]:
+        # A sum of cosines has no quotients.
+        length = kin.written.values.loops[loop.name].length
+        rows = [x / (2 * length) for x in _independent(kin, [held.excess()], messages)]
+    else:
+        rows = _independent(kin, rows_of(held), messages)
     if not rows:
         raise InputError(
             f"{kin.model.name}: loop {loop.name!r} closes nothing: no joint moves its ends against each other; "
             "leave it out"
         )
     return rows
-
-
-def _aligned(kin: SymbolicKinematics, loop: Loop, ends: tuple[_Way, _Way]) -> list[sp.Expr]:
-    message = f"loop {loop.name!r}: its frames are never parallel"
-    axes = [axis for way in ends for axis in _axes(way)]
-    if all(np.linalg.norm(np.cross(axis, axes[0])) < _DEPENDENT for axis in axes):
-        return _in_plane(kin, loop, ends, axes[0] if axes else None, message)
-    values = kin.values.loops[loop.name]
-    frames = [
-        [kin.carried(way, [row[k] for row in R], 0) for k in range(3)]
-        for way, R in zip(ends, (values.rotation_a, values.rotation_b), strict=True)
-    ]
-    half = kin.formulas.number(Fraction(1, 2))
-    turned = [cross3(y, x) for x, y in zip(*frames, strict=True)]
-    return _independent(kin, [half * (turned[0][i] + turned[1][i] + turned[2][i]) for i in range(3)], message)
 
 
 def _in_plane(
@@ -501,22 +510,26 @@ def _at_rest(way: _Way) -> Array:
     return R
 
 
-def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], message: str) -> list[sp.Expr]:
-    """Return those of three sums that the others do not imply."""
+def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], messages: list[str]) -> list[sp.Expr]:
+    """Return those of some sums that the others do not imply."""
     sums = [kin.zero + x for x in sums]
-    kin.drop_dust(sums)
+    # Beside directions, a number of rounding's size is none.
+    kin.drop_dust([*sums, kin.zero + 1])
     keys = list(dict.fromkeys(key for x in sums for key in x.terms))
     moving = np.array([kin.moves(key) for key in keys], dtype=bool)
-    A = np.array([[float(x.terms.get(key, 0)) for key in keys] for x in sums]).reshape(3, len(keys))
+    A = np.array([[float(x.terms.get(key, 0)) for key in keys] for x in sums]).reshape(len(sums), len(keys))
     largest = float(np.abs(A).max(initial=0.0))
     kept: list[int] = []
     if moving.any():
-        kept = sorted(pivoted(A[:, moving], _DEPENDENT * float(np.linalg.norm(A[:, moving], axis=1).max()))[0])
-    for i in set(range(3)) - set(kept):
+        sizes = np.linalg.norm(A[:, moving], axis=1)
+        # Metres and radians do not compare.
+        scale = np.where(sizes > _DEPENDENT * sizes.max(), sizes, np.inf)[:, None]
+        kept = sorted(pivoted(A[:, moving] / scale, _DEPENDENT)[0])
+    for i in sorted({*range(len(sums))} - {*kept}):
         weights = np.linalg.lstsq(A[kept][:, moving].T, A[i, moving], rcond=None)[0]
         left = A[i] - weights @ A[kept]
         if np.abs(left[~moving]).max(initial=0.0) > _MEETS * largest:
             rest = kin.shown(TrigPolynomial(kin.formulas, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
             why = f": {f'{float(rest):.6g}' if rest.is_number else rest} is left between them"
-            raise InputError(f"{kin.model.name}: {message}, whatever the joints do{'' if weights.any() else why}")
+            raise InputError(f"{kin.model.name}: {messages[i]}, whatever the joints do{'' if weights.any() else why}")
     return [kin.shown(sums[i]) for i in kept]

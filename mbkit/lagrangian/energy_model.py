@@ -133,10 +133,11 @@ class EnergyModel(Model):
 
     @cached_property
     def needs(self) -> Needs:
-        """Damping where there is a force or dissipation; energies do not separate other features."""
+        """Damping where there is a force or dissipation, time, and constraints; energies separate no other features."""
         s = self.form
         flags = dict.fromkeys(Needs.__dataclass_fields__, False)
-        return Needs(**{**flags, "damping": any(x != 0 for x in (s.dissipation, *s.forces))})
+        flags |= {"damping": any(x != 0 for x in (s.dissipation, *s.forces)), "time": s.time is not None}
+        return Needs(**flags | {"loops": bool(s.constraints), "no_slip": self.holds_velocities})
 
     @cached_property
     def digest(self) -> str:

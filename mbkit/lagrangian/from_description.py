@@ -9,8 +9,9 @@ from typing import Final, cast
 
 import sympy as sp
 
-from mbkit.derivation.kinematics import dissipation, spring_energy
-from mbkit.errors import InputError, UnsupportedError
+from mbkit._warn import warn
+from mbkit.derivation.kinematics import dissipation, dry_friction, spring_energy
+from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.lagrangian.description_kinematics import (
     SymbolicKinematics,
     closure,
@@ -26,6 +27,7 @@ from mbkit.lagrangian.printing.catalog_symbols import in_symbols
 from mbkit.lagrangian.system import Lagrangian, QuasiLagrangian
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model
+from mbkit.model.changes.dry_friction import held_at_rest
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.beams import BeamEnd
 from mbkit.model.elements.references import names_in
@@ -49,12 +51,14 @@ def from_model(
     """Return a model as a `Lagrangian` to read and to run: T, V and Rayleigh's dissipation in its coordinates.
 
     The joints' formulas are evaluated on exact sums of cosines and sines. Numbers are the decimals of the description.
-    Springs are in V, dampers in the dissipation, armature in T; dry friction and limits are left out, as in every
-    engine. Forces of functions at joints are written out, their potentials in V.
+    Springs are in V, dampers in the dissipation, armature in T. Dry friction is a force -f sign(v), which is zero at
+    rest, where the engines' friction holds any force up to its bound; limits are data, as in every engine. Forces of
+    functions at joints are written out, their potentials in V.
 
     Loop closures become holonomic constraints, in the order of `model.loops`, in the axes of the body that carries
-    both ends. A point closure has three rows, two in a plane, and its multipliers are the force on body a; a frame
-    closure has three more, one where all axes in the loop are parallel (`mbkit.lagrangian.description_kinematics`).
+    both ends, with the rows of `Dynamics.constraint_names`. A point closure has three, two in a plane, and its
+    multipliers are the force on body a; frames that do not turn have one row of their angle where all axes in the loop
+    are parallel (`mbkit.lagrangian.description_kinematics`).
     Blades and what rolls become velocity constraints, in world axes; the height of what rolls is a holonomic one.
     Prescribed coordinates become functions of the time, and T has terms of first and zeroth degree then.
 
@@ -88,6 +92,11 @@ def from_model(
     InputError
         `symbols` of a model that is not in the catalog, names that do not fit, or a loop whose ends never meet or do
         not move against each other.
+
+    Warns
+    -----
+    MbkitWarning
+        Dry friction: no term of the equations holds a joint at rest.
 
     Notes
     -----
@@ -145,6 +154,10 @@ def from_model(
         moved = {}
     put = {q[i]: x for i, x in moved.items()} | {v[i]: sp.diff(x, t) for i, x in moved.items()}
     stored, pushed = acting(kin, t)
+    for rate, size in dry_friction(kin.written, sp.exp):
+        pushed = [x - size * sp.sign(rate) * sp.diff(rate, w) for x, w in zip(pushed, v, strict=True)]
+    if held := held_at_rest(model):
+        warn(f"{model.name}: {held}", MbkitWarning)
     T, V, R, *constraints = (x.xreplace(put) for x in (T, V + stored, R, *(row for _, row in rows)))
     pushed, moving = ([x.xreplace(put) for x in found] for found in (pushed, moving))
     kept = [i for i in range(len(q)) if i not in moved]

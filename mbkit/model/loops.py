@@ -51,21 +51,28 @@ class LoopEnds:
             return sum((_dot(a, b) for a, b in zip(self.a, self.b, strict=True)), 0.0)
         return 0.0
 
+    def excess(self) -> Any:
+        """Return the square of the distance less that of the rod's length."""
+        return _dot(self.gap, self.gap) - self.length * self.length
+
     def stretch(self) -> list[Any]:
         """Return the excess of the distance over the rod's length, to first order."""
-        return [(_dot(self.gap, self.gap) - self.length * self.length) / (2.0 * self.length)]
+        return [self.excess() / (2.0 * self.length)]
 
 
 _GAP: Final = ("x", "y", "z")
 _TURN: Final = ("about x", "about y", "about z")
 _ACROSS: Final = ("axis along x", "axis along y")
 _SIDEWAYS: Final = ("across x", "across y")
+_CROSSING: Final = ("axes",)
+#: Names of the rows that hold directions; the others hold places.
+TURNING: Final = (*_TURN, *_ACROSS, *_CROSSING)
 #: Kind of a loop -> names of its rows, and the rows. They stay where the loop's own joint could not move.
 LOOP_ROWS: Final[dict[str, tuple[tuple[str, ...], Callable[[LoopEnds], list[Any]]]]] = {
     "point": (_GAP, lambda e: list(e.gap)),
     "frame": ((*_GAP, *_TURN), lambda e: [*e.gap, *e.turn()]),
     "revolute": ((*_GAP, *_ACROSS), lambda e: [*e.gap, *e.across()]),
-    "universal": ((*_GAP, "axes"), lambda e: [*e.gap, _dot(e.a[2], e.b[2])]),
+    "universal": ((*_GAP, *_CROSSING), lambda e: [*e.gap, _dot(e.a[2], e.b[2])]),
     "cylindrical": ((*_SIDEWAYS, *_ACROSS), lambda e: [*e.sideways(), *e.across()]),
     "prismatic": ((*_SIDEWAYS, *_TURN), lambda e: [*e.sideways(), *e.turn()]),
     "distance": (("length",), lambda e: e.stretch()),

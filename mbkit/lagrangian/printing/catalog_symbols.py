@@ -39,8 +39,8 @@ _LETTERS: Final = {
 }
 _LETTER: Final = re.compile(r"([A-Za-z]|alpha|beta|gamma|delta|theta|phi|psi)(_?\d+)?")
 _USUAL: Final = {"gravity": "g", "mass": "m", "length": "l", "stiffness": "k", "damping": "d", "inertia": "J"}
-#: What no equation of motion holds.
-_LEFT_OUT: Final = ("lower", "upper", "velocity_limit", "effort_limit", "friction")
+#: Fields that a catalog's system has as the model has them.
+_LEFT_OUT: Final = ("lower", "upper", "velocity_limit", "effort_limit", "friction", "stiction", "stribeck_velocity")
 #: Two descriptions are the same where their numbers differ by rounding only.
 _SAME: Final = 1e-13
 
@@ -65,7 +65,9 @@ def in_symbols(model: Model) -> Model | None:
             pairs = zip(_content(moved)[1], numbers, strict=True)
             if all(np.allclose(x, y, rtol=_SAME, atol=_SAME * float(np.abs(y).max(initial=0.0))) for x, y in pairs):
                 zeros = {name: 0.0 for name, x in values.items() if x == 0.0}
-                return moved.with_parameters(**zeros) if zeros else moved
+                named = moved.with_parameters(**zeros) if zeros else moved
+                # What the catalog's system does not have, such as forces and friction, is the model's own.
+                return replace(model, bindings=tuple(b for b in named.bindings if b.where != "frames"))
             return None
     return None
 

@@ -16,7 +16,7 @@ import sympy as sp
 from sympy.printing.c import C99CodePrinter
 from sympy.printing.numpy import NumPyPrinter
 
-from mbkit._escape import identifier, one_line, python_docstring, terminal
+from mbkit._escape import c_comment, identifier, one_line, python_docstring, terminal
 from mbkit.codegen.program import Operation
 from mbkit.codegen.program import program as operations_of
 from mbkit.derivation import FUNCTIONS, equations_of
@@ -25,6 +25,7 @@ from mbkit.lagrangian.elements import SYMPY
 from mbkit.lagrangian.energies.symbols import free_name
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned, folded
 from mbkit.model import Model
+from mbkit.model.changes.dry_friction import held_at_rest
 
 #: Operations of a term from which on it gets a name of its own: a line of text has some 100 letters.
 _LONG: Final = 10
@@ -51,6 +52,8 @@ class ProgramText(Printable):
         Named terms in the order in which they are computed.
     results : sympy.Matrix
         The quantity, in named terms.
+    note : str
+        Friction at rest, which no term holds; empty without.
     """
 
     model: str
@@ -59,6 +62,7 @@ class ProgramText(Printable):
     inputs: _Inputs
     terms: tuple[tuple[sp.Symbol, sp.Expr], ...]
     results: sp.ImmutableMatrix
+    note: str = ""
 
     def _pairs(self) -> list[tuple[sp.Symbol, sp.Expr]]:
         """Return the terms, then the entries of the result; of a symmetric matrix those from the diagonal on."""
@@ -76,13 +80,16 @@ class ProgramText(Printable):
         for left, right in self._pairs():
             lines += folded(f"{left} = {board.text(_rounded(right))}", _WIDTH)
         head = f"{self.quantity} of {self.model}: {self.operations} operations, {len(self.terms)} named terms"
-        return terminal("\n".join([f"{one_line(head)}; numbers to {_DIGITS} digits", *lines]))
+        notes = [f"note: {one_line(self.note)}"] if self.note else []
+        return terminal("\n".join([f"{one_line(head)}; numbers to {_DIGITS} digits", *notes, *lines]))
 
     def latex(self) -> str:
         """Return an aligned LaTeX block, numbers to 6 digits."""
         board = ExpressionPrinter()
         names = {left: sp.Symbol(str(left).replace("_", "")) for left, _ in self._pairs()[len(self.terms) :]}
-        return aligned((board.latex(names.get(left, left)), board.latex(_rounded(x))) for left, x in self._pairs())
+        note = f"% {one_line(self.note)}\n" if self.note else ""
+        pairs = ((board.latex(names.get(left, left)), board.latex(_rounded(x))) for left, x in self._pairs())
+        return note + aligned(pairs)
 
     def python(self) -> str:
         """Return a Python module with one function, which needs NumPy only; numbers have all their digits."""
@@ -97,7 +104,7 @@ class ProgramText(Printable):
         arguments = ", ".join(name for name, _ in self.inputs)
         head = f'"""{self.quantity} of {python_docstring(self.model)}, in SI units; needs NumPy only."""'
         body = "\n".join(lines).replace("numpy.", "np.")
-        about = f"{self.operations} operations."
+        about = ". ".join(filter(None, (f"{self.operations} operations", python_docstring(self.note)))) + "."
         return f'{head}\n\nimport numpy as np\n\n\ndef {self.quantity}({arguments}):\n    """{about}"""\n{body}\n'
 
     def c(self) -> str:
@@ -108,7 +115,8 @@ class ProgramText(Printable):
         lines += [f"const double {left} = {printer.doprint(right)};" for left, right in self.terms]
         lines += [f"out[{k}] = {printer.doprint(x)};" for k, x in enumerate(self.results)]
         body = "\n".join(f"    {line}" for line in lines)
-        return f"#include <math.h>\n\nvoid {self.quantity}({arguments}, double out[])\n{{\n{body}\n}}\n"
+        note = f"/* {c_comment(self.note)} */\n" if self.note else ""
+        return f"{note}#include <math.h>\n\nvoid {self.quantity}({arguments}, double out[])\n{{\n{body}\n}}\n"
 
 
 def _rounded(x: sp.Expr) -> sp.Expr:
@@ -177,7 +185,8 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
         known.append(x)
     (shape,), (out,) = operations.shapes, operations.outputs
     results = sp.ImmutableMatrix(*shape, lambda i, j: known[int(out[i, j])])
-    return ProgramText(model.name, quantity, operations.arithmetic, inputs, tuple(terms), results)
+    note = held_at_rest(model) if any(o.name == "sign" for o in operations.operations) else ""
+    return ProgramText(model.name, quantity, operations.arithmetic, inputs, tuple(terms), results, note)
 
 
 def _inputs(function: Any, model: Model) -> tuple[_Inputs, set[str]]:

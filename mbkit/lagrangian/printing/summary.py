@@ -29,7 +29,8 @@ _LONG: Final = 800
 class SystemSummary:
     """A system's energies, matrices and equations as text, LaTeX or data.
 
-    `names` are the coordinates' names in their model; `progress` gets the fraction done and the next part.
+    `names` are the coordinates' names in their model, `note` says what the equations leave out, and `progress` gets the
+    fraction done and the next part.
     """
 
     def __init__(
@@ -37,8 +38,9 @@ class SystemSummary:
         system: Lagrangian,
         names: Mapping[str, str] | None = None,
         progress: Callable[[float, str], object] = lambda fraction, what: None,  # noqa: ARG005
+        note: str = "",
     ) -> None:
-        self.system, self._names, self._progress = system, dict(names or {}), progress
+        self.system, self._names, self._progress, self._note = system, dict(names or {}), progress, one_line(note)
         self._size = int(system.T.count_ops())
         self.long = self._size > _READABLE
 
@@ -104,6 +106,7 @@ class SystemSummary:
         s, board = self.system, self._board
         q = ", ".join(self._named(x) for x in s.coordinates)
         out = [f"{one_line(s.name)}: {'coordinate' if len(s.coordinates) == 1 else 'coordinates'} {q}"]
+        out += folded(f"note: {self._note}", width) if self._note else []
         if s.parameters:
             texts = (written(p.name) + ("" if x is None else f" = {x:g}") for p, x in s.parameters.items())
             out.append(f"parameters {', '.join(texts)}")
@@ -168,7 +171,8 @@ class SystemSummary:
             A = original.applyfunc(self._short)
             entries = r" \\ ".join(" & ".join(board.latex(x) for x in A[i, :]) for i in range(A.rows))
             rows.append(rf"{name} &= \begin{{bmatrix}} {entries} \end{{bmatrix}}")
-        out = [f"% {one_line(s.name)}, written by mbkit {__version__}; needs amsmath", _aligned(rows)]
+        out = [f"% {one_line(s.name)}, written by mbkit {__version__}; needs amsmath"]
+        out += [*([f"% {self._note}"] if self._note else []), _aligned(rows)]
         if not self.long:
             out.append(_aligned([f"{left} &= {right}" for left, right in self._equations(self._short, latex=True)]))
         if self._kinematics:
@@ -190,7 +194,7 @@ class SystemSummary:
         def text(x: sp.Basic) -> str:
             return str(x.xreplace(names))
 
-        out: dict[str, Any] = {"name": s.name, "mbkit": __version__, "sympy": sp.__version__}
+        out: dict[str, Any] = {"name": s.name, "mbkit": __version__, "sympy": sp.__version__, "note": self._note}
         out["coordinates"] = [name(q) for q in s.coordinates]
         out["velocities"] = [name(v) for v in s.velocities]
         out["accelerations"] = [name(a) for a in e.accelerations]
@@ -238,10 +242,11 @@ _RESERVED: Final = {"np", "q", "v", "tau", "t", "M", "h", "out", "given", "unkno
 _FUNCTIONS: Final = {"mass_matrix", "nonlinear", "forward_dynamics"}
 
 
-def python_code(system: Lagrangian) -> str:
+def python_code(system: Lagrangian, note: str = "") -> str:
     """Return a module with `mass_matrix`, `nonlinear` and `forward_dynamics` of M(q) v̇ + h(q, v) = τ.
 
-    Its functions take one state, and parameters by keyword. Constraints are refused (UnsupportedError).
+    Its functions take one state, and parameters by keyword. Constraints are refused (UnsupportedError). `note` says
+    what the equations leave out.
     """
     if system.multiplier_symbols:
         raise UnsupportedError(f"{system.name}: a system with constraints cannot be written as a Python module yet")
@@ -262,9 +267,10 @@ def python_code(system: Lagrangian) -> str:
     values = "".join(f"    {names[s]!r}: {x!r},\n" for s, x in system.parameters.items())
     unpack = f"{take}    {', '.join(names[s] for s in e.coordinates)}, = q\n"
     moving = unpack + f"    {', '.join(names[s] for s in e.velocities)}, = v\n"
+    about = f"\nNote: {python_docstring(note)}." if note else ""
     return f'''"""Equations of motion of {python_docstring(system.name)}: M(q) a + h(q, v) = tau, in SI units.
 
-Coordinates q: {coordinates}. Written by mbkit {__version__}; needs NumPy only.
+Coordinates q: {coordinates}. Written by mbkit {__version__}; needs NumPy only.{about}
 """
 
 import numpy as np

@@ -113,6 +113,13 @@ def names_of(model: Model) -> list[str]:
     return out
 
 
+def held_at_rest(model: Model) -> str:
+    """Return in words what f sign(v) leaves out at rest; empty without dry friction."""
+    bounds = zip(names_of(model), DryFrictionLaw(model).bound, strict=True)
+    held = " and ".join(f"{bound:g} at {name!r}" for name, bound in bounds if bound)
+    return f"dry friction is f sign(v): zero at rest, where it can hold up to {held} (N or N m)" if held else ""
+
+
 class Sliding:
     """The model whose joints slide one way or rest, as parameters say, and these parameters' values.
 
