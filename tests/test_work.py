@@ -145,3 +145,112 @@ def test_joints_that_mimic_and_stribeck_s_curve_take_their_part() -> None:
         run = simulate(mb.dynamics(model), [0.0], [0.5], 1.0, "rk4", 1e-3)
         assert run.v[-1] == 0.0
         assert run.work()[-1] == pytest.approx(-energy, abs=1e-8)
+
+
+# A controller that samples, beside wrenches
+
+
+def sampled_law(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:  # noqa: ARG001
+    return -4.0 * q - v
+
+
+def stepped(start: np.ndarray, wrench: np.ndarray, h: float, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States of 2 kg after each step under a force that is held, and the work of the controller and of the wrench."""
+    states, work = [start], [0.0]
+    for k in range(len(wrench)):
+        x, v = states[-1]
+        if k % steps == 0:
+            tau = -4.0 * x - v
+        force = tau + wrench[k]
+        states.append(np.array([x + v * h + force / 4 * h**2, v + force / 2 * h]))
+        work.append(work[-1] + force * (states[-1][0] - x))
+    return (*np.array(states).T, np.array(work))  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize("table", ["constant", "table", "short"])
+def test_wrenches_beside_a_sampled_controller(engine: str, table: str) -> None:
+    """A table of wrenches counts from the start of the run, over samples of four steps."""
+    h, steps, n = 0.05, 4, {"constant": 20, "table": 20, "short": 18}[table]
+    w = np.zeros((n, 6))
+    w[:, 0] = 1.5 if table == "constant" else np.cos(np.arange(n))
+    dyn = mb.dynamics(block().build(point_masses=True), engine)
+    given = {"m": w[0] if table == "constant" else w}
+    run = simulate(dyn, [0.3], [0.2], n * h, dt=h, torque=sampled_law, hold=steps * h, wrenches=given)
+    q, v, work = stepped(np.array([0.3, 0.2]), w[:, 0], h, steps)
+    np.testing.assert_allclose(np.column_stack([run.q, run.v]), np.column_stack([q, v]), atol=1e-13)
+    np.testing.assert_array_equal(run.wrenches()["m"], np.vstack([w, w[-1:]]))
+    np.testing.assert_allclose(run.work(), work, atol=1e-13)
+    assert np.abs(run.power_balance()).max() < 1e-13
+    with pytest.raises(mb.errors.InputError, match=rf"wrench on 'm': expected shape .*\({n}, 6\), got \(3, 6\)"):
+        simulate(dyn, [0.3], [0.2], n * h, dt=h, torque=sampled_law, hold=steps * h, wrenches={"m": w[:3]})
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_batches_have_the_wrenches_of_their_trajectories(each: bool) -> None:
+    h, n = 0.05, 20
+    w = np.zeros((2, n, 6))
+    w[..., 0] = np.array([[1.0], [-2.0]]) if each else np.cos(np.arange(2 * n)).reshape(2, n)
+    dyn = mb.dynamics(block().build(point_masses=True))
+    start = np.array([[0.3, 0.2], [-0.1, 0.5]])
+    given = {"m": w[:, 0] if each else w}
+    run = simulate(dyn, start[:, :1], start[:, 1:], n * h, dt=h, torque=sampled_law, hold=4 * h, wrenches=given)
+    assert run.wrenches()["m"].shape == (2, n + 1, 6)
+    for i in range(2):
+        q, _, work = stepped(start[i], w[i, :, 0], h, 4)
+        np.testing.assert_allclose(run.q[i, :, 0], q, atol=1e-13)
+        np.testing.assert_array_equal(run.wrenches()["m"][i, :-1], w[i])
+        np.testing.assert_allclose(run.work()[i], work, atol=1e-13)
+    assert np.abs(run.power_balance()).max() < 1e-13
+
+
+@pytest.mark.parametrize("batch", [False, True])
+def test_adaptive_methods_take_a_table_over_the_saved_times(batch: bool) -> None:
+    """The times of `save` and of the samples are other ones."""
+    dyn = mb.dynamics(block().build(point_masses=True))
+    save = np.array([0.0, 0.1, 0.25, 0.5])
+    w = np.zeros((3, 6))
+    w[:, 0] = 2.0, -1.0, 3.0
+    fine = np.zeros((10, 6))
+    fine[:, 0] = np.repeat(w[:, 0], [2, 3, 5])
+    q, v, _ = stepped(np.array([0.3, 0.2]), fine[:, 0], 0.05, 4)
+    shape = (2, 1) if batch else (1,)
+    for given in (w, np.tile(w, (2, 1, 1))) if batch else (w,):
+        run = simulate(
+            *(dyn, np.full(shape, 0.3), np.full(shape, 0.2), 0.5, "rk853"),
+            torque=sampled_law,
+            hold=0.2,
+            save=save,
+            wrenches={"m": given},
+        )
+        at = [0, 2, 5, 10]
+        np.testing.assert_allclose(run.q.reshape(-1, 4), np.tile(q[at], (len(run.q.reshape(-1, 4)), 1)), atol=1e-12)
+        np.testing.assert_allclose(run.v.reshape(-1, 4)[0], v[at], atol=1e-12)
+        np.testing.assert_array_equal(run.wrenches()["m"].reshape(-1, 4, 6)[0, :-1], w)
+
+
+def test_springs_dampers_and_friction_are_balanced_beside_them() -> None:
+    b = block(friction=0.3, damping=0.2)
+    b.add_spring("band", body_a="world", body_b="m", point_a=(0, 1, 0), stiffness=20.0, rest_length=0.5, damping=0.4)
+    w = np.zeros((200, 6))
+    w[:, 0] = np.cos(0.1 * np.arange(200))
+    run = simulate(
+        *(mb.dynamics(b.build(point_masses=True)), [[0.3], [0.0]], [[0.2], [1.0]], 2.0),
+        dt=0.01,
+        torque=sampled_law,
+        hold=0.05,
+        wrenches={"m": w},
+    )
+    assert run.events
+    assert np.abs(run.power_balance()).max() < 1e-5
+    assert np.abs(run.work()).max() > 0.1
+
+
+def test_what_is_no_table_of_wrenches_is_named() -> None:
+    dyn = mb.dynamics(block().build(point_masses=True))
+    with pytest.raises(mb.errors.InputError, match=r"between 0 and 1 s, got 1\.0000000001 to 1\.0000000001 s"):
+        simulate(dyn, [0.0], [0.0], 1.0, save=[1.0 + 1e-10])
+    with pytest.raises(mb.errors.InputError, match="wrenches: expected a dict of frame names"):
+        simulate(dyn, [0.0], [0.0], 1.0, torque=sampled_law, hold=0.1, wrenches=[1.0] * 6)  # type: ignore[arg-type]
+    run = simulate(dyn, [0.0], [0.0], 0.0, torque=sampled_law, hold=0.1, wrenches={"m": [1.0] * 6})
+    assert run.wrenches()["m"].tolist() == [[1.0] * 6]

@@ -75,7 +75,7 @@ def integrate(
     wanted = as_events(events)
     if wanted and not chosen.events:
         _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
-    acting = _acting(dyn, wrenches, wrench_axes)
+    acting = acting_of(dyn, wrenches, wrench_axes)
     if acting and not chosen.wrenches:
         _refuse("wrenches on frames", chosen, [m.name for m in METHODS.values() if m.wrenches])
     given = [torque, *(wrenches or {}).values()]
@@ -140,7 +140,7 @@ def integrate(
     return data, outcome.error
 
 
-def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | None:
+def acting_of(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | None:
     """Return the frames on which wrenches act, and the axes of these; None where there are none."""
     axes = axes_named(axes)
     if wrenches is not None and not isinstance(wrenches, Mapping):

@@ -12,11 +12,11 @@ from mbkit._check import Array, batch_of, real
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError, TorqueError
 from mbkit.methods.registry import method_of
-from mbkit.simulate.integrate import integrate, times_of
+from mbkit.simulate.integrate import acting_of, integrate, times_of
 from mbkit.simulate.result import Stats
 from mbkit.simulate.run_data import RunData
 from mbkit.simulate.time_grid import Grid, save_times
-from mbkit.simulate.torque import PiecewiseConstantTorque, TorqueCallback
+from mbkit.simulate.torque import PiecewiseConstantTorque, Torque, TorqueCallback
 
 #: Of a step: a hold that is no multiple of it is off by more.
 _MULTIPLE = 1e-6
@@ -50,7 +50,7 @@ def integrate_held(
         raise InputError("hold: expected a torque function, which is sampled; an array is held as it is")
     if events is not None:
         raise InputError("hold: events end a run within an interval; leave out events, or hold")
-    if wrenches and any(map(callable, wrenches.values())):
+    if acting_of(dyn, wrenches, wrench_axes) and any(map(callable, wrenches.values())):
         raise InputError("hold: wrenches by functions are not sampled; give arrays, or leave out hold")
     hold, chosen, model = real("hold", hold, positive=True), method_of(method), dyn.model
     start, duration, step = times_of(dyn, chosen, t0, duration, dt)
@@ -66,8 +66,15 @@ def integrate_held(
     samples: Array = start + hold * np.arange(count, dtype=float)
     ends = np.append(samples[1:], start + duration)
     wanted = None if fixed or save is None else save_times(save, start, start + duration)
+    grid = Grid.of(start, duration, step)
+    # Tables of wrenches count from the start of the run.
+    bounds = grid.times if fixed else wanted
+    covered = bounds is not None and bounds[0] == start and bounds[-1] == start + duration
+    pushed: Any = Torque(None, model, batch, len(bounds) - 1 if covered and bounds is not None else None, wrenches)
+    pushed = pushed.applied(bounds)
     parts: list[RunData] = []
     rows: list[Array] = []
+    starts: list[Array] = []
     failed: TorqueError | None = None
     for begin, end in zip(samples.tolist(), ends.tolist(), strict=True):
         try:
@@ -75,17 +82,27 @@ def integrate_held(
         except TorqueError as error:
             failed = error
             break
-        rows.append(row)
-        length, steps = end - begin, 1
+        length = end - begin
         if fixed:
             # The difference of two late times is rounded, and no multiple of the step.
             whole = round(length / step)
             length = whole * step if abs(length / step - whole) <= _MULTIPLE else length
-            steps = Grid.of(begin, length, step).steps
-        held = row if batch is None else np.broadcast_to(row[:, None], (batch, steps, model.nv))
-        kept = None if fixed else _kept(wanted, begin, end)
-        arguments = (q, v, length, method, dt, rtol, atol, held, kept, None, None, doubt, begin)
-        data, _ = integrate(dyn, *arguments, wrenches, wrench_axes)
+        times = Grid.of(begin, length, step).times if fixed else _kept(wanted, begin, begin + length)
+        steps = len(times) - 1
+        starts.append(times[: max(steps, 1)])
+        acting = np.zeros((*q.shape[:-1], len(starts[-1]), model.nv + 6 * len(wrenches or ())))
+        if pushed is not None:
+            acting += pushed.at(0.5 * (starts[-1] + times[-len(starts[-1]) :]))
+        acting[..., : model.nv] = row[..., None, :]
+        rows.append(acting)
+        constant = batch is None and (pushed is None or pushed.starts is None)
+        held = {
+            name: acting[0, k : k + 6] if constant else acting[..., :steps, k : k + 6]
+            for name, k in zip(wrenches or (), range(model.nv, acting.shape[-1], 6), strict=True)
+        }
+        torque = row if batch is None else acting[..., :steps, : model.nv]
+        arguments = (q, v, length, method, dt, rtol, atol, torque, None if fixed else times, None, None, doubt, begin)
+        data, _ = integrate(dyn, *arguments, held, wrench_axes)
         if data.stats.finished:
             # Where the next sample is taken.
             data = replace(data, t=np.append(data.t[:-1], end))
@@ -98,7 +115,8 @@ def integrate_held(
     if not parts:
         assert failed is not None
         raise failed
-    return _joined(parts, rows, samples, failed, fixed, wanted, save, Grid.of(start, duration, step)), failed
+    acted = PiecewiseConstantTorque(np.concatenate(rows, axis=-2), np.concatenate(starts))
+    return _joined(parts, acted, failed, fixed, wanted, save, grid), failed
 
 
 def _tell(progress: Any, done: float) -> None:
@@ -119,8 +137,7 @@ def _sampled(control: TorqueCallback, t: float, q: Array, v: Array) -> Array:
 
 def _joined(
     parts: list[RunData],
-    rows: list[Array],
-    samples: Array,
+    acted: PiecewiseConstantTorque,
     failed: TorqueError | None,
     fixed: bool,
     wanted: Array | None,
@@ -152,7 +169,6 @@ def _joined(
         jacobians=sum(x.jacobians for x in stats),
         doubts=tuple(dict.fromkeys(one for x in stats for one in x.doubts)),
     )
-    acted = PiecewiseConstantTorque(np.stack(rows, axis=-2), samples[: len(rows)])
-    return replace(
-        first, t=t[which], q=q[..., which, :], v=v[..., which, :], stats=whole, _applied=acted, _settings=None
-    )
+    states = {"t": t[which], "q": q[..., which, :], "v": v[..., which, :]}
+    events = tuple(sorted((hit for x in parts for hit in x.events), key=lambda hit: (hit.member or 0, hit.t)))
+    return replace(first, **states, stats=whole, events=events, _applied=acted, _settings=None)

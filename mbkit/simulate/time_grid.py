@@ -108,7 +108,7 @@ def save_times(save: ArrayLike, start: float, end: float) -> Array:
         raise InputError("save: expected increasing times")
     if times[0] < start or times[-1] > end + 1e-12 * max(abs(start), abs(end)):
         raise InputError(
-            f"save: expected times between {start:g} and {end:g} s, got {times[0]:g} to {times[-1]:g} s; "
+            f"save: expected times between {start:.15g} and {end:.15g} s, got {times[0]:.15g} to {times[-1]:.15g} s; "
             "times count from t0"
         )
     return np.minimum(times, end)
