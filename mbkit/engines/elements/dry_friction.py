@@ -1,12 +1,14 @@
-"""Dry friction beside an engine's own terms: at speed a force, at rest the answer of Gauss's principle.
+"""Dry friction beside an engine's own terms: at speed a force, at rest a problem of complementarity.
 
-Accelerations at rest minimize Gauss's function with the friction of what does not move (Moreau 1966, Comptes Rendus
-262; Anitescu and Potra 1997, Nonlinear Dynamics 14)::
+A joint at rest holds by any force up to s, or it begins to move against f <= s. Of s alone, accelerations minimize
+Gauss's function with the friction of what does not move (Moreau 1966, Comptes Rendus 262; Anitescu and Potra 1997,
+Nonlinear Dynamics 14)::
 
     v̇ = argmin over a of ½ (a - a0)ᵀ M (a - a0) + Σ s_j |a_j| over the joints at rest,  M a0 = τ + τ_passive - nle
 
 with one minimum. Its dual has a box alone: the forces λ_j of friction, |λ_j| <= s_j, with a = a0 + M⁻¹ λ. Where joints
-are bound by loops, M⁻¹ is the response of the accelerations to forces, and a is unique all the same.
+are bound by loops, M⁻¹ is the response of the accelerations to forces, and a is unique all the same. Where s is above
+f, a joint that would move has its bound lowered to f on that side, and the problem is solved again.
 """
 
 from __future__ import annotations
@@ -50,14 +52,20 @@ _POINTS: Final = 10_000
 _UNDECIDED: Final = "dry friction: which of {n} joints at rest begin to move cannot be decided: singular inertia"
 
 
+#: Of a singular A, accelerations below this part of what forces can do are the rounding of its loops.
+_MOVING: Final = _PROXIMAL
+#: Joints whose power differs by less than this part let go together, as rounding does not break a symmetry.
+_TIE: Final = 1e-9
+
+
 def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
     """Return the forces of `solve_at_rest` of one problem whose A may be singular, (n,)."""
     every = np.ones((1, len(b)), dtype=bool)
     return np.asarray(solve_at_rest(A[None], b[None], bound[None], every, definite=False)[0][0])
 
 
-def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool) -> tuple[Array, Mask]:
-    """Return the λ with |λ| <= bound that minimize ½ λᵀ A λ + bᵀ λ, and where they are inside; (N, n) each.
+def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool) -> tuple[Array, Array]:
+    """Return the λ with |λ| <= bound that minimize ½ λᵀ A λ + bᵀ λ, and the signs of those at bounds; (N, n) each.
 
     λ is zero where `on` is False. A, (N, n, n), is positive definite or semidefinite. Of a semidefinite one, λ is the
     limit of proximal points, whose A is definite (Rockafellar 1976, SIAM Journal on Control and Optimization 14).
@@ -71,13 +79,13 @@ def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool)
     forces = np.zeros(b.shape)
     for _ in range(_POINTS):
         before = forces
-        forces, inside = _of_definite(own, b - near * before, bound, on)
+        forces, side = _of_definite(own, b - near * before, bound, on)
         if (near * np.abs(forces - before) <= noise).all():
-            return forces, inside
+            return forces, side
     raise NumericalError(_UNDECIDED.format(n=b.shape[1]))
 
 
-def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Mask]:
+def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Array]:
     """Return what `solve_at_rest` does, where A is positive definite.
 
     The set of forces at their bounds is exchanged as a whole as long as fewer conditions fail, then one by one, the
@@ -85,7 +93,7 @@ def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Mas
     Operations Research 21).
     """
     size, n = b.shape
-    forces, inside = np.zeros((size, n)), on.copy()
+    forces = np.zeros((size, n))
     side, best, left = np.zeros((size, n)), np.full(size, n + 1), np.full(size, _PATIENCE)
     going = np.arange(size)
     # What is undecided to rounding is at rest.
@@ -98,7 +106,7 @@ def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Mas
         x = np.where(inner, _restricted(own, -pushed, inner), at_bound)
         a = b[going] + (own @ x[..., None])[..., 0]
         wrong = np.where(inner, np.abs(x) > bound[going] * (1 + ROUNDING), here * a > noise[going])
-        forces[going], inside[going] = x, inner
+        forces[going] = x
         counts = wrong.sum(axis=1)
         fewer = counts < best[going]
         alone = ~fewer & (left[going] == 0)
@@ -109,7 +117,7 @@ def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Mas
         side[going] = np.where(change, np.where(inner, np.sign(x), 0.0), here)
         going = going[counts > 0]
         if not len(going):
-            return forces, inside
+            return forces, side
     raise NumericalError(_UNDECIDED.format(n=n))
 
 
@@ -131,18 +139,36 @@ def _restricted(A: Array, right: Array, on: Mask, *, definite: bool = True) -> A
 def friction_forces(
     A: Array, b: Array, bound: Array, less: Array, on: Mask, known: Array, *, definite: bool = True
 ) -> tuple[Array, Mask]:
-    """Return the forces of friction as `solve_at_rest` does, and which of them hold; those `known` do not; (N, n).
+    """Return the forces of friction at rest, and which of them hold; those `known` do not; (N, n).
 
-    What lets go has the friction of motion. Where that is `less` than the bound, the others feel it.
+    First all hold up to their bounds. Of those that would move, the one whose friction takes the most power lets go:
+    on that side it has `less` from then on, the friction of motion, and the problem is solved again with what the
+    others feel of it. It may come to hold after all. Each round lowers a bound, so that there are 2 n at most, and the
+    last is consistent: a joint holds within its bound, or moves against the friction of motion.
     """
-    forces, free = np.where(on, known, 0.0), on & (known != 0)
-    while True:
-        pushed = b + (A @ np.where(free, forces, 0.0)[..., None])[..., 0]
-        held, inside = solve_at_rest(A, pushed, bound, on & ~free, definite=definite)
-        forces, holds = np.where(free, forces, held), inside & ~free & on
-        if not (drops := on & ~free & ~holds & (less < bound)).any():
-            return forces, holds
-        forces, free = np.where(drops, np.sign(forces) * less, forces), free | drops
+    forces, holds = np.zeros(b.shape), np.zeros(b.shape, dtype=bool)
+    lower, upper, free = np.where(known < 0, known, -bound), np.where(known > 0, known, bound), on & (known != 0)
+    rows = np.arange(len(b))
+    while len(rows):
+        own, low, high, loose, act = A[rows], lower[rows], upper[rows], free[rows], on[rows]
+        middle = np.where(act, np.where(loose, known[rows], 0.5 * (low + high)), 0.0)
+        pushed = b[rows] + (own @ middle[..., None])[..., 0]
+        x, side = solve_at_rest(own, pushed, 0.5 * (high - low), act & ~loose, definite=definite)
+        forces[rows] = x = np.where(side < 0, low, np.where(side > 0, high, middle + x))
+        a = b[rows] + (own @ x[..., None])[..., 0]
+        # Forces of loops are not unique: what is at its bound may be held by the others.
+        size = _MOVING / _ROUNDING * _noise(own, b[rows], bound[rows])
+        moves = side != 0 if definite else side * a < -size
+        holds[rows] = act & ~loose & ~moves
+        falls = moves & (np.abs(x) > less[rows])
+        power = np.where(falls, np.abs(a) * bound[rows], 0.0)
+        first = falls & (power >= (1 - _TIE) * power.max(axis=1, keepdims=True))
+        lower[rows] = np.where(first & (side < 0), -less[rows], low)
+        upper[rows] = np.where(first & (side > 0), less[rows], high)
+        # What is known to leave may be held by what the others do then.
+        free[rows] &= ~first.any(axis=1, keepdims=True)
+        rows = rows[first.any(axis=1)]
+    return forces, holds
 
 
 class DryFriction:
