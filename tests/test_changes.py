@@ -287,6 +287,8 @@ def test_a_locked_model_has_the_rows_and_columns_that_are_left(seed, data):
     for term in ("nle", "passive"):
         assert off(getattr(small, term)(q, v), getattr(full, term)(whole_q, whole_v)[kept]) < CLOSE
     assert off(small.gravity(q), full.gravity(whole_q)[kept]) < CLOSE
+    energies = [float(x) for x in (small.potential_energy(q), full.potential_energy(whole_q))]
+    assert energies[0] == pytest.approx(energies[1], rel=1e-12, abs=1e-10)
     assert off(small.pose(q, "tip"), full.pose(whole_q, "tip")) < CLOSE
     rates = small.mass_matrix(q) @ small.forward_dynamics(q, v, tau) - tau
     assert off(rates, small.passive(q, v) - small.nle(q, v)) < 1e-10
@@ -323,6 +325,38 @@ def test_a_locked_gripper_is_one_line():
     q, v = again.full_state(again.neutral())
     assert (q[0], q[-1], v.tolist()) == (0.5, 0.02, [0.0] * 8)
     assert pickle.loads(pickle.dumps(again)).full_state(again.neutral())[0].tolist() == q.tolist()
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
+def test_what_is_locked_keeps_its_energy_and_loses_its_friction(engine):
+    """½ 20 (0.4 - 0.1)² + ½ 5 (3 0.4 - 0.5)² + 2 0.4⁴ J, beside ½ 7 q² of the other joints."""
+    b = mb.ModelBuilder("held", gravity=(0, 0, 0))
+    rubs = {"friction": 1.0, "stiction": 2.0, "stribeck_velocity": 0.1, "damping": 0.3, "armature": 0.2}
+    for k, parent in enumerate(("world", "b0", "b1")):
+        b.add_body(f"b{k}", mass=1.0, com=(0.3, 0, 0), inertia=(0.1, 0.1, 0.1))
+        own = (
+            {"stiffness": mb.Parameter("k", 20.0), "rest": mb.Parameter("rest", 0.1)} if k == 1 else {"stiffness": 7.0}
+        )
+        place = {"axis": (0, 0, 1), "translation": (mb.Parameter("l", 0.5) if k else 0.0, 0, 0)}
+        b.add_joint(f"j{k}", "revolute", parent=parent, child=f"b{k}", **place, **own, **rubs)
+    b.add_coupling("wire", {"j1": mb.Parameter("ratio", 3.0)}, stiffness=mb.Parameter("pull", 5.0), rest_length=0.5)
+    b.add_joint_force("hardens", "j1", potential=lambda q: 2.0 * q**4)
+    full = b.build()
+    reduced = full.lock({"j1": 0.4})
+    assert reduced.joint("j1").stiction is None
+    dyn, whole = mb.dynamics(reduced, engine), mb.dynamics(full, engine)
+    q, v, tau = np.array([0.2, -0.7]), np.array([0.5, 0.0]), np.array([1.0, 9.0])
+    expected = 3.5 * (q @ q) + 10 * 0.3**2 + 2.5 * 0.7**2 + 2 * 0.4**4
+    assert dyn.potential_energy(q) == pytest.approx(expected, rel=1e-14)
+    assert off(dyn.passive(q, v), whole.passive([0.2, 0.4, -0.7], [0.5, 0, 0])[[0, 2]]) < 1e-14
+    # The joint is held by a torque instead.
+    M, h = dyn.mass_matrix(q), dyn.passive(q, v) + tau - dyn.nle(q, v)
+    slides = np.array([0.0, 1 + (2 - 1)])
+    assert off(dyn.forward_dynamics(q, v, tau), np.linalg.solve(M, h - slides)) < 1e-13
+    numbers = {"k": 30.0, "rest": -0.2, "ratio": 1.0, "pull": 4.0, "l": 0.9}
+    other = mb.dynamics(reduced.with_parameters(**numbers), engine)
+    expected = 3.5 * (q @ q) + 15 * 0.6**2 + 2 * 0.1**2 + 2 * 0.4**4
+    assert other.potential_energy(q) == pytest.approx(expected, rel=1e-14)
 
 
 def test_couplings_couplers_and_formulas_hold_the_locked_numbers():

@@ -305,8 +305,9 @@ class Model(Description):
         """Return the model with some joints fixed: its terms are those of this one with these velocities zero.
 
         Bodies and frames stay, and what they carry. What follows a locked joint is locked with it: joints that mimic
-        it, and those that a coupler ties to it. A loop stays, unless nothing moves its ends any more. `full_state` and
-        `reduced_state` bring q and v from one model to the other.
+        it, and those that a coupler ties to it. A loop stays, unless nothing moves its ends any more. Springs at locked
+        joints keep their energy, as springs between bodies that these hold together. `full_state` and `reduced_state`
+        bring q and v from one model to the other.
 
         Parameters
         ----------

@@ -1,7 +1,8 @@
 """Lock joints: the reduced model has the rows and columns of M that are left, and the bias with these velocities zero.
 
 A locked joint is a fixed one with the placement that its coordinates give, so that bodies, frames and all that hangs on
-them stay.
+them stay. Springs at locked joints alone stay as springs between bodies that these hold together: they push nothing,
+and keep their energy.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from mbkit._check import Array, batch_of, finite_array, rows, shown
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model.builder import shape_of
 from mbkit.model.description import expect_name
-from mbkit.model.elements.forces import RATE, Force, GravityCompensation, JointForce, coordinate_arguments
+from mbkit.model.elements.forces import RATE, Force, FrameForce, GravityCompensation, JointForce, coordinate_arguments
 from mbkit.model.elements.formula import Formula, Operation
 from mbkit.model.elements.references import entries, moved_by, with_fields
 from mbkit.model.joint_types import FIXED
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, nominal
-from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop
+from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, PointSpring
 from mbkit.model.poses import body_poses
 
 #: Of limits and of what is closed: digits of a typed number.
@@ -45,6 +46,7 @@ def lock(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike |
     _refuse_driven(model, values)
     bindings, notes = list(model.bindings), []
     parts: dict[str, Any] = {"joints": tuple(_fixed(j, values, bindings) for j in model.joints)}
+    parts["springs"] = (*model.springs, *_still_springs(model, parts["joints"], values, bindings))
     parts["couplers"] = tuple(y for x in model.couplers if (y := _left(x, values, bindings)) is not None)
     couplings = [_shortened(x, values, bindings) for x in model.couplings]
     parts["couplings"] = tuple(x for x in couplings if x is not None)
@@ -196,9 +198,43 @@ def _fixed(joint: Joint, values: Values, bindings: list[Binding]) -> Joint:
         axes=np.zeros((0, 3)),
         pitch=0.0,
         mimic=None,
+        stiction=None,
+        stribeck_velocity=None,
         **empty,  # type: ignore[arg-type]  # arrays
     )
     return with_fields(still, "joints", {"translation": place}, bindings)  # type: ignore[no-any-return]  # a Joint
+
+
+def _still_springs(
+    model: Model, joints: Sequence[Joint], values: Values, bindings: list[Binding]
+) -> Iterator[PointSpring]:
+    """Yield springs with the energies of those at locked joints alone, between bodies that these hold together."""
+    held: list[tuple[str, Any, Any]] = []
+    for joint in model.joints:
+        if joint.name in values:
+            numbers = (entries(joint, "joints", name, model.bindings) for name in ("stiffness", "rest"))
+            # Stiff joints have a coordinate for each velocity.
+            each = zip(*numbers, values[joint.name], strict=False)
+            held += [(joint.name, stiffness, float(x) - rest) for stiffness, rest, x in each]
+    for part in model.couplings:
+        if not {*part.joints} - {*values}:
+            factors, stiffness, length = (
+                entries(part, "couplings", name, model.bindings) for name in ("factors", "stiffness", "rest_length")
+            )
+            for name, factor in zip(part.joints, factors, strict=True):
+                length = length - factor * float(values[name][0])
+            held.append((part.joints[0], stiffness, length))
+    fixed = {j.name: j for j in joints}
+    for k, (name, stiffness, stretch) in enumerate(held):
+        if isinstance(stiffness, float) and isinstance(stretch, float) and not stiffness * stretch:
+            continue
+        joint = fixed[name]
+        origin = entries(joint, "joints", "translation", bindings)
+        fields = {"point_a": origin, "point_b": np.array([stretch, 0.0, 0.0], dtype=object), "stiffness": stiffness}
+        spring = PointSpring(
+            f"spring {k} of {name}", joint.parent, np.zeros(3), joint.child, np.zeros(3), 0.0, 0.0, 0.0
+        )
+        yield with_fields(spring, "springs", fields, bindings)
 
 
 def _shortened(coupling: JointCoupling, values: Values, bindings: list[Binding]) -> JointCoupling | None:
@@ -255,6 +291,11 @@ def _acting(model: Model, force: Force, values: Values) -> Iterator[Force]:
                 f"joints: the potential of force {force.name!r} at {force.joint!r} acts on {more[0]!r} too; remove it "
                 "or write it as a force"
             )
+        if force.potential:
+            # A constant energy, on a body that it does not push.
+            place = dict(zip(force.positions(model), values[force.joint].tolist(), strict=True))
+            potential, body = _filled(force.potential, place), model.joint(force.joint).child
+            yield FrameForce(force.name, body, "local", None, potential, force.symbols, force.numbers)
         return
     numbers = _locked_arguments(model, values)
     numbers = {name: x for name, x in numbers.items() if name not in own}
