@@ -92,6 +92,27 @@ def raise_again() -> None:
         raise KeyboardInterrupt
 
 
+def beside(call: Callable[[], object]) -> None:
+    """Call a library in a thread, so that Ctrl-C raises KeyboardInterrupt at once; the thread ends with the process."""
+    if threading.current_thread() is not threading.main_thread():
+        call()
+        return
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            call()
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    while thread.is_alive():
+        thread.join(_PATIENCE)
+    if errors:
+        raise errors[0]
+
+
 def at_end(action: Callable[[], object], *, remove: bool = False) -> None:
     """Call a function, such as one that ends a process, when an interrupted command ends; or no longer."""
     (_interrupts.at_end.discard if remove else _interrupts.at_end.add)(action)

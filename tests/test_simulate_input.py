@@ -5,12 +5,17 @@
 from __future__ import annotations
 
 import pickle
+import signal
+import subprocess
+import sys
+import time
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
+import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError
@@ -372,3 +377,54 @@ def test_a_run_away_is_not_blamed_on_the_torque(method: str) -> None:
             torque=lambda t, q, v: 3 * v * abs(v),
         )
     assert run.stats.ended in ("diverged", "step_too_small")
+
+
+_NATIVE = """
+import sys
+import mbkit as mb, mbkit.engines.drake.rollout as rollout
+# With steps as long as these Drake does not come back.
+rollout.SimulatorConfig = lambda config=rollout.SimulatorConfig, **given: config(max_step_size=1e9, **given)
+over = rollout.DrakeRun.over
+def waiting(self, t):
+    print("running", flush=True)
+    return over(self, t + 1.0)
+rollout.DrakeRun.over = waiting
+model = mb.catalog.double_pendulum()
+if {study}:
+    mb.work_precision(model, engines=["drake"], methods=["drake_runge_kutta5"], duration=1.0)
+else:
+    mb.simulate(mb.dynamics(model, "drake"), [1.0, 0.5], [0.0, 0.0], 1.0, "drake_runge_kutta5", save=[0, 1])
+"""
+
+
+def test_drake_s_own_steps_are_no_longer_than_its_own_longest() -> None:
+    pytest.importorskip("pydrake")
+    model = mb.catalog.double_pendulum()
+    arguments = [1.0, 0.5], [0.0, 0.0], 1.0
+    run = mb.simulate(mb.dynamics(model, "drake"), *arguments, "drake_runge_kutta5", save=[0, 1])
+    exact = mb.simulate(mb.dynamics(model, "lagrangian"), *arguments, "rk853", rtol=1e-12, save=[0, 1])
+    assert abs(run.q - exact.q).max() < 1e-7
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("study", [False, True])
+def test_a_native_run_ends_at_ctrl_c(study: bool) -> None:
+    pytest.importorskip("pydrake")
+    process = subprocess.Popen(
+        [sys.executable, "-c", _NATIVE.format(study=study)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "running\n"
+        time.sleep(0.3)
+        process.send_signal(signal.SIGINT)
+        # Two seconds, and more on a machine with other work.
+        _, said = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert process.returncode
+    assert "Interrupt" in said

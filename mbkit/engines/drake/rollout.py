@@ -8,22 +8,19 @@ dampers and constraints at its end: the run tends to that of rigid loops with th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import EventStatus
 
-from mbkit import spatial
+from mbkit import _interrupt, spatial
 from mbkit._check import Array
 from mbkit.engines.base import first_names, require_no_forces
 from mbkit.engines.drake.engine import NO_CONSTRAINTS, SAP, DrakeDynamics
 from mbkit.engines.drake.model import CONSTRAINTS, DrakeModel, build
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
-
-# Drake's default of 0.1 s would hold a slow motion's steps down for no reason.
-_MAX_STEP: Final = 1e9
 
 
 class _PlantState:
@@ -99,7 +96,7 @@ class DrakeRun(_PlantState):
         super().__init__(dyn, dyn.maps)
         self.put(q, v)
         simulator = Simulator(self._plant, self._context)
-        config = SimulatorConfig(integration_scheme=scheme, accuracy=accuracy, max_step_size=_MAX_STEP)
+        config = SimulatorConfig(integration_scheme=scheme, accuracy=accuracy)
         ApplySimulatorConfig(config, simulator)
         # The configuration resets the time.
         self._context.SetTime(t)
@@ -107,7 +104,11 @@ class DrakeRun(_PlantState):
         # Too small a step is an error, not carried on with an error that nobody knows.
         integrator.set_throw_on_minimum_step_size_violation(True)
 
+        self._left = False
+
         def monitor(context: Any) -> Any:
+            if self._left:
+                return EventStatus.ReachedTermination(None, "interrupted")
             watch(context.get_time())
             return EventStatus.DidNothing()
 
@@ -116,7 +117,12 @@ class DrakeRun(_PlantState):
 
     def over(self, t: float) -> tuple[Array, Array]:
         """Go on to a time, s; return q and v there."""
-        self._simulator.AdvanceTo(t)
+        try:
+            # Within a step Drake does not look for signals.
+            _interrupt.beside(lambda: self._simulator.AdvanceTo(t))
+        except BaseException:
+            self._left = True
+            raise
         return self.state()
 
     @property
