@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from functools import cache
 from typing import Any
 
@@ -428,3 +429,28 @@ def test_a_native_run_ends_at_ctrl_c(study: bool) -> None:
         process.kill()
     assert process.returncode
     assert "Interrupt" in said
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_a_run_a_step_and_their_work_change_nothing_of_their_arguments(compiled: bool) -> None:
+    dyn = dynamics(catalog.four_bar(), "lagrangian", compile=compiled)
+    q, v = dyn.project([0.5, 0.0, 1.0], [1.0, 0.0, 0.0])
+    frame = dyn.model.bodies[-1].name
+    given = {"torque": np.full((10, 3), 0.1), "save": np.arange(11) * 0.01, "wrenches": {frame: np.ones((10, 6))}}
+    kept = pickle.dumps((q, v, given))
+    calls = (
+        lambda: simulate(dyn, q, v, 0.1, dt=0.01, **given).work(),
+        lambda: simulate(dyn, q, v, 0.1, dt=0.01, torque=lambda t, q, v: -v, hold=0.05),
+        lambda: simulate(dyn, q, v, 0.1, "dop853").check(),
+        lambda: dyn.step(q, v, given["torque"][0], 0.01),
+        lambda: dyn.step(q, v, given["torque"][0], 0.01, wrenches={frame: np.ones(6)}),
+    )
+    for call in calls:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", "constraint", MbkitWarning)
+            call()
+        assert pickle.dumps((q, v, given)) == kept
+        assert all(x.flags.writeable for x in (q, v, given["torque"], given["save"], given["wrenches"][frame]))
+    # Of its first acceleration.
+    with pytest.warns(MbkitWarning, match="is open by"):
+        dyn.forward_dynamics([0.5, 0.1, 1.0], v, np.zeros(3))

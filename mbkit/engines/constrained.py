@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
@@ -27,6 +28,19 @@ QUANTITIES: Final = (
     "constraint_forces",
     "generalized_constraint_force",
 )
+
+
+@contextmanager
+def unwatched(*all_dynamics: Any) -> Iterator[None]:
+    """Let no acceleration warn of an open state, as stages of a run are open by the order of a method's error."""
+    before = [dyn.looks for dyn in all_dynamics]
+    try:
+        for dyn in all_dynamics:
+            dyn.looks = False
+        yield
+    finally:
+        for dyn, looks in zip(all_dynamics, before, strict=True):
+            dyn.looks = looks
 
 
 class Constrained:

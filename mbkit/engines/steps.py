@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, real, real_array, require_finite
+from mbkit.engines.constrained import unwatched
 from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.engines.loads import Wrenches
 from mbkit.errors import InputError, NumericalError, UnsupportedError
@@ -183,7 +184,8 @@ class Steps:
                     one: Any = import_module("mbkit.simulate.solvers.friction.single_step")
                     q1, v1 = one.step(self, chosen, **states, dt=h)
                 else:
-                    q1, v1 = self._step(chosen, **states, dt=h)
+                    with unwatched(self):
+                        q1, v1 = self._step(chosen, **states, dt=h)
                 good = _finite_rows(q1, v1)
             except _NotFiniteError as error:
                 good = error.args[0]

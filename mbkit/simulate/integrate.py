@@ -15,6 +15,7 @@ from mbkit._check import Array, batch_of, real
 from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
+from mbkit.engines.constrained import unwatched
 from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD, METHODS, Method, Tolerances, method_of
@@ -70,8 +71,6 @@ def integrate(
     start, duration, dt = times_of(dyn, chosen, t0, duration, dt)
     _require_engine(dyn, chosen)
     q, v = from_consistent(dyn, q, v, start)
-    # Stages of a run are off the constraints by the order of a method's error.
-    dyn.looks = False
     wanted = as_events(events)
     if wanted and not chosen.events:
         _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
@@ -93,7 +92,7 @@ def integrate(
     bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
     started = time.perf_counter()
     setting: float | Tolerances
-    with bar:
+    with bar, unwatched(dyn, own):
         if chosen.kind == "adaptive":
             setting = _tolerances(dyn, chosen, rtol, atol)
             if isinstance(save, (int, np.integer)):

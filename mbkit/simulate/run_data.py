@@ -11,6 +11,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import ENGINES, Dynamics, dynamics
 from mbkit.engines.base import at_times
+from mbkit.engines.constrained import unwatched
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.methods.registry import Tolerances
 from mbkit.model import Body, Frame, Model
@@ -160,13 +161,14 @@ class RunData:
         of the saved states; a function that jumps makes it first order, and so do rows that jump beside a function.
         """
         dyn, force, t, q, v = self._by(engine), self._acted(), self.t, self.q, self.v
-        if isinstance(force, SampledTorque):
-            whole = _generalized(dyn, q, force.values, self._acting)
-            lost = along(dyn, (), _lost_power, q, v, whole) + np.sum(whole * v, axis=-1)
-            steps = _by_cubics(t, lost)
-        else:
-            held = np.zeros(self._numbers) if force is None else force.between(t)
-            steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
+        with unwatched(dyn):
+            if isinstance(force, SampledTorque):
+                whole = _generalized(dyn, q, force.values, self._acting)
+                lost = along(dyn, (), _lost_power, q, v, whole) + np.sum(whole * v, axis=-1)
+                steps = _by_cubics(t, lost)
+            else:
+                held = np.zeros(self._numbers) if force is None else force.between(t)
+                steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
         if self.model.needs.friction and not dyn.soft_friction:
             steps = steps - self._rubbed(dyn)
         out = np.zeros(q.shape[:-1])
