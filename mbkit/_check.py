@@ -11,7 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbkit.errors import InputError, UnsupportedError
+from mbkit._warn import warn
+from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 
 Array = NDArray[np.float64]
 _MAX_SUMMED: Final = 64
@@ -136,6 +137,17 @@ def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = F
     if (positive and number <= 0) or (nonnegative and number < 0):
         raise InputError(f"{name}: expected a number {'above' if positive else 'of at least'} 0, got {number}")
     return number
+
+
+#: rad: an angle beyond two turns that somebody wrote is likely one in degrees.
+TWO_TURNS: Final = 4 * math.pi
+
+
+def hint_at_degrees(item: str, *angles: float) -> None:
+    """Warn of an angle beyond two turns, rad."""
+    if beyond := [x for x in angles if abs(x) > TWO_TURNS]:
+        says = "beyond two turns; angles are in radians here, numpy.radians makes them of degrees"
+        warn(f"{item} = {beyond[0]:g} rad is {says}", MbkitWarning)
 
 
 def shown(value: Any) -> str:

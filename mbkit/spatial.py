@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, finite_array
+from mbkit._check import Array, finite_array, hint_at_degrees
 from mbkit.errors import InputError
 
 __all__ = [
@@ -151,6 +151,7 @@ def quaternion_from_matrix(R: Array) -> Array:
 
 def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     """Return Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3), of angles in radians: URDF's convention."""
+    hint_at_degrees("rpy", roll, pitch, yaw)
     (cr, cp, cy), (sr, sp, sy) = (tuple(map(f, (roll, pitch, yaw))) for f in (math.cos, math.sin))
     return np.array(
         [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import mbkit as mb
-from mbkit.errors import InputError, MbkitError, ModelError, UnknownNameError
+from mbkit.errors import InputError, MbkitError, MbkitWarning, ModelError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from tests.random_trees import SOUND, off, random_tree, states
 
@@ -587,6 +588,31 @@ def test_variants_are_robots_of_their_own():
     assert len({float(x) for x in many.values["forearm_link.mass"]}) == 20
     assert repr(many) == "<Variants of 'ur5': 20 of 16 numbers, seed 3>"
     assert "forearm_link.mass" in str(many)
+
+
+def test_variants_are_cut_as_a_list_is():
+    many = mb.variants(mb.load("ur5"), {"*.mass": 0.2}, size=6, seed=3)
+    some = many[1:6:2]
+    assert len(some) == 3
+    assert [x.mass for x in some] == [many[k].mass for k in (1, 3, 5)]
+    assert some.dynamics("lagrangian").mass_matrix(np.zeros(6)).shape == (3, 6, 6)
+    with pytest.raises(InputError, match="whole number from 0 to 5"):
+        many[6:]
+    with pytest.raises(UnsupportedError, match=r"pinocchio takes them one by one, as mbkit.dynamics\(many\[k\]"):
+        many.dynamics("pinocchio")
+    with pytest.raises(UnknownNameError, match="pinocchio"):
+        many.dynamics("pinochio")
+
+
+@pytest.mark.parametrize("path", ["*.mass", "upper_arm_link.inertial", "forearm_link.log_cholesky", mb.scale("*.mass")])
+def test_a_spread_in_per_cent_is_hinted_at(path):
+    robot = mb.load("ur5")
+    with pytest.warns(MbkitWarning, match="10 is the standard deviation of the logarithm.* 0.1 is about 10 %") as told:
+        mb.variants(robot, {path: 10}, size=20)
+    assert len(told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", MbkitWarning)
+        mb.variants(robot, {path: 1.0, "wrist_1_link.com": 10.0, "gravity.z": (-20, -1)}, size=20)
 
 
 def test_the_same_seed_draws_the_same_whatever_else_varies(tmp_path):

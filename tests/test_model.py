@@ -6,6 +6,7 @@ import importlib
 import inspect
 import math
 import pickle
+import warnings
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, fields, replace
 from decimal import Decimal
@@ -724,3 +725,97 @@ def test_functions_of_space_take_lists_and_name_wrong_shapes():
     ):
         with pytest.raises(InputError, match=words):
             bad()
+
+
+# Degrees
+
+IN_DEGREES: dict[str, Callable[[Any, Any], Any]] = {
+    "mass_matrix": lambda dyn, q: dyn.mass_matrix(q),
+    "forward_dynamics": lambda dyn, q: dyn.forward_dynamics(q, [0, 0], [0, 0]),
+    "a batch": lambda dyn, q: dyn.nle(np.tile(q, (2, 1)), np.zeros((2, 2))),
+    "pose": lambda dyn, q: dyn.pose(q, "rod1"),
+    "step": lambda dyn, q: dyn.step(q, [0, 0], [0, 0], 1e-3),
+    "linearize": lambda dyn, q: dyn.linearize(q, [0, 0], [0, 0]),
+    "simulate": lambda dyn, q: mb.simulate(dyn, q, [0, 0], 0.01, "rk4", dt=1e-3),
+    "stiffness": lambda dyn, q: mb.simulate.stiffness(dyn, q, [0, 0]),
+    "integrate": lambda dyn, q: dyn.model.integrate(q, [0, 0]),
+    "difference": lambda dyn, q: dyn.model.difference([0, 0], q),
+    "lock": lambda dyn, q: dyn.model.lock(["theta1"], q),
+    "a locked value": lambda dyn, q: dyn.model.lock({"theta1": q[0]}),
+}
+
+
+def hints(call: Callable[[], Any]) -> list[str]:
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        call()
+    assert {w.filename for w in told if "two turns" in str(w.message)} <= {__file__}
+    return [str(w.message) for w in told if "two turns" in str(w.message)]
+
+
+@pytest.mark.parametrize(
+    ("name", "engine"),
+    # MuJoCo has no exact derivatives.
+    [(x, e) for x in IN_DEGREES for e in ("pinocchio", "lagrangian", "mujoco") if (x, e) != ("linearize", "mujoco")],
+)
+def test_degrees_are_hinted_at_in_every_call_that_takes_q(name: str, engine: str) -> None:
+    call, dyn = IN_DEGREES[name], mb.dynamics(mb.catalog.double_pendulum(), engine)
+    (hint,) = hints(lambda: call(dyn, np.degrees([0.5, -0.3])))
+    assert "theta1" in hint
+    assert "28.6479 rad is beyond two turns; angles are in radians" in hint
+    fresh = mb.dynamics(mb.catalog.double_pendulum(), engine)
+    assert hints(lambda: call(fresh, np.array([4 * np.pi, -3.0]))) == []
+
+
+def test_degrees_are_hinted_at_once_and_lengths_are_none() -> None:
+    dyn = mb.dynamics(mb.catalog.double_pendulum())
+    assert len(hints(lambda: [dyn.mass_matrix(np.array([k, 90.0])) for k in range(5)])) == 1
+    cart = mb.dynamics(mb.catalog.cart_pole())
+    assert hints(lambda: cart.mass_matrix([100.0, 3.0])) == []
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "mujoco"])
+def test_runs_may_turn_many_times(engine: str) -> None:
+    dyn = mb.dynamics(mb.catalog.pendulum(), engine)
+
+    def run() -> None:
+        run = mb.simulate(dyn, [0.0], [40.0], 1.0, "rk4", dt=0.005)
+        assert run.q[-1, 0] > 35
+        assert len(run.energy()) == len(run.power_balance()) == len(run.t)
+        run.check()
+
+    def loop() -> None:
+        own, q, v = mb.dynamics(mb.catalog.pendulum(), engine), np.zeros(1), np.array([40.0])
+        for _ in range(200):
+            own.mass_matrix(q)
+            q, v = own.step(q, v, [0.0], 0.005)
+        assert q[0] > 35
+
+    assert hints(run) == hints(loop) == []
+
+
+def test_degrees_of_roll_pitch_and_yaw_are_hinted_at() -> None:
+    b = mb.ModelBuilder("arm")
+    b.add_body("arm", mass=1.0, inertia=I3)
+    for call in (
+        lambda: b.add_joint("j", "revolute", parent="world", child="arm", axis=(0, 0, 1), rpy=(0, 90, 0)),
+        lambda: b.add_frame("tool", body="arm", rpy=(0, 90, 0)),
+        lambda: mb.spatial.pose((0, 0, 1), rpy=(0, 90, 0)),
+        lambda: mb.spatial.matrix_from_rpy(0, 90, 0),
+    ):
+        (hint,) = hints(call)
+        assert "rpy = 90 rad is beyond two turns" in hint
+    text = '<robot name="r"><link name="a"/><link name="b"/><joint name="j" type="fixed"><origin rpy="0 90 0"/>'
+    text += '<parent link="a"/><child link="b"/></joint></robot>'
+    with pytest.raises(ModelError, match="no mass"):
+        mb.load(text, floating_base=True)
+    text = text.replace(
+        '<link name="a"/>',
+        '<link name="a"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" '
+        'iyy="1" iyz="0" izz="1"/></inertial></link>',
+    )
+    assert any(
+        "joint 'j': origin rpy" in note and "URDF's are radians" in note
+        for note in mb.load(text, floating_base=True).notes
+    )
+    assert hints(lambda: mb.explain(mb.load("ur5"), mb.load("ur5").without("gravity"))) == []

@@ -536,3 +536,12 @@ def test_pinocchio_places_the_shapes_and_other_engines_say_that_they_have_none()
         np.testing.assert_allclose(place.translation, X[:3, :3] @ shape.translation + X[:3, 3], atol=50 * EPS)
     with pytest.raises(UnsupportedError, match=r"lagrangian: no viewer .* mbkit\.show has one"):
         mb.dynamics(mb.catalog.pendulum(), "lagrangian").visual_model()
+
+
+def test_a_path_or_a_name_is_shown_as_its_model_is(tmp_path):
+    file = mb.robots()[0].path
+    by_path, by_name = (mb.show(x, path=tmp_path / "page.html").scene for x in (file, mb.robots()[0].name))
+    model = mb.load(file, nonphysical="warn")
+    assert by_path.bodies == by_name.bodies == model.show(path=tmp_path / "page.html").scene.bodies
+    with pytest.raises(InputError, match="expected a Model or a path, got 3"):
+        mb.show(3)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import TWO_TURNS, Array
 from mbkit._reproducible import turned
 from mbkit.errors import ModelError, Suggestions
 from mbkit.load import xml_reader
@@ -244,6 +244,8 @@ def _origin(owner: Element, item: str, read: Reader) -> tuple[_Numbers, _Numbers
     if origin is None:
         return zeros, zeros, ""
     xyz, rpy = (read.numbers(origin, name, item, count=3, default=zeros) for name in ("xyz", "rpy"))
+    if any(abs(x) > TWO_TURNS for x in rpy):
+        read.notes.append(f"{item}: origin rpy {rpy} is beyond two turns; URDF's are radians ({origin.place})")
     return xyz, rpy, _copy(origin, "xyz", "rpy")
 
 

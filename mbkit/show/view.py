@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, count, real, shown
 from mbkit._escape import one_line
 from mbkit.errors import InputError, OutputError
+from mbkit.load import load
 from mbkit.model import Model
 from mbkit.model.elements.formula import NUMPY
 from mbkit.model.elements.motion_laws import position
@@ -77,7 +78,7 @@ class View:
 
 
 def show(
-    model: Model,
+    model: Model | str | os.PathLike[str],
     q: ArrayLike | None = None,
     path: str | os.PathLike[str] | None = None,
     *,
@@ -91,7 +92,8 @@ def show(
 
     Parameters
     ----------
-    model : Model
+    model : Model, str or path
+        Or what `mbkit.load` takes, such as a path; inertias that no body has are told, and drawn.
     q : (nq,) or (K, nq) array_like, optional
         By default the neutral configuration.
     path : str or path, optional
@@ -131,8 +133,10 @@ def show(
     >>> len(view.scene.shapes), view.scene.bodies
     (6, ('world', 'rod1', 'rod2'))
     """
+    if isinstance(model, (str, os.PathLike)):
+        model = load(model, nonphysical="warn")
     if not isinstance(model, Model):
-        raise InputError(f"model: expected a Model, got {shown(model)}; a trajectory has animate()")
+        raise InputError(f"model: expected a Model or a path, got {shown(model)}; a trajectory has animate()")
     require_bodies(model)
     configurations = np.atleast_2d(model.neutral() if q is None else model.check_q(q))
     if len(configurations) > _FRAMES:

@@ -28,6 +28,7 @@ from mbkit.engines.regressors import with_losses
 from mbkit.model import Model
 from mbkit.model.base_parameters import RegressorColumns
 from mbkit.model.manifold import NEAR_UNIT
+from mbkit.model.model import FAR_SQUARED
 
 if TYPE_CHECKING:
     from mbkit.show import Kind
@@ -51,8 +52,8 @@ _DIRECT: Final[dict[str, tuple[str, Call]]] = {
 }
 
 
-def _factory(name: str, arguments: str) -> Callable[[Call, Call, Sound], Call]:
-    """Return a function (bare, checked, sound) -> call; a common one with *arguments would cost 0.3 µs a call."""
+def _factory(name: str, arguments: str) -> Callable[[Call, Call, Sound, Call], Call]:
+    """Return a function (bare, checked, sound, look) -> call; a common one with *arguments would cost 0.3 µs a call."""
     # Wrenches on frames go the checked way.
     loads = arguments.count(",") == 2
     plain = "wrenches is None and " * loads + " and ".join(
@@ -60,12 +61,14 @@ def _factory(name: str, arguments: str) -> Callable[[Call, Call, Sound], Call]:
     )
     finite = "(x := out.ravel('K')).dot(x) < inf" if name == "mass_matrix" else "isfinite(sum(out.tolist()))"
     text = f"""
-def factory(bare, checked, sound):
+def factory(bare, checked, sound, look):
     def {name}({arguments}{", wrenches=None, axes=" + repr(ALIGNED) if loads else ""}):
         try:
             if {plain}:
                 out = bare({arguments})
                 if {finite} and sound(q):
+                    if q.dot(q) > far:
+                        look(q)
                     return out
         except Exception:  # Pinocchio's own errors vary; the checked way words them
             pass
@@ -73,9 +76,10 @@ def factory(bare, checked, sound):
     return {name}
 """
     scope: dict[str, Any] = {"ndarray": np.ndarray, "double": np.dtype(float), "inf": np.inf, "isfinite": isfinite}
+    scope["far"] = FAR_SQUARED
     scope["__name__"] = __name__
     exec(text, scope)
-    factory: Callable[[Call, Call, Sound], Call] = scope["factory"]
+    factory: Callable[[Call, Call, Sound, Call], Call] = scope["factory"]
     return factory
 
 
@@ -213,7 +217,8 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
             del bare["forward_dynamics"]
         for name, call in bare.items():
             checked = getattr(self, name)
-            direct = _FACTORIES[name](call, checked, _sound(self.model, unread.get(name, set())))
+            sound = _sound(self.model, unread.get(name, set()))
+            direct = _FACTORIES[name](call, checked, sound, lambda q: self.model.look_for_degrees(q))
             vars(self)[name] = functools.update_wrapper(direct, checked)
 
     def _method(self, quantity: str) -> Callable[..., Any]:

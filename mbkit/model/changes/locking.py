@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, batch_of, finite_array, rows, shown
+from mbkit._check import Array, batch_of, finite_array, hint_at_degrees, rows, shown
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model.builder import shape_of
 from mbkit.model.description import expect_name
@@ -103,6 +103,8 @@ def _given(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike
             raise InputError(f"joints: {name!r} is fixed already")
     if isinstance(joints, Mapping):
         given = {name: _coordinates(model.joint(name), x) for name, x in joints.items()}
+        for name, x in given.items():
+            hint_at_degrees(f"joints: {name!r}", *x[list(model.joint(name).type.angular)])
     else:
         whole = model.neutral() if q is None else model.check_q(q)
         if whole.ndim > 1:

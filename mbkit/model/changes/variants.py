@@ -13,16 +13,17 @@ import csv
 import os
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, overload
 
 import numpy as np
 
 from mbkit._check import Array, count, finite_array, real, shown
 from mbkit._escape import csv_text, html
-from mbkit.errors import InputError, OutputError
+from mbkit._warn import warn
+from mbkit.errors import InputError, MbkitWarning, OutputError, UnsupportedError
 from mbkit.model.builder import expect_model, shape_of
 from mbkit.model.changes.freeing import LOG_CHOLESKY, SYMMETRIC, Scale, chosen, log_cholesky, numbers_of, with_free
 from mbkit.model.model import Model
@@ -34,6 +35,8 @@ _PLACES: Final = ("com", "translation", "translation_a", "translation_b", "point
 _ADDED: Final = (*_PLACES, "gravity", "rate", "phase")
 #: All ten numbers of a body together.
 _INERTIAL: Final = ".inertial"
+#: Beyond it one standard deviation is a factor of more than e: per cent are a common reason.
+_WIDE: Final = 1.0
 _NOT_NEGATIVE: Final = ("mass", "armature", "damping", "stiffness", "rest_length", "length", "radius")
 _POSITIVE: Final = ("mass", "length", "radius")
 #: Of a moment of inertia: rounding.
@@ -62,8 +65,14 @@ class Variants:
     def __len__(self) -> int:
         return len(next(iter(self.values.values())))
 
-    def __getitem__(self, k: int) -> Model:
-        """Return variant k as a model of plain numbers, for every engine."""
+    @overload
+    def __getitem__(self, k: int) -> Model: ...
+    @overload
+    def __getitem__(self, k: slice) -> Variants: ...
+    def __getitem__(self, k: int | slice) -> Model | Variants:
+        """Return variant k as a model of plain numbers, for every engine; the variants of a slice, as of a list."""
+        if isinstance(k, slice) and len(range(len(self))[k]):
+            return replace(self, values={name: x[k] for name, x in self.values.items()})
         if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not -len(self) <= k < len(self):
             last = len(self) - 1
             raise InputError(f"variant: expected a whole number from 0 to {last}, or from the end, got {shown(k)}")
@@ -72,16 +81,24 @@ class Variants:
     def __iter__(self) -> Iterator[Model]:
         return (self[k] for k in range(len(self)))
 
-    def dynamics(self, **options: Any) -> Any:
+    def dynamics(self, engine: str | None = None, **options: Any) -> Any:
         """Return the own derivation's dynamics of all variants, one a member of each batch; derived once.
 
         Parameters
         ----------
+        engine : str, optional
+            ``"lagrangian"``; others take variants one by one.
         **options
             Those of ``mbkit.dynamics(model, "lagrangian", ...)``.
         """
         # By name: a description knows no engine.
         registry = import_module("mbkit.engines.registry")
+        if engine not in (None, registry.DERIVED):
+            name = registry.find_engine(engine).name
+            raise UnsupportedError(
+                f"variants: {name} takes them one by one, as mbkit.dynamics(many[k], {name!r}); "
+                f"{registry.DERIVED} evaluates all of them in a batch"
+            )
         return registry.dynamics(self.model, registry.DERIVED, **options).at(**self.values)
 
     def to_dict(self) -> dict[str, Any]:
@@ -129,7 +146,9 @@ class Variants:
 
 
 def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, seed: int = 0) -> Variants:
-    """Draw variants of a model: other masses, inertias, friction, payloads, gravity.
+    """Draw variants of a model: other masses, inertias, dampers, payloads, gravity.
+
+    Dry friction is a number of every engine, and does not vary.
 
     Parameters
     ----------
@@ -158,6 +177,11 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
     InputError
         A path that fits nothing, another spread than these, and draws that no body can have, by name.
 
+    Warns
+    -----
+    MbkitWarning
+        A standard deviation of a logarithm above 1.
+
     Examples
     --------
     >>> import mbkit as mb
@@ -179,6 +203,11 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
         # What leaves a double's range is told by name.
         with np.errstate(over="ignore", invalid="ignore"):
             drawn = _drawn(model, path, how, rng, size)
+        factor = drawn and not callable(how) and shape_of(how) == () and not {*str(path).split(".")} & {*_ADDED}
+        if factor and (away := real("spread", how)) > _WIDE:
+            name, x = next(iter(drawn.items()))
+            says = "is the standard deviation of the logarithm, in which 0.1 is about 10 %"
+            warn(f"spread: {str(path)!r}: {away:g} {says}; {name!r} is {x.min():.1g} to {x.max():.1g}", MbkitWarning)
         if twice := [name for name in drawn if name in values]:
             raise InputError(f"spread: {twice[0]!r} is in two entries of the spread; draw it by one")
         if wide := [name for name, x in drawn.items() if not np.isfinite(x).all()]:

@@ -328,7 +328,9 @@ def joint_mistakes(joint: Joint) -> list[Mistake]:
     R, p, axes, pitch = joint.rotation, joint.translation, joint.axes, joint.pitch
     angles = np.array(spatial.rpy_from_matrix(R))
     roll, pitching, yaw = (spatial.matrix_from_rpy(*x) for x in np.diag(angles))
-    too_large, too_small = (spatial.matrix_from_rpy(*(factor * angles)) for factor in (1 / _DEGREE, _DEGREE))
+    too_large, too_small = (
+        spatial.matrix_from_rpy(*np.remainder(factor * angles, 2 * np.pi)) for factor in (1 / _DEGREE, _DEGREE)
+    )
     rows: list[tuple[str, str, dict[str, Any]]] = [
         (kind, f"has no {kind}", {name: np.zeros(joint.type.nv)}) for name, kind in _NUMBERS.items()
     ]
