@@ -159,10 +159,10 @@ class Model(Description):
             manifold.check_quaternions(self, out, name)
         first = out if out.ndim == 1 else out[:1].ravel()
         if first.dot(first) > FAR_SQUARED:
-            self.look_for_degrees(first, name)
+            self._look_for_degrees(first, name)
         return out
 
-    def look_for_degrees(self, q: Array, name: str = "q") -> None:
+    def _look_for_degrees(self, q: Array, name: str = "q") -> None:
         """Warn of an angle beyond two turns in one configuration that a user wrote, once for each model.
 
         Runs turn as they like: a motion that has just come beyond two turns says that the model does, and so does what

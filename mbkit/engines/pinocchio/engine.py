@@ -218,7 +218,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         for name, call in bare.items():
             checked = getattr(self, name)
             sound = _sound(self.model, unread.get(name, set()))
-            direct = _FACTORIES[name](call, checked, sound, lambda q: self.model.look_for_degrees(q))
+            direct = _FACTORIES[name](call, checked, sound, lambda q: self.model._look_for_degrees(q))
             vars(self)[name] = functools.update_wrapper(direct, checked)
 
     def _method(self, quantity: str) -> Callable[..., Any]:
