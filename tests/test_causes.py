@@ -651,3 +651,73 @@ def test_slides_that_follow_each_other_in_another_order_are_an_order_and_no_exch
     assert why.explained or why.agree
     (told,) = (c for c in why.causes if c.kind == "joint order")
     assert not told.acts
+
+
+def rubbing(**numbers: float) -> Model:
+    """Return two hinges, both with a friction of 1 and the second with these numbers."""
+    b, parent = mb.ModelBuilder("rubbing"), "world"
+    for k in range(2):
+        b.add_body(f"b{k}", mass=1.0, com=(0.4, 0, 0), inertia=(0.05, 0.05, 0.05))
+        place = {"axis": (0, 1, 0), "translation": (0.8 * k, 0, 0), "friction": 1.0}
+        b.add_joint(f"j{k}", "revolute", parent=parent, child=f"b{k}", **place, **(numbers if k else {}))
+        parent = f"b{k}"
+    return b.build()
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "kind", "apart"),
+    [
+        ({"stiction": 2.0}, {"stiction": 3.0}, "stiction", 1 / 3),
+        ({}, {"stiction": 3.0}, "stiction", 2 / 3),
+        ({"stiction": 3.0}, {}, "stiction", 2 / 3),
+        # At v_s = 2 mm/s it is 1 + 2 e⁻¹ for 1 + 2 e⁻⁴ of 3.
+        (
+            {"stiction": 3.0, "stribeck_velocity": 1e-3},
+            {"stiction": 3.0, "stribeck_velocity": 2e-3},
+            "Stribeck velocity",
+            2 / 3 * max(np.exp(-0.25) - np.exp(-1), np.exp(-1) - np.exp(-4)),
+        ),
+    ],
+)
+def test_friction_at_rest_and_its_curve_are_compared(one, other, kind, apart) -> None:
+    found = mb.explain(rubbing(**one), rubbing(**other))
+    assert not found.agree
+    assert found.explained
+    (cause,) = found.causes
+    assert (cause.kind, cause.subject) == (kind, "joint 'j1'")
+    assert cause.effects["dry friction"] == pytest.approx(apart, rel=1e-12)
+    with pytest.raises(AssertionError, match=kind):
+        assert_same_dynamics(rubbing(**one), rubbing(**other))
+    # A stiction that is the friction is none.
+    assert mb.explain(rubbing(stiction=1.0), rubbing()).agree
+
+
+def test_every_number_of_a_joint_and_a_frame_is_compared_or_named() -> None:
+    b = mb.ModelBuilder("full")
+    for k in range(2):
+        b.add_body(f"b{k}", mass=1.0, com=(0.4, 0.1, 0), inertia=(0.05, 0.06, 0.07))
+    numbers = dict.fromkeys(("armature", "damping", "friction", "stiffness", "rest"), 1.0)
+    numbers |= {"stiction": 2.0, "stribeck_velocity": 0.1, "pitch": 0.1, "lower": -2.0, "upper": 2.0}
+    numbers |= {"velocity_limit": 5.0, "effort_limit": 9.0}
+    b.add_joint("screw", "helical", parent="world", child="b0", axis=(0, 0, 1), translation=(0.1, 0.2, 0.3), **numbers)
+    place = {"axis": (0, 1, 0), "translation": (0.5, 0, 0)}
+    b.add_joint("hinge", "revolute", parent="b0", child="b1", mimic=("screw", 2.0, 0.1), **place)
+    b.add_frame("tip", body="b1", translation=(0.2, 0, 0))
+    model = b.build()
+    screw, hinge = model.joints
+    R = spatial.matrix_from_rpy(0.1, 0.2, 0.3)
+    changed = {f.name: {f.name: 0.9 * getattr(screw, f.name)} for f in fields(Joint) if f.name not in WORDS}
+    changed |= {"rotation": {"rotation": R}, "axes": {"axes": np.array([[0.0, 0.6, 0.8]])}}
+    assert {*changed} == {f.name for f in fields(Joint)} - WORDS
+    others = [replace(model, joints=(replace(screw, **x), hinge)) for x in changed.values()]
+    follows = (Mimic("screw", 3.0, 0.1), Mimic("screw", 2.0, 0.2), None)
+    others += [replace(model, joints=(screw, replace(hinge, mimic=x))) for x in follows]
+    others += [replace(model, frames=(replace(model.frames[0], translation=np.ones(3)),))]
+    for other in others:
+        found = mb.explain(model, other)
+        assert found.causes or found.notes
+        assert found.explained
+    assert "named frames that stand elsewhere, which changes no term: tip" in found.notes
+
+
+WORDS = {"name", "kind", "parent", "child", "mimic"}

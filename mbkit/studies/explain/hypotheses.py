@@ -18,6 +18,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Joint, Mimic, Model
+from mbkit.model.changes.dry_friction import FrictionNumbers
 from mbkit.model.elements.formula import NUMPY
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
 from mbkit.model.parts import Coupler, Loop
@@ -33,6 +34,8 @@ _URDF: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _MJCF: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 #: Numbers per velocity, and what they are called.
 _NUMBERS: Final = {"armature": "armature", "damping": "damping", "friction": "friction", "stiffness": "spring"}
+#: Numbers of dry friction that a joint may lack.
+_OF_FRICTION: Final = {"stiction": "stiction", "stribeck_velocity": "Stribeck velocity"}
 _LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
 _LOOPS: Final = "loops"
 #: Parts of the whole: section, key, kind of the difference, noun.
@@ -407,6 +410,11 @@ def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> list[Mistake]:
         if not near.numbers(ours, theirs):
             rest = {"rest": b.rest} if name == "stiffness" else {}
             out.append(Mistake(kind, _other_number(name, ours, theirs), {name: theirs} | rest))
+    laws = [FrictionNumbers.of([x]) for x in (a, b)]
+    for (name, kind), ours, theirs in zip(_OF_FRICTION.items(), *(x[1:] for x in laws), strict=True):
+        # Without stiction, that is the friction, and no other difference.
+        if not (near.numbers(ours, theirs) or getattr(a, name) is getattr(b, name) is None):
+            out.append(Mistake(kind, _other_number(kind, ours, theirs), {name: getattr(b, name)}))
     if a.stiffness.any() and near.numbers(a.stiffness, b.stiffness) and not near.vector(a.rest, b.rest):
         says = f"has the spring at rest at {number_text(b.rest)}, not {number_text(a.rest)}"
         out.append(Mistake("spring", says, {"rest": b.rest}))

@@ -179,7 +179,7 @@ class _Descriptions:
             only_a=matching.only_a,
             only_b=matching.only_b,
             causes=causes,
-            notes=tuple(_notes(one, moved_frames, matching)),
+            notes=(*_notes(one, moved_frames, matching), *_named_frames(self.a, self.b, near)),
             explained=explained,
             left=after.terms,
             subtree=() if explained else terms.minimal_differing_subtree(changed.model, differs),
@@ -224,7 +224,8 @@ class _Descriptions:
         if a.velocity_names != b.velocity_names or not a.nv:
             return Gaps(comparable=False)
         at = states_of(b, self.samples, self.seed)
-        return terms.gaps(model_terms(a, at), model_terms(b, at), at.v, owners(a))
+        out = terms.gaps(model_terms(a, at), model_terms(b, at), at.v, owners(a))
+        return replace(out, terms=(*out.terms, *terms.friction_gap(a, b, owners(a))))
 
     def _gaps_by_name(self, one: MergedModel, other: MergedModel) -> Gaps | None:
         """Return the differences of terms with joints matched by name, where the names are the same."""
@@ -304,6 +305,19 @@ def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) ->
     by_structure = sum(m.how == "structure" for m in matching.pairs)
     if by_structure:
         yield f"{by_structure} of {len(matching.pairs)} joints were matched by structure, the others by name"
+
+
+def _named_frames(a: Model, b: Model, near: Tolerances) -> Iterator[str]:
+    """Yield the frames of one name and body that stand elsewhere on it; descriptions are compared without frames."""
+    there = {(f.name, f.body): f for f in b.frames}
+    pairs = [(f, there[f.name, f.body]) for f in a.frames if (f.name, f.body) in there]
+    placed = (
+        x.name
+        for x, y in pairs
+        if not (near.vector(x.rotation, y.rotation) and near.point(x.translation, y.translation))
+    )
+    if names := ", ".join(placed):
+        yield f"named frames that stand elsewhere, which changes no term: {names}"
 
 
 def _summarized_differences(one: MergedModel, other: MergedModel, near: Tolerances) -> list[Hypothesis]:

@@ -14,6 +14,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NonPhysicalWarning, NumericalError
 from mbkit.model import JointCoupling, Model
+from mbkit.model.changes.dry_friction import DryFrictionLaw, FrictionNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
 
@@ -121,6 +122,21 @@ def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
         # A NaN would be lost in a maximum.
         out.append(Gap(term, np.inf if np.isnan(largest) else largest, joint))
     return Gaps(tuple(out))
+
+
+def friction_gap(a: Model, b: Model, joints: Sequence[str]) -> Iterator[Gap]:
+    """Yield the difference of dry friction at rest and about the Stribeck velocities, which random states miss.
+
+    Each velocity's is relative to its own friction.
+    """
+    numbers = [FrictionNumbers.of(x.joints) for x in (a, b)]
+    if all((x.bound == x.sliding).all() for x in numbers):
+        return
+    speeds = np.unique(np.concatenate([x.stribeck for x in numbers]))[:, None] * np.ones(a.nv)
+    ours, theirs = (np.vstack([law.bound, -law.force_at(speeds)]) for law in map(DryFrictionLaw, (a, b)))
+    size = np.maximum(ours, theirs).max(axis=0)
+    apart = np.abs(ours - theirs).max(axis=0) / np.where(size > 0, size, 1.0)
+    yield Gap("dry friction", float(apart.max()), joints[int(np.argmax(apart))])
 
 
 def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
