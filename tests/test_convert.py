@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import mbkit as mb
 from mbkit import spatial
 from mbkit.cli import cli
 from mbkit.engines.mujoco.mjcf_writer import mjcf_text, read_back
-from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, MbkitError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.load import xml_reader
 from tests.random_trees import IN_MUJOCO, random_tree
 
@@ -111,6 +112,45 @@ def test_all_that_a_format_cannot_say_is_named_at_once() -> None:
         mb.convert("panda", "mjcf")  # type: ignore[arg-type]
     with pytest.raises(OutputError, match="kept"):
         mb.convert(mb.catalog.pendulum(), "mjcf").write("/nowhere/at/all.xml")
+
+
+@pytest.mark.parametrize("to", ["urdf", "mjcf"])
+def test_a_number_of_a_joint_is_read_back_or_named(to: str, tmp_path: Path) -> None:
+    """Whatever is not in the file is in an error, or in a note where it moves nothing."""
+    each = ("armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
+    numbers = [{name: 2.0} for name in each] + [{"effort_limit": 0.0}, {"upper": 1.5, "lower": -1.0}]
+    numbers += [{"friction": 1.0, "stiction": 2.0}, {"friction": 1.0, "stiction": 2.0, "stribeck_velocity": 0.1}]
+    numbers += [{"friction": 1.0, "stiction": 1.0}]
+    kinds = ("revolute", 1), ("continuous", 1), ("prismatic", 1), ("planar", 3), ("free", 6)
+    for (kind, n), given in itertools.product(kinds, numbers):
+        b = mb.ModelBuilder("one")
+        b.add_body("body", mass=1.0, com=(0.1, 0.2, 0.3), inertia=(0.1, 0.2, 0.25))
+        how: dict[str, object] = {"axis": (0, 0, 1)} if n == 1 else {}
+        try:
+            b.add_joint("j", kind, parent="world", child="body", **how, **{k: [x] * n for k, x in given.items()})
+            model = b.build()
+        except MbkitError:
+            # No such joint.
+            continue
+        if model.joint("j").sticks:
+            with pytest.raises(UnsupportedError, match="joint 'j' has stiction above its friction"):
+                mb.convert(model, to)
+            continue
+        try:
+            made = mb.convert(model, to)
+        except UnsupportedError as error:
+            named = str(error)
+        else:
+            named = " ".join(made.notes)
+            if to == "urdf" or n == 1:
+                back = mb.load(made.write(tmp_path / f"one.{to.replace('mjcf', 'xml')}"), gravity=model.gravity)
+                found = mb.explain(model, back)
+                assert found.agree
+                if not found.causes:
+                    continue
+        if to == "urdf" or given.keys() & {"velocity_limit", "effort_limit"}:
+            lacks = {"velocity_limit": "limits", "effort_limit": "limits", "upper": "limits", "stiffness": "spring"}
+            assert any(lacks.get(x, x) in named for x in given), (kind, given, named)
 
 
 def test_roll_pitch_yaw_are_those_of_the_matrix_next_to_a_right_angle_too() -> None:

@@ -58,9 +58,12 @@ def _unsupported(model: Model) -> Iterator[str]:
             yield f"{item} has armature"
         if joint.stiffness.any():
             yield f"{item} has a spring"
+        if joint.sticks:
+            yield f"{item} has stiction above its friction"
         if joint.type.nv > 1 and (joint.damping.any() or joint.friction.any()):
             yield f"{item} is {joint.kind} and has damping or friction"
-        if joint.type.nv > 1 and np.isfinite([joint.lower, joint.upper]).any():
+        limits = joint.lower, joint.upper, joint.velocity_limit, joint.effort_limit
+        if joint.type.nv > 1 and any(np.isfinite(x).any() for x in limits):
             yield f"{item} is {joint.kind} and has limits"
     yield from (f"spring {s.name!r} between two points" for s in model.springs)
     yield from (f"coupling {c.name!r} between joints" for c in model.couplings)
@@ -89,8 +92,10 @@ def _link(body: Body) -> str:
 
 
 def _joint(joint: Joint) -> str:
-    bounded = joint.kind == "prismatic" or (joint.kind == "revolute" and np.isfinite([joint.lower, joint.upper]).any())
-    type_ = _TYPES[joint.kind] if joint.kind != "revolute" or bounded else "continuous"
+    turns, limited = joint.kind in ("revolute", "continuous"), np.isfinite([joint.lower, joint.upper]).any()
+    bounded = joint.kind == "prismatic" or (turns and limited)
+    # A continuous joint of URDF has no limits.
+    type_ = ("revolute" if limited else "continuous") if turns else _TYPES[joint.kind]
     out = _ends(joint.rotation, joint.translation, joint.parent, joint.child)
     if joint.kind == "planar":
         out.append(_element("axis", {"xyz": "0 0 1"}))

@@ -184,6 +184,11 @@ class Joint(_Frozen):
         """The formulas of this joint's type."""
         return kind_of(self.kind)
 
+    @property
+    def sticks(self) -> bool:
+        """Whether its friction at rest may be above that of motion."""
+        return self.stiction is not None and bool((self.stiction > self.friction).any())
+
     def _shape(self, name: str) -> tuple[int, ...] | None:
         type_ = self.type
         if name == "axes":

@@ -86,7 +86,8 @@ def convert(model: Model, to: str) -> Converted:
     Raises
     ------
     UnsupportedError
-        The format cannot say it; everything that it cannot say is named.
+        The format cannot say what moves it; everything that it cannot say is named. Limits of velocity and effort,
+        which act in no term, are notes where MJCF lacks them.
     MbkitError
         What was read back differs, with the reason.
 
@@ -139,10 +140,11 @@ def _to_mjcf(model: Model) -> Converted:
         notes.append("MuJoCo acts on joint limits, softly, which mbkit's terms leave out")
     if model.needs.friction:
         notes.append("MuJoCo's dry friction is soft; mbkit's holds exactly at rest")
-    if any(j.stiction is not None for j in model.joints):
-        notes.append("MJCF has no static friction and no Stribeck curve")
     if any(np.isfinite(j.velocity_limit).any() for j in model.joints):
         notes.append("MJCF has no velocity limits")
+    efforts = ((j.name, j.effort_limit[np.isfinite(j.effort_limit)]) for j in model.joints)
+    if lost := [name for name, x in efforts if len(x) and (model.joint(name).type.nv > 1 or not x.all())]:
+        notes.append(f"MJCF has no effort limits of zero or of several velocities at once: {', '.join(lost)}")
     # Bodies whose moments MuJoCo would not take as they are.
     moments = {b.name: np.linalg.eigvalsh(b.inertia) for b in model.bodies if b.mass}
     lifted = [repr(name) for name, (low, middle, high) in moments.items() if low < 1e-15 or low + middle < high]

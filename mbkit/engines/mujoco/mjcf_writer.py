@@ -70,6 +70,8 @@ def _unsupported(model: Model) -> Iterator[str]:
         # What follows another type is told with it.
         if joint.kind not in JOINT_TYPES and not joint.mimic:
             yield f"{name} is {joint.kind}{joint.type.instead and f' ({joint.type.instead})'}"
+        if joint.sticks:
+            yield f"{name} has stiction above its friction"
         parts = [joint.damping] if joint.kind == "ball" else np.split(joint.damping, 2) if joint.kind == "free" else []
         if any(np.ptp(x) > 0 for x in parts):
             yield f"{name} is damped differently along its body axes"

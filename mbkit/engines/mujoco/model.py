@@ -150,7 +150,7 @@ class Placed:
 
 def _require_friction_loss(description: Model) -> None:
     """Raise `UnsupportedError` for dry friction that MuJoCo's friction loss is not."""
-    curves = [j.name for j in description.joints if j.stiction is not None and np.any(j.stiction > j.friction)]
+    curves = [j.name for j in description.joints if j.sticks]
     why = (
         f"no static friction and no Stribeck curve, which {first_names(map(repr, curves))} has"
         if curves
