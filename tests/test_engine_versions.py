@@ -24,7 +24,7 @@ from mbkit._child_process import end_all
 from mbkit.engines.registry import find_engine
 from mbkit.engines.versions import environment, process
 from mbkit.engines.versions.dynamics import VersionDynamics
-from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion, versions_of
+from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion, made_of, versions_of
 from mbkit.engines.versions.remote import serve
 from mbkit.errors import EngineProcessError, InputError, MbkitError, UnknownNameError, UnsupportedError
 from mbkit.studies._targets import engine_names
@@ -315,6 +315,16 @@ def test_an_environment_is_made_once_and_whole(installer, environments):
     assert mb.engine("mujoco==9.9").installed
     environment.remove("mujoco", "9.9")
     assert not mb.engine("mujoco==9.9").installed
+
+
+def test_environments_of_other_packages_are_no_versions_and_candidates_come_before_their_release(environments):
+    for name in ("3.10.0", "3.9.0", "4.0.0", "4.0.0rc1", "4.0.0.post1", "mjx-3.17.0", "warp-4.0.0"):
+        script(environment.python_of(environment.place("mujoco", name)), "exit 0")
+    assert environment.made("mujoco") == ["3.9.0", "3.10.0", "4.0.0rc1", "4.0.0", "4.0.0.post1"]
+    assert environment.made("mujoco-mjx") == ["3.17.0"]
+    assert made_of("mujoco") == tuple(environment.made("mujoco"))
+    with pytest.raises(InputError, match=r"mujoco==3\.12\.0"):
+        mb.engine("mujoco==3.x")
 
 
 def test_two_at_once_build_one(installer):

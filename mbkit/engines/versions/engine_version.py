@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from packaging.version import Version
+
 from mbkit._check import WORLD, real
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.versions import environment
@@ -216,7 +218,7 @@ def engine(name: str, *, seconds: float | None = None) -> EngineVersion:
     head, _, version = (part.strip() for part in name.partition("=="))
     if head not in PACKAGES:
         raise UnknownNameError("engine with versions", head, PACKAGES)
-    if not _VERSION.fullmatch(version):
+    if not (_VERSION.fullmatch(version) and environment.parsed(version)):
         raise InputError(f"name: {form}, got {name!r}")
     limit = PACKAGES[head].limit if seconds is None else real("seconds", seconds, positive=True)
     return EngineVersion(head, version, limit)
@@ -251,9 +253,11 @@ def remote_engines() -> tuple[str, ...]:
     return tuple(name for name, package in PACKAGES.items() if package.tested)
 
 
-def order_of(version: str) -> tuple[int, ...]:
-    """Return the numbers of a version, by which versions are in order."""
-    return tuple(int(x) for x in re.findall(r"\d+", version))
+def order_of(version: str, what: str = "version") -> Version:
+    """Return a version by which versions are in order; raise `InputError` for a text that is none."""
+    if order := environment.parsed(version):
+        return order
+    raise InputError(f"{what}: expected a version such as '3.3', got {version!r}")
 
 
 def versions_of(name: str) -> tuple[str, ...]:
@@ -263,4 +267,4 @@ def versions_of(name: str) -> tuple[str, ...]:
 
 def made_of(name: str) -> tuple[str, ...]:
     """Return the versions of an engine that have an environment, oldest first."""
-    return tuple(sorted(environment.made(PACKAGES[name].distribution), key=order_of))
+    return tuple(environment.made(PACKAGES[name].distribution))

@@ -19,6 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
+from packaging.version import InvalidVersion, Version
 from platformdirs import user_cache_path
 
 from mbkit.errors import OutputError, UnknownNameError, UnsupportedError
@@ -63,10 +64,18 @@ def python_of(environment: Path) -> Path:
 
 
 def made(distribution: str) -> list[str]:
-    """Return the versions that have an environment, in any order."""
+    """Return the versions that have an environment, oldest first; not those of ``name-more`` where it is ``name``."""
     names = (path.name for path in folder().glob(place(distribution, "*").name))
     versions = [name.removeprefix(f"{distribution}-").rpartition("-")[0] for name in names]
-    return [version for version in versions if exists(distribution, version)]
+    return sorted((x for x in versions if parsed(x) and exists(distribution, x)), key=Version)
+
+
+def parsed(version: str) -> Version | None:
+    """Return a version that can be compared with others; None of a text that is no version."""
+    try:
+        return Version(version)
+    except InvalidVersion:
+        return None
 
 
 def exists(distribution: str, version: str) -> bool:

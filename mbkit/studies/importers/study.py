@@ -43,6 +43,7 @@ from mbkit.model import Coupler, Loop, Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.model.elements.forces import by_functions
 from mbkit.model.joint_numbers import owners
+from mbkit.model.model import unchecked
 from mbkit.model.validation import listing
 from mbkit.studies import results
 from mbkit.studies.explain.hypotheses import angle_of, number_text
@@ -516,7 +517,9 @@ def _compared(
         names=(label, engine),
         **asked,
     )
-    compared = stages(reference, loops, imported, **asked)
+    # Links that are fused may be matter that cannot be, as the file or the importer has it.
+    with unchecked():
+        compared = stages(reference, loops, imported, **asked)
     causes, idle, held = own_terms(engine, imported, **asked)
     if isinstance(reference, Imported):
         theirs, _, also = own_terms(label, reference, **asked)

@@ -142,12 +142,10 @@ def _chosen(engine: str, versions: Iterable[str] | None, first: str, last: str) 
     if versions is not None:
         names = list(names_of("versions", versions))
         return sorted((named_version(f"{engine}=={x}") for x in names), key=lambda x: order_of(x.version))
-    for what, value in (("first", first), ("last", last)):
-        if value and value != LATEST and not order_of(value):
-            raise InputError(f"{what}: expected a version such as '3.3', got {value!r}")
+    # 4.0 as the last one takes 4.0.1.
+    low, high = order_of(first or "0", "first"), () if last in ("", LATEST) else order_of(last, "last").release
     known = versions_of(engine)
-    low, high = order_of(first), () if last == LATEST else order_of(last)
-    out = [x for x in known if low <= order_of(x) and order_of(x)[: len(high)] <= high]
+    out = [x for x in known if low <= order_of(x) and order_of(x).release[: len(high)] <= high]
     if not out:
         raise UnknownNameError(f"version of {engine}", f"{first or 'the first'} to {last}", known, every=True)
     return [named_version(f"{engine}=={x}") for x in out]
