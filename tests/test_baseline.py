@@ -678,3 +678,21 @@ def test_poses_and_velocities_of_named_frames_are_numbers_too(tmp_path: Path, mo
     assert [r.term for r in result.moved] == ["frames"]
     assert result.moved[0].joint in made.frames
     assert result.moved[0].error > 1e-8
+
+
+def test_a_renamed_link_moves_no_frame(tmp_path: Path) -> None:
+    """The frame of a tool that is fixed to it has another host by name alone."""
+    text = (
+        '<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>'
+        '<inertia ixx="0.02" iyy="0.03" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link><link name="tool"/>'
+        '<joint name="hinge" type="continuous"><parent link="base"/><child link="arm"/></joint>'
+        '<joint name="mount" type="fixed"><origin xyz="0.3 0 0"/><parent link="arm"/><child link="tool"/></joint></robot>'
+    )
+    path, file = tmp_path / "r.urdf", tmp_path / "r.toml"
+    path.write_text(text, encoding="utf-8")
+    mb.baseline.record(mb.load(path), file, ["pinocchio"], samples=1)
+    path.write_text(text.replace('"arm"', '"upper"'), encoding="utf-8")
+    result = mb.baseline.check(mb.load(path), file)
+    assert result.effect == "no term moves (pinocchio)"
+    path.write_text(text.replace("0.3 0 0", "0.4 0 0").replace('"arm"', '"upper"'), encoding="utf-8")
+    assert "tool most, by 0.1 m and 0 rad" in mb.baseline.check(mb.load(path), file).effect

@@ -227,6 +227,8 @@ def test_bad_input_is_one_message():
     assert out.stderr.count("\n") == 1
     assert "'kepler'" in out.stderr
     assert "exclude each other" in derive("pendulum", "--json", "--latex", status=2).stderr
+    said = derive("pendulum", "--python", "--latex", "--c", status=2).stderr
+    assert all(x in said for x in ("--python", "--latex", "--c", "exclude each other"))
     assert "the function failed" in derive("json:dumps", status=2).stderr
 
 

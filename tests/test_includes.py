@@ -110,6 +110,19 @@ def test_files_are_found_and_placed_as_mujoco_does(content: dict[str, str], name
     assert any("outside" in note for note in model.notes) == any(name.startswith("..") for name in content)
 
 
+@pytest.mark.parametrize(
+    "text",
+    ["hunter2: x\n", "<hunter2/>", "<vault><key>hunter2 & more</key></vault>", "<vault>\n  <key>hunter2</vault>"],
+)
+def test_text_of_a_file_that_is_no_description_is_not_quoted(text: str, tmp_path: Path) -> None:
+    main = files(tmp_path / "here", main=world(include("../kept.txt")))
+    (tmp_path / "kept.txt").write_text(text, encoding="utf-8")
+    with pytest.raises(MbkitError) as error:
+        mb.load(main)
+    assert "kept.txt" in str(error.value)
+    assert "hunter2" not in str(error.value)
+
+
 WRONG = {
     "missing": ({"main": world(include("s/a.xml")), "s__a": inside("\n\n" + include("b.xml"))}, "s/a.xml, line 3: <include file=\"b.xml\">: no such file in .* or .*s"),
     "twice": ({"main": world(include("a.xml") + include("./a.xml")), "a": inside("<geom size='1'/>")}, "line 1: <include file=\"./a.xml\">: was included before"),
@@ -117,7 +130,7 @@ WRONG = {
     "cycle": ({"main": world(include("s/a.xml")), "s__a": inside(include("b.xml")), "s__b": inside(include("s/a.xml"))}, "s/b.xml, line 1: .*included before"),
     "folder": ({"main": world(include("s")), "s__a": inside(body("a"))}, "line 1: <include file=\"s\">: .*this is a folder"),
     "no_xml": ({"main": world(include("a.xml")), "a": "root:x:0:0"}, "line 1: <include file=\"a.xml\">: .*a.xml: line 1, column 1: not well-formed"),
-    "empty": ({"main": world(include("a.xml")), "a": "<x/>"}, "<x> in it is empty"),
+    "empty": ({"main": world(include("a.xml")), "a": "<x/>"}, "its root element is empty"),
     "doctype": ({"main": world(include("a.xml")), "a": "<!DOCTYPE x []><x/>"}, "DOCTYPE"),
     "no_name": ({"main": world("<include/>")}, "line 1: <include>: no file"),
     "not_empty": ({"main": world('<include file="a.xml"><geom/></include>'), "a": inside(body("a"))}, "elements of its own"),

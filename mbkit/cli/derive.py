@@ -31,9 +31,9 @@ _C_FOLDER: Final = "mbkit-export"
     "mbkit derive kepler --python",
 )
 @click.argument("system")
-@click.option("--latex", "form", flag_value="latex", help="Print LaTeX.")
-@click.option("--python", "form", flag_value="python", help="Print a Python module that needs NumPy only.")
-@click.option("--c", "form", flag_value="c", help="Write C99, as mbkit export does.")
+@click.option("--latex", is_flag=True, help="Print LaTeX.")
+@click.option("--python", is_flag=True, help="Print a Python module that needs NumPy only.")
+@click.option("--c", is_flag=True, help="Write C99, as mbkit export does.")
 @click.option(
     "--program",
     "quantity",
@@ -53,13 +53,13 @@ _C_FOLDER: Final = "mbkit-export"
 @shared.force_option
 def derive(
     system: str,
-    form: str | None,
     quantity: str | None,
     options: dict[str, Any],
     snap: float,
     as_json: bool,
     out: Path | None,
     force: bool,
+    **forms: bool,
 ) -> None:
     """Print T, V, M, C, g and the equation of motion of SYSTEM, and what it conserves.
 
@@ -68,6 +68,10 @@ def derive(
     have the same name, NAME is the catalog's, or paper's where the catalog's has a quaternion or a loop;
     mbkit.catalog:NAME and mbkit.lagrangian.systems:NAME are always the one and the other.
     """
+    given = [name for name, on in forms.items() if on]
+    if len(given) > 1:
+        raise click.UsageError(f"{' and '.join(f'--{name}' for name in given)} exclude each other; give one")
+    form = given[0] if given else None
     if as_json and quantity:
         raise click.UsageError("--json and --program exclude each other; --program has --python, --latex and --c")
     if as_json and form:

@@ -34,6 +34,8 @@ _BLANK: Final = b" \t\r\n\xef\xbb\xbf"
 
 #: expat's "syntax error" and "not well-formed (invalid token)" do not name the character.
 _VAGUE: Final = (2, 4)
+#: First elements of descriptions.
+_ROOTS: Final = ("robot", "mujoco", "mujocoinclude", "sdf")
 
 
 @dataclass(eq=False, slots=True)
@@ -173,7 +175,11 @@ def parse(content: bytes, name: str) -> Element:
     try:
         parser.Parse(content, True)
     except expat.ExpatError as error:
-        why = _unexpected(content, parser.ErrorByteIndex)
+        # A file that is no description, which an <include> may name, is not quoted.
+        known = bool(roots) and roots[0].tag in _ROOTS
+        why = (
+            _unexpected(content, parser.ErrorByteIndex) if known else f"it begins with none of <{'>, <'.join(_ROOTS)}>"
+        )
         if error.code not in _VAGUE or not why:
             why = expat.errors.messages.get(error.code, str(error))
         raise LoadError(f"{name}: line {error.lineno}, column {error.offset + 1}: not well-formed XML: {why}") from None
@@ -443,7 +449,7 @@ class _Includes:
         if self.bytes > MOST_BYTES:
             self._refuse(include, f"expected up to {MOST_BYTES} bytes of included files")
         if not root.children:
-            self._refuse(include, f"<{root.tag[:60]}> in it is empty; expected elements inside")
+            self._refuse(include, "its root element is empty; expected elements inside")
         folder = self.path.parent
         file = str(path.relative_to(folder) if path.is_relative_to(folder) else path)
         for element in root.walk():

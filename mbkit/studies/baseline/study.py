@@ -585,12 +585,14 @@ def _effect(recorded: Baseline, model: Model, changed: tuple[Change, ...]) -> st
 
 
 def _moved_frames(recorded: Baseline, model: Model) -> str:
-    """Return how far the poses of named frames moved on their bodies; empty where none did."""
+    """Return how far the poses of named frames moved on their bodies, renamed or not; empty where none did."""
+    carried = {part["child"]: name for name, part in recorded.description.get("joints", {}).items()}
+    bodies = {j.name: j.child for j in model.joints}
     far: dict[str, tuple[float, float]] = {}
     old, new = recorded.description.get("frames", {}), described(model).get("frames", {})
     for name in [n for n in old if n in new]:
         before, after = (_placed(side, name) for side in (old, new))
-        if before[0] != after[0]:
+        if bodies.get(carried.get(before[0], ""), before[0]) != after[0]:
             far[name] = np.inf, np.inf
         turn = spatial.log_quaternion(spatial.quaternion_from_matrix(before[2].T @ after[2]))
         moved = float(np.linalg.norm(after[1] - before[1])), float(np.linalg.norm(turn))
