@@ -16,7 +16,7 @@ from mbkit.lagrangian.from_description import from_model
 from mbkit.lagrangian.printing.catalog_symbols import in_symbols, letters
 from mbkit.lagrangian.system import QuasiLagrangian
 from mbkit.lagrangian.trig.shortest_form import number
-from mbkit.lagrangian.trig.simplify import forms, tidy
+from mbkit.lagrangian.trig.simplify import forms, settled, tidy
 from mbkit.model.parts import Loop, Prescribed
 from mbkit.spatial import matrix_from_quaternion
 from tests.random_trees import off, random_tree, states
@@ -447,3 +447,11 @@ def test_loops_are_written_out_beyond_what_anybody_reads():
     # The first coupler has no mass, and the loop moves it.
     lag = from_model(b.build())
     assert (len(lag.coordinates), len(lag.constraints)) == (25, 24)
+
+
+def test_angles_that_cancel_are_left_out_and_signs_stay():
+    turned = x * (sp.sin(a) * sp.cos(b) - sp.cos(a) * sp.sin(b)) ** 2 + x * sp.cos(a - b) ** 2 + sp.sin(c)
+    assert settled(turned) == x + sp.sin(c)
+    # 1 or -1: the slope is zero, and the value is not known.
+    sign = sp.cos(a) / sp.sqrt(sp.cos(a) ** 2)
+    assert settled(sign).has(a)

@@ -240,6 +240,85 @@ def test_quasi_velocities_by_definition_give_the_textbook_sleigh(way) -> None:
     assert r"\dot{\omega}" in e.latex()
 
 
+A, B, C, D, E = sp.symbols("A B C D E")
+#: Body rates of z-x-z angles.
+RATES = sp.Matrix(
+    [
+        s * sp.sin(theta) * sp.sin(phi) + w * sp.cos(phi),
+        s * sp.sin(theta) * sp.cos(phi) - w * sp.sin(phi),
+        s * sp.cos(theta) + u,
+    ]
+)
+BODY = {"O1": RATES[0], "O2": RATES[1]}
+
+
+def suslov(weight: float = 0, **numbers: float) -> Lagrangian:
+    """A rigid body about a fixed point that does not turn about its third axis."""
+    inertia = sp.Matrix([[A, 0, D], [0, B, E], [D, E, C]])
+    lag = Lagrangian(
+        RATES.dot(inertia * RATES) / 2,
+        weight * m * g * r * sp.cos(theta),
+        [psi, theta, phi],
+        [s, w, u],
+        parameters=[A, B, C, D, E, *([m, g, r] if weight else [])],
+        velocity_constraints=[RATES[2]],
+    )
+    return lag.substituted({sp.Symbol(name): sp.Rational(x).limit_denominator(10) for name, x in numbers.items()})
+
+
+def coin() -> Lagrangian:
+    T = m * (xdot**2 + ydot**2) / 2 + J * u**2 / 2 + I1 * s**2 / 2
+    rows = [xdot - r * sp.cos(psi) * u, ydot - r * sp.sin(psi) * u]
+    return Lagrangian(T, 0, [x, y, phi, psi], parameters=[m, J, I1, r], velocity_constraints=rows)
+
+
+def car() -> Lagrangian:
+    """A bicycle's plane model with a steered front wheel: the centre of mass at `a` before the rear axle."""
+    speed = (xdot - a * sp.sin(theta) * w) ** 2 + (ydot + a * sp.cos(theta) * w) ** 2
+    T = m * speed / 2 + J * w**2 / 2 + I1 * (w + s) ** 2 / 2
+    rear = ydot * sp.cos(theta) - xdot * sp.sin(theta)
+    front = ydot * sp.cos(theta + psi) - xdot * sp.sin(theta + psi) + r * sp.cos(psi) * w
+    return Lagrangian(T, 0, [x, y, theta, psi], parameters=[m, J, I1, a, r], velocity_constraints=[rear, front])
+
+
+ON_ONE_PAGE = {
+    "suslov": (suslov, BODY),
+    "suslov in numbers": (lambda: suslov(A=2, B=3, C=4, D=0.3, E=-0.2), BODY),
+    "heavy suslov": (lambda: suslov(1), BODY),
+    "sleigh": (sleigh, HEADING),
+    "sleigh in rates": (sleigh, None),
+    "disc": (disc, None),
+    "disc in body rates": (disc, {"w1": w, "w2": u * sp.cos(theta), "w3": s + u * sp.sin(theta)}),
+    "knife": (knife, {"v": HEADING["v"], "omega": w}),
+    "coin": (coin, None),
+    "car": (car, {"v": HEADING["v"], "sigma": s}),
+    "ball on a table": (ball, None),
+}
+
+
+@pytest.mark.thorough("ball on a table", "suslov in numbers", "car")
+@pytest.mark.parametrize("name", ON_ONE_PAGE)
+def test_the_three_eliminations_print_the_same_text(name) -> None:
+    make, rates = ON_ONE_PAGE[name]
+    lag = make()
+    made = [getattr(lag, way)(rates) for way in WAYS]
+    for texts in ([str(e) for e in made], [e.latex() for e in made], [str(e.reactions) for e in made]):
+        assert max(map(len, texts)) <= 1.5 * min(map(len, texts))
+
+
+def test_suslov_s_body_has_two_short_equations() -> None:
+    """I ω̇ + ω x I ω = λ e3 with ω3 = 0 (Suslov 1946; Bloch 2003, ch. 8.6)."""
+    lag = suslov()
+    for way in WAYS:
+        e = getattr(lag, way)(BODY)
+        (O1, O2), (Odot1, Odot2) = e.velocities, e.accelerations
+        rows = [A * Odot1 + O2 * (D * O1 + E * O2), B * Odot2 - O1 * (D * O1 + E * O2)]
+        assert [sp.expand(eq.lhs - eq.rhs - row) for eq, row in zip(e.equations(), rows, strict=True)] == [0, 0]
+        held = D * Odot1 + E * Odot2 + (B - A) * O1 * O2
+        assert sp.expand(e.reactions[0] - held) == 0
+        assert len(str(e)) < 70
+
+
 def test_the_reduced_form_runs_to_the_same_end() -> None:
     lag = disc()
     e, q = lag.maggi(), [0.1, 0.2, 0.3, 0.2, 0.4]

@@ -29,7 +29,7 @@ from mbkit.lagrangian.energies.symbols import (
     undefined,
     velocity_of,
 )
-from mbkit.lagrangian.trig.simplify import gradient, is_zero, tidy, tidy_matrix
+from mbkit.lagrangian.trig.simplify import gradient, is_zero, settled, tidy, tidy_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class QuasiVelocities:
                 # [D_i, D_j] in the frame that D's columns are.
                 bracket = self.W * (slopes[j] * D[:, i] - slopes[i] * D[:, j])
                 for k, x in enumerate(bracket):
-                    out[k, i, j] = tidy(x)
+                    out[k, i, j] = settled(x)
                     out[k, j, i] = -out[k, i, j]
         return sp.ImmutableDenseNDimArray(out)
 

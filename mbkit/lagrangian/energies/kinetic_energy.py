@@ -13,7 +13,7 @@ import sympy as sp
 
 from mbkit._warn import warn
 from mbkit.errors import InputError, MbkitWarning
-from mbkit.lagrangian.trig.simplify import DIGITS, LARGE, RandomEvaluation, tidy
+from mbkit.lagrangian.trig.simplify import DIGITS, LARGE, RandomEvaluation, settled, tidy
 
 #: Lines through the velocities, and places on each.
 _LINES: Final = 4
@@ -180,7 +180,7 @@ def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
     out = sp.zeros(*A.shape)
     for block in blocks(A):
         part = A.extract(block, block)
-        det = tidy(part.det(method="berkowitz"))
+        det = settled(part.det(method="berkowitz"))
         if det == 0:
             raise InputError(f"{what}: {part.tolist()} is singular everywhere")
         if len(block) <= _BY_COFACTORS:
@@ -189,7 +189,7 @@ def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
             turned = part.LUsolve(sp.eye(len(block)))
         for i, row in enumerate(block):
             for j, column in enumerate(block):
-                out[row, column] = tidy(turned[i, j])
+                out[row, column] = settled(turned[i, j])
     return sp.ImmutableMatrix(out)
 
 

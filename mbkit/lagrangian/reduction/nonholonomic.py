@@ -48,7 +48,7 @@ from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.reduction.hamilton import ConservedQuantity, numbers_at
 from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
-from mbkit.lagrangian.trig.simplify import DIGITS, RandomEvaluation, is_zero, tidy, tidy_matrix
+from mbkit.lagrangian.trig.simplify import DIGITS, RandomEvaluation, is_zero, settled, settled_matrix, tidy, tidy_matrix
 
 #: Choices of dependent velocities that are looked at.
 _CHOICES: Final = 200
@@ -204,7 +204,7 @@ class _Frame:
         D = inverse(whole, f"quasi_velocities: {', '.join(map(str, w))} and the constraints, whose matrix")
         E = D[:, r:]
         return cls(
-            w, sp.ImmutableMatrix(defined), D[:, :r], E, tidy_matrix(-E * a), tidy(whole.det(method="berkowitz"))
+            w, sp.ImmutableMatrix(defined), D[:, :r], E, tidy_matrix(-E * a), settled(whole.det(method="berkowitz"))
         )
 
 
@@ -301,12 +301,13 @@ def _made(system: EnergyForm, frame: _Frame, motion: _Motion, form: str, **field
     named = dict(zip(system.velocities, system.accelerations, strict=True))
     accelerations = tuple(named.get(w, velocity_of(w)) for w in frame.velocities)
     Q = free.forces.subs(dict(zip(system.velocities, motion.rate, strict=True)), simultaneous=True)
-    whole = free.mass_matrix * (N * sp.Matrix(accelerations)) + motion.force + free.potential_gradient - Q
+    whole = free.mass_matrix * (N * sp.Matrix(accelerations)) + motion.force + free.potential_gradient
+    reactions = settled_matrix(frame.E.T * whole, (*frame.velocities, *accelerations))
     return NonholonomicEquations(
         coordinates=system.coordinates,
         velocities=frame.velocities,
         accelerations=accelerations,
-        potential_gradient=tidy_matrix(N.T * free.potential_gradient),
+        potential_gradient=settled_matrix(N.T * free.potential_gradient),
         forces=tidy_matrix(N.T * Q),
         system=system,
         form=form,
@@ -316,7 +317,7 @@ def _made(system: EnergyForm, frame: _Frame, motion: _Motion, form: str, **field
         drift_velocity=frame.drift,
         definitions=frame.definitions,
         determinant=frame.determinant,
-        reactions=tidy_matrix(frame.E.T * whole),
+        reactions=tidy_matrix(reactions - frame.E.T * Q),
         **fields,
     )
 
@@ -327,7 +328,7 @@ def _maggi(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEq
     slow = dict(zip(system.velocities, N * sp.Matrix(w), strict=True))
     # Of what N w alone does: the rest, of drifts and of the time, is d.
     turning = sum((sp.diff(N, q) * slow[v] for q, v in zip(system.coordinates, system.velocities, strict=True)), 0 * N)
-    C = tidy_matrix(N.T * (M * turning + motion.equations.coriolis_matrix.subs(slow, simultaneous=True) * N))
+    C = settled_matrix(N.T * (M * turning + motion.equations.coriolis_matrix.subs(slow, simultaneous=True) * N), w)
     rest = sp.zeros(len(w), 1)
     if any(frame.drift) or system.time is not None or any(motion.equations.drift):
         rest = N.T * motion.force - C * sp.Matrix(w)
@@ -336,9 +337,9 @@ def _maggi(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEq
         frame,
         motion,
         "Maggi",
-        mass_matrix=tidy_matrix(N.T * M * N),
+        mass_matrix=settled_matrix(N.T * M * N),
         coriolis_matrix=C,
-        drift=tidy_matrix(rest),
+        drift=settled_matrix(rest, w),
     )
 
 
@@ -346,18 +347,20 @@ def _appell(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicE
     maggi = _maggi(system, frame, motion)
     wdot = sp.Matrix(maggi.accelerations)
     a, M = frame.N * wdot, motion.equations.mass_matrix
-    S = tidy((a.T * M * a)[0] / 2) + tidy((a.T * motion.force)[0])
+    S = (a.T * M * a)[0] / 2 + (a.T * motion.force)[0]
     slopes = sp.Matrix([S]).jacobian(maggi.accelerations).T
-    at_rest = slopes.subs(dict.fromkeys(maggi.accelerations, 0))
+    mass_matrix = settled_matrix(slopes.jacobian(maggi.accelerations))
+    at_rest = settled_matrix(slopes.subs(dict.fromkeys(maggi.accelerations, 0)), maggi.velocities)
     return _made(
         system,
         frame,
         motion,
         "Gibbs and Appell",
-        mass_matrix=tidy_matrix(slopes.jacobian(maggi.accelerations)),
+        mass_matrix=mass_matrix,
         coriolis_matrix=maggi.coriolis_matrix,
-        drift=tidy_matrix(at_rest - maggi.coriolis_matrix * sp.Matrix(frame.velocities)),
-        S=S,
+        drift=settled_matrix(at_rest - maggi.coriolis_matrix * sp.Matrix(frame.velocities), maggi.velocities),
+        # Of the shortest parts.
+        S=tidy((wdot.T * mass_matrix * wdot)[0] / 2) + tidy((wdot.T * at_rest)[0]),
     )
 
 
@@ -380,9 +383,9 @@ def _hamel(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEq
         frame,
         motion,
         "Boltzmann and Hamel",
-        mass_matrix=whole.mass_matrix[:r, :r],
-        coriolis_matrix=tidy_matrix(C),
-        drift=tidy_matrix(d),
+        mass_matrix=settled_matrix(whole.mass_matrix[:r, :r]),
+        coriolis_matrix=settled_matrix(C, frame.velocities),
+        drift=settled_matrix(d, frame.velocities),
     )
 
 

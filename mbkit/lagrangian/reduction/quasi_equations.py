@@ -29,7 +29,7 @@ from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities, r
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, constraint_fields
 from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, inverse
 from mbkit.lagrangian.energies.symbols import fits, listed, velocity_of
-from mbkit.lagrangian.trig.simplify import gradient, tidy, tidy_matrix
+from mbkit.lagrangian.trig.simplify import gradient, settled, settled_matrix, tidy, tidy_matrix
 
 
 @dataclass(frozen=True, repr=False)
@@ -115,12 +115,11 @@ def _coriolis_matrix(system: EnergyForm, quasi: QuasiVelocities) -> sp.Immutable
     c = [[[sum(M[h, m] * gamma[m, i, j] for m in range(n)) for j in range(n)] for i in range(n)] for h in range(n)]
 
     def entry(i: int, j: int) -> sp.Expr:
-        terms = (
-            (slopes[k][i, j] + slopes[j][i, k] - slopes[i][j, k] + c[i][k][j] - c[j][k][i] - c[k][j][i])
-            * system.velocities[k]
-            for k in range(n)
+        twice = (
+            slopes[k][i, j] + slopes[j][i, k] - slopes[i][j, k] + c[i][k][j] - c[j][k][i] - c[k][j][i] for k in range(n)
         )
-        return tidy(sum(terms, sp.Integer(0)) / 2)
+        terms = (settled(x / 2) * v for x, v in zip(twice, system.velocities, strict=True))
+        return tidy(sum(terms, sp.Integer(0)))
 
     return sp.ImmutableMatrix(n, n, entry)
 
@@ -138,7 +137,7 @@ def in_quasi_velocities(
     D = tidy_matrix(_checked(system, "D", D, (n, n)))
     e = tidy_matrix(_checked(system, "drift", sp.zeros(n, 1) if drift is None else drift, (n, 1)))
     W, w, k = inverse(D, "D"), _named(system, names), system.kinetic
-    M, b, v = tidy_matrix(D.T * k.M * D), tidy_matrix(D.T * (k.M * e + k.b)), sp.Matrix(w)
+    M, b, v = settled_matrix(D.T * k.M * D), settled_matrix(D.T * (k.M * e + k.b)), sp.Matrix(w)
     T2, T1, T0 = (v.T * M * v)[0] / 2, (b.T * v)[0], k.T0
     if any(e):
         T0 = tidy((e.T * k.M * e)[0] / 2 + (k.b.T * e)[0] + T0)

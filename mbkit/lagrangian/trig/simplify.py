@@ -44,6 +44,39 @@ def tidy(x: sp.Expr) -> sp.Expr:
     return min(tried, key=lambda pair: pair[0])[1]
 
 
+#: Values of an angle on which an expression does not depend.
+_ANY: Final = (sp.Integer(0), sp.pi / 2, sp.pi / 6, sp.Integer(1))
+
+
+@lru_cache(1024)
+def settled(x: sp.Expr) -> sp.Expr:
+    """Return an expression, tidied, without the angles that cancel in it: those along which its slope is zero."""
+    for q in sorted(set().union(*(a.free_symbols for a in x.atoms(sp.sin, sp.cos))), key=str):
+        # A sign, as that of √(cos² q), has the slope zero too.
+        signs = [p for p in x.atoms(sp.Pow) if not p.exp.is_Integer]
+        signs += x.atoms(sp.Abs, sp.sign, sp.Piecewise, AppliedUndef)
+        if x.has(q) and not any(part.has(q) for part in signs) and is_zero(sp.diff(x, q)):
+            values = (x.subs(q, value) for value in _ANY)
+            x = next((y for y in values if not y.has(sp.nan, sp.zoo, sp.oo)), x)
+    return tidy(x)
+
+
+def settled_matrix(A: Any, velocities: Sequence[sp.Symbol] = ()) -> sp.ImmutableMatrix:
+    """Return a matrix whose entries, of second degree in velocities at most, have `settled` coefficients."""
+    at_rest = dict.fromkeys(velocities, sp.Integer(0))
+
+    def entry(x: sp.Expr) -> sp.Expr:
+        total = settled(x.subs(at_rest))
+        for i, v in enumerate(velocities):
+            by_v = sp.diff(x, v)
+            total += settled(by_v.subs(at_rest)) * v
+            for w in velocities[i:]:
+                total += settled(sp.diff(by_v, w) / (2 if v == w else 1)) * v * w
+        return tidy(total) if velocities else total
+
+    return sp.ImmutableMatrix(A).applyfunc(entry)
+
+
 def tidy_matrix(x: Any) -> sp.ImmutableMatrix:
     """Return a matrix with each entry tidied."""
     return sp.ImmutableMatrix(x).applyfunc(tidy)
