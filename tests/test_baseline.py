@@ -686,7 +686,8 @@ def test_a_renamed_link_moves_no_frame(tmp_path: Path) -> None:
         '<robot name="r"><link name="base"/><link name="arm"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>'
         '<inertia ixx="0.02" iyy="0.03" izz="0.03" ixy="0" ixz="0" iyz="0"/></inertial></link><link name="tool"/>'
         '<joint name="hinge" type="continuous"><parent link="base"/><child link="arm"/></joint>'
-        '<joint name="mount" type="fixed"><origin xyz="0.3 0 0"/><parent link="arm"/><child link="tool"/></joint></robot>'
+        '<joint name="mount" type="fixed"><origin xyz="0.3 0 0"/><parent link="arm"/><child link="tool"/></joint>'
+        "</robot>"
     )
     path, file = tmp_path / "r.urdf", tmp_path / "r.toml"
     path.write_text(text, encoding="utf-8")

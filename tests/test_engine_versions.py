@@ -317,7 +317,8 @@ def test_an_environment_is_made_once_and_whole(installer, environments):
     assert not mb.engine("mujoco==9.9").installed
 
 
-def test_environments_of_other_packages_are_no_versions_and_candidates_come_before_their_release(environments):
+@pytest.mark.usefixtures("environments")
+def test_environments_of_other_packages_are_no_versions_and_candidates_come_before_their_release():
     for name in ("3.10.0", "3.9.0", "4.0.0", "4.0.0rc1", "4.0.0.post1", "mjx-3.17.0", "warp-4.0.0"):
         script(environment.python_of(environment.place("mujoco", name)), "exit 0")
     assert environment.made("mujoco") == ["3.9.0", "3.10.0", "4.0.0rc1", "4.0.0", "4.0.0.post1"]

@@ -36,6 +36,7 @@ _BLANK: Final = b" \t\r\n\xef\xbb\xbf"
 _VAGUE: Final = (2, 4)
 #: First elements of descriptions.
 _ROOTS: Final = ("robot", "mujoco", "mujocoinclude", "sdf")
+_FIRST: Final = re.compile(rb"<([A-Za-z]\w*)")
 
 
 @dataclass(eq=False, slots=True)
@@ -176,10 +177,9 @@ def parse(content: bytes, name: str) -> Element:
         parser.Parse(content, True)
     except expat.ExpatError as error:
         # A file that is no description, which an <include> may name, is not quoted.
-        known = bool(roots) and roots[0].tag in _ROOTS
-        why = (
-            _unexpected(content, parser.ErrorByteIndex) if known else f"it begins with none of <{'>, <'.join(_ROOTS)}>"
-        )
+        first = _FIRST.search(_COMMENT.sub(b"", content))
+        known = first is not None and first[1].decode() in _ROOTS
+        why = _unexpected(content, parser.ErrorByteIndex) if known else "its first element is no <robot> or <mujoco>"
         if error.code not in _VAGUE or not why:
             why = expat.errors.messages.get(error.code, str(error))
         raise LoadError(f"{name}: line {error.lineno}, column {error.offset + 1}: not well-formed XML: {why}") from None
