@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
+from mbkit.engines.constrained import off_by
 from mbkit.errors import DoubtfulRunWarning
 from mbkit.methods.registry import Tolerances
 from mbkit.simulate.diagnostics.checks import lost, massless_joints
@@ -345,3 +346,38 @@ def test_steps_that_cover_nothing_end_a_run(reached, ends):
     member.rejected, member.reached = 1_000, reached
     assert member.crawls() == ends
     assert member.ended == ("step_too_small" if ends else "finished")
+
+
+@pytest.mark.parametrize(
+    ("engine", "method"), [("lagrangian", "rk4"), ("pinocchio", "rk4"), ("mujoco", "rk4"), ("mujoco", "mujoco_rk4")]
+)
+def test_a_wild_run_of_one_step_is_told_at_once(engine, method):
+    """One step of Runge and Kutta's over ω h = 10 leads to 1 - 50 + 10⁴/24 and to -(10 - 10³/6) ω."""
+    b = mounted("sprung", "m", "x", "prismatic", gravity=(0, 0, 0), mass=1.0, axis=(1, 0, 0), stiffness=100.0)
+    dyn = mb.dynamics(b.build(point_masses=True), engine)
+    x, w = 1 - 50 + 1e4 / 24, -(10 - 1e3 / 6)
+    with pytest.warns(DoubtfulRunWarning, match=r"gained 118 % of its energy .8e\+06 J"):
+        run = mb.simulate(dyn, [1.0], [0.0], 1.0, method, dt=1.0)
+    assert [run.q[-1, 0], run.v[-1, 0] / 10] == pytest.approx([x, w])
+    assert f"{50 * (x**2 + w**2 - 1):.0e}" == "8e+06"
+    assert "with doubts" in repr(run)
+
+
+def test_a_short_run_in_machine_code_compiles_nothing_for_its_checks():
+    b = mounted("sprung", "m", "x", "prismatic", gravity=(0, 0, 0), mass=1.03, axis=(1, 0, 0), stiffness=100.0)
+    dyn = mb.dynamics(b.build(point_masses=True), "lagrangian", compile=True)
+    assert not mb.simulate(dyn, [1.0], [0.0], 1.0, dt=0.05).stats.doubts
+    assert not {("mass_matrix",), ("potential_energy",)} & set(dyn._machines)
+    assert mb.simulate(dyn, [1.0], [0.0], 1.0, dt=0.25).stats.doubts
+    assert ("potential_energy",) in dyn._machines
+
+
+def test_texts_of_events_and_of_rounding_are_short():
+    b = mounted("slide", "m", "x", "prismatic", gravity=(0, 0, 0), mass=1.0, axis=(1, 0, 0), friction=1.0)
+    dyn = mb.dynamics(b.build(point_masses=True))
+    run = mb.simulate(dyn, [[0.0], [0.0]], [[0.628], [2.5]], 3.0)
+    assert [repr(x) for x in run.events] == ["0.628 s  x stops (trajectory 0)", "2.500 s  x stops (trajectory 1)"]
+    assert off_by(2.1e-16, "those of rigid loops") == "those of rigid loops to rounding"
+    assert off_by(0.021, "those of rigid loops") == "2.1 % off those of rigid loops"
+    idle = mb.model.JointCoupling("tendon", (), np.zeros(0), 0.0, 0.0, 0.0, 0.0)
+    assert str(idle) == "coupling 'tendon' on no joint: it exerts no force"

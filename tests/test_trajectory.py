@@ -594,3 +594,20 @@ def test_a_sampled_controller_that_fails_keeps_what_it_reached():
     ):
         with pytest.raises(InputError, match=words):
             simulate(dynamics(slider()), [0.0], [1.0], 1.0, dt=0.05, **options)
+
+
+def test_a_picture_of_a_four_bar_has_links_that_meet() -> None:
+    """Coupler and rocker end at the pin, wherever each of them begins, and the links stand on two feet."""
+    model = mb.catalog.four_bar()
+    dyn = mb.dynamics(model, "lagrangian")
+    q, v = dyn.project([0.5, 0.0, 1.0], [1.0, 0.0, 0.0])
+    run = simulate(dyn, q, v, 0.5, dt=0.01)
+    drawn = skeleton(model, run.q)
+    starts, ends = drawn.links[:, 0], drawn.links[:, 1]
+    (pin,) = model.loops
+    where = (dyn.pose(run.q, pin.body_a) @ np.append(pin.translation_a, 1.0))[:, :3]
+    meeting = [k for k, end in enumerate(ends) if np.abs(end - where).max() < 1e-8]
+    assert len({tuple(starts[k, 0].round(6)) for k in meeting}) == 2
+    assert len(drawn.anchors) == 2
+    assert not len(drawn.masses)
+    run.picture(3)

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Of each row's scale: what rounding and a few typed digits leave of a consistent state.
 CONSISTENT: Final = 1e-8
+#: Part of accelerations that is rounding, of sums and of a solution.
+ROUNDING: Final = 1e-12
 QUANTITIES: Final = (
     "constraint_residual",
     "constraint_jacobian",
@@ -28,6 +30,11 @@ QUANTITIES: Final = (
     "constraint_forces",
     "generalized_constraint_force",
 )
+
+
+def off_by(error: float, exact: str) -> str:
+    """Return how far accelerations are from exact ones, as text; what double precision cannot tell is rounding."""
+    return f"{100 * error:.2g} % off {exact}" if error > ROUNDING else f"{exact} to rounding"
 
 
 @contextmanager

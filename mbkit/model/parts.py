@@ -295,7 +295,7 @@ class JointCoupling(_Frozen):
 
     def __str__(self) -> str:
         numbers = [f"{n.replace('_', ' ')} {x:g}" for n in _OF_COUPLING if (x := getattr(self, n))]
-        return f"coupling {self.name!r} on {self.length}: {', '.join(numbers) or 'no force'}"
+        return f"coupling {self.name!r} on {self.length or 'no joint'}: {', '.join(numbers) or 'it exerts no force'}"
 
 
 @dataclass(frozen=True, eq=False)

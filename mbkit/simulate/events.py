@@ -93,7 +93,7 @@ class Followed(Event):
     noise: float = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Hit:
     """An event that happened.
 
@@ -112,6 +112,10 @@ class Hit:
     q: Array
     v: Array
     member: int | None = None
+
+    def __repr__(self) -> str:
+        of = "" if self.member is None else f" (trajectory {self.member})"
+        return f"{self.t:{'.3f' if abs(self.t) >= 1 else '.3g'}} s  {self.name}{of}"
 
 
 class Watch:

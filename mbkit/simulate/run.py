@@ -87,9 +87,10 @@ def simulate(
         alone.
     doubt : bool
         Whether a finished run is checked for energy from nowhere, a singular mass matrix, coordinates beyond the
-        digits of a double, tolerances that add up and gimbal lock. That takes a few percent of the run, so that runs
-        of machine code with fewer than 4,000 evaluations are not checked for the first two. Signs of an error are
-        warned of, and kept in ``Trajectory.stats.doubts``. `Trajectory.check` does all checks.
+        digits of a double, tolerances that add up and gimbal lock. That takes a few percent of the run; so short
+        runs, as of machine code with fewer than 4,000 evaluations, are checked for the first two only where two steps
+        of half the length lead elsewhere than one. Signs of an error are warned of, and kept in
+        ``Trajectory.stats.doubts``. `Trajectory.check` does all checks.
     t0 : float, optional
         Time of the first state, s; by default the time that `dyn` holds where time enters the equation of motion
         (``dyn.at(t=3.0)``), else 0. `save`, torque and event functions and ``Trajectory.t`` count from the same zero.

@@ -24,6 +24,7 @@ from mbkit._warn import warn
 from mbkit.engines import known_defects, regressors
 from mbkit.engines.base import MappedDynamics, require_no_forces
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
+from mbkit.engines.constrained import off_by
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.mujoco.bodies import MujocoBodies
 from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopEnds, Softness, friction_law, law
@@ -383,9 +384,9 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             _TOLD.add(key)
             what, rigid = ("dry friction", "exact friction") if self.soft_friction else ("loops", "rigid loops")
             warn(
-                f"{self.model.name}: MuJoCo holds {what} by soft constraints: its accelerations are {100 * error:.2g} "
-                f"% off those of {rigid} at this state; constraint_law(q, v, tau).digits tells it of any state, and "
-                "stiffer solref and solimp leave less",
+                f"{self.model.name}: MuJoCo holds {what} by soft constraints: its accelerations are "
+                f"{off_by(error, f'those of {rigid}')} at this state; constraint_law(q, v, tau).digits tells it of any "
+                "state, and stiffer solref and solimp leave less",
                 MbkitWarning,
             )
 

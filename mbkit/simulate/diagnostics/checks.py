@@ -29,6 +29,8 @@ CHECKED_TIMES: Final = 7
 _MEMBERS: Final = 4
 #: A quick check evaluates one state for so many evaluations of the run in machine code: a few percent of its time.
 _WORK_A_STATE: Final = 3000
+#: Part of a step by which it differs from two of half its length, to the power of the order: that of h|λ| = 1.
+_HALVES: Final = 0.3
 #: Saved velocities among which a quick check looks for the largest kinetic energy.
 _VELOCITIES: Final = 32
 #: Change of the energy that makes a run wrong: methods of first or second order at a common step oscillate by
@@ -71,6 +73,10 @@ def diagnostics(
         return []
     q, v = (x.reshape(-1, *x.shape[-2:]) for x in states[1:])
     most = _MEMBERS * CHECKED_TIMES if work is None else work // _WORK_A_STATE
+    # The forces of a system on paper may drive it.
+    free = not (driven or model.constraints_do_work or (not model.has_bodies and model.needs.damping))
+    if most < 2 and free and not isinstance(setting, Tolerances) and _rushes(dyn, method, setting, q, v):
+        most = 2
     members = max(1, min(_MEMBERS, len(q), most // 2))
     count = max(2, min(CHECKED_TIMES, most // members))
     times = sorted({k * (len(t) - 1) // (count - 1) for k in range(count)})
@@ -86,16 +92,15 @@ def diagnostics(
     if not isinstance(setting, Tolerances) and not quick and method.stability is not None:
         # The cause before its consequences.
         checks.insert(0, step_size(_smooth(dyn), method, setting, float(t[-1] - t[0]), q[0], v[0]))
-    # The forces of a system on paper may drive it.
-    if most >= 2 and not (driven or model.constraints_do_work or (not model.has_bodies and model.needs.damping)):
+    if most >= 2 and free:
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
         fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
         limit = _ENERGY if method.order in _LOW else _ENERGY_HIGH
-        damped = model.loses_energy or dyn.soft_constraints
+        damped = model.loses_energy or (model.constrained and dyn.soft_constraints)
         checks.append(energy_drift([samples[i] for i in whole], fast, damped, limit))
     # Neither the engine nor the method may solve with the mass matrix.
     matrices = [one.M for member in samples for one in member]
-    if matrices and (method.mass_matrix or getattr(dyn, "elimination", "") != "least constraint"):
+    if matrices and (method.mass_matrix or not dyn.derived or getattr(dyn, "elimination", "") != "least constraint"):
         checks.append(condition(matrices[-1:] if quick else matrices))
     checks.append(coordinate_magnitude(at_q, None if method.scaled_by_start else tolerances))
     if tolerances and method.scaled_by_start:
@@ -108,6 +113,26 @@ def diagnostics(
         with suppress(MbkitError, np.linalg.LinAlgError):
             signs += check
     return signs
+
+
+def _rushes(dyn: Dynamics, method: Method, h: float, q: Array, v: Array) -> bool:
+    """Return whether a run that is too short for checks needs them: its step is not two steps of half the length.
+
+    What has no such step is checked, unless the terms of a check would have to be compiled.
+    """
+    if not (method.explicit and method.order):
+        return not dyn.derived
+    i, k = np.unravel_index(np.nan_to_num(np.abs(v).max(axis=-1)).argmax(), v.shape[:-1])
+    own, q, v, tau = dyn._of_sample(int(i)), q[i, k], v[i, k], np.zeros(v.shape[-1])
+    try:
+        q1, v1 = own.step(q, v, tau, h, method.name)
+        q2, v2 = own.step(*own.step(q, v, tau, h / 2, method.name), tau, h / 2, method.name)
+    except MbkitError:
+        return True
+    off, moved = (
+        max(np.abs(dyn.model.difference(x, q2)).max(), h * np.abs(v2 - y).max()) for x, y in ((q1, v1), (q, v))
+    )
+    return bool(off > _HALVES**method.order * moved)
 
 
 def _smooth(dyn: Dynamics) -> Dynamics:
@@ -169,8 +194,8 @@ def energy_drift(samples: list[list[_Sample]], fast: list[Array], damped: bool, 
             worst, share = wrong, abs(wrong) / size
     if worst:
         yield (
-            f"{'gained' if worst > 0 else 'lost'} {share:.2g} of its energy ({abs(worst):.2g} J) with nothing that "
-            f"drives it; take a smaller step, or method={AUTOMATIC_METHOD!r}"
+            f"{'gained' if worst > 0 else 'lost'} {100 * share:.3g} % of its energy ({abs(worst):.2g} J) with nothing "
+            f"that drives it; take a smaller step, or method={AUTOMATIC_METHOD!r}"
         )
 
 

@@ -62,6 +62,9 @@ def skeleton(model: Model, q: Array) -> Skeleton:
             parts["anchors"] += [] if flies or slides else [foot]
             parts["carts"] += [place] if slides else []
         parts["joints"] += [] if flies or slides else [place]
+    for link, point in tree.loop_ends:
+        parts["anchors" if link == "world" else "joints"].append(point)
+        parts["links"] += [] if link == "world" else [[tree.origin(link), point]]
     path, deepest = np.zeros((n, 3)), 0
     carrying = {tree.link[joint.parent] for joint in tree.moving}
     for joint in tree.moving:
@@ -108,6 +111,9 @@ class _Tree:
             self.ground[child] = self.ground.get(parent, child)
             if joint.type.nv:
                 self.depth[child] = self.depth[self.link[parent]] + 1
+        ends = [(x.body_a, x.translation_a) for x in model.loops] + [(x.body_b, x.translation_b) for x in model.loops]
+        #: The links that loops join, and the points where they do.
+        self.loop_ends = [(self.link[body], self.at(body, point)) for body, point in ends]
 
     def bend(self, joint: Joint) -> list[list[Array]]:
         """Return the pieces of a beam's axis, of its end."""
@@ -131,6 +137,7 @@ class _Tree:
         names = [body.name for body in bodies]
         places = [self.origin(name) for name in names]
         places += [self.at(f.body, f.translation) for f in model.frames if f.body in names]
+        places += [point for own, point in self.loop_ends if own == link]
         masses = [self.at(body.name, body.com) for body in bodies if body.mass]
         for points, weigh in ((places, False), (masses, True)):
             far = max(points, key=lambda p: float(np.linalg.norm(p[0] - here[0])), default=here)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from mbkit._escape import one_line
 from mbkit.engines.base import DOUBLE_BITS
+from mbkit.engines.constrained import off_by
 from mbkit.simulate.plotting.style import (
     CROSS,
     PLAIN,
@@ -302,7 +303,7 @@ class Comparison(ResultTable):
         what, them, exact = ("loops", "them", "rigid") if loops else (FRICTION, "it", "exact")
         out += [
             f"{name} holds {what} softly, and agrees with its own law of {them}; its accelerations are "
-            f"{100 * 10**-x:.2g} % off the {exact} ones at the median state"
+            f"{off_by(10.0**-x, f'the {exact} ones')} at the median state"
             for name, x in self.softness.items()
         ]
         rows = [r for r in self.rollouts if not r.informs]
