@@ -95,6 +95,12 @@ class Model(Description):
         return any(getattr(self, feature) for feature in CONSTRAINT_FEATURES)
 
     @property
+    def constraint_parts(self) -> str:
+        """Names of the parts that bind its coordinates or velocities, for a message; its own where it is energies."""
+        parts = (x.name for feature in CONSTRAINT_FEATURES for x in getattr(self, feature))
+        return ", ".join(map(repr, parts)) or self.name
+
+    @property
     def holds_velocities(self) -> bool:
         """Whether some constraints hold velocities alone, as contacts without slip do."""
         return bool(self.no_slip)

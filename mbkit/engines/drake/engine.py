@@ -39,8 +39,8 @@ _WITHOUT_LOOPS: Final = {
             *("forward_dynamics", "forward_dynamics_derivatives", *CONSTRAINT_QUANTITIES),
             *(*closed_loops.QUANTITIES, *loads.OF_SINGLE_BODIES),
         ),
-        f"{NO_CONSTRAINTS}; mbkit.simulate(..., method={SAP!r}) runs its discrete one, and "
-        "mbkit.dynamics(model, 'lagrangian') has the terms",
+        f"{{model}} has constraints ({{parts}}), and {NO_CONSTRAINTS}; mbkit.simulate(..., method={SAP!r}) runs its "
+        "discrete one, and mbkit.dynamics(model, 'lagrangian') has the terms",
     )
 }
 
@@ -73,7 +73,8 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
         super().__init__(model)
         require_tree(model, "drake", "its plants have no constraint of velocities", ("no_slip",))
         if model.constrained:
-            vars(self)["refuses"] = self.refuses | _WITHOUT_LOOPS
+            parts = {"model": model.name, "parts": model.constraint_parts}
+            vars(self)["refuses"] = self.refuses | {k: why.format(**parts) for k, why in _WITHOUT_LOOPS.items()}
         self._hold(build(model))
 
     def _hold(self, compiled: DrakeModel) -> None:

@@ -90,8 +90,8 @@ class DrakeRun(_PlantState):
     ) -> None:
         if dyn.model.constrained:
             raise UnsupportedError(
-                f"drake: {dyn.model.name} has constraints, and {NO_CONSTRAINTS}; method={SAP!r} runs loops in the "
-                "discrete one"
+                f"drake: {dyn.model.name} has constraints ({dyn.model.constraint_parts}), and {NO_CONSTRAINTS}; "
+                f"method={SAP!r} runs loops in the discrete one"
             )
         super().__init__(dyn, dyn.maps)
         self.put(q, v)

@@ -155,7 +155,9 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
     if not isinstance(quantity, str) or quantity not in FUNCTIONS:
         raise UnknownNameError("quantity", str(quantity), FUNCTIONS)
     if model.constrained:
-        raise UnsupportedError(f"program: {model.name} has constraints, which the terms of its tree leave out")
+        raise UnsupportedError(
+            f"program: {model.name} has constraints ({model.constraint_parts}), which the terms of its tree leave out"
+        )
     if not model.nv:
         raise UnsupportedError(f"program: {model.name} has no joint that moves")
     function = equations_of(model).function(quantity)

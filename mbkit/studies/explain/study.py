@@ -104,9 +104,10 @@ def _model(x: Model | Dynamics, which: str) -> Model:
     if not model.has_bodies:
         raise UnsupportedError(f"explain: {model.name} was written as energies and has no bodies to compare")
     if by_functions(model) or (model.forces and isinstance(x, Dynamics)):
+        names = ", ".join(f.name for f in model.forces)
         raise UnsupportedError(
-            f"explain: {model.name} has forces by functions, which have no numbers to match, or engines that hold "
-            "weights are asked; explain model.without('forces')"
+            f"explain: {model.name} has forces ({names}) by functions, which have no numbers to match, or engines that "
+            "hold weights are asked; explain model.without('forces')"
         )
     if not model.nv:
         raise InputError(f"{which}: nothing moves in {model.name} (nv = 0), so there is nothing to explain")

@@ -1,0 +1,466 @@
+"""Random chains with parts of every kind, and their equations in NumPy alone.
+
+Each part says how it is declared to mbkit, and apart from that its energy, force, dissipation or rows in NumPy.
+Derivatives are complex steps, exact to rounding; mbkit computes nothing here.
+"""
+
+# ruff: noqa: ARG001, ARG005  # all parts and all paths are called alike
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+import mbkit as mb
+
+_STEP = 1e-30
+GRAVITY = np.array([0.7, -0.4, -9.81])
+#: Place of the frame `tip` on the last body, m.
+TIP = (0.1, 0.2, 0.3)
+
+
+def derivative(f: Callable[[np.ndarray], Any], x: np.ndarray) -> np.ndarray:
+    """Return ∂f/∂x, with the axis of x last."""
+    return np.stack([np.imag(f(x + 1j * _STEP * e)) / _STEP for e in np.eye(len(x))], axis=-1)
+
+
+def rotation(axis: np.ndarray, angle: Any) -> np.ndarray:
+    x, y, z = axis
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def norm(x: np.ndarray) -> Any:
+    return np.sqrt(np.sum(x * x))
+
+
+def _turn(rng: np.random.Generator) -> np.ndarray:
+    axis = rng.standard_normal(3)
+    return rotation(axis / np.linalg.norm(axis), rng.uniform(-2, 2))
+
+
+@dataclass
+class Part:
+    """A part of a case: how mbkit is told of it, and what it does."""
+
+    kind: str
+    words: tuple[str, ...]
+    declare: Callable[[mb.ModelBuilder], None] = lambda _: None
+    joint: dict[int, dict[str, Any]] = field(default_factory=dict)
+    energy: Callable[..., Any] = lambda *_: 0.0  # of (case, q)
+    inertia: Callable[..., Any] = lambda *_: 0.0  # of (case, q), (n, n)
+    force: Callable[..., Any] = lambda *_: 0.0  # of (case, t, q, v), (n,)
+    rows: Callable[..., list[Any]] | None = None  # of (case, t, q)
+
+
+@dataclass
+class Case:
+    """A chain of joints of one velocity, its parts, and a state that its constraints allow."""
+
+    seed: int
+    kinds: list[str]
+    axes: np.ndarray
+    R: list[np.ndarray]
+    p: np.ndarray
+    mass: np.ndarray
+    com: np.ndarray
+    I: list[np.ndarray]
+    parts: list[Part]
+    q: np.ndarray
+    v: np.ndarray
+    tau: np.ndarray
+    t: float
+    #: Full coordinates are G q + c; a joint that mimics another has none.
+    G: np.ndarray
+    c: np.ndarray
+
+    @property
+    def n(self) -> int:
+        return len(self.q)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        return tuple(w for part in self.parts for w in part.words)
+
+    def model(self, parts: list[Part] | None = None, kept: Callable[[Part], bool] = lambda _: True) -> mb.Model:
+        parts = [x for x in (self.parts if parts is None else parts) if kept(x)]
+        b = mb.ModelBuilder(f"case{self.seed}", gravity=GRAVITY)
+        for k, kind in enumerate(self.kinds):
+            b.add_body(f"b{k}", mass=self.mass[k], com=self.com[k], inertia=self.I[k])
+            more: dict[str, Any] = {}
+            for part in parts:
+                more |= part.joint.get(k, {})
+            parent = f"b{k - 1}" if k else "world"
+            place = {"rotation": self.R[k], "translation": self.p[k], "axis": self.axes[k]}
+            b.add_joint(f"j{k}", kind, parent=parent, child=f"b{k}", **place, **more)
+        b.add_frame("tip", body=f"b{len(self.kinds) - 1}", translation=TIP)
+        for part in parts:
+            part.declare(b)
+        return b.build()
+
+    # Kinematics
+
+    def poses(self, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        x = self.G @ q + self.c
+        R, p, out = np.eye(3), np.zeros(3), []
+        for k, kind in enumerate(self.kinds):
+            p, R = p + R @ self.p[k], R @ self.R[k]
+            if kind == "revolute":
+                R = R @ rotation(self.axes[k], x[k])
+            else:
+                p = p + R @ self.axes[k] * x[k]
+            out.append((R, p))
+        return out
+
+    def pose(self, body: str, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return (np.eye(3), np.zeros(3)) if body == "world" else self.poses(q)[int(body[1:])]
+
+    def point(self, body: str, at: Any, q: np.ndarray) -> np.ndarray:
+        R, p = self.pose(body, q)
+        return p + R @ np.asarray(at)
+
+    def turning(self, k: int, q: np.ndarray) -> np.ndarray:
+        """Return the angular Jacobian of body k, (3, n); it stays exact for complex q."""
+        J = np.zeros((3, len(self.kinds)), dtype=q.dtype)
+        for i, (R, _) in enumerate(self.poses(q)[: k + 1]):
+            if self.kinds[i] == "revolute":
+                J[:, i] = R @ self.axes[i]
+        return J @ self.G
+
+    def moving(self, k: int, at: Any, q: np.ndarray) -> np.ndarray:
+        """Return the linear Jacobian of a point of body k, (3, n)."""
+        J, x = np.zeros((3, len(self.kinds)), dtype=q.dtype), self.point(f"b{k}", at, q)
+        for i, (R, p) in enumerate(self.poses(q)[: k + 1]):
+            a = R @ self.axes[i]
+            J[:, i] = np.cross(a, x - p) if self.kinds[i] == "revolute" else a
+        return J @ self.G
+
+    # Equations
+
+    def mass_matrix(self, q: np.ndarray) -> np.ndarray:
+        M = np.zeros((self.n, self.n), dtype=q.dtype)
+        for k, (R, _) in enumerate(self.poses(q)):
+            J, W = self.moving(k, self.com[k], q), self.turning(k, q)
+            M = M + self.mass[k] * J.T @ J + W.T @ R @ self.I[k] @ R.T @ W
+        return M + sum(part.inertia(self, q) for part in self.parts)
+
+    def potential(self, q: np.ndarray) -> Any:
+        weight = sum(-m * GRAVITY @ self.point(f"b{k}", self.com[k], q) for k, m in enumerate(self.mass))
+        return weight + sum(part.energy(self, q) for part in self.parts)
+
+    def energy(self, q: np.ndarray, v: np.ndarray) -> float:
+        return float(v @ self.mass_matrix(q) @ v / 2 + self.potential(q))
+
+    def loads(self, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the forces without a potential."""
+        return np.zeros(self.n) + sum(part.force(self, t, q, v) for part in self.parts)
+
+    def rows(self, t: Any, q: np.ndarray) -> np.ndarray:
+        return np.array([x for part in self.parts if part.rows for x in part.rows(self, t, q)])
+
+    def acceleration(
+        self, t: float, q: np.ndarray, v: np.ndarray, tau: np.ndarray, hold: tuple[int, ...] = ()
+    ) -> np.ndarray:
+        """Return v̇ by the multipliers of all rows; velocities in `hold` stay zero."""
+        dM = derivative(self.mass_matrix, q)
+        h = np.einsum("ijk,j,k->i", dM, v, v) - np.einsum("jki,j,k->i", dM, v, v) / 2
+        f = tau + self.loads(t, q, v) - h - derivative(self.potential, q)
+        J, bias = np.zeros((0, self.n)), np.zeros(0)
+        if any(part.rows for part in self.parts):
+            J = derivative(lambda x: self.rows(t, x), q)
+
+            def rate(s: float) -> np.ndarray:
+                step = s + 1j * _STEP
+                return np.imag(self.rows(t + step, q + step * v)) / _STEP
+
+            d = 1e-3
+            bias = (8 * (rate(d) - rate(-d)) - (rate(2 * d) - rate(-2 * d))) / (12 * d)
+        for k in hold:
+            J, bias = np.vstack([J, np.eye(self.n)[k]]), np.append(bias, 0.0)
+        m = len(J)
+        kkt = np.block([[self.mass_matrix(q), J.T], [J, np.zeros((m, m))]])
+        return np.linalg.solve(kkt, np.concatenate([f, -bias]))[: self.n]
+
+    def rk4(self, duration: float, dt: float, tau: Callable[..., np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the state after steps of the classical method, with the force as a function of (t, q, v)."""
+        t, q, v = self.t, self.q, self.v
+
+        def f(s: float, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return v, self.acceleration(s, q, v, tau(s, q, v))
+
+        for _ in range(round(duration / dt)):
+            a = f(t, q, v)
+            b = f(t + dt / 2, q + dt / 2 * a[0], v + dt / 2 * a[1])
+            c = f(t + dt / 2, q + dt / 2 * b[0], v + dt / 2 * b[1])
+            d = f(t + dt, q + dt * c[0], v + dt * c[1])
+            q = q + dt / 6 * (a[0] + 2 * b[0] + 2 * c[0] + d[0])
+            v = v + dt / 6 * (a[1] + 2 * b[1] + 2 * c[1] + d[1])
+            t += dt
+        return q, v
+
+
+# Parts
+
+
+def _spring(case: Case, rng: np.random.Generator) -> Part:
+    i, k, rest = int(rng.integers(case.n)), rng.uniform(1, 9), 0.3
+    return Part(
+        "joint.spring", ("spring", "stiffness"), joint={i: {"stiffness": k, "rest": rest}},
+        energy=lambda c, q: k / 2 * (q[i] - rest) ** 2,
+    )  # fmt: skip
+
+
+def _damping(case: Case, rng: np.random.Generator) -> Part:
+    i, d = int(rng.integers(case.n)), rng.uniform(0.2, 1)
+    return Part(
+        "joint.damping", ("damping",), joint={i: {"damping": d}}, force=lambda c, t, q, v: -d * v[i] * np.eye(c.n)[i]
+    )
+
+
+def _armature(case: Case, rng: np.random.Generator) -> Part:
+    i, a = int(rng.integers(case.n)), rng.uniform(0.2, 1)
+    return Part(
+        "joint.armature", ("armature",), joint={i: {"armature": a}},
+        inertia=lambda c, q: a * np.outer(np.eye(c.n)[i], np.eye(c.n)[i]),
+    )  # fmt: skip
+
+
+def _friction(case: Case, rng: np.random.Generator) -> Part:
+    i, f = int(rng.integers(case.n)), rng.uniform(0.2, 1)
+    return Part(
+        "joint.friction", ("friction",), joint={i: {"friction": f}},
+        force=lambda c, t, q, v: -f * np.sign(v[i]) * np.eye(c.n)[i],
+    )  # fmt: skip
+
+
+def _stiction(case: Case, rng: np.random.Generator) -> Part:
+    i, f = int(rng.integers(case.n)), rng.uniform(0.2, 1)
+    s, w = 1.7 * f, rng.uniform(0.5, 2)
+
+    def force(c: Case, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return -(f + (s - f) * np.exp(-((v[i] / w) ** 2))) * np.sign(v[i]) * np.eye(c.n)[i]
+
+    numbers = {"friction": f, "stiction": s, "stribeck_velocity": w}
+    return Part("joint.stiction", ("stiction", "friction", "Stribeck"), joint={i: numbers}, force=force)
+
+
+def _force_of_time(case: Case, rng: np.random.Generator) -> Part:
+    i, a, w = int(rng.integers(case.n)), rng.uniform(1, 3), rng.uniform(1, 3)
+
+    def declare(b: mb.ModelBuilder) -> None:
+        b.add_joint_force("push", f"j{i}", lambda t, q, v: a * ca.cos(w * t) - 0.3 * q * v, potential=lambda q: q**4)
+
+    return Part(
+        "force.time", ("push", "force"), declare,
+        energy=lambda c, q: q[i] ** 4,
+        force=lambda c, t, q, v: (a * np.cos(w * t) - 0.3 * q[i] * v[i]) * np.eye(c.n)[i],
+    )  # fmt: skip
+
+
+def _frame_force(case: Case, rng: np.random.Generator) -> Part:
+    k, w = len(case.kinds) - 1, rng.uniform(1, 3)
+    F, T = rng.standard_normal((2, 3))
+
+    def declare(b: mb.ModelBuilder) -> None:
+        b.add_force("thrust", "tip", force=[F[0] * ca.sin(w * ca.SX.sym("t")), F[1], F[2]], moment=list(T))
+
+    def force(c: Case, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        R, _ = c.pose(f"b{k}", q)
+        local = np.array([F[0] * np.sin(w * t), F[1], F[2]])
+        return c.moving(k, TIP, q).T @ R @ local + c.turning(k, q).T @ R @ T
+
+    return Part("force.frame", ("thrust", "force"), declare, force=force)
+
+
+def _point_spring(case: Case, rng: np.random.Generator) -> Part:
+    last, k, d = f"b{len(case.kinds) - 1}", rng.uniform(5, 20), rng.uniform(0.2, 1)
+    a, rest = np.array([1.0, 2.0, 3.0]), 0.5
+
+    def length(c: Case, q: np.ndarray) -> Any:
+        return norm(c.point(last, (0.1, 0, 0.2), q) - a)
+
+    def force(c: Case, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        J = derivative(lambda x: length(c, x), q)
+        return -d * (J @ v) * J
+
+    def declare(b: mb.ModelBuilder) -> None:
+        ends = {"body_a": "world", "point_a": a, "body_b": last, "point_b": (0.1, 0, 0.2)}
+        b.add_spring("cord", **ends, stiffness=k, rest_length=rest, damping=d)
+
+    return Part(
+        "spring.point", ("cord", "spring"), declare,
+        energy=lambda c, q: k / 2 * (length(c, q) - rest) ** 2, force=force,
+    )  # fmt: skip
+
+
+def _coupling(case: Case, rng: np.random.Generator) -> Part:
+    row = np.zeros(case.n)
+    i, j = rng.permutation(case.n)[:2]
+    row[[i, j]] = rng.uniform(0.3, 2, 2)
+    k, d, a, rest = rng.uniform(1, 9), rng.uniform(0.2, 1), rng.uniform(0.2, 1), 0.2
+
+    def declare(b: mb.ModelBuilder) -> None:
+        factors = {f"j{i}": row[i], f"j{j}": row[j]}
+        b.add_coupling("tendon", factors, stiffness=k, rest_length=rest, damping=d, armature=a)
+
+    return Part(
+        "coupling", ("tendon", "coupling"), declare,
+        energy=lambda c, q: k / 2 * (row @ q - rest) ** 2,
+        inertia=lambda c, q: a * np.outer(row, row),
+        force=lambda c, t, q, v: -d * (row @ v) * row,
+    )  # fmt: skip
+
+
+def _compensation(case: Case, rng: np.random.Generator) -> Part:
+    k, part = int(rng.integers(len(case.kinds))), rng.uniform(0.3, 1.2)
+    return Part(
+        "gravcomp", ("gravity compensation", "weight"),
+        lambda b: b.add_gravity_compensation(f"b{k}", part),
+        energy=lambda c, q: part * c.mass[k] * GRAVITY @ c.point(f"b{k}", c.com[k], q),
+    )  # fmt: skip
+
+
+def _bushing(case: Case, rng: np.random.Generator) -> Part:
+    last, k, d = f"b{len(case.kinds) - 1}", rng.uniform(1, 9, 6), rng.uniform(0.1, 1, 6)
+    R_0, p_0 = case.pose(last, case.q)
+    R_A, p_A = R_0 @ rotation(np.array([0.6, 0.0, 0.8]), 0.7), p_0 + np.array([0.1, -0.2, 0.1])
+
+    def displaced(c: Case, q: np.ndarray) -> np.ndarray:
+        R, p = c.pose(last, q)
+        B = R_A.T @ R
+        angle = np.arccos((np.trace(B) - 1) / 2)
+        turn = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
+        return np.concatenate([R_A.T @ (p - p_A), turn * angle / (2 * np.sin(angle))])
+
+    def force(c: Case, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        J = derivative(lambda x: displaced(c, x), q)
+        return -J.T @ (d * (J @ v))
+
+    def declare(b: mb.ModelBuilder) -> None:
+        a = {"body_a": "world", "rotation_a": R_A, "translation_a": p_A}
+        b.add_bushing("rubber", **a, body_b=last, stiffness=k, damping=d)
+
+    return Part(
+        "bushing", ("rubber", "bushing"), declare,
+        energy=lambda c, q: np.sum(k * displaced(c, q) ** 2) / 2, force=force,
+    )  # fmt: skip
+
+
+def _coupler(case: Case, rng: np.random.Generator) -> Part:
+    i, j = map(int, rng.permutation(case.n)[:2])
+    ratio = rng.uniform(0.4, 1.5)
+    offset = case.q[i] - ratio * case.q[j]
+    return Part(
+        "coupler", ("gear", "coupler"),
+        lambda b: b.add_coupler("gear", f"j{i}", f"j{j}", ratio=ratio, offset=offset),
+        rows=lambda c, t, q: [q[i] - ratio * q[j] - offset],
+    )  # fmt: skip
+
+
+def _prescribed(case: Case, rng: np.random.Generator) -> Part:
+    i, w, a = 0, rng.uniform(1, 3), rng.uniform(0.2, 0.6)
+    start = case.q[i] - a * np.sin(w * case.t)
+    return Part(
+        "prescribed", ("prescribed", "moved in time", "'j0'"),
+        lambda b: b.prescribe(f"j{i}", offset=start, amplitude=a, frequency=w),
+        rows=lambda c, t, q: [q[i] - start - a * np.sin(w * t)],
+    )  # fmt: skip
+
+
+def loop_part(case: Case, rng: np.random.Generator, kind: str) -> Part:
+    """Return a closure between the ground and the last body that is closed where the case stands."""
+    last = f"b{len(case.kinds) - 1}"
+    R_0, p_0 = case.pose(last, case.q)
+    R_B, p_B = _turn(rng), rng.uniform(-0.3, 0.3, 3)
+    R_A, p_A, length = R_0 @ R_B, p_0 + R_0 @ p_B, 0.0
+    if kind == "distance":
+        length = 0.8
+        p_A = p_A + length * R_A[:, 0]
+    if kind in ("cylindrical", "prismatic"):
+        p_A = p_A + 0.3 * R_A[:, 2]
+    if kind in ("revolute", "cylindrical"):
+        R_A = R_A @ rotation(np.array([0.0, 0.0, 1.0]), 0.4)
+    if kind == "universal":
+        R_A = R_A @ rotation(np.array([1.0, 0.0, 0.0]), np.pi / 2)
+
+    def rows(c: Case, t: Any, q: np.ndarray) -> list[Any]:
+        R, p = c.pose(last, q)
+        A, B, gap = R_A, R @ R_B, p + R @ p_B - p_A
+        across, sideways = [A[:, 0] @ B[:, 2], A[:, 1] @ B[:, 2]], [A[:, 0] @ gap, A[:, 1] @ gap]
+        welded = [A[:, 0] @ B[:, 1], A[:, 1] @ B[:, 2], A[:, 2] @ B[:, 0]]
+        return {
+            "point": lambda: [*gap],
+            "distance": lambda: [norm(gap) - length],
+            "revolute": lambda: [*gap, *across],
+            "universal": lambda: [*gap, A[:, 2] @ B[:, 2]],
+            "cylindrical": lambda: [*sideways, *across],
+            "prismatic": lambda: [*sideways, *welded],
+            "frame": lambda: [*gap, *welded],
+        }[kind]()
+
+    def declare(b: mb.ModelBuilder) -> None:
+        ends = {"rotation_a": R_A, "translation_a": p_A, "rotation_b": R_B, "translation_b": p_B}
+        b.add_loop("lp", kind, body_a="world", body_b=last, **ends, length=length)
+
+    return Part(f"loop.{kind}", ("lp", "loop", "close"), declare, rows=rows)
+
+
+LOOPS = {"point": 3, "distance": 1, "revolute": 5, "universal": 4, "cylindrical": 4, "prismatic": 5, "frame": 6}
+PARTS = (
+    _spring, _damping, _armature, _friction, _stiction, _force_of_time, _frame_force, _point_spring, _coupling,
+    _compensation, _bushing, _coupler, _prescribed,
+)  # fmt: skip
+
+
+def random_case(seed: int) -> Case:
+    """Return a chain with two to five kinds of parts; one case in four has a loop, one in six a mimic joint."""
+    rng = np.random.default_rng([seed, 51])
+    kind = str(rng.choice([*LOOPS])) if rng.random() < 0.25 else ""
+    n = LOOPS[kind] + 1 if kind else int(rng.integers(2, 5))
+    mimics = not kind and n > 2 and rng.random() < 0.3
+    kinds = [str(x) for x in rng.choice(["revolute", "revolute", "prismatic"], n)]
+    if kind:
+        # Three hinges and three slides at most move a body in all six ways.
+        kinds = list(rng.permutation((["revolute", "prismatic"] * 4)[:n]))
+        kinds = [str(x) for x in kinds]
+    axes = rng.standard_normal((n, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    I = []
+    for _ in range(n):
+        d, R = rng.uniform(0.05, 0.4, 3), _turn(rng)
+        I.append(R @ np.diag([d[0] + d[1], d[1] + d[2], d[2] + d[0]]) @ R.T)
+    G, c = np.eye(n), np.zeros(n)
+    if mimics:
+        G = np.vstack([np.eye(n - 1), 0.7 * np.eye(n - 1)[0]])
+        c[-1] = 0.2
+    m = G.shape[1]
+    q, v = rng.uniform(-1, 1, m), rng.choice([-1.0, 1.0], m) * rng.uniform(0.3, 1, m)
+    case = Case(
+        seed, kinds, axes, [_turn(rng) for _ in range(n)], rng.uniform(-0.5, 0.5, (n, 3)), rng.uniform(0.5, 2, n),
+        rng.uniform(-0.3, 0.3, (n, 3)), I, [], q, v, rng.standard_normal(m), 0.37, G, c,
+    )  # fmt: skip
+    if mimics:
+        case.parts.append(Part("mimic", ("mimic",), joint={n - 1: {"mimic": ("j0", 0.7, 0.2)}}))
+    if kind:
+        case.parts.append(loop_part(case, rng, kind))
+    wanted = int(rng.integers(2, 6)) - len(case.parts)
+    for k in rng.permutation(len(PARTS)):
+        if wanted <= 0:
+            break
+        binds = PARTS[k] in (_coupler, _prescribed)
+        rows = sum(len(p.rows(case, case.t, case.q)) for p in case.parts if p.rows)
+        # At least one velocity stays free. Friction stands once.
+        if binds and (kind or rows + 2 > m):
+            continue
+        if PARTS[k] in (_friction, _stiction) and any("friction" in p.kind or "stiction" in p.kind for p in case.parts):
+            continue
+        case.parts.append(PARTS[k](case, rng))
+        wanted -= 1
+    if any(p.rows for p in case.parts):
+        J = derivative(lambda x: case.rows(case.t, x), case.q)
+        drift = np.imag(case.rows(case.t + 1j * _STEP, case.q.astype(complex))) / _STEP
+        case.v = case.v - np.linalg.pinv(J) @ (J @ case.v + drift)
+    return case
