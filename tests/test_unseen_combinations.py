@@ -214,7 +214,7 @@ PATHS: dict[str, Callable[[Case, Path], None]] = {
 }
 
 
-@pytest.mark.thorough(every=10)
+@pytest.mark.thorough(every=20)
 @pytest.mark.parametrize("path", PATHS)
 @pytest.mark.parametrize("seed", CASES)
 def test_a_path_is_right_or_refuses_a_part_by_name(seed: int, path: str, tmp_path: Path) -> None:
