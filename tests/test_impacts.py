@@ -189,3 +189,51 @@ def test_bad_impacts_are_refused() -> None:
         lag.impulse(rows=[lag.velocities[0]], restitution=lag.velocities[0])
     with pytest.raises(InputError, match="depend on each other"):
         lag.impulse(rows=[lag.velocities[0], 2 * lag.velocities[0]]).after()
+
+
+def equal_cranks(n: int) -> mb.Model:
+    """Return n cranks of 0.5 m that carry a plate: it moves, and each crank behind the second says nothing new."""
+    b = mb.ModelBuilder("cranks", gravity=(0, -9.81, 0))
+    for k in range(n):
+        b.add_body(f"c{k}", mass=1.0, com=(0.25, 0, 0), inertia=(0.02, 0.02, 0.02))
+        place = {"axis": (0, 0, 1), "translation": (0.6 * k, 0, 0)}
+        b.add_joint(f"c{k}", "continuous", parent="world", child=f"c{k}", **place)
+    b.add_body("plate", mass=3.0, com=(0.6, 0, 0), inertia=(0.3, 0.3, 0.3))
+    b.add_joint("plate", "continuous", parent="c0", child="plate", axis=(0, 0, 1), translation=(0.5, 0, 0))
+    for k in range(1, n):
+        ends = {"translation_a": (0.6 * k, 0, 0), "translation_b": (0.5, 0, 0)}
+        b.add_loop(f"pin{k}", "point", body_a="plate", body_b=f"c{k}", **ends)
+    return b.build()
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_a_blow_on_cranks_of_which_one_is_redundant(engine: str) -> None:
+    """The plate translates: I = n (0.02 + 0.25²) + 3 0.5² about the pivots, and ω = S / I."""
+    for n in (2, 3, 4):
+        model = equal_cranks(n)
+        dyn, angles = mb.dynamics(model, engine), np.array([0.7, -1.2])
+        q = np.array([[x] * n + [-x] for x in angles])
+        blow = np.array([0.3] + [0.0] * n)
+        hit = mb.impact(dyn, q, 0 * q, blow)
+        rate = 0.3 / (n * (0.02 + 0.25**2) + 3 * 0.5**2)
+        np.testing.assert_allclose(hit.v, [[rate] * n + [-rate]] * 2, rtol=0, atol=1e-13)
+        J, M = dyn.constraint_jacobian(q), dyn.mass_matrix(q)
+        needed = (M @ hit.v[..., None])[..., 0] - blow
+        least = [np.linalg.lstsq(J[k].T, needed[k], rcond=1e-9)[0] for k in range(2)]
+        np.testing.assert_allclose(hit.reactions, least, rtol=0, atol=1e-12)
+        alone = mb.impact(dyn, q[0], 0 * q[0], blow)
+        np.testing.assert_allclose(alone.reactions, least[0], rtol=0, atol=1e-12)
+        # A row of the user's that the cranks hold already is one to leave out.
+        with pytest.raises(NumericalError, match="leave such a row out"):
+            mb.impact(dyn, q[0], 0 * q[0], blow, jacobian=J[0, :1])
+
+
+def test_mobility_of_what_was_found_folded_asks_for_a_configuration() -> None:
+    """All cranks lie on one line then, where rounding tells rows apart that are not in any other pose."""
+    for n, redundant in ((3, 1), (4, 2)):
+        dyn = mb.dynamics(equal_cranks(n), "lagrangian")
+        with pytest.raises(InputError, match=r"next to a singular pose.*of the branch on which it moves"):
+            dyn.mobility()
+        found = dyn.mobility([0.7] * n + [-0.7])
+        assert (found.degrees_of_freedom, len(found.redundant)) == (1, redundant)
+    assert "none is redundant" in str(mb.dynamics(equal_cranks(2), "lagrangian").mobility())

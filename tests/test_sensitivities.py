@@ -151,3 +151,17 @@ def test_what_cannot_be_differentiated_is_refused(arm):
 def test_a_run_that_ends_nowhere_is_an_error(arm):
     with pytest.raises(NumericalError, match="double_pendulum"):
         mb.sensitivities(arm, [0.5, -0.4], [1e200, 0.3], 1.0, dt=0.1)
+
+
+def test_a_force_of_the_time_is_refused_as_one():
+    b = mb.ModelBuilder("pushed", gravity=(0, 0, 0))
+    b.add_body("block", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0))
+    b.add_joint_force("push", "x", lambda t, q, v: 3 * t - q)  # noqa: ARG005
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    for call in (
+        lambda: dyn.discretize([0.1], [0.0], [0.0], dt=0.01),
+        lambda: mb.sensitivities(dyn, [0.1], [0.0], 0.1),
+    ):
+        with pytest.raises(UnsupportedError, match="terms that depend on the time"):
+            call()

@@ -305,7 +305,7 @@ class LinearizationQuantities:
             The state after the step is not finite, or the stages of an implicit method are not solved.
         UnsupportedError
             A method without a fixed step of mbkit's own; an engine without derivatives; a model with constraints, with
-            quasi-velocities of its own or with motions prescribed in time.
+            quasi-velocities of its own or with terms that depend on the time.
 
         Examples
         --------
@@ -340,7 +340,7 @@ class LinearizationQuantities:
         """
         for has, feature in (
             (self.model.constrained, "constraints"),
-            (self.model.time_parameter, "motions prescribed in time"),
+            (self.model.time_parameter, "terms that depend on the time"),
             (self.model.velocity_map, "quasi-velocities of its own"),
         ):
             if has:

@@ -23,6 +23,8 @@ from mbkit.errors import InputError, NumericalError
 
 #: Reciprocal condition of the scaled system below which its rows count as dependent.
 _DEPENDENT: Final = 1e-13
+#: Singular values of the constraints' rows that are zero, in terms of the largest one.
+_REDUNDANT: Final = 1e-9
 _TINY: Final = 1e-150
 
 
@@ -37,7 +39,8 @@ class Impact:
     impulses : (k,) or (N, k) array
         P of the rows G, in N s or N m s: that on the coordinates is Gᵀ P.
     reactions : (m,) or (N, m) array
-        Λ of the model's own constraints, in the order of `constraint_names`; m is 0 without any.
+        Λ of the model's own constraints, in the order of `constraint_names`; m is 0 without any. Where rows are
+        redundant, it is the one with the least norm.
     energy_change : float or (N,) array
         T⁺ - T⁻, J. Without Ŝ, with e = 0 and constraints that do not move, it is -½ (v⁺ - v⁻)ᵀ M (v⁺ - v⁻), as
         Carnot's theorem has it.
@@ -81,7 +84,7 @@ def impact(
     InputError
         For unusable arguments, or where there is neither an impulse nor a row.
     NumericalError
-        Rows depend on each other or on the constraints at this pose, or M is singular.
+        Rows of G depend on each other or on the constraints at this pose, or M is singular.
 
     Examples
     --------
@@ -120,12 +123,18 @@ def impact(
     J, rate = np.zeros((*lead, 0, model.nv)), np.zeros((*lead, 0))
     if model.constrained:
         J, rate = dyn.constraint_jacobian(q), dyn.constraint_rate(q, v)
+    # Sums of the rows that are independent, and zeros for the others.
+    mixed, sizes, across = np.linalg.svd(J, full_matrices=False)
+    alone = sizes > _REDUNDANT * sizes.max(axis=-1, keepdims=True, initial=0.0)
+    if redundant := J.shape[-2] > alone.sum(axis=-1).min(initial=model.nv):
+        J, rate = (alone * sizes)[..., None] * across, alone * (mixed.mT @ rate[..., None])[..., 0]
     R = np.concatenate([G, J], axis=-2)
     wanted = np.concatenate([-(1 + e) * (G @ v[..., None])[..., 0], -rate], axis=-1)
-    change, P = _solved(model.name, M, R, given, wanted)
+    change, P = _solved(model.name, M, R, given, wanted, np.concatenate([np.zeros(G.shape[:-1]), ~alone], axis=-1))
     energy = 0.5 * np.einsum("...i,...ij,...j->...", change, M, 2 * v + change)
     k = G.shape[-2]
-    return Impact(v + change, P[..., :k], P[..., k:], float(energy) if not lead else energy)
+    reactions = (mixed @ P[..., k:, None])[..., 0] if redundant else P[..., k:]
+    return Impact(v + change, P[..., :k], reactions, float(energy) if not lead else energy)
 
 
 def _rows(nv: int, jacobian: ArrayLike) -> Array:
@@ -139,11 +148,12 @@ def _rows(nv: int, jacobian: ArrayLike) -> Array:
     return G
 
 
-def _solved(name: str, M: Array, R: Array, force: Array, wanted: Array) -> tuple[Array, Array]:
-    """Return x and P of M x - Rᵀ P = force, R x = wanted."""
+def _solved(name: str, M: Array, R: Array, force: Array, wanted: Array, empty: Array) -> tuple[Array, Array]:
+    """Return x and P of M x - Rᵀ P = force, R x = wanted; P is zero of rows that are `empty`, (..., k)."""
     n, k = M.shape[-1], R.shape[-2]
     K = np.zeros((*M.shape[:-2], n + k, n + k))
     K[..., :n, :n], K[..., :n, n:], K[..., n:, :n] = M, R.swapaxes(-1, -2), R
+    K[..., n:, n:] = empty[..., None] * np.eye(k)
     # Metres beside radians and grams beside tons: each unknown by its own size.
     masses = np.sqrt(np.abs(np.einsum("...ii->...i", M)))
     masses = np.where(masses > 0, masses, np.maximum(masses.max(axis=-1, keepdims=True, initial=0.0), _TINY))
@@ -156,8 +166,8 @@ def _solved(name: str, M: Array, R: Array, force: Array, wanted: Array) -> tuple
     if np.any(worst < _DEPENDENT):
         where = "" if worst.ndim == 0 else f" of sample {int(np.argmin(worst))}"
         raise NumericalError(
-            f"impact: rows of {name} depend on each other at this pose{where}, or no mass moves with them; impulses "
-            "are then undetermined: leave a row out"
+            f"impact: rows of jacobian depend on each other or on the constraints of {name} at this pose{where}, or "
+            "no mass moves with them; impulses are then undetermined: leave such a row out, or give every body a mass"
         )
     x = np.zeros_like(right)
     for _ in range(2):
