@@ -211,6 +211,44 @@ def random_mjcf(seed: int) -> str:
     return _Author(seed).text()
 
 
+def with_tendons(text: str, seed: int) -> str:
+    """Return an MJCF with tendons and actuators of every kind that acts without control, and with held weights."""
+    author, root = _Author(seed), ET.fromstring(text)
+    rng = author.rng = np.random.default_rng([seed, 32])
+    bodies = list(root.find("worldbody").iter("body"))
+    for k, body in enumerate(bodies):
+        ET.SubElement(body, "site", {"name": f"at{k}", **author.pose()})
+        if author.chance(0.3):
+            body.set("gravcomp", author.numbers(1))
+    ET.SubElement(root.find("worldbody"), "site", {"name": "ground", "pos": author.numbers(3)})
+    sites = ["ground", *(f"at{k}" for k in range(len(bodies)))]
+    single = [e for e in root.find("worldbody").iter("joint") if e.get("type", "hinge") in ("hinge", "slide")]
+    for k, joint in enumerate(single):
+        joint.set("name", joint.get("name", f"single{k}"))
+    tendons, actuators = ET.SubElement(root, "tendon"), ET.SubElement(root, "actuator")
+    for k in range(4):
+        spatial = not single or author.chance(0.6)
+        given = {"name": f"tendon{k}"}
+        stiffness, damping = (author.numbers(int(rng.integers(1, 4))) for _ in range(2))
+        lengths = " ".join(repr(float(x)) for x in np.sort(rng.uniform(0.1, 2, 2)))
+        drawn = {"stiffness": stiffness, "damping": damping, "springlength": lengths}
+        given |= {name: x for name, x in drawn.items() if author.chance(0.6)}
+        tendon = ET.SubElement(tendons, "spatial" if spatial else "fixed", given)
+        if not spatial:
+            for joint in rng.choice(len(single), min(len(single), int(rng.integers(1, 4))), replace=False):
+                ET.SubElement(tendon, "joint", {"joint": single[joint].get("name"), "coef": author.numbers(1)})
+            continue
+        for branch in range(int(rng.integers(1, 3))):
+            if branch:
+                ET.SubElement(tendon, "pulley", {"divisor": author.positive(1, 1, 3)})
+            for site in rng.choice(len(sites), min(len(sites), int(rng.integers(2, 5))), replace=False):
+                ET.SubElement(tendon, "site", {"site": sites[site]})
+    for k in range(2):
+        at = {"tendon": f"tendon{k}"} if not single or author.chance(0.5) else {"joint": single[0].get("name")}
+        ET.SubElement(actuators, "general", {**at, "gear": author.numbers(1), "damping": author.numbers(3)})
+    return ET.tostring(root, encoding="unicode")
+
+
 # What MuJoCo computes.
 
 

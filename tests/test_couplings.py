@@ -226,7 +226,7 @@ def test_what_acts_and_what_is_left_out_is_named(tmp_path):
     assert "'slack': stiffness 8 0 0, rest length 0 to 1" in note("springs of tendons")
     assert "'servo' on b: stiffness 5" in note("actuators that act")
     for name, words in {
-        "servo": "force range -4 4",
+        "servo": "forcerange -4 4",
         "spherical": "stiffness 12",
         "biceps": "muscle",
         "runaway": "stiffness -13",

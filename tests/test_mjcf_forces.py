@@ -13,8 +13,10 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import ModelError, UnsupportedError
+from mbkit.load import mjcf_reader
+from mbkit.load.mjcf_attributes import rules
 from mbkit.show import shapes_of
-from tests.random_files import mujoco_terms, random_mjcf, terms_of
+from tests.random_files import errors, mujoco_terms, random_mjcf, terms_of, with_tendons
 from tests.scenes import chain, hinge
 
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "oracle")
@@ -79,6 +81,22 @@ def test_gravity_compensation_of_random_files_is_that_of_mujoco(seed: int, tmp_p
     assert np.abs(passive - at.passive).max() < 1e-13 * max(np.abs(at.passive).max(), np.abs(at.nle).max(), 1.0)
 
 
+def test_without_a_weight_held_upwards_mujoco_holds_none(tmp_path: Path) -> None:
+    text = arm(held='gravcomp="-0.5"').replace('gravcomp="1"', "")
+    model, passive = check(written(text, tmp_path), ("lagrangian",))
+    assert not model.forces
+    # The joints' damper and spring are left.
+    assert not passive[:, :6].any()
+    (read,) = mb.compare_parsers(written(text, tmp_path), ("mujoco",), samples=1).importers
+    assert read.agrees
+    b = hinge(mass=2.0, com=(0.5, 0, 0.1), axis=(0, -1, 0))
+    b.add_gravity_compensation("a", -0.5)
+    with pytest.raises(UnsupportedError, match="gravity compensation of 'a'"):
+        mb.convert(b.build(), "mjcf")
+    with pytest.raises(UnsupportedError, match="gravity compensation of a"):
+        mb.simulate(mb.dynamics(b.build(), "mujoco"), [0.1], [0.0], 0.1, "mujoco_rk4", 1e-2)
+
+
 MOTOR = '<actuator><motor joint="k"/></actuator>'
 
 
@@ -93,7 +111,9 @@ def test_weight_that_actuators_hold(actuators: bool, more: str, lifted: str, tmp
         text = text.replace(f'name="{name}"', f'name="{name}" actuatorgravcomp="true"')
     model, _ = check(written(text, tmp_path), actuators=actuators)
     assert any(bool(f.without) for f in model.forces) != (actuators and bool(more))
-    assert any("gravity compensation by actuators" in note for note in model.notes)
+    said = "act as passive" if actuators and more else "do not act" if actuators else "left out; with actuators=True"
+    assert any(f"servos of gravity compensation by actuators {said}" in note for note in model.notes)
+    assert "servos of gravity compensation" in repr(model)
     q, v = model.random_state(0)
     ours, theirs = (mb.simulate(mb.dynamics(model, "mujoco"), q, v, 0.05, x, 1e-3) for x in ("rk4", "mujoco_rk4"))
     np.testing.assert_allclose(ours.q[-1], theirs.q[-1], rtol=0, atol=1e-9)
@@ -205,6 +225,7 @@ def test_copies_are_those_of_mujoco(tmp_path: Path) -> None:
         (('count="3"', 'count="1.5"'), "whole number"),
         (('count="3"', 'count="100000000"'), "whole number up to"),
         (('count="3"', ""), "count"),
+        (('count="3"', 'count="-1"'), "whole number up to"),
         (('sep="_"', 'pos="1 0 0"'), "unknown attribute 'pos'"),
         (('<frame pos="1 .1 0">', '<frame pos="1 .1 0"/><joint/><frame>'), "<joint> is not copied"),
     ],
@@ -214,6 +235,27 @@ def test_faults_of_copies_are_named(change: tuple[str, str], said: str, tmp_path
         mb.load(written(REPLICATED.replace(*change), tmp_path))
     none = mb.load(written(REPLICATED.replace('count="3"', 'count="0"').split("<tendon")[0] + "</mujoco>", tmp_path))
     assert list(none.joint_names) == ["spin", "z"]
+
+
+def test_copies_that_are_too_many_are_refused_before_any_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mjcf_reader, "_suffixed", lambda *_: pytest.fail("copied"))
+    body, copies = "<body><joint/><geom size='.1'/></body>", '<replicate count="300" offset="1 0 0">{}</replicate>'
+    cube = copies.format(copies.format(copies.format(body)))
+    beside = "".join(['<replicate count="100000">' + body + "</replicate>"] * 2)
+    for inside, said in ((cube, "count '300'; expected a whole number up to 1 "), (beside, "elements in all")):
+        path = written(f"<mujoco><worldbody>{inside}</worldbody></mujoco>", tmp_path)
+        with pytest.raises(ModelError, match=said) as caught:
+            mb.load(path)
+        assert len(caught.value.faults) == 1
+
+
+def test_a_body_in_one_of_its_name_is_a_fault(tmp_path: Path) -> None:
+    inner = '<body name="b"><geom size=".1"/></body>'
+    text = f'<mujoco><worldbody><body name="b"><joint/><geom size=".1"/>{inner}</body></worldbody></mujoco>'
+    with pytest.raises(ModelError, match="body 'b': declared more than once"):
+        mb.load(written(text, tmp_path))
 
 
 # Springs whose rest MuJoCo measures, and of several coordinates
@@ -272,6 +314,28 @@ def test_springs_of_all_joints_and_polynomials(free: str, ball: str, option: str
     (read,) = mb.compare_parsers(path, ("mujoco",), samples=1).importers
     assert read.agrees
     assert bool([f for f in model.forces if "spring" in f.name]) == ("spring" not in option)
+
+
+def test_mujocos_own_steps_have_its_springs_of_ball_and_free_joints(tmp_path: Path) -> None:
+    text = NONLINEAR.format(free="20", ball="3", option="", armature="0")
+    for polynomial in ('stiffness="1 2 3" damping=".1 .2 .3"', 'stiffness="0 0 2" damping="0 1"'):
+        text = text.replace(polynomial, "")
+    model = mb.load(written(text, tmp_path))
+    q, v = model.random_state(0)
+    own = mb.simulate(mb.dynamics(model, "mujoco"), q, v, 0.3, "mujoco_rk4", 1e-3)
+    ours = mb.simulate(mb.dynamics(model, "lagrangian", compile=False), q, v, 0.3, "rk4", 1e-3)
+    np.testing.assert_allclose(own.q[-1], ours.q[-1], rtol=0, atol=1e-11)
+    back = written(mb.convert(model, "mjcf").text, tmp_path)
+    check(back, ("mujoco",))
+    bare, same = (
+        terms_of(mujoco.MjModel.from_xml_path(str(x)), 2, 0) for x in (written(text, tmp_path, "a.xml"), back)
+    )
+    np.testing.assert_allclose(same.passive, bare.passive, rtol=0, atol=1e-12 * np.abs(bare.passive).max())
+    # A spring by a function is not MuJoCo's, nor one that is not alike about all axes.
+    b = chain({"kind": "ball", "mass": 1.0, "inertia": (0.1, 0.1, 0.1), "parent": "world"})
+    b.add_bushing("soft", body_a="world", body_b="b0", stiffness=[0, 0, 0, 1, 2, 1])
+    with pytest.raises(UnsupportedError, match="soft"):
+        mb.simulate(mb.dynamics(b.build(), "mujoco"), [0, 0, 0, 1], [1, 0, 0], 0.1, "mujoco_rk4", 1e-2)
 
 
 @pytest.mark.parametrize(
@@ -349,8 +413,12 @@ BANDS = """<tendon><spatial stiffness="3" damping=".1" springlength="0 1.2"><sit
   <spatial name="bent" stiffness="2 .5 .3" springlength=".4"><site site="b"/><site site="e"/></spatial>
   <fixed stiffness="2 .5 .3" springlength="-.2 .1"><joint joint="j" coef="-1.5"/></fixed>
   <fixed stiffness="2 0 .3"><joint joint="k" coef="2"/></fixed>"""
-LEFT_OUT = """<fixed name="sum" stiffness="2 1"><joint joint="j" coef="1"/><joint joint="k" coef="1"/></fixed>
-  <spatial name="no" stiffness="1 1"><site site="o"/><site site="b"/></spatial>"""
+OVER_SITES = """<fixed name="sum" stiffness="2 1" springlength="-.1 .2"><joint joint="j" coef="1"/>
+    <joint joint="k" coef=".5"/></fixed>
+  <spatial name="over" stiffness="2" damping=".3"><site site="o"/><site site="b"/><site site="e"/></spatial>
+  <spatial name="drum" stiffness="1 1" damping=".3 .2"><site site="o"/><site site="b"/><pulley divisor="2"/>
+    <site site="b"/><site site="e"/></spatial>
+  <spatial name="push" stiffness="-1" damping="-.2"><site site="b"/><site site="e"/></spatial>"""
 
 
 @pytest.mark.thorough("False")
@@ -359,13 +427,124 @@ def test_springs_of_tendons_that_rest_between_two_lengths(off: bool, tmp_path: P
     text = RESTING.split("<tendon>")[0] + BANDS
     if off:
         text = text.replace("<worldbody>", '<option><flag spring="disable"/></option><worldbody>')
-    notes = mb.load(written(f"{text}{LEFT_OUT}</tendon></mujoco>", tmp_path)).notes
-    assert any(note.startswith("left out of tendons: 'sum': ") and "'no': " in note for note in notes)
     path = written(f"{text}</tendon></mujoco>", tmp_path)
     model, _ = check(path)
     assert len(model.forces) == (0 if off else 4)
     (read,) = mb.compare_parsers(path, ("mujoco",), samples=1).importers
     assert read.agrees
+
+
+def test_springs_and_dampers_over_several_sites_and_joints(tmp_path: Path) -> None:
+    more = '<general tendon="drum" gear="-2" damping=".3 .4 .5"/><general joint="j" damping=".3 0 .5"/>'
+    text = f"{RESTING.split('<tendon>')[0]}<tendon>{OVER_SITES}</tendon><actuator>{more}</actuator></mujoco>"
+    path = written(text, tmp_path)
+    model, _ = check(path, ("mujoco",))
+    assert any("'drum': stiffness 1 1 0, rest length" in note for note in model.notes)
+    dyn = mb.dynamics(model.without("damping"), "lagrangian", compile=False)
+    (read,) = mb.compare_parsers(path, ("mujoco",), samples=1).importers
+    assert read.agrees
+    # The springs' forces are those of their energy.
+    q = model.random_state(0)[0]
+    at = mujoco_terms(re.sub(' damping="[^"]*"', "", text), 1, 0)
+    h = 1e-6
+    step = np.eye(model.nv) * h
+    slope = [
+        (dyn.potential_energy(model.integrate(q, x)) - dyn.potential_energy(model.integrate(q, -x))) / 2 for x in step
+    ]
+    still = np.zeros(model.nv)
+    springs = mb.load(written(re.sub(' damping="[^"]*"', "", text), tmp_path))
+    passive = mb.dynamics(springs, "lagrangian", compile=False)
+    np.testing.assert_allclose(passive.passive(at.q, at.v), at.passive, rtol=0, atol=1e-12 * np.abs(at.passive).max())
+    np.testing.assert_allclose(np.array(slope) / h, dyn.gravity(q) - passive.passive(q, still), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("tendon", "actuator", "said"),
+    [
+        ('armature=".1"', "", "tendon 't': armature of a path over sites"),
+        ("", 'tendon="t" armature=".1"', "armature of a path over sites"),
+        ("", 'joint="l" armature=".1"', "armature of what is no sum"),
+        ("", 'joint="l" damping=".1"', "damping of what is no sum"),
+        ('stiffness="2"', "", "tendon 't': stiffness of what is no sum"),
+        ('damping="2"', "", "tendon 't': damping of what is no sum"),
+    ],
+)
+def test_what_acts_on_a_path_and_has_no_description_is_refused(
+    tendon: str, actuator: str, said: str, tmp_path: Path
+) -> None:
+    # A path around a geom acts where it has a stiffness or a damping alone.
+    around = '<geom geom="g"/>' if "armature" not in tendon + actuator else '<site site="b"/>'
+    path = f'<spatial name="t" {tendon}><site site="o"/>{around}<site site="e"/></spatial>'
+    text = (
+        RESTING.split("<tendon>")[0].replace("<geom ", '<geom name="g" ', 1).replace('type="box" size=".1', 'size=".1')
+    )
+    text += f"<tendon>{path}</tendon>{actuator and f'<actuator><general {actuator}/></actuator>'}</mujoco>"
+    mujoco.MjModel.from_xml_string(text)
+    with pytest.raises(ModelError, match=said):
+        mb.load(written(text, tmp_path))
+
+
+@pytest.mark.thorough(every=4)
+@pytest.mark.parametrize("seed", range(24))
+def test_random_tendons_are_those_of_mujoco(seed: int, tmp_path: Path) -> None:
+    text = with_tendons(random_mjcf(seed), seed)
+    at, model = mujoco_terms(text, 2, seed), mb.load(written(text, tmp_path))
+    dyn = mb.dynamics(model.without("friction"), "lagrangian", compile=False)
+    found = errors(at, dyn.mass_matrix(at.q), dyn.nle(at.q, at.v), dyn.passive(at.q, at.v))
+    assert max(found.values()) < 1e3
+
+
+VALUES = (".7", ".3 1 2", "true", ".1 1", "t", "u", "w", "s", "affine", ".2 .5 .3 .1", "1 2 3 4 5 6", "-1 .5")
+
+
+def moved(name: str, given: dict[str, str]) -> str:
+    """Return an MJCF with a tendon on joints, one over sites, and an actuator, one of which has attributes."""
+    own = " ".join(f'{k}="{x}"' for k, x in given.items())
+    at = {x: own if x == name else "" for x in ("fixed", "spatial")}
+    actuator = "" if name in at else f"<actuator><{name} {own}/></actuator>"
+    return f"""<mujoco><worldbody><site name="o" pos="1 1 1"/><body name="b">
+      <joint name="j" axis="1 0 0" springref="20"/><geom size=".1" pos=".3 0 0"/>
+      <site name="s" pos="1 0 0"/><body name="c" pos="0 0 1"><joint name="h"/>
+      <geom size=".1" pos="0 .2 0"/><site name="r" pos="0 1 0"/></body></body>
+      <body name="d"><joint name="w" type="ball"/><geom size=".1" pos=".1 0 0"/></body></worldbody><tendon>
+      <fixed name="t" {at["fixed"]}><joint joint="j" coef="2"/><joint joint="h" coef="-.5"/></fixed>
+      <spatial name="u" {at["spatial"]}><site site="o"/><site site="s"/><site site="r"/></spatial></tendon>
+      {actuator}</mujoco>"""
+
+
+@pytest.mark.thorough("general", "position", "velocity", "pid", "cylinder")
+@pytest.mark.parametrize("name", ["fixed", "spatial", "general", "position", "velocity", "pid", "damper", "cylinder"])
+def test_no_attribute_of_tendons_and_actuators_changes_the_motion_in_silence(name: str, tmp_path: Path) -> None:
+    """M, nle and passive forces are as in MuJoCo or refused; at zero control a note may say what is left out."""
+    section = rules().children["tendon" if name in ("fixed", "spatial") else "actuator"]
+    ways = [{}] if name in ("fixed", "spatial") else [{"joint": "j"}, {"tendon": "t"}, {"tendon": "u"}, {"joint": "w"}]
+    ways = [x | ({"ctrlrange": "0 1"} if name == "damper" else {}) for x in ways]
+    felt = 0
+    for way, key in ((x, k) for x in ways for k in sorted(section.children[name].attributes)):
+        before = mujoco_terms(moved(name, way), 1, 0)
+        for value, acts in ((x, a) for x in VALUES for a in ("passive", "actuated")):
+            terms, text = ("M", "nle", acts), moved(name, way | {key: value})
+            try:
+                at = mujoco_terms(text, 1, 0)
+            except ValueError:
+                continue
+            if all(np.abs(getattr(at, x) - getattr(before, x)).max() < 1e-10 for x in terms):
+                continue
+            felt += 1
+            try:
+                model = mb.load(written(text, tmp_path), actuators=acts == "actuated")
+            except ModelError:
+                break
+            dyn = mb.dynamics(model, "lagrangian", compile=False)
+            own = dyn.mass_matrix(at.q), dyn.nle(at.q, at.v), dyn.passive(at.q, at.v)
+            agrees = all(
+                np.abs(x - getattr(at, n)).max() < 1e-9 * max(1.0, np.abs(getattr(at, n)).max())
+                for n, x in zip(terms, own, strict=True)
+            )
+            said = acts == "actuated" and any(n.startswith("left out of actuators") for n in model.notes)
+            assert agrees or said, (way, key, value, acts)
+            break
+    assert felt >= 3
 
 
 # Curves
@@ -465,6 +644,17 @@ def test_an_equality_of_tendons_is_a_coupler(equality: str, why: str, tmp_path: 
     assert all(stage.same for stage in read.stages if stage.name == "couplers")
 
 
+@pytest.mark.parametrize("polycoef", [".5", ".5 2", ".1 .2 .3"])
+def test_a_short_polynomial_is_filled_as_by_mujoco(polycoef: str, tmp_path: Path) -> None:
+    text = KNEE.replace(".02 .3 -.4 .5 -.6", polycoef)
+    compiled = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(compiled)
+    data.qpos[:] = 0.3, 0.25, 0.7
+    mujoco.mj_forward(compiled, data)
+    dyn = mb.dynamics(mb.load(written(text, tmp_path)), "oracle")
+    np.testing.assert_allclose(dyn.constraint_residual(data.qpos), data.efc_pos, rtol=0, atol=1e-14)
+
+
 # Attached models
 
 HAND = """<mujoco model="hand"><compiler angle="radian"/><option gravity="0 0 0"/>
@@ -485,6 +675,7 @@ ARM = """<mujoco model="arm"><asset><model name="hand" file="sub/hand.xml"/></as
     <geom size=".1" pos="0 .2 .1" class="heavy"/>{attach}</body></worldbody></mujoco>"""
 
 
+@pytest.mark.parametrize("alike", [True, False])
 @pytest.mark.parametrize(
     "attach",
     [
@@ -495,10 +686,18 @@ ARM = """<mujoco model="arm"><asset><model name="hand" file="sub/hand.xml"/></as
         '<frame pos="1 .2 .3" euler="10 20 30"><attach model="hand" body="palm" prefix="r_"/></frame>',
     ],
 )
-def test_what_is_attached_is_that_of_mujoco(attach: str, tmp_path: Path) -> None:
+def test_what_is_attached_is_that_of_mujoco(attach: str, alike: bool, tmp_path: Path) -> None:
     (tmp_path / "sub").mkdir()
-    written(HAND, tmp_path, "sub/hand.xml")
-    path = written(ARM.format(attach=attach), tmp_path)
+    hand, text = HAND, ARM.format(attach=attach)
+    if not alike:
+        hand = HAND.replace('angle="radian"', 'angle="radian" eulerseq="ZyX"')
+        # The main class of this file does not reach the other, whose geoms need MuJoCo's compiler.
+        main = '<joint damping="3" armature=".1"/><geom density="500" shellinertia="true"/><position kp="7"/>'
+        text = text.replace("<default>", f"<default>{main}<tendon damping='2'/>", 1).replace(
+            "</worldbody>", '</worldbody><actuator><position joint="f"/></actuator>'
+        )
+    written(hand, tmp_path, "sub/hand.xml")
+    path = written(text, tmp_path)
     model, _ = check(path, ("lagrangian",), actuators=True)
     compiled = mujoco.MjModel.from_xml_path(str(path))
     names = [compiled.joint(i).name for i in range(compiled.njnt)]
@@ -535,8 +734,7 @@ def test_meshes_of_what_is_attached_are_found(tmp_path: Path) -> None:
         ("arm", ("sub/hand.xml", "sub/none.xml"), "no such file"),
         ("arm", ("sub/hand.xml", "/etc/hand.xml"), "absolute path"),
         ("arm", ('body="palm"', 'body="plam"'), "body 'plam' is not in sub/hand.xml"),
-        ("arm", ('<default><default class="heavy">', '<default><joint damping="1"/><default class="heavy">'), "main"),
-        ("hand", ('angle="radian"', 'angle="radian" eulerseq="XYZ"'), "compiler eulerseq is XYZ, and xyz here"),
+        ("hand", ('angle="radian"', 'angle="radian" boundmass="1"'), "compiler boundmass is 1.0, and 0.0 here"),
         (
             "hand",
             ("<option", '<asset><model name="x" file="y"/></asset><worldbody><attach/></worldbody><option'),
@@ -583,8 +781,39 @@ def test_a_free_body_may_be_aligned(by: str, below: str, matter: str, tmp_path: 
     np.testing.assert_allclose(site, compiled.site_pos[compiled.site("s").id], rtol=0, atol=1e-14)
 
 
-def test_equalities_of_aligned_bodies_name_sites(tmp_path: Path) -> None:
-    text = """<mujoco><worldbody><body name="b"><freejoint align="true"/><geom size=".1" pos=".1 0 0"/></body>
-      </worldbody><equality><connect body1="b" anchor="0 0 0"/></equality></mujoco>"""
-    with pytest.raises(ModelError, match="moved by align; name sites"):
-        mb.load(written(text, tmp_path))
+@pytest.mark.parametrize(
+    "equality",
+    [
+        '<connect body1="b" body2="c" anchor=".1 .2 .3"/>',
+        '<connect body1="c" body2="b" anchor=".1 .2 .3"/>',
+        '<weld body1="b" body2="c" anchor=".3 .2 .1"/>',
+        '<weld body1="c" body2="b" relpose="1 2 3 1 .1 .2 .3" anchor=".3 .2 .1"/>',
+    ],
+)
+def test_equalities_of_aligned_bodies_are_those_of_mujoco(equality: str, tmp_path: Path) -> None:
+    """The anchors stand in the frame that align has moved."""
+    text = f"""<mujoco><worldbody><body name="b" pos="1 0 0" euler="10 20 30"><freejoint align="true"/>
+      <inertial mass="1" diaginertia="1 1.2 1.3" pos=".1 .2 .3" euler="30 0 0"/></body>
+      <body name="c"><joint/><geom size=".1"/></body></worldbody><equality>{equality}</equality></mujoco>"""
+    (loop,) = mb.load(written(text, tmp_path)).loops
+    m = mujoco.MjModel.from_xml_string(text)
+    data = m.eq_data[0]
+    if "connect" in equality:
+        ends = [(np.eye(3), data[:3]), (np.eye(3), data[3:6])]
+    else:
+        R = np.empty(9)
+        mujoco.mju_quat2Mat(R, data[6:10])
+        ends = [(R.reshape(3, 3), data[3:6]), (np.eye(3), data[:3])]
+    for (R, p), own in zip(
+        ends, ((loop.rotation_a, loop.translation_a), (loop.rotation_b, loop.translation_b)), strict=True
+    ):
+        np.testing.assert_allclose(own[1], p, rtol=0, atol=1e-14)
+        np.testing.assert_allclose(own[0], R, rtol=0, atol=1e-14)
+
+
+def test_the_inertia_of_a_mesh_that_a_plugin_makes_is_mujocos(tmp_path: Path) -> None:
+    text = """<mujoco><extension><plugin plugin="mujoco.sdf.torus"><instance name="ring">
+      <config key="radius1" value=".3"/><config key="radius2" value=".1"/></instance></plugin></extension>
+      <asset><mesh name="ring"><plugin instance="ring"/></mesh></asset><worldbody><body><joint axis="1 0 0"/>
+      <geom type="sdf" mesh="ring" mass="2" pos="0 .1 0"><plugin instance="ring"/></geom></body></worldbody></mujoco>"""
+    check(written(text, tmp_path), ("lagrangian",))

@@ -42,7 +42,6 @@ from mbkit.engines.steps import Steps
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.description import CONSTRAINT_FEATURES
-from mbkit.model.elements.forces import by_functions
 from mbkit.model.manifold import NEAR_UNIT
 from mbkit.model.rolling import LIES_FLAT
 
@@ -107,17 +106,17 @@ def require_tree(
             )
 
 
-def require_no_forces(model: Model, engine: str, *, holds_weights: bool = False, holds_friction: bool = False) -> None:
+def require_no_forces(model: Model, engine: str, forces: Any = None, *, holds_friction: bool = False) -> None:
     """Raise `UnsupportedError` for a model with forces by functions or friction, in the name of own integrators.
 
-    Those of an engine that `holds_weights` know gravity compensation, and of one that `holds_friction` its own.
+    They do not have `forces`, by default all of the model's; those of an engine that `holds_friction` have its own.
     """
     if model.needs.friction and not holds_friction:
         raise UnsupportedError(
             f"{engine}: its own integrators do not hold the dry friction of {model.name}; use a method that any engine "
             "has, such as rk4, or model.without('friction')"
         )
-    if forces := by_functions(model) if holds_weights else model.forces:
+    if forces := model.forces if forces is None else forces:
         names = first_names((repr(f.name) for f in forces), ", ...")
         raise UnsupportedError(
             f"{engine}: its own integrators do not know the forces of {model.name} by functions ({names}); use a "

@@ -8,6 +8,7 @@ the world.
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -37,6 +38,7 @@ from mbkit.load.shapes import NOTHING, together
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Body, Model, ModelBuilder, kind_of, quaternions
+from mbkit.model.description import SERVOS
 from mbkit.model.validation import body_fault
 
 _REFUSED: Final = {
@@ -106,7 +108,6 @@ def model_of_mjcf(
     snap = _Tree(b, scene, springs, off).add_bodies(scale)
     _hold_weights(b, mujoco, scene, off, actuators=actuators)
     transmissions = Transmissions(mujoco, scene, off, servos=actuators)
-    transmissions.add_bands(b)
     equalities = Equalities(mujoco, scene, off, wanted=loops, tendons=transmissions.factors)
     if read.faults:
         raise ModelError(str(path), read.faults)
@@ -125,6 +126,11 @@ def model_of_mjcf(
             b.note(note)
     equalities.add_to(b, snap)
     try:
+        if transmissions.functions:
+            with warnings.catch_warnings():
+                # The second build warns.
+                warnings.simplefilter("ignore")
+                transmissions.add_functions(b, b.build(nonphysical=nonphysical, point_masses=False))
         model = b.build(nonphysical=nonphysical, point_masses=False)
     except ModelError as error:
         raise ModelError(str(path), error.faults) from None
@@ -138,6 +144,9 @@ def _join_welded(scene: Scene) -> str:
     Such as mass without inertia: a URDF's links that are fixed to each other are one body too. The frames stay.
     """
     known, joined = {body.name: body for body in scene.bodies}, []
+    if len(known) < len(scene.bodies):
+        # Two bodies of one name are a fault, and one may be below the other.
+        return ""
     for body in reversed(scene.bodies):
         at, carrier = body.mass_properties, known.get(body.parent)
         if body.joints or carrier is None or not at.mass or body.gravcomp != carrier.gravcomp:
@@ -325,10 +334,11 @@ def _damper(joint: MjcfJoint, c1: float, c2: float) -> Any:
 def _hold_weights(b: ModelBuilder, mujoco: Element, scene: Scene, off: set[str], *, actuators: bool) -> None:
     """Add the gravity compensation of bodies, as MuJoCo 4.0.0 applies it.
 
-    It leaves the passive forces out where springs and dampers are off. The part at a joint with ``actuatorgravcomp`` is
-    actuation, with or without an actuator there, and none in a file without actuators or with all of them off.
+    None acts where springs and dampers are off, or where no body's is above zero. The part at a joint with
+    ``actuatorgravcomp`` is actuation, with or without an actuator there, and none in a file without actuators or with
+    all of them off.
     """
-    if {"spring", "damper"} <= off:
+    if {"spring", "damper"} <= off or not any(body.gravcomp > 0 for body in scene.bodies):
         return
     acting = actuators and "actuation" not in off and any(section.children for section in mujoco.all("actuator"))
     moving: dict[str, list[MjcfJoint]] = {"world": []}
@@ -342,8 +352,9 @@ def _hold_weights(b: ModelBuilder, mujoco: Element, scene: Scene, off: set[str],
         if acting or len(by_actuators) < len(joints):
             b.add_gravity_compensation(body.name, body.gravcomp, without=() if acting else by_actuators)
     if lifted:
-        what = "counts as a passive force" if acting else "was left out; with actuators=True MuJoCo's acts"
-        b.note(f"gravity compensation by actuators {what}: joints {name_list(lifted)}")
+        left_out = "do not act, as in MuJoCo" if actuators else "left out; with actuators=True MuJoCo's act"
+        what = "act as passive forces" if acting else left_out
+        b.note(f"{SERVOS} of gravity compensation by actuators {what}: joints {name_list(lifted)}")
 
 
 def _range(

@@ -26,7 +26,7 @@ from mbkit.model.validation import listing
 _BODIES: Final = ("default", "asset", "worldbody")
 _BODIES_AND_FORCES: Final = (*_BODIES, "tendon", "actuator")
 # Elements without effect on masses, springs and damping.
-_UNUSED: Final = frozenset({"camera", "light", "plugin", "texture", "material", "hfield", "skin", "model"})
+_UNUSED: Final = frozenset({"camera", "light", "texture", "material", "hfield", "skin", "model"})
 # Settings that name files, or that would rename or move bodies.
 _UNUSED_SETTINGS: Final = frozenset(
     {"meshdir", "texturedir", "assetdir", "strippath", "discardvisual", "fusestatic", "coordinate"}
@@ -100,6 +100,9 @@ class _Text:
             return None
         unused = _UNUSED_SETTINGS if scaled else _UNUSED_SETTINGS | {"settotalmass"}
         settings = {k: v for k, v in self.settings.items() if k not in unused}
+        # Plugins may make meshes.
+        made = any(mesh.first("plugin") for mesh in self.meshes.values() if id(mesh) in self.needed)
+        sections = (*sections, "extension") if made else sections
         inside = "".join(self._written(e, None) for e in self.mujoco.children if e.tag in sections)
         text = f"<mujoco>{element_text('compiler', settings)}{inside}</mujoco>"
         # Imported late: few files need the compiler.
@@ -160,7 +163,8 @@ class _Text:
         own |= self.needed.get(id(element), {})
         if id(element) in self.scene.called:
             own["name"] = self.scene.called[id(element)]
-        kept = [e for e in element.children if e.tag not in _UNUSED]
+        shaped = tag == "extension" or id(element) in self.needed or id(element) in self.counted
+        kept = [e for e in element.children if e.tag not in _UNUSED and (shaped or e.tag != "plugin")]
         if tag == "asset":
             kept = [e for e in kept if e.tag != "mesh" or id(e) in self.needed]
         return element_text(tag, own, "".join(self._written(e, childclass) for e in kept))

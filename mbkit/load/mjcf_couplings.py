@@ -1,28 +1,30 @@
-"""Tendons and actuators of an MJCF as linear springs, dampers and rotors (XML reference of MuJoCo 4.0).
+"""Tendons and actuators of an MJCF as springs, dampers and rotors (XML reference of MuJoCo 4.0).
 
 A fixed tendon of length l = Σ coef q becomes a `JointCoupling`, or numbers of its only joint. A spatial tendon straight
-between two sites becomes a `PointSpring`. The length of an actuator is gear times a joint's coordinate or a tendon's
-length; its force at zero control and activation is b0 + b1 l + b2 dl/dt with `biasprm` (b0, b1, b2): a spring of
-stiffness -b1 and rest length -b0/b1, and a damper -b2. These act where the file is read with its actuators; without,
-a rotor's inertia and the damping of the transmission act alone.
+between two sites becomes a `PointSpring`. Springs and dampers over several sites, between two rest lengths, or with
+polynomials become forces by functions. A path around geoms that acts, and an inertia on a path, are refused. The
+length of an actuator is gear times a joint's coordinate or a tendon's length; its force at zero control and activation
+is b0 + b1 l + b2 dl/dt with `biasprm` (b0, b1, b2): a spring of stiffness -b1 and rest length -b0/b1, and a damper -b2.
+These act where the file is read with its actuators; without, a rotor's inertia and the damping of the transmission act
+alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit._reproducible import length
-from mbkit.load.mjcf_attributes import HERE, Pose
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
 from mbkit.load.xml_reader import LARGEST, Element, Reader, unused
 from mbkit.model import Joint, JointCoupling, Model, ModelBuilder, PointSpring
 from mbkit.model.description import SERVOS
+from mbkit.model.elements.forces import RATE
 from mbkit.model.validation import sample_mass_matrix
 
 _ACTUATORS: Final = (
@@ -36,6 +38,12 @@ _TENDON_LIMITS: Final = {
     "springyield": "",
     "actuatorfrcrange": "actuatorfrclimited",
 }
+#: Attributes of up to three numbers: of a damper and of a spring.
+_POLYNOMIALS: Final = ("damping", "stiffness")
+_Numbers = tuple[float, ...]
+_NONE: Final[_Numbers] = (0.0, 0.0, 0.0)
+#: Bodies and points on them.
+_Points = tuple[tuple[str, Array], ...]
 #: Parts that equality constraints bind.
 _ENDS: Final = ("joint", "body", "tendon", "site", "flex")
 #: Attributes that every actuator inherits from its default classes: most and fewest numbers, and their default.
@@ -46,6 +54,7 @@ _INHERITED: Final[Mapping[str, tuple[int, int, tuple[float, ...]]]] = {
     "group": (1, 1, (0.0,)),
     "forcerange": (2, 2, ()),
     "ctrlrange": (2, 2, ()),
+    "posrange": (2, 2, ()),
 }
 
 
@@ -110,7 +119,7 @@ class _Actuator:
 class _Band:
     """A spring -x (k0 + k1 x + k2 x²), with x from the nearer one of two lengths, between which it rests."""
 
-    stiffness: tuple[float, float, float]
+    stiffness: _Numbers
     lower: float
     upper: float
 
@@ -138,24 +147,31 @@ class _Acting:
     damping: float = 0.0
     armature: float = 0.0
     dampratio: float = 0.0  # of the critical damping at the pose of the file
-    ends: tuple[tuple[str, Array], ...] = ()  # bodies and points whose distance is l, if any
-    band: _Band | None = None  # a spring that is no line
-    measured: bool = False  # whether the rest length is that distance where the springs of joints rest
+    #: Branches over sites, each with the factor of its length in l.
+    path: tuple[tuple[float, _Points], ...] = ()
+    band: _Band | None = None  # a spring by a function
+    damper: _Numbers | None = None  # by a function: -(c0 + c1 |dl/dt| + c2 (dl/dt)²) dl/dt
+    measured: bool = False  # whether the rest length is that of the path where the springs of joints rest
     control: str = ""  # description of an actuator's control, which is left out
     servo: str = ""  # description of its force at zero control
     left_out: list[str] = field(default_factory=list)
 
     @property
     def acts(self) -> bool:
-        """Whether a part is a spring, damper or rotor."""
+        """Whether a part is a linear spring or damper, or a rotor."""
         return bool(self.stiffness or self.damping or self.armature or self.dampratio)
 
+    @property
+    def ends(self) -> _Points:
+        """Bodies and points whose distance is l, if any."""
+        ((factor, points),) = self.path if len(self.path) == 1 else ((0.0, ()),)
+        return points if factor == 1 and len(points) == 2 and points[0][0] != points[1][0] else ()
+
     def linear(self) -> None:
-        """Move to `left_out` all but springs, dampers and rotors on sums of coordinates, and springs between points."""
-        between = ("damping", "stiffness")[: 1 + (self.rest_length >= 0)] if self.ends else ()
-        for name in ("stiffness", "damping", "armature", "dampratio"):
+        """Move to `left_out` all but springs and dampers on sums of coordinates."""
+        for name in ("stiffness", "damping", "dampratio"):
             value = getattr(self, name)
-            if value < 0 or (value and not self.factors and name not in between):
+            if value < 0 or (value and not self.factors):
                 self.left_out.append(f"{name} {value:g}" + (", which is negative" if value < 0 else ""))
                 setattr(self, name, 0.0)
 
@@ -168,6 +184,11 @@ class _Acting:
         """Return it as a spring between two points."""
         (a, at_a), (b, at_b) = self.ends
         return PointSpring(self.name, a, at_a, b, at_b, self.stiffness, self.rest_length, self.damping)
+
+    def functions(self) -> str:
+        """Return what acts by functions, for a note."""
+        damper = self.damper and f"damping {' '.join(f'{c:g}' for c in self.damper)}"
+        return ", ".join(str(x) for x in (self.band, damper) if x)
 
     def description(self) -> str:
         """Return its name and its effect, for a note."""
@@ -205,10 +226,9 @@ class Transmissions:
 
         tendons = inside("tendon")
         self._tendons = [self._tendon(e, label, k) for k, (e, label) in enumerate(tendons, 1)]
+        self._known = {e.attributes.get("name", ""): t for (e, _), t in zip(tendons, self._tendons, strict=True)}
         #: dl/dq by joint of each tendon; nothing where its length is no sum of coordinates.
-        self.factors = {
-            e.attributes.get("name", ""): t.factors for (e, _), t in zip(tendons, self._tendons, strict=True)
-        }
+        self.factors = {name: t.factors for name, t in self._known.items()}
         self._actuators = [self._actuator(e, label, k) for k, (e, label) in enumerate(inside("actuator"), 1)]
 
     def _collect(self, element: Element, name: str) -> None:
@@ -242,40 +262,49 @@ class Transmissions:
             what = "is not in the file" if joint is None else f"is a {joint.kind} joint"
             read.fault(f"{item}: expected the name of a hinge or slide, joint {name!r} {what}", part)
         out.factors = {joint: factor for joint, factor in factors.items() if factor}
-        if [e.tag for e in element.children] == ["site", "site"]:
-            sites = (self._sites.get(e.attributes.get("site", "")) for e in element.children)
-            ends = tuple(x for x in sites if x is not None)
-            out.ends = ends if len({body for body, _ in ends}) == 2 else ()
-        curved: dict[str, tuple[float, float, float]] = {}
-        for name in ("stiffness", "damping"):
-            first, *higher = read.numbers(full, name, item, count=3, least=1, default=(0.0,))
-            setattr(out, name, 0.0 if any(higher) else first)
-            if any(higher):
-                curved[name] = first, higher[0], (*higher, 0.0)[1]
+        if element.tag == "spatial":
+            out.path = self._path(element, item)
+        c, k = ((*read.numbers(full, n, item, count=3, least=1, default=(0.0,)), *_NONE)[:3] for n in _POLYNOMIALS)
         out.armature = read.number(full, "armature", item, 0.0)
         first, *second = read.numbers(full, "springlength", item, count=2, least=1, default=(-1.0,))
         last = second[0] if second else first
         if first == last == -1.0:
-            # The distance of two points is measured once there is a tree.
-            out.measured = bool(out.ends)
+            # The length of a path is measured once there is a tree.
+            out.measured = bool(out.path)
             first = last = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
-        out.rest_length = first
-        k0, k1, k2 = curved.get("stiffness", (out.stiffness, 0.0, 0.0))
-        if (k1 or k2 or (k0 and first != last)) and not out.measured and (out.ends or len(out.factors) == 1):
-            out.band = _Band((k0, k1, k2), first, last)
-            curved.pop("stiffness", None)
-            out.stiffness = 0.0
-        out.left_out += [f"{name} that depends on the length or its rate" for name in curved]
-        if out.stiffness and first != last:
-            out.left_out.append(f"stiffness {out.stiffness:g} with a range of rest lengths, {first:g} to {last:g}")
-            out.stiffness = 0.0
-        if "spring" in self._disabled:
-            out.stiffness, out.band = 0.0, None
-        out.damping *= "damper" not in self._disabled
-        out.linear()
+        self._hold(out, element, item, c, k, first, last)
         own = full.attributes
         out.left_out += [f"{n} {own[n]}" for n, on in _TENDON_LIMITS.items() if n in own and own.get(on) != "false"]
         return out
+
+    def _hold(self, out: _Acting, element: Element, item: str, c: _Numbers, k: _Numbers, *rest: float) -> None:
+        """Give a tendon or actuator its damper and spring, by functions where they are not linear, or keep a fault."""
+        line, held = bool(out.factors or out.ends), bool(out.factors or out.path)
+        k, c = (_NONE if flag in self._disabled else x for x, flag in ((k, "spring"), (c, "damper")))
+        if any(k[1:]) or k[0] < 0 or (k[0] and not (line and rest[0] == rest[1] and (out.factors or rest[0] >= 0))):
+            out.band = _Band(k, *rest)
+        else:
+            out.stiffness, out.rest_length = k[0], rest[0]
+        if any(c[1:]) or c[0] < 0 or (c[0] and not line):
+            out.damper = c
+        else:
+            out.damping = c[0]
+        lost = {"stiffness": out.band and not held, "damping": out.damper and not held}
+        for what in (n for n, x in (lost | {"armature": out.armature and not out.factors}).items() if x):
+            on = "a path over sites is an inertia that changes with q" if out.path else "what is no sum of coordinates"
+            self._read.fault(f"{item}: {what} of {on}; no description holds it, remove it", element)
+
+    def _path(self, element: Element, item: str) -> tuple[tuple[float, _Points], ...]:
+        """Return the branches of a path over sites; none where it wraps geoms."""
+        branches: list[tuple[float, list[Any]]] = [(1.0, [])]
+        for part in element.children:
+            if part.tag == "pulley":
+                branches.append((1 / (self._read.number(part, "divisor", item) or 1.0), []))
+            elif (site := self._sites.get(part.attributes.get("site", ""))) is None:
+                return ()
+            else:
+                branches[-1][1].append(site)
+        return tuple((factor, tuple(points)) for factor, points in branches if len(points) > 1)
 
     def _spring_reference(self, name: str) -> float:
         joint = self._joints[name]
@@ -290,17 +319,17 @@ class Transmissions:
         settings = self._classes.get(class_, _Actuator()).with_element(element, item, self._read)
         out = self._acting(element, label, "actuator", number)
         (out.armature,), (group,) = settings.numbers["armature"], settings.numbers["group"]
-        gear, (damping, *higher) = settings.numbers["gear"][0], settings.numbers["damping"]
-        out.factors = {joint: gear * c for joint, c in self._driven(element, item).items() if gear * c}
-        if any(higher):
-            out.left_out.append("damping that depends on the rate")
-        elif "damper" not in self._disabled:
-            out.damping = damping
+        gear, (c0, c1, c2) = settings.numbers["gear"][0], (*settings.numbers["damping"], *_NONE)[:3]
+        driven = self._driven(element, item)
+        out.factors = {joint: gear * c for joint, c in driven.factors.items() if gear * c}
+        out.path = tuple((gear * factor, points) for factor, points in driven.path if gear * factor)
+        # MuJoCo's polynomial is of the rate before the gear.
+        out.armature *= bool(gear)
+        self._hold(out, element, item, (c0, c1 / abs(gear), c2 / gear**2) if gear else _NONE, _NONE, 0.0, 0.0)
         gain = f"gain {settings.gain:g}" if settings.gaintype == "fixed" else f"{settings.gaintype} gain"
         limits = "".join(f" {x:g}" for x in settings.numbers["ctrlrange"])
         at = out.coupling().length if out.factors else element.attributes.get("tendon", "no sum of coordinates")
         out.control = f"{label} ({element.tag}, {gain}{f', range{limits}' if limits else ''}) on {at}"
-        out.linear()
         if "actuation" not in self._disabled and group not in self._groups:
             servo = _Acting(out.item, out.name, out.factors)
             _add_bias(settings, servo)
@@ -314,50 +343,60 @@ class Transmissions:
                 out.left_out += servo.left_out
         return out
 
-    def _driven(self, element: Element, item: str) -> dict[str, float]:
-        """Return the factors of the length before the gear; empty where it is no sum of coordinates."""
+    def _driven(self, element: Element, item: str) -> _Acting:
+        """Return what has the length before the gear."""
         own = element.attributes
-        name, tendon = own.get("joint", own.get("jointinparent", "")), own.get("tendon")
-        if name:
-            joint = self._joints.get(name)
-            if joint is None:
-                self._read.fault(f"{item}: joint {name!r} is not in the file", element)
-            return {name: 1.0} if joint is not None and joint.scalar else {}
-        if tendon is not None and tendon not in self.factors:
+        name, tendon = own.get("jointinparent", own.get("joint", "")), own.get("tendon")
+        # The last one wins in MuJoCo, in this order: joint, tendon, and what is no coordinate.
+        if any(x in own for x in ("cranksite", "site", "body")):
+            return _Acting(item, "")
+        if tendon is not None and tendon not in self._known:
             self._read.fault(f"{item}: tendon {tendon!r} is not in the file", element)
-        return self.factors.get(tendon, {}) if tendon is not None else {}
+        if name and name not in self._joints:
+            self._read.fault(f"{item}: joint {name!r} is not in the file", element)
+        out = _Acting(item, name, {name: 1.0} if name in self._joints and self._joints[name].scalar else {})
+        return out if tendon is None else self._known.get(tendon, out)
 
     # Their effect on the model
 
-    def add_bands(self, b: ModelBuilder) -> None:
-        """Add the springs that are no lines: potentials of a joint's coordinate, or of the way between two points."""
-        for x in self._tendons:
-            if x.band is None:
-                continue
-            name, band = f"spring of {x.name}", x.band
-            if x.ends:
-                (a, at_a), (end, at_b) = x.ends
+    @property
+    def functions(self) -> list[_Acting]:
+        """What acts by functions, or has a rest length to be measured."""
+        return [x for x in (*self._tendons, *self._actuators) if x.band or x.damper or x.measured]
 
-                def between(way: Any, band: _Band = band) -> Any:
-                    return band.energy((way[0] ** 2 + way[1] ** 2 + way[2] ** 2) ** 0.5)
+    def add_functions(self, b: ModelBuilder, model: Model) -> None:
+        """Measure rest lengths, and add springs and dampers by functions of a model's q and v.
 
-                b.add_bushing(name, body_a=a, translation_a=at_a, body_b=end, translation_b=at_b, potential=between)
-            else:
-                ((joint, factor),) = x.factors.items()
+        All act along dl/dq: springs as potentials, dampers joint by joint.
+        """
+        # Imported late: few files need it.
+        import casadi as ca
 
-                def along(q: Any, band: _Band = band, factor: float = factor) -> Any:
-                    return band.energy(factor * q)
-
-                b.add_joint_force(name, joint, potential=along)
+        rates = [name + RATE for name in model.velocity_names]
+        q, v = (ca.vertcat(*map(ca.SX.sym, names)) for names in (model.coordinate_names, rates))
+        for x in self.functions:
+            if x.measured:
+                x.rest_length = float(_length(x, model, np, self._resting(model)))
+                x.band = x.band and replace(x.band, lower=x.rest_length, upper=x.rest_length)
+            along = _length(x, model, ca, ca.vertsplit(q))
+            gradient, rows, rate = ca.gradient(along, q), {}, ca.SX(0)
+            for joint in model.joints:
+                here, there = model.layout.q[joint.name], model.layout.v[joint.name]
+                part = ca.vertsplit(gradient[here]) if joint.type.nv else []
+                if any(not entry.is_zero() for entry in part):
+                    own = ca.vertsplit(q[here])
+                    rows[joint.name] = joint.type.pullback(own, part)
+                    rate += ca.dot(gradient[here], ca.vertcat(*joint.type.qdot(own, ca.vertsplit(v[there]))))
+            if x.band and rows:
+                b.add_joint_force(f"spring of tendon {x.name}", next(iter(rows)), potential=x.band.energy(along))
+            c0, c1, c2 = x.damper or (0.0, 0.0, 0.0)
+            for name, row in rows.items() if x.damper else ():
+                pull = -(c0 + c1 * abs(rate) + c2 * rate**2) * rate
+                b.add_joint_force(f"damper of {x.name} at {name}", name, [pull * entry for entry in row])
 
     def applied(self, model: Model) -> Model:
         """Return the model with these springs, dampers and rotors, and with notes on them and on parts left out."""
         acting = [x for x in (*self._tendons, *self._actuators) if x.acts]
-        if measured := [x for x in acting if x.measured]:
-            places = self._resting(model)
-            for x in measured:
-                a, b = (places[body] @ Pose(np.eye(3), point) for body, point in x.ends)
-                x.rest_length = length(b.p - a.p)
         springs = tuple(x.point_spring() for x in acting if x.ends)
         out = with_couplings(replace(model, springs=springs), [x.coupling() for x in acting if not x.ends])
         ratios = []
@@ -372,8 +411,8 @@ class Transmissions:
             notes.append(f"the armature of {branched} acts between branches; MuJoCo 4.0 leaves it out of M there")
         return replace(out, notes=tuple(notes))
 
-    def _resting(self, model: Model) -> dict[str, Pose]:
-        """Return the poses of the bodies where the springs of all joints rest; MuJoCo's ``qpos_spring``."""
+    def _resting(self, model: Model) -> Array:
+        """Return q where the springs of all joints rest; MuJoCo's ``qpos_spring``."""
         q = model.neutral()
         for body in self._scene.bodies:
             for joint in body.joints:
@@ -382,12 +421,7 @@ class Transmissions:
                     q[at] = self._spring_reference(joint.name)
                 elif joint.kind == "free":
                     q[at] = *body.pose.p, *spatial.quaternion_from_matrix(body.pose.R)
-        places = {"world": HERE}
-        for link in model.tree:
-            R, p = link.type.placement(np, link, list(q[model.layout.full_q[link.name]]))
-            moved = Pose(np.array(R, dtype=float), np.array(p, dtype=float))
-            places[link.child] = places[link.parent] @ Pose(link.rotation, link.translation) @ moved
-        return places
+        return q
 
     def _reflected(self, model: Model, coupling: JointCoupling) -> float:
         """Return the inertia that a coupling's length moves in the pose of the file; 0 where M is singular for it."""
@@ -412,17 +446,38 @@ class Transmissions:
             forces = "; ".join(x.servo for x in servos)
             yield f"{SERVOS} left out; with actuators=True they act at zero control: {forces}"
         for what, at, some in (("tendons", "", self._tendons), ("actuators", ", at zero control", self._actuators)):
-            if bands := "; ".join(f"{x.item}: {x.band}" for x in some if x.band):
-                yield f"springs of {what} that rest between two lengths, or are polynomials: {bands}"
+            if bands := "; ".join(f"{x.item}: {x.functions()}" for x in some if x.functions()):
+                yield f"springs of {what}, and dampers, by functions: {bands}"
             if acting := "; ".join(x.description() for x in some if x.acts):
                 yield f"{what} that act as springs, dampers and rotors{at}: {acting}"
             if lost := "; ".join(f"{x.item}: {', '.join(x.left_out)}" for x in some if x.left_out):
                 yield f"left out of {what}: {lost}"
-            if idle := ", ".join(x.item for x in some if not (x.acts or x.band or x.left_out or x.control)):
+            if idle := ", ".join(x.item for x in some if not (x.acts or x.functions() or x.left_out or x.control)):
                 yield f"{what} that exert no force of their own: {idle}"
         if self._actuators:
             controls = "; ".join(x.control for x in self._actuators)
             yield f"controls of actuators were left out, give their forces as tau: {controls}"
+
+
+def _length(x: _Acting, model: Model, m: Any, q: Any) -> Any:
+    """Return the length of a tendon or an actuator, in the arithmetic of `m`."""
+    total = sum(factor * q[model.layout.q[name].start] for name, factor in x.factors.items())
+    # Joints that move all points along leave distances as they are.
+    joints = [model.moving(body) for _, points in x.path for body, _ in points]
+    shared = frozenset.intersection(*joints) if joints else frozenset()
+    here: tuple[Any, Any] = np.eye(3, dtype=object), np.zeros(3, dtype=object)
+    places = {"world": here}
+    for link in model.tree:
+        R, p = link.type.placement(m, link, list(q[model.layout.q[link.name]]))
+        # Products of arrays of objects hold any arithmetic's numbers.
+        R_P, p_P = places[link.parent]
+        R_J, p_J = R_P @ link.rotation.astype(object), p_P + R_P @ link.translation.astype(object)
+        moved = R_J @ np.array(R, dtype=object), p_J + R_J @ np.array(p, dtype=object)
+        places[link.child] = here if link.name in shared else moved
+    for factor, points in x.path:
+        ends = [places[body][1] + places[body][0] @ point.astype(object) for body, point in points]
+        total += factor * sum(m.sqrt(((b - a) ** 2).sum()) for a, b in pairwise(ends))
+    return total
 
 
 def with_couplings(model: Model, couplings: Iterable[JointCoupling]) -> Model:
@@ -452,6 +507,12 @@ def with_couplings(model: Model, couplings: Iterable[JointCoupling]) -> Model:
 
 def _add_bias(settings: _Actuator, out: _Acting) -> None:
     """Add an actuator's force at zero control and activation."""
+    for what, (low, high) in (
+        (what, settings.numbers[f"{what}range"] or (0.0, 0.0)) for what in ("ctrl", "pos", "force")
+    ):
+        acts = low > 0 or high < 0 or (what == "force" and settings.biastype != "none" and any(settings.bias))
+        if acts and high > low and (what != "force" or settings.forcelimited != "false"):
+            out.left_out.append(f"{what}range {low:g} {high:g}")
     if settings.biastype == "none":
         return
     if settings.biastype != "affine":
@@ -469,9 +530,6 @@ def _add_bias(settings: _Actuator, out: _Acting) -> None:
         out.damping -= b2
     else:
         out.left_out.append(f"the force {b2:g} times the rate")
-    limits = settings.numbers["forcerange"]
-    if limits and settings.forcelimited != "false" and any((b0, b1, b2)):
-        out.left_out.append(f"force range {' '.join(f'{x:g}' for x in limits)}")
 
 
 def bound_parts(element: Element) -> str:

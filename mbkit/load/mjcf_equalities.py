@@ -144,7 +144,9 @@ class Equalities:
             if not known[name]:
                 return f"tendon {name!r} is no sum of coordinates"
             sides.append(known[name])
-        shape = self._read.numbers(element, "polycoef", item, count=5, default=(0.0, 1.0, 0.0, 0.0, 0.0))
+        standard = (0.0, 1.0, 0.0, 0.0, 0.0)
+        shape = self._read.numbers(element, "polycoef", item, count=5, least=1, default=standard)
+        shape = (*shape, *standard[len(shape) :])
         refs = {j.name: j.ref for body in self._scene.bodies for j in body.joints}
         held = coupled(sides, shape, refs)
         if isinstance(held, str):
@@ -178,8 +180,6 @@ class Equalities:
             a, b = found
             return None if a is None or b is None else (a, b)
         body1, body2 = names.get("body1", ""), names.get("body2", "world")
-        if moved := {body1, body2} & {*self._scene.aligned}:
-            self._read.fault(f"{item}: the frame of {min(moved)!r} is moved by align; name sites", element)
         for key, body in (("body1", body1), ("body2", body2)):
             if body not in self._poses:
                 self._read.fault(f"{item}: {key} {body!r} is no body of the file", element)

@@ -7,6 +7,7 @@ Inertia by MuJoCo's rules: geoms with a group in ``inertiagrouprange`` and more 
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -148,21 +149,38 @@ def write_out_copies(mujoco: Element, compiler: Compiler, read: Reader) -> str:
     Copy k stands in a <frame> turned by k times the angles, an offset in the axes of the copy before away from it, and
     has the number k behind its names. Tendons, actuators and equalities that name something in it are copied with it.
     """
-    copier = _Copier(mujoco, compiler, read)
-    for world in mujoco.all("worldbody"):
-        copier.write_out(world)
+    copier, known, worlds = _Copier(mujoco, compiler, read), len(read.faults), mujoco.all("worldbody")
+    if (size := sum(map(copier.size, worlds))) > MOST_ELEMENTS:
+        read.fault(f"<replicate>: {size} elements in all; expected up to {MOST_ELEMENTS}")
+    for world in worlds:
+        if len(read.faults) == known:
+            copier.write_out(world)
+        for left in (e for e in world.walk() if e.tag == "replicate"):
+            # One copy has the names that others use.
+            left.tag, left.attributes = "frame", {}
     return f"<replicate> written out: {listing(copier.told, 6)}" if copier.told else ""
 
 
 @dataclass
 class _Copier:
-    """Writes <replicate> elements out, up to a number of elements."""
+    """Writes <replicate> elements out."""
 
     mujoco: Element
     compiler: Compiler
     read: Reader
     told: list[str] = field(default_factory=list)
-    left: int = MOST_ELEMENTS
+
+    def size(self, element: Element) -> int:
+        """Return the number of elements once all is written out; a count that is none, or too large, is a fault."""
+        inside = 1 + sum(map(self.size, element.children))
+        if element.tag != "replicate":
+            return inside
+        count, most = self.read.number(element, "count", "<replicate>"), MOST_ELEMENTS // inside
+        if not (0 <= count <= most and count == int(count)):
+            got = element.attributes.get("count", "")[:40]
+            self.read.fault(f"<replicate>: count {got!r}; expected a whole number up to {most}", element)
+            return inside
+        return int(count) * inside
 
     def write_out(self, owner: Element) -> None:
         """Write out all copies below an element."""
@@ -180,19 +198,14 @@ class _Copier:
         owner.children = children
 
     def _copies(self, element: Element) -> dict[str, Element]:
-        """Return a <frame> for each copy by its suffix; none after a fault."""
+        """Return a <frame> for each copy by its suffix."""
         item, own, read = "<replicate>", element.attributes, self.read
         for name in own.keys() - _OF_COPIES:
             read.fault(f"{item}: unknown attribute {name!r}; there are: {', '.join(sorted(_OF_COPIES))}", element)
         for child in element.children:
             if child.tag in (*_JOINTS, "inertial"):
                 read.fault(f"{item}: <{child.tag}> is not copied; put it into a <body>", child)
-        count, size = read.number(element, "count", item), sum(1 for _ in element.walk())
-        if count != int(count) or count * size > self.left:
-            most = self.left // size
-            read.fault(f"{item}: count {own.get('count', '')[:40]!r}; expected a whole number up to {most}", element)
-            return {}
-        self.left -= int(count) * size
+        count = read.number(element, "count", item)
         offset, angles = (
             np.array(read.numbers(element, name, item, count=3, default=(0, 0, 0))) for name in ("offset", "euler")
         )
@@ -201,12 +214,16 @@ class _Copier:
             # MuJoCo multiplies the angles, which is no power of one turn.
             R = from_euler(k * angles, self.compiler)
             suffix = f"{own.get('sep', '')}{k:0{len(str(int(count)))}d}"
-            x, y, z, w = spatial.quaternion_from_matrix(R)
-            at = {n: " ".join(repr(float(c)) for c in xs) for n, xs in (("pos", p), ("quat", (w, x, y, z)))}
+            at = {"pos": " ".join(repr(float(x)) for x in p), "quat": _quat(R)}
             at |= {n: own[n] for n in ("class", "childclass") if n in own}
             out[suffix] = replace(_suffixed(element, suffix), tag="frame", attributes=at)
             p = p + product(R, offset)
         return out
+
+
+def _quat(R: Array) -> str:
+    x, y, z, w = spatial.quaternion_from_matrix(R)
+    return " ".join(repr(float(c)) for c in (w, x, y, z))
 
 
 def _suffixed(element: Element, suffix: str, names: Mapping[str, Container[str]] = MappingProxyType({})) -> Element:
@@ -220,17 +237,8 @@ def _suffixed(element: Element, suffix: str, names: Mapping[str, Container[str]]
 
 # Attached models
 
-#: Settings of <compiler> that what is attached must share; angles are converted.
-_SHARED: Final = (
-    "eulerseq",
-    "autolimits",
-    "inertiafromgeom",
-    "groups",
-    "balanceinertia",
-    "boundmass",
-    "boundinertia",
-    "alignfree",
-)
+#: Settings of <compiler> that what is attached must share; orientations and angles are converted.
+_SHARED: Final = ["autolimits", "inertiafromgeom", "groups", "balanceinertia", "boundmass", "boundinertia", "alignfree"]
 
 
 def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Reader) -> str:
@@ -239,10 +247,32 @@ def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Re
     All names get the prefix. Defaults become a class of their own; meshes, and the tendons, actuators and equalities
     that name nothing but what is attached, are added. Options of the other file do not count.
     """
-    attacher = _Attacher(mujoco, path, compiler, read)
-    for world in mujoco.all("worldbody"):
+    attacher, worlds = _Attacher(mujoco, path, compiler, read), mujoco.all("worldbody")
+    if any(e.tag == "attach" for world in worlds for e in world.walk()):
+        _set_main_apart(mujoco)
+    for world in worlds:
         attacher.write_out(world)
     return f"<attach> written out: {listing(attacher.told, 6)}" if attacher.told else ""
+
+
+def _set_main_apart(mujoco: Element) -> None:
+    """Move the main default class into one of its own, which reaches all of the file but what is attached."""
+    tops = mujoco.all("default")
+    inside = [e for top in tops for e in top.children]
+    if not any(e.tag != "default" and e.attributes for e in inside):
+        return
+    name = unused("main_", {e.attributes.get("class") for top in tops for e in top.walk()})
+    for section in (e for e in mujoco.children if e not in tops):
+        for e in section.walk():
+            e.attributes |= {k: name for k in ("class", "childclass") if e.attributes.get(k) == "main"}
+        for e in section.children:
+            if section.tag in _NAMING or e.tag in ("mesh", "material"):
+                e.attributes.setdefault("class", name)
+        if section.tag == "worldbody":
+            section.children = [Element("frame", {"childclass": name}, section.line, section.children)]
+    tops[0].children = [Element("default", {"class": name}, tops[0].line, inside)]
+    for top in tops[1:]:
+        top.children = []
 
 
 @dataclass
@@ -340,10 +370,6 @@ class _Attacher:
                 self.read.fault(
                     f"model {model!r}: compiler {name} is {theirs}, and {ours} here; expected the same", asset
                 )
-        main = [e for top in self.mujoco.all("default") for e in top.children if e.tag != "default" and e.attributes]
-        if main:
-            why = "would reach what is attached; put it into a class of its own"
-            self.read.fault(f"model {model!r}: the main default class {why}", main[0])
         factor = compiler.angle / self.compiler.angle
         return _Other(root, path, compiler, Defaults(root, self.read), factor, file)
 
@@ -400,8 +426,7 @@ class _Prefixed:
     def of(self, element: Element, childclass: str | None) -> Element:
         """Return a copy of an element that a class reaches."""
         own = dict(element.attributes)
-        if self.other.factor != 1:
-            self._turn(element, own, childclass)
+        self._turn(element, own, childclass)
         for key, x in own.items():
             named = key in ("name", "class", "childclass", "mesh") or key.rstrip("12") in _NAMES
             if named and x not in ("", "world"):
@@ -411,10 +436,14 @@ class _Prefixed:
         return replace(element, attributes=own, children=children, file=self.other.file)
 
     def _turn(self, element: Element, own: dict[str, str], childclass: str | None) -> None:
-        for key in ("euler", "axisangle"):
-            if key in own:
-                first, last = ([], own[key].split()) if key == "euler" else (own[key].split()[:3], own[key].split()[3:])
-                own[key] = " ".join([*first, *map(self._angle, last)])
+        # Numbers that are none stay: whoever reads them says so.
+        with contextlib.suppress(ValueError, KeyError):
+            own["quat"] = _quat(from_euler(np.array([*map(float, own["euler"].split())]), self.other.compiler))
+            del own["euler"]
+        if self.other.factor == 1:
+            return
+        if words := own.get("axisangle", "").split():
+            own["axisangle"] = " ".join([*words[:3], *map(self._angle, words[3:])])
         # In a default class its type may not be known: every joint says its own angles.
         if element.tag == "joint" and not self.of_classes and not {"joint", "joint1"} & own.keys():
             full = self.other.defaults.filled(element, childclass).attributes

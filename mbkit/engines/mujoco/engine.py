@@ -28,7 +28,7 @@ from mbkit.engines.constrained import off_by
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.mujoco.bodies import MujocoBodies
 from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopEnds, Softness, friction_law, law
-from mbkit.engines.mujoco.model import MujocoModel, build, full_mass_matrix, heard_warnings
+from mbkit.engines.mujoco.model import MujocoModel, build, by_mbkit, full_mass_matrix, heard_warnings
 from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
@@ -119,10 +119,11 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
     def _hold(self, compiled: MujocoModel) -> None:
         self._maps = compiled
         self._v_index = compiled.v_index
-        self._gravcomp = compiled.model.body_gravcomp.copy()
+        self._own_forces = compiled.model.body_gravcomp.copy(), compiled.model.jnt_stiffness.copy()
         if not self.has_elements:
             # Among the terms these forces are mbkit's own; MuJoCo's steps get them back.
             compiled.model.body_gravcomp[:] = 0.0
+            compiled.model.jnt_stiffness[compiled.model.jnt_type <= int(mujoco.mjtJoint.mjJNT_BALL)] = 0.0
         self.mj_model = self._m = compiled.model
         self.disabled = compiled.disabled
         self._d = mujoco.MjData(self._m)
@@ -455,7 +456,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             holds them in world axes), and forces given by functions, which MuJoCo does not know, and exact dry
             friction.
         """
-        require_no_forces(self.model, "mujoco", holds_weights=True, holds_friction=self.soft_friction)
+        require_no_forces(self.model, "mujoco", by_mbkit(self.model), holds_friction=self.soft_friction)
         if self._reduced:
             names = ", ".join(j.name for j in self.model.joints if j.mimic)
             raise UnsupportedError(
@@ -474,7 +475,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             self.passive(q0, v0)  # raises where a spring has no direction to start in
         self._require_loops_that_meet()
         model = copy.copy(self.mj_model)
-        model.body_gravcomp[:] = self._gravcomp
+        model.body_gravcomp[:], model.jnt_stiffness[:] = self._own_forces
         if (self.model.needs.loops or self.soft_friction) and 0 < self.softness.solref[0] < 2 * dt:
             warn(
                 f"{self.model.name}: MuJoCo raises the time constant of its constraints from "

@@ -166,7 +166,7 @@ def _extras(m: Any) -> Iterator[tuple[Beside, _Removal]]:
         zeros = dict.fromkeys(("actuator_armature", "actuator_damping", "actuator_dampingpoly"), 0.0)
         silent = _assigned(i, actuator_forcelimited=1, actuator_forcerange=0.0, **zeros)
         yield Beside(f"actuator {i}", "actuator", text), silent
-    for b in map(int, np.flatnonzero(m.body_gravcomp)):
+    for b in map(int, np.flatnonzero(m.body_gravcomp * (m.ngravcomp > 0))):
         text = f"body {_called(m.body(b), b)} has gravity compensation {m.body_gravcomp[b]:g}"
         yield Beside(f"body {b}", "gravity compensation", text), _zeroed(b, "body_gravcomp")
     if m.opt.density or m.opt.viscosity:
@@ -364,7 +364,8 @@ class _Description:
         """Return a tendon's stiffness, rest length and damping; a spring with a range of rest lengths is left out."""
         m, (low, high) = self.m, self.m.tendon_lengthspring[t].tolist()
         stiffness = float(np.ravel(m.tendon_stiffness[t])[0]) if low == high and not self._off("SPRING") else 0.0
-        return max(stiffness, 0.0), low, float(np.ravel(m.tendon_damping[t])[0]) * (not self._off("DAMPER"))
+        damping = float(np.ravel(m.tendon_damping[t])[0]) * (not self._off("DAMPER"))
+        return max(stiffness, 0.0), low, max(damping, 0.0)
 
     def _path(self, t: int) -> tuple[set[int], slice]:
         """Return the types of the parts that a tendon is wrapped on, and where they stand."""
@@ -402,7 +403,7 @@ class _Description:
             return
         acting = m.nu and not self._off("ACTUATION")
         names = [name for name, j in self.numbers.items() if m.jnt_actgravcomp[j] and not acting]
-        for b in map(int, np.flatnonzero(m.body_gravcomp)):
+        for b in map(int, np.flatnonzero(m.body_gravcomp * (m.ngravcomp > 0))):
             moving = self._tree.moving(self.names[b])
             without = tuple(x for x in names if x in moving)
             yield f"body {b}", GravityCompensation(self.names[b], float(m.body_gravcomp[b]), without)

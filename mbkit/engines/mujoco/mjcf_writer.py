@@ -15,10 +15,9 @@ from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
 from mbkit.engines.mujoco.constraints import OF_JOINTS, OF_TENDON
 from mbkit.engines.mujoco.engine import MujocoDynamics
-from mbkit.engines.mujoco.model import JOINT_TYPES, Placed, heard_warnings, mapped, not_held, specified
+from mbkit.engines.mujoco.model import JOINT_TYPES, Placed, by_mbkit, heard_warnings, mapped, not_held, specified
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Joint, Model
-from mbkit.model.elements.forces import by_functions
 
 _TYPES: Final = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
@@ -81,7 +80,7 @@ def _unsupported(model: Model) -> Iterator[str]:
         if coupling.armature and model.branched(coupling):
             yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
     yield from not_held(model)
-    yield from (f"{force} (a function)" for force in by_functions(model))
+    yield from (f"{force} (a function)" for force in by_mbkit(model))
     yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
 
 
@@ -146,6 +145,7 @@ def _joint(joint: Any, owner: Joint) -> str:
     else:
         attributes |= {"pos": joint.pos} if kind == "ball" else {}
         attributes |= {"damping": owner.damping[-1] or None, "armature": owner.armature[-1] or None}
+        attributes |= _numbers(joint, "stiffness")
     attributes["actuatorgravcomp"] = "true" if joint.actgravcomp else None
     return _attributes(**attributes)
 

@@ -22,7 +22,7 @@ from mbkit.engines.base import STACKS, first_names, unknown_joint
 from mbkit.engines.imported import unused
 from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness
 from mbkit.errors import MbkitError, UnsupportedError
-from mbkit.model import Body, GravityCompensation, Joint, Model
+from mbkit.model import Body, Bushing, GravityCompensation, Joint, Model
 from mbkit.model.validation import static_bodies
 
 if TYPE_CHECKING:
@@ -196,6 +196,12 @@ def specified(
     compiler.alignfree = False
     disabled = _switch_off(spec, description, soft_friction)
     placed = _add_tree(spec, description)
+    for name, spring in turning_springs(description).items():
+        spec.joint(name).stiffness[0] = spring.stiffness[5, 5]
+        if description.joint(name).kind == "free":
+            # MuJoCo's spring of a free joint rests where the body is drawn.
+            placed.bodies[spring.body_b].pos = np.array(spring.translation_a)
+            placed.bodies[spring.body_b].quat = _wxyz(spring.rotation_a)
     for force in _held(description):
         # A body without mass, within a stack, has no weight.
         if force.body in placed.bodies:
@@ -264,14 +270,40 @@ _OFF_WITHOUT: Final = {
 
 
 def _held(description: Model) -> list[GravityCompensation]:
-    return [f for f in description.forces if isinstance(f, GravityCompensation)]
+    held = [f for f in description.forces if isinstance(f, GravityCompensation)]
+    # MuJoCo 4.0 applies them where one at least is above zero.
+    return held if any(f.fraction > 0 for f in held) else []
+
+
+def turning_springs(description: Model) -> dict[str, Bushing]:
+    """Return the bushings that are MuJoCo's own springs of ball and free joints, by joint: alike about all axes."""
+    joints = {(j.parent, j.child): j for j in description.joints if j.kind in ("ball", "free")}
+    out: dict[str, Bushing] = {}
+    for f in description.forces:
+        if not isinstance(f, Bushing) or f.formulas or f.damping.any() or (f.body_a, f.body_b) not in joints:
+            continue
+        joint = joints[f.body_a, f.body_b]
+        free, still = joint.kind == "free", np.eye(3)
+        turned = (
+            [f.translation_b, joint.translation, joint.rotation - still] if free else [f.rotation_a - joint.rotation]
+        )
+        zeros = [f.stiffness - f.stiffness[5, 5] * np.diag([free] * 3 + [1] * 3), f.rotation_b - still, *turned]
+        if (joint.parent == "world" or not free) and not any(x.any() for x in zeros):
+            out.setdefault(joint.name, f)
+    return out
+
+
+def by_mbkit(description: Model) -> list[Any]:
+    """Return the forces that MuJoCo does not have, which are mbkit's beside its terms."""
+    own = [*_held(description), *turning_springs(description).values()]
+    return [f for f in description.forces if f not in own]
 
 
 def _switch_off(spec: Any, description: Model, soft_friction: bool) -> tuple[str, ...]:
     needed = _FOR_LOOPS if description.needs.loops else _FOR_FRICTION if soft_friction else ()
     bits = {need: bit for need, bit in _OFF.items() if bit not in needed}
     bits |= dict(pair for need, pair in _OFF_WITHOUT.items() if not getattr(description.needs, need))
-    if _held(description):
+    if len(by_mbkit(description)) < len(description.forces):
         # Without springs and dampers MuJoCo leaves out gravity compensation too.
         bits.pop("springs", None)
     spec.option.disableflags = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}", 0)) for bit in bits.values())
