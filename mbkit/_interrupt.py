@@ -94,9 +94,6 @@ def raise_again() -> None:
 
 def beside(call: Callable[[], object]) -> None:
     """Call a library in a thread, so that Ctrl-C raises KeyboardInterrupt at once; the thread ends with the process."""
-    if threading.current_thread() is not threading.main_thread():
-        call()
-        return
     errors: list[BaseException] = []
 
     def run() -> None:

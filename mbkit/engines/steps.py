@@ -140,11 +140,9 @@ class Steps:
         self._method("forward_dynamics")
         states, size = self._states({"q": q, "v": v, "tau": tau})
         times = self._start_of_step(t, h, size)
-        if times is None:
-            return self._checked_step(chosen, h, states)
         clock = str(self.model.time_parameter)
-        if not times.ndim:
-            own: Steps = self.at(**{clock: float(times)})
+        if times is None or not times.ndim:
+            own: Steps = self if times is None else self.at(**{clock: float(times)})
             return own._checked_step(chosen, h, states)
         rows = zip(*(np.broadcast_to(x, (len(times), x.shape[-1])) for x in states.values()), strict=True)
         each = [
@@ -156,23 +154,16 @@ class Steps:
 
     def _start_of_step(self, t: ArrayLike | None, h: float, size: int | None = None) -> Array | None:
         """Return the time at which a step begins, () or (N,); None where the model does not depend on it."""
-        model = self.model
-        if t is None:
-            if model.time_parameter is None:
-                return None
-            raise InputError(
-                f"t: expected the time at the start of the step, s, on which {model.name} depends, got None; "
-                "give step(..., t=...)"
-            )
-        times = real_array("t", t)
+        name, timed = self.model.name, self.model.time_parameter is not None
+        if t is None and timed:
+            raise InputError(f"t: expected the time at the start of the step, s, on which {name} depends, got None")
+        times = real_array("t", 0.0 if t is None else t)
         if times.ndim and (times.ndim > 1 or size not in (None, len(times))):
             raise InputError(f"t: expected a number or shape ({size or 'N'},), got {times.shape}")
         require_finite("t", times)
-        if model.time_parameter is None:
-            return None
-        if times.size:
-            model.require_times("t", float(times.min()), float(times.max()) + h)
-        return times
+        if timed and times.size:
+            self.model.require_times("t", float(times.min()), float(times.max()) + h)
+        return times if timed else None
 
     def _checked_step(self, chosen: Method, h: float, states: dict[str, Array]) -> tuple[Array, Array]:
         """Return the state after a step from checked states, or the error of a state that is not finite."""

@@ -361,11 +361,15 @@ def _with_rate(
     return power(dyn, q, v), (after(s) - after(-s)) / (2 * s[:, 0])
 
 
+def _driven(dyn: Dynamics) -> bool:
+    """Return whether constraints do work."""
+    return dyn.model.constrained and (dyn.soft_constraints or dyn.model.constraints_do_work)
+
+
 def _loses(dyn: Dynamics) -> bool:
     """Return whether something beside τ, wrenches and exact dry friction changes the energy."""
     model = dyn.model
-    bound = model.constrained and (dyn.soft_constraints or model.constraints_do_work)
-    return bool(bound or dyn.soft_friction or model.needs.damping or model.forces or not model.has_bodies)
+    return bool(_driven(dyn) or dyn.soft_friction or model.needs.damping or model.forces or not model.has_bodies)
 
 
 def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
@@ -380,7 +384,7 @@ def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
         force = force + _dampers(dyn, q, v) - _dampers(dyn, q, np.zeros_like(v))
     if dyn.soft_friction:
         force = force + dyn._friction.law.force(v) + dyn._friction_beside_passive(q, v, tau)
-    if model.constrained and (dyn.soft_constraints or model.constraints_do_work):
+    if _driven(dyn):
         force = force + dyn.generalized_constraint_force(q, v, tau)
     return np.asarray(np.sum(force * v, axis=-1))
 
