@@ -9,6 +9,8 @@ from __future__ import annotations
 import ctypes
 import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
 from typing import Any
 
@@ -193,9 +195,19 @@ def _for_this_processor(text: str) -> bytes:
     return json.dumps(counts).encode() + b"\n" + jit.object_code(text)
 
 
+@contextmanager
+def fake_gpu() -> Iterator[FakeDriver]:
+    """A GPU that is none, with a gibibyte."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        yield _in_place(monkeypatch)
+
+
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
-    """A GPU that is none, with a gibibyte."""
+    return _in_place(monkeypatch)
+
+
+def _in_place(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
     stands_in, real = FakeDriver(), driver.ptx
 
     def text_after_ptx(text: str, target: str) -> bytes:

@@ -19,7 +19,6 @@ import statistics
 import sys
 import warnings
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -34,14 +33,16 @@ from mbkit.studies.compare.terms import TERMS as ALL_TERMS
 from mbkit.studies.compare.terms import states
 from mbkit.studies.worker import run
 from tests.random_trees import random_tree
-from validation.stamp import stamp
+from validation.robots import FEW, chosen
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 EPS = float(np.finfo(float).eps)
 TERMS = tuple(t for t in ALL_TERMS if t.name in ("M", "nle", "inverse dynamics", "forward dynamics"))
 ENGINES = ("lagrangian", "pinocchio", "mujoco")
 FLOATING = ("talos", "anymal_b", "solo12")
-TREES, LARGEST = 200, 30
+TREES, LARGEST, SAMPLES = 200, 30, 64
+#: All of them.
+ROBOTS = None
 BARS = {"robots": 10.0, "floating robots": 10.0, "random trees": 50.0}
 JUDGED = "lagrangian"
 
@@ -49,7 +50,7 @@ JUDGED = "lagrangian"
 def systems():
     """Return name -> (group, how to make the model); what takes longest first."""
     made = {f"{name} floating": ("floating robots", partial(mb.load, name, floating_base=True)) for name in FLOATING}
-    made |= {r.name: ("robots", partial(mb.load, r.name)) for r in mb.robots()}
+    made |= {r.name: ("robots", partial(mb.load, r.name)) for r in chosen(ROBOTS)}
     for seed in reversed(range(TREES)):
         joints = 1 + seed % LARGEST
         made[f"tree {seed}"] = ("random trees", partial(random_tree, seed, joints, mimic=bool(seed // LARGEST % 2)))
@@ -158,11 +159,15 @@ def as_json(stamped, found):
     return f'{head},\n "systems": {{\n{systems}\n }}\n}}\n'
 
 
+#: See `validation.smoke`.
+SMOKE = {"FLOATING": (), "TREES": 1, "SAMPLES": 2, "ROBOTS": FEW}
+
+
 def main():
     console = Console(width=160 if not sys.stdout.isatty() else None)
     wanted = systems()
     jobs = int(sys.argv[1]) if len(sys.argv) > 1 else None
-    answers = run({name: partial(measured, make) for name, (_, make) in wanted.items()}, jobs=jobs)
+    answers = run({name: partial(measured, make, samples=SAMPLES) for name, (_, make) in wanted.items()}, jobs=jobs)
     found = {}
     for name, result in track(answers, "comparing", len(wanted), console=Console(stderr=True)):
         if isinstance(result, Exception):
@@ -173,12 +178,12 @@ def main():
     over = missed(lines)
     compiled = mb.dynamics(mb.catalog.pendulum(), JUDGED).compile
     stamped = {
-        **stamp(),
+        **stamp(__file__),
         "compiled": compiled,
         "bars": BARS,
         "summary": lines,
     }
-    (HERE / "accuracy.json").write_text(as_json(stamped, found), encoding="utf-8")
+    results("accuracy.json").write_text(as_json(stamped, found), encoding="utf-8")
     console.print(table(lines))
     for x in over:
         console.print(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import time
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -18,9 +17,8 @@ import pinocchio as pin
 
 import mbkit as mb
 from mbkit.studies.compare.body_terms import farthest
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 ROBOTS = (("ur5", False), ("panda", False), ("anymal_b", True), ("talos", True))
 BATCH, LOOP, ROUNDS = 10_000, 400, 9
 #: States of a batch whose results are large.
@@ -152,10 +150,14 @@ def measured(name, floating):
     return {"robot": model.name, "nv": model.nv, "floating": floating, "ns": out}
 
 
+#: See `validation.smoke`.
+SMOKE = {"ROBOTS": (("z1", True),), "BATCH": 3, "LOOP": 2, "ROUNDS": 1, "FEW": 2}
+
+
 def main():
     found = [measured(*robot) for robot in ROBOTS]
-    data = {**stamp(), "batch": BATCH, "robots": found}
-    (HERE / "bench_bodies.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    data = {**stamp(__file__), "batch": BATCH, "robots": found}
+    results("bench_bodies.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     for r in found:
         print(f"{r['robot']} ({r['nv']})")
         for quantity, ns in r["ns"].items():

@@ -22,7 +22,7 @@ import sympy as sp
 from sympy.physics import mechanics as me
 
 from mbkit.studies.worker import Worker
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
 
 def _symbols(n: int) -> tuple[list[Any], list[Any], list[Any], Any]:
@@ -99,6 +99,8 @@ def theirs_kane(n: int) -> float:
     return time.perf_counter() - begun
 
 
+#: Links of the longest chain, and s for one.
+LINKS, LIMIT = 6, 60.0
 WAYS: dict[str, Callable[[int], float]] = {
     f.__name__: f for f in (ours_written, ours_from_model, ours_casadi, theirs_lagrange, theirs_kane)
 }
@@ -122,11 +124,15 @@ def timed(way: str, n: int, seconds: float) -> float | None:
         worker.end()
 
 
+#: See `validation.smoke`.
+SMOKE = {"LINKS": 1, "WAYS": {name: WAYS[name] for name in ("ours_from_model", "theirs_kane")}}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--links", type=int, default=6)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("derivation.json"))
+    parser.add_argument("--links", type=int, default=LINKS)
+    parser.add_argument("--seconds", type=float, default=LIMIT)
+    parser.add_argument("--out", type=Path, default=results("derivation.json"))
     asked = parser.parse_args()
     rows: list[dict[str, Any]] = []
     lost: set[str] = set()
@@ -142,7 +148,7 @@ def main() -> None:
                 row[way] = took
         rows.append(row)
         print(json.dumps(row), flush=True)
-    about = stamp()
+    about = stamp(__file__)
     about["versions"]["sympy"] = sp.__version__
     told = {
         "seconds": rows,

@@ -20,7 +20,7 @@ import mujoco.rollout
 import numpy as np
 
 import mbkit as mb
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
 ROUNDS, STEPS, DT = 7, 200, 1e-3
 SIZES = (1024, 4096, 16384)
@@ -28,12 +28,20 @@ SIZES = (1024, 4096, 16384)
 BARE = 1024
 
 
-def cases():
-    yield "double_pendulum", mb.catalog.double_pendulum()
-    yield "ur5", mb.load("ur5").without("damping")
-    yield "panda, mimic free", mb.load("panda", mimic="free").without("damping")
-    yield "anymal_b, floating", mb.load("anymal_b", floating_base=True).without("damping")
-    yield "talos_reduced", mb.load("talos_reduced").without("damping")
+MODELS = {
+    "double_pendulum": mb.catalog.double_pendulum,
+    "ur5": lambda: mb.load("ur5"),
+    "panda, mimic free": lambda: mb.load("panda", mimic="free"),
+    "anymal_b, floating": lambda: mb.load("anymal_b", floating_base=True),
+    "talos_reduced": lambda: mb.load("talos_reduced"),
+}
+#: Of these, how many rollouts of how many steps are one call.
+ONE_CALL = ("panda, mimic free", 4096, 1000)
+
+
+def made(label):
+    # mujoco.rollout knows friction as a soft constraint alone, and its RK4 takes dampers as another formula does.
+    return MODELS[label]().without("damping", "friction")
 
 
 def states(model, n):
@@ -105,15 +113,15 @@ def row(label, model, pool):
 
 def one_call(pool):
     """Return the rate of 4096 rollouts of 1 s in one call, beside `mujoco.rollout` on a sixteenth of them."""
-    model = mb.load("panda", mimic="free").without("damping")
+    label, n, steps = ONE_CALL
+    model = made(label)
     own, theirs = mb.dynamics(model, "lagrangian"), mb.dynamics(model, "mujoco")
-    n, steps = 4096, 1000
     q, v = states(model, n)
     few = n // 16
     calls = {
         "mujoco": (few, bare(theirs, q[:few], v[:few], pool, steps)),
-        "end saved": (n, lambda: mb.simulate(own, q, v, 1.0, dt=DT, save=[1.0])),
-        "every 10 ms saved": (n, lambda: mb.simulate(own, q, v, 1.0, dt=DT, save=10)),
+        "end saved": (n, lambda: mb.simulate(own, q, v, steps * DT, dt=DT, save=[steps * DT])),
+        "every 10 ms saved": (n, lambda: mb.simulate(own, q, v, steps * DT, dt=DT, save=10)),
     }
     times = {name: [] for name in calls}
     for _, call in calls.values():
@@ -124,15 +132,26 @@ def one_call(pool):
     out = {name: {"rollouts": count, "seconds": float(np.median(times[name]))} for name, (count, _) in calls.items()}
     for told in out.values():
         told["rollouts_per_second"] = told["rollouts"] / told["seconds"]
-    run = mb.simulate(own, q, v, 1.0, dt=DT, save=[1.0])
-    return {"model": "panda, mimic free", "horizon_s": 1.0, "finished": run.stats.finished, "calls": out}
+    run = mb.simulate(own, q, v, steps * DT, dt=DT, save=[steps * DT])
+    return {"model": label, "horizon_s": steps * DT, "finished": run.stats.finished, "calls": out}
+
+
+#: See `validation.smoke`.
+SMOKE = {
+    "MODELS": {"z1": lambda: mb.load("z1")},
+    "ONE_CALL": ("z1", 16, 10),
+    "ROUNDS": 1,
+    "STEPS": 5,
+    "SIZES": (4,),
+    "BARE": 4,
+}
 
 
 def main():
     rows = []
     with mujoco.rollout.Rollout(nthread=cores()) as pool:
-        for label, model in cases():
-            rows.append(row(label, model, pool))
+        for label in MODELS:
+            rows.append(row(label, made(label), pool))
             r = rows[-1]
             ns = ", ".join(f"{k}: {x:.0f}" for k, x in r["ns_per_state_and_step"].items())
             ratios = ", ".join(f"{k}: × {x:.1f}" for k, x in r["times_mujoco"].items())
@@ -142,8 +161,8 @@ def main():
         whole = one_call(pool)
         for name, told in whole["calls"].items():
             print(f"{whole['model']}, 1 s: {name}: {told['rollouts_per_second']:.0f} rollouts per second")
-    about = {"rk4_dt": DT, "steps": STEPS, "cores": cores(), **stamp()}
-    with open("validation/rollouts.json", "w", encoding="utf-8") as f:
+    about = {"rk4_dt": DT, "steps": STEPS, "cores": cores(), **stamp(__file__)}
+    with results("rollouts.json").open("w", encoding="utf-8") as f:
         json.dump({"rows": rows, "one_call": whole, **about}, f, indent=1)
 
 

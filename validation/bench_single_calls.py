@@ -16,19 +16,29 @@ import statistics
 import subprocess
 import sys
 import timeit
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-ROUNDS, CALLS = 101, 500
+ROUNDS, CALLS, FRESH = 101, 500, 9
+#: Rounds and calls of motion, momenta and loads, and repeats of a run.
+FEWER, REPEATS = (7, 30), (20, 9)
+MODELS = {
+    "ur5": lambda: mb.load("ur5"),
+    "panda, mimic free": lambda: mb.load("panda", mimic="free"),
+    "panda, mimic free, undamped": lambda: mb.load("panda", mimic="free").without("damping"),
+    "panda, mimic reduced": lambda: mb.load("panda"),
+    "anymal_b, floating": lambda: mb.load("anymal_b", floating_base=True),
+}
+#: Of these, motion, momenta and loads.
+BODIES = ("ur5", "anymal_b, floating")
 
 
-def pair(ours, bare, rounds=ROUNDS, number=CALLS):
+def pair(ours, bare, rounds, number):
     """Return the least µs of each in several rounds, and their ratio: what else runs only adds."""
     least = [float("inf")] * 2
     for _ in range(rounds):
@@ -43,7 +53,8 @@ def import_seconds():
     for module in ("mbkit", "numpy"):
         code = f"import time; t = time.perf_counter(); import {module}; print(time.perf_counter() - t)"
         runs = [
-            float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout) for _ in range(9)
+            float(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout)
+            for _ in range(FRESH)
         ]
         out[module] = statistics.median(runs)
     return out
@@ -136,8 +147,8 @@ def body_calls(model, m, d, q, v, a):
 def body_rows():
     """Return the rows of motion, momenta and loads of every engine, beside Pinocchio's bare call."""
     rows = []
-    for label, model in (("ur5", mb.load("ur5")), ("anymal_b, floating", mb.load("anymal_b", floating_base=True))):
-        model = model.without("damping")
+    for label in BODIES:
+        model = MODELS[label]().without("damping")
         rng = np.random.default_rng(0)
         q, v = model.random_state(rng)
         a = rng.standard_normal(model.nv)
@@ -148,7 +159,7 @@ def body_rows():
             for dyn in engines:
                 method = getattr(dyn, name)
                 method(*given)
-                row[f"{dyn.engine}_us"], row["bare_us"], _ = pair(lambda f=method, x=given: f(*x), bare, 7, 30)
+                row[f"{dyn.engine}_us"], row["bare_us"], _ = pair(lambda f=method, x=given: f(*x), bare, *FEWER)
             rows.append(row)
             print(f"{label:20} {row['call']:28}", *(f"{k} {x:8.2f}" for k, x in row.items() if k.endswith("_us")))
     return rows
@@ -160,28 +171,37 @@ def step_row(label, model, q, v, tau):
     m = mj.mj_model
     m.opt.integrator, m.opt.timestep = mujoco.mjtIntegrator.mjINT_RK4, 1e-3
     d = mujoco.MjData(m)
-    mine, theirs, ratio = pair(lambda: dyn.step(q, v, tau, 1e-3), lambda: mujoco.mj_step(m, d))
-    times = timeit.repeat(lambda: mb.simulate(dyn, q, v, 1e-3, dt=1e-3, torque=tau), number=20, repeat=9)
-    run = min(times) / 20 * 1e6
+    mine, theirs, ratio = pair(lambda: dyn.step(q, v, tau, 1e-3), lambda: mujoco.mj_step(m, d), ROUNDS, CALLS)
+    calls, rounds = REPEATS
+    times = timeit.repeat(lambda: mb.simulate(dyn, q, v, 1e-3, dt=1e-3, torque=tau), number=calls, repeat=rounds)
+    run = min(times) / calls * 1e6
     print(f"{label:30} step {mine:7.2f} µs  mj_step {theirs:7.2f} µs  × {ratio:.2f}  simulate {run:.0f} µs")
     return {"model": label, "step_us": mine, "mj_step_us": theirs, "ratio": ratio, "simulate_us": run}
 
 
-def main(only_bodies=False):
-    path = Path("validation/single_calls.json")
-    if only_bodies:
+#: See `validation.smoke`.
+SMOKE = {
+    "MODELS": {"two links": mb.catalog.double_pendulum},
+    "BODIES": ("two links",),
+    "ROUNDS": 1,
+    "CALLS": 1,
+    "FRESH": 1,
+    "FEWER": (1, 1),
+    "REPEATS": (1, 1),
+}
+
+
+def main():
+    path = results("single_calls.json")
+    if sys.argv[1:] == ["bodies"]:
         whole = json.loads(path.read_text(encoding="utf-8"))
-        path.write_text(json.dumps(whole | {"bodies": {"rows": body_rows(), **stamp()}}, indent=1), encoding="utf-8")
+        path.write_text(
+            json.dumps(whole | {"bodies": {"rows": body_rows(), **stamp(__file__)}}, indent=1), encoding="utf-8"
+        )
         return
     rows, own_rows, steps = [], [], []
-    cases = (
-        ("ur5", mb.load("ur5")),
-        ("panda, mimic free", mb.load("panda", mimic="free")),
-        ("panda, mimic free, undamped", mb.load("panda", mimic="free").without("damping")),
-        ("panda, mimic reduced", mb.load("panda")),
-        ("anymal_b, floating", mb.load("anymal_b", floating_base=True)),
-    )
-    for label, model in cases:
+    for label, make in MODELS.items():
+        model = make()
         dyn = mb.dynamics(model, "pinocchio")
         m = dyn.pin_model
         rng = np.random.default_rng(0)
@@ -189,7 +209,7 @@ def main(only_bodies=False):
         a = rng.standard_normal(model.nv)
         for engine, kept in ((dyn, rows), (mb.dynamics(model, "lagrangian"), own_rows)):
             for name, ours, bare in calls(engine, m, m.createData(), model, q, v, a):
-                mine, theirs, ratio = pair(ours, bare)
+                mine, theirs, ratio = pair(ours, bare, ROUNDS, CALLS)
                 kept.append({"model": label, "call": name, "mbkit_us": mine, "bare_us": theirs, "ratio": ratio})
                 print(
                     f"{label:30} {engine.engine:10} {name:18} {mine:7.2f} µs  bare {theirs:7.2f} µs  "
@@ -198,10 +218,10 @@ def main(only_bodies=False):
         steps.append(step_row(label, model, q, v, a))
     imports = import_seconds()
     print(f"import mbkit {imports['mbkit']:.3f} s (numpy alone {imports['numpy']:.3f} s)")
-    bodies = {"rows": body_rows(), **stamp()}
-    whole = {"rows": rows, "own": own_rows, "steps": steps, "import_s": imports, "bodies": bodies, **stamp()}
+    bodies = {"rows": body_rows(), **stamp(__file__)}
+    whole = {"rows": rows, "own": own_rows, "steps": steps, "import_s": imports, "bodies": bodies, **stamp(__file__)}
     path.write_text(json.dumps(whole, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] == ["bodies"])
+    main()

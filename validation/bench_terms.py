@@ -45,9 +45,8 @@ from mbkit.engines.mujoco import model as mujoco_model
 from mbkit.engines.pinocchio import model as pinocchio_model
 from mbkit.spatial import conjugate, rotate
 from tests.random_trees import random_tree
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 QUANTITIES = ("inverse_dynamics", "forward_dynamics")
 #: Name -> how to make it, as Python that a fresh process can run too.
 ROBOTS = {
@@ -62,12 +61,14 @@ ROBOTS = {
 AGREE = 1e-9
 # Python's loop over single calls is slow, and one of its calls costs what the next one does.
 LOOPED = 4096
+#: Of a round, how many, and fresh processes for a first result.
+SAMPLES, ROUNDS, FRESH = 65_536, 15, 3
 SIZES = (2, 4, 8, 16, 32, 64, 128)
 
 
 def made(text):
-    # The other engines' algorithms know no damping.
-    return eval(text, {"mb": mb}).without("damping")
+    # The other engines' algorithms know no damping and no dry friction.
+    return eval(text, {"mb": mb}).without("damping", "friction")
 
 
 # The calls. Each takes nothing, returns (N, nv) or fills it, and says how many samples it does.
@@ -220,7 +221,7 @@ FIRST = """
 import sys, time
 import numpy as np
 import mbkit as mb
-model = {make}.without("damping")
+model = {make}.without("damping", "friction")
 q, v = model.random_state(np.random.default_rng(0))
 begun = time.perf_counter()
 getattr(mb.dynamics(model, "lagrangian"), {quantity!r})(q, v, np.zeros(model.nv))
@@ -262,7 +263,7 @@ def robots(samples, rounds, names):
                 for label, x in times.items()
                 if label.startswith("lagrangian")
             }
-            row["first_result"] = first_result(name, quantity, 3)
+            row["first_result"] = first_result(name, quantity, FRESH)
             out.append(row)
             told = "  ".join(f"{label} {x['median']:.1f}" for label, x in row["ns"].items())
             print(f"{name} {quantity}: {told}", file=sys.stderr, flush=True)
@@ -366,13 +367,23 @@ def table(data):
     return "\n".join(lines)
 
 
+#: See `validation.smoke`.
+SMOKE = {
+    "ROBOTS": {"z1": "mb.load('z1')"},
+    "SIZES": (2,),
+    "SAMPLES": 64,
+    "ROUNDS": 1,
+    "FRESH": 1,
+}
+
+
 def main():
     asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    asked.add_argument("--samples", type=int, default=65_536)
-    asked.add_argument("--rounds", type=int, default=15)
+    asked.add_argument("--samples", type=int, default=SAMPLES)
+    asked.add_argument("--rounds", type=int, default=ROUNDS)
     asked.add_argument("--most", type=int, default=SIZES[-1], help="joints of the largest chain and tree")
     asked.add_argument("--robots", nargs="*", default=list(ROBOTS))
-    asked.add_argument("--out", type=Path, default=HERE)
+    asked.add_argument("--out", type=Path, default=results(""))
     given = asked.parse_args()
     load = os.getloadavg()[0]
     if load > 0.3:
@@ -382,7 +393,7 @@ def main():
         "samples": given.samples,
         "rounds": given.rounds,
         "threads": cores(),
-        **stamp(),
+        **stamp(__file__),
         "robots": robots(given.samples, given.rounds, given.robots),
         "growth": growth(given.samples, given.rounds, systems(given.most)),
     }

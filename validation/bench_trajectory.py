@@ -28,7 +28,7 @@ from scipy.integrate import solve_ivp
 
 import mbkit as mb
 from mbkit.studies.study_runs import start_state
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
 ROUNDS, GOAL, TIMES = 9, 1e-9, 10
 #: A way that needs more s than this for one run has lost, and is not timed again.
@@ -238,14 +238,18 @@ def show(row):
         print(f"  rk853 on lagrangian is {ratios} faster than {row['fastest_other']}; load {row['load']:.1f}")
 
 
+#: See `validation.smoke`.
+SMOKE = {"SCENES": (("double_pendulum, 50 ms", mb.catalog.double_pendulum, 0.05),), "ROUNDS": 1, "PATIENCE": 0.02}
+
+
 def main():
     warnings.simplefilter("ignore")
     rows = []
     for label, make, duration in SCENES:
         rows.append(measure(Scene(label, make(), duration)))
         show(rows[-1])
-    about = {"rounds": ROUNDS, **stamp()}
-    with open("validation/trajectory.json", "w", encoding="utf-8") as f:
+    about = {"rounds": ROUNDS, **stamp(__file__)}
+    with results("trajectory.json").open("w", encoding="utf-8") as f:
         json.dump({"rows": rows, **about}, f, indent=1)
 
 

@@ -13,12 +13,14 @@ published ones, and how far mbkit's own linearization is from them, in double an
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import mpmath as mp
 
-HERE = Path(__file__).parent
+from validation.stamp import results, stamp
+
 DIGITS = 50
+#: At which eigenvalues are measured, m/s.
+VELOCITIES = range(11)
 
 #: Table 1 of the paper, as printed, but for the axes: x ahead, y to the right, z down.
 PARAMETERS = {
@@ -273,9 +275,12 @@ def matrices_from_print(m):
     return {name: float(max(as_printed(m[name][i, j], x) for i, j, x in some)) for name, some in entries.items()}
 
 
+#: See `validation.smoke`.
+SMOKE = {"VELOCITIES": (0,)}
+
+
 def main():
     import mbkit as mb
-    from validation.stamp import stamp
 
     mp.mp.dps = DIGITS
     p = parameters()
@@ -283,7 +288,7 @@ def main():
     model = mb.catalog.bicycle()
     oracle, own = mb.dynamics(model, "oracle"), mb.dynamics(model, "lagrangian")
     rows = []
-    for v in range(11):
+    for v in VELOCITIES:
         canonical, ours = eigenvalues(m, g, mp.mpf(v)), own_eigenvalues(oracle, v)
         row = {
             "speed": v,
@@ -303,9 +308,9 @@ def main():
     }
     off, moving = matrices_from_print(m), in_full_motion(oracle)
     print(off, speeds, moving)
-    data = {**stamp(), "matrices_from_print_in_last_digits": off, "critical_speeds": speeds, "rows": rows}
+    data = {**stamp(__file__), "matrices_from_print_in_last_digits": off, "critical_speeds": speeds, "rows": rows}
     data["full_motion"] = dict(zip(("constraints_in_last_digits", "accelerations_in_last_digits"), moving, strict=True))
-    (HERE / "bicycle.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    results("bicycle.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

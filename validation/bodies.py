@@ -18,12 +18,17 @@ from rich.progress import track
 from mbkit.studies.compare.body_terms import BODY_TERMS
 from mbkit.studies.worker import run
 from validation import accuracy
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
 ENGINES = (*accuracy.ENGINES, "drake")
 SAMPLES = 8
 #: In eps.
 BAR, BAR_OF_ENGINES = 50.0, 1e-12 / accuracy.EPS
+
+
+def measured(make, samples):
+    """Return the errors of one system; in a worker, which finds the terms by itself."""
+    return accuracy.measured(make, BODY_TERMS, ENGINES, samples)
 
 
 def missed(found):
@@ -40,13 +45,17 @@ def missed(found):
     return out
 
 
+#: See `validation.smoke`.
+SMOKE = {"accuracy.FLOATING": (), "accuracy.TREES": 1, "accuracy.ROBOTS": accuracy.FEW, "SAMPLES": 1}
+
+
 def main():
     # Nothing is timed here, and thousands of functions would be compiled for a few states each.
     os.environ["MBKIT_COMPILE"] = "0"
     console = Console(width=160 if not sys.stdout.isatty() else None)
     wanted = accuracy.systems()
     jobs = int(sys.argv[1]) if len(sys.argv) > 1 else None
-    calls = {name: partial(accuracy.measured, make, BODY_TERMS, ENGINES, SAMPLES) for name, (_, make) in wanted.items()}
+    calls = {name: partial(measured, make, SAMPLES) for name, (_, make) in wanted.items()}
     found = {}
     for name, result in track(run(calls, jobs=jobs), "comparing", len(wanted), console=Console(stderr=True)):
         if isinstance(result, Exception):
@@ -55,8 +64,8 @@ def main():
     found = dict(sorted(found.items()))
     lines = accuracy.summary(found, BODY_TERMS, ENGINES)
     over = missed(found)
-    stamped = {**stamp(), "bars": {"own": BAR, "engines": BAR_OF_ENGINES}, "summary": lines, "missed": over}
-    (accuracy.HERE / "bodies.json").write_text(accuracy.as_json(stamped, found), encoding="utf-8")
+    stamped = {**stamp(__file__), "bars": {"own": BAR, "engines": BAR_OF_ENGINES}, "summary": lines, "missed": over}
+    results("bodies.json").write_text(accuracy.as_json(stamped, found), encoding="utf-8")
     console.print(accuracy.table(lines))
     for x in over:
         console.print(f"missed: {x['engine']}, {x['term']}: {x['eps']:.3g} eps at {x['system']}, {x['state']}")

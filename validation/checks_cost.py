@@ -14,9 +14,14 @@ import warnings
 import numpy as np
 
 import mbkit as mb
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
 ROUNDS, BATCH = 75, 16
+MODELS = {
+    "double_pendulum": mb.catalog.double_pendulum,
+    "ur5": lambda: mb.load("ur5"),
+    "panda": lambda: mb.load("panda"),
+}
 #: Method, setting, durations in s.
 WAYS = (
     ("rk4", {"dt": 1e-3}, (0.01, 0.1, 1.0)),
@@ -59,11 +64,20 @@ def row(name, dyn, q, v, method, setting, duration):
     }
 
 
+#: See `validation.smoke`.
+SMOKE = {
+    "MODELS": {"z1": lambda: mb.load("z1")},
+    "ROUNDS": 2,
+    "BATCH": 2,
+    "WAYS": (("rk4", {"dt": 1e-3}, (0.01,)), ("rk853", {"rtol": 1e-8}, (0.01,))),
+}
+
+
 def main():
     rows = []
-    models = {"double_pendulum": mb.catalog.double_pendulum(), "ur5": mb.load("ur5"), "panda": mb.load("panda")}
     warnings.simplefilter("ignore")
-    for name, model in models.items():
+    for name, make in MODELS.items():
+        model = make()
         dyn = mb.dynamics(model, "lagrangian")
         q, v = (0.3 * x for x in model.random_state(np.random.default_rng(0), BATCH))
         for method, setting, durations in WAYS:
@@ -75,8 +89,8 @@ def main():
                         "   check() {all_checks:.2f}".format(**rows[-1])
                     )
     print(f"median {statistics.median(r['ratio'] for r in rows):.3f}, largest {max(r['ratio'] for r in rows):.3f}")
-    with open("validation/checks_cost.json", "w", encoding="utf-8") as f:
-        json.dump({"rows": rows, **stamp()}, f, indent=1)
+    with results("checks_cost.json").open("w", encoding="utf-8") as f:
+        json.dump({"rows": rows, **stamp(__file__)}, f, indent=1)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ import json
 import sys
 import time
 import warnings
-from pathlib import Path
 
 import matplotlib
 
@@ -26,9 +25,8 @@ import numpy as np
 import mbkit as mb
 from mbkit import catalog
 from mbkit.errors import MbkitWarning
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 STEPS, WINDOWS = 1_000_000, 10
 # Of what is drawn; beyond the kinetic energy itself no error means anything.
 LOWEST, HIGHEST = 1e-8, 1e1
@@ -140,16 +138,20 @@ def draw(result):
         axes.legend(frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=2)
     panels[0].set_ylabel("energy error / largest kinetic energy")
     fig.tight_layout()
-    (HERE / "figures").mkdir(exist_ok=True)
-    fig.savefig(HERE / "figures" / "energy_drift.png", dpi=110)
-    fig.savefig(HERE / "figures" / "energy_drift.svg", transparent=True, metadata={"Date": None})
+    results("figures").mkdir(exist_ok=True)
+    fig.savefig(results("figures") / "energy_drift.png", dpi=110)
+    fig.savefig(results("figures") / "energy_drift.svg", transparent=True, metadata={"Date": None})
     plt.close(fig)
 
 
+#: See `validation.smoke`.
+SMOKE = {"STEPS": 400}
+
+
 def main():
-    path = HERE / "energy_drift.json"
+    path = results("energy_drift.json")
     if "--figure" not in sys.argv[1:]:
-        result = {**stamp(), "steps": STEPS, "window": STEPS // WINDOWS}
+        result = {**stamp(__file__), "steps": STEPS, "window": STEPS // WINDOWS}
         result["scenes"] = {}
         for name, (model, q, v, dt, about) in scenes().items():
             result["scenes"][name] = {"about": about, "dt": dt, **measured(model, q, v, dt)}

@@ -8,19 +8,21 @@ length h, the first half a segment from the root: its frequencies and motions co
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import sympy as sp
 
 import mbkit as mb
 from validation import beams
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 x, s, t, L, RHO, EI = sp.symbols("x s t L rho EI")
 #: Segments of the chains, and the engines that run them.
 SEGMENTS = (5, 10, 20)
+#: Modes of the turning beam and of the spin-up, and the parts of the full speed at which elements run.
+MODES, COUNTS, PARTS = (2, 4, 6, 8), (1, 2, 3, 4, 5), (1.0, 0.1)
+#: Systems whose frequencies are measured; all of them.
+CASES = None
 ENGINES = ("pinocchio", "mujoco", "drake")
 #: The hub's inertia kg m², its speed rad/s, the torque N m that grows and falls in so long, s, and steps of it.
 HUB, TURN, TORQUE, PULSE = 50.0, 6.0, 2.0, 1.0
@@ -75,6 +77,8 @@ def strings_and_beams() -> dict[str, float]:
     }
     out = {}
     for name, (system, values, exact) in cases.items():
+        if CASES is not None and name not in CASES:
+            continue
         modes = system.normal_modes(3, values)
         # Once as they are found, and once more as coordinates of a Lagrangian.
         a = system.discretized(modes)
@@ -111,9 +115,9 @@ def spin_up() -> dict[str, object]:
             "at_s": float(times[at]),
             "error": float(np.abs(tip - exact).max() / np.abs(exact).max()),
         }
-    out["element"] = {str(part): of_element(part) for part in (1.0, 0.1)}
+    out["element"] = {str(part): of_element(part) for part in PARTS}
     out["of_modes_m"] = {}
-    for count in (1, 2, 3, 4, 5):
+    for count in COUNTS:
         out["of_modes_m"][str(count)] = float(beams.spin_up(count, np.linspace(0, beams.RISE, 1501)).min())
     return out
 
@@ -162,19 +166,19 @@ def chains() -> dict[str, object]:
     beam = mb.lagrangian.beam(L, EI, RHO, rotation=th, coordinates=[th])
     numbers = {L: beams.LENGTH, EI: beams.EI, RHO: beams.DENSITY, J: HUB}
     tips: dict[int, np.ndarray] = {}
-    for count in (2, 4, 6, 8):
+    for count in MODES:
         a = beam.discretized(mb.lagrangian.clamped_free(count, s, L))
         T = J * sp.Symbol("thetadot") ** 2 / 2 + a.T
         lag = mb.lagrangian.Lagrangian(T, a.V, [th, *a.coordinates], parameters=numbers)
         start = np.zeros(count + 1), np.array([TURN, *np.zeros(count)])
         run = mb.simulate(lag.dynamics(), *start, PULSE, "rk853", torque=torque, save=TIMES, rtol=1e-11, atol=1e-13)
         tips[count] = run.q[:, 1:] @ a.at(1.0)
-    size = np.abs(tips[8]).max()
-    element = mb.dynamics(rotor(8), "lagrangian")
-    start = np.zeros(9), np.array([TURN, *np.zeros(8)])
+    size = np.abs(tips[MODES[-1]]).max()
+    element = mb.dynamics(rotor(MODES[-1]), "lagrangian")
+    start = np.zeros(MODES[-1] + 1), np.array([TURN, *np.zeros(MODES[-1])])
     run = mb.simulate(element, *start, PULSE, "rk853", torque=torque, save=TIMES, rtol=1e-11, atol=1e-13)
-    of_modes = {str(n): float(np.abs(tip - tips[8]).max() / size) for n, tip in tips.items() if n < 8}
-    of_element = float(np.abs(tip_of(element, run.q) - tips[8]).max() / size)
+    of_modes = {str(n): float(np.abs(tip - tips[MODES[-1]]).max() / size) for n, tip in tips.items() if n < MODES[-1]}
+    of_element = float(np.abs(tip_of(element, run.q) - tips[MODES[-1]]).max() / size)
     out: dict[str, object] = {"tip_m": float(size), "errors_of_modes": of_modes, "error_of_element": of_element}
     out["chains"] = []
     exact = [float(w) for w in beams.cantilever(beams.EI, beams.DENSITY, beams.LENGTH, 0, 0, 3)]
@@ -192,7 +196,7 @@ def chains() -> dict[str, object]:
             row = {
                 "segments": n,
                 "engine": engine,
-                "tip_error": float(np.abs(tip_of(dyn, run.q) - tips[8]).max() / size),
+                "tip_error": float(np.abs(tip_of(dyn, run.q) - tips[MODES[-1]]).max() / size),
             }
             row["frequency_errors"] = (np.sqrt(squares) / exact - 1).tolist()
             out["chains"].append(row)
@@ -208,15 +212,29 @@ def chains() -> dict[str, object]:
     return out
 
 
+#: See `validation.smoke`.
+SMOKE = {
+    "SEGMENTS": (4, 5),
+    "ENGINES": ("pinocchio",),
+    "MODES": (1, 2),
+    "COUNTS": (1,),
+    "PARTS": (0.1,),
+    "CASES": ("string with a mass",),
+    "PULSE": 0.02,
+    "TIMES": np.linspace(0, 0.02, 3),
+    "beams.RISE": 0.2,
+}
+
+
 def main() -> None:
-    data = stamp()
+    data = stamp(__file__)
     data["frequencies"] = strings_and_beams()
     print(data["frequencies"], flush=True)
     data["spin_up"] = spin_up()
     print(data["spin_up"], flush=True)
     data["chain"] = chains()
     print(data["chain"]["errors_of_modes"], data["chain"]["orders"], flush=True)
-    (HERE / "flexible.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    results("flexible.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import json
 import time
-from pathlib import Path
 
 import numpy as np
 
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 #: Crank, coupler, rocker and the distance between their pivots, m; kg a metre; m/s².
 CRANK, COUPLER, ROCKER, GROUND = 0.3, 0.9, 0.7, 1.0
 LINE, GRAVITY = 2.0, 9.81
@@ -270,6 +268,10 @@ def own(method, **tolerance):
     return run.q, run.stats.seconds / run.stats.steps
 
 
+#: See `validation.smoke`.
+SMOKE = {"TIMES": (0.02, 0.05)}
+
+
 def main():
     exact, drift = truth()
     finer, _ = truth(_STEP / 2)
@@ -291,9 +293,9 @@ def main():
         gap = float(opened(states).max())
         rows.append({"engine": name, "error": errors, "gap": gap, "us_a_step": round(seconds * 1e6, 1)})
         print(f"{name:45}", *(f"{x:9.1e}" for x in (*errors, gap)), f"{seconds * 1e6:9.1f} us")
-    data = {**stamp(), "dt": DT, "times": TIMES, "truth_known_to": uncertain, "truth_energy_drift": drift}
+    data = {**stamp(__file__), "dt": DT, "times": TIMES, "truth_known_to": uncertain, "truth_energy_drift": drift}
     data |= {"pinocchio_without_regularization_is_finite": finite, "rows": rows}
-    (HERE / "four_bar.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    results("four_bar.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -10,14 +10,12 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from pathlib import Path
 
 import mpmath as mp
 import numpy as np
 
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 mp.mp.dps = 40
 G = mp.mpf("9.81")
 
@@ -42,16 +40,18 @@ def oscillator(m=2, k=50, f=3, start=1):
     return {"events": events, "end": [x]}
 
 
+#: Of the block on the belt, after which half a slip follows.
+PERIODS = 25
 BELT = {"m": 2, "k": 50, "f": 3, "s": 5, "speed": mp.mpf("0.2")}
 
 
-def belt(periods=25):
+def belt():
     """Return when a block on a belt lets go, at s/k, and when it has the belt's speed again, about f/k as far."""
     m, k, f, s, u = BELT.values()
     omega = mp.sqrt(mp.mpf(m) / k) ** -1
     slip = (2 * mp.pi - 2 * mp.atan((s - f) * omega / (k * u))) / omega
     stick, low, high, events = 2 * (s - f) / (k * u), mp.mpf(2 * f - s) / k, mp.mpf(s) / k, []
-    for n in range(periods):
+    for n in range(PERIODS):
         go = n * (stick + slip) + stick
         events += [(go, [high - u * go]), (go + slip, [low - u * (go + slip)])]
     # A third of a slip behind the last stop and a stick.
@@ -65,7 +65,7 @@ def belt(periods=25):
 RIDER = {"m": mp.mpf("0.1"), "k": 360, "start": mp.mpf("0.003")}
 
 
-def rider(phases=51):
+def rider():
     """Return the same for the block with a fast rider: many steps of any method in each phase."""
     (m, k, f, s, u), (n, c, out) = BELT.values(), RIDER.values()
     # Of the places and velocities of both, the time, and one.
@@ -87,7 +87,7 @@ def rider(phases=51):
 
     while True:
         after = steps[slips] * z
-        if len(events) == phases:
+        if len(events) == 2 * PERIODS + 1:
             end = [after[0], after[2] - after[0]]
             return {"start": [low, out], "duration": after[4], "events": events, "end": end}
         if margin(after, slips) > 0:
@@ -293,6 +293,9 @@ def _floats(x):
     return [float(y) for y in x]
 
 
+EXACT, TIGHT = ("rk853", "auto", "taylor"), 1e-13
+
+
 def accuracy(problems):
     """Return for each problem and method the worst relative error of times, and errors of positions."""
     import mbkit as mb
@@ -300,8 +303,8 @@ def accuracy(problems):
     rows = []
     for name, (model, q, v, duration, truth) in problems.items():
         dyn = mb.dynamics(model, "lagrangian")
-        for method in ("rk853", "auto", "taylor"):
-            run = mb.simulate(dyn, q, v, duration, method, rtol=1e-13, atol=1e-15)
+        for method in EXACT:
+            run = mb.simulate(dyn, q, v, duration, method, rtol=TIGHT, atol=TIGHT / 100)
             found, exact = run.events, truth["events"]
             same = len(found) == len(exact)
             times = [abs(float((e.t - t) / t)) for e, (t, _) in zip(found, exact, strict=False)]
@@ -310,10 +313,9 @@ def accuracy(problems):
             ]
             end = max(abs(float(a - b)) for a, b in zip(run.q[-1], truth["end"], strict=True))
             rows.append({"problem": name, "method": method, "phases": len(found), "events_found": same})
-            rows[-1] |= {"times": max(times), "places": max(places), "end": end}
-            print(
-                f"{name:20} {method:8} {len(found):3} of {len(exact):3} {max(times):8.1e} {max(places):8.1e} {end:8.1e}"
-            )
+            rows[-1] |= {"times": max(times, default=0.0), "places": max(places, default=0.0), "end": end}
+            worst = " ".join(f"{rows[-1][what]:8.1e}" for what in ("times", "places", "end"))
+            print(f"{name:20} {method:8} {len(found):3} of {len(exact):3} {worst}")
     return rows
 
 
@@ -360,7 +362,11 @@ def orders(alone, ridden):
     return rows
 
 
-def cost(names=("double_pendulum", "ur5", "panda", "anymal"), steps=20_000, rounds=5):
+#: Robots, steps of a run, and rounds.
+COST = (("double_pendulum", "ur5", "panda", "anymal"), 20_000, 5)
+
+
+def cost(names, steps, rounds):
     """Return the time of a step of Moreau's beside that of semi_implicit_euler without friction, in one process."""
     import mbkit as mb
 
@@ -391,6 +397,11 @@ def cost(names=("double_pendulum", "ur5", "panda", "anymal"), steps=20_000, roun
     return rows
 
 
+#: Tolerances, lengths of steps, s, and widths of the smoothed law, rad/s.
+RTOLS, LENGTHS = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12), (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
+WIDTHS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+
+
 def smoothed(problem, friction):
     """Return errors and times of a two-link arm whose friction is f tanh(v/ε), beside the exact law."""
     import casadi as ca
@@ -411,12 +422,12 @@ def smoothed(problem, friction):
         print(f"{law:8} {method:8} {settings} {error:8.1e} {seconds * 1e3:8.1f} ms {run.stats.evaluations}")
 
     exact = mb.dynamics(model, "lagrangian")
-    for rtol in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
+    for rtol in RTOLS:
         measure("exact", exact, "rk853", rtol=rtol, atol=rtol)
-    for dt in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4):
+    for dt in LENGTHS:
         measure("exact", exact, "rk4", dt=dt)
         measure("exact", exact, "moreau", dt=dt)
-    for width in (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+    for width in WIDTHS:
         b = mb.ModelBuilder.of(model.without("friction"))
         for joint, f in zip(("shoulder", "elbow"), friction, strict=True):
             b.add_joint_force(f"dry {joint}", joint, lambda t, q, v, f=float(f), w=width: -f * ca.tanh(v / w))  # noqa: ARG005
@@ -428,6 +439,21 @@ def smoothed(problem, friction):
     return rows
 
 
+#: See `validation.smoke`.
+SMOKE = {
+    "PERIODS": 1,
+    "PENDULUM": PENDULUM | {"f": mp.mpf(2)},
+    "ARM_TIME": mp.mpf("0.1"),
+    "EXACT": ("rk853",),
+    "TIGHT": 1e-4,
+    "STEPS": {"moreau": [50, 100], "rk853": [1e-3, 1e-4]},
+    "COST": (("double_pendulum",), 5, 1),
+    "RTOLS": (1e-4,),
+    "LENGTHS": (1e-2,),
+    "WIDTHS": (1e-1,),
+}
+
+
 def main():
     problems = described()
     data = {
@@ -436,11 +462,11 @@ def main():
     }
     finer = arm(ARM_STEP / 2)
     known = zip(finer["events"], problems["two-link arm"][-1]["events"], strict=True)
-    data["arm_known_to"] = max(float(abs(a[0] - b[0])) for a, b in known)
+    data["arm_known_to"] = max((float(abs(a[0] - b[0])) for a, b in known), default=0.0)
     print("arm known to", data["arm_known_to"])
-    data["cost_of_moreau"] = cost()
+    data["cost_of_moreau"] = cost(*COST)
     data["smoothed"] = smoothed(problems["two-link arm"], ARM["f"])
-    (HERE / "friction.json").write_text(json.dumps({**stamp(), **data}, indent=1) + "\n", encoding="utf-8")
+    results("friction.json").write_text(json.dumps({**stamp(__file__), **data}, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -38,9 +38,8 @@ from tests.random_files import EPS, errors, mujoco_terms, mutant, random_mjcf
 from tests.random_trees import ALL, random_tree, states
 from validation import newton_euler
 from validation.plain_model import plain
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 URDFS = ("double_pendulum", "asr_twodof", "finger_edu", "so100", "ur5", "panda", "borinot", "hextilt")
 URDFS += ("simple_humanoid", "kinova")
 WRITTEN = ("ur5", "z1", "solo12")
@@ -51,6 +50,8 @@ ROUNDING = 1e3
 COARSE = 1e-6
 #: Seconds for one file.
 PATIENCE = 60.0
+#: Files of each kind, and trees.
+COUNT, TREES = 10_000, 165
 ALONE = "Pinocchio alone holds the model"
 #: How the outcomes begin that may be; every other one is a failure.
 GOOD = {
@@ -269,10 +270,14 @@ def is_good(part: str, made: str) -> bool:
     return (made.split(": ", 1)[1] if part == "mutants" and ": " in made else made).startswith(GOOD[part])
 
 
+#: See `validation.smoke`.
+SMOKE = {"COUNT": 3, "TREES": 1}
+
+
 def main() -> int:
     """Run and write."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 10_000
-    trees = int(sys.argv[2]) if len(sys.argv) > 2 else 165
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else COUNT
+    trees = int(sys.argv[2]) if len(sys.argv) > 2 else TREES
     seconds = float(sys.argv[3]) * 20 if len(sys.argv) > 3 else float("inf")
     os.environ.setdefault("MBKIT_COMPILE", "0")
     table = {}
@@ -287,8 +292,8 @@ def main() -> int:
         }
         print(f"{part}: {found.total()} in {time.perf_counter() - begun:.0f} s")
         print(json.dumps(table[part]["outcomes"], indent=1), flush=True)
-    told = {**stamp(), **table}
-    (HERE / "fuzz.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+    told = {**stamp(__file__), **table}
+    results("fuzz.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return int(any(x["failures"] for x in table.values()))
 
 

@@ -35,12 +35,15 @@ from mbkit.codegen.cuda.runs import WHOLE
 from mbkit.codegen.program import program
 from mbkit.derivation.steps.fixed import STATE, Part, parts_of
 from mbkit.errors import InputError
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-DATA = Path(__file__).with_suffix(".json")
 ROBOTS = {"ur5": False, "panda": False, "anymal": True, "talos": False}
 #: States of the comparison with the CPU; of the other quantities than forward dynamics.
 STATES, FEWER = 1_000_000, 100_000
+#: Sizes of batches; runs side by side and steps of each; s that a call is timed for at least.
+BATCHES, RUNS, LEAST = (1_000, 10_000, 100_000, 1_000_000, 4_000_000), (2**18, 1000), 0.3
+#: Of a new process.
+DEVICE = "cuda"
 #: Joints up to which derivatives are compared: LLVM takes a minute for more.
 _MOST_DERIVED = 20
 #: Angles, rad, that are reduced with more bits of 2/π.
@@ -118,11 +121,11 @@ def on_device(x: np.ndarray, *, major: bool) -> DeviceArray:
     return out
 
 
-def seconds(call: Callable[[], Any], *, least: float = 0.3, times: int = 5) -> float:
+def seconds(call: Callable[[], Any], *, times: int = 5) -> float:
     """Return the median time of a call."""
     call()
     found: list[float] = []
-    while len(found) < times and sum(found) < least * times:
+    while len(found) < times and sum(found) < LEAST * times:
         began = time.perf_counter()
         call()
         found.append(time.perf_counter() - began)
@@ -133,7 +136,7 @@ def rates(model: mb.Model) -> Iterator[dict[str, Any]]:
     """Yield states a second of both dynamics by size of the batch, on arrays of the GPU and of the host."""
     gpu, cpu = (mb.dynamics(model, "lagrangian", compile=True, device=x) for x in ("cuda", None))
     for quantity in ("forward_dynamics", "inverse_dynamics"):
-        for n in (1_000, 10_000, 100_000, 1_000_000, 4_000_000):
+        for n in BATCHES:
             given = [*states(model, min(n, 100_000)).values()]
             given = [np.resize(x, (n, x.shape[1])) for x in given]
             row: dict[str, Any] = {"quantity": quantity, "states": n}
@@ -147,9 +150,10 @@ def rates(model: mb.Model) -> Iterator[dict[str, Any]]:
             yield row
 
 
-def steps(model: mb.Model, n: int = 2**18, count: int = 1000) -> dict[str, Any]:
+def steps(model: mb.Model) -> dict[str, Any]:
     """Return RK4 steps a second of runs whose ends are kept, and how many numbers differ from the CPU's."""
     gpu, cpu = (mb.dynamics(model, "lagrangian", compile=True, device=x) for x in ("cuda", None))
+    n, count = RUNS
     given = states(model, n)
     v, dt = 0.1 * given["v"], 1e-4
     count //= 4 if model.nv > 10 else 1
@@ -184,7 +188,7 @@ import numpy as np, mbkit as mb
 model = mb.load(sys.argv[1], floating_base=sys.argv[2] == "True")
 q, v = model.random_state(0, 1000)
 began = time.perf_counter()
-mb.dynamics(model, "lagrangian", device="cuda").forward_dynamics(q, v, v)
+mb.dynamics(model, "lagrangian", device=sys.argv[3] or None).forward_dynamics(q, v, v)
 print(time.perf_counter() - began)
 """
 
@@ -193,7 +197,7 @@ def first_calls(name: str) -> dict[str, float]:
     """Return the time from a model to the first accelerations in a new process, s: nothing kept on disk, and kept."""
     with tempfile.TemporaryDirectory() as folder:
         own = {"MBKIT_CACHE_DIR": folder, "CUDA_CACHE_DISABLE": "1"}
-        command = [sys.executable, "-c", _FIRST, name, str(ROBOTS[name])]
+        command = [sys.executable, "-c", _FIRST, name, str(ROBOTS[name]), DEVICE]
         found = [
             float(subprocess.run(command, env=os.environ | own, check=True, capture_output=True, text=True).stdout)
             for _ in range(2)
@@ -244,7 +248,7 @@ def exchange(model: mb.Model) -> dict[str, str]:
     return out
 
 
-def varied(n: int = 1_000_000) -> dict[str, Any]:
+def varied() -> dict[str, Any]:
     """Return accelerations a second of an arm whose payload and dampers differ from sample to sample."""
     payload, damping = mb.Parameter("payload"), mb.Parameter("damping")
     arm = mb.ModelBuilder("arm", gravity=[0, 0, -9.81])
@@ -256,7 +260,7 @@ def varied(n: int = 1_000_000) -> dict[str, Any]:
         arm.add_joint(f"joint{i}", "revolute", **place, axis=axis, damping=damping)
         parent = name
     model = arm.build()
-    rng = np.random.default_rng(0)
+    rng, n = np.random.default_rng(0), STATES
     values = {"payload": rng.uniform(0.1, 5, n), "damping": rng.uniform(0, 2, n)}
     cpu, gpu = (mb.dynamics(model, "lagrangian", compile=True, device=x).at(**values) for x in (None, "cuda"))
     given = [np.asfortranarray(x) for x in states(model, n).values()]
@@ -322,7 +326,7 @@ def measured(keep: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     """Return all that needs a GPU; what is done is kept after each part, and a part that fails stops no other."""
     began = time.perf_counter()
     models = {name: loaded(name) for name in ROBOTS}
-    out: dict[str, Any] = {"made": stamp(), "device": device_of("cuda").title, "CPU cores": cores()}
+    out: dict[str, Any] = {"made": stamp(__file__), "device": device_of("cuda").title, "CPU cores": cores()}
     robots: dict[str, Callable[[str], Any]] = {
         "first calls, s": first_calls,
         "same": lambda name: same(models[name]),
@@ -363,21 +367,35 @@ def wrong(data: dict[str, Any]) -> list[str]:
     ]
 
 
+#: See `validation.smoke`.
+SMOKE = {
+    "ROBOTS": {"ur5": False},
+    "loaded": lambda _: mb.catalog.pendulum(),
+    "QUANTITIES": {name: QUANTITIES[name] for name in ("mass_matrix", "forward_dynamics")},
+    "STATES": 8,
+    "FEWER": 8,
+    "BATCHES": (8,),
+    "RUNS": (4, 10),
+    "LEAST": 0.0,
+    "DEVICE": "",
+}
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print and write; return 1 where a number is wrong."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--assemble", action="store_true", help="only registers and spilled bytes, by ptxas")
     chosen = parser.parse_args(arguments)
-    data = json.loads(DATA.read_text()) if DATA.exists() else {}
+    data = json.loads(results("gpu.json").read_text()) if results("gpu.json").exists() else {}
 
     def keep(found: dict[str, Any]) -> None:
-        DATA.write_text(json.dumps({**data, **found}, indent=1) + "\n")
+        results("gpu.json").write_text(json.dumps({**data, **found}, indent=1) + "\n")
 
     if chosen.assemble:
         path = ptxas_path()
         if path is None:
             raise SystemExit("ptxas is not installed: pip install nvidia-cuda-nvcc")
-        found = {"assembled": {"made": stamp(), **assembled(path)}}
+        found = {"assembled": {"made": stamp(__file__), **assembled(path)}}
     else:
         data = {"assembled": data.get("assembled", {})}
         found = measured(keep)

@@ -20,17 +20,19 @@ import argparse
 import json
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
 from mbkit.model.base_parameters import regressor_columns
+from validation.stamp import results, stamp
 
 ROBOTS = ("ur5", "panda")
 ENGINES = ("pinocchio", "mujoco", "lagrangian")
-SAMPLES = 100_000
+SAMPLES, TRIALS = 100_000, 200
+#: Of the motion that identifies, s.
+LASTS = 10.0
 #: Calls of a loop, whose time for a sample does not depend on their number.
 CALLS = 5_000
 
@@ -51,7 +53,7 @@ def arrays(found):
 
 def identified(name, trials):
     model, rng = mb.load(name), np.random.default_rng(0)
-    motion = mb.excitation(model, duration=10.0, rate=100.0, seed=0)
+    motion = mb.excitation(model, duration=LASTS, rate=100.0, seed=0)
     before, true = other_masses(model, rng), model.base_parameters().values
     state = motion.q, motion.v, motion.a
     exact = {}
@@ -147,14 +149,16 @@ def speed(name):
     }
 
 
+#: See `validation.smoke`.
+SMOKE = {"ROBOTS": ("z1",), "SAMPLES": 20, "CALLS": 5, "TRIALS": 2, "LASTS": 2.0}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--trials", type=int, default=TRIALS)
     parser.add_argument("--speed", action="store_true", help="measure times alone, and keep the rest")
     asked = parser.parse_args()
-    from validation.stamp import stamp
-
-    path = Path(__file__).with_suffix(".json")
+    path = results("identification.json")
     rows = json.loads(path.read_text())["identified"] if asked.speed else []
     for name in ROBOTS[: 0 if asked.speed else None]:
         rows.append(identified(name, asked.trials))
@@ -162,7 +166,7 @@ def main():
     speeds = [speed(name) for name in ROBOTS]
     for row in speeds:
         print(row)
-    text = json.dumps({"identified": rows, "speed": speeds, **stamp()}, indent=1)
+    text = json.dumps({"identified": rows, "speed": speeds, **stamp(__file__)}, indent=1)
     path.write_text(text + "\n", encoding="utf-8")
 
 

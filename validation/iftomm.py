@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from pathlib import Path
 
 import numpy as np
 
@@ -20,12 +19,18 @@ import mbkit as mb
 from mbkit.errors import MbkitWarning, UnsupportedError
 from validation import elliptic, squeezer
 from validation.closed_forms import published
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12)
 TIMES = np.arange(1.0, 11.0)
 #: N, engine and methods of A02.
+#: Of Andrews' squeezer: s of the runs, and the methods with their settings; Pinocchio takes the first five.
+SQUEEZED = 0.05
+WAYS = [("rk853", {"rtol": x}) for x in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)]
+WAYS += [("taylor", {"rtol": x}) for x in (1e-6, 1e-10, 1e-14)]
+WAYS += [(m, {"rtol": x}) for m in ("rodas5", "dop853", "radau") for x in (1e-4, 1e-6, 1e-8)]
+WAYS += [("rk4", {"dt": x}) for x in (4e-5, 2e-5, 1e-5, 5e-6)] + [("gauss4", {"dt": x}) for x in (1e-4, 5e-5)]
+STIFF = ("rodas5", "radau", "auto")
 ROWS = ((1, "lagrangian", ("rk853", "taylor", "rodas5")), (1, "pinocchio", ("rk853",)))
 ROWS += ((4, "lagrangian", ("rk853", "taylor", "rodas5")), (4, "pinocchio", ("rk853",)), (40, "lagrangian", ("rk853",)))
 
@@ -54,10 +59,10 @@ def figures(run, **more):
 def pendulum():
     """A01: the error of x and y at 10 s."""
     dyn = mb.dynamics(mb.catalog.pendulum(), "lagrangian")
-    theta, _ = elliptic.pendulum([10.0], -math.pi / 2)
+    theta, _ = elliptic.pendulum(TIMES[-1:], -math.pi / 2)
     out = []
     for rtol in TOLERANCES:
-        end = run(dyn, [-math.pi / 2], [0.0], 10.0, "rk853", rtol=rtol, save=[0.0, 10.0])
+        end = run(dyn, [-math.pi / 2], [0.0], TIMES[-1], "rk853", rtol=rtol, save=[0.0, TIMES[-1]])
         x, exact = end.q[-1, 0], theta[0, 0]
         error = math.hypot(math.sin(x) - math.sin(exact), math.cos(x) - math.cos(exact))
         out.append(figures(end, rtol=rtol, error=error))
@@ -80,7 +85,7 @@ def four_bars(n, engine, methods):
     exact, out = angle_of_rows(n, TIMES), []
     for method in methods:
         for rtol in TOLERANCES:
-            found = run(dyn, q, v, 10.0, method, repeats=1 if n > 4 else 2, rtol=rtol, save=[0.0, *TIMES])
+            found = run(dyn, q, v, TIMES[-1], method, repeats=1 if n > 4 else 2, rtol=rtol, save=[0.0, *TIMES])
             error = float(np.abs(found.q[1:, 0] - exact[: len(found.q) - 1]).max())
             at_1s = float(abs(found.q[1, 0] - exact[0]))
             out.append(figures(found, n=n, engine=engine, method=method, rtol=rtol, error=error, error_1s=at_1s))
@@ -98,21 +103,14 @@ def andrews():
     """The problem of the IVP test set: errors of all turns and rates, from the truth and from what was printed."""
     told = published()["andrews_squeezing_mechanism"]
     start, end = np.array([float(x) for x in told["q0"]]), told["reference_t_0p03"]
-    turn, rate = (x.astype(float) for x in squeezer.truth())
+    turn, rate = (x.astype(float) for x in squeezer.truth(squeezer.STEPS))
     finer, _ = squeezer.truth(2 * squeezer.STEPS)
     model = mb.catalog.andrews_squeezer()
     torque = np.array([told["drive_torque_on_beta"], *[0.0] * 6])
-    ways = [("rk853", {"rtol": x}) for x in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)]
-    ways += [("taylor", {"rtol": x}) for x in (1e-6, 1e-10, 1e-14)]
-    ways += [(m, {"rtol": x}) for m in ("rodas5", "dop853", "radau") for x in (1e-4, 1e-6, 1e-8)]
-    ways += [("rk4", {"dt": x}) for x in (4e-5, 2e-5, 1e-5, 5e-6)] + [
-        ("gauss4", {"dt": 1e-4}),
-        ("gauss4", {"dt": 5e-5}),
-    ]
     out = []
     for engine in ("lagrangian", "pinocchio"):
         dyn = mb.dynamics(model, engine)
-        for method, setting in ways if engine == "lagrangian" else ways[:5]:
+        for method, setting in WAYS if engine == "lagrangian" else WAYS[:5]:
             try:
                 found = run(dyn, np.zeros(7), np.zeros(7), 0.03, method, torque=torque, save=[0.03], **setting)
             except UnsupportedError:
@@ -148,7 +146,9 @@ def squeezer_from_iftomm():
     rest = fsolve(lambda x: dyn.constraint_residual(np.array([beta, *x])), np.zeros(6), xtol=1e-14)
     q, torque, out = np.array([beta, *rest]), np.array([told["drive_torque_on_beta"], *[0.0] * 6]), []
     for rtol in TOLERANCES:
-        found = run(dyn, q, np.zeros(7), 0.05, "rk853", rtol=rtol, torque=torque, save=np.linspace(0, 0.05, 101))
+        found = run(
+            dyn, q, np.zeros(7), SQUEEZED, "rk853", rtol=rtol, torque=torque, save=np.linspace(0, SQUEEZED, 101)
+        )
         energy = found.energy()
         balance = energy - energy[0] - torque[0] * (found.q[:, 0] - q[0])
         out.append(figures(found, rtol=rtol, balance=float(np.abs(balance).max())))
@@ -162,7 +162,7 @@ def bricard():
     for engine in ("lagrangian", "pinocchio"):
         dyn = mb.dynamics(model, engine)
         for rtol in TOLERANCES:
-            found = run(dyn, np.zeros(6), np.zeros(6), 10.0, "rk853", rtol=rtol, save=[0.0, *TIMES])
+            found = run(dyn, np.zeros(6), np.zeros(6), TIMES[-1], "rk853", rtol=rtol, save=[0.0, *TIMES])
             ends[engine, rtol] = found.q
             out.append(figures(found, engine=engine, rtol=rtol))
     best = ends["lagrangian", TOLERANCES[-1]]
@@ -260,17 +260,29 @@ def stiff_governor():
     dyn = mb.dynamics(governor(), "lagrangian")
     s, _, known = governor_truth(TIMES)
     out = []
-    for method in ("rodas5", "radau", "auto"):
+    for method in STIFF:
         for rtol in TOLERANCES[:3]:
             v = np.array([_GOVERNOR["omega0"], 0, 0, 0])
-            found = run(dyn, np.zeros(4), v, 10.0, method, rtol=rtol, save=[0.0, *TIMES])
+            found = run(dyn, np.zeros(4), v, TIMES[-1], method, rtol=rtol, save=[0.0, *TIMES])
             error = float(np.abs(0.5 + found.q[1:, 1] - s[: len(found.q) - 1]).max())
             out.append(figures(found, method=method, rtol=rtol, error=error))
     return {"truth_known_to": known, "rows": out}
 
 
+#: See `validation.smoke`.
+SMOKE = {
+    "TOLERANCES": (1e-3,),
+    "TIMES": np.array([0.02, 0.04]),
+    "ROWS": ROWS[1:2],
+    "SQUEEZED": 1e-3,
+    "WAYS": [("rk853", {"rtol": 1e-3})],
+    "STIFF": ("rodas5",),
+    "squeezer.STEPS": 40,
+}
+
+
 def main():
-    data = {**stamp()}
+    data = {**stamp(__file__)}
     for name, part in (
         ("pendulum", pendulum),
         ("andrews", andrews),
@@ -281,7 +293,7 @@ def main():
     ):
         data[name] = part()
         print(name, "done", flush=True)
-        (HERE / "iftomm.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        results("iftomm.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

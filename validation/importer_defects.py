@@ -14,14 +14,14 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+from mbkit.engines.imported import IMPORTERS
 from mbkit.engines.versions import process
 from mbkit.engines.versions.engine_version import engine
 from mbkit.errors import MbkitWarning
 from mbkit.studies.importers import Parsed, compare_parsers
 from mbkit.studies.importers.result import TERMS
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-OUT = Path(__file__).parent / "importer_defects.json"
 VERSIONS = (
     *(f"newton=={x}" for x in ("1.8.0", "1.7.0", "1.6.1", "1.5.2")),
     *(f"mujoco-warp=={x}" for x in ("4.0.0", "3.17.0", "3.16.0", "3.15.0", "3.14.0", "3.13.0")),
@@ -105,10 +105,15 @@ def told(p: Parsed) -> dict[str, Any]:
     }
 
 
+#: See `validation.smoke`.
+SMOKE = {"VERSIONS": ("mujoco",), "FILES": {k: FILES[k] for k in ("impossible_inertia", "gravity")}}
+
+
 def main() -> None:
     """Measure the versions that are named, or all, and write after each."""
     warnings.simplefilter("ignore", MbkitWarning)
-    data = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
+    out = results("importer_defects.json")
+    data = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {}
     read: dict[str, Any] = data.get("read", {})
     with tempfile.TemporaryDirectory() as folder:
         for version in sys.argv[1:] or VERSIONS:
@@ -118,8 +123,11 @@ def main() -> None:
                 first = compare_parsers(path, [version]).importers[0]
                 read.setdefault(name, {})[version] = told(first)
                 print(f"{version} {name}: {read[name][version]}", flush=True)
-            process.end(engine(version))
-            OUT.write_text(json.dumps(stamp() | {"files": FILES, "read": read}, indent=1) + "\n", encoding="utf-8")
+            if version not in IMPORTERS:
+                process.end(engine(version))
+            out.write_text(
+                json.dumps(stamp(__file__) | {"files": FILES, "read": read}, indent=1) + "\n", encoding="utf-8"
+            )
 
 
 if __name__ == "__main__":

@@ -16,18 +16,19 @@ from __future__ import annotations
 import json
 import re
 import sys
-from pathlib import Path
 from typing import Any
 
 from mbkit.engines.imported import IMPORTERS
-from mbkit.load import robots, xml_reader
+from mbkit.load import xml_reader
 from mbkit.load.xml_reader import Element
 from mbkit.studies.explain.result import Cause, effect, grouped
 from mbkit.studies.importers import Parsed, compare_parsers
 from mbkit.studies.results import to_plain
-from validation.stamp import stamp
+from validation.robots import FEW, chosen
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
+#: All of them.
+ROBOTS = None
 QUOTED = re.compile(r"'([^']+)'")
 
 
@@ -84,16 +85,20 @@ def briefly(p: Parsed) -> dict[str, Any]:
 
 def trained(names: list[str]) -> None:
     """Measure importers in environments of their own, and write after each robot."""
-    path = HERE / "importers_trained.json"
+    path = results("importers_trained.json")
     held = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     table: dict[str, Any] = held.get("robots", {})
-    for robot in robots():
+    for robot in chosen(ROBOTS):
         result = compare_parsers(robot.path, names)
         root, lines = xml_reader.read(robot.path), robot.path.read_text(encoding="utf-8").splitlines()
         row = {p.engine.partition("==")[0]: told(p, root, lines) for p in result.importers if p.stages or p.refused}
         table[robot.name] = table.get(robot.name, {}) | row
-        path.write_text(json.dumps(stamp() | {"robots": to_plain(table)}, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(stamp(__file__) | {"robots": to_plain(table)}, indent=1) + "\n", encoding="utf-8")
         print(f"{robot.name}: {result.verdict}", flush=True)
+
+
+#: See `validation.smoke`.
+SMOKE = {"ROBOTS": FEW}
 
 
 def main() -> None:
@@ -103,7 +108,7 @@ def main() -> None:
         return
     table: dict[str, Any] = {}
     floating: dict[str, Any] = {}
-    for robot in robots():
+    for robot in chosen(ROBOTS):
         result = compare_parsers(robot.path, floating_base=True)
         floating[robot.name] = {p.engine: briefly(p) for p in result.importers}
         result = compare_parsers(robot.path)
@@ -111,8 +116,8 @@ def main() -> None:
         table[robot.name] = {p.engine: told(p, root, lines) for p in result.importers}
         print(f"{robot.name}: {result.verdict}", flush=True)
     for name, told_of in (("importers", table), ("importers_floating", floating)):
-        text = json.dumps(stamp() | {"robots": to_plain(told_of)}, indent=1) + "\n"
-        (HERE / f"{name}.json").write_text(text, encoding="utf-8")
+        text = json.dumps(stamp(__file__) | {"robots": to_plain(told_of)}, indent=1) + "\n"
+        results(f"{name}.json").write_text(text, encoding="utf-8")
     for engine in IMPORTERS:
         agree = [sum(row[engine]["status"] == "agrees" for row in x.values()) for x in (table, floating)]
         print(f"{engine} agrees on {agree[0]}, and on {agree[1]} with a floating base")

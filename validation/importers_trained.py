@@ -6,12 +6,18 @@ still, robot by robot: some minutes, and environments of 600 MB each.
 
 from __future__ import annotations
 
-from validation.importers import trained
+from validation.importers import FEW, trained
+
+ENGINES = ["newton", "mujoco-warp", "mjx"]
+
+
+#: See `validation.smoke`.
+SMOKE = {"ENGINES": ["mujoco"], "importers.ROBOTS": FEW[:1]}
 
 
 def main() -> None:
     """Measure, and write after each robot."""
-    trained(["newton", "mujoco-warp", "mjx"])
+    trained(ENGINES)
 
 
 if __name__ == "__main__":

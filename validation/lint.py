@@ -25,11 +25,13 @@ from typing import NamedTuple
 import mbkit as mb
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load.loader import find
-from validation.stamp import stamp
+from validation.robots import FEW, chosen
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
-VERDICTS, DATA = HERE / "lint_verdicts.toml", HERE / "lint.json"
+VERDICTS = Path(__file__).with_name("lint_verdicts.toml")
 
+#: All of them.
+ROBOTS = None
 Edit = Callable[[ET.Element, str], None]
 
 
@@ -209,17 +211,21 @@ def verdict_of(robot: str, row: mb.studies.lint.LintFinding, verdicts: list[dict
     return next((v for v in verdicts if all(fits(v, key, text) for key, text in place.items())), None)
 
 
+#: See `validation.smoke`.
+SMOKE = {"ROBOTS": FEW, "PLANTED": PLANTED[:1]}
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m validation.lint", description=__doc__.splitlines()[0])
     parser.add_argument("--planted", action="store_true", help="the planted mistakes alone; nothing is written")
     asked = parser.parse_args()
     warnings.simplefilter("ignore", MbkitWarning)
     known: dict[str, mb.studies.lint.LintResult] = {}
-    out, missing = dict(stamp()), 0
+    out, missing = dict(stamp(__file__)), 0
     if not asked.planted:
         verdicts = tomllib.loads(VERDICTS.read_text(encoding="utf-8"))["verdict"]
         findings, refused = [], {}
-        for robot in mb.robots():
+        for robot in chosen(ROBOTS):
             try:
                 known[robot.name] = mb.lint(robot.name)
             except MbkitError as error:
@@ -246,7 +252,7 @@ def main() -> int:
         print(("found " if row["found"] else "MISSED"), *list(row.values())[:4], row["message"], row["also"], sep=" | ")
     print(f"{sum(r['found'] for r in out['planted'])} of {len(PLANTED)} planted mistakes found")
     if not asked.planted and not missing:
-        DATA.write_text(json.dumps(out, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        results("lint.json").write_text(json.dumps(out, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return 1 if missing else 0
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import sys
 from itertools import pairwise
-from pathlib import Path
 
 import matplotlib as mpl
 
@@ -20,9 +19,8 @@ import numpy as np
 
 import mbkit as mb
 from mbkit.simulate import integrate
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 STEPS, WINDOWS, KEPT = 1_000_000, 20, 2_000
 EPS = float(np.finfo(float).eps)
 METHODS = ("rk4", "implicit_midpoint")
@@ -84,17 +82,21 @@ def draw(result):
     panels[1, 0].set_ylabel("energy error / largest kinetic energy")
     panels[0, 0].legend(frameon=False, fontsize=8)
     fig.tight_layout()
-    fig.savefig(HERE / "figures" / "long_loops.svg", transparent=True, metadata={"Date": None})
+    fig.savefig(results("figures") / "long_loops.svg", transparent=True, metadata={"Date": None})
     plt.close(fig)
 
 
+#: See `validation.smoke`.
+SMOKE = {"STEPS": 40, "KEPT": 2}
+
+
 def main():
-    path = HERE / "long_loops.json"
+    path = results("long_loops.json")
     if "--figure" not in sys.argv[1:]:
         found = {}
         for name, (model, q, v, dt) in scenes().items():
             found[name] = {"dt": dt, "methods": {method: measured(model, q, v, dt, method) for method in METHODS}}
-        result = {**stamp(), "steps": STEPS, "window": STEPS // WINDOWS, "scenes": found}
+        result = {**stamp(__file__), "steps": STEPS, "window": STEPS // WINDOWS, "scenes": found}
         path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     result = json.loads(path.read_text(encoding="utf-8"))
     draw(result)

@@ -8,15 +8,26 @@ from __future__ import annotations
 
 import json
 import time
-from pathlib import Path
 
 import numpy as np
 
 import mbkit as mb
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 SAMPLES, BATCH, STEPS = 16, 4096, 200
+#: All of the catalog.
+NAMES = None
+#: What is timed: the mechanism and what else it takes.
+TIMED = (
+    ("four_bar", {}),
+    ("four_bars", {"n": 1}),
+    ("four_bars", {"n": 4}),
+    ("four_bars", {"n": 40}),
+    # A light crank, driven by forces of a stiff spring.
+    ("andrews_squeezer", {"dt": 1e-5}),
+    ("delta_robot", {}),
+    ("stewart_platform", {}),
+)
 
 
 def best(call, repeats=5):
@@ -93,26 +104,21 @@ def bare_constraint_dynamics(dyn, q, v):
     return best(lambda: [pin.constraintDynamics(m, d, x, w, force, models, data, settings) for x, w in states]) / 256
 
 
+#: See `validation.smoke`.
+SMOKE = {"SAMPLES": 1, "BATCH": 32, "STEPS": 2, "NAMES": ("four_bar", "scissor"), "TIMED": TIMED[:1]}
+
+
 def main():
-    names = [n for n in mb.catalog.systems() if mb.catalog.get(n)().loops]
+    names = NAMES or [n for n in mb.catalog.systems() if mb.catalog.get(n)().loops]
     rows = []
     for name in names:
         rows.append(agreement(name))
         print(name, {e: f"{x['error']:.1e}" for e, x in rows[-1]["worst"].items()}, rows[-1]["softness"])
-    timed = [
-        speed("four_bar"),
-        speed("four_bars", n=1),
-        speed("four_bars", n=4),
-        speed("four_bars", n=40),
-        # A light crank, driven by forces of a stiff spring.
-        speed("andrews_squeezer", dt=1e-5),
-        speed("delta_robot"),
-        speed("stewart_platform"),
-    ]
+    timed = [speed(name, **options) for name, options in TIMED]
     for row in timed:
         print(row)
-    data = {**stamp(), "samples": SAMPLES, "batch": BATCH, "agreement": rows, "speed": timed}
-    (HERE / "mechanisms.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+    data = {**stamp(__file__), "samples": SAMPLES, "batch": BATCH, "agreement": rows, "speed": timed}
+    results("mechanisms.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -26,7 +26,11 @@ from pathlib import Path
 
 import numpy as np
 
-READINGS = 20
+from validation.stamp import results, stamp
+
+READINGS, MODELS = 20, 2000
+#: All of them.
+CHOSEN = None
 Q, V = np.array([0.1, 0.2]), np.zeros(2)
 
 
@@ -175,23 +179,25 @@ def measure(name, count):
     }
 
 
+#: See `validation.smoke`.
+SMOKE = {"MODELS": 20, "CHOSEN": ("graph",)}
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--models", type=int, default=2000)
-    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--models", type=int, default=MODELS)
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CHOSEN or CASES))
     asked = parser.parse_args()
     # Nothing comes from disk: each model is compiled.
     os.environ["MBKIT_CACHE_DIR"] = os.environ["HEYOKA_CACHE_DIR"] = ""
-    path = Path(__file__).with_suffix(".json")
+    path = results("memory.json")
     rows = {row["case"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
     context = multiprocessing.get_context("spawn")
     for name in asked.cases:
         with context.Pool(1) as pool:
             row = rows[name] = pool.apply(measure, (name, asked.models))
         print(f"{name:32} {row['kB_per_model']:8.2f} kB a model  {row['first_MB']:6.0f} to {row['last_MB']:.0f} MB")
-        from validation.stamp import stamp
-
-        whole = {"rows": [rows[case] for case in CASES if case in rows], **stamp()}
+        whole = {"rows": [rows[case] for case in CASES if case in rows], **stamp(__file__)}
         path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
 
 

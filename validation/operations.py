@@ -37,9 +37,8 @@ from mbkit.derivation.model_values import scalar
 from mbkit.engines.pinocchio import model as pinocchio_model
 from tests.random_trees import random_tree
 from validation import bench_terms
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 ROBOTS = {name: make for name, make in bench_terms.ROBOTS.items() if name != "double_pendulum"} | {
     "tiago_dual": "mb.load('tiago_dual', mimic='free')"
 }
@@ -53,7 +52,7 @@ FORMS = {
 }
 SIZES = (2, 4, 8, 16, 32, 64, 128, 256)
 #: Samples of a kernel's batch, few enough for the second cache, and of all that a round evaluates.
-BATCH, SAMPLES = 256, 65_536
+BATCH, SAMPLES, ROUNDS = 256, 65_536, 21
 #: Chains of multiply-adds: as many as hide their latency, and few enough for the registers.
 CHAINS, TURNS = 12, 100_000
 
@@ -242,13 +241,25 @@ def systems(most):
         yield "tree", n, random_tree(n, n, ("revolute", "prismatic"), **bare)
 
 
+#: See `validation.smoke`.
+SMOKE = {
+    "ROBOTS": {"z1": "mb.load('z1')"},
+    "SIZES": (2,),
+    "BATCH": 8,
+    "SAMPLES": 64,
+    "ROUNDS": 1,
+    "TURNS": 10,
+    "MBKIT_COMPILE": "1",
+}
+
+
 def main():
     asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     asked.add_argument("--samples", type=int, default=SAMPLES)
-    asked.add_argument("--rounds", type=int, default=21)
+    asked.add_argument("--rounds", type=int, default=ROUNDS)
     asked.add_argument("--most", type=int, default=SIZES[-1], help="joints of the largest chain and tree")
     asked.add_argument("--robots", nargs="*", default=list(ROBOTS), choices=ROBOTS)
-    asked.add_argument("--out", type=Path, default=HERE)
+    asked.add_argument("--out", type=Path, default=results(""))
     given = asked.parse_args()
     if (load := os.getloadavg()[0]) > 0.3:
         print(f"others are at work here (load {load:.2f}): the times will not hold", file=sys.stderr)
@@ -258,7 +269,7 @@ def main():
         "samples": given.samples,
         "rounds": given.rounds,
         "width": jit.host().width,
-        **stamp(),
+        **stamp(__file__),
         "forms": FORMS,
         "robots": [robot(name, ROBOTS[name], given.samples, given.rounds, unit) for name in given.robots],
         "growth": bench_terms.growth(given.samples, given.rounds, systems(given.most)),

@@ -7,16 +7,15 @@ makes that file.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
+from validation.stamp import results
 from validation.terms_figure import COLOURS, draw_growth, style
 
-HERE = Path(__file__).parent
 TITLES = {"inverse_dynamics": "Inverse dynamics", "mass_matrix": "M", "forward_dynamics": "Forward dynamics"}
 GROWN = {"inverse_dynamics": "#cc79a7", "forward_dynamics": "#444444"}
 #: Form or engine -> colour and mark.
@@ -94,7 +93,7 @@ def draw(data, folder):
 
 
 def main():
-    draw(json.loads((HERE / "operations.json").read_text(encoding="utf-8")), HERE / "figures")
+    draw(json.loads(results("operations.json").read_text(encoding="utf-8")), results("figures"))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,8 @@ from typing import Any
 from IPython.display import SVG, Markdown
 from matplotlib.figure import Figure
 
+from validation.stamp import changed
+
 HERE = Path(__file__).parent
 #: Packages whose versions matter for what is measured.
 NAMED = ("mbkit", "python", "pin", "mujoco", "drake", "casadi", "sympy", "llvmlite", "heyoka", "numpy", "scipy")
@@ -25,11 +27,12 @@ def load(name: str) -> Any:
 
 
 def origin(data: dict[str, Any], part: str) -> Markdown:
-    """Return the line that says when, on what and with what versions a file was measured, and how to do so again."""
+    """Return the line of when, on what, with what versions and code a file was measured, and how to do so again."""
     told = [f"Measured on {data['date']}" if "date" in data else "Measured (the file has no date)"]
     told += [f"processor {data['processor']}"] if "processor" in data else []
     found = data.get("versions", {})
     told += [", ".join(f"{name} {found[name]}" for name in NAMED if name in found and found[name] != "not installed")]
+    told += [changed(data)]
     return Markdown(f"*{'; '.join(x for x in told if x)}. Again: `python -m validation --only {part}`.*")
 
 

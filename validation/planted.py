@@ -27,12 +27,14 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
 TOP = Path(__file__).resolve().parents[1]
-LIST, DATA = (Path(__file__).with_suffix(x) for x in (".toml", ".json"))
+LIST = Path(__file__).with_suffix(".toml")
 #: Copies side by side, and seconds that the tests of one defect may take.
 WORKERS, LIMIT = 2, 300
+#: Of the defects of the list, these alone.
+SOME = slice(None)
 PASSED, FAILED = 0, 1
 
 
@@ -99,9 +101,14 @@ def planted(defect: Defect, copy: Path) -> tuple[str, float]:
     return found[1] if found else "the tests cannot be collected", seconds
 
 
-def main(words: list[str]) -> int:
+#: See `validation.smoke`.
+SMOKE = {"WORKERS": 1, "SOME": slice(0, 1)}
+
+
+def main() -> int:
     """Plant the defects, print and write the table."""
-    chosen = [d for d in defects() if not words or any(w in d.file or w in d.text for w in words)]
+    words = sys.argv[1:]
+    chosen = [d for d in defects()[SOME] if not words or any(w in d.file or w in d.text for w in words)]
     rows: dict[int, tuple[str, float]] = {}
     with tempfile.TemporaryDirectory() as folder, Progress(console=Console(stderr=True)) as bar:
         task, copies = bar.add_task("planting", total=len(chosen)), Queue[Path]()
@@ -129,11 +136,11 @@ def main(words: list[str]) -> int:
             {"file": d.path, "text": d.text, "wrong": d.wrong, "caught_by": rows[k][0], "seconds": round(rows[k][1], 1)}
             for k, d in enumerate(chosen)
         ]
-        DATA.write_text(
-            json.dumps({**stamp(), "defects": parts}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+        results("planted.json").write_text(
+            json.dumps({**stamp(__file__), "defects": parts}, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
         )
     return int(bool(lost))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

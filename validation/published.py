@@ -18,7 +18,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,10 +34,9 @@ from mbkit.simulate import Event, Trajectory, at_section
 from validation import elliptic
 from validation.closed_forms import published
 from validation.scenes import SCENES, Scene
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
 Array = NDArray[np.float64]
-HERE = Path(__file__).parent
 SCENE: dict[str, Scene] = {scene.name: scene for scene in SCENES}
 PERIODS = 1000
 
@@ -247,12 +245,16 @@ def table(found: list[dict[str, Any]]) -> Table:
     return out
 
 
+#: See `validation.smoke`.
+SMOKE = {"CHECKS": {k: CHECKS[k] for k in ("pendulum (IFToMM A01)", "spherical pendulum")}, "WAYS": WAYS[1:2]}
+
+
 def main() -> int:
     console = Console(width=160 if not sys.stdout.isatty() else None)
     found = rows()
     lines = ",\n".join(f"  {json.dumps(row, ensure_ascii=False)}" for row in found)
-    head = json.dumps(stamp(), indent=1).removesuffix("\n}")
-    (HERE / "published_checks.json").write_text(f'{head},\n "checks": [\n{lines}\n ]\n}}\n', encoding="utf-8")
+    head = json.dumps(stamp(__file__), indent=1).removesuffix("\n}")
+    results("published_checks.json").write_text(f'{head},\n "checks": [\n{lines}\n ]\n}}\n', encoding="utf-8")
     console.print(table(found))
     missed = unreached(found)
     for line in missed:

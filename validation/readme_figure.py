@@ -10,7 +10,6 @@ import argparse
 import json
 import math
 from collections import Counter
-from pathlib import Path
 
 import matplotlib
 
@@ -18,9 +17,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from mbkit.studies.compare.all_robots import all_robots
-from validation.stamp import stamp
+from validation.robots import FEW
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
+#: All of them.
+ROBOTS, SAMPLES = None, 64
 ENGINES = {"lagrangian": "mbkit's own\nderivation", "pinocchio": "Pinocchio", "mujoco": "MuJoCo"}
 NAMES = ("ink", "faint", *ENGINES)
 COLOURS = {
@@ -92,18 +93,22 @@ def draw(rows, theme):
     return fig
 
 
+#: See `validation.smoke`.
+SMOKE = {"ROBOTS": FEW, "SAMPLES": 2}
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--draw", action="store_true", help="draw what check_all.json has")
-    kept = HERE / "check_all.json"
+    kept = results("check_all.json")
     if not parser.parse_args().draw:
-        rows = summary(sorted(all_robots(samples=64), key=lambda o: o.robot))
-        stamped = {**stamp(), "robots": rows}
+        rows = summary(sorted(all_robots(ROBOTS, samples=SAMPLES), key=lambda o: o.robot))
+        stamped = {**stamp(__file__), "robots": rows}
         kept.write_text(json.dumps(stamped, indent=1) + "\n", encoding="utf-8")
     rows = json.loads(kept.read_text(encoding="utf-8"))["robots"]
     for theme in COLOURS:
         fig = draw(rows, theme)
-        path = HERE / "figures" / f"digits_{theme}.svg"
+        path = results("figures") / f"digits_{theme}.svg"
         fig.savefig(path, metadata={"Date": None})
         # matplotlib leaves spaces at the ends of lines.
         path.write_text("\n".join(x.rstrip() for x in path.read_text(encoding="utf-8").splitlines()) + "\n")

@@ -15,10 +15,15 @@ from typing import Any
 
 import mbkit as mb
 from mbkit.studies.stress import Breaking, CaseResult, StressResult
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-FILE = Path(__file__).with_suffix(".json")
+#: All of them, with every method.
+CASES = METHODS = None
 OURS = ("lagrangian", "pinocchio")
+
+
+#: See `validation.smoke`.
+SMOKE = {"CASES": ("joint_spring",), "METHODS": ("rk4",)}
 
 
 def main() -> None:
@@ -29,10 +34,10 @@ def main() -> None:
     if asked.data is not None:
         result = StressResult.from_json(asked.data.read_text(encoding="utf-8"))
     else:
-        result = mb.stress(quick=asked.quick)
+        result = mb.stress(CASES, methods=METHODS, quick=asked.quick)
     rows = list(result.breaking())
     told: dict[str, Any] = {
-        **({} if asked.data else {"date": stamp()["date"]}),
+        **({} if asked.data else {name: stamp(__file__)[name] for name in ("date", "code")}),
         "processor": result.processor,
         "versions": result.versions,
         "seconds": result.seconds,
@@ -50,7 +55,7 @@ def main() -> None:
             for case in result.cases
         ],
     }
-    FILE.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    results("stress.json").write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     print("\n".join(table(result.cases, rows)))
 
 

@@ -7,7 +7,6 @@ Run ``python -m validation.terms_figure`` to draw ``validation/terms.json`` agai
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import matplotlib
 
@@ -15,8 +14,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 from mbkit.report.formatting import time_text
+from validation.stamp import results
 
-HERE = Path(__file__).parent
 COLOURS = {"pinocchio": "#0072b2", "lagrangian": "#d55e00", "mujoco": "#009e73"}
 ENGINES = {name: COLOURS[name] for name in ("lagrangian", "pinocchio")}
 #: Of growth: each kind of system with its line.
@@ -121,7 +120,7 @@ def draw(data, folder):
 
 
 def main():
-    draw(json.loads((HERE / "terms.json").read_text(encoding="utf-8")), HERE / "figures")
+    draw(json.loads(results("terms.json").read_text(encoding="utf-8")), results("figures"))
 
 
 if __name__ == "__main__":

@@ -11,18 +11,19 @@ import json
 import sys
 import time
 import warnings
-from pathlib import Path
 from typing import Any
 
 import mbkit as mb
 from mbkit.engines.registry import DERIVED
 from mbkit.engines.versions.engine_version import engine
 from mbkit.studies.compare.result import Comparison
-from validation.stamp import stamp
+from validation.robots import FEW, chosen
+from validation.stamp import results, stamp
 
-OUT = Path(__file__).parent / "trained_engines.json"
 ENGINES = ("newton", "mujoco-warp", "mjx", "mjx-single")
 SAMPLES = 24
+#: All of them.
+ROBOTS = None
 
 
 def measured(model: mb.Model, name: str) -> dict[str, Any]:
@@ -45,13 +46,18 @@ def measured(model: mb.Model, name: str) -> dict[str, Any]:
     }
 
 
+#: See `validation.smoke`.
+SMOKE = {"ENGINES": ("mujoco==4.0.0",), "SAMPLES": 2, "ROBOTS": FEW}
+
+
 def main() -> None:
     """Measure the robots one after the other, and write after each."""
     names = [x for x in sys.argv[1:] if x in ENGINES] or ENGINES
     wanted = [x for x in sys.argv[1:] if x not in ENGINES]
-    held = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
+    out = results("trained_engines.json")
+    held = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {}
     robots = held.get("robots", {})
-    for robot in mb.robots():
+    for robot in chosen(ROBOTS):
         if wanted and not any(x in robot.name for x in wanted):
             continue
         rows = robots.setdefault(robot.name, {})
@@ -64,8 +70,8 @@ def main() -> None:
             # Without the folder of this machine.
             rows["refused"] = str(error).replace(f"{robot.path.parent}/", "")
         versions = {name: engine(name).version for name in ENGINES}
-        text = {"samples": SAMPLES, "engines": versions, "robots": robots, **stamp()}
-        OUT.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        text = {"samples": SAMPLES, "engines": versions, "robots": robots, **stamp(__file__)}
+        out.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         said = ", ".join(f"{n}: {r.get('passed', r)}" for n, r in rows.items() if isinstance(r, dict))
         print(f"{robot.name}: {said or rows}", flush=True)
 

@@ -27,10 +27,9 @@ import numpy as np
 
 import mbkit as mb
 from mbkit.engines.versions.engine_version import engine, remote_engines
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-OUT = Path(__file__).parent / "transfer.json"
-RECORD = OUT.parent / "importers.json"
+RECORD = Path(__file__).with_name("importers.json")
 #: Whether the base floats, and the name in example-robot-data.
 ROBOTS = {
     "panda": (False, "panda_description/panda"),
@@ -58,6 +57,15 @@ RUNS = (
 )
 #: At the default step alone: a step of Warp on a CPU takes milliseconds.
 AT_DEFAULT = ("mujoco-warp",)
+#: Engine, method, and the shortest step of its error over the step, s.
+STEPS = (
+    (*TWIN, 1e-5),
+    ("mujoco", "mujoco_rk4", 1e-4),
+    ("newton", "newton_featherstone", 1e-4),
+    ("mjx-single", "mujoco_euler", 1e-5),
+    ("mjx-single", "mujoco_rk4", 2e-5),
+)
+FALLS = "panda"
 Law = Callable[[float, Any, Any], Any]
 Runs = dict[str, list[float]]
 
@@ -217,16 +225,10 @@ def files() -> dict[str, Any]:
 
 def steps() -> dict[str, Any]:
     """Return errors after 0.3 s of a Panda that falls, over the step, in both precisions."""
-    case, out, ends = Case("panda"), dict[str, list[list[float]]](), [0.0, 0.3]
+    case, out, ends = Case(FALLS), dict[str, list[list[float]]](), [0.0, 0.3]
     own = mb.dynamics(case.model, "lagrangian")
     exact = mb.simulate(own, case.q, case.v, ends[-1], "rk853", rtol=1e-13, save=ends)
-    for name, method, least in (
-        (*TWIN, 1e-5),
-        ("mujoco", "mujoco_rk4", 1e-4),
-        ("newton", "newton_featherstone", 1e-4),
-        ("mjx-single", "mujoco_euler", 1e-5),
-        ("mjx-single", "mujoco_rk4", 2e-5),
-    ):
+    for name, method, least in STEPS:
         dyn = mb.dynamics(case.model, name)
         for step in (x for x in (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5) if x >= least):
             run = mb.simulate(dyn, case.q, case.v, ends[-1], method, dt=step, save=ends, doubt=False)
@@ -239,6 +241,16 @@ def steps() -> dict[str, Any]:
 WHOLE: dict[str, Callable[[], Any]] = {"files": files, "steps": steps}
 
 
+#: See `validation.smoke`.
+SMOKE = {
+    "ROBOTS": {"z1": (False, "z1_description/z1")},
+    "TIMES": (0.02, 0.04),
+    "RUNS": (TWIN, ("mujoco", "mujoco_rk4"), ("drake", "drake_sap")),
+    "STEPS": (("mujoco", "mujoco_rk4", 1e-2),),
+    "FALLS": "z1",
+}
+
+
 def main() -> None:
     """Measure the parts one after the other, and write after each run."""
     warnings.simplefilter("ignore")
@@ -246,13 +258,14 @@ def main() -> None:
 
     def write(part: str, value: Any) -> None:
         # Another process may measure other parts.
-        held = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
+        out = results("transfer.json")
+        held = json.loads(out.read_text(encoding="utf-8")) if out.exists() else {}
         robots = held.get("robots", {})
         text = {"times": TIMES, "hold": HOLD, "step": STEP, "bandwidth": BANDWIDTH, "slower": SLOWER}
         text |= {"engines": {name: engine(name).version for name in remote_engines()}}
         text |= {x: value if part == x else held.get(x, {}) for x in WHOLE}
-        text |= {"robots": robots | ({part: value} if part in ROBOTS else {}), **stamp()}
-        OUT.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        text |= {"robots": robots | ({part: value} if part in ROBOTS else {}), **stamp(__file__)}
+        out.write_text(json.dumps(text, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
     kept: dict[str, Any] = {}
     for part in wanted:

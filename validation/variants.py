@@ -21,9 +21,13 @@ import pinocchio as pin
 
 import mbkit as mb
 from mbkit.engines.mujoco.mjcf_writer import read_back
-from validation.stamp import stamp
+from validation.robots import FEW as TWO
+from validation.robots import chosen
+from validation.stamp import results, stamp
 
 STATES, SIZE, ROUNDS, DT, STEPS = 3, 1000, 40, 1e-3, 100
+#: All of them.
+ROBOTS = None
 ENGINES = ("lagrangian", "pinocchio", "mujoco")
 #: Robots with few bodies and many, on a free base too.
 FREE = ("anymal", "hyq", "solo8", "talos", "g1", "ur5", "iiwa7", "z1", "b1", "go2", "laikago", "a1")
@@ -34,7 +38,7 @@ PLACE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 0.5), np.array([0.1, 0.2, 0.3]))
 
 def robots():
     """Yield name, whether on a free base, and the model, of every robot that loads."""
-    for robot in mb.robots():
+    for robot in chosen(ROBOTS):
         if robot.reason is None:
             yield robot.name, False, mb.load(robot.name, mimic="free")
     for name in FREE:
@@ -350,6 +354,9 @@ def seconds(call, *arguments):
     return time.perf_counter() - start
 
 
+RATED = {"ur5": lambda: mb.load("ur5"), "anymal, free base": lambda: mb.load("anymal", floating_base=True)}
+
+
 def rates():
     rows = []
     spreads = {
@@ -357,7 +364,8 @@ def rates():
         "all inertial numbers": {"*.inertial": 0.1},
         "masses and dampers": {"*.mass": 0.1, "*.damping": 0.3},
     }
-    for label, model in (("ur5", mb.load("ur5")), ("anymal, free base", mb.load("anymal", floating_base=True))):
+    for label, make in RATED.items():
+        model = make()
         b = mb.ModelBuilder.of(model)
         for name in model.joint_names:
             if model.joint(name).type.nv == 1:
@@ -381,13 +389,17 @@ def rates():
     return rows
 
 
+#: See `validation.smoke`.
+SMOKE = {"ROBOTS": TWO[:1], "FREE": (), "RATED": {"z1": lambda: mb.load("z1")}, "SIZE": 3, "ROUNDS": 1, "STEPS": 2}
+
+
 def main():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", mb.errors.MbkitWarning)
         rows, refused = judged()
         files = written()
-    out = {**stamp(), "judged": rows, "refused": refused, "written": files, "rates": rates()}
-    with open("validation/variants.json", "w", encoding="utf-8") as file:
+    out = {**stamp(__file__), "judged": rows, "refused": refused, "written": files, "rates": rates()}
+    with results("variants.json").open("w", encoding="utf-8") as file:
         json.dump(out, file, indent=1)
         file.write("\n")
     print(len(rows), "changes,", len(refused), "refused; worst", max(rows, key=worst))

@@ -35,9 +35,10 @@ from mbkit.studies.versions.measure import FILE, RUN
 from mbkit.studies.versions.result import Change, VersionRow
 from tests.random_trees import random_tree
 from validation.arms import joint, link, urdf, written
-from validation.stamp import stamp
+from validation.robots import FEW as TWO
+from validation.robots import chosen
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
 #: Engine -> its versions.
 VERSIONS: dict[str, tuple[str, ...]] = {
     "mujoco": (
@@ -59,6 +60,8 @@ VERSIONS: dict[str, tuple[str, ...]] = {
 #: Of engines in which robots are trained, the last six versions, on these.
 TRAINED = {"newton", "mujoco-warp"}
 FEW = ("ur5", "panda", "hyq", "anymal")
+#: All of them.
+ROBOTS = None
 BARE = {"springs": False, "damping": False}
 TREES = {
     "turning": lambda: random_tree(5, 6, ("revolute", "free", "ball", "planar"), armature=False, **BARE),
@@ -79,7 +82,7 @@ OF_ONE = re.compile(
 def robots() -> list[str]:
     """Return the robots of example-robot-data that mbkit reads."""
     out = []
-    for robot in mb.robots():
+    for robot in chosen(ROBOTS):
         try:
             mb.load(robot.name)
         except MbkitError:
@@ -236,11 +239,20 @@ def smallest(engine: str) -> dict[str, Any]:
     return out
 
 
+#: See `validation.smoke`.
+SMOKE = {
+    "VERSIONS": {"mujoco": ("4.0.0",)},
+    "ROBOTS": TWO[:1],
+    "TREES": {"rotors": TREES["rotors"]},
+    "SMALLEST": {"weld_turned": SMALLEST["weld_turned"]},
+}
+
+
 def main() -> None:
-    path = HERE / "versions.json"
+    path = results("versions.json")
     names = sys.argv[1:] or list(VERSIONS)
     out: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if sys.argv[1:] and path.exists() else {}
-    out |= stamp()
+    out |= stamp(__file__)
     warnings.simplefilter("ignore", MbkitWarning)
     with tempfile.TemporaryDirectory() as folder:
         trees = [replace(make(), name=name) for name, make in TREES.items()]

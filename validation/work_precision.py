@@ -12,7 +12,6 @@ import json
 import math
 import sys
 import time
-from pathlib import Path
 
 import matplotlib
 
@@ -21,10 +20,8 @@ import matplotlib.pyplot as plt
 
 import mbkit as mb
 from validation.scenes import SCENES
-from validation.stamp import stamp
+from validation.stamp import results, stamp
 
-HERE = Path(__file__).parent
-DATA = HERE / "work_precision.json"
 COLOURS = {"pinocchio": "#0072b2", "lagrangian": "#d55e00", "mujoco": "#009e73"}
 LABELS = {"pinocchio": "on Pinocchio", "lagrangian": "on the own derivation", "mujoco": "on MuJoCo"}
 #: Seconds that a scene may take; some have slow methods that would leave others too few settings for an order.
@@ -46,7 +43,7 @@ def measured(scene):
     out = json.loads(result.to_json())
     for name in ("versions", "processor"):
         del out[name]
-    out["date"] = stamp()["date"]
+    out["date"] = stamp(__file__)["date"]
     out["fastest"] = {f"{level:g}": fastest(result, level) for level in LEVELS}
     return {"scene": scene.name, "about": scene.about, **out}
 
@@ -77,9 +74,9 @@ def draw(scenes):
     """Draw the wide PNG, and the SVG as wide as a page of the book."""
     plt.rcParams.update({"font.size": 8.5, "axes.spines.top": False, "axes.spines.right": False})
     plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "mbkit"})
-    drawn(scenes, 5, (13, 5.6)).savefig(HERE / "figures" / "work_precision.png", dpi=130)
+    drawn(scenes, 5, (13, 5.6)).savefig(results("figures") / "work_precision.png", dpi=130)
     tall = drawn(scenes, 2, (7.2, 13))
-    tall.savefig(HERE / "figures" / "work_precision.svg", transparent=True, metadata={"Date": None})
+    tall.savefig(results("figures") / "work_precision.svg", transparent=True, metadata={"Date": None})
 
 
 def drawn(scenes, columns, size):
@@ -138,8 +135,17 @@ def orders(scenes):
                 print(f"{scene['scene']}: {told}, of {c['order_points']} points")
 
 
-def main(arguments):
-    known = {s["scene"]: s for s in json.loads(DATA.read_text())["scenes"]} if DATA.exists() else {}
+#: See `validation.smoke`.
+SMOKE = {"SCENES": SCENES[:1], "BUDGET": 1.0}
+
+
+def main():
+    arguments = sys.argv[1:]
+    known = (
+        {s["scene"]: s for s in json.loads(results("work_precision.json").read_text())["scenes"]}
+        if results("work_precision.json").exists()
+        else {}
+    )
     names = [a for a in arguments if not a.startswith("-")]
     for scene in SCENES:
         if "--draw" in arguments or (names and scene.name not in names):
@@ -149,8 +155,8 @@ def main(arguments):
         print(f"{scene.name}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
         # Kept at once: what follows may be interrupted.
         done = [known[s.name] for s in SCENES if s.name in known]
-        told = {**stamp(), "scenes": done}
-        DATA.write_text(json.dumps(told) + "\n", encoding="utf-8")
+        told = {**stamp(__file__), "scenes": done}
+        results("work_precision.json").write_text(json.dumps(told) + "\n", encoding="utf-8")
     done = [known[s.name] for s in SCENES if s.name in known]
     draw(done)
     table(done)
@@ -159,4 +165,4 @@ def main(arguments):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -1,0 +1,64 @@
+"""`python -m validation`: every part runs, with little of everything, and a file of results tells its code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from validation import smoke, stamp
+from validation.__main__ import PARTS
+from validation.pages import origin
+
+KEPT = Path(stamp.__file__).parent
+STAMP = {"date", "versions", "processor", "code"}
+#: Written into a file by whoever measured.
+BY_HAND = {"gpu.json": {"left out", "remarks"}, "derivation.json": {"python"}}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_runs_and_writes_what_is_kept(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file, data in smoke.run(name, tmp_path).items():
+        wanted = set(json.loads((KEPT / file).read_text(encoding="utf-8"))) - STAMP - BY_HAND.get(file, set())
+        assert wanted <= set(data), file
+        assert stamp.changed(data.get("made", data)) == ""
+    assert all((tmp_path / x).is_file() for x in PARTS[name].writes)
+
+
+SCRIPT = '''"""Says what it does."""
+from validation.other import value
+# Why.
+print(value)
+'''
+
+
+def test_the_code_of_a_script_is_what_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "validation"
+    folder.mkdir()
+    monkeypatch.setattr(stamp, "HERE", folder)
+
+    def digest(script: str = SCRIPT, other: str = "value = 1\n") -> str:
+        (folder / "one.py").write_text(script, encoding="utf-8")
+        (folder / "other.py").write_text(other, encoding="utf-8")
+        stamp.script_code.cache_clear()
+        return stamp.script_code("one")
+
+    try:
+        first = digest()
+        assert digest(SCRIPT.replace("Says", "Tells").replace("# Why.", "# For a reason.\n")) == first
+        assert digest(SCRIPT.replace("print", "repr")) != first
+        assert digest(other="value = 2\n") != first
+        assert digest(other='value = 1\n\n\ndef f():\n    """Text."""\n') != first
+    finally:
+        stamp.script_code.cache_clear()
+
+
+def test_a_caption_says_that_other_code_made_a_file() -> None:
+    data = {"date": "2026-01-01", **stamp.stamp(stamp.__file__)}
+    assert "code" not in origin(data, "accuracy").data
+    old = {k: x for k, x in data.items() if k != "code"}
+    assert "made before the code was kept with it" in origin(old, "accuracy").data
+    for part, words in (("script", "made by other code"), ("mbkit", "mbkit's code has changed since")):
+        assert words in origin(data | {"code": data["code"] | {part: "another"}}, "accuracy").data
