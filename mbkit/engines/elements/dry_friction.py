@@ -50,10 +50,6 @@ _PROXIMAL: Final = 2.0**-32
 #: Proximal points, at most; two are enough, unless A is nearly singular, too.
 _POINTS: Final = 10_000
 _UNDECIDED: Final = "dry friction: which of {n} joints at rest begin to move cannot be decided: singular inertia"
-
-
-#: Of a singular A, accelerations below this part of what forces can do are the rounding of its loops.
-_MOVING: Final = _PROXIMAL
 #: Joints whose power differs by less than this part let go together, as rounding does not break a symmetry.
 _TIE: Final = 1e-9
 
@@ -156,8 +152,8 @@ def friction_forces(
         x, side = solve_at_rest(own, pushed, 0.5 * (high - low), act & ~loose, definite=definite)
         forces[rows] = x = np.where(side < 0, low, np.where(side > 0, high, middle + x))
         a = b[rows] + (own @ x[..., None])[..., 0]
-        # Forces of loops are not unique: what is at its bound may be held by the others.
-        size = _MOVING / _ROUNDING * _noise(own, b[rows], bound[rows])
+        # Forces of loops are not unique: what is at its bound may be held by the others, to the rounding of A.
+        size = _PROXIMAL / _ROUNDING * _noise(own, b[rows], bound[rows])
         moves = side != 0 if definite else side * a < -size
         holds[rows] = act & ~loose & ~moves
         falls = moves & (np.abs(x) > less[rows])

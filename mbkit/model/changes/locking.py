@@ -24,7 +24,7 @@ from mbkit.model.elements.references import entries, moved_by, with_fields
 from mbkit.model.joint_types import FIXED
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.model import Model
-from mbkit.model.parameters import Binding, nominal
+from mbkit.model.parameters import Binding, Expression, nominal
 from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, PointSpring
 from mbkit.model.poses import body_poses
 
@@ -211,32 +211,25 @@ def _still_springs(
     model: Model, joints: Sequence[Joint], values: Values, bindings: list[Binding]
 ) -> Iterator[PointSpring]:
     """Yield springs with the energies of those at locked joints alone, between bodies that these hold together."""
-    held: list[tuple[str, Any, Any]] = []
-    for joint in model.joints:
-        if joint.name in values:
-            numbers = (entries(joint, "joints", name, model.bindings) for name in ("stiffness", "rest"))
-            # Stiff joints have a coordinate for each velocity.
-            each = zip(*numbers, values[joint.name], strict=False)
-            held += [(joint.name, stiffness, float(x) - rest) for stiffness, rest, x in each]
-    for part in model.couplings:
-        if not {*part.joints} - {*values}:
-            factors, stiffness, length = (
-                entries(part, "couplings", name, model.bindings) for name in ("factors", "stiffness", "rest_length")
-            )
-            for name, factor in zip(part.joints, factors, strict=True):
-                length = length - factor * float(values[name][0])
-            held.append((part.joints[0], stiffness, length))
+    held = list[tuple[str, Any, Any]]()
+    for joint in (x for x in model.joints if x.name in values):
+        stiffness, rest = (entries(joint, "joints", name, model.bindings) for name in ("stiffness", "rest"))
+        # Stiff joints have a coordinate for each velocity.
+        held += [(joint.name, k, float(x) - r) for k, x, r in zip(stiffness, values[joint.name], rest, strict=False)]
+    for part in (x for x in model.couplings if {*x.joints} <= {*values}):
+        fields = ("factors", "stiffness", "rest_length")
+        factors, stiffness, stretch = (entries(part, "couplings", name, model.bindings) for name in fields)
+        for name, factor in zip(part.joints, factors, strict=True):
+            stretch = stretch - factor * float(values[name][0])
+        held.append((part.joints[0], stiffness, stretch))
     fixed = {j.name: j for j in joints}
     for k, (name, stiffness, stretch) in enumerate(held):
-        if isinstance(stiffness, float) and isinstance(stretch, float) and not stiffness * stretch:
-            continue
-        joint = fixed[name]
-        origin = entries(joint, "joints", "translation", bindings)
-        fields = {"point_a": origin, "point_b": np.array([stretch, 0.0, 0.0], dtype=object), "stiffness": stiffness}
-        spring = PointSpring(
-            f"spring {k} of {name}", joint.parent, np.zeros(3), joint.child, np.zeros(3), 0.0, 0.0, 0.0
-        )
-        yield with_fields(spring, "springs", fields, bindings)
+        if isinstance(stiffness, Expression) or isinstance(stretch, Expression) or stiffness * stretch:
+            joint, none = fixed[name], np.zeros(3)
+            spring = PointSpring(f"spring {k} of {name}", joint.parent, none, joint.child, none, 0.0, 0.0, 0.0)
+            ends = entries(joint, "joints", "translation", bindings), np.array([stretch, 0.0, 0.0], dtype=object)
+            numbers = {"point_a": ends[0], "point_b": ends[1], "stiffness": stiffness}
+            yield with_fields(spring, "springs", numbers, bindings)
 
 
 def _shortened(coupling: JointCoupling, values: Values, bindings: list[Binding]) -> JointCoupling | None:

@@ -559,11 +559,11 @@ def _other_numbers(a: Any, b: Any, near: Tolerances) -> str:
     """Return what differs between two parts of one name; empty where nothing does."""
     if isinstance(a, Loop):
         return ", and ".join(loop_differences(a, b, near))
-    if isinstance(a, Coupler) and not _alike(a, b, near):
+    if isinstance(a, Coupler) and not alike(a, b, near):
         return f"has {_follows(b)} for {_follows(a)}"
     if type(a) in MOTION_LAWS:
         return "" if _same_motion(a, b, near) else "moves it otherwise"
-    return "" if _alike(a, b, near) else "has other numbers for it"
+    return "" if alike(a, b, near) else "has other numbers for it"
 
 
 def _follows(x: Coupler) -> str:
@@ -584,7 +584,8 @@ def _same_motion(a: Motion, b: Motion, near: Tolerances) -> bool:
     return near.vector(x, y, max(1.0, float(np.abs(x).max())))
 
 
-def _alike(a: Any, b: Any, near: Tolerances) -> bool:
+def alike(a: Any, b: Any, near: Tolerances) -> bool:
+    """Return whether all numbers and names of two parts are equal."""
     return all(
         near.point(x, y) if isinstance(x, np.ndarray) else near.number(x, y) if isinstance(x, float) else x == y
         for x, y in zip(a._values(), b._values(), strict=True)

@@ -20,6 +20,7 @@ from mbkit.studies.explain.engine_differences import engine_causes
 from mbkit.studies.explain.hypotheses import (
     CONSTRAINTS,
     Hypothesis,
+    alike,
     differences,
     link_differences,
     links_in_common_axes,
@@ -311,14 +312,9 @@ def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) ->
 def _named_frames(a: Model, b: Model, near: Tolerances) -> Iterator[str]:
     """Yield the frames of one name and body that stand elsewhere on it; descriptions are compared without frames."""
     there = {(f.name, f.body): f for f in b.frames}
-    pairs = [(f, there[f.name, f.body]) for f in a.frames if (f.name, f.body) in there]
-    placed = (
-        x.name
-        for x, y in pairs
-        if not (near.vector(x.rotation, y.rotation) and near.point(x.translation, y.translation))
-    )
-    if names := ", ".join(placed):
-        yield f"named frames that stand elsewhere, which changes no term: {names}"
+    moved = [f.name for f in a.frames if not alike(f, there.get((f.name, f.body), f), near)]
+    if moved:
+        yield f"named frames that stand elsewhere, which changes no term: {', '.join(moved)}"
 
 
 def _summarized_differences(one: MergedModel, other: MergedModel, near: Tolerances) -> list[Hypothesis]:
