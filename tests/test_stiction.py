@@ -184,3 +184,31 @@ def test_a_loop_holds_up_to_the_stiction_of_all_its_joints_and_slides_against_th
             tau = bare.nle(q, still) + pull * holds * n
             rate = np.sign(pull) * (abs(pull) > 1) * (abs(pull) * holds - slides) / (n @ M @ n)
             assert off(dyn.forward_dynamics(q, still, tau), rate * n) < 1e-9
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_what_rests_on_a_driven_cart_slides_back_where_the_drive_is_too_fast(engine: str) -> None:
+    """2 kg with f = 3 N and s = 5 N on x = A cos ωt, at t = 0: it is pulled by 2 A ω², N."""
+    for pull in (2.0, 4.9, 5.1, 8.0):
+        b = mb.ModelBuilder("cart", gravity=(0, 0, 0))
+        for name, parent in (("cart", "world"), ("block", "cart")):
+            b.add_body(name, mass=2.0)
+            rubs = {"friction": 3.0, "stiction": 5.0} if name == "block" else {}
+            b.add_joint(name, "prismatic", parent=parent, child=name, axis=(1, 0, 0), **rubs)
+        b.prescribe("cart", amplitude=pull / 18, frequency=3.0, phase=np.pi / 2)
+        dyn = mb.dynamics(b.build(), engine)
+        q, v = dyn.project([pull / 18, 0.3], [0.0, 0.0])
+        a = dyn.forward_dynamics(q, v * [1, 0], [0.0, 0.0])
+        assert a == pytest.approx([-pull / 2, (pull - 3) / 2 if pull > 5 else 0.0], rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_moreau_s_step_begins_in_the_same_pattern(engine: str) -> None:
+    rng = np.random.default_rng(3)
+    f = rng.uniform(0, 3, 3)
+    dyn = mb.dynamics(chain(f, 2 * f, rng.uniform(0.3, 3, 3)), engine)
+    q, tau = states(rng, 3, 40)
+    run = mb.simulate(dyn, q, 0 * q, 1e-6, "moreau", dt=1e-6, torque=tau[:, None])
+    a = dyn.forward_dynamics(q, 0 * q, tau)
+    assert ((run.v[:, -1] == 0) == (a == 0)).all()
+    assert off(1e6 * run.v[:, -1], a) < 1e-3
