@@ -49,7 +49,7 @@ def explain(
 ) -> Explanation:
     """Explain why two descriptions, or two engines, differ.
 
-    Every difference between the descriptions is named: armature, damping, friction, springs, gravity, a
+    Every difference between the descriptions is named: armature, damping, friction and its curve, springs, gravity, a
     lost, fused or changed body, inertia about the wrong point or in the wrong axes, a joint's place, axis,
     zero or pitch, quaternion and joint order, mimic joints, velocity frames, a known defect of an engine.
     Joints are matched by structure and name, and a mere choice of frames is no difference.
