@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from mbkit.codegen import jit
 from validation import smoke, stamp
 from validation.__main__ import PARTS
-from validation.pages import origin
+from validation.pages import LEVELS, SIMD, lanes, origin
 
 KEPT = Path(stamp.__file__).parent
-STAMP = {"date", "versions", "processor", "code"}
+STAMP = {"date", "versions", "processor", "simd", "code"}
 #: Written into a file by whoever measured.
 BY_HAND = {"gpu.json": {"left out", "remarks"}, "derivation.json": {"python"}}
 
@@ -62,3 +63,13 @@ def test_a_caption_says_that_other_code_made_a_file() -> None:
     assert "made before the code was kept with it" in origin(old, "accuracy").data
     for part, words in (("script", "made by other code"), ("mbkit", "mbkit's code has changed since")):
         assert words in origin(data | {"code": data["code"] | {part: "another"}}, "accuracy").data
+
+
+def test_ratios_of_batches_stand_with_the_level_of_simd() -> None:
+    assert set(PARTS) >= SIMD
+    told = stamp.stamp("accuracy.py")
+    assert lanes(told) == f"SIMD of {jit.host().width} doubles ({LEVELS[jit.host().width]})"
+    assert lanes({"simd": {"doubles": 4}}) == "SIMD of 4 doubles (AVX2)"
+    for part in SIMD:
+        assert lanes(told) in origin(told, part).data
+        assert "the level of SIMD was not kept" in origin({"date": "2026-01-01"}, part).data

@@ -39,6 +39,7 @@ import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
+from mbkit.codegen import jit
 from mbkit.codegen.compiled import cores
 from mbkit.codegen.program import program
 from mbkit.engines.mujoco import model as mujoco_model
@@ -377,6 +378,45 @@ SMOKE = {
 }
 
 
+#: The level of x86-64 without AVX-512.
+NARROWER = "x86-64-v3"
+
+
+def narrower(robots, samples, rounds):
+    """Return ratios to Pinocchio where registers hold half as many doubles: in a process that is told so.
+
+    None on a processor whose registers hold no more.
+    """
+    if jit.host().width <= jit.LEVELS[NARROWER][1]:
+        return None
+    code = "import json, sys; from validation import bench_terms as b; given = json.loads(sys.argv[1]); "
+    command = [
+        sys.executable,
+        "-c",
+        code + "print(json.dumps(b.ratios(*given)))",
+        json.dumps([robots, samples, rounds]),
+    ]
+    own = {"MBKIT_CPU": NARROWER, "PYTHONPATH": os.pathsep.join(sys.path)}
+    run = subprocess.run(command, env=os.environ | own, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+def ratios(robots, samples, rounds):
+    """Return how many times as fast as Pinocchio the own derivation is here: one thread, C order."""
+    rows = []
+    for name, make in robots.items():
+        model = made(make)
+        for quantity in QUANTITIES:
+            states = states_of(model, samples)
+            (_, own, n), (_, (theirs, _), m) = (
+                next(calls(model, quantity, states)) for calls in (lagrangian_calls, pinocchio_calls)
+            )
+            times = timed({"own": (own, n), "theirs": (theirs, m)}, rounds)
+            ratio = float(np.median(times["theirs"] / times["own"]))
+            rows.append({"robot": name, "quantity": quantity, "times_as_fast_as_pinocchio": ratio})
+    return {"simd": stamp(__file__)["simd"], "robots": rows}
+
+
 def main():
     asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     asked.add_argument("--samples", type=int, default=SAMPLES)
@@ -395,8 +435,9 @@ def main():
         "threads": cores(),
         **stamp(__file__),
         "robots": robots(given.samples, given.rounds, given.robots),
-        "growth": growth(given.samples, given.rounds, systems(given.most)),
     }
+    data["narrower"] = narrower({name: ROBOTS[name] for name in given.robots}, given.samples, given.rounds)
+    data["growth"] = growth(given.samples, given.rounds, systems(given.most))
     data["exponents"] = exponents(data["growth"])
     given.out.mkdir(parents=True, exist_ok=True)
     (given.out / "terms.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")

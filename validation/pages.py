@@ -17,6 +17,10 @@ from matplotlib.figure import Figure
 from validation.stamp import changed
 
 HERE = Path(__file__).parent
+#: Parts with ratios of the own derivation's batches, which fill the processor's registers, to code that does not.
+SIMD = {"bench_terms", "bench_bodies", "bench_rollouts", "operations", "mechanisms", "identification", "gpu"}
+#: Doubles in a register -> what has such ones.
+LEVELS = {8: "AVX-512", 4: "AVX2", 2: "SSE2 or NEON"}
 #: Packages whose versions matter for what is measured.
 NAMED = ("mbkit", "python", "pin", "mujoco", "drake", "casadi", "sympy", "llvmlite", "heyoka", "numpy", "scipy")
 
@@ -32,8 +36,16 @@ def origin(data: dict[str, Any], part: str) -> Markdown:
     told += [f"processor {data['processor']}"] if "processor" in data else []
     found = data.get("versions", {})
     told += [", ".join(f"{name} {found[name]}" for name in NAMED if name in found and found[name] != "not installed")]
+    told += [lanes(data)] if part in SIMD else []
     told += [changed(data)]
     return Markdown(f"*{'; '.join(x for x in told if x)}. Again: `python -m validation --only {part}`.*")
+
+
+def lanes(data: dict[str, Any]) -> str:
+    """Return how many doubles the registers had that a file was measured with: ratios to scalar code go with it."""
+    # The part that measures the limit of the vector units has always had it.
+    doubles = data.get("simd", {}).get("doubles", data.get("width"))
+    return f"SIMD of {doubles} doubles ({LEVELS[doubles]})" if doubles else "the level of SIMD was not kept"
 
 
 def command(*words: str, columns: int = 80) -> int:

@@ -1,4 +1,4 @@
-"""What every file of results begins with: the day, the versions of everything that computes, the processor, the code.
+"""What every file of results begins with: day, versions of everything that computes, processor, SIMD, and code.
 
 The code of a script is its own text and that of every module of `validation` and `tests` that it imports, without
 comments and docstrings; that of mbkit is all of its files. Pages compare both with the code beside them.
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import mbkit
+from mbkit.codegen import jit
 from mbkit.studies.results import processor, versions
 
 HERE = Path(__file__).parent
@@ -26,6 +27,7 @@ def stamp(script: str) -> dict[str, Any]:
     """Return the stamp of a script, which gives its `__file__`."""
     name = Path(script).stem
     told = {"date": datetime.date.today().isoformat(), "versions": versions(), "processor": processor()}
+    told["simd"] = {"doubles": jit.host().width, "chosen": os.environ.get("MBKIT_CPU", "")}
     return told | {"code": {"of": name, "script": script_code(name), "mbkit": package_code()}}
 
 
