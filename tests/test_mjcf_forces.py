@@ -240,15 +240,20 @@ def test_faults_of_copies_are_named(change: tuple[str, str], said: str, tmp_path
 def test_copies_that_are_too_many_are_refused_before_any_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mjcf_reader, "_suffixed", lambda *_: pytest.fail("copied"))
-    body, copies = "<body><joint/><geom size='.1'/></body>", '<replicate count="300" offset="1 0 0">{}</replicate>'
-    cube = copies.format(copies.format(copies.format(body)))
-    beside = "".join(['<replicate count="100000">' + body + "</replicate>"] * 2)
-    for inside, said in ((cube, "count '300'; expected a whole number up to 1 "), (beside, "elements in all")):
+    body = "<body><joint/><geom size='.1'/></body>"
+
+    def refused(inside: str, said: str) -> None:
         path = written(f"<mujoco><worldbody>{inside}</worldbody></mujoco>", tmp_path)
         with pytest.raises(ModelError, match=said) as caught:
             mb.load(path)
         assert len(caught.value.faults) == 1
+
+    # Those beside each other count together.
+    each = '<replicate count="{}">' + body + "</replicate>"
+    refused(each.format(10) + each.format(124_999), "'124999'; expected a whole number up to 124990")
+    monkeypatch.setattr(mjcf_reader, "_suffixed", lambda *_: pytest.fail("copied"))
+    copies = '<replicate count="300" offset="1 0 0">{}</replicate>'
+    refused(copies.format(copies.format(copies.format(body))), "count '300'; expected a whole number up to ")
 
 
 def test_a_body_in_one_of_its_name_is_a_fault(tmp_path: Path) -> None:

@@ -270,7 +270,7 @@ class Transmissions:
         last = second[0] if second else first
         if first == last == -1.0:
             # The length of a path is measured once there is a tree.
-            out.measured = bool(out.path)
+            out.measured = any(k) and bool(out.path)
             first = last = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
         self._hold(out, element, item, c, k, first, last)
         own = full.attributes
@@ -378,6 +378,8 @@ class Transmissions:
             if x.measured:
                 x.rest_length = float(_length(x, model, np, self._resting(model)))
                 x.band = x.band and replace(x.band, lower=x.rest_length, upper=x.rest_length)
+            if not x.functions():
+                continue
             along = _length(x, model, ca, ca.vertsplit(q))
             gradient, rows, rate = ca.gradient(along, q), {}, ca.SX(0)
             for joint in model.joints:

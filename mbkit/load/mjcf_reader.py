@@ -149,38 +149,37 @@ def write_out_copies(mujoco: Element, compiler: Compiler, read: Reader) -> str:
     Copy k stands in a <frame> turned by k times the angles, an offset in the axes of the copy before away from it, and
     has the number k behind its names. Tendons, actuators and equalities that name something in it are copied with it.
     """
-    copier, known, worlds = _Copier(mujoco, compiler, read), len(read.faults), mujoco.all("worldbody")
-    if (size := sum(map(copier.size, worlds))) > MOST_ELEMENTS:
-        read.fault(f"<replicate>: {size} elements in all; expected up to {MOST_ELEMENTS}")
-    for world in worlds:
-        if len(read.faults) == known:
-            copier.write_out(world)
-        for left in (e for e in world.walk() if e.tag == "replicate"):
-            # One copy has the names that others use.
-            left.tag, left.attributes = "frame", {}
+    copier = _Copier(mujoco, compiler, read)
+    for world in mujoco.all("worldbody"):
+        copier.size(world)
+        copier.write_out(world)
     return f"<replicate> written out: {listing(copier.told, 6)}" if copier.told else ""
 
 
 @dataclass
 class _Copier:
-    """Writes <replicate> elements out."""
+    """Writes <replicate> elements out, up to a number of elements."""
 
     mujoco: Element
     compiler: Compiler
     read: Reader
     told: list[str] = field(default_factory=list)
+    left: int = MOST_ELEMENTS
 
     def size(self, element: Element) -> int:
-        """Return the number of elements once all is written out; a count that is none, or too large, is a fault."""
+        """Return the number of elements once all is written out; after a fault a <replicate> stands for one copy."""
         inside = 1 + sum(map(self.size, element.children))
         if element.tag != "replicate":
             return inside
-        count, most = self.read.number(element, "count", "<replicate>"), MOST_ELEMENTS // inside
-        if not (0 <= count <= most and count == int(count)):
-            got = element.attributes.get("count", "")[:40]
-            self.read.fault(f"<replicate>: count {got!r}; expected a whole number up to {most}", element)
-            return inside
-        return int(count) * inside
+        count, most = self.read.number(element, "count", "<replicate>", -1.0), self.left // inside
+        if 0 <= count <= most and count == int(count):
+            self.left -= int(count) * inside
+            return int(count) * inside
+        got = element.attributes.get("count", "")[:40]
+        self.read.fault(f"<replicate>: count {got!r}; expected a whole number up to {most}", element)
+        for one in (e for e in element.walk() if e.tag == "replicate"):
+            one.tag, one.attributes = "frame", {}
+        return inside
 
     def write_out(self, owner: Element) -> None:
         """Write out all copies below an element."""
@@ -346,7 +345,7 @@ class _Attacher:
         assets = (e for asset in self.mujoco.all("asset") for e in asset.all("model"))
         asset = next((e for e in assets if e.attributes.get("name") == model), None)
         if asset is None:
-            self.read.fault(f"<attach>: model {model!r} is no <model> of <asset>", element)
+            self.read.fault(f"<attach>: model {model!r} is no <model> of <asset> by name", element)
             return None
         file = asset.attributes.get("file", "").replace("\\", "/")
         if PurePosixPath(file).is_absolute() or PureWindowsPath(file).drive:
