@@ -166,7 +166,7 @@ def _extras(m: Any) -> Iterator[tuple[Beside, _Removal]]:
         zeros = dict.fromkeys(("actuator_armature", "actuator_damping", "actuator_dampingpoly"), 0.0)
         silent = _assigned(i, actuator_forcelimited=1, actuator_forcerange=0.0, **zeros)
         yield Beside(f"actuator {i}", "actuator", text), silent
-    for b in map(int, np.flatnonzero(m.body_gravcomp * (m.ngravcomp > 0))):
+    for b in map(int, np.flatnonzero(m.body_gravcomp * np.any(m.body_gravcomp > 0))):
         text = f"body {_called(m.body(b), b)} has gravity compensation {m.body_gravcomp[b]:g}"
         yield Beside(f"body {b}", "gravity compensation", text), _zeroed(b, "body_gravcomp")
     if m.opt.density or m.opt.viscosity:
@@ -403,7 +403,7 @@ class _Description:
             return
         acting = m.nu and not self._off("ACTUATION")
         names = [name for name, j in self.numbers.items() if m.jnt_actgravcomp[j] and not acting]
-        for b in map(int, np.flatnonzero(m.body_gravcomp * (m.ngravcomp > 0))):
+        for b in map(int, np.flatnonzero(m.body_gravcomp * np.any(m.body_gravcomp > 0))):
             moving = self._tree.moving(self.names[b])
             without = tuple(x for x in names if x in moving)
             yield f"body {b}", GravityCompensation(self.names[b], float(m.body_gravcomp[b]), without)
