@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 from mbkit._child_process import WorkerDiedError
 from mbkit.cli import cli
 from mbkit.errors import OutputError, UnknownNameError
+from mbkit.load.loader import find
 from mbkit.studies.compare import all_robots as sweeps
 from mbkit.studies.compare.all_robots import RobotOutcome, all_robots
 from mbkit.studies.worker import run
@@ -122,6 +123,18 @@ def test_import_of_the_command_is_light():
 def test_files_have_the_robots_own_name_whatever_its_case_was(here, command, files):
     assert call(*command).exit_code == 0
     assert {p.name for p in (here / "o").iterdir()} == files
+
+
+def test_two_files_of_one_name_have_reports_of_their_own(here):
+    arm = find("double_pendulum_simple").path.read_text()
+    for place in ("arm.urdf", "old/arm.urdf", "new/arm_2.urdf"):
+        (here / place).parent.mkdir(exist_ok=True)
+        (here / place).write_text(arm)
+    for place in ("arm.urdf", "old/arm.urdf", str(here / "new" / "arm_2.urdf")):
+        done = call("check", place, *QUICK, "--engines", "pinocchio,mujoco", "--out", "o")
+        assert done.exit_code == 0, done.output
+    stems = ("arm", "old_arm", "new_arm_2")
+    assert {p.name for p in (here / "o").iterdir()} == {f"{stem}.{x}" for stem in stems for x in ("html", "json")}
 
 
 @pytest.mark.thorough

@@ -124,6 +124,11 @@ def test_solids_with_their_own_mass_and_inertia_have_no_findings(tmp_path, seed)
     assert result.verdict.startswith("nothing found on 6 links (6 with shapes)")
 
 
+def steiner(p: Any) -> np.ndarray:
+    """Return p² 1 - p pᵀ."""
+    return np.dot(p, p) * np.eye(3) - np.outer(p, p)
+
+
 def flipped(inertia: np.ndarray) -> np.ndarray:
     """Return an inertia with the products' other sign."""
     return 2 * np.diag(np.diag(inertia)) - inertia
@@ -137,6 +142,8 @@ MISTAKES: Mapping[str, tuple[Callable[[Link], dict[str, Any]], str]] = {
     "g mm²": (lambda x: {"inertia": 1e9 * x.truth[1]}, "radius of gyration"),
     "exchanged": (lambda x: {"inertia": x.truth[1][::-1, ::-1]}, "axes"),
     "sign": (lambda x: {"inertia": flipped(x.truth[1])}, "sign of products"),
+    # About the link's origin: the parallel axis theorem with the centre at x.xyz.
+    "origin": (lambda x: {"inertia": x.truth[1] + x.truth[0] * steiner(x.xyz)}, "inertia about origin"),
     "triangle": (lambda x: {"inertia": np.diag([1, 1, 3.0]) * x.truth[1][0, 0]}, "matter"),
     "identity": (lambda _: {"mass": 1.0, "inertia": np.eye(3)}, "placeholder"),
 }
@@ -241,6 +248,58 @@ def test_axes_are_judged_where_the_mass_is_spread_as_the_shapes(found, share):
     off = share * checks.CENTRED * float(np.linalg.norm(a.size))
     rows = found(replace(a, inertia=a.truth[1][::-1, ::-1], com=(0, 0, 0.3 + off)))
     assert (("axes", "a") in rows) == (share < 1)
+
+
+@pytest.mark.parametrize("share", [0.98, 1.02])
+def test_an_inertia_about_the_origin_fits_only_there(found, share):
+    long = Link("a", size=(0.05, 0.05, 0.4))
+    mass, own = long.truth
+    # A centre so far from the origin that the inertia about this is `SOLID` times that about the centre.
+    off = float(np.sqrt(share * (checks.SOLID - 1) * np.trace(own) / (2 * mass)))
+    row = found(replace(long, xyz=(0, 0, off), inertia=own + mass * steiner((0, 0, off)))).get(
+        ("inertia about origin", "a")
+    )
+    assert (row is not None) == (share > 1)
+    assert row is None or row.confidence == "likely"
+    assert row is None or row.value == pytest.approx(1 + share * (checks.SOLID - 1), rel=1e-9)
+    # A solid body that is also heavy elsewhere fits at neither point.
+    far = own + mass * steiner((0, 0, 0.2)) + share * checks.FITS * np.trace(own) / np.sqrt(3) * np.eye(3)
+    assert (("inertia about origin", "a") in found(replace(long, inertia=far))) == (share < 1)
+    # With a part s of the theorem's term the distances are as s to 1 - s.
+    p = (0, 0, float(np.sqrt(1.2 * np.trace(own) / (np.sqrt(2) * mass))))
+    part = share * checks.BETTER / (1 + checks.BETTER)
+    row = found(replace(long, xyz=p, inertia=own + part * mass * steiner(p)))
+    assert (("inertia about origin", "a") in row) == (share > 1)
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_inertias_off_from_a_solid_body_share_one_finding(found, share):
+    a, b = Link("a"), Link("b", "a")
+    for factor in (share * checks.SOLID, 1 / (share * checks.SOLID)):
+        row = found(replace(a, inertia=factor * a.truth[1]), b).get(("solid body", "a"))
+        assert (row is not None) == (share > 1)
+        assert row is None or (row.confidence, row.others) == ("look", ())
+        assert row is None or row.value == pytest.approx(factor, rel=1e-9)
+    rows = found(replace(a, inertia=2.5 * a.truth[1]), replace(b, inertia=a.truth[1] / 5))
+    assert rows["solid body", "b"].others == ("a",)
+    assert "b 0.2, a 2.5" in rows["solid body", "b"].message
+
+
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_axes_of_unit_length(tmp_path, share):
+    path = write(tmp_path, Link("a"), Link("b", "a", joint="fixed"))
+    length = 1 + share * checks.UNIT
+    path.write_text(path.read_text().replace('axis xyz="0 1 0"', f'axis xyz="0 {length!r} 0"'))
+    rows = [row for row in mb.lint(path).rows if row.check == "unit axes"]
+    assert [row.part for row in rows] == ["a_joint"] * (share > 1)
+    assert all(row.value == pytest.approx(length) and row.confidence == "look" for row in rows)
+
+
+def test_what_one_file_cannot_show_is_said(tmp_path):
+    result = mb.lint(write(tmp_path, Link("a")))
+    done = CliRunner().invoke(cli, ["lint", str(tmp_path / "robot.urdf")])
+    for text in (result.to_markdown(), done.output):
+        assert "sign of an axis, the mass of the whole" in " ".join(text.split())
 
 
 def leaning(product: float) -> Link:

@@ -22,6 +22,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 import mbkit as mb
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load.loader import find
@@ -85,6 +87,16 @@ def turned(rpy: str) -> Edit:
         _part(robot, "link", link).find("inertial/origin").set("rpy", rpy)
 
     return edit
+
+
+def about_origin(robot: ET.Element, link: str) -> None:
+    """Write the inertia about the link's origin; the frame of the inertia keeps its axes."""
+    inertial = _part(robot, "link", link).find("inertial")
+    origin, m = inertial.find("origin"), float(inertial.find("mass").get("value"))
+    R = mb.spatial.matrix_from_rpy(*_numbers(origin, "rpy"))
+    p = R.T @ np.array(_numbers(origin, "xyz"))
+    more = m * (p @ p * np.eye(3) - np.outer(p, p))
+    moments(lambda old: {n: x + more["xyz".index(n[1]), "xyz".index(n[2])] for n, x in old.items()})(robot, link)
 
 
 def copied(*others: str) -> Edit:
@@ -152,6 +164,11 @@ PLANTED = (
     Planted("tiago_pro", "arm_left_3_link", "inertia in kg cm²", "radius of gyration", inertia(1e4)),
     Planted("romeo_laas_small", "LHipYaw_link", "in kg mm², without shapes", "radius of gyration", inertia(1e6)),
     Planted("solo12", "HL_LOWER_LEG", "inertia for a thousandth of the mass", "radius of gyration", inertia(1e-3)),
+    Planted("go2", "RL_calf", "inertia about the link's origin", "inertia about origin", about_origin),
+    Planted("z1", "link02", "inertia about the link's origin", "inertia about origin", about_origin),
+    Planted("solo12", "HR_UPPER_LEG", "inertia about the link's origin", "inertia about origin", about_origin),
+    Planted("xarm7", "link4", "inertia three times too large", "solid body", inertia(3.0)),
+    Planted("ur5_robot", "elbow_joint", "axis of length 2", "unit axes", joint("axis", xyz=2.0)),
     Planted("talos_full_v2", "arm_left_2_link", "products of the other sign", "sign of products", PRODUCTS),
     Planted("solo12", "FL_UPPER_LEG", "products of the other sign", "sign of products", PRODUCTS),
     Planted("b1", "trunk", "products of the other sign", "sign of products", PRODUCTS),

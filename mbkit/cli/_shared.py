@@ -129,11 +129,14 @@ def load_options(command: Command) -> Command:
 
 
 def stem_of(target: str, name: str) -> str:
-    """Return the stem of a target's files: the robot's name, because several robots' files hold the same name."""
+    """Return the stem of a target's files: the robot's name or the file's path, since several files hold one name."""
     from mbkit.load.loader import canonical
     from mbkit.report.output_folder import file_stem
 
-    return file_stem(canonical(target) or name)
+    if (robot := canonical(target)) is None and Path(target).is_file():
+        # The end of a path tells more than its beginning.
+        name = os.path.relpath(Path(target).with_suffix(""))[-100:]
+    return file_stem(robot or name)
 
 
 def in_options(message: str) -> str:

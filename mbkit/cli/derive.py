@@ -76,7 +76,7 @@ def derive(
         raise click.UsageError("--json and --program exclude each other; --program has --python, --latex and --c")
     if as_json and form:
         raise click.UsageError(f"--json and --{form} exclude each other: the JSON holds the equations in both forms")
-    from mbkit.report.output_folder import check_writable, file_stem, write
+    from mbkit.report.output_folder import check_writable, write
 
     if out is not None:
         check_writable(out)
@@ -91,7 +91,8 @@ def derive(
     on_paper = isinstance(target, EnergyModel)
     if quantity is not None:
         text, ending = _program(target, quantity, form, snap)
-        tell(text if out is None else str(write(out, f"{file_stem(target.name)}{ending}", text + "\n", force=force)))
+        stem = shared.stem_of(system, target.name)
+        tell(text if out is None else str(write(out, f"{stem}{ending}", text + "\n", force=force)))
         return
     if form == "c":
         model = target if on_paper else in_symbols(target) or target
@@ -114,7 +115,7 @@ def derive(
     if ending == ".txt":
         # By this line mbkit knows its own file.
         text += f"\n\nWritten by mbkit {__version__}"
-    tell(str(write(out, f"{file_stem(lag.name)}{ending}", text + "\n", force=force)))
+    tell(str(write(out, f"{shared.stem_of(system, lag.name)}{ending}", text + "\n", force=force)))
 
 
 def _model(name: str, options: dict[str, Any]) -> Model:

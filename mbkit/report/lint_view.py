@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mbkit.report.document import Bullet, Column, Document, Items, Section, Span, Style, Table
-from mbkit.studies.lint.result import LIKELY, LOOK, SURE, LintFinding, LintResult
+from mbkit.studies.lint.result import LIKELY, LOOK, SURE, UNSEEN, LintFinding, LintResult
 
 _STYLES: dict[str, Style] = {SURE: "bad", LIKELY: "allowed", LOOK: "muted"}
 #: Parts of one finding that are named.
@@ -28,7 +28,7 @@ def lint_view(result: LintResult) -> Document:
         good=result.passed,
         sections=[
             Section("", [Table(columns, [*groups.values()])]),
-            Section("Not judged", [Items([Bullet("", text) for text in result.skipped])]),
+            Section("Not judged", [Items([Bullet("", text) for text in (*result.skipped, UNSEEN)])]),
         ],
         result=result,
     )

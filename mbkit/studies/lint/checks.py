@@ -21,6 +21,7 @@ from mbkit.engines import Dynamics
 from mbkit.model import Body, Model
 from mbkit.model.joint_numbers import owners
 from mbkit.model.validation import body_fault, listing
+from mbkit.spatial import skew
 from mbkit.studies.compare.findings import stiff_joints
 from mbkit.studies.compare.result import Finding
 from mbkit.studies.lint.geometry import Geometry
@@ -43,6 +44,11 @@ CENTRED: Final = 0.15
 #: Inertias over their traces differ by less where they are alike, and by more where they are not.
 ALIKE: Final = 0.1
 UNLIKE: Final = 0.25
+#: A shell has up to about twice the inertia of a solid body; and this part of its trace is near.
+SOLID: Final = 2.0
+FITS: Final = 0.5
+#: Lengths of axes that were typed with two digits are off by less.
+UNIT: Final = 0.01
 #: The products' other sign brings an inertia nearer by more than this.
 BETTER: Final = 2.5
 #: Masses, and distances between joints, of neighbours: a wrong unit makes 1e3 of a ratio that may be a third.
@@ -75,6 +81,8 @@ class Judged:
     shapes: Mapping[str, Geometry]
     control_period: float
     engine: Dynamics | None
+    #: Lengths of the axes in a URDF, by joint.
+    axes: Mapping[str, float]
 
     @cached_property
     def bodies(self) -> tuple[Body, ...]:
@@ -213,6 +221,40 @@ def axes(at: Judged) -> Iterator[LintFinding]:
         if apart > UNLIKE and best < ALIKE and not _sign_is_wrong(apart, other):
             says = f"its inertia is off that of its shapes by {apart:.2g} of its trace, in other axes {best:.2g}"
             yield LintFinding(body.name, "axes", apart, f"below {UNLIKE:g}", LIKELY, says)
+
+
+def _solids(at: Judged) -> Iterator[tuple[Body, Array, Array, Array]]:
+    """Yield links and three inertias over the trace of the last.
+
+    These are the link's, the same if it was written about the link's origin, and that of a solid body of its hull.
+    """
+    for body, shape in at.shaped():
+        if np.trace(body.inertia) > 0 and not _placeholder(body):
+            solid = shape.hull.inertia * (body.mass / shape.hull.mass)
+            moved = body.inertia + body.mass * skew(body.com) @ skew(body.com)
+            yield body, *(x / np.trace(solid) for x in (body.inertia, moved, solid))
+
+
+@check
+def inertia_about_origin(at: Judged) -> Iterator[LintFinding]:
+    """Find inertias that fit a solid body only if they are about the link's origin, and not about its centre."""
+    for body, own, moved, solid in _solids(at):
+        ratio, apart, other = np.trace(own), np.linalg.norm(own - solid), np.linalg.norm(moved - solid)
+        if ratio > SOLID and other < FITS and other * BETTER < apart:
+            says = f"its inertia is {ratio:.2g} times that of its shapes, and {np.trace(moved):.2g} if about its origin"
+            expected = "about the centre of mass"
+            yield LintFinding(body.name, "inertia about origin", float(ratio), expected, LIKELY, says)
+
+
+@check
+def solid_body(at: Judged) -> Iterator[LintFinding]:
+    """Judge inertias against those of solid bodies of the same shapes and mass."""
+    ratios = {body.name: float(np.trace(own)) for body, own, _, _ in _solids(at)}
+    if off := {k: x for k, x in ratios.items() if max(x, 1 / x) > SOLID}:
+        first, *others = sorted(off, key=lambda k: -abs(np.log(off[k])))
+        shown = listing([f"{k} {off[k]:.2g}" for k in (first, *others)], 6)
+        says, expected = f"inertia over a solid body's: {shown}", f"{1 / SOLID:g} to {SOLID:g} for what is not hollow"
+        yield LintFinding(first, "solid body", off[first], expected, LOOK, says, tuple(others))
 
 
 # Links alone
@@ -368,6 +410,15 @@ def limits_in_degrees(at: Judged) -> Iterator[LintFinding]:
                 )
                 confidence = _confidence(value / MOST_TURN)
                 yield LintFinding(joint.name, "limits in degrees", value, "up to two turns", confidence, says)
+
+
+@check
+def unit_axes(at: Judged) -> Iterator[LintFinding]:
+    """Find axes that are not of unit length, which parsers take as directions."""
+    for name, length in at.axes.items():
+        if abs(length - 1) > UNIT:
+            says = f"axis of length {length:.3g}"
+            yield LintFinding(name, "unit axes", length, "length 1", LOOK, says)
 
 
 @check

@@ -14,6 +14,8 @@ SURE: Final = "sure"
 LIKELY: Final = "likely"
 LOOK: Final = "look"
 SURENESS: Final = (SURE, LIKELY, LOOK)
+#: What is never judged, since nothing in the file contradicts it.
+UNSEEN: Final = "what one file cannot show: the sign of an axis, the mass of the whole, where a joint's zero is"
 
 
 @dataclass(frozen=True)
@@ -77,4 +79,4 @@ class LintResult(ResultTable):
         yield Title(self.model, f": {self.verdict}")
         if self.rows:
             yield Table([c for c in columns_of(LintFinding) if c.head != "value"], self.rows)
-        yield Items(self.skipped)
+        yield Items((*self.skipped, UNSEEN))

@@ -25,6 +25,7 @@ from mbkit.errors import (
     NonPhysicalWarning,
     UnsupportedError,
 )
+from mbkit.load import xml_reader
 from mbkit.load.shapes import MassProperties, together
 from mbkit.load.urdf_reader import read_links
 from mbkit.model import Body, Model
@@ -102,7 +103,7 @@ def lint(
     geometry = _geometry(links, skipped) if shapes else {}
     if not shapes:
         skipped.append("shapes were not read")
-    at = Judged(model, links, geometry, control_period, _engine(model, skipped))
+    at = Judged(model, links, geometry, control_period, _engine(model, skipped), _axes(links))
     found = [finding for run in CHECKS.values() for finding in run(at)]
     return LintResult(
         model=model.name,
@@ -141,6 +142,14 @@ def _links(model: Model) -> Model:
             if all(_is(body, parts[body.name]) for body in model.bodies):
                 return links
     return model
+
+
+def _axes(links: Model) -> dict[str, float]:
+    """Return the lengths of the axes of a URDF, which loaded; the axes of a fixed joint say nothing."""
+    moving = {j.name for j in links.joints if j.type.nv}
+    joints = xml_reader.read(Path(links.source)).all("joint") if links.source.lower().endswith(".urdf") else []
+    axes = {e.attributes["name"]: e.first("axis") for e in joints if e.attributes["name"] in moving}
+    return {k: float(np.linalg.norm([*map(float, e.attributes["xyz"].split())])) for k, e in axes.items() if e}
 
 
 def _is(body: Body, parts: list[MassProperties]) -> bool:
