@@ -102,6 +102,52 @@ def test_frequencies_are_those_of_closed_forms():
     assert max(flexible.strings_and_beams().values()) < 1e-12
 
 
+def on(force, *, fixed=CLAMP, V=BENT, **more):
+    return Continuum(MOVING, V, w, (0, L), fixed=fixed, forces={w: force}, **more)
+
+
+def test_forces_of_the_deflection_are_stiffness_of_the_modes():
+    values = {rho: 1.7, EI: 3.1, L: 2.3, P: 3.0}
+    squares = (np.array([1.875104068711961, 4.694091132974175]) / 2.3) ** 4 * 3.1 / 1.7
+    found = on(-P * w).normal_modes(2, values).frequencies
+    assert np.abs(found - [1.60321, 5.77950]).max() < 1e-5
+    assert np.abs(found / np.sqrt(squares + 3.0 / 1.7) - 1).max() < 1e-13
+    # Loads move the place of rest alone; a force may have a potential that its ends show.
+    assert np.abs(on(m * sp.sin(t) * x).normal_modes(2, values).frequencies / np.sqrt(squares) - 1).max() < 1e-13
+    pinned, k = {0: [w], L: [w]}, np.arange(1, 3) * np.pi / 2.3
+    found = on(P * w.diff(x, 2), fixed=pinned).normal_modes(2, values).frequencies
+    assert np.abs(found / np.sqrt((3.1 * k**4 + 3.0 * k**2) / 1.7) - 1).max() < 1e-12
+    with pytest.raises(NumericalError, match="not stable"):
+        on(-P * w).normal_modes(2, values | {P: -30.0})
+    # Modes and assumed modes are of one system.
+    a = on(-P * w).discretized(on(-P * w).normal_modes(2, values))
+    whole = Lagrangian(a.T, a.V, a.coordinates, forces=a.forces, parameters=values)
+    assert np.abs(mb.equilibrium(whole, [0, 0]).frequencies / np.sqrt(squares + 3.0 / 1.7) - 1).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("force", "words"),
+    [
+        (-P * w.diff(t), r"forces\[w\(x, t\)\]: w_t damps"),
+        (-P * w**2, r"forces\[w\(x, t\)\]: modes of free vibration are of linear forces"),
+        (-P * w.diff(x), "forces: they have no potential"),
+        (-P * w.diff(x, 2), "forces: they have no potential"),
+    ],
+)
+def test_forces_without_modes_of_real_shapes_are_refused(force, words):
+    with pytest.raises(UnsupportedError, match=words):
+        on(force).normal_modes(1, {rho: 1.7, EI: 3.1, L: 2.3, P: 3.0})
+
+
+def test_names_are_free_in_ends_and_forces_too():
+    a1, slope = sp.symbols("a1 w_x")
+    for more in ({"V_ends": {L: a1 * w**2}}, {"T_ends": {L: a1 * w.diff(t) ** 2}}, {"force": -a1 * w}):
+        with pytest.raises(InputError, match="name: a1 is in the energies or forces already"):
+            on(**({"force": 0 * w} | more)).discretized([(x / L) ** 2])
+    with pytest.raises(InputError, match=r"V_ends\[L\]: w_x is how a derivative"):
+        on(0 * w, V_ends={L: slope * w.diff(x) ** 2})
+
+
 def test_a_free_beam_moves_as_a_rigid_body_too():
     free = Continuum(MOVING, BENT, w, (0, L)).normal_modes(4, {rho: 1.3, EI: 2.1, L: 1.7})
     assert (free.frequencies[:2] == 0).all()

@@ -27,6 +27,7 @@ from mbkit._check import Array, arrays_shown, real, shown
 from mbkit.engines.steps import Slopes, differentiable_method, step_derivatives
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, Method
+from mbkit.methods.small_motions import graded
 from mbkit.model import Model
 
 if TYPE_CHECKING:
@@ -77,6 +78,12 @@ class Linearization(NamedTuple):
 
     def __repr__(self) -> str:
         return arrays_shown(self)
+
+    @property
+    def eigenvalues(self) -> Any:
+        """Eigenvalues of A, 1/s, (2nv,) or (N, 2nv): slow ones beside fast ones keep their digits."""
+        rows = [graded(A, vectors=False)[0] for A in self.A.reshape(-1, *self.A.shape[-2:])]
+        return np.array(rows, dtype=complex).reshape(self.A.shape[:-1])
 
     def discretize(self, dt: float, method: Literal["zoh"] = "zoh") -> DiscreteLinearization:
         """Return the linear system's exact solution over dt seconds, with the force held.

@@ -172,6 +172,8 @@ class Continuum(Densities):
     def normal_modes(self, count: int, values: Mapping[Any, float]) -> NormalModes:
         """Return the first modes of free vibration, shapes and circular frequencies, by Ritz's method.
 
+        Forces that are linear in the fields count as stiffness; loads move the place of rest alone.
+
         Parameters
         ----------
         count : int
@@ -183,7 +185,8 @@ class Continuum(Densities):
         InputError
             A parameter without a value.
         UnsupportedError
-            Energies that are not quadratic, or with terms linear in the rates.
+            Energies that are not quadratic, or with terms linear in the rates; forces of rates, not linear, or without
+            a potential, as those that follow.
         NumericalError
             Frequencies that do not settle to ten digits, as with coefficients that are not smooth.
         """

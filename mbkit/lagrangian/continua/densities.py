@@ -59,13 +59,18 @@ class Densities:
                 raise InputError(f"{what}: {e} is no end; the ends are {self.ends[0]} and {self.ends[1]}")
         return out
 
+    @property
+    def parts(self) -> dict[str, sp.Expr]:
+        """All energies and forces by their names."""
+        ends = [(what, e, x) for what in ("T_ends", "V_ends") for e, x in getattr(self, what).items()]
+        forces = {f"forces[{self.jets.fields[k]}]": x for k, x in self.forces.items()}
+        return {"T": self.T, "V": self.V} | {f"{what}[{e}]": x for what, e, x in ends} | forces
+
     def _check(self) -> None:
         jets, most = self.jets, self.orders
-        self.jets.check_parameters({"T": self.T, "V": self.V} | {"ends": sp.Add(*self.ends)})
+        self.jets.check_parameters(self.parts | {"ends": sp.Add(*self.ends)})
         ends = [(what, e, x) for what in ("T_ends", "V_ends") for e, x in getattr(self, what).items()]
-        parts = [("T", self.T), ("V", self.V), *((f"{what}[{e}]", x) for what, e, x in ends)]
-        parts += [(f"forces[{jets.fields[k]}]", x) for k, x in self.forces.items()]
-        for what, x in parts:
+        for what, x in self.parts.items():
             for s in jets.among(x):
                 if jets.order(s)[1][1] > (0 if what.startswith("V") else 1):
                     most_rates = "no rates" if what.startswith("V") else "no second derivatives by the time"

@@ -64,7 +64,9 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
         raise UnsupportedError(f"count: expected at most {_COUNT} modes, got {count}")
     if not isinstance(values, Mapping):
         raise InputError(f"values: expected a mapping of parameters to numbers, got {values!r}")
-    held = system.T + system.V + sp.Add(*system.ends, *system.T_ends.values(), *system.V_ends.values())
+    moved = _moved(system)
+    ends = (*system.ends, *system.T_ends.values(), *system.V_ends.values())
+    held = sp.Add(system.T, system.V, *ends, *moved.values())
     own = held.free_symbols - {system.jets.x, *system.jets.among(held)}
     given = {name_of(s): sp.Rational(real(f"values[{s}]", x)) for s, x in values.items()}
     missing = [s for s in own if s.name not in given]
@@ -92,6 +94,21 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
     return NormalModes(np.sqrt(squares), tuple(shapes))
 
 
+def _moved(system: Densities) -> dict[int, sp.Expr]:
+    """Return the forces without loads, which move the place of rest alone; refuse those of rates."""
+    out = {}
+    for k, x in system.forces.items():
+        moving = system.jets.among(x)
+        rates = [s for s in moving if system.jets.order(s)[1][1]]
+        if rates:
+            raise UnsupportedError(
+                f"forces[{system.jets.fields[k]}]: {plain(rates)} damps or turns the modes, which then have no shapes "
+                "of real numbers; take modes without this force, discretized, and mbkit.equilibrium of their Lagrangian"
+            )
+        out[k] = sp.expand(x - x.xreplace(dict.fromkeys(moving, sp.Integer(0))))
+    return out
+
+
 class _Ritz:
     """Mass and stiffness of the powers ξ^p of each field, which are near to dependent: hence the digits."""
 
@@ -100,13 +117,21 @@ class _Ritz:
         self._length = _digits((system.ends[1] - system.ends[0]).subs(numbers))
         if self._length <= 0:
             raise InputError(f"values: the length from {system.ends[0]} to {system.ends[1]} is not above zero")
-        #: Fields and derivatives of products in T - V, each with a function of the powers' sum.
-        self._pairs: list[tuple[tuple[int, Order], tuple[int, Order], OfPower]] = []
+        #: Fields and derivatives of products in T - V and in the work of forces, in which the first one's variation
+        #: counts alone, each with a function of the powers' sum and the number of rates, or -1 of work.
+        self._pairs: list[tuple[tuple[int, Order], tuple[int, Order], OfPower, int]] = []
         for sign, what, x in ((1, "T", system.T), (-1, "V", system.V)):
             self._read(what, sign * x.subs(numbers), self._along(what))
         for sign, what, parts in ((1, "T_ends", system.T_ends), (-1, "V_ends", system.V_ends)):
             for end, x in parts.items():
                 self._read(what, sign * x.subs(numbers), self._at(end))
+        for k, x in _moved(system).items():
+            what = f"forces[{system.jets.fields[k]}]"
+            for product, c in terms(system, what, x.subs(numbers)):
+                if len(product) > 1:
+                    raise UnsupportedError(f"{what}: modes of free vibration are of linear forces, got {product} in it")
+                if product:
+                    self._pairs.append(((k, (0, 0)), system.jets.order(product[0]), self._along(what)(c), -1))
 
     def _read(self, what: str, x: sp.Expr, measure: Callable[[sp.Expr], OfPower]) -> None:
         for product, c in terms(self._system, what, x):
@@ -116,7 +141,7 @@ class _Ritz:
                 )
             if len(product) == 2:
                 first, second = (self._system.jets.order(s) for s in product)
-                self._pairs.append((first, second, measure(c)))
+                self._pairs.append((first, second, measure(c), first[1][1] + second[1][1]))
 
     def _along(self, what: str) -> Callable[[sp.Expr], OfPower]:
         """Return what makes ∫ c ξ^n dx of a coefficient, as a function of n."""
@@ -154,9 +179,9 @@ class _Ritz:
 
     def _matrices(self, powers: int) -> tuple[Any, Any]:
         n = len(self._system.jets.fields) * powers
-        forms = {rates: mpmath.matrix(n, n) for rates in range(3)}
-        for (f, first), (g, second), of_power in self._pairs:
-            scale, rates = self._length ** (first[0] + second[0]), first[1] + second[1]
+        forms = {rates: mpmath.matrix(n, n) for rates in range(-1, 3)}
+        for (f, first), (g, second), of_power, rates in self._pairs:
+            scale = self._length ** (first[0] + second[0])
             rows = [math.perm(p, first[0]) for p in range(powers)], [math.perm(p, second[0]) for p in range(powers)]
             for p in range(first[0], powers):
                 for r in range(second[0], powers):
@@ -165,7 +190,7 @@ class _Ritz:
                     if rates == 1 and first[1]:
                         i, j = j, i
                     forms[rates][i, j] += x
-                    if rates != 1:
+                    if rates in (0, 2):
                         forms[rates][j, i] += x
         G = forms[1]
         if mpmath.mnorm(G - G.T, mpmath.inf) > _ZERO * mpmath.mnorm(G, mpmath.inf):
@@ -173,13 +198,18 @@ class _Ritz:
                 "T: a term of a deflection and another one's rate couples the modes like a gyroscope, and they have no "
                 "shapes of real numbers; take shapes of the system at rest, and mbkit.simulate"
             )
-        return forms[2], -forms[0]
+        return forms[2], -forms[0] - forms[-1]
 
     def eigenpairs(self, powers: int, count: int) -> tuple[Array, list[list[list[Any]]], float]:
         """Return the least ω², for each the coefficients of the powers, field by field, and how much was added."""
         with mpmath.workdps(_DIGITS):
             B = self._basis(powers)
             M, K = (B.T * A * B for A in self._matrices(powers))
+            if mpmath.mnorm(K - K.T, mpmath.inf) > _ZERO * mpmath.mnorm(K, mpmath.inf):
+                raise UnsupportedError(
+                    "forces: they have no potential, so that the modes need have no shapes of real numbers; take modes "
+                    "without them, discretized, and mbkit.equilibrium of their Lagrangian"
+                )
             if _cholesky(M) is None:
                 raise NumericalError("T: some shape of a field has no kinetic energy, or a negative one")
             shift, L = mpmath.mpf(0), _cholesky(K)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,9 +23,12 @@ from mbkit.engines.constraint_manifold import manifold_of, refuse_unreachable, r
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian.system import Lagrangian
+from mbkit.methods.small_motions import SmallMotion, small_motion
 
 #: Of the forces that balance: what rounding leaves of them.
 _BALANCED: Final = 1e-11
+#: Of the largest force, what rounding leaves of one that cancels, over the part above.
+_CANCELS: Final = 1e-3
 # Random starts, and steps from each.
 _STARTS: Final = 30
 _MOST: Final = 200
@@ -38,10 +41,9 @@ _STEP: Final = float(np.finfo(float).eps) ** 0.2
 #: s: when a system that depends on the time is looked at again, and what may differ then.
 _LATER: Final = (0.7310585786300049, 2.0178)
 _SAME: Final = 1e-9
-# Of the largest: what rounding and differences leave of a part that is zero.
-_ZERO: Final = 1e-8
-# Eigenvalues are roots where they meet: half of the digits.
-_ROOT: Final = 1e-6
+#: Part of the terms of an exact derivative, and of differences, that rounding leaves.
+_EXACT: Final = 8 * float(np.finfo(float).eps)
+_DIFFERENCES: Final = 8 * float(np.finfo(float).eps) ** 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,11 +227,13 @@ class _Balance:
             out = out - self.dyn.jacobian(q, name).T @ wrench
         return np.asarray(out)
 
-    def scale(self, q: Array, tau: Array) -> float:
-        """Return the size of the forces that balance, which scales the residual's rounding."""
+    def scale(self, q: Array, tau: Array) -> Array:
+        """Return the size of each row of the residual, which scales its rounding; rows may differ in unit."""
         # The stiffness gives a scale where all forces are zero.
-        parts = tau, self.load(q), self._stiffness(q)
-        return float(max(*(np.abs(x).max(initial=0.0) for x in parts), np.finfo(float).tiny))
+        parts = np.abs(np.column_stack([tau, self.load(q), self._stiffness(q)])).max(axis=1)
+        if self._manifold is not None:
+            parts = np.append(parts, np.abs(self._manifold.jacobian(q)).max(axis=1))
+        return np.asarray(np.maximum(parts, np.finfo(float).tiny ** 0.5))
 
     def residual(self, q: Array, multipliers: Array, tau: Array) -> Array:
         """Return the residual, (nv,) of forces and (m,) of constraints."""
@@ -337,8 +341,11 @@ class _Balance:
         r = self.residual(q, multipliers, tau)
         damping, size = 0.0, float(np.linalg.norm(r))
         for _ in range(_MOST):
-            if self._left(r, q, tau) <= 1e-3 or size == 0.0:
+            own, left = self._left(r, q, tau)
+            if own <= 1e-3 or size == 0.0:
                 break
+            # What is little beside a stiff direction may be much of a soft one: on, as long as it gets less by half.
+            less = 0.5 if left <= 1e-3 else 1.0
             K = self._whole_stiffness(q, multipliers)
             if self._manifold is not None:
                 J = self._manifold.jacobian(q)
@@ -349,19 +356,23 @@ class _Balance:
             ahead = self.model.integrate(q, step[:nv]), multipliers + step[nv:]
             new = self.residual(*ahead, tau)
             new_size = float(np.linalg.norm(new))
-            if new_size < size and np.abs(step[:nv]).max() < 3.0:
+            if new_size < less * size and np.abs(step[:nv]).max() < 3.0:
                 (q, multipliers), r, size = ahead, new, new_size
                 damping = 0.0 if damping < 1e-9 else damping / 10
-            elif self._left(r, q, tau) <= 1.0:
+            elif left <= 1.0:
                 break
             else:
                 damping = max(10 * damping, 1e-6)
                 if damping > 1e9:
                     break
-        return q, multipliers, r, self._left(r, q, tau)
+        return q, multipliers, r, self._left(r, q, tau)[1]
 
-    def _left(self, r: Array, q: Array, tau: Array) -> float:
-        return float(np.abs(r).max(initial=0.0)) / (_BALANCED * self.scale(q, tau))
+    def _left(self, r: Array, q: Array, tau: Array) -> tuple[float, float]:
+        """Return the residual relative to its rounding: of the forces of each row, and beside those of all rows."""
+        rows = self.scale(q, tau)[: len(r)]
+        beside = np.maximum(rows, _CANCELS * rows.max(initial=0.0))
+        own, left = (float((np.abs(r) / (_BALANCED * x)).max(initial=0.0)) for x in (rows, beside))
+        return own, left
 
     # Small motions
 
@@ -372,21 +383,38 @@ class _Balance:
         if self._changes(q, tau, multipliers):
             # Mathieu's equation and its kind: no instant says whether the whole motion stays small.
             return SmallMotion(None, np.empty(0), np.empty(0, dtype=complex))
-        beside = (self.model.integrate(q, s * np.ones(self.model.nv)) for s in (-_ASIDE, _ASIDE))
-        scale = max(float(np.abs(self._whole_stiffness(p, multipliers)).max(initial=0.0)) for p in beside)
-        return small_motion(*self._linear(q, multipliers), scale)
+        matrices, N = self._matrices(q, multipliers), self._free(q)
+        # Products with N add rounding of their own.
+        errors = [np.abs(N).T @ E @ np.abs(N) for E in self._errors(q, multipliers, *matrices)]
+        M, D, K = (N.T @ A @ N for A in matrices)
+        return small_motion(M, D, K, errors)
 
-    def _linear(self, q: Array, multipliers: Array) -> tuple[Array, Array, Array]:
+    def _matrices(self, q: Array, multipliers: Array) -> tuple[Array, Array, Array]:
+        """Return M, D and K of all coordinates."""
+        return self.dyn.mass_matrix(q), self._damping(q), self._whole_stiffness(q, multipliers)
+
+    def _errors(self, q: Array, multipliers: Array, M: Array, D: Array, K: Array) -> tuple[Array, Array, Array]:
+        """Return bounds of the errors of M, D and K, entry by entry."""
+        places = [self.model.integrate(q, s * np.ones(self.model.nv)) for s in (-_ASIDE, _ASIDE)]
+        # Terms that cancel here do not beside it: their size is the curvature of their sum.
+        terms = np.abs([K, *((self._whole_stiffness(p, multipliers) - K) / _ASIDE**2 for p in places)]).sum(axis=0)
+        M, D = np.abs(M), np.abs(D)
+        if isinstance(self.dyn, LagrangianDynamics):
+            return _EXACT * M, _EXACT * D, _EXACT * terms
+        loads = np.max([np.abs(self.load(p)) for p in (q, *places)], axis=0)[:, None] / _ASIDE
+        return _EXACT * M, _EXACT * (D + loads + M.max(axis=1, keepdims=True)), _DIFFERENCES * (terms + loads)
+
+    def _linear(self, q: Array, multipliers: Array) -> list[Array]:
         """Return M, D and K of what the constraints leave free."""
-        N = np.eye(self.model.nv)
-        if self._manifold is not None:
-            _, sizes, V = np.linalg.svd(self._manifold.jacobian(q))
-            N = V[int(np.count_nonzero(sizes > 1e-10 * sizes[0])) :].T
-        M, D, K = (
-            np.asarray(N.T @ A @ N)
-            for A in (self.dyn.mass_matrix(q), self._damping(q), self._whole_stiffness(q, multipliers))
-        )
-        return M, D, K
+        N = self._free(q)
+        return [np.asarray(N.T @ A @ N) for A in self._matrices(q, multipliers)]
+
+    def _free(self, q: Array) -> Array:
+        """Return columns of the velocities that the constraints leave free."""
+        if self._manifold is None:
+            return np.eye(self.model.nv)
+        _, sizes, V = np.linalg.svd(self._manifold.jacobian(q))
+        return np.asarray(V[int(np.count_nonzero(sizes > 1e-10 * sizes[0])) :].T)
 
     def _changes(self, q: Array, tau: Array, multipliers: Array) -> bool:
         """Return whether the small motions change with the time; refuse forces or constraints that do (InputError)."""
@@ -396,8 +424,8 @@ class _Balance:
         for t in _LATER:
             later = _Balance(self._whole, self._wrenches, t)
             theirs = later.multipliers(q, tau)
-            left = np.abs(later.residual(q, theirs, tau)).max(initial=0.0)
-            if left > _SAME * (1 + later.scale(q, tau)):
+            left = np.abs(later.residual(q, theirs, tau))
+            if (left > _SAME * (1 + later.scale(q, tau)[: len(left)])).any():
                 raise InputError(
                     f"dynamics: {self.model.name} depends on the time {self.model.time_parameter}, which moves it; "
                     "there is no equilibrium of such a system"
@@ -418,75 +446,3 @@ def _damped(K: Array, r: Array, damping: float) -> Array:
     except np.linalg.LinAlgError:
         step = np.full(len(K), np.nan)
     return np.asarray(step if np.isfinite(step).all() else np.linalg.lstsq(K, -r, rcond=1e-10)[0])
-
-
-# Small motions about a state of rest: M δq̈ + D δq̇ + K δq = 0
-
-
-class SmallMotion(NamedTuple):
-    """Whether small motions stay small, their angular frequencies in rad/s and eigenvalues in 1/s."""
-
-    stable: bool | None
-    frequencies: Array
-    eigenvalues: Any
-
-
-def small_motion(M: Array, D: Array, K: Array, scale: float = 0.0) -> SmallMotion:
-    """Return the eigenvalues of M δq̈ + D δq̇ + K δq = 0 and its stability; massless coordinates have none.
-
-    Entries of K that are rounding beside `scale` count as zero. Merkin 1997, Introduction to the Theory of Stability,
-    ch. 3 (Lagrange and Dirichlet) and 6 (Kelvin and Tait).
-    """
-    if not len(M):
-        return SmallMotion(None, np.empty(0), np.empty(0, dtype=complex))
-    largest = float(np.abs(K).max())
-    if _symmetric(K) or largest <= _ZERO * max(scale, largest):
-        # Without the rounding of directions without stiffness.
-        values, vectors = np.linalg.eigh((K + K.T) / 2)
-        values[np.abs(values) <= _ZERO * max(scale, largest)] = 0.0
-        K = np.asarray(vectors * values @ vectors.T)
-    eigenvalues = _eigenvalues(M, D, K)
-    size = float(np.abs(eigenvalues).max(initial=0.0))
-    turning = eigenvalues[eigenvalues.imag > _ROOT * size] if size else eigenvalues[:0]
-    return SmallMotion(_stable(M, D, K, eigenvalues, size), np.sort(turning.imag), eigenvalues)
-
-
-def _eigenvalues(M: Array, D: Array, K: Array) -> Any:
-    from scipy.linalg import eig, eigh
-
-    unit, zero = np.eye(len(M)), np.zeros((len(M), len(M)))
-    if _undamped(D, M, K) and _symmetric(K):
-        try:
-            squares = eigh((K + K.T) / 2, (M + M.T) / 2, eigvals_only=True)
-        except np.linalg.LinAlgError:
-            pass
-        else:
-            # What rounding leaves of a free direction is no frequency.
-            squares[np.abs(squares) < _ZERO * np.abs(squares).max()] = 0.0
-            roots = np.sqrt(-squares.astype(complex))
-            return np.sort_complex(np.concatenate([roots, -roots]))
-    values = eig(np.block([[zero, unit], [-K, -D]]), np.block([[unit, zero], [zero, M]]), right=False)
-    return np.sort_complex(values[np.isfinite(values)])
-
-
-def _stable(M: Array, D: Array, K: Array, eigenvalues: Any, size: float) -> bool | None:
-    if _symmetric(K):
-        squares = np.linalg.eigvalsh((K + K.T) / 2)
-        scale = float(np.abs(squares).max())
-        friction = np.linalg.eigvalsh((D + D.T) / 2)
-        # Neither damping nor gyroscopic forces undo a minimum of the potential.
-        if scale and squares[0] > _ZERO * scale and friction[0] >= -_ZERO * max(float(np.abs(D).max()), 1e-300):
-            return True
-        if scale and squares[0] < -_ZERO * scale and _undamped(D, M, K):
-            return False
-    growth = float(eigenvalues.real.max(initial=-np.inf))
-    return False if growth > _ROOT * size else True if growth < -_ROOT * size else None
-
-
-def _symmetric(K: Array) -> bool:
-    return bool(np.abs(K - K.T).max() <= _ZERO * np.abs(K).max())
-
-
-def _undamped(D: Array, M: Array, K: Array) -> bool:
-    """Return whether D is negligible beside the geometric mean of M and K."""
-    return bool(np.abs(D).max() <= 1e-12 * np.sqrt(np.abs(M).max() * np.abs(K).max()))

@@ -23,6 +23,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.base import at_time, no_dynamics
 from mbkit.engines.registry import DERIVED
 from mbkit.errors import InputError, NumericalError
+from mbkit.methods.small_motions import graded
 from mbkit.model import Model
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import tangent_maps, unit_quaternions
@@ -320,6 +321,6 @@ def stiffness_of(J: Array, enough: float, *, exact: bool, member: int | None = N
         bound = float(min(balanced.sum(axis=axis).max(initial=0.0) for axis in (0, 1)))
         if bound <= enough:
             return Stiffness(np.zeros(0, dtype=complex), bound, exact, member)
-    rates = np.linalg.eigvals(J).astype(complex)
+    rates = graded(J, vectors=False)[0]
     rates = rates[np.argsort(-np.abs(rates), kind="stable")]
     return Stiffness(rates, float(np.abs(rates).max(initial=0.0)), exact, member)
