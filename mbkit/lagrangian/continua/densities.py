@@ -60,7 +60,7 @@ class Densities:
         return out
 
     @property
-    def parts(self) -> dict[str, sp.Expr]:
+    def _parts(self) -> dict[str, sp.Expr]:
         """All energies and forces by their names."""
         ends = [(what, e, x) for what in ("T_ends", "V_ends") for e, x in getattr(self, what).items()]
         forces = {f"forces[{self.jets.fields[k]}]": x for k, x in self.forces.items()}
@@ -68,9 +68,9 @@ class Densities:
 
     def _check(self) -> None:
         jets, most = self.jets, self.orders
-        self.jets.check_parameters(self.parts | {"ends": sp.Add(*self.ends)})
+        self.jets.check_parameters(self._parts | {"ends": sp.Add(*self.ends)})
         ends = [(what, e, x) for what in ("T_ends", "V_ends") for e, x in getattr(self, what).items()]
-        for what, x in self.parts.items():
+        for what, x in self._parts.items():
             for s in jets.among(x):
                 if jets.order(s)[1][1] > (0 if what.startswith("V") else 1):
                     most_rates = "no rates" if what.startswith("V") else "no second derivatives by the time"
