@@ -33,6 +33,7 @@ from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, follower
 from mbkit.derivation.least_constraint import hard_poses
 from mbkit.derivation.mass_matrix_solve import Factors
+from mbkit.derivation.model_values import scalar
 from mbkit.errors import InputError
 from mbkit.model import Model, NoSlip
 from mbkit.model.elements.motion_laws import MOTION_LAWS
@@ -52,6 +53,8 @@ _REFINED_CAREFUL: Final = 2
 _REFINED: Final = 1
 #: Part of a row that is left of it, once the others are taken away, up to which it follows from them.
 DEPENDENT: Final = 1e-7
+#: Largest size of a row over its remainder with which accelerations still have digits: κ up to about as much.
+MOST_DEPENDENT: Final = 1e12
 #: Of a mechanism's size: what a few typed digits leave where ends can meet.
 _MEETS: Final = 1e-9
 #: Height of a disc's centre over its radius below which it lies flat: there its height has a kink, where searches for a
@@ -133,42 +136,147 @@ class ConstraintTerms:
 
 
 class ConstraintFactors:
-    """Factors of M and of S = J M⁻¹ Jᵀ, which give v̇ and λ, and how often the solution is `refined`.
+    """Factors of M = LᵀDL and of J's rows in the metric of M, which give v̇ and λ, and how often they are `refined`.
 
-    Where M itself would lose digits or has no inverse, as with links without mass in a loop, `careful` ones are those
-    of W = M + Jᵀ diag(s) J. Near a singular pose, and with masses that differ by decades, factors lose the square of
-    the digits that the equations lose.
+    B = D^-½ L^-ᵀ Jᵀ = Q R with Q orthogonal: v̇ is the free acceleration with its part along Q replaced (Golub and Van
+    Loan 2013, Matrix Computations, ch. 5.3 and 6.2). So errors grow with the condition κ of B; J M⁻¹ Jᵀ = RᵀR would have
+    its square. Where M itself would lose digits or has no inverse, as with links without mass in a loop, `careful` ones
+    are those of W = M + Jᵀ diag(s) J.
     """
 
     def __init__(self, c: ConstraintTerms, M: Any, order: tuple[int, ...], *, careful: bool, refined: int) -> None:
         self._c, self._M, self.careful, self._refined = c, M, careful, refined
         self._stiffening = c.stiffening(M) if careful else None
         self._W = Factors(c.weight(M) if careful else M, order)
-        #: W⁻¹ Jᵀ, (n, m), and J W⁻¹ Jᵀ with its factors.
-        self.Y = self._W.solve(c.jacobian.T)
-        self.matrix = ca.mtimes(c.jacobian, self.Y)
-        self.S = Factors(self.matrix, range(c.jacobian.shape[0]))
+        self.rows = OrthogonalColumns(self._W.half(c.jacobian.T))
+
+    def change(self, residual: Any, rows: int | None = None) -> Any:
+        """Return the least x in the metric of M with J x = residual, of all rows or of the first ones."""
+        return self._W.whole(self.rows.least(residual, rows))
 
     def solved(self, force: Any, rate: Any) -> tuple[Any, Any]:
-        """Return x and λ of M x - Jᵀ λ = force, J x = rate."""
+        """Return x and λ of M x - Jᵀ λ = force, J x = rate, of one right-hand side or several, (n, k) and (m, k)."""
         J = self._c.jacobian
-        given = force + ca.mtimes(J.T, self._stiffening * rate) if self.careful else force
-        free = self._W.solve(given)
-        multipliers = self.S.solve(rate - ca.mtimes(J, free))
-        return free + ca.mtimes(self.Y, multipliers), multipliers
+        given = force + ca.mtimes(J.T, ca.mtimes(ca.diag(self._stiffening), rate)) if self.careful else force
+        x, multipliers = self.rows.held(self._W.half(given), rate)
+        return self._W.whole(x), multipliers
 
-    def motion(self, force: Any) -> tuple[Any, Any]:
-        """Return v̇ and λ of M v̇ - Jᵀ λ = force, J v̇ = -γ.
+    def motion(self, force: Any, rate: Any | None = None) -> tuple[Any, Any]:
+        """Return x and λ of M x - Jᵀ λ = force, J x = rate, refined; by default v̇ with J v̇ = -γ.
 
         Only the rate's derivative is zero: integrators project states (`mbkit.derivation.steps.onto_constraints`).
         """
         c, M = self._c, self._M
-        a, multipliers = self.solved(force, -c.gamma)
+        rate = -c.gamma if rate is None else rate
+        x, multipliers = self.solved(force, rate)
         for _ in range(self._refined):
-            left = force - ca.mtimes(M, a) + ca.mtimes(c.jacobian.T, multipliers)
-            da, more = self.solved(left, -c.gamma - ca.mtimes(c.jacobian, a))
-            a, multipliers = a + da, multipliers + more
-        return a, multipliers
+            left = force - ca.mtimes(M, x) + ca.mtimes(c.jacobian.T, multipliers)
+            dx, more = self.solved(left, rate - ca.mtimes(c.jacobian, x))
+            x, multipliers = x + dx, multipliers + more
+        # No digit is left where the rows depend on each other.
+        doubt = ca.if_else(self.rows.dependence < MOST_DEPENDENT**2, 0.0, np.nan)
+        return x + doubt, multipliers + doubt
+
+
+class OrthogonalColumns:
+    """B = Q R of a matrix (n, m) whose columns are independent, by Householder's reflections of sparse columns.
+
+    A reflection moves the rows that its column has and no other (Golub and Van Loan 2013, Matrix Computations, ch. 5.1
+    and 11.1). One of these rows then holds R's, the one that the fewest later columns have: so a leg of a platform fills
+    in nothing in the others.
+    """
+
+    def __init__(self, B: Any) -> None:
+        self._n, self._m = B.shape
+        columns: list[dict[int, Any]] = [{} for _ in range(self._m)]
+        for i, j in zip(*B.sparsity().get_triplet(), strict=True):
+            columns[j][i] = scalar(B[i, j])
+        #: Squares of the columns.
+        self.squares = [_dot(x, x) for x in columns]
+        #: Which columns share a row with one before.
+        self._joined: list[int] = []
+        #: Of each column the row of R_jj; and of its reflection 1 - w u uᵀ w and u.
+        self._pivots: list[int] = []
+        self._reflections: list[tuple[Any, dict[int, Any]]] = []
+        #: 1/R_jj, infinite where a column follows from those before it.
+        self.inverse: list[Any] = []
+        for j, column in enumerate(columns):
+            later = columns[j + 1 :]
+            u = {i: x for i, x in column.items() if i not in self._pivots}
+            pivot = min(u, key=lambda i: sum(i in x for x in later), default=-1)
+            self._pivots.append(pivot)
+            if len(u) < len(column):
+                self._joined.append(j)
+            if pivot < 0:
+                # It follows from them everywhere, or is zero; the evaluation reports it.
+                self._reflections.append((0.0, {}))
+                self.inverse.append(np.inf)
+                continue
+            size, x = ca.sqrt(_dot(u, u)), u[pivot]
+            # Away from the column, so that nothing cancels.
+            side = ca.if_else(x < 0, -1.0, 1.0)
+            u[pivot] = x + side * size
+            self._reflections.append((1.0 / (size * (size + side * x)), u))
+            self.inverse.append(-side / size)
+            for other in later:
+                self._reflect(j, other)
+        self._R = [
+            {i: column[p] for i, p in enumerate(self._pivots[:j]) if p in column} for j, column in enumerate(columns)
+        ]
+
+    @property
+    def dependence(self) -> Any:
+        """The largest square of a column over that of its part beside the columns before it."""
+        worst: Any = ca.SX(0.0)
+        for j in self._joined:
+            worst = ca.fmax(worst, self.squares[j] * self.inverse[j] ** 2)
+        return worst
+
+    def _reflect(self, j: int, y: dict[int, Any]) -> None:
+        weight, u = self._reflections[j]
+        if not u.keys().isdisjoint(y):
+            factor = weight * _dot(u, y)
+            for i, x in u.items():
+                y[i] = y.get(i, 0.0) - factor * x
+
+    def least(self, rate: Any, rows: int | None = None) -> Any:
+        """Return the least y with Bᵀ y = rate, of all columns or of the first ones."""
+        z = self._coordinates(rate, self._m if rows is None else rows)
+        return self._back(dict(zip(self._pivots, z, strict=False)), len(z), rate.shape[1])
+
+    def held(self, free: Any, rate: Any) -> tuple[Any, Any]:
+        """Return the y nearest to `free` with Bᵀ y = rate, and λ with y = free + B λ; columns (n, k) and (m, k)."""
+        z = self._coordinates(rate, self._m)
+        y = {i: scalar(free[i, :]) for i in range(self._n)}
+        for j in range(self._m):
+            self._reflect(j, y)
+        left = [a - y.get(p, 0.0) for a, p in zip(z, self._pivots, strict=True)]
+        multipliers: list[Any] = [0.0] * self._m
+        for j in reversed(range(self._m)):
+            multipliers[j] = left[j] * self.inverse[j]
+            for i, r in self._R[j].items():
+                left[i] = left[i] - r * multipliers[j]
+        y |= dict(zip(self._pivots, z, strict=True))
+        k = rate.shape[1]
+        return self._back(y, self._m, k), ca.vertcat(ca.SX(0, k), *multipliers)
+
+    def _coordinates(self, rate: Any, rows: int) -> list[Any]:
+        """Return R^-ᵀ rate."""
+        out: list[Any] = []
+        for j in range(rows):
+            known = sum((r * out[i] for i, r in self._R[j].items()), 0.0)
+            out.append((scalar(rate[j, :]) - known) * self.inverse[j])
+        return out
+
+    def _back(self, y: dict[int, Any], rows: int, k: int) -> Any:
+        """Return Q y, (n, k)."""
+        for j in reversed(range(rows)):
+            self._reflect(j, y)
+        return ca.vertcat(ca.SX(0, k), *(y.get(i, ca.SX(1, k)) for i in range(self._n)))
+
+
+def _dot(a: dict[int, Any], b: dict[int, Any]) -> Any:
+    return sum((x * b[i] for i, x in a.items() if i in b), 0.0)
 
 
 # Rows of loops, of prescribed motions and of contacts without slip
@@ -765,7 +873,19 @@ class ConstrainedMotion(ConstraintQuantities):
 
     @cached_property
     def forward_dynamics_derivatives(self) -> tuple[Any, Any, Any]:
-        """∂FD/∂q along the manifold, ∂FD/∂v and ∂FD/∂τ; the last is M⁻¹ on what the constraints leave free."""
-        a = self.forward_dynamics
-        by_q = ca.mtimes(ca.jacobian(a, self.q), ca.jacobian(self.kin.qdot, self.v))
-        return by_q, ca.jacobian(a, self.v), ca.jacobian(a, self.tau)
+        """∂FD/∂q along the manifold, ∂FD/∂v and ∂FD/∂τ; the last is M⁻¹ on what the constraints leave free.
+
+        From M v̇ + h - Jᵀ λ = τ and J v̇ + γ = 0 at v̇ = FD: neither is differentiated through its factors.
+        """
+        c, n = self.constraints, self.model.nv
+        a, multipliers = self._constrained
+        symbols = ca.SX.sym("multipliers", c.jacobian.shape[0])
+        force = self.inverse_dynamics - ca.mtimes(c.jacobian.T, symbols)
+        rate = ca.mtimes(c.jacobian, self.a) + c.gamma
+        both = ca.vertcat(force, rate)
+        slopes = ca.horzcat(ca.jtimes(both, self.q, self.tangent), ca.jacobian(both, self.v))
+        slopes = ca.substitute(slopes, ca.vertcat(self.a, symbols), ca.vertcat(a, multipliers))
+        right = ca.horzcat(-slopes, ca.vertcat(ca.SX.eye(n), ca.SX(len(c.names), n)))
+        out, _ = self.constraint_factors.motion(right[:n, :], right[n:, :])
+        by_q, by_v, by_tau = ca.horzsplit(out, [0, n, 2 * n, 3 * n])
+        return by_q, by_v, by_tau

@@ -8,6 +8,7 @@ couplings couple branches; the entries that they fill in are added to the patter
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, Final
 
 import casadi as ca
@@ -100,6 +101,27 @@ class Elimination:
             moved = sum((factor * x[i] for i, factor in self.factors[k].items()), 0.0)
             x[k] = (x[k] - pulls[k] if pulls else x[k]) * self.inverse[k] - moved
         return ca.vertcat(ca.SX(0, f.shape[1]), *x)
+
+
+    def half(self, f: Any) -> Any:
+        """Return D^-½ L^-ᵀ f, (n,) or (n, k), whose squares are those of f in the metric of M⁻¹."""
+        x = [scalar(f[k, :]) for k in range(len(self._order))]
+        for k in reversed(self._order):
+            for i, factor in self.factors[k].items():
+                x[i] = x[i] - factor * x[k]
+        return ca.vertcat(ca.SX(0, f.shape[1]), *(x * root for x, root in zip(x, self._roots, strict=True)))
+
+    def whole(self, y: Any) -> Any:
+        """Return L⁻¹ D^-½ y: M⁻¹ f of y = `half`(f)."""
+        x = [scalar(y[k, :]) for k in range(len(self._order))]
+        for k in self._order:
+            moved = sum((factor * x[i] for i, factor in self.factors[k].items()), 0.0)
+            x[k] = x[k] * self._roots[k] - moved
+        return ca.vertcat(ca.SX(0, y.shape[1]), *x)
+
+    @cached_property
+    def _roots(self) -> list[Any]:
+        return [ca.sqrt(x) for x in self.inverse]
 
 
 class Factors(Elimination):

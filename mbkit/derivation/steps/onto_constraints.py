@@ -127,8 +127,7 @@ def _shift(equations: Any) -> ca.Function:
     if "shift" not in equations.kept:
         own, extra = equations.constraint_factors, equations.extra_arguments
         residual = ca.SX.sym("residual", k)
-        held = Factors(own.matrix[:k, :k], range(k)).solve(residual) if k else residual
-        out = -ca.mtimes(own.Y[:, :k], held)
+        out = -own.change(residual, k)
         equations.kept["shift"] = ca.Function("shift", [equations.q, residual, *extra.values()], [out])
     shift: ca.Function = equations.kept["shift"]
     return shift
@@ -142,7 +141,7 @@ def _change(equations: Any) -> ca.Function:
     if "change" not in equations.kept:
         own, extra = equations.constraint_factors, equations.extra_arguments
         residual = ca.SX.sym("residual", equations.constraints.jacobian.shape[0])
-        out = -ca.mtimes(own.Y, own.S.solve(residual))
+        out = -own.change(residual)
         equations.kept["change"] = ca.Function("change", [equations.q, residual, *extra.values()], [out])
     change: ca.Function = equations.kept["change"]
     return change
@@ -156,8 +155,8 @@ def dependence(equations: Any) -> ca.Function:
     """
     if "dependence" not in equations.kept:
         worst: Any = 0.0
-        for inverse, size in zip(equations.constraint_factors.S.inverse, _largest(equations), strict=True):
-            worst = ca.fmax(worst, size * inverse)
+        for inverse, size in zip(equations.constraint_factors.rows.inverse, _largest(equations), strict=True):
+            worst = ca.fmax(worst, size * inverse**2)
         given = [equations.q, *equations.extra_arguments.values()]
         equations.kept["dependence"] = ca.Function("dependence", given, [worst])
     out: ca.Function = equations.kept["dependence"]
@@ -169,7 +168,7 @@ def _largest(equations: Any) -> list[float]:
     model, extra = equations.model, equations.extra_arguments
     given = [np.array([1.0 if x is None else x for x in model.parameters.values()])] if extra else []
     diagonal = ca.Function(
-        "S", [equations.q, *extra.values()], [ca.densify(ca.diag(equations.constraint_factors.matrix))]
+        "S", [equations.q, *extra.values()], [ca.densify(ca.vertcat(*equations.constraint_factors.rows.squares))]
     )
     poses = random_state(model, np.random.default_rng(0), _POSES)[0]
     values = np.array([np.array(diagonal(q, *given))[:, 0] for q in poses])
