@@ -51,8 +51,9 @@ _TINY: Final = 1e-300
 #: locks. Each time leaves what the factors lose of the error before.
 _REFINED_CAREFUL: Final = 2
 _REFINED: Final = 1
-#: Part of a row that is left of it, once the others are taken away, up to which it follows from them.
-DEPENDENT: Final = 1e-7
+#: Part of a row that is left of it, once the others are taken away, up to which it follows from them: rounding of J at
+#: a pose that is known to all digits, times the some thousand operations that lead to it.
+DEPENDENT: Final = 1e-12
 #: Largest size of a row over its remainder with which accelerations still have digits: κ up to about as much.
 MOST_DEPENDENT: Final = 1e12
 #: Of a mechanism's size: what a few typed digits leave where ends can meet.
@@ -74,6 +75,11 @@ _BETTER: Final = 1e3
 _WELL: Final = 0.01
 #: Residual of a closed configuration, m or rad.
 _CLOSED: Final = 1e-10
+#: Steps of Newton's after that, which leave rounding alone.
+_POLISHED: Final = 2
+#: Poses beside a closed one, and how far they are away, rad or m.
+_BESIDE: Final = 3
+_ASIDE: Final = 0.2
 
 
 class ConstraintTerms:
@@ -501,9 +507,26 @@ class _Numbers:
             return np.asarray(np.linalg.lstsq(J, -f, rcond=1e-10)[0])
 
         q, size, _ = shortened_steps(self.model, q, terms, step, enough=_CLOSED * 1e-3, most=_STEPS)
+        # Dependent rows are told from nearly dependent ones by the last digits.
+        for _ in range(_POLISHED):
+            q = self.model.integrate(q, step(*terms(q)[1]))
+        size, _ = terms(q)
         # Half a turn away the sine of a frame's angle is zero too, and its rows depend on each other.
         turned = np.array(self._call(q, self._parameters)[3])
         return q if size < _CLOSED and (turned >= 0).all() else None
+
+
+    def around(self, q: Array, kept: list[int], held: list[int]) -> Iterator[tuple[tuple[int, ...], float, Array]]:
+        """Yield the independent rows, the remainder of the last one, and the pose, of a closed pose and some beside."""
+        first, least = independent_rows(self(q)[1][kept], len(held))
+        yield first, least, q
+        free = np.linalg.svd(self(q)[1][kept])[2][len(first) :]
+        rng = np.random.default_rng(0)
+        for _ in range(_BESIDE if len(free) else 0):
+            move = rng.standard_normal(len(free)) @ free
+            x = self.closed(self.model.integrate(q, _ASIDE / float(np.linalg.norm(move)) * move), held)
+            if x is not None and np.isfinite(self(x)[1]).all():
+                yield *independent_rows(self(x)[1][kept], len(held)), x
 
 
 #: The name under which a model keeps its own.
@@ -531,17 +554,21 @@ def _chosen_rows(model: Model) -> RowChoice:
     anywhere = [random_state(model, rng, None)[0] for _ in range(_LOOKS)]
     kept = _with_something_to_say(numbers, anywhere)
     held = [i for i in kept if i < numbers.positions]
-    tried = [model.neutral(), *anywhere, *(_wide(model, rng) for _ in range(_STARTS))]
-    closed = [x for x in (numbers.closed(q, held) for q in tried) if x is not None]
-    closed = [q for q in closed if np.isfinite(numbers(q)[1]).all()]
-    if not closed:
-        # The state that a user gives tells more: it is refused there, with the residual of each row.
-        return RowChoice(tuple(kept), len(held), tuple(range(len(kept))))
-    found = [(*independent_rows(numbers(q)[1][kept], len(held)), q) for q in closed]
-    most = max(len(rows) for rows, *_ in found)
-    found = [x for x in found if len(x[0]) == most]
-    # The first that is far from singular poses; the search for the others may end elsewhere on another processor.
-    rows, _, q = next((x for x in found if x[1] > _WELL), max(found, key=lambda x: x[1]))
+    found: list[tuple[tuple[int, ...], float, Array]] = []
+    for start in (model.neutral(), *anywhere, *(_wide(model, rng) for _ in range(_STARTS))):
+        q = numbers.closed(start, held)
+        if q is None or not np.isfinite(numbers(q)[1]).all():
+            continue
+        # On a branch rows may depend on each other at every pose: the rank is that of the poses around.
+        found += [max(numbers.around(q, kept, held), key=lambda x: (len(x[0]), x[1]))]
+        # One that is far from singular poses; the search for others may end elsewhere on another processor.
+        if found[-1][1] > _WELL:
+            break
+    else:
+        if not found:
+            # The state that a user gives tells more: it is refused there, with the residual of each row.
+            return RowChoice(tuple(kept), len(held), tuple(range(len(kept))))
+    rows, _, q = max(found, key=lambda x: x[1])
     return RowChoice(tuple(kept), len(held), rows, q)
 
 
