@@ -273,7 +273,7 @@ class PinConstraints:
         NumericalError
             A singular pose, or a mass matrix that is singular on what the rows leave free.
         """
-        from scipy.linalg import lapack
+        from scipy.linalg import solve_triangular
 
         from mbkit.derivation.constraints import DEPENDENT
 
@@ -284,23 +284,32 @@ class PinConstraints:
         across = 1.0 / np.sqrt(np.where(masses > 0, masses, 1.0))
         scaled = J * across
         sizes = np.linalg.norm(scaled, axis=1)
-        scaled = scaled / np.where(sizes > 0, sizes, 1.0)[:, None]
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        scaled = scaled / sizes[:, None]
         if not np.isfinite(scaled).all() or not np.isfinite(force).all():
             raise NumericalError(f"pinocchio: the terms of {self._model.name} are not finite at this state")
-        if k and np.linalg.svd(scaled, compute_uv=False)[-1] < DEPENDENT:
-            raise NumericalError(self._singular(scaled))
-        rates = 1.0 / np.where(sizes > 0, sizes, 1.0)
-        K = np.block([[across[:, None] * M * across, -scaled.T], [scaled, np.zeros((k, k))]])
-        factors = lapack.dgetrf(K)
+        # The rows in the metric of M and of themselves: M may have no inverse, and where J v̇ is prescribed they change
+        # neither v̇ nor λ. Orthogonal factors lose digits with the condition, those of J M⁻¹ Jᵀ with its square.
         a, forces = np.zeros(n), np.zeros(k)
-        for _ in range(1 + _REFINED):
-            left = np.concatenate([across * (force - M @ a + J.T @ forces), -rates * (gamma + J @ a)])
-            x, _ = lapack.dgetrs(*factors[:2], left)
-            a, forces = a + across * x[:n], forces + rates * x[n:]
-        if factors[2] or not np.isfinite(a).all():
+        try:
+            L = np.linalg.cholesky(across[:, None] * M * across + scaled.T @ scaled)
+        except np.linalg.LinAlgError:
             raise NumericalError(
                 f"pinocchio: the mass matrix of {self._model.name} is singular on what its constraints leave free"
-            )
+            ) from None
+        B = solve_triangular(L, scaled.T, lower=True)
+        lengths = np.linalg.norm(B, axis=0)
+        if k and np.linalg.svd(B / np.where(lengths > 0, lengths, 1.0), compute_uv=False)[-1] < DEPENDENT:
+            raise NumericalError(self._singular(scaled))
+        Q, R = np.linalg.qr(B)
+        for _ in range(1 + _REFINED):
+            rate = -(gamma + J @ a) / sizes
+            free = solve_triangular(L, across * (force - M @ a + J.T @ forces) + scaled.T @ rate, lower=True)
+            along, z = Q.T @ free, solve_triangular(R, rate, trans="T")
+            left = free - Q @ along
+            x = left - Q @ (Q.T @ left) + Q @ z
+            a = a + across * solve_triangular(L, x, lower=True, trans="T")
+            forces = forces + solve_triangular(R, z - along) / sizes
         return a, spread(J, rows.J, forces)
 
     def _singular(self, J: Array) -> str:
