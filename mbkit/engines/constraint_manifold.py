@@ -34,8 +34,8 @@ _ROUNDS: Final = 8
 # How far Newton's iteration may move a state before it is looked whether its factors are of rounding.
 _FLUNG: Final = 1e-4
 #: Of the largest singular value of J, the smallest one at a singular pose: there v̇ from the equation of motion loses as
-#: many digits, eps/σ², as that of the pose itself is off, σ. It is the cube root of eps.
-AT_POSE: Final = 6e-6
+#: many digits, eps/σ, as that of the pose itself is off, σ.
+AT_POSE: Final = float(np.sqrt(_EPS))
 _MOST: Final = 60
 _TWIN: Final = "_constrained_twin"
 

@@ -37,8 +37,8 @@ _STILL: Final = 1e-7
 #: Of what γ can be at velocities of this size: its rest at one that stays on a branch to the digits of a loose run.
 _ON_BRANCH: Final = 1e-5
 #: Of J's largest singular value, the smallest one below which a step is one across the pose. v̇ from the equation of
-#: motion loses eps/σ² of itself, `LOOSEST` at a tenth of this; begun there, the step's own stages would be in the pose.
-_WORSE: Final = 10 * float(np.sqrt(np.finfo(float).eps / LOOSEST))
+#: motion loses eps/σ of itself, `LOOSEST` at a tenth of this; begun there, the step's own stages would be in the pose.
+_WORSE: Final = 10 * float(np.finfo(float).eps) / LOOSEST
 #: Of the motion's time scale: the difference of times by which J's rate is found.
 _APART: Final = 1e-4
 #: Where a step of rk853 has the pose: in the middle of the widest gap between its stages, 1/3 and 0.6.

@@ -13,7 +13,7 @@ So derivatives come from terms that every engine has, and nothing is differenced
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,10 +21,6 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array
 from mbkit.engines.closed_loops.loop_loads import LoopLoads
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-
-#: Smallest over largest singular value of J on the dependent coordinates, with rows of unit size, up to which these
-#: do not follow from the independent ones: what `mbkit.derivation.constraints.DEPENDENT` is for rows.
-_DEAD: Final = 1e-7
 
 
 class ReducedInertia(NamedTuple):
@@ -165,8 +161,11 @@ class IndependentMotion(LoopLoads):
 
     def _require_leading(self, J: Array, q: Array, names: Sequence[str]) -> None:
         """Refuse poses at which the other coordinates do not follow."""
+        # The import loads CasADi.
+        from mbkit.derivation.constraints import DEPENDENT
+
         singular = np.linalg.svd(J, compute_uv=False)
-        if J.shape[-1] == 0 or (good := singular[..., -1] > _DEAD * singular[..., 0]).all():
+        if J.shape[-1] == 0 or (good := singular[..., -1] > DEPENDENT * singular[..., 0]).all():
             return
         k = int(np.argmin(np.atleast_1d(good)))
         pose = np.atleast_2d(q)[k]

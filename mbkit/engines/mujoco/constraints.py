@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 #: Bounds that MuJoCo keeps an impedance in, and the least size that it divides by (mjMINIMP, mjMAXIMP, mjMINVAL).
 _LEAST, _MOST = 1e-4, 0.9999
 _TINY: Final = 1e-15
-#: Rows of A that say nothing new, as in a frame's loop in a plane.
-_DEPENDENT: Final = 1e-10
 _DEFAULT_SOLREF: Final = (0.02, 1.0)
 _DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
 #: MuJoCo's equality for each kind of loop that it holds.
@@ -186,6 +184,9 @@ def law(
     MuJoCo's are M, J, r, the smooth force and the estimates of the inverse weights; nothing of its solver is.
     `turned` and `columns` turn an acceleration and a Jacobian into the description's coordinates.
     """
+    # The import loads CasADi, which trees never need here.
+    from mbkit.derivation.constraints import DEPENDENT
+
     J, r = np.array(d.efc_J).reshape(-1, m.nv), np.array(d.efc_pos)
     rate, bias = J @ d.qvel, np.concatenate([_bias(m, d, i) for i in range(m.neq)])
     stiffness, damping = softness.gains
@@ -208,7 +209,8 @@ def law(
     B = np.linalg.solve(L, J.T).T
     free = np.linalg.solve(L, d.qfrc_smooth)
     f = np.linalg.solve(B @ B.T + np.diag(R), reference - B @ free)
-    rigid = free + np.linalg.lstsq(B, -bias - B @ free, rcond=_DEPENDENT)[0]
+    # Rows that say nothing new, as those of a frame's loop in a plane, are left out.
+    rigid = free + np.linalg.lstsq(B, -bias - B @ free, rcond=DEPENDENT)[0]
     soft, rigid = (turned(np.linalg.solve(L.T, x)) for x in (free + B.T @ f, rigid))
     return ConstraintLaw(softness, soft, rigid, columns(J), r, rate, bias, impedance, R, reference, f)
 
