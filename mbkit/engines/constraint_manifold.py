@@ -8,6 +8,7 @@ pose: a set may have full rank on one branch of a mechanism only (a row of equal
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -550,6 +551,9 @@ class Mobility:
     configuration_freedoms : int
         Velocities less the rank of the rows that hold positions: the dimension of the configurations. With rows that
         hold velocities alone it is the larger one: a car moves sideways, if not at once.
+    gap : tuple of float
+        The smallest singular value that counts for the rank, of J with rows of unit size, and the largest that does
+        not, 0 without one. Accelerations keep their digits less those of the first.
     """
 
     model: str
@@ -557,6 +561,7 @@ class Mobility:
     rows: tuple[str, ...]
     redundant: tuple[str, ...]
     configuration_freedoms: int
+    gap: tuple[float, float] = (1.0, 0.0)
 
     def __str__(self) -> str:
         n = len(self.redundant)
@@ -573,12 +578,15 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
     model = dyn.model
     if not model.constrained:
         return Mobility(model.name, model.nv, (), (), model.nv)
-    names, equations = names_of(dyn), manifold_of(dyn).equations
+    manifold = manifold_of(dyn)
+    names, equations = manifold.equations.all_constraints.names, manifold.equations
     held = equations.all_constraints.positions
     if q is None:
-        if model.has_bodies and equations.closed_configuration is None:
+        q = equations.closed_configuration
+        if q is None and model.has_bodies:
             # No rank is that of a mechanism whose loops never close.
             refuse_unreachable(dyn)
+        q = manifold.dyn.model.neutral() if q is None else q
         independent: Collection[int] = equations.independent_constraints
         if (closed := equations.closed_configuration) is not None and independent:
             sizes = singular_values(np.asarray(dyn.constraint_jacobian(closed))[[*independent]])
@@ -589,10 +597,16 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
                     "configuration of the branch on which it moves"
                 )
     else:
-        independent, _ = independent_rows(np.asarray(dyn.constraint_jacobian(q)), held)
+        with suppress(InputError):
+            # The digits that rounding left out of a closed pose tell dependent rows from nearly dependent ones.
+            if (np.abs(manifold.value(q)) <= CONSISTENT).all():
+                q = manifold.restored(q, np.zeros(model.nv))
+        independent, _ = independent_rows(manifold.all_rows(q), held)
     redundant = tuple(name for i, name in enumerate(names) if i not in independent)
     freedoms = model.nv - sum(i < held for i in independent)
-    return Mobility(model.name, model.nv - len(independent), names, redundant, freedoms)
+    rank, sizes = len(independent), np.append(by_size(manifold.all_rows(q))[2], 0.0)
+    gap = (float(sizes[rank - 1]) if rank else 1.0, float(sizes[rank]))
+    return Mobility(model.name, model.nv - rank, names, redundant, freedoms, gap)
 
 
 # Independence
