@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from mbkit._check import Array
 from mbkit._reproducible import pivoted
 from mbkit.derivation.constraints import DEPENDENT, discs_of, independent_rows
-from mbkit.derivation.mass_matrix_solve import solve
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
@@ -45,7 +44,7 @@ def _function(eq: Any, name: str) -> ca.Function:
     """Return a compiled function of (q), (q, v) or (q, v, τ), and the parameters."""
     if name in (projection.__name__, dependence.__name__):
         return {"projection": projection, "dependence": dependence}[name](eq)
-    c, m, k = eq.constraints, eq.constraints.jacobian.shape[0], eq.constraints.positions
+    c, k = eq.constraints, eq.constraints.positions
     inputs = {"q": eq.q, "v": eq.v}
     if name == "constraint_rows":
         del inputs["v"]
@@ -57,16 +56,10 @@ def _function(eq: Any, name: str) -> ca.Function:
         outputs["V"] = c.weight(M, k)
     elif name == "constraint_step":
         # q after a step of Newton's, and v consistent there.
-        space = SymbolicSpace(eq.model)
-        Y = solve(c.weight(eq.mass_matrix), c.jacobian.T, eq.elimination_order)
-        S = ca.mtimes(c.jacobian, Y)
-        held, q1 = c.jacobian[:k, :], eq.q
-        if k:
-            X = Y if k == m else solve(c.weight(eq.mass_matrix, k), held.T, eq.elimination_order)
-            moved = -ca.mtimes(X, solve(ca.mtimes(held, X), c.value, range(k)))
-            q1 = space.retract(eq.q, space.to_integrator_velocity(eq.q, moved))
-        Y1, S1, rate1 = (ca.substitute(x, eq.q, q1) for x in (Y, S, c.rate))
-        v1 = eq.v - ca.mtimes(Y1, solve(S1, rate1, range(m)))
+        space, own = SymbolicSpace(eq.model), eq.constraint_factors
+        moved = -own.change(c.value, k)
+        q1 = space.retract(eq.q, space.to_integrator_velocity(eq.q, moved)) if k else eq.q
+        v1 = eq.v - ca.substitute(own.change(c.rate), eq.q, q1)
         outputs = {"q1": q1, "v1": v1}
     elif name == "all_rows":
         del inputs["v"]
@@ -84,7 +77,7 @@ def _function(eq: Any, name: str) -> ca.Function:
         }
     else:
         # curvature: ∂(Jᵀ λ)/∂q; λ takes the place of v's first entries.
-        outputs = {"H": ca.jacobian(ca.mtimes(c.jacobian.T, eq.v[:m]), eq.q)}
+        outputs = {"H": ca.jacobian(ca.mtimes(c.jacobian.T, eq.v[: len(c.names)]), eq.q)}
     inputs |= eq.extra_arguments
     dense = [ca.densify(x) for x in outputs.values()]
     return ca.Function(name, list(inputs.values()), dense, list(inputs), list(outputs), {"cse": True})
