@@ -145,14 +145,14 @@ class ConstraintFactors:
     """Factors of M = LᵀDL and of J's rows in the metric of M, which give v̇ and λ, and how often they are `refined`.
 
     B = D^-½ L^-ᵀ Jᵀ = Q R with Q orthogonal: v̇ is the free acceleration with its part along Q replaced (Golub and Van
-    Loan 2013, Matrix Computations, ch. 5.3 and 6.2). So errors grow with the condition κ of B; J M⁻¹ Jᵀ = RᵀR would have
-    its square. Where M itself would lose digits or has no inverse, as with links without mass in a loop, `careful` ones
-    are those of W = M + Jᵀ diag(s) J.
+    Loan 2013, Matrix Computations, ch. 5.3 and 6.2). So errors grow with the condition κ of B; J M⁻¹ Jᵀ = RᵀR
+    would have its square. Where M itself would lose digits or has no inverse, as with links without mass in a loop,
+    `careful` ones are those of W = M + Jᵀ diag(s) J.
     """
 
     def __init__(self, c: ConstraintTerms, M: Any, order: tuple[int, ...], *, careful: bool, refined: int) -> None:
         self._c, self._M, self.careful, self._refined = c, M, careful, refined
-        self._stiffening = c.stiffening(M) if careful else None
+        self._stiffening: Any = c.stiffening(M) if careful else None
         self._W = Factors(c.weight(M) if careful else M, order)
         self.rows = OrthogonalColumns(self._W.half(c.jacobian.T))
 
@@ -188,8 +188,8 @@ class OrthogonalColumns:
     """B = Q R of a matrix (n, m) whose columns are independent, by Householder's reflections of sparse columns.
 
     A reflection moves the rows that its column has and no other (Golub and Van Loan 2013, Matrix Computations, ch. 5.1
-    and 11.1). One of these rows then holds R's, the one that the fewest later columns have: so a leg of a platform fills
-    in nothing in the others.
+    and 11.1). One of these rows then holds R's, the one that the fewest later columns have: so a leg of a platform
+    fills in nothing in the others.
     """
 
     def __init__(self, B: Any) -> None:
@@ -514,7 +514,6 @@ class _Numbers:
         # Half a turn away the sine of a frame's angle is zero too, and its rows depend on each other.
         turned = np.array(self._call(q, self._parameters)[3])
         return q if size < _CLOSED and (turned >= 0).all() else None
-
 
     def around(self, q: Array, kept: list[int], held: list[int]) -> Iterator[tuple[tuple[int, ...], float, Array]]:
         """Yield the independent rows, the remainder of the last one, and the pose, of a closed pose and some beside."""

@@ -102,7 +102,6 @@ class Elimination:
             x[k] = (x[k] - pulls[k] if pulls else x[k]) * self.inverse[k] - moved
         return ca.vertcat(ca.SX(0, f.shape[1]), *x)
 
-
     def half(self, f: Any) -> Any:
         """Return D^-½ L^-ᵀ f, (n,) or (n, k), whose squares are those of f in the metric of M⁻¹."""
         x = [scalar(f[k, :]) for k in range(len(self._order))]

@@ -191,7 +191,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if model.constrained and self.lacks_constraints:
             require_tree(model, self.engine, self.lacks_constraints)
         #: Whether the first accelerations look whether their state satisfies the constraints.
-        self.looks = model.constrained and not self.soft_constraints
+        self.looks = self.branches = model.constrained and not self.soft_constraints
         self._lock: Any = fork_safe(threading.RLock()) if self._one_at_a_time else nullcontext()
         # Also where a copy begins again.
         vars(self)["model"] = model
@@ -391,10 +391,15 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if self.looks:
             self.looks = False
             self._warn_of_open_states(q)
-        if not wrenches:
-            return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
-        frames, w = self._stacked_wrenches(wrenches)
-        return self._evaluate("forward_dynamics_with_wrenches", frames, axes_named(axes), q=q, v=v, tau=tau, wrenches=w)
+        if wrenches:
+            frames, w = self._stacked_wrenches(wrenches)
+            acting = frames, axes_named(axes)
+            a = self._evaluate("forward_dynamics_with_wrenches", *acting, q=q, v=v, tau=tau, wrenches=w)
+        else:
+            a = self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
+        if self.branches:
+            self._require_branch(q, v, a)
+        return a
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> Any:
         """Return ½ vᵀ M v in J, a float or shape (N,).

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of
 from mbkit._warn import warn
-from mbkit.errors import InputError, MbkitWarning, UnsupportedError
+from mbkit.errors import InputError, MbkitWarning, NumericalError, UnsupportedError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 CONSISTENT: Final = 1e-8
 #: Part of accelerations that is rounding, of sums and of a solution.
 ROUNDING: Final = 1e-12
+#: Of the accelerations along a redundant row: what a stage of a long step leaves on its branch, and no other
+#: branch does.
+_OFF_BRANCH: Final = 1e-2
 QUANTITIES: Final = (
     "constraint_residual",
     "constraint_jacobian",
@@ -78,6 +81,9 @@ class Constrained:
     #: Options with which the engine holds dry friction by its own soft law, and whether it does.
     own_friction: ClassVar[Mapping[str, Any]] = {}
     soft_friction: bool = False
+    #: Whether accelerations are held against rows that are redundant on the branch on which the mechanism moves.
+    branches: bool
+    _row_choice: Any
     _evaluate: Callable[..., Array]
     _without_friction: Callable[[str], Callable[..., Any]]
 
@@ -120,6 +126,25 @@ class Constrained:
                 f"{self.model.name}: constraint {name} is open by {residual[worst]:.2g}: these accelerations "
                 "are those of no motion; project(q, v) returns the nearest consistent state",
                 MbkitWarning,
+            )
+
+    def _require_branch(self, q: ArrayLike, v: ArrayLike, a: Array) -> None:
+        """Refuse accelerations that break rows which are redundant where the mechanism moves (NumericalError)."""
+        choice = self._row_choice
+        lost = [i for i in range(len(choice.kept)) if i not in choice.independent]
+        self.branches = bool(lost)
+        if not lost or not a.size:
+            return
+        J, gamma = self.constraint_jacobian(q)[..., lost, :], self.constraint_bias(q, v)[..., lost]
+        left = np.abs((J @ a[..., None])[..., 0] + gamma)
+        sizes = np.linalg.norm(J, axis=-1) * np.linalg.norm(a, axis=-1)[..., None] + np.abs(gamma)
+        if (broken := np.argwhere(~(left <= _OFF_BRANCH * sizes))).size:
+            every = self.constraint_names
+            row, names = every[lost[broken[0][-1]]], [every[i] for i in choice.independent]
+            raise NumericalError(
+                f"q: {self.model.name}: {row}, which follows from the other rows "
+                f"where the mechanism moves, contradicts the accelerations that {', '.join(names)} allow: the pose is "
+                "singular or on another branch; mobility(q) has its rank"
             )
 
     def constraint_residual(self, q: ArrayLike) -> Array:

@@ -23,7 +23,6 @@ import casadi as ca
 import numpy as np
 
 from mbkit.derivation.constraints import ConstraintTerms
-from mbkit.derivation.mass_matrix_solve import Factors
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.model.manifold import random_state
 
