@@ -93,34 +93,36 @@ class Elimination:
 
     def solve(self, f: ca.SX, pulls: Sequence[Any] | None = None) -> ca.SX:
         """Return M⁻¹ f, (n,) or (n, k); less L⁻¹ D⁻¹ of pulls."""
-        x = [scalar(f[k, :]) for k in range(len(self._order))]
-        for k in reversed(self._order):
-            for i, factor in self.factors[k].items():
-                x[i] = x[i] - factor * x[k]
-        for k in self._order:
-            moved = sum((factor * x[i] for i, factor in self.factors[k].items()), 0.0)
-            x[k] = (x[k] - pulls[k] if pulls else x[k]) * self.inverse[k] - moved
+        x = self._lowered(f)
+        return self._raised([a - b for a, b in zip(x, pulls, strict=True)] if pulls else x, self.inverse)
+
+    def half(self, f: ca.SX) -> ca.SX:
+        """Return D^-½ L^-ᵀ f, (n,) or (n, k), whose squares are those of f in the metric of M⁻¹."""
+        x = (a * root for a, root in zip(self._lowered(f), self._roots, strict=True))
         return ca.vertcat(ca.SX(0, f.shape[1]), *x)
 
-    def half(self, f: Any) -> Any:
-        """Return D^-½ L^-ᵀ f, (n,) or (n, k), whose squares are those of f in the metric of M⁻¹."""
-        x = [scalar(f[k, :]) for k in range(len(self._order))]
-        for k in reversed(self._order):
-            for i, factor in self.factors[k].items():
-                x[i] = x[i] - factor * x[k]
-        return ca.vertcat(ca.SX(0, f.shape[1]), *(x * root for x, root in zip(x, self._roots, strict=True)))
-
-    def whole(self, y: Any) -> Any:
+    def whole(self, y: ca.SX) -> ca.SX:
         """Return L⁻¹ D^-½ y: M⁻¹ f of y = `half`(f)."""
-        x = [scalar(y[k, :]) for k in range(len(self._order))]
-        for k in self._order:
-            moved = sum((factor * x[i] for i, factor in self.factors[k].items()), 0.0)
-            x[k] = x[k] * self._roots[k] - moved
-        return ca.vertcat(ca.SX(0, y.shape[1]), *x)
+        return self._raised([scalar(y[k, :]) for k in range(len(self._order))], self._roots)
 
     @cached_property
     def _roots(self) -> list[Any]:
         return [ca.sqrt(x) for x in self.inverse]
+
+    def _lowered(self, f: ca.SX) -> list[Any]:
+        """Return L^-ᵀ f by its rows."""
+        x = [scalar(f[k, :]) for k in range(len(self._order))]
+        for k in reversed(self._order):
+            for i, factor in self.factors[k].items():
+                x[i] = x[i] - factor * x[k]
+        return x
+
+    def _raised(self, x: list[Any], scales: list[Any]) -> ca.SX:
+        """Return L⁻¹ of rows times their scales."""
+        for k in self._order:
+            moved = sum((factor * x[i] for i, factor in self.factors[k].items()), 0.0)
+            x[k] = x[k] * scales[k] - moved
+        return ca.vertcat(*x) if x else ca.SX(0, 1)
 
 
 class Factors(Elimination):
