@@ -77,6 +77,9 @@ _WELL: Final = 0.01
 _CLOSED: Final = 1e-10
 #: Steps of Newton's after that, which leave rounding alone.
 _POLISHED: Final = 2
+#: Singular value of independent rows over the largest one, above which a pose that is closed up to `_CLOSED` has as
+#: many: at a distance d from a singular pose rows are open by d² and have a slope of d.
+_KNOWN: Final = 1e-5
 #: Poses beside a closed one, and how far they are away, rad or m.
 _BESIDE: Final = 3
 _ASIDE: Final = 0.2
@@ -496,14 +499,19 @@ class _Numbers:
         f, J, still, _ = self._call(q, self._parameters)
         return np.concatenate([np.array(f)[:, 0], np.array(still)[self.positions :, 0]]), np.array(J)
 
-    def closed(self, q: Array, kept: list[int]) -> Array | None:
-        """Return a configuration near q where these rows are zero, by damped Gauss-Newton; None where it ends else."""
+    def closed(self, q: Array, kept: list[int], still: int | None = None) -> Array | None:
+        """Return a configuration near q where these rows are zero, by damped Gauss-Newton; None where it ends else.
+
+        The velocity `still` moves nothing.
+        """
 
         def terms(x: Array) -> tuple[float, tuple[Array, Array]]:
             f, J = (rows[kept] for rows in self(x))
             return float(np.linalg.norm(f)), (f, J)
 
         def step(f: Array, J: Array) -> Array:
+            if still is not None:
+                J[:, still] = 0.0
             return np.asarray(np.linalg.lstsq(J, -f, rcond=1e-10)[0])
 
         q, size, _ = shortened_steps(self.model, q, terms, step, enough=_CLOSED * 1e-3, most=_STEPS)
@@ -515,17 +523,36 @@ class _Numbers:
         turned = np.array(self._call(q, self._parameters)[3])
         return q if size < _CLOSED and (turned >= 0).all() else None
 
-    def around(self, q: Array, kept: list[int], held: list[int]) -> Iterator[tuple[tuple[int, ...], float, Array]]:
-        """Yield the independent rows, the remainder of the last one, and the pose, of a closed pose and some beside."""
-        first, least = independent_rows(self(q)[1][kept], len(held))
-        yield first, least, q
-        free = np.linalg.svd(self(q)[1][kept])[2][len(first) :]
-        rng = np.random.default_rng(0)
-        for _ in range(_BESIDE if len(free) else 0):
-            move = rng.standard_normal(len(free)) @ free
-            x = self.closed(self.model.integrate(q, _ASIDE / float(np.linalg.norm(move)) * move), held)
+    def around(self, q: Array, kept: list[int], held: list[int]) -> Iterator[_Pose]:
+        """Yield what the rows are at a closed pose, and at some beside it.
+
+        Beside it one coordinate is held, for the search would end at q again where this is a singular pose.
+        """
+        J = self(q)[1][kept]
+        yield _Pose.of(J, len(held), q)
+        free = np.linalg.svd(J)[2][len(independent_rows(J, len(held))[0]) :]
+        moving = np.argsort(-np.linalg.norm(free, axis=0).round(6), kind="stable")[:_BESIDE] if len(free) else ()
+        for i in moving:
+            x = self.closed(self.model.integrate(q, _ASIDE * np.eye(len(J.T))[i]), held, still=i)
             if x is not None and np.isfinite(self(x)[1]).all():
-                yield *independent_rows(self(x)[1][kept], len(held)), x
+                yield _Pose.of(self(x)[1][kept], len(held), x)
+
+
+class _Pose(NamedTuple):
+    """The independent rows at a pose, whether their number is known, and the remainder of the last one."""
+
+    known: bool
+    least: float
+    rows: tuple[int, ...]
+    q: Array
+
+    @classmethod
+    def of(cls, J: Array, first: int, q: Array) -> _Pose:
+        """Return those of J, of which the first rows hold positions."""
+        rows, least = independent_rows(J, first)
+        sizes = np.linalg.svd(J, compute_uv=False)
+        # As far from a singular pose as its digits may be off, rows are none of its own.
+        return cls(not rows or bool(sizes[len(rows) - 1] > _KNOWN * sizes[0]), least, rows, q)
 
 
 #: The name under which a model keeps its own.
@@ -553,22 +580,21 @@ def _chosen_rows(model: Model) -> RowChoice:
     anywhere = [random_state(model, rng, None)[0] for _ in range(_LOOKS)]
     kept = _with_something_to_say(numbers, anywhere)
     held = [i for i in kept if i < numbers.positions]
-    found: list[tuple[tuple[int, ...], float, Array]] = []
+    found: list[_Pose] = []
     for start in (model.neutral(), *anywhere, *(_wide(model, rng) for _ in range(_STARTS))):
         q = numbers.closed(start, held)
         if q is None or not np.isfinite(numbers(q)[1]).all():
             continue
         # On a branch rows may depend on each other at every pose: the rank is that of the poses around.
-        found += [max(numbers.around(q, kept, held), key=lambda x: (len(x[0]), x[1]))]
+        found += [max(numbers.around(q, kept, held), key=lambda x: (x.known, len(x.rows), x.least))]
         # One that is far from singular poses; the search for others may end elsewhere on another processor.
-        if found[-1][1] > _WELL:
+        if found[-1].known and found[-1].least > _WELL:
             break
-    else:
-        if not found:
-            # The state that a user gives tells more: it is refused there, with the residual of each row.
-            return RowChoice(tuple(kept), len(held), tuple(range(len(kept))))
-    rows, _, q = max(found, key=lambda x: x[1])
-    return RowChoice(tuple(kept), len(held), rows, q)
+    if not found:
+        # The state that a user gives tells more: it is refused there, with the residual of each row.
+        return RowChoice(tuple(kept), len(held), tuple(range(len(kept))))
+    best = max(found, key=lambda x: (x.known, x.least))
+    return RowChoice(tuple(kept), len(held), best.rows, best.q)
 
 
 def _wide(model: Model, rng: np.random.Generator) -> Array:

@@ -416,11 +416,6 @@ class Constrained:
         Mobility
             With `degrees_of_freedom` of velocity, `configuration_freedoms`, `rows`, and the names of `redundant` ones.
 
-        Raises
-        ------
-        InputError
-            Without q, where no configuration was found that tells the rank of the rows.
-
         Examples
         --------
         >>> import mbkit as mb

@@ -581,14 +581,6 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
             refuse_unreachable(dyn)
         q = manifold.dyn.model.neutral() if q is None else q
         independent: Collection[int] = equations.independent_constraints
-        if (closed := equations.closed_configuration) is not None and independent:
-            sizes = singular_values(np.asarray(dyn.constraint_jacobian(closed))[[*independent]])
-            if sizes[-1] < _FOLDED * sizes[0]:
-                raise InputError(
-                    f"q: {model.name} was found closed next to a singular pose alone, where rounding tells rows apart "
-                    f"(singular values from {sizes[0]:.1e} to {sizes[-1]:.1e}), and no mobility follows; give a "
-                    "configuration of the branch on which it moves"
-                )
     else:
         with suppress(InputError):
             # The digits that rounding left out of a closed pose tell dependent rows from nearly dependent ones.
@@ -612,8 +604,6 @@ _BESIDE: Final = 4
 _ASIDE: Final = 0.05
 #: Of a row's size beside the pose: its slope where a square is nearly zero.
 _FLAT: Final = 1e-4
-#: Least singular value of independent rows, in terms of the largest one: below, a pose is next to a singular one.
-_FOLDED: Final = 1e-5
 #: A slope that is rounding alone.
 _ROUNDED: Final = 1e-14
 #: Residual of a consistent configuration, in terms of the rows' sizes.

@@ -18,13 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, arrays_shown, batch_of, real, real_array, require_finite
+from mbkit.derivation.constraints import DEPENDENT
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.errors import InputError, NumericalError
 
 #: Reciprocal condition of the scaled system below which its rows count as dependent.
 _DEPENDENT: Final = 1e-13
-#: Singular values of the constraints' rows that are zero, in terms of the largest one.
-_REDUNDANT: Final = 1e-9
 _TINY: Final = 1e-150
 
 
@@ -125,7 +124,7 @@ def impact(
         J, rate = dyn.constraint_jacobian(q), dyn.constraint_rate(q, v)
     # Sums of the rows that are independent, and zeros for the others.
     mixed, sizes, across = np.linalg.svd(J, full_matrices=False)
-    alone = sizes > _REDUNDANT * sizes.max(axis=-1, keepdims=True, initial=0.0)
+    alone = sizes > DEPENDENT * sizes.max(axis=-1, keepdims=True, initial=0.0)
     if redundant := J.shape[-2] > alone.sum(axis=-1).min(initial=model.nv):
         J, rate = (alone * sizes)[..., None] * across, alone * (mixed.mT @ rate[..., None])[..., 0]
     R = np.concatenate([G, J], axis=-2)
