@@ -158,8 +158,7 @@ def ways(own: Any, paper: Any, q: np.ndarray, v: np.ndarray, method: str, h: flo
         if method in EXPLICIT:
             x = q, v
             for k in range(3):
-                now = dyn.at(**{clock: k * h}) if clock else dyn
-                x = now.step(*x, zero, h, method)
+                x = dyn.step(*x, zero, h, method, t=k * h if clock else None)
             out[f"{name}, steps"] = x
     return out
 
