@@ -9,6 +9,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
+
 import mbkit as mb
 from validation.__main__ import PARTS
 from validation.stamp import stamp
@@ -59,6 +61,18 @@ def test_pages_name_files_and_parts_that_exist():
     assert set(re.findall(r"\borigin\(\w+, \"(\w+)\"\)", text)) <= set(PARTS)
     # Each file is shown somewhere with its day, processor and versions.
     assert set(re.findall(r"\borigin\(\w+, \"(\w+)\"\)", text)) == {name for name, part in PARTS.items() if part.writes}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_each_file_that_a_page_shows_has_its_caption_there(page):
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(r"json\.loads\(.*validation", text), "validation.pages.load reads it"
+    shown = dict(re.findall(r"^(\w+) = load\(\"(\w+)\"\)$", text, re.MULTILINE))
+    # What was published elsewhere was measured by nobody here.
+    bare = {
+        name for name in shown if shown[name] != "published" and not re.search(rf"(origin|under)\(.*\b{name}\b", text)
+    }
+    assert not bare, f"no origin(...) of {bare}"
 
 
 def test_versions_that_the_page_explains_are_those_of_the_record():
