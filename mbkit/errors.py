@@ -104,24 +104,12 @@ class UnknownNameError(MbkitError, LookupError):
         What else the caller can do.
     every : bool
         Whether to list all known names, however many there are.
-    meant : sequence of str
-        Names to suggest in place of the nearest ones.
     """
 
-    def __init__(
-        self,
-        what: str,
-        name: str,
-        known: Iterable[str],
-        hint: str = "",
-        *,
-        every: bool = False,
-        meant: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, what: str, name: str, known: Iterable[str], hint: str = "", *, every: bool = False) -> None:
         self.what, self.name, self.known, self.hint, self.every = what, name, tuple(known), hint, every
-        self.meant = tuple(meant)
         listed = f"there are: {', '.join(self.known) or 'none'}"
-        if near := self.meant or nearest(name, self.known):
+        if near := nearest(name, self.known):
             advice = f"did you mean {' or '.join(repr(n) for n in near)}?" + (f" {listed}" if every else "")
         elif every or len(self.known) <= 40:
             advice = listed
@@ -130,7 +118,7 @@ class UnknownNameError(MbkitError, LookupError):
         super().__init__(f"unknown {what} {_shortened(repr(name), 200)}; {advice}" + (f" {hint}" if hint else ""))
 
     def __reduce__(self) -> tuple[Callable[..., UnknownNameError], tuple[object, ...]]:
-        return partial(type(self), every=self.every, meant=self.meant), (self.what, self.name, self.known, self.hint)
+        return partial(type(self), every=self.every), (self.what, self.name, self.known, self.hint)
 
 
 class ModelError(MbkitError, ValueError):

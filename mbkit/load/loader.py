@@ -71,15 +71,7 @@ _SHORT: Final = {
     "ur5": "ur_description/ur5_robot",
     "ur5_limited": "ur_description/ur5_joint_limited_robot",
 }
-# Makers, or what they call themselves, and their robots.
-_MAKERS: Final = {
-    "anybotics": ["anymal_b", "anymal_c"],
-    "franka": ["panda"],
-    "pal": ["talos", "tiago"],
-    "ufactory": ["xarm7"],
-    "unitree": ["g1", "go2", "z1"],
-    "universal": ["ur3", "ur5", "ur10"],
-}
+_MAKERS: Final = {"franka": ["panda"], "pal": ["talos", "tiago"], "unitree": ["g1", "go2"], "universal": ["ur5"]}
 
 
 def load(
@@ -347,13 +339,14 @@ def unknown(name: str) -> UnknownNameError:
     modules = _modules()
     known = sorted({x for r in robots() for x in (r.name, r._spellings[0])} | _SHORT.keys() | modules.keys())
     # Packages of descriptions call a robot's folder so, and other names begin with the maker's.
+    if (folder := find(re.sub("(_mj|_moveit)?_description$", "", name))) is not None:
+        known = [folder.name]
     words = _key(name).replace(" ", "_").split("_")
-    folder = find(re.sub("(_mj|_moveit)?_description$", "", name))
-    meant = [folder.name] if folder else [x for x in words if find(x)] or _MAKERS.get(words[0], [])
+    meant = " or ".join(map(repr, [x for x in words if find(x)] or _MAKERS.get(words[0], [])))
+    near = "" if folder or not meant else f"there is {meant}; "
     other = "" if modules or not name.endswith("_description") else f"; names of {_DESCRIPTIONS} need that package"
     return UnknownNameError(
-        *("robot", name, known, f"(a path to a file ends in .urdf or .xml; mbkit robots lists all names{other})"),
-        meant=meant,
+        "robot", name, known, f"({near}a path to a file ends in .urdf or .xml; mbkit robots lists all names{other})"
     )
 
 

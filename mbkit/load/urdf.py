@@ -79,7 +79,7 @@ def model_of(
         raise LoadError(f"{source}: Pinocchio's URDF parser refuses this file: {error}") from None
     try:
         b = ModelBuilder(urdf.name, gravity=gravity)
-        return _Conversion(b, raw, urdf, floating_base, mimic, nonphysical).build()
+        return _Conversion(b, raw, urdf, floating_base, mimic).build(nonphysical)
     except ModelError as error:
         raise ModelError(source, error.faults) from None
 
@@ -87,17 +87,8 @@ def model_of(
 class _Conversion:
     """Adds what Pinocchio parsed to a builder, joint by joint."""
 
-    def __init__(
-        self,
-        b: ModelBuilder,
-        raw: Any,
-        urdf: UrdfFile,
-        floating_base: bool,
-        mimic: str,
-        nonphysical: Literal["error", "warn"],
-    ) -> None:
-        self.b, self.raw, self.urdf, self.mimic, self.nonphysical = b, raw, urdf, mimic, nonphysical
-        self.point_masses = nonphysical == "warn"
+    def __init__(self, b: ModelBuilder, raw: Any, urdf: UrdfFile, floating_base: bool, mimic: str) -> None:
+        self.b, self.raw, self.urdf, self.mimic = b, raw, urdf, mimic
         self.joints = {j.name: j for j in urdf.joints}
         self.snap = Snapper()
         self.links = {link.name for link in urdf.links}
@@ -110,7 +101,7 @@ class _Conversion:
             self._add_joint(index)
         self._add_frames()
 
-    def build(self) -> Model:
+    def build(self, nonphysical: Literal["error", "warn"]) -> Model:
         """Return the model, with notes on all decisions."""
         odd: dict[str, list[tuple[str, str]]] = {}
         for link, why in self.urdf.odd_links.items():
@@ -129,7 +120,7 @@ class _Conversion:
         notes += [f"link {x!r} is called {n!r} here, because 'world' is the ground" for x, n in self.names.items()]
         for note in notes if self.snap.note is None else [*notes, self.snap.note]:
             self.b.note(note)
-        return self.b.build(nonphysical=self.nonphysical, point_masses=self.point_masses, parts=odd)
+        return self.b.build(nonphysical=nonphysical, point_masses=self.urdf.point_masses, parts=odd)
 
     def _frame(self, link: str) -> Any:
         return self.raw.frames[self.raw.getFrameId(link, pin.BODY)]
@@ -158,7 +149,7 @@ class _Conversion:
 
     def _add_body(self, name: str, inertia: Any) -> None:
         body = Body(name, inertia.mass, inertia.lever, inertia.inertia)
-        if body_fault(body, point_masses=self.point_masses):
+        if body_fault(body, point_masses=self.urdf.point_masses):
             self.suspects.add(name)
         self.b.add_body(name, mass=body.mass, com=body.com, inertia=body.inertia)
 

@@ -103,6 +103,7 @@ class UrdfFile:
     joints: tuple[UrdfJoint, ...]  # in the file's order
     odd_links: Mapping[str, str]  # links of inconsistent inertia, which links fixed to them may correct, and why
     notes: tuple[str, ...]
+    point_masses: bool  # whether mass without inertia is meant
 
 
 def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: bool, lenient: bool) -> UrdfFile:
@@ -139,6 +140,7 @@ def examine(robot: Element, source: str, *, floating_base: bool, mimic_matters: 
         tuple(followed),
         odd,
         notes=(*notes, *read.notes, *unread),
+        point_masses=lenient,
     )
 
 

@@ -95,10 +95,7 @@ class Variants:
         registry = import_module("mbkit.engines.registry")
         if engine not in (None, registry.DERIVED):
             name = registry.find_engine(engine).name
-            raise UnsupportedError(
-                f"variants: {name} takes them one by one, as mbkit.dynamics(many[k], {name!r}); "
-                f"{registry.DERIVED} evaluates all of them in a batch"
-            )
+            raise UnsupportedError(f"variants: {name} takes them one by one, as mbkit.dynamics(many[k], {name!r})")
         return registry.dynamics(self.model, registry.DERIVED, **options).at(**self.values)
 
     def to_dict(self) -> dict[str, Any]:
@@ -146,9 +143,7 @@ class Variants:
 
 
 def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, seed: int = 0) -> Variants:
-    """Draw variants of a model: other masses, inertias, dampers, payloads, gravity.
-
-    Dry friction is a number of every engine, and does not vary.
+    """Draw variants of a model: other masses, inertias, dampers, payloads, gravity; dry friction does not vary.
 
     Parameters
     ----------
