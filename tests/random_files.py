@@ -225,6 +225,14 @@ def with_tendons(text: str, seed: int) -> str:
     single = [e for e in root.find("worldbody").iter("joint") if e.get("type", "hinge") in ("hinge", "slide")]
     for k, joint in enumerate(single):
         joint.set("name", joint.get("name", f"single{k}"))
+    for joint in root.find("worldbody").iter("joint"):
+        k, *higher = author.positive(3, 0.5, 3).split()
+        # A spring about all axes has no odd power.
+        springs = [k, *higher] if joint in single else [k, "0", higher[0]]
+        if author.chance(0.4):
+            joint.set("stiffness", " ".join(springs[: 1 + 2 * author.chance(0.5)]))
+        if author.chance(0.4):
+            joint.set("damping", author.positive(int(rng.integers(1, 4))))
     tendons, actuators = ET.SubElement(root, "tendon"), ET.SubElement(root, "actuator")
     for k in range(4):
         spatial = not single or author.chance(0.6)

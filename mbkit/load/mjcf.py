@@ -104,7 +104,8 @@ def model_of_mjcf(
     scale = wanted / total if wanted > 0 and total > 0 else 1.0
     springs = infer_springs(mujoco, path, scene)
     b = ModelBuilder(mujoco.attributes.get("model") or path.stem, gravity=gravity)
-    joined = _join_welded(scene)
+    # A body may be below one of its name.
+    joined = "" if read.faults else _join_welded(scene)
     snap = _Tree(b, scene, springs, off).add_bodies(scale)
     _hold_weights(b, mujoco, scene, off, actuators=actuators)
     transmissions = Transmissions(mujoco, scene, off, servos=actuators)
@@ -144,9 +145,6 @@ def _join_welded(scene: Scene) -> str:
     Such as mass without inertia: a URDF's links that are fixed to each other are one body too. The frames stay.
     """
     known, joined = {body.name: body for body in scene.bodies}, []
-    if len(known) < len(scene.bodies):
-        # Two bodies of one name are a fault, and one may be below the other.
-        return ""
     for body in reversed(scene.bodies):
         at, carrier = body.mass_properties, known.get(body.parent)
         if body.joints or carrier is None or not at.mass or body.gravcomp != carrier.gravcomp:
