@@ -261,6 +261,19 @@ def test_expressions_on_one_line():
         sp.Float(9.81) * m: "9.81 m",
         sp.cos(2 * th): "cos 2θ",
         sp.tanh(k / m): "tanh(k/m)",
+        sp.sin(sp.Mul(2, m + k, evaluate=False)): "sin(2 (m + k))",
+        sp.sin(2 * m + 2 * k): "sin(2 m + 2 k)",
+        sp.cos(2 * sp.Symbol("lean")): "cos(2 lean)",
+        sp.cos(th) / sp.sqrt(sp.cos(th) ** 2): "cos θ/|cos θ|",
+        sp.sqrt((r - m) ** 2) * sp.sqrt(k**4): "k² |m - r|",
+        1 / sp.sqrt(k**2 * g**2): "1/(|g| |k|)",
+        sp.sqrt(2) * sp.Float(1.0) * m: "√2 m",
+        sp.sin(th + sp.pi / 4): "sin(θ + ¼ π)",
+        sp.atan2(th, k): "atan2(θ, k)",
+        sp.Piecewise((m, sp.And(th > 0, k < 1)), (k, True)): "(m if (k < 1) and (θ > 0) else k)",
         sp.Integer(0): "0",
     }
     assert {x: board.text(x) for x in told} == told
+    assert board.latex(sp.sin(2 * th - 2 * r)) == r"\sin{\left(2 \theta - 2 r \right)}"
+    assert board.latex(sp.sin(sp.Mul(2, m + k, evaluate=False))) == r"\sin{\left(2 \left(m + k\right) \right)}"
+    assert board.latex(1 / sp.sqrt(th**2)) == r"\frac{1}{\left|{\theta}\right|}"

@@ -138,7 +138,7 @@ def from_model(
         raise InputError(f"coordinates: {clash[0]!r} is a parameter of {model.name}; give coordinates=... other names")
     v = chart_velocities(model, q)
     kin = SymbolicKinematics(source, q, v, parameters, progress or (lambda *_: None))
-    T, R = kin.kinetic_energy, dissipation(kin.written)
+    T, R = kin.kinetic_energy, tidy(dissipation(kin.written))
     plain = symbols is None and not source.parameters
     weight, g = _weight(kin, {s.name for s in (*q, *v)}) if plain else (kin.gravity_energy, {})
     V = weight + spring_energy(kin.written)

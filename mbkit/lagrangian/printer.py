@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, Final
 
 import sympy as sp
-from sympy.core.function import AppliedUndef
+from sympy.core.function import Application, AppliedUndef
 from sympy.printing.latex import LatexPrinter
 from sympy.printing.pretty.pretty_symbology import pretty_symbol
 
@@ -128,13 +128,15 @@ class ExpressionPrinter:
     def _product(self, x: sp.Expr) -> str:
         if x.is_Add:
             return self._atom(x)
+        if roots := {f: y for f in sp.Mul.make_args(x) if (y := _absolute(f)) is not None}:
+            x = x.xreplace(roots)
         number, rest = x.as_coeff_Mul()
         below = sp.Mul(*(1 / f for f in sp.Mul.make_args(rest) if _below(f)))
         above = sp.Mul(*(f for f in sp.Mul.make_args(rest) if not _below(f)))
         factors = self._factors(above) if above != 1 else []
         parts = [self._atom(f) for f in factors]
-        if number != 1 or not parts:
-            parts.insert(0, _number(number))
+        if (size := _number(number)) != "1" or not parts:
+            parts.insert(0, size)
         line = " ".join(parts)
         if below == 1:
             return line
@@ -147,16 +149,20 @@ class ExpressionPrinter:
             return f"({self.text(x)})"
         if x.is_Symbol:
             return written(x.name)
-        if x.is_Number:
-            return _number(x)
+        if x.is_Number or x is sp.pi:
+            return "π" if x is sp.pi else _number(x)
+        if (size := _absolute(x)) is not None:
+            return self.text(size)
         if x.is_Pow and x.exp == sp.Rational(1, 2):
-            return f"√{self._atom(x.base)}" if x.base.is_Symbol else f"√({self.text(x.base)})"
+            plain = x.base.is_Symbol or x.base.is_Integer
+            return f"√{self._atom(x.base)}" if plain else f"√({self.text(x.base)})"
         if x.is_Pow and x.exp.is_Rational:
             high = str(x.exp).translate(_HIGH)
             if isinstance(x.base, (sp.sin, sp.cos, sp.tan)) and x.exp.is_Integer:
                 text = self._argument(x.base.args[0])
                 return f"{x.base.func.__name__}{high}{'' if text.startswith('(') else ' '}{text}"
-            return f"{self._atom(x.base) if x.base.is_Symbol or x.base.is_Add else f'({self.text(x.base)})'}{high}"
+            plain = x.base.is_Symbol or x.base.is_Add or isinstance(x.base, sp.Abs)
+            return f"{self._atom(x.base) if plain else f'({self.text(x.base)})'}{high}"
         if isinstance(x, sp.Abs):
             return f"|{self.text(x.args[0])}|"
         if isinstance(x, sp.Derivative) and len(x.expr.args) == 1 and x.variables[0] == x.expr.args[0]:
@@ -167,7 +173,9 @@ class ExpressionPrinter:
         if isinstance(x, sp.Piecewise):
             cases = [f"{self.text(y)} if {_compared(c, self)}" if c != sp.true else self.text(y) for y, c in x.args]
             return f"({' else '.join(cases)})"
-        if isinstance(x, sp.Function) and len(x.args) == 1:
+        if isinstance(x, Application) and len(x.args) > 1:
+            return f"{x.func.__name__}({', '.join(map(self.text, x.args))})"
+        if isinstance(x, sp.Function):
             space = " " if isinstance(x, (sp.sin, sp.cos, sp.tan)) else ""
             text = self._argument(x.args[0]) if space else f"({self.text(x.args[0])})"
             name = written(x.func.__name__) if isinstance(x, AppliedUndef) else x.func.__name__
@@ -180,8 +188,9 @@ class ExpressionPrinter:
         if x.is_Symbol:
             return self._atom(x)
         number, rest = x.as_coeff_Mul()
-        if rest.is_Symbol and number.is_Integer and number > 0:
-            return f"{number}{self._atom(rest)}"
+        letter = self._atom(rest)
+        if rest.is_Symbol and number.is_Integer and number > 0 and sum(map(str.isalpha, letter)) == 1:
+            return f"{number}{letter}"
         return f"({self.text(x)})"
 
     # LaTeX
@@ -201,8 +210,12 @@ class ExpressionPrinter:
             return sp.Add(*(self._arranged(t) for t in self._ordered(x.args)), evaluate=False)
         if x.is_Mul:
             return sp.Mul(*(self._arranged(f) for f in self._factors(x)), evaluate=False)
+        if (size := _absolute(x)) is not None:
+            return self._arranged(size)
         if x.is_Pow:
             return sp.Pow(self._arranged(x.base), x.exp, evaluate=False)
+        if isinstance(x, sp.Function) and len(x.args) == 1 and x.args[0].is_Add:
+            return x.func(self._arranged(x.args[0]), evaluate=False)
         return x
 
 
@@ -219,6 +232,10 @@ class _Latex(LatexPrinter):  # type: ignore[misc]
             stem, letter, digits = (self._print_Symbol(sp.Symbol(part), style) for part in numbered.groups())
             return f"{stem}_{{{letter}_{{{digits}}}}}"
         return latex(expr.name, lambda name: str(super(_Latex, self)._print_Symbol(sp.Symbol(name), style)))
+
+    def _needs_function_brackets(self, expr: sp.Expr) -> bool:
+        # sin 2 (a + b) may be a product.
+        return bool(super()._needs_function_brackets(expr) or (expr.is_Mul and any(f.is_Add for f in expr.args)))
 
     def _print_Function(self, expr: sp.Function, exp: str | None = None) -> str:
         if not isinstance(expr, AppliedUndef):
@@ -266,6 +283,16 @@ def _below(x: sp.Expr) -> bool:
     return bool(x.is_Pow and x.exp.is_Rational and x.exp.is_negative)
 
 
+def _absolute(x: sp.Expr) -> sp.Expr | None:
+    """Return the root of even powers as absolute values, which it is of real numbers; None of anything else."""
+    if not (x.is_Pow and x.exp.is_Rational and x.exp.q == 2):
+        return None
+    powers = [f.as_base_exp() for f in sp.Mul.make_args(x.base)]
+    if not all(e.is_even for _, e in powers):
+        return None
+    return sp.Mul(*((b if (e * x.exp).is_even else sp.Abs(b)) ** (e * x.exp) for b, e in powers))
+
+
 def _signed(x: sp.Expr) -> tuple[bool, sp.Expr]:
     """Return whether a term has a minus in front, and the term without; a sum of negative terms has one."""
     number, rest = x.as_coeff_Mul()
@@ -274,13 +301,18 @@ def _signed(x: sp.Expr) -> tuple[bool, sp.Expr]:
     for k, f in enumerate(factors):
         if f.is_Add and all(t.as_coeff_Mul()[0].is_negative for t in f.args):
             factors[k], flipped = -f, not flipped
-    return flipped, sp.Mul(abs(number), *factors)
+    # SymPy multiplies a number into a sum.
+    size = sp.Mul(*factors)
+    return flipped, sp.Mul(abs(number), size, evaluate=abs(number) == 1 or not size.is_Add)
 
 
 def _compared(x: Any, board: ExpressionPrinter) -> str:
     """Return a comparison, or several joined, as text."""
     if isinstance(x, sp.core.relational.Relational):
         return f"{board.text(x.lhs)} {x.rel_op} {board.text(x.rhs)}"
+    if isinstance(x, (sp.And, sp.Or)):
+        word = " and " if isinstance(x, sp.And) else " or "
+        return word.join(f"({_compared(c, board)})" for c in sorted(x.args, key=str))
     return one_line(str(x))
 
 
