@@ -339,9 +339,8 @@ def test_the_remedy_for_a_model_that_is_too_large_works():
     model = replace(panda, loops=(grip,), prescribed=(Prescribed(panda.joint_names[0], rate=1.0),))
     with pytest.raises(UnsupportedError, match="too many terms") as refusal:
         from_model(model)
-    assert "dynamics(model, " not in str(refusal.value)
-    assert "dynamics(model.without('loops', 'prescribed'), " in str(refusal.value)
-    assert mb.dynamics(model.without("loops", "prescribed"), "lagrangian", compile=False).model == panda
+    assert 'dynamics(model, "lagrangian") computes the same' in str(refusal.value)
+    assert len(mb.dynamics(model, "lagrangian", compile=False).constraint_names) == 4
 
 
 @pytest.mark.thorough

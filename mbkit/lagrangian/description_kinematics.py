@@ -26,7 +26,6 @@ from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 from mbkit.lagrangian.trig.shortest_form import number, shortest_form
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model, NoSlip
-from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.joint_types import cross3
 from mbkit.model.loops import CROSSED, LOOP_ROWS, TURNING, WELDED, LoopEnds
@@ -40,16 +39,8 @@ _Way = list[Joint]
 _DUST: Final = Fraction(1, 10**15)
 
 
-def instead_of_writing(model: Model) -> str:
-    """Return the advice of a message for a model that is too large to be written out."""
-    features = [f for f in CONSTRAINT_FEATURES if getattr(model, f)]
-    if not features:
-        return 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
-    names = ", ".join(map(repr, features))
-    return (
-        f"leave out bodies, as engines do not take its {' and '.join(features)}; "
-        f'mbkit.dynamics(model.without({names}), "lagrangian") computes the tree without them'
-    )
+#: The advice of a message for a model that is too large to be written out.
+INSTEAD_OF_WRITING: Final = 'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
 
 
 class _Numbers(Values):
@@ -106,7 +97,7 @@ class SymbolicKinematics(Kinematics):
         generators = [*parameters.values(), *self._opaque.values(), *(s for s in coordinates if s in lengths)]
         self._lengths = [i for i, g in enumerate(generators) if g in lengths]
         self.formulas = space = TrigRing(
-            model.name, [*halves, *dict.fromkeys(turns)], [*generators, *velocities], instead=instead_of_writing(model)
+            model.name, [*halves, *dict.fromkeys(turns)], [*generators, *velocities], instead=INSTEAD_OF_WRITING
         )
         self._halved = len(halves)
         self._written_in = TrigRing(

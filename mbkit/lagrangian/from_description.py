@@ -13,11 +13,11 @@ from mbkit._warn import warn
 from mbkit.derivation.kinematics import dissipation, dry_friction, spring_energy
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.lagrangian.description_kinematics import (
+    INSTEAD_OF_WRITING,
     SymbolicKinematics,
     closure,
     coupled,
     exact,
-    instead_of_writing,
     rolling,
 )
 from mbkit.lagrangian.elements import acting, law
@@ -191,7 +191,7 @@ def _with_points(model: Model) -> Model:
             if turned := _turned(model, joint):
                 raise UnsupportedError(
                     f"{model.name}: {turned} at the end of beam {joint.name!r} turns with it, and is not written out; "
-                    'mbkit.dynamics(model, "lagrangian") computes the same without writing it'
+                    f"{INSTEAD_OF_WRITING}"
                 )
             joint = replace(joint, kind=joint.type.point.name)
         joints.append(joint)
@@ -232,13 +232,12 @@ def _check(model: Model) -> None:
         )
     if not model.nv:
         raise UnsupportedError(f"{model.name}: no joint of it moves, so there is no equation")
-    # Engines take trees of any size. What they refuse is solved here alone.
     bound = model.loops or model.prescribed
     most = _MOST_ROLLING if model.no_slip else _MOST_BOUND if bound else _MOST
     if model.nv > most:
         raise UnsupportedError(
             f"model: expected at most {most} coordinates to be written out, got {model.nv} coordinates of "
-            f"{model.name}; {instead_of_writing(model)}"
+            f"{model.name}; {INSTEAD_OF_WRITING}"
         )
 
 
