@@ -274,6 +274,6 @@ def test_expressions_on_one_line():
         sp.Integer(0): "0",
     }
     assert {x: board.text(x) for x in told} == told
-    assert board.latex(sp.sin(2 * th - 2 * r)) == r"\sin{\left(2 \theta - 2 r \right)}"
+    assert board.latex(sp.cos(2 * th - 2 * r)) == r"\cos{\left(2 r - 2 \theta \right)}"
     assert board.latex(sp.sin(sp.Mul(2, m + k, evaluate=False))) == r"\sin{\left(2 \left(m + k\right) \right)}"
     assert board.latex(1 / sp.sqrt(th**2)) == r"\frac{1}{\left|{\theta}\right|}"
