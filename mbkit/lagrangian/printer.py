@@ -214,7 +214,7 @@ class ExpressionPrinter:
             return self._arranged(size)
         if x.is_Pow:
             return sp.Pow(self._arranged(x.base), x.exp, evaluate=False)
-        if isinstance(x, sp.Function) and len(x.args) == 1 and x.args[0].is_Add:
+        if isinstance(x, sp.Function) and len(x.args) == 1:
             return x.func(self._arranged(x.args[0]), evaluate=False)
         return x
 
