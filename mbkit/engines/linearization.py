@@ -81,7 +81,7 @@ class Linearization(NamedTuple):
 
     @property
     def eigenvalues(self) -> Any:
-        """Eigenvalues of A, 1/s, (2nv,) or (N, 2nv): slow ones beside fast ones keep their digits."""
+        """Eigenvalues of A, 1/s, (2nv,) or (N, 2nv); slow ones beside fast ones keep their digits."""
         rows = [graded(A, vectors=False)[0] for A in self.A.reshape(-1, *self.A.shape[-2:])]
         return np.array(rows, dtype=complex).reshape(self.A.shape[:-1])
 
