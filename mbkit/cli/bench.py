@@ -13,7 +13,7 @@ from mbkit.cli import _shared as shared
 from mbkit.cli._shared import Report
 
 #: Limits of evaluations in a run, of all methods and of a few.
-_WORK, _QUICK_WORK = 6_000, 24_000
+_WORK, _QUICK_WORK = 3_000, 12_000
 
 
 @shared.command("mbkit bench double_pendulum --quick", "mbkit bench ur5 --methods rk4,rk853 --duration 2 --out results")
@@ -43,7 +43,7 @@ def bench(
 ) -> None:
     """Measure error against run time on TARGET: every engine, every method.
 
-    TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written. Runs have up to 6,000 evaluations,
+    TARGET is what `mbkit check` takes. A page, its figure, JSON and CSV are written. Runs have up to 3,000 evaluations,
     one called from Python counting eight, so that a small system takes some seconds; with --full 200,000.
     Ctrl-C ends the study early and writes the finished part.
     """

@@ -18,7 +18,7 @@ from mbkit.errors import MbkitError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
-    from mbkit.studies import Finding
+    from mbkit.studies import Comparison, Finding
 
 
 @shared.command(
@@ -100,13 +100,20 @@ def _check_one(report: Report, target: str, options: dict[str, Any], *, full: bo
     stem = shared.stem_of(target, model.name)
     report.prepare(stem, "json", "html")
     with Bar(f"check {model.name}") as bar:
-        result = compare(model, **settings, progress=bar)
+        result = compare(model, **settings, progress=bar, checkpoint=_tell_terms)
     result = replace(result, findings=(*result.findings, *_of_file(model, target)))
     written = report.write(compare_view.view(result, target, full=full), stem)
     if result.nothing:
         needed = "" if result.rows else "; two engines that hold the model are needed"
         shared.say("error", f"{result.verdict}{needed}")
     shared.leave(MISUSE if not written or result.nothing else AGREE if result.passed else DIFFER)
+
+
+def _tell_terms(result: Comparison) -> None:
+    """Print the verdict on terms at once; what follows takes longer."""
+    from mbkit.report.compare_view import headline
+
+    shared.say("terms", f"{'✓' if result.passed else '✗'} {headline(result)}; rollouts and run times follow")
 
 
 def _of_file(model: Model, target: str) -> Iterator[Finding]:

@@ -136,6 +136,9 @@ def _fastest(result: WorkPrecision) -> str:
     if not parts:
         return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m"
     count = f"{len(result.curves)} curve{'s' * (len(result.curves) != 1)}"
+    if result.untimed:
+        stopped += f"no time was left for {' and '.join(result.untimed)}, so none is the fastest; "
+        return f"{stopped}of {count}, least time: {', '.join(parts)}"
     return f"{stopped}fastest of {count}: {', '.join(parts)}"
 
 
@@ -314,6 +317,8 @@ def _curves(result: WorkPrecision) -> list[doc.Block]:
     lines = curve_lines(result)
     if not lines:
         return []
+    counts = [p.repeats for _, p in result.rows() if p.repeats]
+    repeats = " to ".join(dict.fromkeys(str(x) for x in (min(counts, default=0), max(counts, default=0))))
     work, timing = result.settings.get("work"), result.settings.get("timing")
     most = f" ({work:.0f} evaluations of the dynamics; one that is called from Python counts eight)" if work else ""
     legend = [doc.Bullet("", "on the front: nothing beats it in both error and run time", "●", "good")]
@@ -326,7 +331,7 @@ def _curves(result: WorkPrecision) -> list[doc.Block]:
         doc.Paragraph(
             "The order is the slope of log error over log step, where neither coarse steps nor rounding hide it. A "
             f"curve ends where finer settings bring nothing, or a run would take too much work{most}. Run times are "
-            f"medians of repeated runs{f', {timing}' if timing else ''}; ± is half the interquartile range. Compiling "
+            f"medians of {repeats} timings{f', {timing}' if timing else ''}, the longest runs timed least; ± is half the interquartile range. Compiling "
             "is timed from nothing, whatever the caches hold.",
             on="page",
             note=True,

@@ -249,7 +249,7 @@ def announced(caught: Iterable[warnings.WarningMessage]) -> str:
 #: What a comparison shows of `work_precision`: a few methods, runs of little work, and seconds at the most.
 _HORIZON: Final = 0.5
 _REPEATS: Final = 3
-_WORK: Final = 24_000
+_WORK: Final = 6_000
 _SECONDS: Final = 60.0
 
 
@@ -262,6 +262,7 @@ def compare(
     tolerance: float = 1e-12,
     terms_only: bool = False,
     progress: Progress | None = None,
+    checkpoint: Callable[[Comparison], object] | None = None,
 ) -> Comparison:
     """Compare engines on one description.
 
@@ -279,6 +280,8 @@ def compare(
         Whether to leave out rollouts, error against run time and omissions.
     progress : callable, optional
         Called as ``progress(fraction, text)``.
+    checkpoint : callable, optional
+        Receives the comparison of the terms, before what follows them.
 
     Raises
     ------
@@ -306,14 +309,7 @@ def compare(
         rows, refused = study.rows(lambda f, text: tell(0.05 + f * (0.85 if terms_only else 0.35), text))
         refusals += refused
         result |= {"softness": study.softness, "findings": study.findings}
-    # Without mass nothing can be simulated.
-    massless = any(r.term == "M" and r.zero for r in rows)
-    if enough and not terms_only and not massless:
-        beyond, refused = _beyond_terms(model, built, seed, tell)
-        result |= beyond
-        refusals += refused
-    tell(1.0, "done")
-    return Comparison(
+    out = Comparison(
         model=model.name,
         facts=model_info(model),
         engines=tuple(built),
@@ -327,6 +323,16 @@ def compare(
         **results.provenance(begun),
         **result,
     )
+    # Without mass nothing can be simulated.
+    massless = any(r.term == "M" and r.zero for r in rows)
+    if enough and not terms_only and not massless:
+        if checkpoint is not None:
+            checkpoint(out)
+        beyond, refused = _beyond_terms(model, built, seed, tell)
+        seconds = time.perf_counter() - begun
+        out = replace(out, refusals=(*out.refusals, *refused), seconds=seconds, **beyond)
+    tell(1.0, "done")
+    return out
 
 
 def _beyond_terms(

@@ -9,6 +9,7 @@ from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, block_html, columns, counted
+from mbkit.studies.study_runs import OUT_OF_TIME
 from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, pareto_front
 from mbkit.studies.work_precision.figure import figure
 
@@ -27,7 +28,7 @@ class WorkPrecision(ResultTable):
     `refusals` are engines and methods that failed, with the reason. `complete` is False after an interruption, and
     `seconds` is the time of the whole study.
 
-    `settings` has seed, repeats, steps, tolerances, torque, the saved times, the executor, and how run times were
+    `settings` has `changed`, what the model was measured without or otherwise, seed, repeats, steps, tolerances, torque, the saved times, the executor, and how run times were
     measured: those of worker processes, which share the cores, cannot be compared with those of another study.
     """
 
@@ -76,6 +77,12 @@ class WorkPrecision(ResultTable):
         )
 
     @property
+    def untimed(self) -> tuple[str, ...]:
+        """Engines of which no run was measured because the time was used up: who is the fastest is then unknown."""
+        lost = {r.engine for r in self.refusals if r.reason == OUT_OF_TIME}
+        return tuple(sorted(lost - {c.engine for c, p in self.rows() if math.isfinite(p.error)}))
+
+    @property
     def turns(self) -> tuple[str, ...]:
         """Of each curve that rounding bends back, the best step, below which errors grow again."""
         return tuple(
@@ -92,8 +99,8 @@ class WorkPrecision(ResultTable):
 
     @property
     def shortened(self) -> tuple[str, ...]:
-        """Curves that failed or ran out of time, and a horizon that was cut."""
-        out = [] if self.complete else ["interrupted"]
+        """What was taken out of the model, curves that failed or ran out of time, and a horizon that was cut."""
+        out = [*self.settings.get("changed", ()), *([] if self.complete else ["interrupted"])]
         if failed := self.failed:
             names = list(dict.fromkeys(f"{r.engine} {r.term}".strip() for r in failed))
             out.append(f"{counted(len(names), 'curve')} left out: {', '.join(names)}")

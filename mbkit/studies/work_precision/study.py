@@ -41,6 +41,8 @@ _LATEST: Final = 5.0
 #: Counted work of a run up to so many velocities; it is less beyond, where an evaluation takes longer.
 _WORK: Final = 200_000
 _VELOCITIES: Final = 8
+#: Least part of the usual time for a study of less work.
+_LEAST_USUAL: Final = 0.1
 #: Part of the usual time for the search of a reference.
 _FOR_REFERENCE: Final = 0.25
 _ALONE: Final = "interleaved in one process"
@@ -149,7 +151,8 @@ def work_precision(
     limit = _LATEST * usual if seconds is None else real("seconds", seconds, positive=True)
     whole = _WORK * min(1.0, _VELOCITIES / model.nv)
     most = whole if work is None else count("work", work, least=1)
-    budget = TimeBudget(limit, min(usual, limit), most)
+    # Of runs that are kept short, fewer are timed again, the longest least.
+    budget = TimeBudget(limit, min(usual * min(max(most / whole, _LEAST_USUAL), 1.0), limit), most)
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
     _check_executor(executor, torque)
     checkpoints = Checkpointer(progress, checkpoint)
@@ -164,7 +167,7 @@ def work_precision(
     start = _start(integrated, (q0, v0), seed, known)
     if known is None:
         known = _computed_reference(
-            *(integrated, *start, asked, force, _FOR_REFERENCE * budget.usual),
+            *(integrated, *start, asked, force, _FOR_REFERENCE * min(usual, limit)),
             lambda done: checkpoints.report(0.1 * done, "reference"),
         )
     problem = _problem(integrated, start, force, asked, known)
@@ -176,10 +179,9 @@ def work_precision(
     settings = plans(methods_of, float(problem.times[1]), steps, tolerances)
     sweep = Sweep(problem, settings, repeats, seed, budget, executor)
     facts = results.model_info(integrated)
-    if integrated is not model and model.layout.reduced:
-        facts["notes"] = [*facts["notes"], "mimic joints free"]
-    if model.needs.friction:
-        facts["notes"] = [*facts["notes"], "without the dry friction of its joints"]
+    changed = ["without dry friction"] if model.needs.friction else []
+    changed += ["mimic joints free"] if integrated is not model and model.layout.reduced else []
+    facts["notes"] = [*facts["notes"], *changed]
     soft = [name for name in methods_of if model.constrained and find_engine(name).load().soft_constraints]
     if soft:
         which = " and ".join(soft)
@@ -201,6 +203,7 @@ def work_precision(
             complete=complete,
             **results.provenance(begun),
             settings={
+                "changed": changed,
                 "seed": seed,
                 "repeats": repeats,
                 "allowed": budget.seconds,

@@ -453,13 +453,17 @@ class Sweep:
 
     def _here(self) -> Iterator[tuple[float, str]]:
         until = self.budget.until(_COMPILED, _MIN_PART)
-        # Jacobians and series take longest to derive; they come last, so that the others have their time.
+        # Jacobians and series take longest to derive; they come last, so that the others have their time. Engines take
+        # turns, so that each has a curve before the time is used up.
+        engines = {x.settings.engine for x in self._curves}
+        turn = {x: k for e in engines for k, x in enumerate(x for x in self._curves if x.settings.engine == e)}
         by_cost = sorted(
-            self._curves, key=lambda x: (x.settings.info.stages == 0, find_engine(x.settings.engine).derived)
+            self._curves,
+            key=lambda x: (x.settings.info.stages == 0, turn[x], find_engine(x.settings.engine).derived),
         )
         for k, one in enumerate(by_cost):
             yield 0.2 * k / len(self._curves), f"compiling {one.settings.method} on {one.settings.engine}"
-            if k and time.process_time() > until:
+            if k >= len(engines) and time.process_time() > until:
                 one.give_up(OUT_OF_TIME)
             elif not one.over:
                 one.compile()
