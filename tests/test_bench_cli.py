@@ -12,7 +12,9 @@ from click.testing import CliRunner, Result
 import mbkit as mb
 from mbkit.cli import cli
 from mbkit.errors import OutputError
+from mbkit.report import work_precision_view
 from mbkit.studies._checkpoint import InterruptedSweepError
+from mbkit.studies.study_runs import OUT_OF_TIME
 
 SHORT = ("--engines", "pinocchio,mujoco", "--methods", "rk4,mujoco_rk4", "--quick", "--seconds", "30", "--repeats", "1")
 
@@ -182,3 +184,35 @@ def test_a_bench_says_that_its_runs_are_short_and_full_ones_are_not():
     assert short.shortened == ("runs of up to 6,000 evaluations alone",)
     assert whole.shortened == ()
     assert call("bench", "pendulum", "--full", "--quick").exit_code == 2
+
+
+def test_what_was_taken_out_of_the_model_comes_first(tmp_path):
+    (tmp_path / "r.urdf").write_text(
+        '<robot name="r"><link name="base"/><link name="rod"><inertial><origin xyz="0.2 0 0"/><mass value="1"/>'
+        '<inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="hinge" '
+        'type="continuous"><parent link="base"/><child link="rod"/><axis xyz="0 1 0"/><dynamics friction="0.1"/>'
+        "</joint></robot>"
+    )
+    arguments = ["--engines", "lagrangian", "--methods", "rk4", "--duration", "0.1", "--repeats", "1"]
+    done = call("bench", str(tmp_path / "r.urdf"), *arguments, "--out", str(tmp_path / "out"))
+    assert "; without dry friction; " in " ".join(done.stdout.split("\n\n")[0].split())
+    (page,) = (tmp_path / "out").glob("*.html")
+    assert "without dry friction" in page.read_text()
+
+
+def test_little_time_is_shared_by_all_engines_and_names_no_winner_without_them():
+    """Each engine has its first curve before any has its second, whatever the clock says."""
+    model, methods = mb.catalog.pendulum(), ["rk4", "rk853", "radau"]
+    result = mb.work_precision(model, methods=methods, repeats=1, duration=0.2, seconds=1e-3, work=1000)
+    assert {c.engine for c in result.curves} == {"pinocchio", "lagrangian", "mujoco"}
+    assert {c.method for c in result.curves} == {"rk4"}
+    assert result.untimed == ()
+    lost = [r for r in result.refusals if r.reason == OUT_OF_TIME]
+    less = replace(
+        result,
+        curves=tuple(c for c in result.curves if c.engine == "pinocchio"),
+        refusals=(*lost, *(replace(lost[0], engine=e, term="rk4") for e in ("lagrangian", "mujoco"))),
+    )
+    assert less.untimed == ("lagrangian", "mujoco")
+    assert work_precision_view.headline(less).startswith("no time was left for lagrangian and mujoco, so none is")
+    assert "fastest of" not in work_precision_view.headline(less)

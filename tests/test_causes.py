@@ -9,11 +9,14 @@ from dataclasses import fields, replace
 from functools import cache
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import mbkit as mb
 from mbkit import spatial
+from mbkit.cli import cli
 from mbkit.engines import Dynamics
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
@@ -721,3 +724,57 @@ def test_every_number_of_a_joint_and_a_frame_is_compared_or_named() -> None:
 
 
 WORDS = {"name", "kind", "parent", "child", "mimic"}
+
+
+ARM = (
+    '<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody><body name="b"><joint name="j" '
+    'axis="0 1 0"/><geom size="0.1" pos="0.2 0 0"/></body></worldbody><actuator><position name="servo" joint="j" '
+    'kp="100" kv="9"/></actuator></mujoco>'
+)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("0.002", "0.01", "beside the terms: timestep 0.002 → 0.01"),
+        ("implicitfast", "Euler", "integrator implicitfast → euler"),
+        ('kp="100"', 'kp="80"', "gainprm of actuator 'servo' 100 → 80"),
+        ('kp="100"', 'kp="100" forcerange="-1 1"', "forcerange of actuator 'servo' 0 → -1, 0 → 1"),
+        ('0.1"', '0.1" friction="0.5"', "friction of geom 0 1 → 0.5"),
+        ('name="j"', 'name="j" range="-1 1" limited="true"', "limited of joint 'j' 0 → 1"),
+        ("<worldbody>", '<contact><exclude body1="world" body2="b"/></contact><worldbody>', "exclusions of contact"),
+    ],
+)
+def test_files_that_mujoco_runs_otherwise_are_told_apart(old, new, told, tmp_path):
+    """Time step, integrator and servo decide the motion of 0.3 s, by bare MuJoCo, where all terms are the same."""
+    paths = [tmp_path / "a.xml", tmp_path / "b.xml", tmp_path / "same.xml"]
+    for path, text in zip(paths, (ARM, ARM.replace(old, new, 1), ARM), strict=True):
+        path.write_text(text, encoding="utf-8")
+    shown = CliRunner().invoke(cli, ["diff", *map(str, paths[:2])])
+    first = " ".join(shown.output.split("\n\n")[0].split())
+    assert first.startswith("✗ a.xml and b.xml: b.xml has the terms of a.xml (to 0.0e+00)")
+    assert told in first
+    assert shown.exit_code == 1
+    assert json.loads(CliRunner().invoke(cli, ["diff", *map(str, paths[:2]), "--json"]).stdout)["agree"] is False
+    same = CliRunner().invoke(cli, ["diff", str(paths[0]), str(paths[2])])
+    assert same.exit_code == 0
+    assert "beside" not in same.output
+    if old in ("0.002", "implicitfast", 'kp="100"') and "forcerange" not in new:
+        ends = []
+        for path in paths[:2]:
+            m = mujoco.MjModel.from_xml_path(str(path))
+            d = mujoco.MjData(m)
+            d.ctrl[:] = 1.0
+            while d.time < 0.3 - 1e-9:
+                mujoco.mj_step(m, d)
+            ends.append(d.qpos[0])
+        assert abs(ends[1] - ends[0]) > 1e-6
+
+
+def test_what_a_file_of_another_format_cannot_hold_is_not_compared(tmp_path):
+    (tmp_path / "a.xml").write_text(ARM, encoding="utf-8")
+    model = mb.load(tmp_path / "a.xml").without("limits")
+    (tmp_path / "a.urdf").write_text(mb.convert(model, "urdf").text, encoding="utf-8")
+    shown = CliRunner().invoke(cli, ["diff", str(tmp_path / "a.xml"), str(tmp_path / "a.urdf")])
+    first = " ".join(shown.output.split("\n\n")[0].split())
+    assert "not compared: options of simulation, servos, force ranges, contacts, limits of a.xml" in first

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -60,8 +61,34 @@ def diff(
         a, b = (os.path.basename(target) or target for target in targets)
         names = (a, b) if a != b else (targets[0], targets[1])
     result = explain(*sides, names=names, **settings)
+    if not engines and (beside := _beside_terms(first, str(second))):
+        unlike = not beside[0].startswith("not compared")
+        head = "beside the terms: " if unlike else ""
+        result = replace(result, beside=(f"{head}{beside[0]}", *beside[1:]), agree=result.agree and not unlike)
     shared.show(explanation_view(result), as_json=as_json)
     shared.leave(shared.AGREE if result.agree else shared.DIFFER)
+
+
+def _beside_terms(first: str, second: str) -> tuple[str, ...]:
+    """Return what differs in what MuJoCo simulates of two MJCFs, or was not compared of one."""
+    from mbkit.engines.mujoco.simulated import differences, settings_of
+    from mbkit.load.sanitized_text import strip
+
+    paths = [x for x in (first, second) if x.lower().endswith((".xml", ".mjcf")) and os.path.isfile(x)]
+    files = [x for x in (strip(Path(path)) for path in paths) if x.format == "mjcf"]
+    what = "options of simulation, servos, force ranges, contacts, limits"
+    if not files:
+        return ()
+    if len(files) < 2:
+        return (f"not compared: {what} of {files[0].path.name}",)
+    try:
+        out = tuple(differences(*(settings_of(x.text, x.meshes) for x in files)))
+    except Exception as error:  # MuJoCo raises errors of many kinds
+        return (f"not compared: {what}, as MuJoCo does not read it ({' '.join(str(error).split())[:120]})",)
+    pairs = [sorted((x.tag, *x.attributes.items()) for c in f.root.all("contact") for x in c.children) for f in files]
+    out += ("pairs and exclusions of contact",) if pairs[0] != pairs[1] else ()
+    lost = any(tag in ("mesh", "hfield") for f in files for tag, _ in f.gone)
+    return out or (("not compared: contacts of meshes",) if lost else ())
 
 
 def _model(target: str, options: Mapping[str, Any]) -> Model:

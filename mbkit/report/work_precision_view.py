@@ -331,8 +331,8 @@ def _curves(result: WorkPrecision) -> list[doc.Block]:
         doc.Paragraph(
             "The order is the slope of log error over log step, where neither coarse steps nor rounding hide it. A "
             f"curve ends where finer settings bring nothing, or a run would take too much work{most}. Run times are "
-            f"medians of {repeats} timings{f', {timing}' if timing else ''}, the longest runs timed least; ± is half the interquartile range. Compiling "
-            "is timed from nothing, whatever the caches hold.",
+            f"medians of {repeats} timings{f', {timing}' if timing else ''}, the longest runs timed least; ± is half "
+            "the interquartile range. Compiling is timed from nothing, whatever the caches hold.",
             on="page",
             note=True,
         ),

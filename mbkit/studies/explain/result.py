@@ -55,7 +55,8 @@ class Explanation(ResultTable):
     of the smallest part that still differs. Two sides differ where a term differs by more than `tolerance`. `massless`
     says whether M is zero on both sides at every state, so that equal terms are no agreement. `compared` says whether
     accelerations of the whole systems were: there are none without a state that keeps the constraints, nor where the
-    mass matrix is singular.
+    mass matrix is singular. `beside` has what differs, or was not compared, of two files beside their terms: options of
+    simulation, servos, contacts.
     """
 
     a: str
@@ -76,6 +77,7 @@ class Explanation(ResultTable):
     tolerance: float
     massless: bool = False
     compared: bool = True
+    beside: tuple[str, ...] = ()
 
     @property
     def acting(self) -> tuple[Cause, ...]:
@@ -95,14 +97,21 @@ class Explanation(ResultTable):
     @property
     def verdict(self) -> str:
         """One sentence: the same, or why not."""
+        more = f" (and {len(self.beside) - _MAX_LINES} more)" if len(self.beside) > _MAX_LINES else ""
+        return self._of_terms + (f"; {', '.join(self.beside[:_MAX_LINES])}{more}" if self.beside else "")
+
+    @property
+    def _of_terms(self) -> str:
         count, silent = len(self.acting), len(self.causes) - len(self.acting)
         beside = f"; {_counted(silent, 'difference')} that change{'s' * (silent == 1)} no term" if silent else ""
-        if self.agree:
+        alike = self.comparable and not (self.massless or self.acting) and self.worst <= self.tolerance
+        if self.agree or (self.beside and alike):
             cancel = f"; {_counted(count, 'difference')} that cancel" if count else ""
             if not self.compared:
                 none = "no motion was compared: no state keeps the constraints, or the mass matrix is singular"
                 return f"{self.b} is described as {self.a} is (to {self.worst:.1e}); {none}{cancel}{beside}"
-            return f"{self.b} moves as {self.a} does (to {self.worst:.1e}){cancel}{beside}"
+            moves = f"moves as {self.a} does" if self.agree else f"has the terms of {self.a}"
+            return f"{self.b} {moves} (to {self.worst:.1e}){cancel}{beside}"
         apart = "in its coordinates"
         if self.comparable:
             apart = f"by {self.worst:.1e}" if self.tolerance < self.worst < math.inf else "in its constraints"

@@ -28,8 +28,9 @@ class WorkPrecision(ResultTable):
     `refusals` are engines and methods that failed, with the reason. `complete` is False after an interruption, and
     `seconds` is the time of the whole study.
 
-    `settings` has `changed`, what the model was measured without or otherwise, seed, repeats, steps, tolerances, torque, the saved times, the executor, and how run times were
-    measured: those of worker processes, which share the cores, cannot be compared with those of another study.
+    `settings` has `changed`, what the model was measured without or otherwise; seed, repeats, steps, tolerances,
+    torque, the saved times, the executor, and how run times were measured: those of worker processes, which share the
+    cores, cannot be compared with those of another study.
     """
 
     model: str

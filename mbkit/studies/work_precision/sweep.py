@@ -478,11 +478,14 @@ class Sweep:
             yield 0.6 + 0.4 * (k + 1) / self.repeats, f"timing, round {k + 1} of {self.repeats}"
 
     def _coarse_to_fine(self, until: float) -> Iterator[CurveMeasurement]:
-        """Run each setting once, the cheapest next run of all curves first; begin none that would not end in time."""
+        """Run each setting once, the cheapest next run of all curves first; begin none that would not end in time.
+
+        The coarsest run of each compiled method is always begun, so that no engine is left without one.
+        """
         while going := [one for one in self._curves if not one.over]:
             one = min(going, key=lambda x: x.expected)
             left = until - time.process_time()
-            if one.expected > left:
+            if one.expected > max(left, 0.0):
                 for other in going:
                     other.give_up(OUT_OF_TIME)
             elif one.work > self.budget.work and not one.settings.required:
