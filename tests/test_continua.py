@@ -282,7 +282,7 @@ def test_chains_of_rigid_segments_come_to_the_beam_as_the_square_of_their_length
 
 
 def test_the_chain_of_the_study_of_a_turning_hub_in_numbers():
-    data = flexible.json.loads((flexible.HERE / "flexible.json").read_text(encoding="utf-8"))
+    data = flexible.json.loads(flexible.results("flexible.json").read_text(encoding="utf-8"))
     assert max(data["frequencies"].values()) < 1e-12
     assert all(1.9 < order < 2.1 for of in data["chain"]["orders"].values() for order in of.values())
 

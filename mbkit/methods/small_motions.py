@@ -99,16 +99,16 @@ def eigenvalues(pencil: Sequence[Array], errors: Sequence[Array]) -> tuple[Any, 
             step = (y.conj() * residual).sum(axis=1) / along
             # Vectors that are not near leave a residual that is more than a shift of λ and rounding.
             left, change = (np.nan_to_num(a / rounding) for a in (residual, slope))
-            shift = (change.conj() * left).sum(axis=1) / (change.conj() * change).sum(axis=1)
-            wrong = np.nan_to_num(np.abs(left - shift[:, None] * change), nan=0.0).max(axis=1)
-            bound = np.maximum(wrong, 1.0) * (abs(y) * rounding).sum(axis=1) / abs(along)
+            shift = np.nan_to_num((change.conj() * left).sum(axis=1) / (abs(change) ** 2).sum(axis=1))
+            left = np.maximum(rounding, np.abs(residual - shift[:, None] * slope))
+            least, bound = ((abs(y) * a).sum(axis=1) / abs(along) for a in (rounding, left))
             bound = np.nan_to_num(bound + np.abs(step) + np.abs(shift), nan=np.inf)
         at = np.where(np.isfinite(step), at - step, at)
         better = bound < error[due]
         values[due[better]], error[due[better]] = at[better], bound[better]
         # Beside what is so much faster, vectors are mixed at first, and no residual shows it.
         mixed = np.abs(at) < _GRADED * np.abs(values).max() * (turn == 0)
-        more = ~(np.abs(step) <= bound / 2) | (wrong > 1.0) | mixed
+        more = ~(bound <= 2 * least) | mixed
         due, at, x, y = due[more], at[more], x[more], y[more]
         if not len(due) or turn + 1 == _ROUNDS:
             break

@@ -154,7 +154,8 @@ def equilibrium(
     Newton's iteration with the exact stiffness, and Levenberg and Marquardt's damping far from the end, finds one
     equilibrium, not all. Stability is that of M δq̈ + D δq̇ + K δq = 0 on what constraints leave free. Where K is
     symmetric and D feeds no energy in, K's sign decides (Lagrange and Dirichlet, Kelvin and Tait); else the
-    eigenvalues do.
+    eigenvalues do. Each has a bound of its error from the rounding of M, D and K, entry by entry, whatever their units;
+    what the bound does not decide is None. Dry friction, which holds a range of configurations, is left out.
 
     Examples
     --------
@@ -216,7 +217,7 @@ class _Balance:
             if not self.model.has_bodies:
                 raise UnknownNameError("frame", name, (), hint="a system on paper takes tau=")
         self._manifold: Any = manifold_of(dyn).at(t) if self.model.constrained else None
-        self._zero = np.zeros(self.model.nv)
+        self._zero, self._unit = np.zeros(self.model.nv), np.eye(self.model.nv)
 
     # What balances
 
@@ -276,7 +277,7 @@ class _Balance:
     def _slopes(self, function: Callable[[Array], Array], h: float) -> Array:
         """Return the derivative of a function of a step (nv,) at zero, by differences of fourth order."""
         columns = []
-        for e in h * np.eye(self.model.nv):
+        for e in h * self._unit:
             ahead, behind, far, back = (function(s * e) for s in (1.0, -1.0, 2.0, -2.0))
             columns.append((8 * (ahead - behind) - (far - back)) / (12 * h))
         return np.array(columns).T.reshape(self.model.nv, self.model.nv)
@@ -299,8 +300,11 @@ class _Balance:
         """Return ∂(inverse dynamics)/∂v at rest."""
         if isinstance(self.dyn, LagrangianDynamics):
             return np.asarray(self.dyn.inverse_dynamics_derivatives(q, self._zero, self._zero).v)
-        # Differences of a quadratic are exact.
-        return self._slopes(lambda v: self.dyn.inverse_dynamics(q, v, self._zero), 1.0)
+        # Of a quadratic differences are exact, and those of two speeds leave out the jump of dry friction.
+        change = (
+            np.array([self.dyn.inverse_dynamics(q, s * e, self._zero) for s in (2, -2, 1, -1)]) for e in self._unit
+        )
+        return np.array([[0.5, -0.5, -0.5, 0.5] @ rows for rows in change]).T.reshape(self._unit.shape)
 
     def _whole_stiffness(self, q: Array, multipliers: Array) -> Array:
         """Return ∂(load - Jᵀ λ)/∂q at these multipliers."""
@@ -399,6 +403,9 @@ class _Balance:
         # Terms that cancel here do not beside it: their size is the curvature of their sum.
         terms = np.abs([K, *((self._whole_stiffness(p, multipliers) - K) / _ASIDE**2 for p in places)]).sum(axis=0)
         M, D = np.abs(M), np.abs(D)
+        if self.model.has_bodies:
+            # Sums over bodies round by what they add in other rows and columns too.
+            terms += np.where(self._unit, 0.0, np.maximum(terms.max(axis=0), terms.max(axis=1)[:, None]))
         if isinstance(self.dyn, LagrangianDynamics):
             return _EXACT * M, _EXACT * D, _EXACT * terms
         loads = np.max([np.abs(self.load(p)) for p in (q, *places)], axis=0)[:, None] / _ASIDE
@@ -412,7 +419,7 @@ class _Balance:
     def _free(self, q: Array) -> Array:
         """Return columns of the velocities that the constraints leave free."""
         if self._manifold is None:
-            return np.eye(self.model.nv)
+            return self._unit
         _, sizes, V = np.linalg.svd(self._manifold.jacobian(q))
         return np.asarray(V[int(np.count_nonzero(sizes > 1e-10 * sizes[0])) :].T)
 
