@@ -29,7 +29,7 @@ from mbkit.model import Joint, Model, NoSlip
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.joint_types import cross3
 from mbkit.model.loops import CROSSED, LOOP_ROWS, TURNING, WELDED, LoopEnds
-from mbkit.model.parts import Coupler, Loop, PointSpring, Prescribed
+from mbkit.model.parts import Coupler, Loop, PointSpring
 from mbkit.model.rolling import contact
 
 Vector = list[Any]
@@ -330,19 +330,11 @@ def _turn(angle: sp.Expr) -> sp.Expr:
 _EPS: Final = 2.0**-52
 
 
-def motion(kin: SymbolicKinematics, prescribed: Prescribed, t: sp.Symbol) -> sp.Expr:
-    """Return offset + rate t + amplitude sin(frequency t + phase)."""
-    x = kin.written.values.motion(prescribed)
-    turns = bool(kin.model.joint(prescribed.joint).type.angular)
-    offset = _read(x.offset) if turns else x.offset
-    return offset + x.rate * t + x.amplitude * sp.sin(x.frequency * t + _read(x.phase))
-
-
 def coupled(kin: SymbolicKinematics, coupler: Coupler) -> sp.Expr:
     """Return q less what its leaders give it."""
     x = kin.written.values.couplers[coupler.name]
     at, *leading = (kin.symbols_of[name][0] for name in (coupler.joint, *coupler.leaders))
-    offset = _read(x.offset) if kin.model.joint(coupler.joint).type.angular and x.offset else x.offset
+    offset = read_angle(x.offset) if kin.model.joint(coupler.joint).type.angular and x.offset else x.offset
     higher = sum((c * leading[0] ** (k + 2) for k, c in enumerate(x.curve)), sp.Integer(0))
     return at - sum(r * y for r, y in zip(x.ratios, leading, strict=True)) - offset - higher
 
@@ -355,7 +347,8 @@ def angle(x: float) -> sp.Expr:
     return number(Fraction(repr(x)))
 
 
-def _read(x: sp.Expr) -> sp.Expr:
+def read_angle(x: sp.Expr) -> sp.Expr:
+    """Return a number as an angle, and anything else as it is."""
     return angle(float(x)) if x.is_Number else x
 
 

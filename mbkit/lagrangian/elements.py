@@ -8,7 +8,7 @@ from typing import Any, Final
 import sympy as sp
 
 from mbkit.errors import UnsupportedError
-from mbkit.lagrangian.description_kinematics import SymbolicKinematics, exact, motion
+from mbkit.lagrangian.description_kinematics import SymbolicKinematics, exact, read_angle
 from mbkit.model.elements.forces import RATE, TIME, GravityCompensation, JointForce
 from mbkit.model.elements.formula import Arithmetic
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
@@ -66,13 +66,14 @@ SYMPY: Final = Arithmetic(
 
 def law(kin: SymbolicKinematics, part: Motion, t: sp.Symbol) -> sp.Expr:
     """Return a prescribed motion as a function of the time."""
-    if isinstance(part, Prescribed):
-        return motion(kin, part, t)
     numbers = kin.written.values.motion(part)
-    of = MOTION_LAWS[type(part)]
     if hasattr(numbers, "knots"):
         return _pieces(numbers, t)
-    return sp.sympify(of.path(part, numbers, t, SYMPY))
+    if isinstance(part, Prescribed):
+        numbers.phase = read_angle(numbers.phase)
+        if kin.model.joint(part.joint).type.angular:
+            numbers.offset = read_angle(numbers.offset)
+    return sp.sympify(MOTION_LAWS[type(part)].path(part, numbers, t, SYMPY))
 
 
 def _pieces(numbers: Any, t: sp.Symbol) -> sp.Expr:

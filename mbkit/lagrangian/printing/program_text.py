@@ -104,7 +104,7 @@ class ProgramText(Printable):
         arguments = ", ".join(name for name, _ in self.inputs)
         head = f'"""{self.quantity} of {python_docstring(self.model)}, in SI units; needs NumPy only."""'
         body = "\n".join(lines).replace("numpy.", "np.")
-        about = ". ".join(filter(None, (f"{self.operations} operations", python_docstring(self.note)))) + "."
+        about = f"{self.operations} operations{'; ' * bool(self.note)}{python_docstring(self.note)}."
         return f'{head}\n\nimport numpy as np\n\n\ndef {self.quantity}({arguments}):\n    """{about}"""\n{body}\n'
 
     def c(self) -> str:
