@@ -9,6 +9,7 @@ from contextvars import ContextVar
 from dataclasses import replace
 from functools import cached_property
 from importlib import import_module
+from math import hypot
 from operator import itemgetter
 from os import PathLike
 from typing import Any, Final
@@ -36,8 +37,6 @@ _ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness"
 _OF_RUNS: Final = ("mbkit.simulate", "mbkit.studies")
 #: rad: less than this beyond two turns a motion may have come in a step.
 _JUST_BEYOND: Final = 1.0
-#: Below this square of its length no entry of q is beyond two turns.
-FAR_SQUARED: Final = TWO_TURNS**2
 _FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "forces", *CONSTRAINT_FEATURES)
 
 
@@ -164,7 +163,8 @@ class Model(Description):
         if self.quaternions:
             manifold.check_quaternions(self, out, name)
         first = out if out.ndim == 1 else out[:1].ravel()
-        if first.dot(first) > FAR_SQUARED:
+        # Below this length no entry is beyond two turns.
+        if hypot(*first.tolist()) > TWO_TURNS:
             self._look_for_degrees(first, name)
         return out
 

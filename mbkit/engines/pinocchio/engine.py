@@ -9,13 +9,13 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from functools import cached_property
-from math import isfinite
+from math import hypot, isfinite
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 import pinocchio as pin
 
-from mbkit._check import Array
+from mbkit._check import TWO_TURNS, Array
 from mbkit.engines import known_defects
 from mbkit.engines.base import Dynamics, first_names, unit_quaternions
 from mbkit.engines.elements.passive import JointPassive
@@ -28,7 +28,6 @@ from mbkit.engines.regressors import with_losses
 from mbkit.model import Model
 from mbkit.model.base_parameters import RegressorColumns
 from mbkit.model.manifold import NEAR_UNIT
-from mbkit.model.model import FAR_SQUARED
 
 if TYPE_CHECKING:
     from mbkit.show import Kind
@@ -67,7 +66,7 @@ def factory(bare, checked, sound, look):
             if {plain}:
                 out = bare({arguments})
                 if {finite} and sound(q):
-                    if q.dot(q) > far:
+                    if hypot(*q.tolist()) > far:
                         look(q)
                     return out
         except Exception:  # Pinocchio's own errors vary; the checked way words them
@@ -76,7 +75,7 @@ def factory(bare, checked, sound, look):
     return {name}
 """
     scope: dict[str, Any] = {"ndarray": np.ndarray, "double": np.dtype(float), "inf": np.inf, "isfinite": isfinite}
-    scope["far"] = FAR_SQUARED
+    scope |= {"far": TWO_TURNS, "hypot": hypot}
     scope["__name__"] = __name__
     exec(text, scope)
     factory: Callable[[Call, Call, Sound, Call], Call] = scope["factory"]
