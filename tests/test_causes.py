@@ -738,10 +738,10 @@ ARM = (
     [
         ("0.002", "0.01", "beside the terms: timestep 0.002 → 0.01"),
         ("implicitfast", "Euler", "integrator implicitfast → euler"),
-        ('kp="100"', 'kp="80"', "gainprm of actuator 'servo' 100 → 80"),
-        ('kp="100"', 'kp="100" forcerange="-1 1"', "forcerange of actuator 'servo' 0 → -1, 0 → 1"),
-        ('0.1"', '0.1" friction="0.5"', "friction of geom 0 1 → 0.5"),
-        ('name="j"', 'name="j" range="-1 1" limited="true"', "limited of joint 'j' 0 → 1"),
+        ('kp="100"', 'kp="80"', "gainprm of actuator servo 100 → 80"),
+        ('kp="100"', 'kp="100" forcerange="-1 1"', "forcerange of actuator servo 0 → -1 1"),
+        ('0.1"', '0.1" friction="0.5"', "friction of geom 0 1 0.005 0.0001 → 0.5 0.005 0.0001"),
+        ('name="j"', 'name="j" range="-1 1" limited="true"', "limited of jnt j 0 → 1"),
         ("<worldbody>", '<contact><exclude body1="world" body2="b"/></contact><worldbody>', "exclusions of contact"),
     ],
 )

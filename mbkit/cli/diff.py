@@ -75,16 +75,17 @@ def _beside_terms(first: str, second: str) -> tuple[str, ...]:
     from mbkit.load.sanitized_text import strip
 
     paths = [x for x in (first, second) if x.lower().endswith((".xml", ".mjcf")) and os.path.isfile(x)]
-    files = [x for x in (strip(Path(path)) for path in paths) if x.format == "mjcf"]
-    what = "options of simulation, servos, force ranges, contacts, limits"
-    if not files:
+    if not paths:
         return ()
-    if len(files) < 2:
-        return (f"not compared: {what} of {files[0].path.name}",)
+    out: tuple[str, ...] = ()
+    why = f" of {os.path.basename(paths[0])}" if len(paths) < 2 else ""
     try:
-        out = tuple(differences(*(settings_of(x.text, x.meshes) for x in files)))
+        files = [] if why else [strip(Path(path)) for path in paths]
+        out = tuple(differences(*(settings_of(x.text, x.meshes) for x in files))) if files else ()
     except Exception as error:  # MuJoCo raises errors of many kinds
-        return (f"not compared: {what}, as MuJoCo does not read it ({' '.join(str(error).split())[:120]})",)
+        why = f", which MuJoCo does not read here ({' '.join(str(error).split())[:120]})"
+    if why:
+        return (f"not compared: options of simulation, servos, force ranges, contacts, limits{why}",)
     pairs = [sorted((x.tag, *x.attributes.items()) for c in f.root.all("contact") for x in c.children) for f in files]
     out += ("pairs and exclusions of contact",) if pairs[0] != pairs[1] else ()
     lost = any(tag in ("mesh", "hfield") for f in files for tag, _ in f.gone)

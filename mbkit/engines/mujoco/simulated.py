@@ -1,4 +1,4 @@
-"""What MuJoCo holds of an MJCF beside the terms: options of simulation, servos, force ranges, contacts, limits."""
+"""What MuJoCo simulates of an MJCF beside the terms: options, servos, force ranges, contacts, limits."""
 
 from __future__ import annotations
 
@@ -9,69 +9,42 @@ import mujoco
 import numpy as np
 
 #: Options that are numbers of a list.
-_NAMED: Final = {
-    "integrator": mujoco.mjtIntegrator,
-    "cone": mujoco.mjtCone,
-    "jacobian": mujoco.mjtJacobian,
-    "solver": mujoco.mjtSolver,
-}
-#: Kind of object: prefix of its arrays, how many there are, and what acts in runs alone.
-_ARRAYS: Final[tuple[tuple[str, str, str, str], ...]] = (
-    (
-        *("actuator", "actuator", "nu"),
+_NAMED: Final = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}
+#: Kind of object -> how many there are, and what of it acts in runs alone.
+_FIELDS: Final = {
+    "actuator": (
+        "nu",
         "trntype dyntype gaintype biastype dynprm gainprm biasprm gear ctrllimited ctrlrange forcelimited forcerange "
-        "actlimited actrange actearly delay cranklength armature damping",
+        "actlimited actrange delay",
     ),
-    ("joint", "jnt", "njnt", "limited range margin solref solimp actfrclimited actfrcrange"),
-    ("velocity", "dof", "nv", "solref solimp"),
-    (
-        *("tendon", "tendon", "ntendon"),
-        "limited range margin solref_lim solimp_lim frictionloss solref_fri solimp_fri actfrclimited actfrcrange",
-    ),
-    (
-        *("geom", "geom", "ngeom"),
-        "type size pos quat contype conaffinity condim priority friction solmix solref solimp margin gap",
-    ),
-    ("equality", "eq", "neq", "active0 solref solimp"),
-)
-_DIGITS: Final = 6
+    "jnt": ("njnt", "limited range margin solref solimp actfrclimited actfrcrange"),
+    "tendon": ("ntendon", "limited range margin solref_lim solimp_lim frictionloss actfrclimited actfrcrange"),
+    "geom": ("ngeom", "type size pos quat contype conaffinity condim priority friction solref solimp margin gap"),
+    "eq": ("neq", "active0 solref solimp"),
+}
 
-Settings = dict[tuple[str, str], Any]
+Settings = dict[str, Any]
 
 
 def settings_of(text: str, files: dict[str, bytes]) -> Settings:
-    """Return (option or object, what) -> its numbers; raises whatever MuJoCo does over a text that it cannot read."""
+    """Return the numbers by what they are of; raises whatever MuJoCo does over a text that it cannot read."""
     m = mujoco.MjModel.from_xml_string(text, files)
-    names = (x for x in dir(m.opt) if not x.startswith("_") and x != "gravity")
-    out: Settings = {("", name): _value(getattr(m.opt, name), name) for name in names}
-    for kind, prefix, count, fields in _ARRAYS:
+    names = {x: getattr(m.opt, x) for x in dir(m.opt) if not x.startswith("_") and x != "gravity"}
+    out = {x: _NAMED[x](y).name.split("_")[1].lower() if x in _NAMED else _numbers(y) for x, y in names.items()}
+    for kind, (count, fields) in _FIELDS.items():
         for k in range(getattr(m, count)):
-            if kind == "geom" and not (m.geom_contype[k] or m.geom_conaffinity[k]):
-                continue
-            name = "" if kind == "velocity" else getattr(m, prefix)(k).name
-            label = f"{kind} {name!r}" if name else f"{kind} {k}"
-            out |= {(label, field): _value(getattr(m, f"{prefix}_{field}")[k]) for field in fields.split()}
+            if kind != "geom" or m.geom_contype[k] or m.geom_conaffinity[k]:
+                label = f"{kind} {getattr(m, kind)(k).name or k}"
+                out |= {f"{x} of {label}": _numbers(getattr(m, f"{kind}_{x}")[k]) for x in fields.split()}
     return out
 
 
-def _value(x: Any, name: str = "") -> Any:
-    if name in _NAMED:
-        return _NAMED[name](x).name.rpartition("_")[2].lower()
-    return tuple(float(y) for y in np.atleast_1d(x))
+def _numbers(x: Any) -> str:
+    return " ".join(f"{y:.6g}" for y in np.trim_zeros(np.atleast_1d(x).astype(float), "b")) or "0"
 
 
 def differences(a: Settings, b: Settings) -> Iterator[str]:
     """Yield what differs, in words."""
-    owners = {side: {label for label, _ in some} for side, some in (("a", a), ("b", b))}
-    for key, old in a.items():
-        if (new := b.get(key, old)) != old:
-            yield f"{key[1]}{f' of {key[0]}' if key[0] else ''} {_pair(old, new)}"
-    for label in sorted(owners["a"] ^ owners["b"]):
-        yield f"{label} {'lost' if label in owners['a'] else 'new'}"
-
-
-def _pair(old: Any, new: Any) -> str:
-    if isinstance(old, str):
-        return f"{old} → {new}"
-    moved = [(x, y) for x, y in zip(old, new, strict=True) if x != y]
-    return ", ".join(f"{x:.{_DIGITS}g} → {y:.{_DIGITS}g}" for x, y in moved[:2]) + (", ..." if len(moved) > 2 else "")
+    for what in dict.fromkeys([*a, *b]):
+        if a.get(what) != b.get(what):
+            yield f"{what} {a.get(what, 'none')} → {b.get(what, 'none')}"
