@@ -131,14 +131,10 @@ def _inverse_iteration(pencil: Sequence[Array], at: Any, x: Any, y: Any) -> tupl
     inverse = np.linalg.inv(
         (z * z * A + z * B + C) * scale[:, :, None] * scale[:, None, :] + (1 + 1j) * _EPS * np.eye(len(A))
     )
-    x, y = (
-        scale * np.einsum("kij,kj->ki", way, scale * np.einsum("kij,kj->ki", slope, vectors))
-        for way, slope, vectors in (
-            (inverse, 2 * z * A + B, x),
-            (inverse.conj().swapaxes(1, 2), (2 * z * A + B).conj().swapaxes(1, 2), y),
-        )
-    )
-    return x / np.linalg.norm(x / scale, axis=1, keepdims=True), y / np.linalg.norm(y / scale, axis=1, keepdims=True)
+    slope = 2 * z * A + B
+    ahead = scale * np.einsum("kij,kj->ki", inverse, scale * np.einsum("kij,kj->ki", slope, x))
+    back = scale * np.einsum("kji,kj->ki", inverse.conj(), scale * np.einsum("kji,kj->ki", slope.conj(), y))
+    return ahead, back
 
 
 def _unit(M: Array) -> Array:

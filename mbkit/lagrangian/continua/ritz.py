@@ -94,17 +94,19 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
     return NormalModes(np.sqrt(squares), tuple(shapes))
 
 
+_NOT_REAL: Final = (
+    "so that modes need have no shapes of real numbers; take modes without them, discretized, and mbkit.equilibrium"
+)
+
+
 def _moved(system: Densities) -> dict[int, sp.Expr]:
     """Return the forces without loads, which move the place of rest alone; refuse those of rates."""
     out = {}
     for k, x in system.forces.items():
         moving = system.jets.among(x)
-        rates = [s for s in moving if system.jets.order(s)[1][1]]
-        if rates:
-            raise UnsupportedError(
-                f"forces[{system.jets.fields[k]}]: {plain(rates)} damps or turns the modes, which then have no shapes "
-                "of real numbers; take modes without this force, discretized, and mbkit.equilibrium of their Lagrangian"
-            )
+        if rates := [s for s in moving if system.jets.order(s)[1][1]]:
+            what = f"forces[{system.jets.fields[k]}]: {plain(rates)} damps or turns the modes"
+            raise UnsupportedError(f"{what}, {_NOT_REAL}")
         out[k] = sp.expand(x - x.xreplace(dict.fromkeys(moving, sp.Integer(0))))
     return out
 
@@ -206,10 +208,7 @@ class _Ritz:
             B = self._basis(powers)
             M, K = (B.T * A * B for A in self._matrices(powers))
             if mpmath.mnorm(K - K.T, mpmath.inf) > _ZERO * mpmath.mnorm(K, mpmath.inf):
-                raise UnsupportedError(
-                    "forces: they have no potential, so that the modes need have no shapes of real numbers; take modes "
-                    "without them, discretized, and mbkit.equilibrium of their Lagrangian"
-                )
+                raise UnsupportedError(f"forces: they have no potential, {_NOT_REAL}")
             if _cholesky(M) is None:
                 raise NumericalError("T: some shape of a field has no kinetic energy, or a negative one")
             shift, L = mpmath.mpf(0), _cholesky(K)
