@@ -10,12 +10,15 @@ import sys
 import warnings
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import mbkit as mb
+from mbkit.cli import cli
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.oracle import OracleDynamics
@@ -689,3 +692,24 @@ def test_mujoco_is_named_where_its_own_run_is_off(monkeypatch):
     assert {r.off for r in result.rollouts if r.passed is False} == {"mujoco"}
     assert "rollout mujoco_rk4 on mujoco differs" in result.verdict
     assert "pinocchio" not in compare_view.headline(result).split(":")[0]
+
+
+def test_terms_are_told_before_anything_is_integrated(tmp_path: Path) -> None:
+    told: list[mb.studies.Comparison] = []
+    whole = mb.compare(mb.catalog.pendulum(), samples=2, checkpoint=told.append)
+    (terms,) = told
+    assert terms.rows == whole.rows
+    assert terms.passed
+    assert (terms.rollouts, terms.precision, terms.omissions) == ((), None, ())
+    assert whole.rollouts
+    # Timings are counted: the page names how many there are of a setting.
+    assert whole.precision is not None
+    counts = [p.repeats for _, p in whole.precision.rows()]
+    assert 1 <= min(counts) <= max(counts) <= 3
+    out = CliRunner().invoke(cli, ["check", "pendulum", "--samples", "2", "--out", str(tmp_path)])
+    assert out.stderr.startswith("terms: ✓ pinocchio, lagrangian, mujoco agree to ")
+    page = (tmp_path / "pendulum.html").read_text(encoding="utf-8")
+    assert "medians of " in page
+    assert " timings, interleaved in one process, the longest runs timed least" in page
+    brief = CliRunner().invoke(cli, ["check", "pendulum", "--samples", "2", "--no-rollouts", "--out", str(tmp_path)])
+    assert "terms:" not in brief.stderr
