@@ -247,6 +247,15 @@ def test_a_pose_on_another_branch_is_refused_by_its_row() -> None:
         dyn.forward_dynamics(np.array([moving, other]), np.zeros((2, 4)), [1.0, 0, 0, 0])
 
 
+def test_the_digits_of_an_acceleration_under_redundant_rows_are_its_own() -> None:
+    # As many rows as velocities, so that the shapes tell nothing.
+    oracle, q, v = mb.dynamics(mb.catalog.bricard(), "oracle"), np.zeros(6), np.zeros(6)
+    high, low = oracle.extended("forward_dynamics", q, v, np.ones(6))
+    assert np.array_equal(high, oracle.forward_dynamics(q, v, np.ones(6)))
+    assert np.abs(low).max() < EPS * np.abs(high).max()
+    assert high == pytest.approx(high[0] * np.ones(6), rel=1e-14)
+
+
 # A neck of two parallel rods, each welded to a pin: singular values of J from 2.45 down to 4.6e-9
 
 NECK = """

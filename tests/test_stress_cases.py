@@ -23,6 +23,7 @@ from mbkit.studies.stress.cases._common import TABLE
 from mbkit.studies.stress.cases.exact_motions import cart_pole, pendulum, precession
 from mbkit.studies.stress.cases.rigid import box_spin, straight_inertia
 from mbkit.studies.stress.cases.springs import largest_step, stable_steps
+from mbkit.studies.stress.measure import Limits, measure, prepare
 from mbkit.studies.work_precision.reference import gap
 from validation import closed_forms, elliptic
 
@@ -156,6 +157,20 @@ def test_starts_are_consistent(case: Case) -> None:
         M = sample_mass_matrix(model) if model.has_bodies else np.eye(1)
         scaled = M / np.sqrt(np.diag(M))[:, None] / np.sqrt(np.diag(M))
         assert np.linalg.eigvalsh(scaled)[0] > 0
+
+
+@pytest.mark.thorough("neck", "bricard_turned", "delta_robot")
+@pytest.mark.parametrize("name", ["cranks", "neck", "bennett", "bricard_turned", "delta_robot"])
+def test_nearly_redundant_loops_lose_digits_with_their_condition(name: str) -> None:
+    case, scales = cases.get(name), []
+    for value in case.quick:
+        scales += [problem_of(case, value).scale]
+        truth = prepare(case, value, case.bar, 1.0).truth
+        for engine in ("lagrangian", "pinocchio"):
+            cell = measure(case, value, engine, "forward_dynamics", Limits(1.0, 1e-3, 1e-8), truth)
+            assert cell.outcome(case.bar) == "held", (value, engine, cell)
+    # κ grows as the inverse of what makes the rows differ.
+    assert scales[2] / scales[1] == pytest.approx(1e3, rel=0.02)
 
 
 # Closed forms against 40 digits and published figures

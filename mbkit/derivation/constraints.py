@@ -39,7 +39,7 @@ from mbkit.model import Model, NoSlip
 from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.joint_types import cross3
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
-from mbkit.model.manifold import random_state, shortened_steps
+from mbkit.model.manifold import integrate, random_state, shortened_steps
 from mbkit.model.parts import Loop
 from mbkit.model.rolling import LIES_FLAT, NO_SLIP_ROWS, Contact, contact
 from mbkit.model.validation import sample_mass_matrix
@@ -517,7 +517,7 @@ class _Numbers:
         q, size, _ = shortened_steps(self.model, q, terms, step, enough=_CLOSED * 1e-3, most=_STEPS)
         # Dependent rows are told from nearly dependent ones by the last digits.
         for _ in range(_POLISHED):
-            q = self.model.integrate(q, step(*terms(q)[1]))
+            q = integrate(self.model, q, step(*terms(q)[1]))
         size, _ = terms(q)
         # Half a turn away the sine of a frame's angle is zero too, and its rows depend on each other.
         turned = np.array(self._call(q, self._parameters)[3])
@@ -533,7 +533,7 @@ class _Numbers:
         free = np.linalg.svd(J)[2][len(independent_rows(J, len(held))[0]) :]
         moving = np.argsort(-np.linalg.norm(free, axis=0).round(6), kind="stable")[:_BESIDE] if len(free) else ()
         for i in moving:
-            x = self.closed(self.model.integrate(q, _ASIDE * np.eye(len(J.T))[i]), held, still=i)
+            x = self.closed(integrate(self.model, q, _ASIDE * np.eye(len(J.T))[i]), held, still=i)
             if x is not None and np.isfinite(self(x)[1]).all():
                 yield _Pose.of(self(x)[1][kept], len(held), x)
 
@@ -598,7 +598,7 @@ def _chosen_rows(model: Model) -> RowChoice:
 
 
 def _wide(model: Model, rng: np.random.Generator) -> Array:
-    return model.integrate(model.neutral(), rng.uniform(-3, 3, model.nv))
+    return integrate(model, model.neutral(), rng.uniform(-3, 3, model.nv))
 
 
 def _with_something_to_say(numbers: _Numbers, poses: list[Array]) -> list[int]:

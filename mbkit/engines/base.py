@@ -398,7 +398,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         else:
             a = self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
         if self.branches:
-            self._require_branch(q, v, a)
+            pushed = np.add(tau, self.generalized_force(q, wrenches, axes)) if wrenches else tau
+            self._require_branch(q, v, a, pushed)
         return a
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> Any:

@@ -86,6 +86,8 @@ class Constrained:
     _row_choice: Any
     _evaluate: Callable[..., Array]
     _without_friction: Callable[[str], Callable[..., Any]]
+    inverse_dynamics: Callable[..., Array]
+    mass_matrix: Callable[..., Array]
 
     def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
         """Return the forces of dry friction in accelerations under τ, less those in `passive`; (N, nv)."""
@@ -128,8 +130,8 @@ class Constrained:
                 MbkitWarning,
             )
 
-    def _require_branch(self, q: ArrayLike, v: ArrayLike, a: Array) -> None:
-        """Refuse accelerations that break rows which are redundant where the mechanism moves (NumericalError)."""
+    def _require_branch(self, q: ArrayLike, v: ArrayLike, a: Array, force: ArrayLike) -> None:
+        """Refuse accelerations under a force that break rows which are redundant where it moves (NumericalError)."""
         choice = self._row_choice
         lost = [i for i in range(len(choice.kept)) if i not in choice.independent]
         self.branches = bool(lost)
@@ -137,7 +139,13 @@ class Constrained:
             return
         J, gamma = self.constraint_jacobian(q)[..., lost, :], self.constraint_bias(q, v)[..., lost]
         left = np.abs((J @ a[..., None])[..., 0] + gamma)
-        sizes = np.linalg.norm(J, axis=-1) * np.linalg.norm(a, axis=-1)[..., None] + np.abs(gamma)
+        slopes = np.linalg.norm(J, axis=-1)
+        sizes = slopes * np.linalg.norm(a, axis=-1)[..., None] + np.abs(gamma)
+        if not (left <= _OFF_BRANCH * sizes).all():
+            # What holds the mechanism still leaves the rounding of the free acceleration, in any direction.
+            free = np.abs(np.subtract(force, self.inverse_dynamics(q, v, np.zeros_like(a)))).max(axis=-1, keepdims=True)
+            masses = np.diagonal(self.mass_matrix(q), axis1=-2, axis2=-1)
+            sizes = sizes + ROUNDING / _OFF_BRANCH * slopes * free / masses.max(axis=-1, keepdims=True)
         if (broken := np.argwhere(~(left <= _OFF_BRANCH * sizes))).size:
             every = self.constraint_names
             row, names = every[lost[broken[0][-1]]], [every[i] for i in choice.independent]

@@ -55,7 +55,8 @@ class Problem:
     exact, floor, source : callable or None, float, and str
         The closed form of the motion, from times (K,) to q (K, nq), its error, rad or m, and where it is from.
     scale : float
-        Size of the motion, by which an error of q is divided, rad or m.
+        Size of the motion, by which an error of q is divided, rad or m; of terms the condition of the rows, by which
+        one of accelerations is.
     dt : float or None
         Step of fixed-step methods, s, where the case prescribes it.
     facts : dict

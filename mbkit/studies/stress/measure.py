@@ -343,7 +343,7 @@ def measure(
     report_stage("engine")
     dyn, heard = cache.dynamics(engine)
     if isinstance(truth, Terms):
-        cell = _evaluate(value, method, dyn, truth)
+        cell = _evaluate(cache, method, dyn, truth)
     elif case.measure == "terms":
         return Measurement(value, "not run", note="not run: no truth")
     else:
@@ -421,7 +421,7 @@ def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
     return min(drift / size, _MAX_ERROR) if size > 0 and not hidden else math.nan
 
 
-def _evaluate(value: float, term: str, dyn: Dynamics, truth: Terms) -> Measurement:
+def _evaluate(cache: _ValueCache, term: str, dyn: Dynamics, truth: Terms) -> Measurement:
     """Return the error of a term over all states, and the time of one evaluation."""
     report_stage("method")
     arguments = [getattr(truth.at, name) for name in TERMS[term]]
@@ -432,9 +432,10 @@ def _evaluate(value: float, term: str, dyn: Dynamics, truth: Terms) -> Measureme
     # Writeable arrays, as users have them: engines have a fast path for those.
     one = [np.array(x[0]) for x in arguments]
     ns, _ = interleaved({"": lambda: function(*one)}, rounds=3)[""]
-    cell = Measurement(value, "finished", seconds=1e-9 * ns, warnings=tuple(heard))
+    cell = Measurement(cache.value, "finished", seconds=1e-9 * ns, warnings=tuple(heard))
     if not np.isfinite(computed).all():
         return replace(cell, end="nan", note="numbers that are not finite, and nothing was said")
     if term not in truth.values:
         return replace(cell, note=truth.missing[term])
-    return replace(cell, error=error_of(term, computed, truth))
+    condition = cache.problem.scale if term == "forward_dynamics" else 1.0
+    return replace(cell, error=error_of(term, computed, truth) / condition)

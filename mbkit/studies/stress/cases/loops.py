@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
@@ -11,11 +12,14 @@ from numpy.typing import ArrayLike
 
 from mbkit import catalog
 from mbkit._check import Array
+from mbkit.derivation.constraints import choose_rows
+from mbkit.engines import dynamics
 from mbkit.engines.consistent.random_states import states_of
+from mbkit.engines.registry import PINOCCHIO
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.parts import Prescribed
 from mbkit.studies.stress.case import Problem
-from mbkit.studies.stress.cases._common import EPS, Series, motion, powers
+from mbkit.studies.stress.cases._common import EPS, Series, motion, powers, rows
 
 #: Of the four-bar that is cut down to a change point: crank, coupler, rocker, m.
 _CRANK, _COUPLER, _ROCKER = 0.3, 0.9, 0.7
@@ -79,6 +83,120 @@ def heavy_bricard(ratio: float) -> Problem:
     model = replace(model, bodies=(heavy, *others))
     q = model.neutral()
     return _moving(model, q, np.zeros(model.nv), 1.0)
+
+
+# Loops that hold what others hold already, but for so much: at 0 the mechanism would move, and it stands still
+
+
+def _cranks(b: ModelBuilder, apart: float) -> None:
+    """Add three cranks under a plate, of which the third is turned by so much against the others."""
+    tips = [(0.3 * math.sin(angle), 0.0, 0.3 * math.cos(angle)) for angle in (0.4, 0.4, 0.4 + apart)]
+    for k, tip in enumerate(tips):
+        _bar(b, f"crank{k}", "world", _Y, (0.5 * k, 0.0, 0.0), tip)
+    _bar(b, "plate", "crank0", _Y, tips[0], (1.0, 0.0, 0.0))
+    for k in (1, 2):
+        on = tuple(0.5 * k * (i == 0) + x - y for i, (x, y) in enumerate(zip(tips[k], tips[0], strict=True)))
+        b.add_loop(f"loop{k}", "point", body_a=f"crank{k}", translation_a=tips[k], body_b="plate", translation_b=on)
+
+
+def _neck(b: ModelBuilder, apart: float) -> None:
+    """Add a robot's neck: a crank on a plate, turned by two rods beside the plate, each welded to its pin."""
+    top, lever = np.array([-0.033, -0.027, 0.0]), np.array([0.002, 0.007, 0.0])
+    _bar(b, "plate", "world", _Z, (0, 0, 0), top)
+    _bar(b, "crank", "plate", _Z, top, lever)
+    for k, (end, foot) in enumerate(((lever, lever), (-lever, (apart - 1) * lever))):
+        _bar(b, f"pin{k}", "crank", _Z, end, -end)
+        _bar(b, f"rod{k}", "world", _Z, foot, top + end - foot)
+        b.add_loop(f"weld{k}", "frame", body_a=f"rod{k}", translation_a=top + end - foot, body_b=f"pin{k}")
+
+
+def _bennett(b: ModelBuilder, apart: float) -> None:
+    """Add Bennett's mechanism of four bars, whose hinges are square to both their bars, but for a turn of one."""
+    # A skew quadrilateral whose opposite sides are equal (Bennett 1914, The skew isogram mechanism).
+    corners = np.array([[0.5, 0.1, 0.2], [0.1, 0.4, -0.2], [-0.5, -0.1, 0.2], [-0.1, -0.4, -0.2]])
+    sides = np.roll(corners, -1, axis=0) - corners
+    axes = np.cross(np.roll(sides, 1, axis=0), sides)
+    axes[1] += apart * np.linalg.norm(axes[1]) * sides[1] / np.linalg.norm(sides[1])
+    for k in range(4):
+        place = sides[k - 1] if k else corners[0]
+        _bar(b, f"bar{k}", f"bar{k - 1}" if k else "world", axes[k] / np.linalg.norm(axes[k]), place, sides[k])
+    b.add_loop("closed", "frame", body_a="bar3", body_b="world", translation_b=corners[3])
+
+
+_Y, _Z = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+def _bar(b: ModelBuilder, name: str, parent: str, axis: ArrayLike, place: ArrayLike, tip: ArrayLike) -> None:
+    b.add_body(name, mass=1.0, com=0.5 * np.asarray(tip), inertia=(0.01, 0.01, 0.01))
+    b.add_joint(f"{name} hinge", "revolute", parent=parent, child=name, axis=axis, translation=place)
+
+
+def _bricard(apart: float) -> Model:
+    """Return Bricard's mechanism with its second hinge turned by so much."""
+    model = catalog.bricard()
+    axes = np.array([[apart, 1.0, 0.0]]) / math.hypot(apart, 1.0)
+    return replace(model, joints=tuple(replace(x, axes=axes) if x.name == "q2" else x for x in model.joints))
+
+
+def _delta(apart: float) -> Model:
+    """Return the robot Delta with a third rod between a pair, whose lower end is so far out of their plane."""
+    model = catalog.delta_robot()
+    out = np.array([apart, 0.0, 0.0])
+    body = next(x for x in model.bodies if x.name == "rod1a")
+    joint, loop = model.joint("rod1a"), next(x for x in model.loops if x.name == "ball1a")
+    aside = np.array([1.0, 0.0, 1.0])
+    upper, lower = loop.translation_a + out, aside * loop.translation_b + out
+    middle = replace(joint, name="rod1c", child="rod1c", translation=aside * joint.translation)
+    return replace(
+        model,
+        bodies=(*model.bodies, replace(body, name="rod1c")),
+        joints=(*model.joints, middle),
+        loops=(
+            *model.loops,
+            replace(loop, name="ball1c", body_a="rod1c", translation_a=upper, translation_b=lower),
+        ),
+    )
+
+
+#: Rows that are nearer to each other than the last value's count as dependent.
+_redundant = Series(
+    *("near-singular", "apart", "", powers(-1, -10, 3), (1e-1, 1e-4, 1e-7)),
+    measure="terms",
+    bar=1e3 * EPS,
+    why="accelerations lose digits with the condition of the rows in the metric of the mass matrix, which divides them",
+)
+
+
+@rows(
+    _redundant.row("cranks", "Three cranks carry a plate, and one differs by so much, m or rad.", add=_cranks),
+    _redundant.row("neck", "Two rods beside a plate turn a crank, each welded to its pin.", add=_neck),
+    _redundant.row("bennett", "Bennett's mechanism, of six rows three, with one hinge turned.", add=_bennett),
+    _redundant.row("bricard_turned", "Bricard's mechanism, of six rows five, with one hinge turned.", make=_bricard),
+    _redundant.row("delta_robot", "Delta with a third rod between two parallel ones.", make=_delta),
+)
+def nearly_redundant(
+    apart: float,
+    add: Callable[[ModelBuilder, float], None] | None = None,
+    make: Callable[[float], Model] | None = None,
+) -> Problem:
+    """Return the accelerations of a mechanism from rest, under random forces."""
+    if make is not None:
+        model = make(apart)
+    else:
+        b = ModelBuilder("nearly_redundant")
+        assert add is not None
+        add(b, apart)
+        model = b.build()
+    q, v = model.neutral()[None], np.zeros((1, model.nv))
+    return Problem(model, q, v, np.random.default_rng(0).standard_normal((1, model.nv)), scale=condition_of_rows(model))
+
+
+def condition_of_rows(model: Model) -> float:
+    """Return κ of L⁻¹ Jᵀ at the neutral pose with M = L Lᵀ, of independent rows of unit size."""
+    dyn, q = dynamics(model, PINOCCHIO), model.neutral()
+    L = np.linalg.cholesky(dyn.mass_matrix(q))
+    B = np.linalg.solve(L, dyn.constraint_jacobian(q)[list(choose_rows(model).independent)].T)
+    return float(np.linalg.cond(B / np.linalg.norm(B, axis=0)))
 
 
 #: Of a drive: amplitude, m, and frequency, rad/s.
