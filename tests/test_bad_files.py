@@ -600,9 +600,9 @@ def test_what_is_no_file(tmp_path):
         (tmp_path / "pipe.urdf", "not a regular file"),
         (tmp_path, "a folder"),
         (tmp_path / "nowhere.urdf", "no such file"),
-        ("a\0b.urdf", ""),
+        ("a\0b.urdf", None),
         (Path("/dev/zero"), "expected a URDF or MJCF file"),
-        (tmp_path / ("x" * 5000 + ".urdf"), ""),
+        (tmp_path / ("x" * 5000 + ".urdf"), None),
         (tmp_path / "large.urdf", "1073741824 bytes"),
     ):
         with pytest.raises(LoadError, match=expected):

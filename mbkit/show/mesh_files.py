@@ -48,7 +48,9 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
     mean_color = cache(_mean_color)
     try:
         if suffix == ".dae":
-            surfaces = list(_Collada(content, path, mean_color).surfaces())
+            # What is not finite is told of the whole.
+            with np.errstate(invalid="ignore"):
+                surfaces = list(_Collada(content, path, mean_color).surfaces())
         elif suffix == ".obj":
             surfaces = _wavefront(content.decode("utf-8", "replace"), path.parent, mean_color)
         else:
