@@ -38,7 +38,8 @@ ARGUMENTS = {
     name: tuple(
         name
         for name, x in inspect.signature(getattr(Dynamics, name)).parameters.items()
-        if name in ("q", "v", "a", "tau") and x.default is x.empty
+        # Loads take a or τ; here they take a.
+        if name in ("q", "v", "a", "tau") and (x.default is x.empty or name == "a")
     )
     for name in QUANTITIES
     if name != "function"

@@ -79,7 +79,7 @@ class WorkPrecision(ResultTable):
 
     @property
     def untimed(self) -> tuple[str, ...]:
-        """Engines of which no run was measured because the time was used up; who is the fastest is then unknown."""
+        """Engines without a measured run because the time was used up, beside which no engine is the fastest."""
         lost = {r.engine for r in self.refusals if r.reason == OUT_OF_TIME}
         return tuple(sorted(lost - {c.engine for c, p in self.rows() if math.isfinite(p.error)}))
 
