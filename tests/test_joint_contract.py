@@ -61,7 +61,9 @@ def value(dyn, quantity: str, at: dict[str, np.ndarray], axes: tuple[str, ...] =
     more |= {"wrenches": {frame: WRENCH}} if "wrenches" in takes else {}
     options = [{"axes": x} for x in axes] if "axes" in takes else [{}]
     options = [x | {"kind": kind} for x in options for kind in (SPATIAL, CLASSICAL)] if "kind" in takes else options
-    given = [at[name[0]] for name, x in takes.items() if name in ("q", "v", "a", "tau") and x.default is x.empty]
+    # Loads take a or τ; here they take a.
+    needed = (name for name, x in takes.items() if x.default is x.empty or name == "a")
+    given = [at[name[0]] for name in needed if name in ("q", "v", "a", "tau")]
     return np.stack([np.asarray(method(*given, **more, **x)) for x in options], axis=-1)
 
 
