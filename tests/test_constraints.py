@@ -696,6 +696,19 @@ def test_a_start_time_shifts_all_times_of_a_constrained_run(form, method):
         assert run.stats.steps == runs[0].stats.steps or method in ("rk853", "dop853")
 
 
+@pytest.mark.parametrize("run", [False, True])
+@pytest.mark.parametrize("engine", ["pinocchio", "lagrangian"])
+def test_arrays_of_an_open_state_are_told_also_after_a_run(engine, run):
+    """A call that skips the checks of lists skips no open state."""
+    dyn = mb.dynamics(mb.catalog.four_bar(), engine)
+    q, v = mb.dynamics(dyn.model, "lagrangian").project([0.4, 0.0, 1.0], np.zeros(3))
+    if run:
+        mb.simulate(dyn, q, v, 0.002, dt=1e-3)
+        dyn.step(q, v, v, 1e-3)
+    with pytest.warns(MbkitWarning, match="is open by"):
+        dyn.forward_dynamics(q + 0.1 * np.eye(3)[0], v, v)
+
+
 @pytest.mark.parametrize("engine", ["pinocchio", "lagrangian", "oracle"])
 def test_the_first_accelerations_of_an_open_loop_warn(engine):
     model = mb.catalog.slider_crank()

@@ -481,6 +481,31 @@ def test_a_controlled_run_is_drawn_with_its_torques_and_forces():
     assert not any("torques" in (axis.get_ylabel() or axis.get_title()) for axis in free.plot().axes)
 
 
+def test_a_batch_with_parameters_of_its_own_is_not_saved_without_them(tmp_path):
+    dyn = dynamics(catalog.pendulum(mass=mb.Parameter("m", 2.0)), "lagrangian").at(m=[1.0, 2.0])
+    with pytest.raises(UnsupportedError, match=r"save: .* have parameters of their own"):
+        simulate(dyn, np.ones((2, 1)), np.zeros((2, 1)), 0.01).save(tmp_path / "run.npz")
+
+
+def test_the_work_of_a_saved_run_holds_wrenches_held_torques_and_turns_of_dry_friction(tmp_path):
+    """A slide of 2 kg with friction 3 N turns at 0.1 s under a held torque of -7 N, then a table of wrenches pushes."""
+    b = ModelBuilder("slide", gravity=(0, 0, 0))
+    b.add_body("block", mass=2.0, inertia=(1, 1, 1))
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), friction=3.0)
+    push, start = np.zeros((100, 6)), {"q0": [0.0], "v0": [0.5]}
+    push[30:, 0], push[60:, 0] = -2.0, -6.0
+    more = {"torque": lambda t, q, v: [-7.0], "hold": 0.05, "wrenches": {"block": push}}
+    run, path = simulate(dynamics(b.build()), **start, duration=1.0, dt=0.01, **more), tmp_path / "run.npz"
+    run.save(path)
+    again = Trajectory.load(path, run.model)
+    np.testing.assert_array_equal(again.wrenches()["block"], run.wrenches()["block"])
+    assert str(again.events) == str(run.events)
+    assert run.events
+    # 1/2 m (v² - v0²) is the work, as nothing stores energy.
+    np.testing.assert_allclose(again.work(), run.v[:, 0] ** 2 - 0.25, atol=1e-12)
+    np.testing.assert_allclose(again.power_balance(), 0.0, atol=1e-12)
+
+
 @pytest.mark.parametrize("batch", [False, True])
 def test_a_saved_run_comes_back_with_all_its_digits(batch, tmp_path):
     run, path = driven(batch), tmp_path / "run.npz"

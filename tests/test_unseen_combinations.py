@@ -228,3 +228,10 @@ def test_a_path_is_right_or_refuses_a_part_by_name(seed: int, path: str, tmp_pat
         except UnsupportedError as error:
             refusal = str(error)
     assert not refusal or any(word.lower() in refusal.lower() for word in case.words), refusal
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_a_hinge_that_a_loop_holds_may_have_stiction(engine: str) -> None:
+    """It rests whatever its friction is; its response to forces is rounding, of either sign."""
+    case = random_case(203)
+    assert_close(dynamics(case, engine=engine).forward_dynamics(case.q, case.v, case.tau), expected(case))

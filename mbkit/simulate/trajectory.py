@@ -24,10 +24,11 @@ from mbkit.errors import InputError, LoadError, MbkitWarning, OutputError, Unsup
 from mbkit.methods.registry import AUTOMATIC_METHOD, METHODS, Method
 from mbkit.model import Model
 from mbkit.simulate.diagnostics.checks import CHECKED_TIMES, diagnostics
+from mbkit.simulate.events import Hit
 from mbkit.simulate.integrate import integrate
 from mbkit.simulate.result import Stats
 from mbkit.simulate.run_data import RunData, RunSettings, dynamics_of_trajectory
-from mbkit.simulate.torque import SampledTorque
+from mbkit.simulate.torque import PiecewiseConstantTorque, SampledTorque
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -264,7 +265,7 @@ class Trajectory(RunData):
         return out.astype({"trajectory": int}) if self.q.ndim == 3 else out
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write states, forces and what is known of the run to a file of NumPy's (.npz), which `load` reads.
+        """Write states, forces, events and what is known of the run to a file of NumPy's (.npz), which `load` reads.
 
         The model is not in it: its digest is. OutputError where the file cannot be written.
 
@@ -279,10 +280,21 @@ class Trajectory(RunData):
         >>> bool((again.q == run.q).all()), again.method
         (True, 'rk4')
         """
-        about = {"format": 1, "digest": self.model.digest, "model": self.model.name, "method": self.method}
+        if self._dyn is not None and self._dyn.samples is not None:
+            which = f"save: trajectories of {self.model.name} have parameters of their own, which no file keeps"
+            raise UnsupportedError(f"{which}; save runs of one set of numbers, or pickle the batch")
+        about = {"format": 2, "digest": self.model.digest, "model": self.model.name, "method": self.method}
         about |= {"engine": self.engine, "stats": asdict(self.stats)}
-        arrays: dict[str, Any] = {"t": self.t, "q": self.q, "v": self.v, "about": np.array(json.dumps(about))}
-        arrays |= {"tau": self.tau} if self.driven else {}
+        about["wrenches"] = self._acting and ([frame.name for frame in self._acting[0]], self._acting[1])
+        arrays: dict[str, Any] = {"t": self.t, "q": self.q, "v": self.v}
+        # A held force keeps its rows, whose work is exact.
+        if isinstance(acted := self._acted(), SampledTorque):
+            arrays["tau"] = acted.values
+        elif acted is not None:
+            arrays |= {"rows": acted.rows} | ({} if acted.starts is None else {"starts": acted.starts})
+        about["events"] = [(x.name, float(x.t), None if x.member is None else int(x.member)) for x in self.events]
+        arrays |= {f"event_{name}": np.array([getattr(x, name) for x in self.events]) for name in "qv"}
+        arrays["about"] = np.array(json.dumps(about))
         try:
             with open(path, "wb") as file:
                 np.savez_compressed(file, **arrays)
@@ -293,7 +305,7 @@ class Trajectory(RunData):
     def load(cls, path: str | os.PathLike[str], model: Model) -> Trajectory:
         """Return a run that `save` wrote, of the same model; nothing in the file is executed.
 
-        Events, wrenches on frames and what a run was started with are not in it: `check` knows its doubts alone.
+        The settings of the run are not in it: `check` knows its doubts alone.
 
         Raises
         ------
@@ -311,14 +323,18 @@ class Trajectory(RunData):
             stats |= {"reached": tuple(reached) if isinstance(reached, list) else reached}
             known = Stats(**stats | {"doubts": tuple(stats["doubts"])})
             parts = arrays["t"], arrays["q"], arrays["v"], model, about["method"], about["engine"], known
-            digest = about["digest"]
+            digest, acting = about["digest"], about.get("wrenches")
+            listed = zip(about.get("events", ()), arrays.get("event_q", ()), arrays.get("event_v", ()), strict=True)
+            hits = tuple(Hit(name, t, q, v, member) for (name, t, member), q, v in listed)
         except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
             raise LoadError(f"{path}: expected a run that Trajectory.save wrote ({error})") from None
         if digest != model.digest:
             other = f"a run of {about['model']!r} with other numbers than this {model.name!r}"
             raise InputError(f"model: {path} is {other} (digests differ)")
-        acted = SampledTorque(arrays["tau"]) if "tau" in arrays else None
-        return cls(*parts, _applied=acted)
+        rows, tau = arrays.get("rows"), arrays.get("tau")
+        held = None if rows is None else PiecewiseConstantTorque(rows, arrays.get("starts"))
+        frames = acting and (tuple(model.frame(name) for name in acting[0]), acting[1])
+        return cls(*parts, events=hits, _applied=held if tau is None else SampledTorque(tau), _acting=frames)
 
     def _facts(self) -> list[tuple[str, str]]:
         count = f"{len(self.q)} trajectories of " if self.q.ndim == 3 else ""

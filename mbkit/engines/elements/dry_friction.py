@@ -294,6 +294,9 @@ class DryFriction:
         for j in np.flatnonzero(self.law.bound):
             unit = np.broadcast_to(size * np.eye(a.shape[-1])[j], a.shape)
             out[..., j] = (np.asarray(accelerate(tau + _padded(unit, tau)), dtype=np.float64) - a) / size
+        # A joint that loops hold responds by rounding alone, of either sign; the least response keeps A definite.
+        masses, own = (np.einsum("...ii->...i", np.asarray(x)) for x in ((dyn._bare or dyn).mass_matrix(q), out))
+        own[...] = np.maximum(own, _PROXIMAL / np.where(masses > 0, masses, np.inf))
         return np.asarray(0.5 * (out + out.mT))
 
     def phase(self, dyn: Any, sides: Array, still: Mask) -> Any:

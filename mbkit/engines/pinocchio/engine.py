@@ -206,13 +206,11 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
             if self._joint_passive.armature is not None:
                 own = {name: own[name] for name in ("gravity", "nle")}
             bare |= own
-        if self.model.constrained:
-            bare["forward_dynamics"] = self._locked(self._forward_dynamics)
         if self.model.forces or needs.friction:
             # They are added the checked way.
             del bare["inverse_dynamics"], bare["forward_dynamics"]
-        elif self.model.prescribed:
-            # Of one time, and `at` copies the rest.
+        elif self.model.constrained:
+            # States that are open, or on another branch, are told the checked way.
             del bare["forward_dynamics"]
         for name, call in bare.items():
             checked = getattr(self, name)
