@@ -37,6 +37,7 @@ PARTS = {
     ),
     "energy_drift": Part(1, ("energy_drift.json",), "a million steps of a symplectic method"),
     "long_loops": Part(1, ("long_loops.json",), "a million steps of mechanisms with loops: gap and energy"),
+    "near_redundant": Part(2, ("near_redundant.json",), "digits of accelerations beside the condition of the rows"),
     "lint": Part(5, ("lint.json",), "what lint finds on the robots, with verdicts, and of planted mistakes"),
     "importers": Part(1, ("importers.json", "importers_floating.json"), "one file through three importers"),
     "importers_trained": Part(20, ("importers_trained.json",), "the robots through importers of trained engines"),

@@ -196,7 +196,7 @@ class OrthogonalColumns:
     """
 
     def __init__(self, B: Any) -> None:
-        self._n, self._m = B.shape
+        self._B, (self._n, self._m) = B, B.shape
         columns: list[dict[int, Any]] = [{} for _ in range(self._m)]
         for i, j in zip(*B.sparsity().get_triplet(), strict=True):
             columns[j][i] = scalar(B[i, j])
@@ -255,19 +255,41 @@ class OrthogonalColumns:
 
     def held(self, free: Any, rate: Any) -> tuple[Any, Any]:
         """Return the y nearest to `free` with Bᵀ y = rate, and λ with y = free + B λ; columns (n, k) and (m, k)."""
-        z = self._coordinates(rate, self._m)
-        y = {i: scalar(free[i, :]) for i in range(self._n)}
-        for j in range(self._m):
-            self._reflect(j, y)
-        left = [a - y.get(p, 0.0) for a, p in zip(z, self._pivots, strict=True)]
-        multipliers: list[Any] = [0.0] * self._m
+        z, y = self._coordinates(rate, self._m), self._turned(free)
+        weights = self.weights([a - y.get(p, 0.0) for a, p in zip(z, self._pivots, strict=True)])
+        return self._back(y | dict(zip(self._pivots, z, strict=True)), self._m, rate.shape[1]), weights
+
+    def balanced(self, f: Any, which: list[int]) -> tuple[Any, Any, list[Any]]:
+        """Return the least f - B λ whose entries `which` are zero, λ, and how far B's rows `which` determine it.
+
+        With μ = R λ it is f - Q μ: of the μ with the rows of Q μ = f the nearest to Qᵀ f. The last are squares of the
+        parts of these rows beside those before, of one at most.
+        """
+        y = self._turned(f)
+        mu, rows = ca.vertcat(ca.SX(0, 1), *(y.get(p, ca.SX(1, 1)) for p in self._pivots)), self._B[which, :]
+        own = OrthogonalColumns(ca.vertcat(ca.SX(0, len(which)), *self._coordinates(rows.T, self._m)))
+        mu, _ = own.held(mu, f[which])
+        parts = [scalar(mu[i]) for i in range(self._m)]
+        left = f - self._back(dict(zip(self._pivots, parts, strict=True)), self._m, 1)
+        # It vanishes up to rounding.
+        left[which] = 0.0
+        return left, self.weights(parts), [1.0 / ca.SX(x) ** 2 for x in own.inverse]
+
+    def weights(self, z: list[Any]) -> Any:
+        """Return λ with R λ = z."""
+        left, out = [*z], [ca.SX(0.0)] * self._m
         for j in reversed(range(self._m)):
-            multipliers[j] = left[j] * self.inverse[j]
+            out[j] = left[j] * self.inverse[j]
             for i, r in self._R[j].items():
-                left[i] = left[i] - r * multipliers[j]
-        y |= dict(zip(self._pivots, z, strict=True))
-        k = rate.shape[1]
-        return self._back(y, self._m, k), ca.vertcat(ca.SX(0, k), *multipliers)
+                left[i] = left[i] - r * out[j]
+        return ca.vertcat(*out)
+
+    def _turned(self, y: Any) -> dict[int, Any]:
+        """Return the entries of the reflections of y, (n, k); those at the pivots are Qᵀ y."""
+        out = {i: scalar(y[i, :]) for i in range(self._n)}
+        for j in range(self._m):
+            self._reflect(j, out)
+        return out
 
     def _coordinates(self, rate: Any, rows: int) -> list[Any]:
         """Return R^-ᵀ rate."""
@@ -422,9 +444,7 @@ class Constraints:
         dependent = [i for i in range(rows.shape[0]) if i not in independent]
         if not dependent:
             return multipliers
-        G, W = Factors(ca.mtimes(J, J.T), range(m)), ca.SX(len(dependent), m)
-        for _ in range(1 + _REFINED):
-            W += G.solve(ca.mtimes(J, (rows[dependent, :] - ca.mtimes(W, J)).T)).T
+        W = -OrthogonalColumns(J.T).held(rows[dependent, :].T, ca.SX(m, len(dependent)))[1].T
         own = Factors(ca.SX.eye(m) + ca.mtimes(W.T, W), range(m)).solve(multipliers)
         out: Any = ca.SX(rows.shape[0], 1)
         out[list(independent)], out[dependent] = own, ca.mtimes(W, own)
@@ -719,36 +739,16 @@ class ConstraintQuantities:
         One column: τ, λ of all rows, J a + γ, and of its rows the sizes; last the remainder of the worst row of J once
         the others are taken away, or of a velocity without an actuator in J's rows, as a square.
 
-        With f = M a + h - τ_passive, split into the actuated velocities S and the others U, λ minimizes
-        |f_S - J_Sᵀ λ|² where J_Uᵀ λ = f_U. By Lagrange's multipliers μ, since J_S f_S + J_U f_U = J f::
-
-            J Jᵀ λ = J f + J_U μ        J_Uᵀ λ = f_U
+        With f = M a + h - τ_passive, τ = f - Jᵀ λ is zero where nothing acts.
         """
         c, n = self.constraints, self.model.nv
-        J, f, m = c.jacobian, self.inverse_dynamics, c.jacobian.shape[0]
+        J, f = c.jacobian, self.inverse_dynamics
         others = [i for i in range(n) if i not in actuators]
-        gram = ca.mtimes(J, J.T)
-        G, rest = Factors(gram, range(m)), J[:, others]
-        Y = G.solve(rest)
-        reduced = ca.mtimes(rest.T, Y)
-        S = Factors(reduced, range(len(others)))
-
-        def holding(force: Any) -> Any:
-            x = G.solve(ca.mtimes(J, force))
-            return x + ca.mtimes(Y, S.solve(force[others] - ca.mtimes(rest.T, x))) if others else x
-
-        multipliers = holding(f)
-        for _ in range(_REFINED):
-            multipliers = multipliers + holding(f - ca.mtimes(J.T, multipliers))
-        tau = f - ca.mtimes(J.T, multipliers)
-        # It vanishes up to rounding.
-        tau[others] = 0.0
+        rows = OrthogonalColumns(J.T)
+        tau, multipliers, parts = rows.balanced(f, others)
         left: Any = ca.SX(1.0)
-        for k, inverse in enumerate(G.inverse):
-            left = ca.fmin(left, 1.0 / (ca.SX(inverse) * gram[k, k]))
-        # A part of the projection on J's rows: one at most.
-        for inverse in S.inverse:
-            left = ca.fmin(left, 1.0 / ca.SX(inverse))
+        for part in (*(1.0 / (x * ca.SX(y) ** 2) for x, y in zip(rows.squares, rows.inverse, strict=True)), *parts):
+            left = ca.fmin(left, part)
         rates = ca.mtimes(J, self.a) + c.gamma
         out = ca.vertcat(tau, self._spread(multipliers), rates, ca.sqrt(ca.sum2(J**2)), left)
         return self.named("actuator_forces", ("q", "v", "a"), [self.q, self.v, self.a], out)
@@ -838,7 +838,7 @@ class ConstrainedMotion(ConstraintQuantities):
 
     @cached_property
     def constraint_factors(self) -> ConstraintFactors:
-        """Factors of M, or more careful ones where M would lose digits, and of J M⁻¹ Jᵀ."""
+        """Factors of M, or more careful ones where M would lose digits, and of J's rows in its metric."""
         doubtful = self.elimination == "least constraint"
         careful = singular_mass_matrix(self.model) or (doubtful and self._constraints_hold_what_mass_does_not())
         times = _REFINED_CAREFUL if careful else _REFINED if doubtful else 0
@@ -893,9 +893,7 @@ class ConstrainedMotion(ConstraintQuantities):
         pushed = self.tau + motion.generalized_force(frames, axes, wrenches) if frames else self.tau
         acting = self.inverse_dynamics - pushed
         J = self.constraints.jacobian
-        G, multipliers = Factors(ca.mtimes(J, J.T), range(J.shape[0])), ca.SX(J.shape[0], 1)
-        for _ in range(1 + _REFINED):
-            multipliers += G.solve(ca.mtimes(J, acting - ca.mtimes(J.T, multipliers)))
+        left, multipliers, _ = OrthogonalColumns(J.T).balanced(acting, [])
         loops = rows.loop_wrenches(multipliers)
         outside, own = [], []
         for loop, (force, moment) in zip(self.model.loops, loops, strict=True):
@@ -912,7 +910,6 @@ class ConstrainedMotion(ConstraintQuantities):
                     own.append(ca.horzcat(*(ca.SX(y) for x in (F, N) for y in constant_transposed_times(R, x))))
                 outside.append((body, F, add(N, cross3(point, F))))
         table = motion.joint_wrenches(joints, frames, axes, wrenches, outside)
-        left = acting - ca.mtimes(J.T, multipliers)
         sizes = ca.horzcat(ca.norm_2(left), ca.norm_2(self.inverse_dynamics) + ca.norm_2(pushed), ca.SX(1, 4))
         out = ca.vertcat(table, ca.SX(0, 6), *own, sizes)
         given = {"q": self.q, "v": self.v, "a": self.a, "tau": self.tau, "wrenches": wrenches}

@@ -32,7 +32,7 @@ _AHEAD: Final = 4
 _WINDOW: Final = 4
 #: Of a unit vector: the entries of the constraints that depend on each other.
 _TAKES_PART: Final = 0.1
-#: Of the rows' size, 1/s: what typed digits leave of a velocity that is zero, as in `independent_rows`.
+#: Of the rows' size, 1/s: what typed digits leave of a velocity that is zero.
 _STILL: Final = 1e-7
 #: Of what γ can be at velocities of this size: its rest at one that stays on a branch to the digits of a loose run.
 _ON_BRANCH: Final = 1e-5

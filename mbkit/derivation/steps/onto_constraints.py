@@ -8,9 +8,9 @@ end of the step, Y = M⁻¹ Jᵀ there, and the drift taken away in the metric o
 the order of the method stays (Hairer, Lubich, Wanner 2006, Geometric Numerical Integration, algorithm IV.4.2). Rows
 that hold velocities alone move no position: the coordinates go where the velocities led them.
 
-λ and μ are found by the simplified Newton iteration, with the factors of S = J Y at q. As a rule one iteration is
-enough, even with the factors that the last stage has left: the drift is that of a step, and the stage is near the end.
-`quick_projection` says where that leaves more than rounding, and the step is then taken again with
+λ and μ are found by the simplified Newton iteration, with the factors of forward dynamics at q. As a rule one iteration
+is enough, even with the factors that the last stage has left: the drift is that of a step, and the stage is near the
+end. `quick_projection` says where that leaves more than rounding, and the step is then taken again with
 `thorough_projection`. Both have the same result, to rounding, as `mbkit.engines.constraint_manifold.Manifold.pulled`,
 which goes on for as long as it takes.
 """
@@ -133,7 +133,7 @@ def _shift(equations: Any) -> ca.Function:
 
 
 def _change(equations: Any) -> ca.Function:
-    """Return (q, residual, more) -> -M⁻¹ Jᵀ S⁻¹ residual: the least change of velocities by which rows lose a residual.
+    """Return (q, residual, more) -> the least change of velocities, in the metric of M, by which rows lose a residual.
 
     Its factors are those of forward dynamics at q, which a program has once.
     """
@@ -149,8 +149,8 @@ def _change(equations: Any) -> ca.Function:
 def dependence(equations: Any) -> ca.Function:
     """Return (q, more) -> how nearly rows of J depend on each other.
 
-    The largest ratio of a pivot of S at usual poses to the one at q: about 1, and infinite where a row follows from
-    others or has no slope. Its root grows as the inverse of the distance from such a pose.
+    The largest ratio of a row's square at usual poses, in the metric of M, to that of its part beside the rows before
+    it at q: infinite where a row follows from others or has no slope. Its root grows as the inverse of the distance.
     """
     if "dependence" not in equations.kept:
         worst: Any = 0.0
@@ -163,11 +163,11 @@ def dependence(equations: Any) -> ca.Function:
 
 
 def _largest(equations: Any) -> list[float]:
-    """Return the largest diagonal entries of S at some configurations, at the nominal values of parameters."""
+    """Return the largest squares of rows in the metric of M at some configurations, at nominal values of parameters."""
     model, extra = equations.model, equations.extra_arguments
     given = [np.array([1.0 if x is None else x for x in model.parameters.values()])] if extra else []
     diagonal = ca.Function(
-        "S", [equations.q, *extra.values()], [ca.densify(ca.vertcat(*equations.constraint_factors.rows.squares))]
+        "squares", [equations.q, *extra.values()], [ca.densify(ca.vertcat(*equations.constraint_factors.rows.squares))]
     )
     poses = random_state(model, np.random.default_rng(0), _POSES)[0]
     values = np.array([np.array(diagonal(q, *given))[:, 0] for q in poses])

@@ -32,7 +32,7 @@ LEAST: Final = "least"
 _CONSISTENT: Final = 1e-8
 #: Square of the remainder of a row beside the others, from which on singular values look at it again. The square of
 #: `mbkit.derivation.constraints.DEPENDENT` with four digits to spare.
-_SUSPECT: Final = 1e-10
+_SUSPECT: Final = 1e-20
 
 
 class ActuatorForces(NamedTuple):
@@ -160,18 +160,13 @@ class Actuation(Constrained):
         self._require_consistent(rows @ a + gamma[own], sizes, a)
         self._require_determined(rows, which)
         others = [i for i in range(self.model.nv) if i not in which]
-        scaled = (rows / sizes[:, None]).T
-        # Of the multipliers those that the joints without actuators need, and beside these the best for the others.
-        Q, R = np.linalg.qr(scaled[others].T, mode="complete")
-        k = len(others)
-        multipliers = Q[:, :k] @ np.linalg.solve(R[:k].T, f[others]) if k else np.zeros(len(rows))
-        free, acting = Q[:, k:], list(which)
-        if free.shape[1]:
-            left = f[acting] - scaled[acting] @ multipliers
-            multipliers = multipliers + free @ np.linalg.lstsq(scaled[acting] @ free, left, rcond=None)[0]
-        tau = f - scaled @ multipliers
+        Q, R = np.linalg.qr((rows / sizes[:, None]).T)
+        # As `mbkit.derivation.constraints.OrthogonalColumns.balanced`.
+        mu = Q.T @ f
+        mu += np.linalg.lstsq(Q[others], f[others] - Q[others] @ mu, rcond=None)[0]
+        tau = f - Q @ mu
         tau[others] = 0.0
-        return np.concatenate([tau, spread(rows, J, multipliers / sizes)])
+        return np.concatenate([tau, spread(rows, J, np.linalg.solve(R, mu) / sizes)])
 
     def _judged(self, out: Array, q: Array, a: Array, which: tuple[int, ...]) -> Array:
         """Return τ and λ of `mbkit.derivation`'s answer for states, or raise why they are not determined."""

@@ -131,7 +131,7 @@ class EnergyEquations(ConstraintQuantities, Equations):
 
     @cached_property
     def constraint_factors(self) -> ConstraintFactors:
-        """Factors of M and of J M⁻¹ Jᵀ."""
+        """Factors of M and of J's rows in its metric."""
         return ConstraintFactors(self.constraints, self.mass_matrix, self.elimination_order, careful=True, refined=2)
 
     @cached_property
