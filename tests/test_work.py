@@ -125,6 +125,18 @@ def test_the_drive_of_a_prescribed_motion_does_the_work() -> None:
         run.work("pinocchio")
 
 
+def test_the_drive_of_a_table_works_from_its_first_time_to_its_last() -> None:
+    """Nothing is known of a table beyond its ends, where rates are those of one side."""
+    b, t = block(), np.linspace(0, 2, 41)
+    b.prescribe("x", (t, 0.3 * np.sin(2 * t)))
+    dyn = mb.dynamics(b.build(point_masses=True), "lagrangian")
+    q, v = dyn.at(**{str(dyn.model.time_parameter): 0.0}).project([0.0], [0.6])
+    run = simulate(dyn, q, v, 2.0, dt=1e-3)
+    assert run.work()[-1] == pytest.approx(run.v[-1, 0] ** 2 - run.v[0, 0] ** 2, abs=3e-6)
+    # At the knots of a cubic spline the power has another rate on each side.
+    assert np.abs(run.power_balance()).max() < 3e-6
+
+
 def test_a_hoop_that_turns_does_work_on_its_bead() -> None:
     """T2 - T0 + V stays, so that T + V changes by 2 T0 = m R² Ω² sin² θ."""
     run = written(systems.bead_on_hoop, 0.02)

@@ -176,7 +176,8 @@ class _Copier:
             self.left -= int(count) * inside
             return int(count) * inside
         got = element.attributes.get("count", "")[:40]
-        self.read.fault(f"<replicate>: count {got!r}; expected a whole number up to {most}", element)
+        more = f"expected a whole number up to {most}, as all copies may have {MOST_ELEMENTS:,} elements"
+        self.read.fault(f"<replicate>: count {got!r}; {more}", element)
         for one in (e for e in element.walk() if e.tag == "replicate"):
             one.tag, one.attributes = "frame", {}
         return inside

@@ -349,17 +349,17 @@ def _with_rate(
     """Return a power of (q, v), and its rate along the motion."""
     model, clock = dyn.model, dyn.model.time_parameter
     of_samples: Any = dyn
+    up = down = np.broadcast_to(_NEAR * h, (*q.shape[:-1], 1))
+    if clock is not None:
+        # The time is the last parameter; beyond its ends a table is not known.
+        times = of_samples.parameter_values[:, -1].reshape(up.shape)
+        up, down = np.minimum(up, model.interval[1] - times), np.minimum(up, times - model.interval[0])
 
     def after(s: Array) -> Array:
         there = (integrate_finite(model, q, s * v), v + s * a)
-        if clock is None:
-            return power(dyn, *there)
-        # The time is the last parameter.
-        times = of_samples.parameter_values[:, -1] + np.broadcast_to(s[:, 0], q.shape[:-1]).ravel()
-        return power(dyn.at(**{clock: times}), *there)
+        return power(dyn if clock is None else dyn.at(**{clock: (times + s).ravel()}), *there)
 
-    s = _NEAR * h
-    return power(dyn, q, v), (after(s) - after(-s)) / (2 * s[:, 0])
+    return power(dyn, q, v), (after(up) - after(-down)) / (up + down)[..., 0]
 
 
 def _driven(dyn: Dynamics) -> bool:
