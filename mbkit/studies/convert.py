@@ -153,6 +153,8 @@ def _to_mjcf(model: Model) -> Converted:
     text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
     at = states_of(model, _STATES, 0)
     back = read_back(model, text)
+    # What MuJoCo cannot give, it refuses by name: loops beside mimic joints.
+    back.mass_matrix(at.q)
     values = evaluated(back, at)
     if model.needs.loops:
         own = dynamics(model, DERIVED, compile=False).constraint_residual(at.q)
