@@ -275,6 +275,9 @@ def test_the_digits_of_an_acceleration_under_redundant_rows_are_its_own() -> Non
     assert np.array_equal(high, oracle.forward_dynamics(q, v, np.ones(6)))
     assert np.abs(low).max() < EPS * np.abs(high).max()
     assert high == pytest.approx(high[0] * np.ones(6), rel=1e-14)
+    wrenches = {"bar1": np.ones(6)}
+    high, _ = oracle.extended("forward_dynamics", q, v, np.ones(6), wrenches)
+    assert np.array_equal(high, oracle.forward_dynamics(q, v, np.ones(6), wrenches))
 
 
 # A neck of two parallel rods, each welded to a pin: singular values of J from 2.45 down to 4.6e-9

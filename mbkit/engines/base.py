@@ -391,6 +391,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if self.looks:
             self.looks = False
             self._warn_of_open_states(q)
+        # The last evaluation is that of the accelerations, whose digits `OracleDynamics` keeps.
+        pushed = np.add(tau, self.generalized_force(q, wrenches, axes)) if wrenches and self.branches else tau
         if wrenches:
             frames, w = self._stacked_wrenches(wrenches)
             acting = frames, axes_named(axes)
@@ -398,7 +400,6 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         else:
             a = self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
         if self.branches:
-            pushed = np.add(tau, self.generalized_force(q, wrenches, axes)) if wrenches else tau
             self._require_branch(q, v, a, pushed)
         return a
 
