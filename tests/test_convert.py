@@ -15,6 +15,7 @@ from mbkit.cli import cli
 from mbkit.engines.mujoco.mjcf_writer import mjcf_text, read_back
 from mbkit.errors import InputError, MbkitError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.load import xml_reader
+from tests.plain_mechanics import random_case
 from tests.random_trees import IN_MUJOCO, random_tree
 
 
@@ -159,6 +160,12 @@ def test_roll_pitch_yaw_are_those_of_the_matrix_next_to_a_right_angle_too() -> N
         roll, yaw = rng.uniform(-3, 3, 2)
         R = spatial.matrix_from_rpy(roll, pitch, yaw)
         np.testing.assert_allclose(spatial.matrix_from_rpy(*spatial.rpy_from_matrix(R)), R, rtol=0, atol=2e-15)
+
+
+def test_loops_beside_mimic_joints_are_refused_by_name() -> None:
+    # MuJoCo would hold both softly, and its terms of them are none to read back.
+    with pytest.raises(UnsupportedError, match=r"loops and mimic joints \('j2'\)"):
+        mb.convert(random_case(148).model(), "mjcf")
 
 
 def test_the_door(tmp_path: Path) -> None:
