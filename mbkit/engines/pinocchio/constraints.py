@@ -273,8 +273,6 @@ class PinConstraints:
         NumericalError
             A singular pose, or a mass matrix that is singular on what the rows leave free.
         """
-        from scipy.linalg import solve_triangular
-
         from mbkit.derivation.constraints import DEPENDENT
 
         which = list(self.choice.independent)
@@ -297,19 +295,19 @@ class PinConstraints:
             raise NumericalError(
                 f"pinocchio: the mass matrix of {self._model.name} is singular on what its constraints leave free"
             ) from None
-        B = solve_triangular(L, scaled.T, lower=True)
+        B = np.linalg.solve(L, scaled.T)
         lengths = np.linalg.norm(B, axis=0)
         if k and np.linalg.svd(B / np.where(lengths > 0, lengths, 1.0), compute_uv=False)[-1] < DEPENDENT:
             raise NumericalError(self._singular(scaled))
         Q, R = np.linalg.qr(B)
         for _ in range(1 + _REFINED):
             rate = -(gamma + J @ a) / sizes
-            free = solve_triangular(L, across * (force - M @ a + J.T @ forces) + scaled.T @ rate, lower=True)
-            along, z = Q.T @ free, solve_triangular(R, rate, trans="T")
+            free = np.linalg.solve(L, across * (force - M @ a + J.T @ forces) + scaled.T @ rate)
+            along, z = Q.T @ free, np.linalg.solve(R.T, rate)
             left = free - Q @ along
             x = left - Q @ (Q.T @ left) + Q @ z
-            a = a + across * solve_triangular(L, x, lower=True, trans="T")
-            forces = forces + solve_triangular(R, z - along) / sizes
+            a = a + across * np.linalg.solve(L.T, x)
+            forces = forces + np.linalg.solve(R, z - along) / sizes
         return a, spread(J, rows.J, forces)
 
     def _singular(self, J: Array) -> str:
