@@ -32,8 +32,7 @@ from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, follower
 from mbkit.derivation.least_constraint import hard_poses
-from mbkit.derivation.mass_matrix_solve import Factors
-from mbkit.derivation.model_values import scalar
+from mbkit.derivation.mass_matrix_solve import ConstraintFactors, ConstraintTerms, Factors, OrthogonalColumns
 from mbkit.errors import InputError
 from mbkit.model import Model, NoSlip
 from mbkit.model.elements.motion_laws import MOTION_LAWS
@@ -44,9 +43,6 @@ from mbkit.model.parts import Loop
 from mbkit.model.rolling import LIES_FLAT, NO_SLIP_ROWS, Contact, contact
 from mbkit.model.validation import sample_mass_matrix
 
-#: Mass of a coordinate that has none, in terms of the mean one.
-_MASSLESS: Final = 1e-20
-_TINY: Final = 1e-300
 #: Times that a solution is refined by careful factors, and by those of a mass matrix that loses digits where a joint
 #: locks. Each time leaves what the factors lose of the error before.
 _REFINED_CAREFUL: Final = 2
@@ -54,8 +50,6 @@ _REFINED: Final = 1
 #: Part of a row that is left of it, once the others are taken away, up to which it follows from them: rounding of J at
 #: a pose that is known to all digits, times the some thousand operations that lead to it.
 DEPENDENT: Final = 1e-12
-#: Largest size of a row over its remainder with which accelerations still have digits: κ up to about as much.
-MOST_DEPENDENT: Final = 1e12
 #: Of a mechanism's size: what a few typed digits leave where ends can meet.
 _MEETS: Final = 1e-9
 #: Height of a disc's centre over its radius below which it lies flat: there its height has a kink, where searches for a
@@ -83,231 +77,6 @@ _KNOWN: Final = 1e-5
 #: Poses beside a closed one, and how far they are away, rad or m.
 _BESIDE: Final = 3
 _ASIDE: Final = 0.2
-
-
-class ConstraintTerms:
-    """f(q, t), and of all rows J, the rate J v + c, and γ, with the rate's derivative J v̇ + γ.
-
-    `names` has one text for each row, and `qdot` is D(q) v where velocities are not the coordinates' rates. `speeds`
-    has A v - b of the rows that hold velocities alone, which stand behind those of f. `by_time` is c: ∂f/∂t, then -b.
-    """
-
-    def __init__(
-        self,
-        value: ca.SX,
-        q: ca.SX,
-        v: ca.SX,
-        time: Any,
-        names: tuple[str, ...],
-        qdot: ca.SX | None = None,
-        speeds: ca.SX | None = None,
-    ) -> None:
-        self.value, self.names = value, names
-        self._q, self._v, self._qdot = q, v, qdot
-        by_q = ca.jacobian(value, q)
-        J = by_q if qdot is None else ca.mtimes(by_q, ca.jacobian(qdot, v))
-        speeds = ca.SX(0, 1) if speeds is None else speeds
-        self.jacobian = ca.vertcat(J, ca.jacobian(speeds, v))
-        by_time = ca.SX(value.shape[0], 1) if time is None else ca.jacobian(value, time)
-        self.by_time = ca.vertcat(by_time, ca.substitute(speeds, v, ca.SX.zeros(*v.shape)))
-        self.rate = ca.vertcat(ca.mtimes(J, v) + by_time, speeds)
-        self.gamma = ca.jtimes(self.rate, q, v if qdot is None else qdot)
-        if time is not None:
-            self.gamma = self.gamma + ca.jacobian(self.rate, time)
-
-    def rate_along(self, by: Any) -> Any:
-        """Return the derivative of ḟ along a move of the configuration, (nv,), with v and the time held."""
-        move = by if self._qdot is None else ca.substitute(self._qdot, self._v, by)
-        return ca.jtimes(self.rate, self._q, move)
-
-    @property
-    def positions(self) -> int:
-        """How many rows hold positions: the first ones."""
-        return int(self.value.shape[0])
-
-    def stiffening(self, M: Any) -> Any:
-        """Return s > 0, (m, 1), so that W = M + Jᵀ diag(s) J has an inverse where M has it on J's null space.
-
-        With J v̇ prescribed, the term changes neither v̇ nor λ. s is the geometric mean of the sum's and the lightest
-        coordinate's mass along a row: W keeps the digits of both, of a light rod in a loop as of a heavy body.
-        """
-        masses = ca.diag(M)
-        masses = masses + _MASSLESS / masses.shape[0] * ca.sum1(masses)
-        squares = self.jacobian**2
-        heavy, light = ca.mtimes(squares, masses), ca.mtimes(squares, 1 / masses)
-        # Of a row without slope the term is zero.
-        return ca.sqrt((heavy + _TINY) / (light + _TINY)) / (ca.sum2(squares) + _TINY)
-
-    def weight(self, M: Any, rows: int | None = None) -> Any:
-        """Return W = M + Jᵀ diag(s) J of `stiffening`, of all rows or of the first ones."""
-        J = self.jacobian[:rows, :]
-        return M + ca.mtimes(J.T, self.stiffening(M)[:rows, :] * J)
-
-
-class ConstraintFactors:
-    """Factors of M = LᵀDL and of J's rows in the metric of M, which give v̇ and λ, and how often they are `refined`.
-
-    B = D^-½ L^-ᵀ Jᵀ = Q R with Q orthogonal: v̇ is the free acceleration with its part along Q replaced (Golub and Van
-    Loan 2013, Matrix Computations, ch. 5.3 and 6.2). So errors grow with the condition κ of B; J M⁻¹ Jᵀ = RᵀR
-    would have its square. Where M itself would lose digits or has no inverse, as with links without mass in a loop,
-    `careful` ones are those of W = M + Jᵀ diag(s) J.
-    """
-
-    def __init__(self, c: ConstraintTerms, M: Any, order: tuple[int, ...], *, careful: bool, refined: int) -> None:
-        self._c, self._M, self.careful, self._refined = c, M, careful, refined
-        self._stiffening: Any = c.stiffening(M) if careful else None
-        self._W = Factors(c.weight(M) if careful else M, order)
-        self.rows = OrthogonalColumns(self._W.half(c.jacobian.T))
-
-    def change(self, residual: Any, rows: int | None = None) -> Any:
-        """Return the least x in the metric of M with J x = residual, of all rows or of the first ones."""
-        return self._W.whole(self.rows.least(residual, rows))
-
-    def solved(self, force: Any, rate: Any) -> tuple[Any, Any]:
-        """Return x and λ of M x - Jᵀ λ = force, J x = rate, of one right-hand side or several, (n, k) and (m, k)."""
-        J = self._c.jacobian
-        given = force + ca.mtimes(J.T, ca.mtimes(ca.diag(self._stiffening), rate)) if self.careful else force
-        x, multipliers = self.rows.held(self._W.half(given), rate)
-        return self._W.whole(x), multipliers
-
-    def motion(self, force: Any, rate: Any | None = None) -> tuple[Any, Any]:
-        """Return x and λ of M x - Jᵀ λ = force, J x = rate, refined; by default v̇ with J v̇ = -γ.
-
-        Only the rate's derivative is zero: integrators project states (`mbkit.derivation.steps.onto_constraints`).
-        """
-        c, M = self._c, self._M
-        rate = -c.gamma if rate is None else rate
-        x, multipliers = self.solved(force, rate)
-        for _ in range(self._refined):
-            left = force - ca.mtimes(M, x) + ca.mtimes(c.jacobian.T, multipliers)
-            dx, more = self.solved(left, rate - ca.mtimes(c.jacobian, x))
-            x, multipliers = x + dx, multipliers + more
-        # No digit is left where the rows depend on each other.
-        doubt = ca.if_else(self.rows.dependence < MOST_DEPENDENT**2, 0.0, np.nan)
-        return x + doubt, multipliers + doubt
-
-
-class OrthogonalColumns:
-    """B = Q R of a matrix (n, m) whose columns are independent, by Householder's reflections of sparse columns.
-
-    A reflection moves the rows that its column has and no other (Golub and Van Loan 2013, Matrix Computations, ch. 5.1
-    and 11.1). One of these rows then holds R's, the one that the fewest later columns have: so a leg of a platform
-    fills in nothing in the others.
-    """
-
-    def __init__(self, B: Any) -> None:
-        self._B, (self._n, self._m) = B, B.shape
-        columns: list[dict[int, Any]] = [{} for _ in range(self._m)]
-        for i, j in zip(*B.sparsity().get_triplet(), strict=True):
-            columns[j][i] = scalar(B[i, j])
-        #: Squares of the columns.
-        self.squares = [_dot(x, x) for x in columns]
-        #: Which columns share a row with one before.
-        self._joined: list[int] = []
-        #: Of each column the row of R_jj; and of its reflection 1 - w u uᵀ w and u.
-        self._pivots: list[int] = []
-        self._reflections: list[tuple[Any, dict[int, Any]]] = []
-        #: 1/R_jj, infinite where a column follows from those before it.
-        self.inverse: list[Any] = []
-        for j, column in enumerate(columns):
-            later = columns[j + 1 :]
-            u = {i: x for i, x in column.items() if i not in self._pivots}
-            pivot = min(u, key=lambda i: sum(i in x for x in later), default=-1)
-            self._pivots.append(pivot)
-            if len(u) < len(column):
-                self._joined.append(j)
-            if pivot < 0:
-                # It follows from them everywhere, or is zero; the evaluation reports it.
-                self._reflections.append((0.0, {}))
-                self.inverse.append(np.inf)
-                continue
-            size, x = ca.sqrt(_dot(u, u)), u[pivot]
-            # Away from the column, so that nothing cancels.
-            side = ca.if_else(x < 0, -1.0, 1.0)
-            u[pivot] = x + side * size
-            self._reflections.append((1.0 / (size * (size + side * x)), u))
-            self.inverse.append(-side / size)
-            for other in later:
-                self._reflect(j, other)
-        self._R = [
-            {i: column[p] for i, p in enumerate(self._pivots[:j]) if p in column} for j, column in enumerate(columns)
-        ]
-
-    @property
-    def dependence(self) -> Any:
-        """The largest square of a column over that of its part beside the columns before it."""
-        worst: Any = ca.SX(0.0)
-        for j in self._joined:
-            worst = ca.fmax(worst, self.squares[j] * self.inverse[j] ** 2)
-        return worst
-
-    def _reflect(self, j: int, y: dict[int, Any]) -> None:
-        weight, u = self._reflections[j]
-        if not u.keys().isdisjoint(y):
-            factor = weight * _dot(u, y)
-            for i, x in u.items():
-                y[i] = y.get(i, 0.0) - factor * x
-
-    def least(self, rate: Any, rows: int | None = None) -> Any:
-        """Return the least y with Bᵀ y = rate, of all columns or of the first ones."""
-        z = self._coordinates(rate, self._m if rows is None else rows)
-        return self._back(dict(zip(self._pivots, z, strict=False)), len(z), rate.shape[1])
-
-    def held(self, free: Any, rate: Any) -> tuple[Any, Any]:
-        """Return the y nearest to `free` with Bᵀ y = rate, and λ with y = free + B λ; columns (n, k) and (m, k)."""
-        z, y = self._coordinates(rate, self._m), self._turned(free)
-        weights = self.weights([a - y.get(p, 0.0) for a, p in zip(z, self._pivots, strict=True)])
-        return self._back(y | dict(zip(self._pivots, z, strict=True)), self._m, rate.shape[1]), weights
-
-    def balanced(self, f: Any, which: list[int]) -> tuple[Any, Any, list[Any]]:
-        """Return the least f - B λ whose entries `which` are zero, λ, and how far B's rows `which` determine it.
-
-        With μ = R λ it is f - Q μ: of the μ with the rows of Q μ = f the nearest to Qᵀ f. The last are squares of the
-        parts of these rows beside those before, of one at most.
-        """
-        y = self._turned(f)
-        mu, rows = ca.vertcat(ca.SX(0, 1), *(y.get(p, ca.SX(1, 1)) for p in self._pivots)), self._B[which, :]
-        own = OrthogonalColumns(ca.vertcat(ca.SX(0, len(which)), *self._coordinates(rows.T, self._m)))
-        mu, _ = own.held(mu, f[which])
-        parts = [scalar(mu[i]) for i in range(self._m)]
-        left = f - self._back(dict(zip(self._pivots, parts, strict=True)), self._m, 1)
-        # It vanishes up to rounding.
-        left[which] = 0.0
-        return left, self.weights(parts), [1.0 / ca.SX(x) ** 2 for x in own.inverse]
-
-    def weights(self, z: list[Any]) -> Any:
-        """Return λ with R λ = z."""
-        left, out = [*z], [ca.SX(0.0)] * self._m
-        for j in reversed(range(self._m)):
-            out[j] = left[j] * self.inverse[j]
-            for i, r in self._R[j].items():
-                left[i] = left[i] - r * out[j]
-        return ca.vertcat(*out)
-
-    def _turned(self, y: Any) -> dict[int, Any]:
-        """Return the entries of the reflections of y, (n, k); those at the pivots are Qᵀ y."""
-        out = {i: scalar(y[i, :]) for i in range(self._n)}
-        for j in range(self._m):
-            self._reflect(j, out)
-        return out
-
-    def _coordinates(self, rate: Any, rows: int) -> list[Any]:
-        """Return R^-ᵀ rate."""
-        out: list[Any] = []
-        for j in range(rows):
-            known = sum((r * out[i] for i, r in self._R[j].items()), 0.0)
-            out.append((scalar(rate[j, :]) - known) * self.inverse[j])
-        return out
-
-    def _back(self, y: dict[int, Any], rows: int, k: int) -> Any:
-        """Return Q y, (n, k)."""
-        for j in reversed(range(rows)):
-            self._reflect(j, y)
-        return ca.vertcat(ca.SX(0, k), *(y.get(i, ca.SX(1, k)) for i in range(self._n)))
-
-
-def _dot(a: dict[int, Any], b: dict[int, Any]) -> Any:
-    return sum((x * b[i] for i, x in a.items() if i in b), 0.0)
 
 
 # Rows of loops, of prescribed motions and of contacts without slip

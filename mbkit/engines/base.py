@@ -391,7 +391,6 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if self.looks:
             self.looks = False
             self._warn_of_open_states(q)
-        # The last evaluation is that of the accelerations, whose digits `OracleDynamics` keeps.
         pushed = np.add(tau, self.generalized_force(q, wrenches, axes)) if wrenches and self.branches else tau
         if wrenches:
             frames, w = self._stacked_wrenches(wrenches)

@@ -217,7 +217,7 @@ class OracleDynamics(Dynamics):
         return high[0] if size is None else high
 
     def _require_branch(self, q: ArrayLike, v: ArrayLike, a: Array, force: ArrayLike) -> None:
-        # The rows that it evaluates are not what was asked for.
+        # The rows that it evaluates are not what was asked for; `forward_dynamics` evaluates accelerations last.
         last = self._values.last
         super()._require_branch(q, v, a, force)
         self._values.last = last

@@ -22,7 +22,7 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
-from mbkit.derivation.constraints import ConstraintTerms
+from mbkit.derivation.mass_matrix_solve import ConstraintTerms
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.model.manifold import random_state
 

@@ -11,8 +11,9 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
-from mbkit.derivation.constraints import ConstraintFactors, ConstraintQuantities, ConstraintTerms
+from mbkit.derivation.constraints import ConstraintQuantities
 from mbkit.derivation.equations import Equations
+from mbkit.derivation.mass_matrix_solve import ConstraintFactors, ConstraintTerms
 from mbkit.derivation.model_values import Constants, Values
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities
