@@ -228,7 +228,8 @@ def test_a_path_is_right_or_refuses_a_part_by_name(seed: int, path: str, tmp_pat
         except UnsupportedError as error:
             refusal = str(error)
     # A model may be too large to be written out, whatever its parts.
-    assert not refusal or "too many terms" in refusal or any(word.lower() in refusal.lower() for word in case.words), refusal
+    words = (*case.words, "too many terms")
+    assert not refusal or any(word.lower() in refusal.lower() for word in words), refusal
 
 
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
