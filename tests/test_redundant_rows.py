@@ -179,7 +179,7 @@ def swing(theta: float, tau: float = 0.0) -> float:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("apart", [1e-1, 1e-3, 1e-5, 1e-6, 1e-7, 1e-8])
+@pytest.mark.parametrize("apart", [1e-1, 1e-3, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11])
 def test_cranks_that_differ_by_little_do_not_move(engine: str, apart: float) -> None:
     dyn = mb.dynamics(cranks(apart), engine)
     q = np.array([THETA, THETA, THETA + apart, -THETA])
@@ -202,6 +202,24 @@ def test_forces_of_cranks_that_differ_by_little_lose_digits_with_the_condition(a
         size = np.abs(forces.constraint_forces).max()
         assert multipliers == pytest.approx(forces.constraint_forces, abs=close * size)
         assert dyn.loop_wrenches(q, still, [1.0, 0, 0, 0]) == pytest.approx(loads, abs=close * np.abs(loads).max())
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e5])
+def test_rows_are_told_apart_whatever_the_size_of_a_mechanism(size: float) -> None:
+    """Three equal cranks, in metres or not, have one freedom."""
+    b = mb.ModelBuilder("scaled")
+    for k in range(3):
+        b.add_body(f"crank{k}", mass=1.0, inertia=(0.1 * size**2,) * 3)
+        place = {"axis": (0, 1, 0), "translation": (0.5 * size * k, 0, 0)}
+        b.add_joint(f"hinge{k}", "revolute", parent="world", child=f"crank{k}", **place)
+    b.add_body("plate", mass=1.0, inertia=(size**2,) * 3)
+    end = (0.1 * size, 0, 0.3 * size)
+    b.add_joint("pin", "revolute", parent="crank0", child="plate", axis=(0, 1, 0), translation=end)
+    for k in (1, 2):
+        place = {"body_b": "plate", "translation_b": (0.5 * size * k, 0, 0)}
+        b.add_loop(f"loop{k}", "point", body_a=f"crank{k}", translation_a=end, **place)
+    mobility = mb.dynamics(b.build(), "lagrangian", compile=False).mobility()
+    assert (mobility.degrees_of_freedom, len(mobility.redundant)) == (1, 1)
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -67,8 +67,8 @@ _LOSES: Final = 1e-5
 _BETTER: Final = 1e3
 #: Remainder of the last independent row, of 1, at a closed configuration that is far from singular poses.
 _WELL: Final = 0.01
-#: Residual of a closed configuration, m or rad.
-_CLOSED: Final = 1e-10
+#: Residual of a closed configuration, in terms of its rows' size; what is open by more closes elsewhere, or nowhere.
+_CLOSED: Final = 1e-13
 #: Steps of Newton's after that, which leave rounding alone.
 _POLISHED: Final = 2
 #: Singular value of independent rows over the largest one, above which a pose that is closed up to `_CLOSED` has as
@@ -303,11 +303,13 @@ class _Numbers:
                 J[:, still] = 0.0
             return np.asarray(np.linalg.lstsq(J, -f, rcond=1e-10)[0])
 
-        q, size, _ = shortened_steps(self.model, q, terms, step, enough=_CLOSED * 1e-3, most=_STEPS)
+        q, size, _ = shortened_steps(self.model, q, terms, step, enough=_CLOSED, most=_STEPS)
         # Dependent rows are told from nearly dependent ones by the last digits.
         for _ in range(_POLISHED):
             q = integrate(self.model, q, step(*terms(q)[1]))
-        size, _ = terms(q)
+        size, (_, J) = terms(q)
+        # Long levers have large rows.
+        size /= max(1.0, float(np.abs(J).max(initial=0.0)))
         # Half a turn away the sine of a frame's angle is zero too, and its rows depend on each other.
         turned = np.array(self._call(q, self._parameters)[3])
         return q if size < _CLOSED and (turned >= 0).all() else None

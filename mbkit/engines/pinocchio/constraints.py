@@ -51,8 +51,8 @@ _RIGID: Final = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.C
 _MU: Final = 1e-10
 _ITERATIONS: Final = 20
 _ACCURACY: Final = 1e-14
-#: Pivot of a row that depends on the others, in terms of the largest one. It is the square of the row's remainder.
-_NO_PIVOT: Final = 1e-12
+#: Pivot of a row that may depend on the others, in terms of μ, which leaves about as much of it: LAPACK decides then.
+_NO_PIVOT: Final = 1e3
 #: Disagreement of the ends' accelerations in terms of these, up to which an answer is taken.
 _AGREES: Final = 1e-11
 #: Times that a solution of LAPACK is refined: of masses that differ by decades the factors lose digits of the rows.
@@ -222,7 +222,7 @@ class PinConstraints:
         if not isfinite(sum(a.tolist())):
             return None
         pivots = self._pivots()
-        if np.count_nonzero(pivots - mu > _NO_PIVOT * pivots.max()) != len(self.choice.independent):
+        if np.count_nonzero(pivots - mu > _NO_PIVOT * mu) != len(self.choice.independent):
             return None
         return a if self._agree(q, v, a) else None
 

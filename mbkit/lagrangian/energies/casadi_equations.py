@@ -220,8 +220,9 @@ class VelocityMap:
         """Raise `InputError` where D or its inverse has no value at a state to start from."""
         q, v = np.atleast_2d(q), np.atleast_2d(v)
         _, D, W = self.linear(q, v)
-        # cos π/2 is 6e-17.
-        bad = ~(np.abs(W) @ np.abs(D) < _SINGULAR).all(axis=(1, 2))
+        # cos π/2 is 6e-17, and the inverse of zero is none.
+        with np.errstate(invalid="ignore"):
+            bad = ~(np.abs(W) @ np.abs(D) < _SINGULAR).all(axis=(1, 2))
         if bad.any():
             raise InputError(
                 f"q0: D(q) of q̇ = D v is singular at {q[int(np.argmax(bad))].tolist()}; start elsewhere, "
