@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -60,13 +61,11 @@ def defects() -> list[Defect]:
 
 
 def _copy(folder: Path) -> Path:
-    """Copy the tracked files as they are now."""
-    names = subprocess.run(["git", "ls-files", "-z"], cwd=TOP, capture_output=True, check=True).stdout.split(b"\0")
-    for name in filter(None, names):
-        source, target = TOP / os.fsdecode(name), folder / os.fsdecode(name)
-        if source.is_file():
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(source.read_bytes())
+    """Copy what a test needs, as it is now; a checkout may be an archive, without git."""
+    for name in ("mbkit", "tests", "validation", "notebooks"):
+        shutil.copytree(TOP / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", ".ipynb_checkpoints"))
+    for file in (*TOP.glob("*.toml"), *TOP.glob("*.md")):
+        shutil.copy(file, folder)
     return folder
 
 
