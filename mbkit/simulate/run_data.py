@@ -156,7 +156,7 @@ class RunData:
         written as energies it holds what changes T + V beside its forces, as where a frame is moved.
 
         The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇; UnsupportedError
-        where its rows change between two saved states. So is that of dry friction, f |Δq| from one stop or turn in
+        where its rows change between two saved states. So is that of dry friction, ``f |Δq|`` from one stop or turn in
         `events` to the next. All else, also torque on quasi-velocities, is a quadrature of fourth order in the distance
         of the saved states, of second order in an interval with a turn or stop of dry friction; a function that jumps
         makes it first order, and so do rows that jump beside a function.
