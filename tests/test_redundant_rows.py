@@ -298,6 +298,27 @@ def test_the_digits_of_an_acceleration_under_redundant_rows_are_its_own() -> Non
     assert np.array_equal(high, oracle.forward_dynamics(q, v, np.ones(6), wrenches))
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_forces_and_inertias_on_another_branch_are_refused_as_accelerations_are(engine: str) -> None:
+    dyn, still = mb.dynamics(cranks(0.0), engine), np.zeros(4)
+    moving = np.array([THETA, THETA, THETA, -THETA])
+    other = np.array([4.7123890, -1.5707963, -1.5707963, 1.5707963])
+    asked = {
+        "constraint_forces": (still, [1.0, 0, 0, 0]),
+        "generalized_constraint_force": (still, [1.0, 0, 0, 0]),
+        "forward_dynamics_derivatives": (still, [1.0, 0, 0, 0]),
+        "actuator_forces": (still, still),
+        "loop_wrenches": (still, still),
+        "project_acceleration": (still, still),
+        "reduced_inertia": ("hinge0",),
+    }
+    for name, given in asked.items():
+        if name in dyn.supports or name == "project_acceleration":
+            getattr(dyn, name)(moving, *given)
+            with pytest.raises(NumericalError, match=r"loop 'loop2' z.*contradicts"):
+                getattr(dyn, name)(other, *given)
+
+
 # A neck of two parallel rods, each welded to a pin: singular values of J from 2.45 down to 4.6e-9
 
 NECK = """

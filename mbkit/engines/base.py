@@ -473,11 +473,11 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         Examples
         --------
         >>> import mbkit as mb
-        >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
-        >>> by = dyn.forward_dynamics_derivatives([0.1, 0.2], [1.0, -2.0], [0.0, 0.0])
+        >>> by = mb.dynamics(mb.catalog.double_pendulum()).forward_dynamics_derivatives([0.1, 0.2], [1, -2], [0, 0])
         >>> by.q.shape, by.v.shape, by.tau.shape
         ((2, 2), (2, 2), (2, 2))
         """
+        self._require_motion(q, v, tau)
         return ForwardDynamicsDerivatives(*self._derivatives("forward_dynamics_derivatives", q=q, v=v, tau=tau))
 
     def _derivatives(self, quantity: str, **arguments: ArrayLike) -> list[Array]:

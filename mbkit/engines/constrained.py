@@ -86,6 +86,7 @@ class Constrained:
     _row_choice: Any
     _evaluate: Callable[..., Array]
     _without_friction: Callable[[str], Callable[..., Any]]
+    forward_dynamics: Callable[..., Array]
     inverse_dynamics: Callable[..., Array]
     mass_matrix: Callable[..., Array]
 
@@ -101,6 +102,8 @@ class Constrained:
     def _bound(self, quantity: str, **states: ArrayLike) -> Array:
         if not self.model.constrained:
             raise UnsupportedError(f"{quantity}: {self.model.name} has no loops and no other constraints")
+        if "tau" in states:
+            self._require_motion(**states)
         return self._evaluate(quantity, **states)
 
     @property
@@ -129,6 +132,14 @@ class Constrained:
                 "are those of no motion; project(q, v) returns the nearest consistent state",
                 MbkitWarning,
             )
+
+    def _require_motion(self, q: ArrayLike, v: ArrayLike | None = None, tau: ArrayLike | None = None) -> None:
+        """Refuse a pose on another branch by its accelerations, under unit forces without τ (NumericalError)."""
+        if not self.branches or len(self._row_choice.kept) == len(self._row_choice.independent):
+            return
+        still = np.zeros(self.model.nv)
+        with unwatched(self):
+            self.forward_dynamics(q, still if v is None else v, still + 1.0 if tau is None else tau)
 
     def _require_branch(self, q: ArrayLike, v: ArrayLike, a: Array, force: ArrayLike) -> None:
         """Refuse accelerations under a force that break rows which are redundant where it moves (NumericalError)."""
@@ -392,6 +403,7 @@ class Constrained:
         if not model.constrained:
             states.held_parts(model, hold)
             return a
+        self._require_motion(q, v)
         lead = np.broadcast_shapes(q.shape[:-1], v.shape[:-1], a.shape[:-1])
         q, v, a = (np.broadcast_to(x, (*lead, x.shape[-1])) for x in (q, v, a))
         if not lead:

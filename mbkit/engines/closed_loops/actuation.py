@@ -111,6 +111,7 @@ class Actuation(Constrained):
                 f"actuator_forces: {self.model.name} has no loops and no other constraints; "
                 "inverse_dynamics(q, v, a) is the force of its joints"
             )
+        self._require_motion(q, v)
         out = self._evaluate("actuator_forces", self._actuated(actuators), q=q, v=v, a=a)
         n = self.model.nv
         return ActuatorForces(out[..., :n], out[..., n:])

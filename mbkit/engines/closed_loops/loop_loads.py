@@ -128,6 +128,7 @@ class LoopLoads(Actuation, Loads):
                 "on bodies beside those of loops; constraint_forces(q, v, tau) has them, and joint_wrenches of "
                 "model.without('no_slip') takes them as wrenches"
             )
+        self._require_motion(q, v, tau)
         states: dict[str, Any] = {"q": q, "v": v, "a": a, "tau": tau}
         frames: tuple[Frame, ...] = ()
         if wrenches:

@@ -111,6 +111,7 @@ class IndependentMotion(LoopLoads):
                 f"coordinates: {model.name} has {degrees} degrees of freedom: expected as many different names, got "
                 f"{', '.join(names) or 'none'}"
             )
+        self._require_motion(q)
         J, M = self.constraint_jacobian(q)[..., own, :], self.mass_matrix(q)
         sizes = np.linalg.norm(J, axis=-1, keepdims=True)
         J = J / np.where(sizes > 0, sizes, 1.0)
