@@ -143,11 +143,11 @@ def real(name: str, value: Any, *, positive: bool = False, nonnegative: bool = F
 TWO_TURNS: Final = 4 * math.pi
 
 
-def hint_at_degrees(item: str, *angles: float) -> None:
-    """Warn of an angle beyond two turns, rad."""
+def hint_at_degrees(item: str, *angles: float, unless: tuple[str, ...] = ()) -> None:
+    """Warn of an angle beyond two turns, rad, unless some modules asked."""
     if beyond := [x for x in angles if abs(x) > TWO_TURNS]:
         says = "beyond two turns; angles are in radians here, numpy.radians makes them of degrees"
-        warn(f"{item} = {beyond[0]:g} rad is {says}", MbkitWarning)
+        warn(f"{item} = {beyond[0]:g} rad is {says}", MbkitWarning, unless)
 
 
 def shown(value: Any) -> str:

@@ -104,12 +104,17 @@ class UnknownNameError(MbkitError, LookupError):
         What else the caller can do.
     every : bool
         Whether to list all known names, however many there are.
+    near : iterable of str
+        Names that are meant; by default known ones that look like it.
     """
 
-    def __init__(self, what: str, name: str, known: Iterable[str], hint: str = "", *, every: bool = False) -> None:
+    def __init__(
+        self, what: str, name: str, known: Iterable[str], hint: str = "", *, every: bool = False, near: Any = ()
+    ) -> None:
         self.what, self.name, self.known, self.hint, self.every = what, name, tuple(known), hint, every
+        self.near = near = [*near] or nearest(name, self.known)
         listed = f"there are: {', '.join(self.known) or 'none'}"
-        if near := nearest(name, self.known):
+        if near:
             advice = f"did you mean {' or '.join(repr(n) for n in near)}?" + (f" {listed}" if every else "")
         elif every or len(self.known) <= 40:
             advice = listed
@@ -118,7 +123,7 @@ class UnknownNameError(MbkitError, LookupError):
         super().__init__(f"unknown {what} {_shortened(repr(name), 200)}; {advice}" + (f" {hint}" if hint else ""))
 
     def __reduce__(self) -> tuple[Callable[..., UnknownNameError], tuple[object, ...]]:
-        return partial(type(self), every=self.every), (self.what, self.name, self.known, self.hint)
+        return partial(type(self), every=self.every, near=self.near), (self.what, self.name, self.known, self.hint)
 
 
 class ModelError(MbkitError, ValueError):

@@ -219,8 +219,8 @@ def test_what_acts_and_what_is_left_out_is_named(tmp_path):
         return next(text for head, text in notes.items() if head.startswith(start))
 
     for name, words in {"sum": "range -1 2", "3 (fixed, line 1)": "9"}.items():
-        assert name in note("left out of tendons")
-        assert words in note("left out of tendons")
+        assert name in note("left out of the motion of tendons")
+        assert words in note("left out of the motion of tendons")
     assert "'sum' on a - 2 b: stiffness 7" in note("tendons that act")
     assert "'string' between" in note("tendons that act")
     assert "'slack': stiffness 8 0 0, rest length 0 to 1" in note("springs of tendons")
@@ -233,13 +233,13 @@ def test_what_acts_and_what_is_left_out_is_named(tmp_path):
         "weight": "15",
         "soft": "constant force 1e+30",
     }.items():
-        assert f"'{name}': " in note("left out of actuators")
-        assert words in note("left out of actuators")
-    assert "14" in note("left out of actuators")
+        assert f"'{name}': " in note("left out of the motion of actuators")
+        assert words in note("left out of the motion of actuators")
+    assert "14" in note("left out of the motion of actuators")
     for words in ("'drive' (motor, gain 1) on a", "'off' (position, gain 11) on a", "'biceps' (muscle, muscle gain"):
         assert words in note("controls")
     assert [(x.name, x.joint, x.leader) for x in model.couplers] == [("tie", "a", "b")]
-    assert "connect" in note("equality")
+    assert "connect" in note("left out of the motion of equality")
 
 
 @pytest.mark.parametrize(

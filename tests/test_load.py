@@ -188,9 +188,10 @@ def test_usual_names(name, file):
     ("source", "options", "error", "words"),
     [
         ("pnada", {}, UnknownNameError, "unknown robot 'pnada'; did you mean 'panda'"),
-        ("franka", {}, UnknownNameError, "there is 'panda'"),
-        ("franka_emika_panda", {}, UnknownNameError, "there is 'panda'"),
-        ("PAL-Robotics", {}, UnknownNameError, "there is 'talos' or 'tiago'"),
+        ("franka", {}, UnknownNameError, "unknown robot 'franka.*'; did you mean 'panda'. .a path"),
+        ("franka_emika_panda", {}, UnknownNameError, "unknown robot 'franka.*'; did you mean 'panda'. .a path"),
+        ("franka_description", {}, UnknownNameError, "unknown robot 'franka.*'; did you mean 'panda'. .a path"),
+        ("PAL-Robotics", {}, UnknownNameError, "did you mean 'talos' or 'tiago'"),
         ("panda_description/pandas", {}, UnknownNameError, "panda_description/panda"),
         (Path("nowhere.urdf"), {}, LoadError, r"nowhere\.urdf: no such file"),
         ("nowhere.xml", {}, LoadError, r"nowhere\.xml: no such file"),

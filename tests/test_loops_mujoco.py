@@ -300,7 +300,10 @@ def test_equalities_without_a_loop_are_named(tmp_path: Path) -> None:
     ):
         model = loaded(tmp_path, equality)
         assert not model.loops
-        assert any(note.startswith("equality constraints left out: 'x'") and why in note for note in model.notes)
+        assert any(
+            note.startswith("left out of the motion of equality constraints: 'x'") and why in note
+            for note in model.notes
+        )
     path = tmp_path / "off.xml"
     flag = '<option><flag equality="disable"/></option><worldbody>'
     path.write_text((SCENE % '<weld site1="s" site2="r"/>').replace("<worldbody>", flag, 1))

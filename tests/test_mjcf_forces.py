@@ -343,6 +343,23 @@ def test_mujocos_own_steps_have_its_springs_of_ball_and_free_joints(tmp_path: Pa
         mb.simulate(mb.dynamics(b.build(), "mujoco"), [0, 0, 0, 1], [1, 0, 0], 0.1, "mujoco_rk4", 1e-2)
 
 
+@pytest.mark.parametrize(("spring", "run"), [("3", True), ("3 0 2", False)])
+def test_a_check_runs_springs_of_ball_joints_or_says_why_not_and_names_what_is_left_out(
+    spring: str, run: bool, tmp_path: Path
+) -> None:
+    """MuJoCo has linear springs of ball joints; a fluid acts in none of mbkit's engines."""
+    joint = '<joint type="ball" stiffness="3"/>' if run else f'<joint axis="0 1 0" stiffness="{spring}"/>'
+    world = f'<body pos="0 0 1">{joint}<geom type="box" size=".1 .2 .3" pos="0 0 -.3"/></body>'
+    text = f'<mujoco><option density="1.2"/><worldbody>{world}</worldbody></mujoco>'
+    result = mb.compare(mb.load(written(text, tmp_path)), samples=2)
+    assert [x.says for x in result.findings if x.kind == "left out of the motion"] == [
+        "the forces of a fluid (option density 1.2), with fluidshape and fluidcoef of geoms"
+    ]
+    assert bool(result.rollouts) is run
+    assert all(row.passed for row in result.rollouts)
+    assert any(r.term == "rollouts" and "by functions" in r.reason for r in result.refusals) is not run
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -546,7 +563,7 @@ def test_no_attribute_of_tendons_and_actuators_changes_the_motion_in_silence(nam
                 np.abs(x - getattr(at, n)).max() < 1e-9 * max(1.0, np.abs(getattr(at, n)).max())
                 for n, x in zip(terms, own, strict=True)
             )
-            said = acts == "actuated" and any(n.startswith("left out of actuators") for n in model.notes)
+            said = acts == "actuated" and any(n.startswith("left out of the motion of actuators") for n in model.notes)
             assert agrees or said, (way, key, value, acts)
             break
     assert felt >= 3

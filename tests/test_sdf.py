@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import mbkit as mb
 from mbkit.errors import LoadError, MbkitError
+from mbkit.studies.compare.findings import findings
 
 CLOSE = 1e-12
 drake = pytest.mark.skipif(find_spec("pydrake") is None, reason="Drake is not installed")
@@ -235,7 +236,13 @@ def test_a_pose_may_be_empty_or_a_quaternion():
 def test_what_drake_ignores_is_noted():
     model = mb.load(changed("<frame", '<plugin name="p" filename="p.so"/><frame'))
     assert any("plugin" in note for note in model.notes)
-    assert any("friction" in note for note in mb.load(changed("<damping>", "<friction>1</friction><damping>")).notes)
+    model = mb.load(changed("<damping>", "<friction>1</friction><damping>"))
+    lost = "dry friction, which Drake does not read from SDF: hinge (1 N m or N)"
+    assert f"left out of the motion: {lost}" in model.notes
+    # A check says it on its first screen.
+    assert [(x.kind, x.says) for x in findings(model, np.ones((1, model.nv)), np.eye(model.nv)[None])][:1] == [
+        ("left out of the motion", lost)
+    ]
 
 
 @drake

@@ -42,7 +42,6 @@ from mbkit.engines.steps import Steps
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.description import CONSTRAINT_FEATURES
-from mbkit.model.manifold import NEAR_UNIT
 from mbkit.model.rolling import LIES_FLAT
 
 if TYPE_CHECKING:
@@ -75,15 +74,6 @@ def first_names(texts: Iterable[str], more: str = " and {} more") -> str:
     """Return the first few texts of a list, and how many more there are."""
     all_ = list(texts)
     return ", ".join(all_[:_MAX_NAMES]) + (more.format(len(all_) - _MAX_NAMES) if all_[_MAX_NAMES:] else "")
-
-
-def unit_quaternions(q: Array, starts: Iterable[int]) -> bool:
-    """Return whether the quaternions that begin at these places are of unit length; False of one with a NaN."""
-    for start in starts:
-        x, y, z, w = q[start : start + 4].tolist()
-        if not -NEAR_UNIT < x * x + y * y + z * z + w * w - 1.0 < NEAR_UNIT:
-            return False
-    return True
 
 
 def require_tree(

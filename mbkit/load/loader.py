@@ -339,15 +339,13 @@ def unknown(name: str) -> UnknownNameError:
     modules = _modules()
     known = sorted({x for r in robots() for x in (r.name, r._spellings[0])} | _SHORT.keys() | modules.keys())
     # Packages of descriptions call a robot's folder so, and other names begin with the maker's.
-    if (folder := find(re.sub("(_mj|_moveit)?_description$", "", name))) is not None:
-        known = [folder.name]
-    words = _key(name).replace(" ", "_").split("_")
-    meant = " or ".join(map(repr, [x for x in words if find(x)] or _MAKERS.get(words[0], [])))
-    near = "" if folder or not meant else f"there is {meant}; "
+    stem = re.sub("(_mj|_moveit)?_description$", "", name)
+    words = _key(stem).replace(" ", "_").split("_") if "/" not in name else [""]
+    folder = find(stem)
+    near = [folder.name] if folder else [x for x in words if find(x)] or _MAKERS.get(words[0], [])
     other = "" if modules or not name.endswith("_description") else f"; names of {_DESCRIPTIONS} need that package"
-    return UnknownNameError(
-        "robot", name, known, f"({near}a path to a file ends in .urdf or .xml; mbkit robots lists all names{other})"
-    )
+    hint = f"(a path to a file ends in .urdf or .xml; mbkit robots lists all names{other})"
+    return UnknownNameError("robot", name, known, hint, near=near)
 
 
 def _modules() -> dict[str, Path]:

@@ -38,7 +38,7 @@ from mbkit.load.shapes import NOTHING, together
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.model import Body, Model, ModelBuilder, kind_of, quaternions
-from mbkit.model.description import SERVOS
+from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.validation import body_fault
 
 _REFUSED: Final = {
@@ -257,8 +257,8 @@ class _Tree:
         friction = read.number(element, "frictionloss", item, 0.0)
         if friction and not kind_of(kind).coordinate_velocities:
             self.b.note(
-                f"dry friction {friction:g} of {joint.kind} joint {joint.name!r} is left out: "
-                "it acts along each velocity, whose axes move with the body"
+                f"{LEFT_OUT}: dry friction {friction:g} of {joint.kind} joint {joint.name!r}, "
+                "which acts along each velocity, whose axes move with the body"
             )
             friction = 0.0
         self.b.add_joint(
@@ -382,13 +382,13 @@ def _notes(mujoco: Element, path: Path, scene: Scene, flags: Mapping[str, str], 
         counts = ", ".join(f"{n} {tag}" for tag, n in sorted(sections.items()))
         yield f"sections left out, with whatever they do to the motion: {counts}"
     if lost := ", ".join(f"{what} ({n})" for what, n in sorted(scene.left_out.items()) if n):
-        yield f"not represented here, and left out: {lost}"
+        yield f"{LEFT_OUT}: {lost}"
     medium = Element("option", {}, 0)
     for element in mujoco.all("option"):
         medium.attributes |= {k: v for k, v in element.attributes.items() if k in ("density", "viscosity", "wind")}
     if any(scene.read.number(medium, name, "the file", 0.0) for name in ("density", "viscosity")):
         numbers = ", ".join(f"{k} {v}" for k, v in sorted(medium.attributes.items()))
-        yield f"the forces of a fluid were left out (option {numbers}), with fluidshape and fluidcoef of geoms"
+        yield f"{LEFT_OUT}: the forces of a fluid (option {numbers}), with fluidshape and fluidcoef of geoms"
     if others := ", ".join(f"{k}={v}" for k, v in sorted(flags.items()) if k not in _HONOURED):
         yield f"option flags are an engine's, and were left out: {others}"
     if unnamed := " and ".join(f"{n} {kind}" for kind, n in sorted(scene.unnamed.items())):

@@ -23,7 +23,7 @@ from mbkit._check import Array
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
 from mbkit.load.xml_reader import LARGEST, Element, Reader, unused
 from mbkit.model import Joint, JointCoupling, Model, ModelBuilder, PointSpring
-from mbkit.model.description import SERVOS
+from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.forces import RATE
 from mbkit.model.validation import sample_mass_matrix
 
@@ -453,7 +453,7 @@ class Transmissions:
             if acting := "; ".join(x.description() for x in some if x.acts):
                 yield f"{what} that act as springs, dampers and rotors{at}: {acting}"
             if lost := "; ".join(f"{x.item}: {', '.join(x.left_out)}" for x in some if x.left_out):
-                yield f"left out of {what}: {lost}"
+                yield f"{LEFT_OUT} of {what}: {lost}"
             if idle := ", ".join(x.item for x in some if not (x.acts or x.functions() or x.left_out or x.control)):
                 yield f"{what} that exert no force of their own: {idle}"
         if self._actuators:

@@ -22,6 +22,7 @@ from mbkit.load.mjcf_reader import Scene
 from mbkit.load.urdf_reader import Snapper
 from mbkit.load.xml_reader import Element, unused
 from mbkit.model import ModelBuilder
+from mbkit.model.description import LEFT_OUT
 from mbkit.model.validation import listing
 
 _KINDS: Final = {"connect": "point", "weld": "frame"}
@@ -220,7 +221,7 @@ class Equalities:
         if self._soft:
             b.note(f"left out, since loops are exact: {listing(self._soft, 6)}")
         if self._left_out:
-            b.note(f"equality constraints left out: {'; '.join(self._left_out)}")
+            b.note(f"{LEFT_OUT} of equality constraints: {'; '.join(self._left_out)}")
 
 
 def _inverse(X: Pose) -> Pose:

@@ -51,6 +51,8 @@ def digest(*parts: Any) -> str:
 
 #: How the notes of a model on the servos of its file begin; the repr says which choice holds.
 SERVOS: Final = "servos"
+#: How notes begin on what would act, and does not here.
+LEFT_OUT: Final = "left out of the motion"
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import cached_property
 from importlib import import_module
 from math import hypot
-from operator import itemgetter
 from os import PathLike
 from typing import Any, Final
 
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import TWO_TURNS, Array, batch_of, count, generator, hint_at_degrees, real, rows
 from mbkit._escape import html
-from mbkit._warn import called_within, warn
+from mbkit._warn import warn
 from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, UnsupportedError
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
@@ -33,8 +32,11 @@ _ROUND: Final = (100, 1_000, 10_000, 100_000, 1_000_000)
 _PER_VELOCITY: Final = {"damping": "damping", "springs": "stiffness", "armature": "armature", "friction": "friction"}
 #: Elements between joints or points, and the numbers that make them act.
 _ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness", "damping", "armature")}
-#: Packages that evaluate runs, or states of their own.
-_OF_RUNS: Final = ("mbkit.simulate", "mbkit.studies")
+#: Modules that evaluate runs, or states of their own.
+_OF_RUNS: Final = (
+    *(f"mbkit.simulate.{x}" for x in ("integrate", "run_data", "sensitivity", "trajectory")),
+    "mbkit.studies",
+)
 #: rad: less than this beyond two turns a motion may have come in a step.
 _JUST_BEYOND: Final = 1.0
 _FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "forces", *CONSTRAINT_FEATURES)
@@ -174,25 +176,19 @@ class Model(Description):
         Runs turn as they like: a motion that has just come beyond two turns says that the model does, and so does what
         evaluates a run.
         """
-        if "_turns" in self.__dict__:
+        if "_turns" in self.__dict__ or not self._hinges:
             return
-        angles = self._angles(q.tolist())
-        if max(angles) <= TWO_TURNS and min(angles) >= -TWO_TURNS:
-            return
-        k = int(np.argmax(np.abs(angles)))
-        if abs(angles[k]) > TWO_TURNS + _JUST_BEYOND and (name != "q" or not called_within(*_OF_RUNS)):
-            hint_at_degrees(f"{self.name}: {name}: {self.coordinate_names[self._hinges[k]]}", angles[k])
-        self.__dict__["_turns"] = True
+        k = max(self._hinges, key=lambda i: abs(q[i]))
+        if abs(q[k]) > TWO_TURNS:
+            self.__dict__["_turns"] = True
+        if abs(q[k]) > TWO_TURNS + _JUST_BEYOND:
+            where = f"{self.name}: {name}: {self.coordinate_names[k]}"
+            hint_at_degrees(where, q[k], unless=_OF_RUNS if name == "q" else ())
 
     @cached_property
-    def _hinges(self) -> tuple[int, ...]:
+    def _hinges(self) -> list[int]:
         """Indices of the angles in q."""
-        return tuple(self.layout.q[j.name].start + k for j in self.independent_joints for k in j.type.angular)
-
-    @cached_property
-    def _angles(self) -> Callable[[list[float]], tuple[float, ...]]:
-        """A quick function of q that returns its angles, and the first one again, so that there are two at least."""
-        return itemgetter(*self._hinges, self._hinges[0]) if self._hinges else lambda _: (0.0, 0.0)
+        return [self.layout.q[j.name].start + k for j in self.independent_joints for k in j.type.angular]
 
     def check_v(self, v: ArrayLike, name: str = "v") -> Array:
         """Return `v` (or an acceleration or force) as float64, checked."""

@@ -29,6 +29,7 @@ from mbkit.errors import UnsupportedError
 from mbkit.load.urdf_reader import BASE_JOINT, Snapper
 from mbkit.load.xml_reader import Element
 from mbkit.model import Model, ModelBuilder
+from mbkit.model.description import LEFT_OUT
 from mbkit.model.joint_types import kind_of
 from mbkit.spatial import skew
 
@@ -136,8 +137,9 @@ def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> M
     held = f"the base {bases} floats in SDF, and is held here at its pose; floating_base=True lets it move"
     if len(loose) > 1:
         held = f"the bases {bases} float in SDF, and are held here at their poses; floating_base=True lets them move"
-    dry = [x for e in root.walk() if e.tag == "friction" for x in [e.text.strip()] if x.strip("0.")]
-    ignored = "dry friction of joints is not read" if dry else ""
+    pairs = [(j, e.text.strip()) for j in root.walk() if j.tag == "joint" for e in j.walk() if e.tag == "friction"]
+    dry = ", ".join(f"{j.attributes.get('name')} ({x} N m or N)" for j, x in pairs if x.strip("0."))
+    ignored = f"{LEFT_OUT}: dry friction, which Drake does not read from SDF: {dry}" if dry else ""
     for note in (held if loose and not floating_base else "", ignored, *told, snap.note):
         if note:
             b.note(note)

@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from mbkit._check import TWO_TURNS, Array
 from mbkit.engines import known_defects
-from mbkit.engines.base import Dynamics, first_names, unit_quaternions
+from mbkit.engines.base import Dynamics, first_names
 from mbkit.engines.elements.passive import JointPassive
 from mbkit.engines.frames_and_momenta import ALIGNED, WORLD
 from mbkit.engines.pinocchio.bodies import PinocchioBodies
@@ -110,7 +110,12 @@ def _sound(model: Model, unread: set[int]) -> Sound:
             return bool(-NEAR_UNIT < x * x + y * y + z * z + w * w - 1.0 < NEAR_UNIT and isfinite(a + b + c))
 
         return floating
-    return lambda q: unit_quaternions(q, starts) and isfinite(sum(q.tolist()))
+
+    def sound(q: Array) -> bool:
+        quaternions = (q[k : k + 4] for k in starts)
+        return all(abs(x.dot(x) - 1.0) < NEAR_UNIT for x in quaternions) and isfinite(sum(q.tolist()))
+
+    return sound
 
 
 #: Joint types of which computeRNEADerivatives and computeABADerivatives of 4.1.0 are wrong (pinocchio#2053).

@@ -194,8 +194,9 @@ def energy_drift(samples: list[list[_Sample]], fast: list[Array], damped: bool, 
             worst, share = wrong, abs(wrong) / size
     if worst:
         yield (
-            f"{'gained' if worst > 0 else 'lost'} {100 * share:.3g} % of its energy ({abs(worst):.2g} J) with nothing "
-            f"that drives it; take a smaller step, or method={AUTOMATIC_METHOD!r}"
+            f"{'gained' if worst > 0 else 'lost'} {abs(worst):.2g} J, {100 * share:.3g} % of the run's largest kinetic "
+            "energy or change of potential energy, with nothing that drives it; take a smaller step, or "
+            f"method={AUTOMATIC_METHOD!r}"
         )
 
 

@@ -22,7 +22,6 @@ from mbkit.engines import Dynamics
 from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO
 from mbkit.methods.registry import DEFAULT_METHOD, EULER_METHOD, METHODS
 from mbkit.model import Model
-from mbkit.model.elements.forces import by_functions
 from mbkit.simulate import Trajectory
 from mbkit.studies.compare.errors import EPS, ROUNDINGS, interleaved
 from mbkit.studies.compare.findings import STEP, stiff_joints
@@ -49,8 +48,7 @@ def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str
         # Where loops are rigid the motion is another one: the same formula on the same soft accelerations is compared.
         ours_on = [MUJOCO]
         note = "; ".join(x for x in (note, "on MuJoCo's own accelerations, whose loops are soft") if x)
-    # MuJoCo's own integrators know no forces by functions.
-    if MUJOCO not in engines or not ours_on or by_functions(model):
+    if MUJOCO not in engines or not ours_on:
         return ()
     rows: list[RolloutRow] = []
     q0, v0 = start_state(model, seed)

@@ -8,7 +8,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.model import Model
-from mbkit.model.description import SERVOS
+from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.joint_numbers import dry_friction, owners, per_velocity
 from mbkit.studies.compare.result import ACTUATORS, FRICTION, LIMITS, STIFF, Finding
 from mbkit.studies.results import counted
@@ -18,13 +18,17 @@ STEP: Final = 1e-3
 
 
 def findings(model: Model, forces: Array, M: Array, J: Array | None = None) -> tuple[Finding, ...]:
-    """Return the servos of the file, dry friction beside the other forces, limits, and stiff joints.
+    """Return what the file has and is left out, dry friction beside the other forces, limits, and stiff joints.
 
     `forces` are the sums of the sizes of gravity, velocity and passive forces at some states, (N, nv), `M` and `J` the
     mass matrices and the Jacobians of the constraints there, (N, nv, nv) and (N, m, nv).
     """
-    servos = [Finding(ACTUATORS, note, ()) for note in model.notes if note.startswith(SERVOS)]
-    return tuple(x for x in (*servos, _friction(model, forces), _limits(model), *stiff_joints(model, M, J)) if x)
+    noted = [
+        Finding(ACTUATORS if x.startswith(SERVOS) else LEFT_OUT, x.removeprefix(LEFT_OUT).lstrip(": "), ())
+        for x in model.notes
+        if x.startswith((SERVOS, LEFT_OUT))
+    ]
+    return tuple(x for x in (*noted, _friction(model, forces), _limits(model), *stiff_joints(model, M, J)) if x)
 
 
 def _friction(model: Model, forces: Array) -> Finding | None:

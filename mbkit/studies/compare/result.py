@@ -131,8 +131,9 @@ class RolloutRow:
 class Finding:
     """What the description has that bears on runs: what no engine uses, dry friction, joints for other methods.
 
-    `kind` is ``"dry friction"``, ``"limits"`` or ``"stiff joint"``; `says` tells it in words, and `joints` has its
-    joints. `mbkit check` adds ``"the file itself"``, with the links and joints that `mbkit.lint` names.
+    `kind` is ``"actuators"``, ``"left out of the motion"``, ``"dry friction"``, ``"limits"`` or ``"stiff joint"``;
+    `says` tells it in words, and `joints` has its joints. `mbkit check` adds ``"the file itself"``, with the links and
+    joints that `mbkit.lint` names.
     `size` of friction is its ratio to the other forces at that joint and the median state, the largest of all joints;
     of a stiff joint its time constant, s; of the file the number of findings; of limits NaN.
     """
