@@ -43,10 +43,6 @@ from mbkit.model.parts import Loop
 from mbkit.model.rolling import LIES_FLAT, NO_SLIP_ROWS, Contact, contact
 from mbkit.model.validation import sample_mass_matrix
 
-#: Times that a solution is refined by careful factors, and by those of a mass matrix that loses digits where a joint
-#: locks. Each time leaves what the factors lose of the error before.
-_REFINED_CAREFUL: Final = 2
-_REFINED: Final = 1
 #: Part of a row that is left of it, once the others are taken away, up to which it follows from them: rounding of J at
 #: a pose that is known to all digits, times the some thousand operations that lead to it.
 DEPENDENT: Final = 1e-12
@@ -518,7 +514,7 @@ class ConstraintQuantities:
         rows = OrthogonalColumns(J.T)
         tau, multipliers, parts = rows.balanced(f, others)
         left: Any = ca.SX(1.0)
-        for part in (*(1.0 / (x * ca.SX(y) ** 2) for x, y in zip(rows.squares, rows.inverse, strict=True)), *parts):
+        for part in (*(x / y for x, y in zip(rows.remainders, rows.squares, strict=True)), *parts):
             left = ca.fmin(left, part)
         rates = ca.mtimes(J, self.a) + c.gamma
         out = ca.vertcat(tau, self._spread(multipliers), rates, ca.sqrt(ca.sum2(J**2)), left)
@@ -612,10 +608,7 @@ class ConstrainedMotion(ConstraintQuantities):
         """Factors of M, or more careful ones where M would lose digits, and of J's rows in its metric."""
         doubtful = self.elimination == "least constraint"
         careful = singular_mass_matrix(self.model) or (doubtful and self._constraints_hold_what_mass_does_not())
-        times = _REFINED_CAREFUL if careful else _REFINED if doubtful else 0
-        return ConstraintFactors(
-            self.constraints, self.mass_matrix, self.elimination_order, careful=careful, refined=times
-        )
+        return ConstraintFactors(self.constraints, self.mass_matrix, self.elimination_order, careful=careful)
 
     def _constraints_hold_what_mass_does_not(self) -> bool:
         """Return whether W = M + Jᵀ diag(s) J of `ConstraintTerms` keeps digits that M loses at some hard pose.

@@ -20,8 +20,7 @@ from mbkit.model import Model
 #: Mass of a coordinate that has none, in terms of the mean one.
 _MASSLESS: Final = 1e-20
 _TINY: Final = 1e-300
-#: Largest size of a row over its remainder with which accelerations still have digits: κ up to about as much.
-MOST_DEPENDENT: Final = 1e12
+DEPENDENT: Final = 1e-12
 
 
 def elimination_order(model: Model) -> tuple[int, ...]:
@@ -229,16 +228,16 @@ class ConstraintTerms:
 
 
 class ConstraintFactors:
-    """Factors of M = LᵀDL and of J's rows in the metric of M, which give v̇ and λ, and how often they are `refined`.
+    """Factors of M = LᵀDL and of J's rows in the metric of M, which give v̇ and λ.
 
     B = D^-½ L^-ᵀ Jᵀ = Q R with Q orthogonal: v̇ is the free acceleration with its part along Q replaced (Golub and Van
     Loan 2013, Matrix Computations, ch. 5.3 and 6.2). So errors grow with the condition κ of B; J M⁻¹ Jᵀ = RᵀR
     would have its square. Where M itself would lose digits or has no inverse, as with links without mass in a loop,
-    `careful` ones are those of W = M + Jᵀ diag(s) J.
+    `careful` ones are those of W = M + Jᵀ diag(s) J, and a solution is refined once.
     """
 
-    def __init__(self, c: ConstraintTerms, M: Any, order: tuple[int, ...], *, careful: bool, refined: int) -> None:
-        self._c, self._M, self.careful, self._refined = c, M, careful, refined
+    def __init__(self, c: ConstraintTerms, M: Any, order: tuple[int, ...], *, careful: bool) -> None:
+        self._c, self._M, self.careful = c, M, careful
         self._stiffening: Any = c.stiffening(M) if careful else None
         self._W = Factors(c.weight(M) if careful else M, order)
         self.rows = OrthogonalColumns(self._W.half(c.jacobian.T))
@@ -255,19 +254,19 @@ class ConstraintFactors:
         return self._W.whole(x), multipliers
 
     def motion(self, force: Any, rate: Any | None = None) -> tuple[Any, Any]:
-        """Return x and λ of M x - Jᵀ λ = force, J x = rate, refined; by default v̇ with J v̇ = -γ.
+        """Return x and λ of M x - Jᵀ λ = force, J x = rate; by default v̇ with J v̇ = -γ.
 
         Only the rate's derivative is zero: integrators project states (`mbkit.derivation.steps.onto_constraints`).
         """
         c, M = self._c, self._M
         rate = -c.gamma if rate is None else rate
         x, multipliers = self.solved(force, rate)
-        for _ in range(self._refined):
+        if self.careful:
             left = force - ca.mtimes(M, x) + ca.mtimes(c.jacobian.T, multipliers)
             dx, more = self.solved(left, rate - ca.mtimes(c.jacobian, x))
             x, multipliers = x + dx, multipliers + more
         # No digit is left where the rows depend on each other.
-        doubt = ca.if_else(self.rows.dependence < MOST_DEPENDENT**2, 0.0, np.nan)
+        doubt = ca.if_else(self.rows.independent, 0.0, np.nan)
         return x + doubt, multipliers + doubt
 
 
@@ -284,15 +283,16 @@ class OrthogonalColumns:
         columns: list[dict[int, Any]] = [{} for _ in range(self._m)]
         for i, j in zip(*B.sparsity().get_triplet(), strict=True):
             columns[j][i] = scalar(B[i, j])
-        #: Squares of the columns.
+        #: Squares of the columns, and of their parts beside the columns before them.
         self.squares = [_dot(x, x) for x in columns]
+        self.remainders: list[Any] = []
         #: Which columns share a row with one before.
         self._joined: list[int] = []
         #: Of each column the row of R_jj; and of its reflection 1 - w u uᵀ w and u.
         self._pivots: list[int] = []
         self._reflections: list[tuple[Any, dict[int, Any]]] = []
-        #: 1/R_jj, infinite where a column follows from those before it.
-        self.inverse: list[Any] = []
+        #: 1/R_jj, no number where a column follows from those before it.
+        self._inverse: list[Any] = []
         for j, column in enumerate(columns):
             later = columns[j + 1 :]
             u = {i: x for i, x in column.items() if i not in self._pivots}
@@ -303,14 +303,18 @@ class OrthogonalColumns:
             if pivot < 0:
                 # It follows from them everywhere, or is zero; the evaluation reports it.
                 self._reflections.append((0.0, {}))
-                self.inverse.append(np.inf)
+                self._inverse.append(np.inf)
+                self.remainders.append(0.0)
                 continue
-            size, x = ca.sqrt(_dot(u, u)), u[pivot]
+            self.remainders.append(_dot(u, u))
+            x = u[pivot]
             # Away from the column, so that nothing cancels.
-            side = ca.if_else(x < 0, -1.0, 1.0)
-            u[pivot] = x + side * size
-            self._reflections.append((1.0 / (size * (size + side * x)), u))
-            self.inverse.append(-side / size)
+            size = (1.0 - 2.0 * (x < 0)) * ca.sqrt(self.remainders[j])
+            u[pivot] = longer = x + size
+            # One quotient for both.
+            weight = reciprocal(size * longer)
+            self._reflections.append((weight, u))
+            self._inverse.append(-weight * longer)
             for other in later:
                 self._reflect(j, other)
         self._R = [
@@ -318,12 +322,12 @@ class OrthogonalColumns:
         ]
 
     @property
-    def dependence(self) -> Any:
-        """The largest square of a column over that of its part beside the columns before it."""
-        worst: Any = ca.SX(0.0)
+    def independent(self) -> Any:
+        """Whether each column has a part beside the columns before it, relative to its size."""
+        out: Any = ca.SX(1.0)
         for j in self._joined:
-            worst = ca.fmax(worst, self.squares[j] * self.inverse[j] ** 2)
-        return worst
+            out = ca.logic_and(out, self.remainders[j] > DEPENDENT**2 * self.squares[j])
+        return out
 
     def _reflect(self, j: int, y: dict[int, Any]) -> None:
         weight, u = self._reflections[j]
@@ -357,13 +361,13 @@ class OrthogonalColumns:
         left = f - self._back(dict(zip(self._pivots, parts, strict=True)), self._m, 1)
         # It vanishes up to rounding.
         left[which] = 0.0
-        return left, self.weights(parts), [1.0 / ca.SX(x) ** 2 for x in own.inverse]
+        return left, self.weights(parts), own.remainders
 
     def weights(self, z: list[Any]) -> Any:
         """Return λ with R λ = z."""
         left, out = [*z], [ca.SX(0.0)] * self._m
         for j in reversed(range(self._m)):
-            out[j] = left[j] * self.inverse[j]
+            out[j] = left[j] * self._inverse[j]
             for i, r in self._R[j].items():
                 left[i] = left[i] - r * out[j]
         return ca.vertcat(*out)
@@ -380,7 +384,7 @@ class OrthogonalColumns:
         out: list[Any] = []
         for j in range(rows):
             known = sum((r * out[i] for i, r in self._R[j].items()), 0.0)
-            out.append((scalar(rate[j, :]) - known) * self.inverse[j])
+            out.append((scalar(rate[j, :]) - known) * self._inverse[j])
         return out
 
     def _back(self, y: dict[int, Any], rows: int, k: int) -> Any:

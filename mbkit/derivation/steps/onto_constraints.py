@@ -153,11 +153,11 @@ def dependence(equations: Any) -> ca.Function:
     it at q: infinite where a row follows from others or has no slope. Its root grows as the inverse of the distance.
     """
     if "dependence" not in equations.kept:
-        worst: Any = 0.0
-        for inverse, size in zip(equations.constraint_factors.rows.inverse, _largest(equations), strict=True):
-            worst = ca.fmax(worst, size * inverse**2)
+        left: Any = ca.SX(np.inf)
+        for square, usual in zip(equations.constraint_factors.rows.remainders, _largest(equations), strict=True):
+            left = ca.fmin(left, square / usual)
         given = [equations.q, *equations.extra_arguments.values()]
-        equations.kept["dependence"] = ca.Function("dependence", given, [worst])
+        equations.kept["dependence"] = ca.Function("dependence", given, [1.0 / left])
     out: ca.Function = equations.kept["dependence"]
     return out
 

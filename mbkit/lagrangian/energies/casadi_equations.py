@@ -133,7 +133,7 @@ class EnergyEquations(ConstraintQuantities, Equations):
     @cached_property
     def constraint_factors(self) -> ConstraintFactors:
         """Factors of M and of J's rows in its metric."""
-        return ConstraintFactors(self.constraints, self.mass_matrix, self.elimination_order, careful=True, refined=2)
+        return ConstraintFactors(self.constraints, self.mass_matrix, self.elimination_order, careful=True)
 
     @cached_property
     def _constrained(self) -> tuple[Any, Any]:
