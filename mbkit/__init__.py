@@ -4,8 +4,7 @@ The equation, everywhere in this library::
 
     M(q) v̇ + C(q, v) v + g(q) = τ + τ_passive(q, v),      q̇ = D(q) v
 
-SI units and radians; notebooks/reference/conventions.md has the conventions. Heavy parts load when they are first
-used.
+SI units and radians; notebooks/reference/conventions.md has the conventions. Heavy parts load when they are first used.
 """
 
 from __future__ import annotations

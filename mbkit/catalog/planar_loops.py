@@ -137,12 +137,7 @@ def inverted_slider_crank(
 
 @system
 def five_bar(
-    *,
-    ground: Number = 0.6,
-    proximal: Number = 0.3,
-    distal: Number = 0.5,
-    density: Number = 2.0,
-    gravity: Number = 9.81,
+    *, ground: Number = 0.6, proximal: Number = 0.3, distal: Number = 0.5, density: Number = 2.0, gravity: Number = 9.81
 ) -> Model:
     """Return the symmetric five-bar: two arms of two thin rods each that hold a common tip.
 
@@ -216,12 +211,7 @@ def pantograph(*, arm: Number = 0.5, ratio: Number = 2.0, density: Number = 0.5,
 
 @system
 def peaucellier(
-    *,
-    arm: Number = 0.52,
-    side: Number = 0.25,
-    crank: Number = 0.165,
-    density: Number = 1.0,
-    gravity: Number = 9.81,
+    *, arm: Number = 0.52, side: Number = 0.25, crank: Number = 0.165, density: Number = 1.0, gravity: Number = 9.81
 ) -> Model:
     """Return the linkage of Peaucellier and Lipkin, which leads a point exactly on a straight line.
 
@@ -288,12 +278,7 @@ def watt(*, arm: Number = 0.5, coupler: Number = 0.4, density: Number = 1.0, gra
 
 @system
 def chebyshev(
-    *,
-    rocker: Number = 0.5,
-    coupler: Number = 0.2,
-    ground: Number = 0.4,
-    density: Number = 1.0,
-    gravity: Number = 9.81,
+    *, rocker: Number = 0.5, coupler: Number = 0.2, ground: Number = 0.4, density: Number = 1.0, gravity: Number = 9.81
 ) -> Model:
     """Return Chebyshev's linkage: two crossed rockers, whose coupler's middle stays near a level line.
 
@@ -325,12 +310,7 @@ def chebyshev(
 
 @system
 def hoecken(
-    *,
-    crank: Number = 0.1,
-    ground: Number = 0.2,
-    rocker: Number = 0.25,
-    density: Number = 1.0,
-    gravity: Number = 9.81,
+    *, crank: Number = 0.1, ground: Number = 0.2, rocker: Number = 0.25, density: Number = 1.0, gravity: Number = 9.81
 ) -> Model:
     """Return Hoecken's linkage: a four-bar that leads its coupler's end near a level line for half a turn.
 

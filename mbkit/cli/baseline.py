@@ -92,11 +92,10 @@ def check(
 ) -> None:
     """Hold robots and engines against what was recorded in each PATH, a file or a folder of them.
 
-    A changed parameter of the description is named first; then a number that moved, with its
-    term, joint and engine, and the version that did. New versions alone ask, on a terminal, whether to
-    record again. Exit status: 0 as recorded, 1 something differs (or with --strict an engine is
-    missing), 2 misuse, a file that cannot be read, or nothing that could be checked; 0 too for
-    what --rebaseline recorded.
+    A changed parameter of the description is named first; then a number that moved, with its term, joint and engine,
+    and the version that did. New versions alone ask, on a terminal, whether to record again. Exit status: 0 as
+    recorded, 1 something differs (or with --strict an engine is missing), 2 misuse, a file that cannot be read, or
+    nothing that could be checked; 0 too for what --rebaseline recorded.
     """
     files = _files(paths)
     _check_target(files, target, options)
@@ -207,9 +206,7 @@ def _bisect_one(file: Path, target: str | None, options: dict[str, Any], *, tabl
     return result
 
 
-@shared.command(
-    "mbkit baseline diff old.toml new.toml",
-)
+@shared.command("mbkit baseline diff old.toml new.toml")
 @click.argument("path_a", type=_FILE)
 @click.argument("path_b", type=_FILE)
 @shared.json_option

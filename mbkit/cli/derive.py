@@ -26,9 +26,7 @@ _C_FOLDER: Final = "mbkit-export"
 
 
 @shared.command(
-    "mbkit derive cart_pole",
-    "mbkit derive double_pendulum --latex --out equations",
-    "mbkit derive kepler --python",
+    "mbkit derive cart_pole", "mbkit derive double_pendulum --latex --out equations", "mbkit derive kepler --python"
 )
 @click.argument("system")
 @click.option("--latex", is_flag=True, help="Print LaTeX.")
@@ -214,9 +212,8 @@ def _text(
 def export(target: str, options: dict[str, Any], as_json: bool, out: Path, force: bool, **choices: Any) -> None:
     """Write the equations of motion of TARGET as C99 that needs no library.
 
-    TARGET is what `mbkit check` takes. The header tells how to compile and call it, the
-    units, the conventions and the order of the joints. A file that mbkit wrote before is
-    replaced; an unknown quantity lists those that there are.
+    TARGET is what `mbkit check` takes. The header tells how to compile and call it, the units, the conventions and the
+    order of the joints. A file that mbkit wrote before is replaced; an unknown quantity lists those that there are.
     """
     from mbkit.studies._targets import model_of
 

@@ -71,21 +71,18 @@ def diff(
 
 def _beside_terms(first: str, second: str) -> tuple[str, ...]:
     """Return what differs in what MuJoCo simulates of two MJCFs, or was not compared of one."""
-    from mbkit.engines.mujoco.simulated import differences, settings_of
+    from mbkit.engines.mujoco.simulated import differences
     from mbkit.load.sanitized_text import strip
 
     paths = [x for x in (first, second) if x.lower().endswith((".xml", ".mjcf")) and os.path.isfile(x)]
-    if not paths:
-        return ()
-    out: tuple[str, ...] = ()
-    why = f" of {os.path.basename(paths[0])}" if len(paths) < 2 else ""
+    missing = "not compared: options of simulation, servos, force ranges, contacts, limits"
+    if len(paths) < 2:
+        return tuple(f"{missing} of {os.path.basename(path)}" for path in paths)
     try:
-        files = [] if why else [strip(Path(path)) for path in paths]
-        out = tuple(differences(*(settings_of(x.text, x.meshes) for x in files))) if files else ()
+        files = [strip(Path(path)) for path in paths]
+        out = tuple(differences((x.text, x.meshes) for x in files))
     except Exception as error:  # MuJoCo raises errors of many kinds
-        why = f", which MuJoCo does not read here ({' '.join(str(error).split())[:120]})"
-    if why:
-        return (f"not compared: options of simulation, servos, force ranges, contacts, limits{why}",)
+        return (f"{missing}, which MuJoCo does not read here ({' '.join(str(error).split())[:120]})",)
     pairs = [sorted((x.tag, *x.attributes.items()) for c in f.root.all("contact") for x in c.children) for f in files]
     out += ("pairs and exclusions of contact",) if pairs[0] != pairs[1] else ()
     lost = any(tag in ("mesh", "hfield") for f in files for tag, _ in f.gone)

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 
 
 @shared.command(
-    "mbkit stress --list",
-    "mbkit stress --quick",
-    "mbkit stress joint_spring heavy_tip --engines lagrangian,mujoco",
+    "mbkit stress --list", "mbkit stress --quick", "mbkit stress joint_spring heavy_tip --engines lagrangian,mujoco"
 )
 @click.argument("cases", nargs=-1, metavar="[CASE]...")
 @click.option("--quick", is_flag=True, help="Fewer values and methods: under two minutes instead of thirty.")
@@ -44,9 +42,8 @@ def stress(
 ) -> None:
     """Sweep each CASE's number over decades: where does each engine and method break, and how.
 
-    All cases where none is named; --list tells them. A page, JSON and CSV are written.
-    Every run is in a process of its own with a bound of time and memory. Ctrl-C ends the
-    study early and writes the finished part.
+    All cases where none is named; --list tells them. A page, JSON and CSV are written. Every run is in a process of its
+    own with a bound of time and memory. Ctrl-C ends the study early and writes the finished part.
     """
     if listing:
         _list(as_json=report.as_json)

@@ -21,14 +21,7 @@ from typing import Any, Final, NamedTuple
 
 import casadi as ca
 
-from mbkit.derivation.kinematics import (
-    Kinematics,
-    Vector,
-    add,
-    constant_times,
-    constant_transposed_times,
-    dot3,
-)
+from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_times, constant_transposed_times, dot3
 from mbkit.derivation.links import Inertia
 from mbkit.derivation.regressor import energy_regressor, momentum_regressor, torque_regressor
 from mbkit.derivation.rotations import SYMMETRIC, Matrix
@@ -339,8 +332,7 @@ BODY_QUANTITIES: Final[dict[str, BodyQuantity]] = {
     "jacobian": BodyQuantity(("q",), _frame_jacobians, 3, 6),
     "velocity": BodyQuantity(("q", "v"), lambda m, frames, axes: _rows([m.velocity(name, axes) for name in frames])),
     "acceleration": BodyQuantity(
-        ("q", "v", "a"),
-        lambda m, frames, axes, kind: _rows([m.acceleration(name, axes, kind, m.a) for name in frames]),
+        ("q", "v", "a"), lambda m, frames, axes, kind: _rows([m.acceleration(name, axes, kind, m.a) for name in frames])
     ),
     "jacobian_dot_v": BodyQuantity(
         ("q", "v"), lambda m, frames, axes: _rows([m.jacobian_rate_times_v(name, axes) for name in frames])

@@ -58,10 +58,7 @@ def elimination_of(model: Model) -> Elimination:
 
 
 def equations_of(
-    model: Model,
-    constants: Constants = "literal",
-    elimination: Elimination | None = None,
-    acting: Acting = NOTHING,
+    model: Model, constants: Constants = "literal", elimination: Elimination | None = None, acting: Acting = NOTHING
 ) -> Equations:
     """Return a model's equations: from the energies that it was written as, or from its bodies.
 

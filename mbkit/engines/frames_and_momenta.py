@@ -53,8 +53,7 @@ def seen_from(R: Array, p: Array, linear: Array, angular: Array, axes: str) -> A
 def accelerated(R: Array, p: Array, velocity: Array, classical: Array, axes: str, kind: str) -> Array:
     """Return an acceleration, (6,), in these axes.
 
-    `velocity` and `classical`, (6,), are velocity and acceleration of a frame's origin in world axes, and angular
-    ones.
+    `velocity` and `classical`, (6,), are velocity and acceleration of a frame's origin in world axes, and angular ones.
     """
     v, w = velocity[:3], velocity[3:]
     spatial = seen_from(R, p, classical[:3] - skew(w) @ v, classical[3:], axes)

@@ -256,11 +256,7 @@ class Lagrangian(EnergyForm):
     # Impacts
 
     def impulse(
-        self,
-        impulses: Mapping[Any, Any] | None = None,
-        *,
-        rows: Any = (),
-        restitution: Any = 0,
+        self, impulses: Mapping[Any, Any] | None = None, *, rows: Any = (), restitution: Any = 0
     ) -> ImpulseEquations:
         """Return the equations of an impact, which changes velocities at once: M (v⁺ - v⁻) = Ŝ + Jᵀ P.
 

@@ -89,10 +89,9 @@ def load(
 ) -> Model:
     """Load a robot by name, or a URDF, MJCF or SDF: a file, its text, or a xacro file of a URDF.
 
-    No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF
-    its inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers, and
-    the rotors of its actuators as armature; a tendon whose inertia changes with q is refused. Limits are data, off in
-    every engine.
+    No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF its
+    inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers, and the rotors of
+    its actuators as armature; a tendon whose inertia changes with q is refused. Limits are data, off in every engine.
 
     Parameters
     ----------

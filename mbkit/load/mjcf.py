@@ -1,9 +1,8 @@
 """MJCF to `Model`, element by element, by MuJoCo's rules (XML reference of 4.0).
 
-Pinocchio's MJCF parser (4.1.0) loses bodies, masses and springs without a message. A body's frame is its last
-joint's; a frame of the body's name keeps the body's origin. A body with several joints becomes a chain of massless
-bodies. Coordinates are MuJoCo's: a hinge is at its ``ref`` in the pose of the file, a free joint's are its pose in
-the world.
+Pinocchio's MJCF parser (4.1.0) loses bodies, masses and springs without a message. A body's frame is its last joint's;
+a frame of the body's name keeps the body's origin. A body with several joints becomes a chain of massless bodies.
+Coordinates are MuJoCo's: a hinge is at its ``ref`` in the pose of the file, a free joint's are its pose in the world.
 """
 
 from __future__ import annotations

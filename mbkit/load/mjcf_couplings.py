@@ -2,11 +2,10 @@
 
 A fixed tendon of length l = Σ coef q becomes a `JointCoupling`, or numbers of its only joint. A spatial tendon straight
 between two sites becomes a `PointSpring`. Springs and dampers over several sites, between two rest lengths, or with
-polynomials become forces by functions. A path around geoms that acts, and an inertia on a path, are refused. The
-length of an actuator is gear times a joint's coordinate or a tendon's length; its force at zero control and activation
-is b0 + b1 l + b2 dl/dt with `biasprm` (b0, b1, b2): a spring of stiffness -b1 and rest length -b0/b1, and a damper -b2.
-These act where the file is read with its actuators; without, a rotor's inertia and the damping of the transmission act
-alone.
+polynomials become forces by functions. A path around geoms that acts, and an inertia on a path, are refused. The length
+of an actuator is gear times a joint's coordinate or a tendon's length; its force at zero control and activation is b0 +
+b1 l + b2 dl/dt with `biasprm` (b0, b1, b2): a spring of stiffness -b1 and rest length -b0/b1, and a damper -b2. These
+act where the file is read with its actuators; without, a rotor's inertia and the damping of the transmission act alone.
 """
 
 from __future__ import annotations

@@ -300,8 +300,7 @@ class EmbeddedTableau(Tableau):
 def dormand_prince_853() -> EmbeddedTableau:
     """Return Dormand and Prince's pair of order 8, with errors estimated by orders 5 and 3.
 
-    Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.5 and
-    its program DOP853.
+    Hairer, Nørsett, Wanner 1993, Solving Ordinary Differential Equations I, II.5 and its program DOP853.
     """
     b = np.array(_B_853)
     third = b.copy()

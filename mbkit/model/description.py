@@ -278,8 +278,7 @@ class Description:
     nonphysical : tuple of (str, str)
         Bodies with an inconsistent inertia, each with the reason.
     bindings : tuple of Binding
-        The numbers that are expressions of parameters. The parts hold their nominal
-        values, and NaN without one.
+        The numbers that are expressions of parameters. The parts hold their nominal values, and NaN without one.
     source : str
         Path of the file that the loader read, with the shapes to draw; empty without one. Like the notes, it does not
         count for equality.

@@ -49,9 +49,8 @@ def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
     model : Model
     kind : {"visual", "collision", "sticks"}
         Of the file that the model came from; where it has none of them, the other ones if they are on half of the
-        bodies. Without a file, and for a
-        link whose mesh cannot be read, and for "sticks": capsules from joint to joint, and boxes with the mass and
-        inertia of the bodies.
+        bodies. Without a file, and for a link whose mesh cannot be read, and for "sticks": capsules from joint to
+        joint, and boxes with the mass and inertia of the bodies.
 
     Raises
     ------

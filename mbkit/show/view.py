@@ -145,14 +145,7 @@ def show(
 
 
 def animate(
-    model: Model,
-    q: Array,
-    t: Array,
-    path: str | os.PathLike[str] | None,
-    *,
-    shapes: Kind,
-    triangles: int,
-    fps: float,
+    model: Model, q: Array, t: Array, path: str | os.PathLike[str] | None, *, shapes: Kind, triangles: int, fps: float
 ) -> View:
     """Show a motion: configurations (K, nq) at times (K,) in s; for the arguments see `Trajectory.animate`."""
     if not isinstance(model, Model):

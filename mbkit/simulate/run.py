@@ -80,11 +80,10 @@ def simulate(
     progress : bool or callable, optional
         True shows a bar when the run takes more than 2 s; a callable gets the fraction done.
     events : Event or sequence of Event, optional
-        What ends the run or is noted on the way, for methods that have events: `mbkit.simulate.at_limits`,
-        `at_energy`, `at_section`, or an `Event` of any function of (t, q, v). ``Trajectory.events`` has those that
-        happened. Where one ends a single run, its state is the last one of the trajectory too; each trajectory of a
-        batch ends by itself, is NaN at the saved times after that, and has the event's state in ``Trajectory.events``
-        alone.
+        What ends the run or is noted on the way, for methods that have events: `mbkit.simulate.at_limits`, `at_energy`,
+        `at_section`, or an `Event` of any function of (t, q, v). ``Trajectory.events`` has those that happened. Where
+        one ends a single run, its state is the last one of the trajectory too; each trajectory of a batch ends by
+        itself, is NaN at the saved times after that, and has the event's state in ``Trajectory.events`` alone.
     doubt : bool
         Whether a finished run is checked for energy from nowhere, a singular mass matrix, coordinates beyond the
         digits of a double, tolerances that add up and gimbal lock. That takes a few percent of the run; so short

@@ -291,7 +291,9 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
     held = np.broadcast_to(held, (*v.shape[:-2], len(h), held.shape[-1]))
     pushed, wrenches = held[..., :nv], held[..., nv:]
     coordinates, plain = np.array(_plain(dyn.model), dtype=int).reshape(-1, 2).T
-    losing, turned = bool(_loses(dyn) or wrenches.any()), len(plain) < nv and bool(pushed.any())
+    model = dyn.model
+    lossy = dyn.soft_friction or model.needs.damping or model.forces or not model.has_bodies or _driven(dyn)
+    losing, turned = bool(lossy or wrenches.any()), len(plain) < nv and bool(pushed.any())
     ends = [(q[..., i : len(h) + i, :], v[..., i : len(h) + i, :]) for i in (0, 1)]
     owns = [_at_end(dyn, v.shape[:-1], i) for i in (0, 1)]
     a = [np.zeros(0)] * 2
@@ -365,12 +367,6 @@ def _with_rate(
 def _driven(dyn: Dynamics) -> bool:
     """Return whether constraints do work."""
     return dyn.model.constrained and (dyn.soft_constraints or dyn.model.constraints_do_work)
-
-
-def _loses(dyn: Dynamics) -> bool:
-    """Return whether something beside τ, wrenches and exact dry friction changes the energy."""
-    model = dyn.model
-    return bool(_driven(dyn) or dyn.soft_friction or model.needs.damping or model.forces or not model.has_bodies)
 
 
 def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:

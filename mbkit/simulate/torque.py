@@ -91,11 +91,7 @@ class StateFeedback:
     """
 
     def __init__(
-        self,
-        gain: ArrayLike,
-        q: ArrayLike | None = None,
-        v: ArrayLike | None = None,
-        torque: ArrayLike | None = None,
+        self, gain: ArrayLike, q: ArrayLike | None = None, v: ArrayLike | None = None, torque: ArrayLike | None = None
     ) -> None:
         shape = _shape("gain", gain)
         if len(shape) != 2 or shape[1] < 2 * shape[0]:

@@ -101,10 +101,7 @@ class Worker(Child):
         self._send(pickle.dumps(main) + call)
 
     def finish(
-        self,
-        cpu_seconds: float = inf,
-        stage_seconds: Mapping[str, float] | None = None,
-        deadline: float = inf,
+        self, cpu_seconds: float = inf, stage_seconds: Mapping[str, float] | None = None, deadline: float = inf
     ) -> Any:
         """Return the result of the call that was begun; see `call`."""
         limits = stage_seconds or {}

@@ -5,10 +5,9 @@ Discrete mechanics and variational integrators, ch. 1.3)::
 
     L_d(q0, q1) = h L(q_m, w)      q_m = q0 moved by h w/2      q1 = q0 moved by h w
 
-with w the velocity of `mbkit.model.integration_space`, constant over the step, and forces by the
-discrete Lagrange-d'Alembert principle (ch. 3.2). So it is symplectic on T*Q, keeps what
-Noether's theorem keeps, and is its own inverse under h -> -h. With μ = ∂L/∂w and f = ∂L/∂q
-plus all applied forces, both at (q_m, w), plain coordinates have ::
+with w the velocity of `mbkit.model.integration_space`, constant over the step, and forces by the discrete
+Lagrange-d'Alembert principle (ch. 3.2). So it is symplectic on T*Q, keeps what Noether's theorem keeps, and is its own
+inverse under h -> -h. With μ = ∂L/∂w and f = ∂L/∂q plus all applied forces, both at (q_m, w), plain coordinates have ::
 
     p0 = μ - h/2 f      p1 = p0 + h f
 

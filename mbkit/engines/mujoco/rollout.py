@@ -78,12 +78,7 @@ def rollout(
 
 
 def _run(
-    m: Any,
-    data: list[Any],
-    start: Array,
-    control: Array | None,
-    steps: int,
-    progress: Callable[[float], object] | None,
+    m: Any, data: list[Any], start: Array, control: Array | None, steps: int, progress: Callable[[float], object] | None
 ) -> Array:
     """Return the states after 0, 1, ... steps, (N, steps + 1, size)."""
     states = np.empty((len(start), steps + 1, start.shape[1]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 import mujoco
@@ -23,11 +23,9 @@ _FIELDS: Final = {
     "eq": ("neq", "active0 solref solimp"),
 }
 
-Settings = dict[str, Any]
 
-
-def settings_of(text: str, files: dict[str, bytes]) -> Settings:
-    """Return the numbers by what they are of; raises whatever MuJoCo does over a text that it cannot read."""
+def _settings(text: str, files: dict[str, bytes]) -> dict[str, Any]:
+    """Return the numbers by what they are of."""
     m = mujoco.MjModel.from_xml_string(text, files)
     names = {x: getattr(m.opt, x) for x in dir(m.opt) if not x.startswith("_") and x != "gravity"}
     out = {x: _NAMED[x](y).name.split("_")[1].lower() if x in _NAMED else _numbers(y) for x, y in names.items()}
@@ -43,8 +41,9 @@ def _numbers(x: Any) -> str:
     return " ".join(f"{y:.6g}" for y in np.trim_zeros(np.atleast_1d(x).astype(float), "b")) or "0"
 
 
-def differences(a: Settings, b: Settings) -> Iterator[str]:
-    """Yield what differs, in words."""
+def differences(files: Iterable[tuple[str, dict[str, bytes]]]) -> Iterator[str]:
+    """Yield what differs between two texts with their files; raises what MuJoCo does over one that it cannot read."""
+    a, b = (_settings(*file) for file in files)
     for what in dict.fromkeys([*a, *b]):
         if a.get(what) != b.get(what):
             yield f"{what} {a.get(what, 'none')} → {b.get(what, 'none')}"

@@ -127,7 +127,7 @@ _WITHOUT_LOOPS: Final = {
     "forward_dynamics_derivatives": (
         f"computeConstraintDynamicsDerivatives of Pinocchio {pin.__version__} is not the derivative by q of "
         "constraintDynamics; mbkit.dynamics(model, 'lagrangian') has it"
-    ),
+    )
 }
 
 

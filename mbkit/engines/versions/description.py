@@ -77,12 +77,7 @@ def travelling(engine: str, steps: Steps | None, model: Model) -> tuple[dict[str
     return {
         "gravity": model.gravity.tolist(),
         "bodies": {
-            b.name: {
-                "mass": b.mass,
-                "com": b.com.tolist(),
-                "inertia": b.inertia.tolist(),
-                "static": b.name in static,
-            }
+            b.name: {"mass": b.mass, "com": b.com.tolist(), "inertia": b.inertia.tolist(), "static": b.name in static}
             for b in model.bodies
         },
         "joints": [

@@ -69,18 +69,15 @@ class Densities:
     def _check(self) -> None:
         jets, most = self.jets, self.orders
         self.jets.check_parameters(self._parts | {"ends": sp.Add(*self.ends)})
-        ends = [(what, e, x) for what in ("T_ends", "V_ends") for e, x in getattr(self, what).items()]
         for what, x in self._parts.items():
             for s in jets.among(x):
-                if jets.order(s)[1][1] > (0 if what.startswith("V") else 1):
+                field, (along, rates) = jets.order(s)
+                if rates > (0 if what.startswith("V") else 1):
                     most_rates = "no rates" if what.startswith("V") else "no second derivatives by the time"
                     raise InputError(f"{what}: expected {most_rates} of the fields, got {s}")
-        for what, e, x in ends:
-            for s in jets.among(x):
-                field, (along, _) = jets.order(s)
-                if along >= most[field]:
+                if "_ends[" in what and along >= most[field]:
                     raise InputError(
-                        f"{what}[{e}]: {s} cannot be passed on: T and V hold derivatives of {jets.fields[field]} along "
+                        f"{what}: {s} cannot be passed on: T and V hold derivatives of {jets.fields[field]} along "
                         f"{jets.x} of order {most[field]} at most, so that an end holds those below"
                     )
         for e, conditions in self.fixed.items():

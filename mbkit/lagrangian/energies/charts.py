@@ -65,12 +65,7 @@ def _indexed(model: Model, joint: Joint, names: Sequence[str]) -> list[str]:
 def quaternion(yaw: Any, pitch: Any, roll: Any) -> list[Any]:
     """Return the quaternion (x, y, z, w) of z-y-x angles from the cosine and sine of half of each."""
     (a, A), (b, B), (c, C) = yaw, pitch, roll
-    return [
-        a * b * C - A * B * c,
-        a * B * c + A * b * C,
-        A * b * c - a * B * C,
-        a * b * c + A * B * C,
-    ]
+    return [a * b * C - A * B * c, a * B * c + A * b * C, A * b * c - a * B * C, a * b * c + A * B * C]
 
 
 def turning(q: Sequence[Any], rate: Sequence[Any]) -> list[Any]:

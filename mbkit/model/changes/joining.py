@@ -61,13 +61,7 @@ def _degrees(R: Array) -> list[float]:
 
 
 def join(
-    base: Model,
-    arm: Model,
-    *,
-    at: str,
-    pose: ArrayLike | None = None,
-    prefix: str = "",
-    name: str | None = None,
+    base: Model, arm: Model, *, at: str, pose: ArrayLike | None = None, prefix: str = "", name: str | None = None
 ) -> Model:
     """Put one model on a frame of another: an arm on a cart, a hand on an arm, two arms on one body.
 

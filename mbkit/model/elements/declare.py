@@ -186,13 +186,7 @@ class ElementBuilder:
         return numbers if several else numbers[0]
 
     def add_joint_force(
-        self,
-        name: str,
-        joint: str,
-        force: Any = None,
-        *,
-        potential: Any = None,
-        parameters: Constants | None = None,
+        self, name: str, joint: str, force: Any = None, *, potential: Any = None, parameters: Constants | None = None
     ) -> None:
         """Add a generalized force at a joint, a function of (t, q, v): a spring, a damper, a motor.
 

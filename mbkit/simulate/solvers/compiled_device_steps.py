@@ -45,13 +45,7 @@ def step_on_device(
 
 
 def _run(
-    problem: IntegrationProblem,
-    record: GridRecord,
-    arena: Arena,
-    w0: Array,
-    members: Indices,
-    done: float,
-    end: float,
+    problem: IntegrationProblem, record: GridRecord, arena: Arena, w0: Array, members: Indices, done: float, end: float
 ) -> None:
     dyn, grid, torque = problem.dyn, problem.grid, problem.torque
     assert isinstance(dyn, LagrangianDynamics)

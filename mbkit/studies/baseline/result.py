@@ -127,8 +127,7 @@ class BaselineResult(ResultTable):
     def lines(self, everything: bool = False) -> Iterator[tuple[str, str]]:
         """Iterate over the findings, gravest first: (subject, message).
 
-        Unless `everything` is set, the first 20 parameters and of each engine the 5 numbers that
-        are off most.
+        Unless `everything` is set, the first 20 parameters and of each engine the 5 numbers that are off most.
         """
         most = len(self.moved) if everything else _MOST
         shown = self.changes if everything else self.changes[:_MOST_CHANGES]

@@ -1,11 +1,10 @@
 """`record`, `check` and `diff`: engines' numbers into a file, and what moved since.
 
 Errors are those of `mbkit.studies.compare.errors`, on the recorded values' own scales, so nothing but the file and an
-engine is needed. An engine's own error against 34 digits, measured at recording, says what its rounding is: 16
-times that is allowed, because the error is the worst of a handful of states and another processor rounds elsewhere;
-and of an error below 8 eps (`FINE`) 16 times 8 eps, because a handful of states can by chance show almost none. What
-differed by more than `ROUNDING` when it was recorded is no rounding; it is held against the engine's own values, to
-`OWN`.
+engine is needed. An engine's own error against 34 digits, measured at recording, says what its rounding is: 16 times
+that is allowed, because the error is the worst of a handful of states and another processor rounds elsewhere; and of an
+error below 8 eps (`FINE`) 16 times 8 eps, because a handful of states can by chance show almost none. What differed by
+more than `ROUNDING` when it was recorded is no rounding; it is held against the engine's own values, to `OWN`.
 """
 
 from __future__ import annotations
@@ -81,8 +80,7 @@ def record(
 
     The file has the model's parameters, every term at a few seeded states, there the pose and the velocity of frames
     that the file names, and the end of a short rollout, by the oracle; how far each engine was from these; and
-    versions. The same model, versions and processor give the same
-    bytes.
+    versions. The same model, versions and processor give the same bytes.
 
     Parameters
     ----------

@@ -108,13 +108,7 @@ def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajector
 
 
 def _row(
-    dyn: Dynamics,
-    ours: Trajectory,
-    theirs: Trajectory,
-    condition: Array,
-    beyond: bool,
-    amplified: float,
-    note: str,
+    dyn: Dynamics, ours: Trajectory, theirs: Trajectory, condition: Array, beyond: bool, amplified: float, note: str
 ) -> RolloutRow:
     """Return two runs compared up to the last step that has a condition; beyond it may have grown too much.
 

@@ -121,9 +121,7 @@ def acceleration_errors(error: Array, reference: Array, scales: Scales) -> Error
     condition = scales.of_accelerations
     forward = ratio(np.linalg.norm(root * e, axis=1), size * condition)
     return Errors(
-        e.max(axis=1, initial=0.0),
-        np.maximum(forward, backward),
-        ratio(e, own * condition[:, None]).max(axis=0),
+        e.max(axis=1, initial=0.0), np.maximum(forward, backward), ratio(e, own * condition[:, None]).max(axis=0)
     )
 
 

@@ -46,17 +46,16 @@ class Row:
     """One term of one engine against the reference, worst over all samples.
 
     `reference` is ``"oracle"``, an engine where the oracle has no value, or ``"own law"`` where an engine's constraints
-    are soft. `max_abs` is the largest absolute
-    difference of any entry, in the term's own unit; `relative` the worst normwise error of a sample, and `median` the
-    median, see `mbkit.studies.compare.errors`; `per_joint` the worst error of a joint relative to its own scale, and
-    `joint` that joint, empty for energies. `worst_kind` (random, neutral, at limits, near singular), `worst_q` and
-    `worst_v` are the state of the worst sample. `ns` is the median of nanoseconds per evaluation of a single state,
-    `ns_spread` half their interquartile range. `reason` says why the row failed, naming joints and a known defect
-    where there is one; or why more than the comparison's tolerance was allowed. `allowed` is the error that passes:
-    that tolerance, or more where the engine's own formula cannot do better. `defect` is the engine's known defect,
-    where the row failed with one announced. `zero` says whether the reference is zero in every entry at every state,
-    so that the row is no evidence. `bits` are those of the significand with which the engine computes: 53, or 24 in
-    single precision, where `allowed` is what that precision costs the term.
+    are soft. `max_abs` is the largest absolute difference of any entry, in the term's own unit; `relative` the worst
+    normwise error of a sample, and `median` the median, see `mbkit.studies.compare.errors`; `per_joint` the worst error
+    of a joint relative to its own scale, and `joint` that joint, empty for energies. `worst_kind` (random, neutral, at
+    limits, near singular), `worst_q` and `worst_v` are the state of the worst sample. `ns` is the median of nanoseconds
+    per evaluation of a single state, `ns_spread` half their interquartile range. `reason` says why the row failed,
+    naming joints and a known defect where there is one; or why more than the comparison's tolerance was allowed.
+    `allowed` is the error that passes: that tolerance, or more where the engine's own formula cannot do better.
+    `defect` is the engine's known defect, where the row failed with one announced. `zero` says whether the reference is
+    zero in every entry at every state, so that the row is no evidence. `bits` are those of the significand with which
+    the engine computes: 53, or 24 in single precision, where `allowed` is what that precision costs the term.
     """
 
     term: str

@@ -19,12 +19,7 @@ from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
 
 #: Compared terms: name in tables, quantity, arguments.
-TERMS: Final = (
-    ("M", "mass_matrix", "q"),
-    ("g", "gravity", "q"),
-    ("nle", "nle", "qv"),
-    ("passive", "passive", "qv"),
-)
+TERMS: Final = (("M", "mass_matrix", "q"), ("g", "gravity", "q"), ("nle", "nle", "qv"), ("passive", "passive", "qv"))
 _TINY: Final = 1e-300
 #: Of each row's size: what rounded digits of a description leave of a state that keeps its constraints.
 _OPEN: Final = 1e-6

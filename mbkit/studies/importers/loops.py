@@ -19,10 +19,7 @@ from mbkit.studies.explain.hypotheses import angle_of
 from mbkit.studies.explain.merged_model import Tolerances
 
 #: What switches equalities off, by element.
-_SWITCHES: Final = {
-    **dict.fromkeys(("equality", "connect", "weld"), ("active",)),
-    "flag": ("equality", "constraint"),
-}
+_SWITCHES: Final = {**dict.fromkeys(("equality", "connect", "weld"), ("active",)), "flag": ("equality", "constraint")}
 
 
 @dataclass(frozen=True)

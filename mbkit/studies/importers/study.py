@@ -52,13 +52,7 @@ from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
-from mbkit.studies.importers.loops import (
-    WrittenLoops,
-    activated,
-    closures,
-    coupler_differences,
-    loop_differences,
-)
+from mbkit.studies.importers.loops import WrittenLoops, activated, closures, coupler_differences, loop_differences
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import Worker, describe

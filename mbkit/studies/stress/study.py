@@ -17,13 +17,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from mbkit._check import count, real
-from mbkit._child_process import (
-    OUT_OF_MEMORY,
-    WorkerClosedError,
-    WorkerDiedError,
-    WorkerStartError,
-    WorkerTimeoutError,
-)
+from mbkit._child_process import OUT_OF_MEMORY, WorkerClosedError, WorkerDiedError, WorkerStartError, WorkerTimeoutError
 from mbkit.engines.registry import DERIVED, ENGINES, INDEPENDENT, compared
 from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS

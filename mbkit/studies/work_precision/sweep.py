@@ -458,8 +458,7 @@ class Sweep:
         engines = {x.settings.engine for x in self._curves}
         turn = {x: k for e in engines for k, x in enumerate(x for x in self._curves if x.settings.engine == e)}
         by_cost = sorted(
-            self._curves,
-            key=lambda x: (x.settings.info.stages == 0, turn[x], find_engine(x.settings.engine).derived),
+            self._curves, key=lambda x: (x.settings.info.stages == 0, turn[x], find_engine(x.settings.engine).derived)
         )
         for k, one in enumerate(by_cost):
             yield 0.2 * k / len(self._curves), f"compiling {one.settings.method} on {one.settings.engine}"

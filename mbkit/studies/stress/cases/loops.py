@@ -151,10 +151,7 @@ def _delta(apart: float) -> Model:
         model,
         bodies=(*model.bodies, replace(body, name="rod1c")),
         joints=(*model.joints, middle),
-        loops=(
-            *model.loops,
-            replace(loop, name="ball1c", body_a="rod1c", translation_a=upper, translation_b=lower),
-        ),
+        loops=(*model.loops, replace(loop, name="ball1c", body_a="rod1c", translation_a=upper, translation_b=lower)),
     )
 
 
@@ -175,9 +172,7 @@ _redundant = Series(
     _redundant.row("delta_robot", "Delta with a third rod between two parallel ones.", make=_delta),
 )
 def nearly_redundant(
-    apart: float,
-    add: Callable[[ModelBuilder, float], None] | None = None,
-    make: Callable[[float], Model] | None = None,
+    apart: float, add: Callable[[ModelBuilder, float], None] | None = None, make: Callable[[float], Model] | None = None
 ) -> Problem:
     """Return the accelerations of a mechanism from rest, under random forces."""
     if make is not None:
