@@ -2,6 +2,8 @@
 
 BLAS sums in an order, and with fused operations, that are those of the processor. The digest of a description must not
 hang on the last bits of these, and a choice of rows must not hang on which of two equal ones they make the larger.
+
+Whether rows depend on each other is decided here alone, by `DEPENDENT`.
 """
 
 from __future__ import annotations
@@ -10,9 +12,13 @@ import math
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbkit._check import Array
 
+#: Part of a row that is left of it, once the others are taken away, up to which it follows from them: rounding of J at
+#: a pose that is known to all digits, times the some thousand operations that lead to it.
+DEPENDENT: Final = 1e-12
 #: Of the largest remainder: those that differ by less are equal but for rounding and the digits of a description.
 _TIE: Final = 1e-6
 
@@ -41,7 +47,7 @@ def length(x: Array) -> float:
     return math.sqrt(total)
 
 
-def pivoted(rows: Array, dependent: float) -> tuple[list[int], list[float], Array]:
+def pivoted(rows: Array, dependent: float = DEPENDENT) -> tuple[list[int], list[float], Array]:
     """Return independent rows in the order of their choice, the size of each remainder, and a basis of them.
 
     Gram and Schmidt's orthogonalization, twice for each row, with pivoting (Golub, Van Loan 2013, Matrix Computations,
@@ -50,7 +56,7 @@ def pivoted(rows: Array, dependent: float) -> tuple[list[int], list[float], Arra
     Parameters
     ----------
     rows : (m, n) array
-    dependent : float
+    dependent : float, optional
         Size of a remainder up to which a row follows from the others.
 
     Returns
@@ -74,3 +80,33 @@ def pivoted(rows: Array, dependent: float) -> tuple[list[int], list[float], Arra
         sizes.append(float(norms[k]))
         left -= (left @ unit)[:, None] * unit
     return order, sizes, basis[: len(order)].T
+
+
+def independent_rows(J: Array, first: int | None = None) -> tuple[tuple[int, ...], float]:
+    """Return the largest set of rows that are independent, and the remainder of the last one, by pivoting.
+
+    Of the first rows as many are taken as are independent among themselves, then others: a position that the rates of
+    others imply has to be held all the same.
+    """
+    scaled, first = unit_rows(J), len(J) if first is None else first
+    rows, sizes, basis = pivoted(scaled[:first])
+    more, others, _ = pivoted(scaled[first:] - scaled[first:] @ basis @ basis.T)
+    return (*sorted(rows), *(first + k for k in sorted(more))), min([*sizes, *others], default=0.0)
+
+
+def unit_rows(J: Array) -> Array:
+    """Return J with rows of unit size, (..., m, n), and zeros for a row whose slope is rounding of the others'."""
+    size = np.linalg.norm(J, axis=-1, keepdims=True)
+    return np.asarray(J / np.where(size > DEPENDENT * size.max(axis=-2, keepdims=True, initial=0.0), size, np.inf))
+
+
+def singular_values(J: Array) -> Array:
+    """Return the singular values of one or more matrices; NaN where a matrix is not finite."""
+    good = np.asarray(np.isfinite(J).all(axis=(-1, -2)))[..., None]
+    sizes = np.linalg.svd(np.where(good[..., None], J, 0.0), compute_uv=False)
+    return np.where(good, sizes, np.nan)
+
+
+def dependent(J: Array) -> NDArray[np.bool_]:
+    """Return whether rows of unit size or less depend on each other, of one matrix (m, n) or each of a batch."""
+    return np.asarray(~(singular_values(J)[..., -1:] > DEPENDENT).all(axis=-1))

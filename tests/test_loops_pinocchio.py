@@ -269,7 +269,7 @@ def test_a_singular_pose_is_refused():
     assert dyn.constraint_solver == "constraintDynamics"
     zero = np.zeros(3)
     for v in ([0.0, 0, 0], [1.0, -1, 1]):
-        with pytest.raises(NumericalError, match="singular pose, where rows of loop 'pin' depend"):
+        with pytest.raises(NumericalError, match=r"singular pose, where rows depend on each other .*loop 'pin'"):
             dyn.forward_dynamics(zero, v, zero)
         with pytest.raises(NumericalError, match="singular pose"):
             dyn.constraint_forces(zero, v, zero)

@@ -7,6 +7,7 @@ near decides the condition of the rows; what 40 digits give knows nothing of mbk
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import mpmath as mp
 import numpy as np
@@ -317,6 +318,26 @@ def test_forces_and_inertias_on_another_branch_are_refused_as_accelerations_are(
             getattr(dyn, name)(moving, *given)
             with pytest.raises(NumericalError, match=r"loop 'loop2' z.*contradicts"):
                 getattr(dyn, name)(other, *given)
+
+
+@pytest.mark.parametrize("options", [{}, {"compile": False}, {"engine": "oracle"}, {"engine": "pinocchio"}])
+def test_a_singular_pose_is_told_by_its_rows(options: dict[str, Any]) -> None:
+    """Bars in line: the row along them has the slope that rounding of π leaves; no link without mass is to blame."""
+    b = mb.ModelBuilder("in_line")
+    for k, parent in enumerate(("world", "bar0", "bar1")):
+        b.add_body(f"bar{k}", mass=1.0, com=(0.5, 0, 0), inertia=(0.01, 0.1, 0.1))
+        place = {"axis": (0, 1, 0), "translation": (float(k > 0), 0, 0)}
+        b.add_joint(f"hinge{k}", "revolute", parent=parent, child=f"bar{k}", **place)
+    b.add_loop("pin", "point", body_a="bar2", body_b="world", translation_a=(1, 0, 0), translation_b=(1, 0, 0))
+    dyn, still = mb.dynamics(b.build(), **{"engine": "lagrangian", **options}), np.zeros((2, 3))
+    rhombus = np.array([0.4, np.pi - 0.8, -np.pi + 0.8])
+    q, _ = dyn.project(rhombus, still[0])
+    poses = np.array([q, [0.0, np.pi, -np.pi]])
+    for name in ("forward_dynamics", "constraint_forces", "actuator_forces"):
+        if name != "actuator_forces":
+            getattr(dyn, name)(q, still[0], still[0])
+        with pytest.raises(NumericalError, match=r"singular pose, where rows depend on each other \(loop 'pin' x;"):
+            getattr(dyn, name)(poses, still, still)
 
 
 # A neck of two parallel rods, each welded to a pin: singular values of J from 2.45 down to 4.6e-9

@@ -20,14 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, Final, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit._reproducible import pivoted
+from mbkit._reproducible import DEPENDENT, independent_rows
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, follower
@@ -43,9 +43,9 @@ from mbkit.model.parts import Loop
 from mbkit.model.rolling import LIES_FLAT, NO_SLIP_ROWS, Contact, contact
 from mbkit.model.validation import sample_mass_matrix
 
-#: Part of a row that is left of it, once the others are taken away, up to which it follows from them: rounding of J at
-#: a pose that is known to all digits, times the some thousand operations that lead to it.
-DEPENDENT: Final = 1e-12
+#: Of the accelerations along a redundant row: what a stage of a long step leaves on its branch, and no other
+#: branch does.
+OFF_BRANCH: Final = 1e-2
 #: Of a mechanism's size: what a few typed digits leave where ends can meet.
 _MEETS: Final = 1e-9
 #: Height of a disc's centre over its radius below which it lies flat: there its height has a kink, where searches for a
@@ -181,7 +181,7 @@ class Constraints:
     def __init__(self, kin: Kinematics, time: Any) -> None:
         self._kin = kin
         rows = _rows(kin, time)
-        choice = choose_rows(kin.model)
+        choice = self.choice = choose_rows(kin.model)
         kept = [rows[i] for i in choice.kept]
         self.names = tuple(row.name for row in kept)
         self.independent, self.closed = choice.independent, choice.closed
@@ -196,8 +196,7 @@ class Constraints:
         self.every = terms(rows).jacobian
         #: All rows that say something, and those of the equation.
         self.all = terms(kept)
-        all_are = len(self.independent) == len(self.names)
-        self.terms = self.all if all_are else terms([kept[i] for i in self.independent])
+        self.terms = self.all if not choice.redundant else terms([kept[i] for i in self.independent])
 
     def spread(self, multipliers: Any) -> Any:
         """Return the multipliers of all rows with the least norm whose force is that of the independent ones."""
@@ -243,6 +242,18 @@ class Constraints:
         return _ends(self._kin, loop).gap
 
 
+def off_branch(J: Any, gamma: Any, a: Any, force: Any, M: Any) -> Any:
+    """Return NaN where accelerations under a force break rows that are redundant where it moves, and else 0."""
+    doubt, rest = 0.0, ca.mtimes(J, a) + gamma
+    # What holds the mechanism still leaves the rounding of the free acceleration, in any direction.
+    size, rounding = ca.sumsqr(a), DEPENDENT**2 * ca.sumsqr(force) / ca.sumsqr(ca.diag(M))
+    for i in range(J.shape[0]):
+        slope = ca.sumsqr(J[i, :])
+        most = OFF_BRANCH**2 * (slope * size + gamma[i] ** 2) + slope * rounding
+        doubt = ca.if_else(rest[i] ** 2 <= most, doubt, np.nan)
+    return doubt
+
+
 # Which rows say something, and which of those are independent: from numbers
 
 
@@ -251,13 +262,19 @@ class RowChoice:
     """Which of all rows say something, and which of those are independent where the loops are closed.
 
     `closed` is a configuration at which they are, or None where none was found. The first `positions` of the kept rows
-    hold positions.
+    hold positions; `names` are those of the kept rows.
     """
 
     kept: tuple[int, ...]
     positions: int
     independent: tuple[int, ...]
+    names: tuple[str, ...]
     closed: Array | None = field(default=None, compare=False)
+
+    @property
+    def redundant(self) -> tuple[int, ...]:
+        """The kept rows that follow from the independent ones where the loops are closed."""
+        return tuple(i for i in range(len(self.kept)) if i not in self.independent)
 
 
 class _Numbers:
@@ -366,7 +383,7 @@ def _chosen_rows(model: Model) -> RowChoice:
     numbers, rng = _Numbers(model), np.random.default_rng(0)
     anywhere = [random_state(model, rng, None)[0] for _ in range(_LOOKS)]
     kept = _with_something_to_say(numbers, anywhere)
-    held = [i for i in kept if i < numbers.positions]
+    held, names = [i for i in kept if i < numbers.positions], tuple(numbers.names[i] for i in kept)
     found: list[_Pose] = []
     for start in (model.neutral(), *anywhere, *(_wide(model, rng) for _ in range(_STARTS))):
         q = numbers.closed(start, held)
@@ -379,9 +396,9 @@ def _chosen_rows(model: Model) -> RowChoice:
             break
     if not found:
         # The state that a user gives tells more: it is refused there, with the residual of each row.
-        return RowChoice(tuple(kept), len(held), tuple(range(len(kept))))
+        return RowChoice(tuple(kept), len(held), tuple(range(len(kept))), names)
     best = max(found, key=lambda x: (x.known, x.least))
-    return RowChoice(tuple(kept), len(held), best.rows, best.q)
+    return RowChoice(tuple(kept), len(held), best.rows, names, best.q)
 
 
 def _wide(model: Model, rng: np.random.Generator) -> Array:
@@ -422,21 +439,6 @@ def _with_something_to_say(numbers: _Numbers, poses: list[Array]) -> list[int]:
             )
         kept += sorted(int(own[k]) for k in chosen)
     return sorted(kept)
-
-
-def independent_rows(J: Array, first: int | None = None) -> tuple[tuple[int, ...], float]:
-    """Return the largest set of rows that are independent, and the remainder of the last one, by pivoting.
-
-    Of the first rows as many are taken as are independent among themselves, then others: a position that the rates of
-    others imply has to be held all the same.
-    """
-    size = np.linalg.norm(J, axis=1)
-    scale = np.where(size > DEPENDENT * size.max(initial=0.0), size, np.inf)
-    scaled = J / scale[:, None]
-    first = len(J) if first is None else first
-    rows, sizes, basis = pivoted(scaled[:first], DEPENDENT)
-    more, others, _ = pivoted(scaled[first:] - scaled[first:] @ basis @ basis.T, DEPENDENT)
-    return (*sorted(rows), *(first + k for k in sorted(more))), min([*sizes, *others], default=0.0)
 
 
 #: Name of each quantity of constraints -> the arguments of its function.
@@ -626,7 +628,15 @@ class ConstrainedMotion(ConstraintQuantities):
 
     @cached_property
     def _constrained(self) -> tuple[Any, Any]:
-        return self.constraint_factors.motion(self.tau + self.passive - self.nle)
+        force = self.tau + self.passive - self.nle
+        a, multipliers = self.constraint_factors.motion(force)
+        rows = self.constraint_rows
+        lost, every = list(rows.choice.redundant), rows.all
+        # A row whose slope is rounding of the others' follows from them.
+        sizes = self.constraint_factors.rows.squares
+        doubt = ca.if_else(reduce(ca.fmin, sizes) > DEPENDENT**2 * reduce(ca.fmax, sizes), 0.0, np.nan)
+        doubt += off_branch(every.jacobian[lost, :], every.gamma[lost, :], a, force, self.mass_matrix)
+        return a + doubt, multipliers + doubt
 
     @property
     def forward_dynamics(self) -> Any:

@@ -181,7 +181,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if model.constrained and self.lacks_constraints:
             require_tree(model, self.engine, self.lacks_constraints)
         #: Whether the first accelerations look whether their state satisfies the constraints.
-        self.looks = self.branches = model.constrained and not self.soft_constraints
+        self.looks = model.constrained and not self.soft_constraints
         self._lock: Any = fork_safe(threading.RLock()) if self._one_at_a_time else nullcontext()
         # Also where a copy begins again.
         vars(self)["model"] = model
@@ -381,16 +381,11 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if self.looks:
             self.looks = False
             self._warn_of_open_states(q)
-        pushed = np.add(tau, self.generalized_force(q, wrenches, axes)) if wrenches and self.branches else tau
         if wrenches:
             frames, w = self._stacked_wrenches(wrenches)
             acting = frames, axes_named(axes)
-            a = self._evaluate("forward_dynamics_with_wrenches", *acting, q=q, v=v, tau=tau, wrenches=w)
-        else:
-            a = self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
-        if self.branches:
-            self._require_branch(q, v, a, pushed)
-        return a
+            return self._evaluate("forward_dynamics_with_wrenches", *acting, q=q, v=v, tau=tau, wrenches=w)
+        return self._evaluate("forward_dynamics", q=q, v=v, tau=tau)
 
     def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> Any:
         """Return ½ vᵀ M v in J, a float or shape (N,).
@@ -629,6 +624,9 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         model, index = self.model, tuple(np.argwhere(~np.isfinite(out))[0].tolist())
         sample = f" in sample {index[0]}" if next(iter(states.values())).ndim == 2 else ""
         if model.has_bodies:
+            if model.constrained and not self.soft_constraints and "tau" in states:
+                i = index[0] if sample else 0
+                self._of_sample(i)._require_regular(*(np.atleast_2d(states[k])[i] for k in "qv"))
             where, why = f"index {index}{sample}", self._suspects()
         else:
             q = states["q"][index[0]] if sample else states["q"]

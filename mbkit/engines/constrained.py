@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of
+from mbkit._reproducible import dependent, unit_rows
 from mbkit._warn import warn
 from mbkit.errors import InputError, MbkitWarning, NumericalError, UnsupportedError
 
@@ -21,9 +22,8 @@ if TYPE_CHECKING:
 CONSISTENT: Final = 1e-8
 #: Part of accelerations that is rounding, of sums and of a solution.
 ROUNDING: Final = 1e-12
-#: Of the accelerations along a redundant row: what a stage of a long step leaves on its branch, and no other
-#: branch does.
-_OFF_BRANCH: Final = 1e-2
+#: Of a unit vector: the entries of rows that depend on each other.
+_TAKES_PART: Final = 0.1
 QUANTITIES: Final = (
     "constraint_residual",
     "constraint_jacobian",
@@ -38,6 +38,18 @@ QUANTITIES: Final = (
 def off_by(error: float, exact: str) -> str:
     """Return how far accelerations are from exact ones, as text; what double precision cannot tell is rounding."""
     return f"{100 * error:.2g} % off {exact}" if error > ROUNDING else f"{exact} to rounding"
+
+
+def singular_pose(who: str, name: str, rows: Sequence[str], J: Array) -> NumericalError:
+    """Return the error of a pose at which rows J depend on each other, with those that take part."""
+    # The vector of the smallest singular value says which.
+    U, sizes, _ = np.linalg.svd(unit_rows(J))
+    part = ", ".join(row for row, x in zip(rows, U[:, -1], strict=True) if abs(x) > _TAKES_PART)
+    return NumericalError(
+        f"{who}: {name} is at a singular pose, where rows depend on each other ({part}; singular values from "
+        f"{sizes[0]:.2g} down to {sizes[-1]:.2g}): accelerations and forces are not determined there; take a pose "
+        "beside it"
+    )
 
 
 @contextmanager
@@ -81,14 +93,11 @@ class Constrained:
     #: Options with which the engine holds dry friction by its own soft law, and whether it does.
     own_friction: ClassVar[Mapping[str, Any]] = {}
     soft_friction: bool = False
-    #: Whether accelerations are held against rows that are redundant on the branch on which the mechanism moves.
-    branches: bool
+    engine: ClassVar[str]
     _row_choice: Any
     _evaluate: Callable[..., Array]
     _without_friction: Callable[[str], Callable[..., Any]]
     forward_dynamics: Callable[..., Array]
-    inverse_dynamics: Callable[..., Array]
-    mass_matrix: Callable[..., Array]
 
     def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
         """Return the forces of dry friction in accelerations under τ, less those in `passive`; (N, nv)."""
@@ -102,8 +111,6 @@ class Constrained:
     def _bound(self, quantity: str, **states: ArrayLike) -> Array:
         if not self.model.constrained:
             raise UnsupportedError(f"{quantity}: {self.model.name} has no loops and no other constraints")
-        if "tau" in states:
-            self._require_motion(**states)
         return self._evaluate(quantity, **states)
 
     @property
@@ -135,35 +142,31 @@ class Constrained:
 
     def _require_motion(self, q: ArrayLike, v: ArrayLike | None = None, tau: ArrayLike | None = None) -> None:
         """Refuse a pose on another branch by its accelerations, under unit forces without τ (NumericalError)."""
-        if not self.branches or len(self._row_choice.kept) == len(self._row_choice.independent):
+        if self.soft_constraints or not self._row_choice.redundant:
             return
         still = np.zeros(self.model.nv)
         with unwatched(self):
             self.forward_dynamics(q, still if v is None else v, still + 1.0 if tau is None else tau)
 
-    def _require_branch(self, q: ArrayLike, v: ArrayLike, a: Array, force: ArrayLike) -> None:
-        """Refuse accelerations under a force that break rows which are redundant where it moves (NumericalError)."""
-        choice = self._row_choice
-        lost = [i for i in range(len(choice.kept)) if i not in choice.independent]
-        self.branches = bool(lost)
-        if not lost or not a.size:
+    def _require_regular(self, q: ArrayLike, v: ArrayLike) -> None:
+        """Refuse a state at which rows depend on each other, or contradict those that imply them (NumericalError)."""
+        choice, names, own = self._row_choice, self.constraint_names, list(self._row_choice.independent)
+        try:
+            rows = np.column_stack([self.constraint_jacobian(q), self.constraint_bias(q, v)])
+        except NumericalError:
+            # Numbers that overflow say nothing of the pose.
             return
-        J, gamma = self.constraint_jacobian(q)[..., lost, :], self.constraint_bias(q, v)[..., lost]
-        left = np.abs((J @ a[..., None])[..., 0] + gamma)
-        slopes = np.linalg.norm(J, axis=-1)
-        sizes = slopes * np.linalg.norm(a, axis=-1)[..., None] + np.abs(gamma)
-        if not (left <= _OFF_BRANCH * sizes).all():
-            # What holds the mechanism still leaves the rounding of the free acceleration, in any direction.
-            free = np.abs(np.subtract(force, self.inverse_dynamics(q, v, np.zeros_like(a)))).max(axis=-1, keepdims=True)
-            masses = np.diagonal(self.mass_matrix(q), axis1=-2, axis2=-1)
-            sizes = sizes + ROUNDING / _OFF_BRANCH * slopes * free / masses.max(axis=-1, keepdims=True)
-        if (broken := np.argwhere(~(left <= _OFF_BRANCH * sizes))).size:
-            every = self.constraint_names
-            row, names = every[lost[broken[0][-1]]], [every[i] for i in choice.independent]
+        if dependent(unit_rows(rows[own, :-1])):
+            raise singular_pose(self.engine, self.model.name, [names[i] for i in own], rows[own, :-1])
+        lost = list(choice.redundant)
+        rows[:, -1] /= max(1.0, float(np.abs(rows[:, -1]).max(initial=0.0)))
+        rows = unit_rows(rows)
+        left = rows[lost] - np.linalg.lstsq(rows[own].T, rows[lost].T, rcond=None)[0].T @ rows[own]
+        if (sizes := np.linalg.norm(left, axis=1)).max(initial=0.0) > CONSISTENT:
             raise NumericalError(
-                f"q: {self.model.name}: {row}, which follows from the other rows "
-                f"where the mechanism moves, contradicts the accelerations that {', '.join(names)} allow: the pose is "
-                "singular or on another branch; mobility(q) has its rank"
+                f"q: {self.model.name}: {names[lost[int(sizes.argmax())]]}, which follows from the other rows "
+                f"where the mechanism moves, contradicts the accelerations that {', '.join(names[i] for i in own)} "
+                "allow: the pose is singular or on another branch; mobility(q) has its rank"
             )
 
     def constraint_residual(self, q: ArrayLike) -> Array:

@@ -17,14 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit._reproducible import pivoted
-from mbkit.derivation.constraints import DEPENDENT, discs_of, independent_rows
+from mbkit._reproducible import DEPENDENT, dependent, independent_rows, pivoted, singular_values
+from mbkit.derivation.constraints import discs_of
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
-from mbkit.engines.constrained import CONSISTENT
+from mbkit.engines.constrained import CONSISTENT, singular_pose
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.manifold import random_state, shortened_steps
 
@@ -102,16 +102,6 @@ class _Terms(NamedTuple):
     def held(self) -> Array:
         """J of the rows that hold positions."""
         return self.J[: len(self.f)]
-
-
-def singular_values(J: Array) -> Array:
-    """Return the singular values of one or more matrices; NaN where a matrix is not finite."""
-    finite = np.isfinite(J)
-    if finite.all():
-        return np.asarray(np.linalg.svd(J, compute_uv=False))
-    good = np.asarray(finite.all(axis=(-1, -2)))[..., None]
-    sizes = np.linalg.svd(np.where(good[..., None], J, 0.0), compute_uv=False)
-    return np.where(good, sizes, np.nan)
 
 
 def _scale(J: Array) -> Array:
@@ -353,10 +343,10 @@ class Manifold:
         # A row of held coordinates alone, such as a drive's, says nothing of the others at any pose.
         beside = [self.jacobian(model.integrate(q, _ASIDE * rng.standard_normal(model.nv))) for _ in range(_BESIDE)]
         moving = np.flatnonzero(np.max([np.abs(x[:, free]).max(axis=1, initial=0.0) for x in beside], axis=0) > 0)
-        if len(moving) and len(dependent := _dependent(J[moving])[0]):
+        if len(moving) and len(lost := _dependent(J[moving])[0]):
             raise InputError(
                 f"hold: {names} held, the other coordinates of {model.name} are not determined at this pose: "
-                f"{_named(moving[dependent], self)} has no slope or depends on other rows; hold other coordinates"
+                f"{_named(moving[lost], self)} has no slope or depends on other rows; hold other coordinates"
             )
 
     def restored(self, q: Array, v: Array, held: Collection[int] = ()) -> Array:
@@ -407,7 +397,7 @@ def manifold_of(dyn: Dynamics) -> Manifold:
     return Manifold(vars(dyn)[_TWIN])
 
 
-def least_change(W: Array, J: Array, change: Array, rounding: float = 1e-12, *, free: Array | None = None) -> Array:
+def least_change(W: Array, J: Array, change: Array, rounding: float = DEPENDENT, *, free: Array | None = None) -> Array:
     """Return the x with J x = change that is the least in xᵀ W x; the nearest to it where J has dependent rows.
 
     Only entries that are `free` are other than zero.
@@ -630,19 +620,15 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
     sizes = np.max([np.linalg.norm(manifold.jacobian(x), axis=1) for x in (q, *beside)], axis=0)
     scale = np.where(sizes > _ROUNDED, sizes, 1.0)
     J = manifold.jacobian(q) / scale[:, None]
-    dependent, others = _dependent(J)
+    lost, _ = _dependent(J)
     flat = bool((np.linalg.norm(J, axis=1) < _FLAT)[sizes > _ROUNDED].any())
-    if not len(dependent) and not flat:
+    if not len(lost) and not flat:
         manifold.judge()
         return
     _explain(manifold, [q, *beside], scale, sizes)
-    if everywhere or not len(dependent):
+    if everywhere or not len(lost):
         return
-    raise NumericalError(
-        f"q: {dyn.model.name} is at a singular pose, where {_named(dependent, manifold)} "
-        f"{_reason(others, manifold, 'has no slope')}: forces and accelerations are not determined there; take a pose "
-        "beside it"
-    )
+    raise singular_pose("q", dyn.model.name, manifold.names, J)
 
 
 def _require_redundant(manifold: Manifold, q: Array) -> None:
@@ -712,10 +698,10 @@ def _explain(manifold: Manifold, starts: list[Array], scale: Array, sizes: Array
             f"constraints: {_named(flat, manifold)} has no slope where it holds, here and at the poses around, so "
             "that no force can hold it; write a square as f = 0 instead of f**2 = 0, or start from another pose"
         )
-    dependent, others = min((_dependent(J) for J in slopes), key=lambda pair: len(pair[0]))
-    if len(dependent):
+    lost, others = min((_dependent(J) for J in slopes), key=lambda pair: len(pair[0]))
+    if len(lost):
         raise InputError(
-            f"constraints: the set is redundant, here and at poses around; {_named(dependent, manifold)} "
+            f"constraints: the set is redundant, here and at poses around; {_named(lost, manifold)} "
             f"{_reason(others, manifold, 'holds by itself')}; leave it out, as its multiplier is not determined, or "
             "start from another pose"
         )
@@ -739,16 +725,16 @@ def _nearest(manifold: Manifold, q: Array, scale: Array) -> tuple[Array, Array]:
 
 def _dependent(J: Array) -> tuple[Array, Array]:
     """Return the rows that the others imply, and those others that are needed for it."""
-    if len(J) and len(J) <= J.shape[1] and singular_values(J)[-1] > DEPENDENT:
+    if len(J) <= J.shape[1] and not dependent(J):
         # No remainder is smaller than the smallest singular value; this is the quicker answer.
         return np.empty(0, dtype=int), np.empty(0, dtype=int)
-    order, *_ = pivoted(J, DEPENDENT)
-    kept, dependent = np.array(order, dtype=int), np.setdiff1d(np.arange(len(J)), order)
-    if not len(dependent) or not len(kept):
-        return dependent, np.empty(0, dtype=int)
+    order, *_ = pivoted(J)
+    kept, lost = np.array(order, dtype=int), np.setdiff1d(np.arange(len(J)), order)
+    if not len(lost) or not len(kept):
+        return lost, np.empty(0, dtype=int)
     # As a combination of those that were kept.
-    weights = np.linalg.lstsq(J[kept].T, J[dependent].T, rcond=None)[0]
-    return dependent, np.sort(kept[np.abs(weights).max(axis=1) > 1e-6])
+    weights = np.linalg.lstsq(J[kept].T, J[lost].T, rcond=None)[0]
+    return lost, np.sort(kept[np.abs(weights).max(axis=1) > 1e-6])
 
 
 def _named(which: Iterable[int], manifold: Manifold) -> str:

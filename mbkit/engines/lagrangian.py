@@ -87,8 +87,8 @@ def _quick(checked: _Function) -> _Function:
     arguments = ", ".join(x.name for x in given if x.default is x.empty)
     loads = "".join(f", {x.name}={x.default!r}" for x in given if x.default is not x.empty)
     rest = "".join(f", {x.name}" for x in given if x.default is not x.empty)
-    # Accelerations look first whether their state is open, and each time whether it is on another branch.
-    looking = " and not (self.looks or self.branches)" if name == "forward_dynamics" else ""
+    # Accelerations look first whether their state is open.
+    looking = " and not self.looks" if name == "forward_dynamics" else ""
     text = f"""
 def {name}(self, {arguments}{loads}):
     call = self._direct.get("{name}"){f" if wrenches is None{looking} else None" if loads else ""}

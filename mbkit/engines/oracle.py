@@ -216,12 +216,6 @@ class OracleDynamics(Dynamics):
         high, _ = self._arithmetic.pair(self._values.last)
         return high[0] if size is None else high
 
-    def _require_branch(self, q: ArrayLike, v: ArrayLike, a: Array, force: ArrayLike) -> None:
-        # The rows that it evaluates are not what was asked for; `forward_dynamics` evaluates accelerations last.
-        last = self._values.last
-        super()._require_branch(q, v, a, force)
-        self._values.last = last
-
     def _exact(self, quantity: str, arguments: tuple[Any, ...]) -> Any:
         names = _ARGUMENTS.get(quantity)
         if names is None:

@@ -14,7 +14,7 @@ import numpy as np
 import sympy as sp
 
 from mbkit._check import Array
-from mbkit._reproducible import pivoted
+from mbkit._reproducible import DEPENDENT, pivoted
 from mbkit.derivation.kinematics import Kinematics, compensation_energies, gravity_energy, kinetic_energy
 from mbkit.derivation.model_values import Values
 from mbkit.errors import InputError
@@ -403,8 +403,6 @@ def rolling(kin: SymbolicKinematics, part: NoSlip) -> tuple[list[sp.Expr], list[
 # Both ends are written in the axes of the last body that their ways to the ground share. So the rows hold the joints of
 # the loop only, and a plane mechanism has no row across its plane. Dependent rows are left out.
 
-#: Remainder that rounded rotations leave of a dependent row, relative to the largest coefficient.
-_DEPENDENT: Final = 1e-12
 #: Of the largest number, or rad: what a few typed digits leave where ends can meet.
 _MEETS: Final = 1e-9
 
@@ -435,7 +433,7 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
     told = ("its points never meet", apart)
     messages = [f"loop {loop.name!r}: {told[name in TURNING]}" for name in names]
     axes = [axis for way in ends for axis in _axes(way)] if loop.kind in WELDED else []
-    if loop.kind in WELDED and all(np.linalg.norm(np.cross(axis, axes[0])) < _DEPENDENT for axis in axes):
+    if loop.kind in WELDED and all(np.linalg.norm(np.cross(axis, axes[0])) < DEPENDENT for axis in axes):
         rows = _independent(kin, rows_of(held)[: -len(held.turn())], messages)
         rows += _in_plane(kin, loop, ends, axes[0] if axes else None, messages[-1])
     elif names == LOOP_ROWS["distance"][0]:
@@ -507,8 +505,8 @@ def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], messages: 
     if moving.any():
         sizes = np.linalg.norm(A[:, moving], axis=1)
         # Metres and radians do not compare.
-        scale = np.where(sizes > _DEPENDENT * sizes.max(), sizes, np.inf)[:, None]
-        kept = sorted(pivoted(A[:, moving] / scale, _DEPENDENT)[0])
+        scale = np.where(sizes > DEPENDENT * sizes.max(), sizes, np.inf)[:, None]
+        kept = sorted(pivoted(A[:, moving] / scale)[0])
     for i in sorted({*range(len(sums))} - {*kept}):
         weights = np.linalg.lstsq(A[kept][:, moving].T, A[i, moving], rcond=None)[0]
         left = A[i] - weights @ A[kept]

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
+from mbkit._reproducible import singular_values
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_times, first_names
 
@@ -197,7 +198,7 @@ class Approach:
 
     def saw(self, dyn: Dynamics, t: float, q: Array, v: Array) -> None:
         """Take in the end of a step, of one state or a batch."""
-        from mbkit.engines.constraint_manifold import AT_POSE, singular_values
+        from mbkit.engines.constraint_manifold import AT_POSE
 
         states, alone = [manifold_at(dyn, t).jacobian(q)], q.ndim == 1 and bool(v.any()) and bool(np.isfinite(v).all())
         apart = _APART / float(np.abs(v).max()) if alone else 0.0
@@ -265,14 +266,13 @@ class SingularPoses:
         from mbkit.engines.constraint_manifold import manifold_of
 
         J = manifold_of(at_times(manifold_of(self._dyn).dyn, t, 1)).jacobian(q)
-        finite = np.isfinite(J).all(axis=(1, 2))
-        # Without vectors, which would cost far more.
-        sizes = np.linalg.svd(J[finite], compute_uv=False)[:, -1]
-        for at, size, slopes in zip(t[finite].tolist(), sizes.tolist(), J[finite], strict=True):
+        for at, size, slopes in zip(t.tolist(), singular_values(J)[:, -1].tolist(), J, strict=True):
             self.take(at, size, slopes)
 
     def take(self, t: float, size: float, slopes: Array) -> None:
-        """Take in the end of a step by J's smallest singular value and J."""
+        """Take in the end of a step by J's smallest singular value and J; one that is not finite says nothing."""
+        if size != size:
+            return
         self._seen = [*self._seen[1 - _WINDOW :], (t, size, slopes)]
         if len(self._seen) == _WINDOW:
             self._decide()
@@ -316,12 +316,9 @@ class SingularPosesOfBatch:
 
     def saw(self, dyn: Dynamics, t: float, q: Array, members: Iterable[int]) -> None:
         """Take in the ends of the steps of these members, whose dynamics are `dyn`."""
-        from mbkit.engines.constraint_manifold import singular_values
-
         J = manifold_at(dyn, t).jacobian(q)
         for i, size, slopes in zip(members, singular_values(J)[..., -1].tolist(), J, strict=True):
-            if size == size:
-                self._members[int(i)].take(t, size, slopes)
+            self._members[int(i)].take(t, size, slopes)
 
     def saw_run(self, member: int, t: Array, q: Array) -> None:
         """Take in the ends of all steps of one member, (n,) and (n, nq)."""

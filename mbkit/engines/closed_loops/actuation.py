@@ -13,14 +13,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array
-from mbkit.engines.constrained import Constrained
-from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit._reproducible import DEPENDENT, dependent, unit_rows
+from mbkit.engines.constrained import Constrained, singular_pose
+from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Joint
 
 if TYPE_CHECKING:
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
 LEAST: Final = "least"
 #: Of a row's size times the acceleration's: what rounding and a few typed digits leave of a consistent one.
 _CONSISTENT: Final = 1e-8
-#: Square of the remainder of a row beside the others, from which on singular values look at it again. The square of
-#: `mbkit.derivation.constraints.DEPENDENT` with four digits to spare.
-_SUSPECT: Final = 1e-20
 
 
 class ActuatorForces(NamedTuple):
@@ -54,7 +52,6 @@ class ActuatorForces(NamedTuple):
 class Actuation(Constrained):
     """The part of `Dynamics` for forces of actuators under constraints."""
 
-    engine: ClassVar[str]
     # Of the other parts of `Dynamics`.
     of_samples: Callable[..., Any]
     _method: Callable[[str], Callable[..., Any]]
@@ -147,7 +144,7 @@ class Actuation(Constrained):
         if self.model.has_bodies:
             return choose_rows(self.model)
         every = tuple(range(len(self.constraint_names)))
-        return RowChoice(every, len(every) - len(self.velocity_constraint_names), every)
+        return RowChoice(every, len(every) - len(self.velocity_constraint_names), every, self.constraint_names)
 
     def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Array:
         """Return τ and λ at one state, from the engine's own terms by LAPACK."""
@@ -178,7 +175,8 @@ class Actuation(Constrained):
         states, accelerations = np.atleast_2d(q), np.atleast_2d(a)
         fast = np.maximum(1.0, np.abs(accelerations).max(axis=1, initial=0.0))[:, None]
         broken = ~(np.abs(rates) <= _CONSISTENT * np.maximum(sizes, 1.0) * fast).all(axis=1)
-        for k in np.flatnonzero(~(left > _SUSPECT) | broken).tolist():
+        flat = ~(sizes.min(axis=1) > DEPENDENT * sizes.max(axis=1))
+        for k in np.flatnonzero(~(left > DEPENDENT**2) | flat | broken).tolist():
             own = self.of_samples([k])
             J = own._evaluate("constraint_jacobian", q=states[k]).reshape(kept, n)
             self._require_determined(J[list(self._row_choice.independent)], which)
@@ -199,16 +197,11 @@ class Actuation(Constrained):
 
     def _require_determined(self, J: Array, which: tuple[int, ...]) -> None:
         """Refuse a singular pose, and actuators that hold still while the mechanism moves."""
-        from mbkit.derivation.constraints import DEPENDENT
-
         model, n = self.model, self.model.nv
-        sizes = np.linalg.norm(J, axis=1)
-        scaled = J / np.where(sizes > 0, sizes, 1.0)[:, None]
-        if len(J) and np.linalg.svd(scaled, compute_uv=False)[-1] <= DEPENDENT:
-            raise NumericalError(
-                f"{self.engine}: {model.name} is at a singular pose, where its constraints depend on each other: "
-                "forces are not determined there; take a pose beside it"
-            )
+        scaled = unit_rows(J)
+        if dependent(scaled):
+            names = [self.constraint_names[i] for i in self._row_choice.independent]
+            raise singular_pose(self.engine, model.name, names, J)
         others = [i for i in range(n) if i not in which]
         if not others:
             return

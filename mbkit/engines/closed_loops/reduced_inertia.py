@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array
+from mbkit._reproducible import dependent, unit_rows
 from mbkit.engines.closed_loops.loop_loads import LoopLoads
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 
@@ -114,7 +115,7 @@ class IndependentMotion(LoopLoads):
         self._require_motion(q)
         J, M = self.constraint_jacobian(q)[..., own, :], self.mass_matrix(q)
         sizes = np.linalg.norm(J, axis=-1, keepdims=True)
-        J = J / np.where(sizes > 0, sizes, 1.0)
+        J = unit_rows(J)
         rest = np.setdiff1d(np.arange(model.nv), named)
         self._require_leading(J[..., rest], q, names)
         N = np.zeros((*J.shape[:-2], model.nv, degrees))
@@ -162,13 +163,9 @@ class IndependentMotion(LoopLoads):
 
     def _require_leading(self, J: Array, q: Array, names: Sequence[str]) -> None:
         """Refuse poses at which the other coordinates do not follow."""
-        # The import loads CasADi.
-        from mbkit.derivation.constraints import DEPENDENT
-
-        singular = np.linalg.svd(J, compute_uv=False)
-        if J.shape[-1] == 0 or (good := singular[..., -1] > DEPENDENT * singular[..., 0]).all():
+        if not (bad := dependent(J)).any():
             return
-        k = int(np.argmin(np.atleast_1d(good)))
+        k = int(np.argmax(bad))
         pose = np.atleast_2d(q)[k]
         where = ", ".join(f"{n} = {x:.6g}" for n, x in zip(self.model.coordinate_names, pose, strict=True))
         raise NumericalError(

@@ -18,12 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, arrays_shown, batch_of, real, real_array, require_finite
-from mbkit.derivation.constraints import DEPENDENT
+from mbkit._reproducible import DEPENDENT
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.errors import InputError, NumericalError
 
-#: Reciprocal condition of the scaled system below which its rows count as dependent.
-_DEPENDENT: Final = 1e-13
 _TINY: Final = 1e-150
 
 
@@ -162,7 +160,7 @@ def _solved(name: str, M: Array, R: Array, force: Array, wanted: Array, empty: A
     right = np.concatenate([force, wanted], axis=-1)
     sizes = np.linalg.svd(scaled, compute_uv=False)
     worst = sizes[..., -1] / sizes[..., 0] if n + k else np.ones(M.shape[:-2])
-    if np.any(worst < _DEPENDENT):
+    if np.any(worst < DEPENDENT):
         where = "" if worst.ndim == 0 else f" of sample {int(np.argmin(worst))}"
         raise NumericalError(
             f"impact: rows of jacobian depend on each other or on the constraints of {name} at this pose{where}, or "

@@ -31,6 +31,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array, real, rows
+from mbkit._reproducible import DEPENDENT
 from mbkit.engines.elements.dry_friction import forces_at_rest
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
@@ -184,9 +185,6 @@ def law(
     MuJoCo's are M, J, r, the smooth force and the estimates of the inverse weights; nothing of its solver is.
     `turned` and `columns` turn an acceleration and a Jacobian into the description's coordinates.
     """
-    # The import loads CasADi, which trees never need here.
-    from mbkit.derivation.constraints import DEPENDENT
-
     J, r = np.array(d.efc_J).reshape(-1, m.nv), np.array(d.efc_pos)
     rate, bias = J @ d.qvel, np.concatenate([_bias(m, d, i) for i in range(m.neq)])
     stiffness, damping = softness.gains

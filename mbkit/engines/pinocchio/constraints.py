@@ -31,14 +31,14 @@ import numpy as np
 import pinocchio as pin
 
 from mbkit._check import Array
-from mbkit.engines.base import first_names
+from mbkit._reproducible import dependent, unit_rows
 from mbkit.engines.closed_loops.actuation import spread
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
+from mbkit.engines.constrained import singular_pose
 from mbkit.engines.pinocchio.model import PinModel
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.loops import LOOP_KINDS
-from mbkit.model.rolling import NO_SLIP_ROWS
 
 if TYPE_CHECKING:
     from mbkit.derivation.constraints import RowChoice
@@ -273,7 +273,7 @@ class PinConstraints:
         NumericalError
             A singular pose, or a mass matrix that is singular on what the rows leave free.
         """
-        from mbkit.derivation.constraints import DEPENDENT
+        from mbkit.derivation.constraints import off_branch
 
         which = list(self.choice.independent)
         J, gamma = rows.J[which], rows.gamma[which]
@@ -282,8 +282,7 @@ class PinConstraints:
         across = 1.0 / np.sqrt(np.where(masses > 0, masses, 1.0))
         scaled = J * across
         sizes = np.linalg.norm(scaled, axis=1)
-        sizes = np.where(sizes > 0, sizes, 1.0)
-        scaled = scaled / sizes[:, None]
+        sizes, scaled = np.where(sizes > 0, sizes, 1.0), unit_rows(scaled)
         if not np.isfinite(scaled).all() or not np.isfinite(force).all():
             raise NumericalError(f"pinocchio: the terms of {self._model.name} are not finite at this state")
         # The rows in the metric of M and of themselves: M may have no inverse, and where J v̇ is prescribed they change
@@ -296,9 +295,8 @@ class PinConstraints:
                 f"pinocchio: the mass matrix of {self._model.name} is singular on what its constraints leave free"
             ) from None
         B = np.linalg.solve(L, scaled.T)
-        lengths = np.linalg.norm(B, axis=0)
-        if k and np.linalg.svd(B / np.where(lengths > 0, lengths, 1.0), compute_uv=False)[-1] < DEPENDENT:
-            raise NumericalError(self._singular(scaled))
+        if dependent(unit_rows(B.T)):
+            raise singular_pose("pinocchio", self._model.name, [self.choice.names[i] for i in which], scaled)
         Q, R = np.linalg.qr(B)
         for _ in range(1 + _REFINED):
             rate = -(gamma + J @ a) / sizes
@@ -308,23 +306,9 @@ class PinConstraints:
             x = left - Q @ (Q.T @ left) + Q @ z
             a = a + across * np.linalg.solve(L.T, x)
             forces = forces + np.linalg.solve(R, z - along) / sizes
-        return a, spread(J, rows.J, forces)
-
-    def _singular(self, J: Array) -> str:
-        # The smallest singular value's vector says which rows depend on each other.
-        weights = np.linalg.svd(J.T)[2][-1]
-        parts = [
-            *(f"loop {x.name!r}" for x in self._model.loops for _ in range(LOOP_KINDS[x.kind])),
-            *(f"coupler {x.name!r}" for x in self._model.couplers),
-            *(f"motion of {x.joint!r}" for x in self._model.prescribed),
-            *(f"no slip {x.name!r}" for k in (0, 1) for x in self._model.no_slip for _ in NO_SLIP_ROWS[x.kind][k]),
-        ]
-        rows = [self.choice.kept[i] for i in self.choice.independent]
-        names = dict.fromkeys(parts[i] for i, w in zip(rows, weights, strict=True) if abs(w) > 1e-3)
-        return (
-            f"pinocchio: {self._model.name} is at a singular pose, where rows of {first_names(names)} depend on each "
-            "other: accelerations and forces are not determined there; take a pose beside it"
-        )
+        lost = list(self.choice.redundant)
+        a = a + (float(off_branch(rows.J[lost], rows.gamma[lost], a, force, M)) if lost else 0.0)
+        return a, spread(J, rows.J, forces) + 0.0 * a.sum()
 
 
 class PinocchioConstrained(RowsOfFrames):
