@@ -132,19 +132,6 @@ class Manifold:
         names: tuple[str, ...] = self.equations.constraints.names
         return names
 
-    @property
-    def judged(self) -> bool:
-        """Whether the constraints were independent at some pose, with these values of the parameters."""
-        return self._values() in self.equations.kept.get("judged", ())
-
-    def judge(self) -> None:
-        """Keep that they were."""
-        self.equations.kept.setdefault("judged", set()).add(self._values())
-
-    def _values(self) -> tuple[float, ...]:
-        model = self.dyn.model
-        return tuple(float(x or 0.0) for n, x in model.parameters.items() if n != model.time_parameter)
-
     def call(self, name: str, *arguments: Array) -> list[Array]:
         """Return the outputs of a compiled function, with its parameters behind."""
         code = self.dyn.code(name, make=lambda: _function(self.equations, name))
@@ -623,7 +610,6 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
     lost, _ = _dependent(J)
     flat = bool((np.linalg.norm(J, axis=1) < _FLAT)[sizes > _ROUNDED].any())
     if not len(lost) and not flat:
-        manifold.judge()
         return
     _explain(manifold, [q, *beside], scale, sizes)
     if everywhere or not len(lost):

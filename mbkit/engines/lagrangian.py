@@ -456,14 +456,7 @@ class LagrangianDynamics(Dynamics):
         out = code(*states, *self._trailing(states[0]), threads=self.threads)[0]
         return np.asarray(of_parameters(self.model, quantity, out))
 
-    def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Array:
-        if self.model.constrained:
-            # Kept with the equations: a run at other times, or of another object, asks again at every evaluation.
-            manifold = self._states_held.Manifold(self)
-            if not manifold.judged:
-                self.model.require_independent(q, once=True)
-                manifold.judge()
-        return self._trimmed("forward_dynamics", q, v, tau)
+    _forward_dynamics = _term("forward_dynamics")
 
     # Steps
 

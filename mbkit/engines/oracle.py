@@ -277,7 +277,6 @@ class OracleDynamics(Dynamics):
 
     def _forward_dynamics(self, q: Array, v: Array, tau: Array) -> Any:
         if self.model.constrained or self._acting[0]:
-            self.model.require_independent(q, once=True)
             return self._run(("forward_dynamics",), q, v, tau)[0][:, :, 0]
         terms = self._terms(q, v)
         force = self._arithmetic.array(tau) + terms["passive"] - terms["nle"]

@@ -111,13 +111,10 @@ class Model(Description):
         """Whether constraints may feed energy, as motions prescribed in time and blades with a speed do."""
         return self.time_parameter is not None or any(x.speed for x in self.no_slip)
 
-    def require_independent(self, q: Array, *, once: bool = False) -> None:
-        """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq), with the rows.
-
-        With `once`, constraints that were independent at some configuration are not tested again.
-        """
+    def require_independent(self, q: Array) -> None:
+        """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq), with the rows."""
         if self.constrained and len(q) and None not in self.parameters.values():
-            _states_of(self).require_independent(q, once=once)
+            _states_of(self).require_independent(q)
 
     # Earlier names of the same, for scripts.
     written = property(lambda self: self.energy_equations)

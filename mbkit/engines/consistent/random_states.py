@@ -48,10 +48,9 @@ class ConsistentStates:
         out.manifold = Manifold(self.manifold.dyn._with(model, {}))
         return out
 
-    def require_independent(self, q: Array, *, once: bool = False) -> None:
-        """Refuse constraints that depend on each other at q; with `once`, if that was never looked at."""
-        if not (once and self.manifold.judged):
-            require_independent(self.manifold.dyn, np.atleast_2d(q)[0])
+    def require_independent(self, q: Array) -> None:
+        """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq)."""
+        require_independent(self.manifold.dyn, np.atleast_2d(q)[0])
 
     def random(self, rng: np.random.Generator, size: int | None) -> tuple[Array, Array]:
         """Return random consistent states that are no singular poses."""
