@@ -67,9 +67,6 @@ _WELL: Final = 0.01
 _CLOSED: Final = 1e-13
 #: Steps of Newton's after that, which leave rounding alone.
 _POLISHED: Final = 2
-#: Singular value of independent rows over the largest one, above which a pose that is closed up to `_CLOSED` has as
-#: many: at a distance d from a singular pose rows are open by d² and have a slope of d.
-_KNOWN: Final = 1e-5
 #: Poses beside a closed one, and how far they are away, rad or m.
 _BESIDE: Final = 3
 _ASIDE: Final = 0.2
@@ -333,30 +330,21 @@ class _Numbers:
         Beside it one coordinate is held, for the search would end at q again where this is a singular pose.
         """
         J = self(q)[1][kept]
-        yield _Pose.of(J, len(held), q)
+        yield _Pose(*independent_rows(J, len(held)), q)
         free = np.linalg.svd(J)[2][len(independent_rows(J, len(held))[0]) :]
         moving = np.argsort(-np.linalg.norm(free, axis=0).round(6), kind="stable")[:_BESIDE] if len(free) else ()
         for i in moving:
             x = self.closed(integrate(self.model, q, _ASIDE * np.eye(len(J.T))[i]), held, still=i)
             if x is not None and np.isfinite(self(x)[1]).all():
-                yield _Pose.of(self(x)[1][kept], len(held), x)
+                yield _Pose(*independent_rows(self(x)[1][kept], len(held)), x)
 
 
 class _Pose(NamedTuple):
-    """The independent rows at a pose, whether their number is known, and the remainder of the last one."""
+    """The independent rows at a pose, and the remainder of the last one."""
 
-    known: bool
-    least: float
     rows: tuple[int, ...]
+    least: float
     q: Array
-
-    @classmethod
-    def of(cls, J: Array, first: int, q: Array) -> _Pose:
-        """Return those of J, of which the first rows hold positions."""
-        rows, least = independent_rows(J, first)
-        sizes = np.linalg.svd(J, compute_uv=False)
-        # As far from a singular pose as its digits may be off, rows are none of its own.
-        return cls(not rows or bool(sizes[len(rows) - 1] > _KNOWN * sizes[0]), least, rows, q)
 
 
 #: The name under which a model keeps its own.
@@ -390,14 +378,14 @@ def _chosen_rows(model: Model) -> RowChoice:
         if q is None or not np.isfinite(numbers(q)[1]).all():
             continue
         # On a branch rows may depend on each other at every pose: the rank is that of the poses around.
-        found += [max(numbers.around(q, kept, held), key=lambda x: (x.known, len(x.rows), x.least))]
+        found += [max(numbers.around(q, kept, held), key=lambda x: (len(x.rows), x.least))]
         # One that is far from singular poses; the search for others may end elsewhere on another processor.
-        if found[-1].known and found[-1].least > _WELL:
+        if found[-1].least > _WELL:
             break
     if not found:
         # The state that a user gives tells more: it is refused there, with the residual of each row.
         return RowChoice(tuple(kept), len(held), tuple(range(len(kept))), names)
-    best = max(found, key=lambda x: (x.known, x.least))
+    best = max(found, key=lambda x: x.least)
     return RowChoice(tuple(kept), len(held), best.rows, names, best.q)
 
 
