@@ -14,13 +14,13 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
+from mbkit._reproducible import DEPENDENT
 from mbkit.derivation.model_values import scalar
 from mbkit.model import Model
 
 #: Mass of a coordinate that has none, in terms of the mean one.
 _MASSLESS: Final = 1e-20
 _TINY: Final = 1e-300
-DEPENDENT: Final = 1e-12
 
 
 def elimination_order(model: Model) -> tuple[int, ...]:

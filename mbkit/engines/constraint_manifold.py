@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit._reproducible import DEPENDENT, dependent, independent_rows, pivoted, singular_values
+from mbkit._reproducible import DEPENDENT, dependent, independent_rows, pivoted, singular_values, unit_rows
 from mbkit.derivation.constraints import discs_of
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
@@ -218,11 +218,7 @@ class Manifold:
         """Return, for each of a batch, whether the constraints may depend on each other there."""
         if self.dyn.samples is not None or len(self.equations.all_constraints.names) > len(self.names):
             return np.full(len(q), True)
-        J = self.jacobian(q)
-        size = np.linalg.norm(J, axis=-1)
-        typical = np.maximum(size.max(axis=0), _ROUNDED)
-        least = np.linalg.svd(J / typical[:, None], compute_uv=False)[:, -1]
-        return np.asarray(~(least > _FLAT))
+        return np.asarray(~(self.dependence(q) < _FLAT**-2))
 
     def member(self, k: int) -> Manifold:
         """Return the states of one sample of a batch of parameters; the same where there is none."""
@@ -300,7 +296,7 @@ class Manifold:
 
     def apartness(self, q: Array) -> float:
         """Return the smallest singular value of J with rows of unit size over the largest one."""
-        return float(np.divide(*by_size(self.jacobian(q))[2][[-1, 0]]))
+        return float(np.divide(*singular_values(unit_rows(self.jacobian(q)))[[-1, 0]]))
 
     def acceleration(self, q: Array, v: Array, a: Array, held: Collection[int] = ()) -> Array:
         """Return the nearest a with J a + γ = 0, in the metric of the mass matrix."""
@@ -359,13 +355,6 @@ class Manifold:
                 "start nearer to a closed configuration"
             )
         return np.asarray(x)
-
-
-def by_size(J: Array) -> tuple[Array, Array, Array, Array]:
-    """Return the sizes of J's rows, and the singular value decomposition of J with rows of unit size."""
-    size = np.linalg.norm(J, axis=-1)
-    size = np.where(size > 0, size, 1.0)
-    return size, *np.linalg.svd(J / size[..., None], full_matrices=False)
 
 
 def _residuals(x: Array) -> str:
@@ -566,7 +555,7 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
         independent, _ = independent_rows(manifold.all_rows(q), held)
     redundant = tuple(name for i, name in enumerate(names) if i not in independent)
     freedoms = model.nv - sum(i < held for i in independent)
-    rank, sizes = len(independent), np.append(by_size(manifold.all_rows(q))[2], 0.0)
+    rank, sizes = len(independent), np.append(singular_values(unit_rows(manifold.all_rows(q))), 0.0)
     gap = (float(sizes[rank - 1]) if rank else 1.0, float(sizes[rank]))
     return Mobility(model.name, model.nv - rank, names, redundant, freedoms, gap)
 

@@ -8,13 +8,8 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines.constraint_manifold import (
-    Manifold,
-    by_size,
-    least_change,
-    refuse_unreachable,
-    require_independent,
-)
+from mbkit._reproducible import unit_rows
+from mbkit.engines.constraint_manifold import Manifold, least_change, refuse_unreachable, require_independent
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError
 from mbkit.model import Model
@@ -113,7 +108,8 @@ def flowed(manifold: Manifold, q: Array, v: Array, well: float) -> tuple[Array, 
         rows, J = manifold.call("constraint_rows", both)
         if not np.isfinite(J).all():
             return None
-        size, U, sizes, Vt = by_size(J[:, held])
+        size = np.linalg.norm(J[:, held], axis=-1)
+        U, sizes, Vt = np.linalg.svd(unit_rows(J[:, held]), full_matrices=False)
         if not (sizes[:, -1] > well * sizes[:, 0]).all():
             return None
         f = rows[..., 0] / size

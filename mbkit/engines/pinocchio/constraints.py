@@ -55,8 +55,6 @@ _ACCURACY: Final = 1e-14
 _NO_PIVOT: Final = 1e3
 #: Disagreement of the ends' accelerations in terms of these, up to which an answer is taken.
 _AGREES: Final = 1e-11
-#: Times that a solution of LAPACK is refined: of masses that differ by decades the factors lose digits of the rows.
-_REFINED: Final = 2
 _ALIGNED: Final = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _LOCAL: Final = pin.ReferenceFrame.LOCAL
 
@@ -298,7 +296,8 @@ class PinConstraints:
         if dependent(unit_rows(B.T)):
             raise singular_pose("pinocchio", self._model.name, [self.choice.names[i] for i in which], scaled)
         Q, R = np.linalg.qr(B)
-        for _ in range(1 + _REFINED):
+        # Refined once: of masses that differ by decades the factors lose digits of the rows.
+        for _ in range(2):
             rate = -(gamma + J @ a) / sizes
             free = np.linalg.solve(L, across * (force - M @ a + J.T @ forces) + scaled.T @ rate)
             along, z = Q.T @ free, np.linalg.solve(R.T, rate)

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, finite_array, generator
 from mbkit._escape import html, terminal
+from mbkit._reproducible import DEPENDENT
 from mbkit.engines.base import Dynamics, at_time
 from mbkit.engines.constraint_manifold import manifold_of, refuse_unreachable, require_independent
 from mbkit.engines.lagrangian import LagrangianDynamics
@@ -421,7 +422,7 @@ class _Balance:
         if self._manifold is None:
             return self._unit
         _, sizes, V = np.linalg.svd(self._manifold.jacobian(q))
-        return np.asarray(V[int(np.count_nonzero(sizes > 1e-10 * sizes[0])) :].T)
+        return np.asarray(V[int(np.count_nonzero(sizes > DEPENDENT * sizes[0])) :].T)
 
     def _changes(self, q: Array, tau: Array, multipliers: Array) -> bool:
         """Return whether the small motions change with the time; refuse forces or constraints that do (InputError)."""
