@@ -6,6 +6,7 @@ near decides the condition of the rows; what 40 digits give knows nothing of mbk
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,9 @@ from scipy.integrate import solve_ivp
 
 import mbkit as mb
 from mbkit.derivation.constraints import choose_rows
-from mbkit.errors import NumericalError
+from mbkit.errors import InputError, NumericalError
 from mbkit.methods import METHODS
+from mbkit.model.parts import Prescribed
 
 EPS = float(np.finfo(float).eps)
 #: As `mbkit.derivation.constraints.DEPENDENT`: a row with less of it left follows from the others.
@@ -31,6 +33,7 @@ class Mechanism:
     """A chain from the ground, and point loops from its last body to the ground, in numbers alone."""
 
     def __init__(self, seed: int) -> None:
+        self.seed = seed
         rng = np.random.default_rng([seed, 52])
         self.planar = bool(rng.random() < 0.4)
         self.kinds = PLANE if self.planar else SPACE
@@ -101,64 +104,115 @@ class Mechanism:
             J[:, i] = mp.matrix([a[1] * d[2] - a[2] * d[1], a[2] * d[0] - a[0] * d[2], a[0] * d[1] - a[1] * d[0]])
         return J, W
 
-    def exact(self) -> tuple[np.ndarray, float, float]:
-        """Return v̇ at rest, κ of L⁻¹ Jᵀ on independent rows, and the size of the free acceleration."""
-        n, g = len(self.kinds), mp.matrix([0, 0, mp.mpf("-9.81")])
-        M, f = mp.zeros(n, n), mp.matrix(self.tau)
-        for k, (R, _) in enumerate(self.poses()):
-            J, W = self.slopes(k, self.coms[k])
-            m = mp.mpf(self.masses[k])
-            M = M + m * J.T * J + W.T * R * mp.diag([mp.mpf(x) for x in self.moments[k]]) * R.T * W
-            f = f + m * J.T * g
+    def bias(self, v: np.ndarray) -> list[tuple[mp.matrix, mp.matrix, mp.matrix]]:
+        """Return ω of each body, and at v̇ = 0 its ω̇ and the acceleration of its origin."""
+        turn, rate, at, place, R = *(mp.zeros(3, 1) for _ in range(4)), mp.eye(3)
+        out = []
+        for kind, axis, speed, (R_next, p) in zip(self.kinds, self.axes, v, self.poses(), strict=True):
+            own = R * axis * mp.mpf(speed)
+            at = at + drift(turn, rate, p - place)
+            if kind == "prismatic":
+                at = at + 2 * cross(turn, own)
+            else:
+                rate, turn = rate + cross(turn, own), turn + own
+            place, R = p, R_next
+            out.append((turn, rate, at))
+        return out
+
+    def exact(self, moving: bool) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """Return v that the rows allow, v̇, κ of L⁻¹ Jᵀ on independent rows, and the size of the free acceleration."""
+        n, g, poses = len(self.kinds), mp.matrix([0, 0, mp.mpf("-9.81")]), self.poses()
+        M, bodies = mp.zeros(n, n), []
+        for k, (R, _) in enumerate(poses):
+            (J, W), m = self.slopes(k, self.coms[k]), mp.mpf(self.masses[k])
+            inertia = R * mp.diag([mp.mpf(x) for x in self.moments[k]]) * R.T
+            M = M + m * J.T * J + W.T * inertia * W
+            bodies.append((J, W, m, inertia, R * mp.matrix(self.coms[k])))
         L = mp.cholesky(M)
-        free = mp.lu_solve(L, f)
-        # Of the rows, those that are left, one after the other, the largest first; twice taken away.
+        # Of the rows, those that are left, one after the other, the largest first.
         rows = [mp.lu_solve(L, self.slopes(n - 1, p)[0][i, :].T) for _, p in self.points for i in range(3)]
         left, basis, kept = [x.copy() for x in rows], [], []
         sizes = [mp.norm(x) for x in rows]
         biggest = max(sizes)
-        while left:
+        while True:
             parts = [mp.norm(x) / s if s > DEPENDENT * biggest else mp.mpf(0) for x, s in zip(left, sizes, strict=True)]
             k = max(range(len(left)), key=parts.__getitem__)
             if parts[k] <= DEPENDENT:
                 break
             q = left[k] / mp.norm(left[k])
-            basis.append(q)
+            basis.append((k, q))
             kept.append(np.array([float(x) for x in rows[k] / sizes[k]]))
             left = [x - q * (q.T * x)[0] for x in left]
-        y = free
-        for q in basis:
-            y = y - q * (q.T * y)[0]
-        a, first = mp.lu_solve(L.T, y), mp.lu_solve(L.T, free)
+        z = mp.matrix(np.random.default_rng([self.seed, 1]).standard_normal(n) * moving)
+        y = without(basis, L.T * z)
+        v = np.array([float(x) for x in mp.lu_solve(L.T, y)])
+        # What the digits of v leave of J v belongs to the state: v̇ is exact for v as it is.
+        bias, f = self.bias(v), mp.matrix(self.tau)
+        for (J, W, m, inertia, com), (turn, rate, at) in zip(bodies, bias, strict=True):
+            torque = inertia * rate + cross(turn, inertia * turn)
+            f = f + m * J.T * (g - at - drift(turn, rate, com)) - W.T * torque
+        turn, rate, at = bias[-1]
+        gamma = [x for _, p in self.points for x in at + drift(turn, rate, poses[-1][0] * mp.matrix(p))]
+        free = mp.lu_solve(L, f)
+        # rowᵀ y = -γ, one after the other.
+        y, held = without(basis, free), mp.zeros(n, 1)
+        for k, q in basis:
+            held = held - q * (gamma[k] + (rows[k].T * held)[0]) / (rows[k].T * q)[0]
+        a, first = mp.lu_solve(L.T, y + held), mp.lu_solve(L.T, free)
         condition = np.linalg.cond(np.array(kept).T) if kept else 1.0
-        return np.array([float(x) for x in a]), float(condition), float(mp.norm(first))
+        return v, np.array([float(x) for x in a]), float(condition), float(mp.norm(first))
+
+
+def cross(a: mp.matrix, b: mp.matrix) -> mp.matrix:
+    return mp.matrix([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def drift(turn: mp.matrix, rate: mp.matrix, arm: mp.matrix) -> mp.matrix:
+    """Return the acceleration of a point against a body's origin: ω̇ × r + ω × (ω × r)."""
+    return cross(rate, arm) + cross(turn, cross(turn, arm))
+
+
+def without(basis: list[tuple[int, mp.matrix]], y: mp.matrix) -> mp.matrix:
+    for _, q in basis:
+        y = y - q * (q.T * y)[0]
+    return y
 
 
 @pytest.mark.thorough(every=50)
 @pytest.mark.parametrize("seed", range(1000))
 def test_accelerations_keep_what_the_condition_of_the_rows_leaves(seed: int) -> None:
-    with mp.workdps(40):
-        mechanism = Mechanism(seed)
-        exact, condition, free = mechanism.exact()
+    mechanism = Mechanism(seed)
     model = mechanism.model()
-    n = model.nv
-    for engine in ("lagrangian", "pinocchio"):
-        dyn = mb.dynamics(model, engine, **({"compile": False} if engine == "lagrangian" else {}))
-        a = dyn.forward_dynamics(mechanism.q, np.zeros(n), mechanism.tau)
-        # The points are rounded, by eps of their size over their distance: the condition too.
-        assert np.abs(a - exact).max() <= 1e3 * EPS * condition * free, (engine, condition, a, exact)
+    engines = {
+        "lagrangian": mb.dynamics(model, "lagrangian", compile=False),
+        "pinocchio": mb.dynamics(model, "pinocchio"),
+    }
+    for moving in (False, True):
+        with mp.workdps(40):
+            v, exact, condition, free = mechanism.exact(moving)
+        assert v.any() == moving
+        for engine, dyn in engines.items():
+            a = dyn.forward_dynamics(mechanism.q, v, mechanism.tau)
+            # The points are rounded, by eps of their size over their distance: the condition too.
+            assert np.abs(a - exact).max() <= 1e3 * EPS * condition * free, (engine, moving, condition, a, exact)
 
 
 # Three cranks that carry a plate: one freedom where they are equal, none where they differ however little
 
 LENGTH, CRANK, PLATE, ABOUT_Y, G, THETA = 0.3, 1.0, 2.0, 0.01, 9.81, 0.4
 ENGINES = ("lagrangian", "oracle", "pinocchio")
+#: Closed mechanisms of the catalog.
+LOOPS = (
+    *("slider_crank", "four_bar", "four_bars", "inverted_slider_crank", "five_bar", "pantograph", "peaucellier"),
+    *("watt", "chebyshev", "hoecken", "scissor", "parallel_gripper", "planar_3rrr", "andrews_squeezer", "bricard"),
+    *("flyball_governor", "double_cardan_shaft", "stewart_platform", "delta_robot"),
+)
 
 
-def cranks(apart: float) -> mb.Model:
-    """Return three cranks under a plate; the third stands at THETA + apart where the others stand at THETA."""
+def cranks(apart: float, count: int = 3) -> mb.Model:
+    """Return cranks under a plate; a third stands at THETA + apart where the others stand at THETA."""
     b = mb.ModelBuilder("cranks")
-    for k in range(3):
+    for k in range(count):
         b.add_body(f"crank{k}", mass=CRANK, com=(0, 0, LENGTH / 2), inertia=(ABOUT_Y, ABOUT_Y, 0.001))
         b.add_joint(
             f"hinge{k}", "revolute", parent="world", child=f"crank{k}", axis=(0, 1, 0), translation=(0.5 * k, 0, 0)
@@ -167,7 +221,7 @@ def cranks(apart: float) -> mb.Model:
     b.add_joint("pin", "revolute", parent="crank0", child="plate", axis=(0, 1, 0), translation=(0, 0, LENGTH))
     x = 1.0 + LENGTH * (np.sin(THETA + apart) - np.sin(THETA))
     z = LENGTH * (np.cos(THETA + apart) - np.cos(THETA))
-    for k, at in ((1, (0.5, 0, 0)), (2, (x, 0, z))):
+    for k, at in ((1, (0.5, 0, 0)), (2, (x, 0, z)))[: count - 1]:
         end = {"body_a": f"crank{k}", "translation_a": (0, 0, LENGTH)}
         b.add_loop(f"loop{k}", "point", **end, body_b="plate", translation_b=at)
     return b.build()
@@ -376,3 +430,150 @@ def test_a_neck_of_two_rods_stands_still(engine: str, tmp_path: Path) -> None:
     assert sizes[0] == pytest.approx(2.45, rel=1e-2)
     assert sizes[-1] < 1e-8
     assert np.abs(dyn.forward_dynamics(model.neutral(), np.zeros(6), tau)).max() < 1e-9
+
+
+# Loops that cannot be, poses off their branch, and rows that contradict each other
+
+QUICK = [("lagrangian", {"compile": False}), ("pinocchio", {}), ("oracle", {})]
+#: Each way to ask for a motion, of dynamics at (q, v).
+ASKED = {
+    "forward_dynamics": lambda dyn, q, v: dyn.forward_dynamics(q, v, 0 * v),
+    "constraint_forces": lambda dyn, q, v: dyn.constraint_forces(q, v, 0 * v),
+    "actuator_forces": lambda dyn, q, v: dyn.actuator_forces(q, v, 0 * v),
+    "step": lambda dyn, q, v: dyn.step(q, v, 0 * v, 1e-3, "rk4", t=0.0),
+    "simulate": lambda dyn, q, v: mb.simulate(dyn, q, v, 2e-3, "rk4", dt=1e-3),
+    "project": lambda dyn, q, v: dyn.project(q, v),
+    "random_state": lambda dyn, *_: dyn.model.random_state(0),
+    "mobility": lambda dyn, *_: dyn.mobility(),
+    "mobility of q": lambda dyn, q, _: dyn.mobility(q),
+}
+
+
+def rod_between_cranks(length: float) -> mb.Model:
+    b = mb.ModelBuilder("rod")
+    for k in range(2):
+        b.add_body(f"crank{k}", mass=1.0, com=(0, 0, 0.15), inertia=(0.01, 0.01, 0.001))
+        place = {"axis": (0, 1, 0), "translation": (0.5 * k, 0, 0)}
+        b.add_joint(f"hinge{k}", "revolute", parent="world", child=f"crank{k}", **place)
+    ends = {"translation_a": (0, 0, LENGTH), "translation_b": (0, 0, LENGTH)}
+    b.add_loop("rod", "distance", body_a="crank0", body_b="crank1", length=length, **ends)
+    return b.build()
+
+
+@pytest.mark.parametrize(("engine", "options"), QUICK)
+def test_a_rod_that_is_too_long_for_its_cranks_is_refused_with_what_is_left(engine: str, options: dict) -> None:
+    q, v = np.array([0.3, 0.6]), np.zeros(2)
+    # The cranks' ends are 0.3 + 0.5 + 0.3 m apart at most: (1.1² - 5²)/(2 5) is left of the row.
+    for ask in set(ASKED) - {"mobility of q"}:
+        # Each time anew: what was looked at once would be let through.
+        dyn = mb.dynamics(rod_between_cranks(5.0), engine, **options)
+        with pytest.raises(InputError, match=r"no configuration.*loop 'rod' length cannot hold.* is \[-2.38\]"):
+            ASKED[ask](dyn, q, v)
+        with pytest.raises(InputError, match="no configuration"):
+            ASKED[ask](dyn, q, v)
+
+
+@pytest.mark.parametrize(("engine", "options"), QUICK)
+def test_a_pose_off_the_branch_is_refused_with_its_residual_and_a_closed_pose(engine: str, options: dict) -> None:
+    dyn, v = mb.dynamics(cranks(0.0), engine, **options), np.zeros(4)
+    q = np.array([THETA, THETA, THETA + 0.01, -THETA])
+    # The end of the third crank beside the plate's point.
+    left = LENGTH * (np.sin(THETA + 0.01) - np.sin(THETA))
+    for ask in ("step", "simulate", "mobility of q"):
+        with pytest.raises(InputError, match=rf"{left:.3g}.*closed is q = \[") as told:
+            ASKED[ask](dyn, q, v)
+        closed = np.array([float(x) for x in str(told.value).split("q = [")[1].split("]")[0].split(",")])
+        assert closed == pytest.approx(closed[0] * np.array([1, 1, 1, -1]), abs=1e-7)
+        assert closed == pytest.approx(q, abs=0.02)
+    with pytest.warns(mb.errors.MbkitWarning, match=rf"loop 'loop2' x is open by {left:.2g}"):
+        dyn.constraint_forces(q, v, v)
+
+
+@pytest.mark.parametrize(("engine", "options"), QUICK)
+def test_forces_at_a_singular_pose_name_its_rows(engine: str, options: dict) -> None:
+    # All rods of a parallelogram in line; links without mass are not to blame.
+    b = mb.ModelBuilder("flat")
+    for name, parent, at, length in (("crank", "world", 0, 1), ("coupler", "crank", 1, 2), ("rocker", "world", 2, 1)):
+        b.add_body(name, mass=1.0, com=(length / 2, 0, 0), inertia=(0.1, 0.1, 0.1))
+        b.add_joint(name, "revolute", parent=parent, child=name, axis=(0, 1, 0), translation=(at, 0, 0))
+    b.add_loop("pin", "point", body_a="coupler", translation_a=(2, 0, 0), body_b="rocker", translation_b=(1, 0, 0))
+    dyn = mb.dynamics(b.build(), engine, **options)
+    for ask in (dyn.constraint_forces, dyn.generalized_constraint_force, dyn.forward_dynamics):
+        with pytest.raises(NumericalError, match=r"singular pose, where .*loop 'pin'"):
+            ask(np.zeros(3), np.zeros(3), np.ones(3))
+
+
+def driven(first: float, second: float, amplitudes: tuple[float, float] | None = None) -> mb.Model:
+    """Return two equal cranks that are both driven, at a rate or by a sine of this frequency."""
+    model = cranks(0.0, 2)
+    laws = [{"rate": first}, {"rate": second}]
+    if amplitudes is not None:
+        laws = [{"amplitude": a, "frequency": f} for a, f in zip(amplitudes, (first, second), strict=True)]
+    return replace(model, prescribed=tuple(Prescribed(f"hinge{k}", **law) for k, law in enumerate(laws)))
+
+
+@pytest.mark.parametrize(("engine", "options"), QUICK)
+def test_drives_that_contradict_each_other_are_named(engine: str, options: dict) -> None:
+    q, v = np.zeros(3), np.array([1.0, 1.0, -1.0])
+    same = mb.dynamics(driven(1.0, 1.0), engine, **options)
+    assert same.step(q, v, 0 * v, 1e-3, "rk4", t=0.0)[0] == pytest.approx(1e-3 * v, rel=1e-12)
+    # One crank turns at 1 rad/s, the other is to turn at 2.
+    dyn = mb.dynamics(driven(1.0, 2.0), engine, **options)
+    for ask in ("step", "simulate", "project", "random_state"):
+        with pytest.raises(InputError, match=r"motion of 'hinge1' by -[\d.]+.* against .*motion of 'hinge0'") as told:
+            ASKED[ask](dyn, q, v)
+        assert ask == "random_state" or "by -1 per second" in str(told.value)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_run_along_which_drives_part_ends_by_name(compiled: bool) -> None:
+    # With the same rate at first: ½ sin 2t and sin t.
+    dyn = mb.dynamics(driven(2.0, 1.0, (0.5, 1.0)), "lagrangian", compile=compiled)
+    with pytest.warns(mb.errors.MbkitWarning, match=r"diverged after t = 0 s .*'hinge1'.*contradicts.*'hinge0'"):
+        run = mb.simulate(dyn, np.zeros(3), [1.0, 1.0, -1.0], 0.05, "rk4", dt=1e-3)
+    # A compiled run said that it had finished, with NaN.
+    assert not run.stats.finished
+    assert np.isfinite(run.q).all()
+
+
+def test_blades_of_different_speeds_contradict_each_other() -> None:
+    b = mb.ModelBuilder("cart", gravity=(0, 0, 0))
+    b.add_body("cart", mass=2.0, inertia=(0.1, 0.2, 0.3))
+    b.add_joint("move", "planar", parent="world", child="cart")
+    for k, speed in enumerate((1.0, 2.0)):
+        b.add_blade(f"axle{k}", body_a="cart", translation_a=(0, 0.2 * k, 0), axis_a=(0, 1, 0), speed=speed)
+    model = b.build()
+    for ask in (lambda: mb.dynamics(model, "lagrangian").project([0, 0, 0], [0, 1, 0]), lambda: model.random_state(0)):
+        with pytest.raises(InputError, match=r"'axle1' velocity by -1 per second against no slip 'axle0' velocity"):
+            ask()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_multipliers_of_redundant_rows_are_the_least_and_said_not_to_be_unique(engine: str) -> None:
+    dyn, q, v = mb.dynamics(cranks(0.0), engine), np.array([THETA, THETA, THETA, -THETA]), np.zeros(4)
+    tau = np.array([1.0, 0.5, -0.3, 0.2])
+    forces, J = dyn.constraint_forces(q, v, tau), dyn.constraint_jacobian(q)
+    assert forces == pytest.approx(np.linalg.pinv(J.T) @ dyn.generalized_constraint_force(q, v, tau), abs=1e-12)
+    # Others have the same force Jᵀ λ, and so the same norm of M⁻¹, which chooses none.
+    other = forces + np.linalg.svd(J.T)[2][-1]
+    assert J.T @ other == pytest.approx(J.T @ forces, abs=1e-13)
+    assert str(dyn.mobility(q)).endswith("1 is redundant: loop 'loop2' z; multipliers are not unique")
+    assert "not unique" not in str(mb.dynamics(cranks(0.1), engine).mobility())
+
+
+@pytest.mark.parametrize("name", ["cranks", *LOOPS])
+def test_mobility_is_the_same_at_each_pose_of_the_branch(name: str) -> None:
+    model = cranks(0.0) if name == "cranks" else getattr(mb.catalog, name)()
+    dyn = mb.dynamics(model, "lagrangian", compile=False)
+    known = dyn.mobility()
+    if name == "cranks":
+        poses = np.outer([0.3, 1.1, 2.9], [1, 1, 1, -1])
+    elif name == "bricard":
+        # Each joint by the same angle.
+        poses = dyn.model.neutral()[None]
+    else:
+        poses = model.random_state(3, 3)[0]
+    for q in poses:
+        here = dyn.mobility(q)
+        told = ("degrees_of_freedom", "configuration_freedoms", "rows", "redundant")
+        assert [getattr(here, x) for x in told] == [getattr(known, x) for x in told]

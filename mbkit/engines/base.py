@@ -180,8 +180,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
             model.require_values(self.engine)
         if model.constrained and self.lacks_constraints:
             require_tree(model, self.engine, self.lacks_constraints)
-        #: Whether the first accelerations look whether their state satisfies the constraints.
-        self.looks = model.constrained and not self.soft_constraints
+        #: Whether the first accelerations, and the first step, look whether their state satisfies the constraints.
+        self.looks = self.unstepped = model.constrained and not self.soft_constraints
         self._lock: Any = fork_safe(threading.RLock()) if self._one_at_a_time else nullcontext()
         # Also where a copy begins again.
         vars(self)["model"] = model
@@ -378,9 +378,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         >>> print(dyn.forward_dynamics([0.1, 0.2], [1.0, -2.0], [0.0, 0.0]).round(4))
         [ 1.2275 -5.5282]
         """
-        if self.looks:
-            self.looks = False
-            self._warn_of_open_states(q)
+        self._look(q)
         if wrenches:
             frames, w = self._stacked_wrenches(wrenches)
             acting = frames, axes_named(axes)

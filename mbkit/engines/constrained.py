@@ -94,6 +94,7 @@ class Constrained:
     own_friction: ClassVar[Mapping[str, Any]] = {}
     soft_friction: bool = False
     engine: ClassVar[str]
+    looks: bool
     _row_choice: Any
     _evaluate: Callable[..., Array]
     _without_friction: Callable[[str], Callable[..., Any]]
@@ -111,6 +112,8 @@ class Constrained:
     def _bound(self, quantity: str, **states: ArrayLike) -> Array:
         if not self.model.constrained:
             raise UnsupportedError(f"{quantity}: {self.model.name} has no loops and no other constraints")
+        if "tau" in states:
+            self._look(states["q"])
         return self._evaluate(quantity, **states)
 
     @property
@@ -134,14 +137,22 @@ class Constrained:
         worst = np.unravel_index(int(np.argmax(residual)), residual.shape) if residual.size else ()
         if worst and residual[worst] > CONSISTENT * max(1.0, float(np.abs(q).max())):
             name = self.constraint_names[worst[-1]]
+            if self._row_choice.closed is None:
+                self._states_held.refuse_unreachable(self._states_held.manifold_of(self).dyn)
             warn(
                 f"{self.model.name}: constraint {name} is open by {residual[worst]:.2g}: these accelerations "
                 "are those of no motion; project(q, v) returns the nearest consistent state",
                 MbkitWarning,
             )
 
+    def _look(self, q: ArrayLike) -> None:
+        if self.looks:
+            self._warn_of_open_states(q)
+            self.looks = False
+
     def _require_motion(self, q: ArrayLike, v: ArrayLike | None = None, tau: ArrayLike | None = None) -> None:
         """Refuse a pose on another branch by its accelerations, under unit forces without τ (NumericalError)."""
+        self._look(q)
         if self.soft_constraints or not self._row_choice.redundant:
             return
         still = np.zeros(self.model.nv)
@@ -163,10 +174,12 @@ class Constrained:
         rows = unit_rows(rows)
         left = rows[lost] - np.linalg.lstsq(rows[own].T, rows[lost].T, rcond=None)[0].T @ rows[own]
         if (sizes := np.linalg.norm(left, axis=1)).max(initial=0.0) > CONSISTENT:
+            k = lost[int(sizes.argmax())]
+            others = ", ".join(names[i] for i in self._states_held.needed(rows[:, :-1], np.array(own), [k]))
             raise NumericalError(
-                f"q: {self.model.name}: {names[lost[int(sizes.argmax())]]}, which follows from the other rows "
-                f"where the mechanism moves, contradicts the accelerations that {', '.join(names[i] for i in own)} "
-                "allow: the pose is singular or on another branch; mobility(q) has its rank"
+                f"q: {self.model.name}: {names[k]}, which follows from the other rows where the mechanism moves, "
+                f"contradicts the accelerations that {others} allow, by {sizes.max():.2g} of the row: the pose is "
+                f"singular or on another branch; mobility(q) has its rank; the mechanism moves at q = {choice.closed}"
             )
 
     def constraint_residual(self, q: ArrayLike) -> Array:

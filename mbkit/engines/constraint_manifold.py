@@ -8,7 +8,6 @@ pose: a set may have full rank on one branch of a mechanism only (a row of equal
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -63,7 +62,8 @@ def _function(eq: Any, name: str) -> ca.Function:
         outputs = {"q1": q1, "v1": v1}
     elif name == "all_rows":
         del inputs["v"]
-        outputs = {"f": eq.constraint_residual, "J": eq.constraint_jacobian, "ways": eq.loop_ways}
+        every = eq.all_constraints
+        outputs = {"f": every.value, "J": every.jacobian, "ways": eq.loop_ways, "by_time": every.by_time}
     elif name == "multipliers":
         inputs["tau"] = eq.tau
         outputs = {"lambda": eq.constraint_forces}
@@ -147,12 +147,20 @@ class Manifold:
         """Return J of all rows, redundant ones among them."""
         return self.call("all_rows", q)[1]
 
-    def still_open(self, q: Array) -> list[str]:
-        """Return the rows that stay open where the independent rows are zero: dependent ones, and half a turn."""
-        f, J, ways = self.call("all_rows", q)
-        scale = np.maximum(np.abs(J[: len(f)]).sum(axis=1), 1.0) * max(1.0, float(np.abs(q).max()))
-        names = self.equations.all_constraints.names
-        rows = [names[k] for k in np.flatnonzero(~(np.abs(f[:, 0]) <= CONSISTENT * scale))]
+    def still_open(self, q: Array, v: Array | None = None) -> list[str]:
+        """Return the rows that stay open where the independent rows are zero: dependent ones, and half a turn.
+
+        With v, those too whose rates are not zero. A dependent row is named with those that it contradicts.
+        """
+        f, J, ways, by_time = self.call("all_rows", q)
+        rates = [] if v is None else [(J @ v + by_time[:, 0], v, " per second")]
+        every, kept = self.equations.all_constraints.names, np.array(self.equations.independent_constraints, dtype=int)
+        rows = []
+        for left, x, unit in ((f[:, 0], q, ""), *rates):
+            scale = np.maximum(np.abs(J[: len(left)]).sum(axis=1), 1.0) * max(1.0, float(np.abs(x).max(initial=0.0)))
+            for k in np.flatnonzero(~(np.abs(left) <= CONSISTENT * scale)):
+                against = ", ".join(every[i] for i in needed(J, kept, [int(k)])) if k not in kept else ""
+                rows.append(f"{every[k]} by {left[k]:.3g}{unit}{against and f' against {against}'}")
         model = self.dyn.model
         turned = [f"loop {x.name!r} half a turn off" for x in model.loops]
         turned += [f"no slip {x.name!r}, whose disc lies flat" for x in discs_of(model)]
@@ -191,17 +199,20 @@ class Manifold:
                 scale = CONSISTENT * terms.scale[: len(residual)] * max(1.0, float(np.abs(x).max()))
                 if not (np.abs(residual) <= scale).all():
                     where = "" if q.ndim == 1 else f" of state {k}"
+                    closed = closed_near(self.member(k).dyn, one_q)
                     raise InputError(
                         f"{name}: the constraints of {self.dyn.model.name} ask for {what} = 0, which is "
-                        f"{_residuals(residual)}{where}; project(q0, v0) returns the nearest consistent state"
+                        f"{_residuals(residual)}{where}; project(q0, v0) returns the nearest consistent state; {closed}"
                     )
         if self.dyn.samples is None:
-            f, _, ways = self.call("all_rows", states[0])
-            suspects = np.flatnonzero((np.abs(f) > CONSISTENT).any(axis=(1, 2)) | (ways < 0).any(axis=(1, 2))).tolist()
+            f, J, ways, by_time = self.call("all_rows", states[0])
+            left = np.concatenate([np.abs(f), np.abs(J @ states[1][..., None] + by_time)], axis=1)
+            suspects = np.flatnonzero((left > CONSISTENT).any(axis=(1, 2)) | (ways < 0).any(axis=(1, 2))).tolist()
             for k in suspects:
-                if still := self.still_open(states[0][k]):
+                if still := self.still_open(states[0][k], states[1][k]):
                     where = "" if q.ndim == 1 else f" of state {k}"
-                    raise InputError(f"q0: {self.dyn.model.name} is open there{where}: {', '.join(still)}")
+                    closed = closed_near(self.dyn, states[0][k])
+                    raise InputError(f"q0: {self.dyn.model.name} is open there{where}: {', '.join(still)}; {closed}")
 
     def _inconsistent(self, q: Array, v: Array) -> list[int]:
         """Return which states of a batch may be inconsistent."""
@@ -292,7 +303,10 @@ class Manifold:
             x = self.restored(model.integrate(x, step if size < last else 0.5 * step), v, held)
             last = min(last, size)
         terms = self._terms(x, v)
-        return x, v + least_change(terms.W, terms.J, -terms.rate, free=free)
+        v = v + least_change(terms.W, terms.J, -terms.rate, free=free)
+        if not held and (still := self.still_open(x, v)):
+            raise InputError(f"v: {model.name}: no velocity satisfies all constraints: open stay {', '.join(still)}")
+        return x, v
 
     def apartness(self, q: Array) -> float:
         """Return the smallest singular value of J with rows of unit size over the largest one."""
@@ -506,7 +520,7 @@ class Mobility:
     degrees_of_freedom : int
         Velocities less the rank of J: the dimension of the velocities that a configuration allows.
     rows, redundant : tuple of str
-        Names of all rows, and of those that follow from the others.
+        Names of all rows, and of those that follow from the others: with any, multipliers are not unique.
     configuration_freedoms : int
         Velocities less the rank of the rows that hold positions: the dimension of the configurations. With rows that
         hold velocities alone it is the larger one: a car moves sideways, if not at once.
@@ -525,6 +539,7 @@ class Mobility:
     def __str__(self) -> str:
         n = len(self.redundant)
         which = f"{n or 'none'} {'are' if n > 1 else 'is'} redundant{': ' if n else ''}{', '.join(self.redundant)}"
+        which += "; multipliers are not unique" if n else ""
         freedoms = f"{self.degrees_of_freedom}"
         if self.configuration_freedoms != self.degrees_of_freedom:
             freedoms += f" of velocity and {self.configuration_freedoms} of configuration"
@@ -548,11 +563,14 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
         q = manifold.dyn.model.neutral() if q is None else q
         independent: Collection[int] = equations.independent_constraints
     else:
-        with suppress(InputError):
-            # The digits that rounding left out of a closed pose tell dependent rows from nearly dependent ones.
-            if (np.abs(manifold.value(q)) <= CONSISTENT).all():
-                q = manifold.restored(q, np.zeros(model.nv))
-        independent, _ = independent_rows(manifold.all_rows(q), held)
+        if still := manifold.still_open(q):
+            raise InputError(f"q: {model.name} is open there: {', '.join(still)}; {closed_near(manifold.dyn, q)}")
+        # The digits that rounding left out of a closed pose tell dependent rows from nearly dependent ones.
+        q = manifold.restored(q, np.zeros(model.nv))
+        J, chosen = manifold.all_rows(q), equations.independent_constraints
+        independent, _ = independent_rows(J, held)
+        if len(chosen) == len(independent) == len(independent_rows(J[list(chosen)])[0]):
+            independent = chosen
     redundant = tuple(name for i, name in enumerate(names) if i not in independent)
     freedoms = model.nv - sum(i < held for i in independent)
     rank, sizes = len(independent), np.append(singular_values(unit_rows(manifold.all_rows(q))), 0.0)
@@ -621,26 +639,33 @@ def _require_redundant(manifold: Manifold, q: Array) -> None:
         )
 
 
-def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> None:
+def closed_near(dyn: Dynamics, q: Array) -> str:
+    """Return the nearest closed configuration found, for a message; an `InputError` where `refuse_unreachable` does."""
+    return f"closed is q = {np.array2string(refuse_unreachable(dyn, q), precision=8, separator=', ', threshold=20)}"
+
+
+def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> Array:
     """Refuse constraints that no configuration satisfies, or that are redundant where one does (InputError).
 
-    The search starts at q, then at random configurations.
+    The search starts at q, then at random configurations; the first closed one is returned.
     """
     states, model = manifold_of(dyn), dyn.model
     rng = np.random.default_rng(0)
     starts = [_far_out(model, float(rng.choice([1.0, 3.0])), rng) for _ in range(_STARTS)]
     starts[:0] = [] if q is None else [q]
     least, left = np.inf, np.zeros(states.equations.constraints.positions)
+    unit = left + 1.0
     for start in starts:
         sizes = np.linalg.norm(states.position_jacobian(start), axis=1)
-        end, f = _nearest(states, start, np.where(sizes > _ROUNDED, sizes, 1.0))
+        scale = np.where(sizes > _ROUNDED, sizes, 1.0)
+        end, f = _nearest(states, start, scale)
         size = float(np.linalg.norm(f))
         still = states.still_open(end) if size < _HOLDS else []
         if size < _HOLDS and not still:
             require_independent(dyn, end, everywhere=True)
-            return
+            return end
         if size < least:
-            least, left = size, f
+            least, left, unit = size, f, scale
     if least < _HOLDS:
         raise InputError(
             f"q: {model.name}: from {len(starts)} starts its loops close only with something open: "
@@ -650,7 +675,7 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> None:
     raise InputError(
         f"constraints: no configuration satisfies them all, from {len(starts)} starts; it seems that "
         f"{_named(against, states)} {'contradict each other' if len(against) > 1 else 'cannot hold'}: the least "
-        f"that is left of them is {least:.3g}"
+        f"that is left of them is {_residuals((unit * left)[against])}"
     )
 
 
@@ -707,9 +732,14 @@ def _dependent(J: Array) -> tuple[Array, Array]:
     kept, lost = np.array(order, dtype=int), np.setdiff1d(np.arange(len(J)), order)
     if not len(lost) or not len(kept):
         return lost, np.empty(0, dtype=int)
-    # As a combination of those that were kept.
-    weights = np.linalg.lstsq(J[kept].T, J[lost].T, rcond=None)[0]
-    return lost, np.sort(kept[np.abs(weights).max(axis=1) > 1e-6])
+    return lost, needed(J, kept, lost)
+
+
+def needed(J: Array, kept: Array, rows: Sequence[int] | Array) -> Array:
+    """Return which of the kept rows take part in the combinations of them that are nearest to others."""
+    J = unit_rows(J)
+    weights = np.linalg.lstsq(J[kept].T, J[rows].T, rcond=None)[0]
+    return np.sort(kept[np.abs(weights).max(axis=1) > 1e-6])
 
 
 def _named(which: Iterable[int], manifold: Manifold) -> str:

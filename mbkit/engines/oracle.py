@@ -186,7 +186,9 @@ class OracleDynamics(Dynamics):
         """Return the same dynamics at other values of the model's named parameters."""
         if self._given is not None:
             raise InputError("at: this oracle already has its constants; put the parameters' values among them")
-        return type(self)(self.model.with_nominal(values), backend=self._arithmetic.name)
+        out = type(self)(self.model.with_nominal(values), backend=self._arithmetic.name)
+        out.looks, out.unstepped = self.looks, self.unstepped
+        return out
 
     def _of_model(self, model: Model, form: str) -> OracleDynamics:
         if form not in self._others:

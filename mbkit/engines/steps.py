@@ -48,6 +48,8 @@ class Steps:
     # Of `Dynamics`.
     engine: ClassVar[str]
     model: Model
+    unstepped: bool
+    _states_held: Any
     soft_friction: bool
     projects: Any
     at: Callable[..., Any]
@@ -143,13 +145,15 @@ class Steps:
         clock = str(self.model.time_parameter)
         if times is None or not times.ndim:
             own: Steps = self if times is None else self.at(**{clock: float(times)})
-            return own._checked_step(chosen, h, states)
+            out = own._checked_step(chosen, h, states)
+            self.unstepped = False
+            return out
         rows = zip(*(np.broadcast_to(x, (len(times), x.shape[-1])) for x in states.values()), strict=True)
         each = [
             self._of_sample(i).at(**{clock: time})._checked_step(chosen, h, dict(zip(states, row, strict=True)))
             for i, (time, row) in enumerate(zip(times.tolist(), rows, strict=True))
         ]
-        n = self.model.nq, self.model.nv
+        self.unstepped, n = False, (self.model.nq, self.model.nv)
         return tuple(np.array([x[k] for x in each]).reshape(-1, n[k]) for k in (0, 1))  # type: ignore[return-value]
 
     def _start_of_step(self, t: ArrayLike | None, h: float, size: int | None = None) -> Array | None:
@@ -167,6 +171,8 @@ class Steps:
 
     def _checked_step(self, chosen: Method, h: float, states: dict[str, Array]) -> tuple[Array, Array]:
         """Return the state after a step from checked states, or the error of a state that is not finite."""
+        if self.unstepped and states["q"].size:
+            self._states_held.manifold_of(self).at(self.model.time).check(states["q"], states["v"])
         # An overflow is reported as an error.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             try:

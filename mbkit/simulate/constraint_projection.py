@@ -16,7 +16,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_times
-from mbkit.errors import InputError, NumericalError
+from mbkit.errors import NumericalError
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.singular_poses import Passage, manifold_at
 
@@ -25,14 +25,10 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
     """Return initial states without rounding; an `InputError` where one or the constraints are inconsistent."""
     if not dyn.model.constrained:
         return q, v
-    from mbkit.engines.constraint_manifold import refuse_unreachable, require_independent
+    from mbkit.engines.constraint_manifold import require_independent
 
     manifold = manifold_at(dyn, t)
-    try:
-        manifold.check(q, v)
-    except InputError:
-        refuse_unreachable(manifold.member(0).dyn, np.atleast_2d(q)[0])
-        raise
+    manifold.check(q, v)
     if not dyn.projects:
         # Soft ones need no independence.
         return q, v

@@ -120,11 +120,12 @@ def flowed(manifold: Manifold, q: Array, v: Array, well: float) -> tuple[Array, 
     q, _ = both
     if not (np.abs(f) <= _REACHED * (1 + np.abs(both).max())).all():
         return None
-    if not manifold.apartness(q) > well or manifold.still_open(q):
+    if not manifold.apartness(q) > well:
         return None
     v1 = v
     # Once more for what rounding leaves.
     for _ in range(2):
         x = manifold._terms(q, v1)
         v1 = v1 + least_change(x.W, x.J, -x.rate)
-    return (q, v1) if np.linalg.norm(v1) <= _SLOPE * np.linalg.norm(v) else None
+    good = np.linalg.norm(v1) <= _SLOPE * np.linalg.norm(v) and not manifold.still_open(q, v1)
+    return (q, v1) if good else None

@@ -186,9 +186,10 @@ class SteppedRun:
         self._members: Indices | None = None if problem.batch is None else np.arange(problem.batch)
         self._row = self.record.rows(0, 0).stop
         self._q, self._w = problem.q0.copy(), w0
+        if members is not None:
+            self.record.steps[members] = 0
         if members is not None and self._members is not None:
             self._members, self._q, self._w = members, self._q[members], self._w[members]
-            self.record.steps[members] = 0
             stepper.only(members)
 
     def to_end(self) -> FunctionError | None:
