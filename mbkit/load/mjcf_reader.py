@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from types import MappingProxyType
@@ -152,7 +152,8 @@ def write_out_copies(mujoco: Element, compiler: Compiler, read: Reader) -> str:
     copier = _Copier(mujoco, compiler, read)
     for world in mujoco.all("worldbody"):
         copier.size(world)
-        copier.write_out(world)
+        # What is inside is written out first: its numbers stand before those around it.
+        _replace_all(world, "replicate", copier.copies)
     return f"<replicate> written out: {listing(copier.told, 6)}" if copier.told else ""
 
 
@@ -182,23 +183,8 @@ class _Copier:
             one.tag, one.attributes = "frame", {}
         return inside
 
-    def write_out(self, owner: Element) -> None:
-        """Write out all copies below an element."""
-        children: list[Element] = []
-        for child in owner.children:
-            # What is inside is written out first: its numbers stand before those of this one.
-            self.write_out(child)
-            if child.tag == "replicate":
-                copies = self._copies(child)
-                self.told.append(f"{len(copies)} copies ({child.place})")
-                self.told += _copy_naming(self.mujoco, child, copies)
-                children += copies.values()
-            else:
-                children.append(child)
-        owner.children = children
-
-    def _copies(self, element: Element) -> dict[str, Element]:
-        """Return a <frame> for each copy by its suffix."""
+    def copies(self, element: Element) -> Iterable[Element]:
+        """Return a <frame> for each copy, and copy what names something in it."""
         item, own, read = "<replicate>", element.attributes, self.read
         for name in own.keys() - _OF_COPIES:
             read.fault(f"{item}: unknown attribute {name!r}; there are: {', '.join(sorted(_OF_COPIES))}", element)
@@ -218,7 +204,17 @@ class _Copier:
             at |= {n: own[n] for n in ("class", "childclass") if n in own}
             out[suffix] = replace(_suffixed(element, suffix), tag="frame", attributes=at)
             p = p + product(R, offset)
-        return out
+        self.told += [f"{len(out)} copies ({element.place})", *_copy_naming(self.mujoco, element, out)]
+        return out.values()
+
+
+def _replace_all(owner: Element, tag: str, parts: Callable[[Element], Iterable[Element]]) -> None:
+    """Put its parts in the place of each element of a tag below another one, those inside first."""
+    children: list[Element] = []
+    for child in owner.children:
+        _replace_all(child, tag, parts)
+        children += parts(child) if child.tag == tag else [child]
+    owner.children = children
 
 
 def _quat(R: Array) -> str:
@@ -251,7 +247,7 @@ def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Re
     if any(e.tag == "attach" for world in worlds for e in world.walk()):
         _set_main_apart(mujoco)
     for world in worlds:
-        attacher.write_out(world)
+        _replace_all(world, "attach", attacher.attached)
     return f"<attach> written out: {listing(attacher.told, 6)}" if attacher.told else ""
 
 
@@ -300,18 +296,8 @@ class _Attacher:
     added: set[tuple[str, str]] = field(default_factory=set)
     left: int = MOST_ELEMENTS
 
-    def write_out(self, owner: Element) -> None:
-        """Write out all that is attached below an element."""
-        children: list[Element] = []
-        for child in owner.children:
-            if child.tag == "attach":
-                children += self._attached(child)
-            else:
-                self.write_out(child)
-                children.append(child)
-        owner.children = children
-
-    def _attached(self, element: Element) -> list[Element]:
+    def attached(self, element: Element) -> list[Element]:
+        """Return what is attached; nothing after a fault."""
         own, read = element.attributes, self.read
         model, prefix = (read.name(element, name, "<attach>") for name in ("model", "prefix"))
         if model not in self.others:

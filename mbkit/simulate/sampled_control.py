@@ -13,7 +13,6 @@ from mbkit.engines import Dynamics
 from mbkit.errors import InputError, TorqueError
 from mbkit.methods.registry import method_of
 from mbkit.simulate.integrate import acting_of, integrate, times_of
-from mbkit.simulate.result import Stats
 from mbkit.simulate.run_data import RunData
 from mbkit.simulate.time_grid import Grid, save_times
 from mbkit.simulate.torque import PiecewiseConstantTorque, Torque, TorqueCallback
@@ -107,8 +106,8 @@ def integrate_held(
             # Where the next sample is taken.
             data = replace(data, t=np.append(data.t[:-1], end))
         parts.append(data)
-        if progress:
-            _tell(progress, (end - start) / duration)
+        if callable(progress):
+            progress(min(1.0, (end - start) / duration))
         if not data.stats.finished:
             break
         q, v = data.q[..., -1, :], data.v[..., -1, :]
@@ -117,11 +116,6 @@ def integrate_held(
         raise failed
     acted = PiecewiseConstantTorque(np.concatenate(rows, axis=-2), np.concatenate(starts))
     return _joined(parts, acted, failed, fixed, wanted, save, grid), failed
-
-
-def _tell(progress: Any, done: float) -> None:
-    if callable(progress):
-        progress(min(1.0, done))
 
 
 def _kept(wanted: Array | None, begin: float, end: float) -> Array:
@@ -158,15 +152,13 @@ def _joined(
         which = np.isin(t, wanted)
     stats = [x.stats for x in parts]
     message = last.stats.message if failed is None else f"stopped by the torque function after t = {t[-1]:.6g} s"
-    whole = Stats(
-        steps=sum(x.steps for x in stats),
-        evaluations=sum(x.evaluations for x in stats),
-        seconds=sum(x.seconds for x in stats),
+    added = ("steps", "evaluations", "seconds", "rejected", "jacobians")
+    whole = replace(
+        last.stats,
+        **{name: sum(getattr(x, name) for x in stats) for name in added},
         ended=last.stats.ended if failed is None else "function_failed",
-        reached=last.stats.reached,
         message=message,
-        rejected=sum(x.rejected for x in stats),
-        jacobians=sum(x.jacobians for x in stats),
+        chosen="",
         doubts=tuple(dict.fromkeys(one for x in stats for one in x.doubts)),
     )
     states = {"t": t[which], "q": q[..., which, :], "v": v[..., which, :]}
