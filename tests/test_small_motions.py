@@ -249,3 +249,28 @@ def test_random_systems_over_twelve_decades(batch):
     assert np.mean(decided) > 0.9
     assert np.quantile(digits, 0.5) < 1e-12
     assert np.quantile(digits, 0.95) < 1e-4
+
+
+def test_each_frequency_of_undamped_systems_is_one_of_the_exact_ones():
+    """Units over twelve decades in M and K: of two near motions neither is given for the other."""
+    rng = np.random.default_rng(0)
+    for case in range(60):
+        n = rng.integers(2, 7)
+        inertial = 10.0 ** rng.uniform(-6, 6, n) if case % 2 else np.ones(n)
+        A = rng.standard_normal((n, n))
+        M = np.outer(inertial, inertial) * (A @ A.T + 0.1 * np.eye(n))
+        B, elastic = rng.standard_normal((n, n)), 10.0 ** rng.uniform(-6, 6, n)
+        K = np.outer(elastic, elastic) * (B @ B.T)
+        M, K = (M + M.T) / 2, (K + K.T) / 2
+        with mpmath.workdps(60):
+            inverse = mpmath.cholesky(mpmath.matrix(M.tolist())) ** -1
+            squares = mpmath.eigsy(inverse * mpmath.matrix(K.tolist()) * inverse.T, eigvals_only=True)
+            exact = [float(mpmath.sqrt(x)) for x in squares]
+        found = small_motion(M, 0 * M, K).frequencies.tolist()
+        values, error = eigenvalues((M, 0 * M, K), [EPS * np.abs(M), 0 * M, EPS * np.abs(K)])
+        # What is within its bound of zero is no frequency.
+        assert len(found) >= n - 1
+        for frequency in found:
+            nearest = min(exact, key=lambda x, f=frequency: abs(x / f - 1))
+            exact.remove(nearest)
+            assert abs(nearest - frequency) <= error[np.argmin(np.abs(values - 1j * frequency))]
