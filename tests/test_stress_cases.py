@@ -173,6 +173,21 @@ def test_nearly_redundant_loops_lose_digits_with_their_condition(name: str) -> N
     assert scales[2] / scales[1] == pytest.approx(1e3, rel=0.02)
 
 
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "oracle"])
+def test_cranks_stand_still_until_their_rows_count_as_equal(engine: str) -> None:
+    case = cases.get("cranks")
+    assert (case.values[0], case.values[-1]) == (1e-1, 1e-12)
+    for value in case.values:
+        problem = problem_of(case, value)
+        a = dynamics(problem.model, engine).forward_dynamics(problem.q[0], problem.v[0], problem.tau[0])
+        together = np.array([1.0, 1.0, 1.0, -1.0])
+        # Three bars and a plate of 1 kg on cranks of 0.3 m at 0.4 rad, as one.
+        force = (3 / 2 + 1) * 0.3 * 9.81 * math.sin(0.4) + problem.tau[0] @ together
+        moved = force / (3 * (0.01 + 0.3**2 / 4) + 0.3**2)
+        assert problem.facts["freedoms"] == (value == 1e-12)
+        assert a == pytest.approx(problem.facts["freedoms"] * moved * together, rel=1e-10, abs=1e-9)
+
+
 # Closed forms against 40 digits and published figures
 
 

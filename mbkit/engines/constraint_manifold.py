@@ -359,6 +359,8 @@ class Manifold:
 
         x, size, (rows,) = shortened_steps(self.dyn.model, q, terms, step, enough=4 * _EPS, most=_MOST)
         if not size <= 1e-10 * (1 + float(np.abs(x).max())):
+            if not held:
+                refuse_unreachable(self.dyn, q)
             raise InputError(
                 f"q: {self.dyn.model.name} has no consistent state near it; f = {_residuals(rows.f)} is the "
                 "least reached"
@@ -654,18 +656,16 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> Array:
     starts = [_far_out(model, float(rng.choice([1.0, 3.0])), rng) for _ in range(_STARTS)]
     starts[:0] = [] if q is None else [q]
     least, left = np.inf, np.zeros(states.equations.constraints.positions)
-    unit = left + 1.0
     for start in starts:
         sizes = np.linalg.norm(states.position_jacobian(start), axis=1)
-        scale = np.where(sizes > _ROUNDED, sizes, 1.0)
-        end, f = _nearest(states, start, scale)
+        end, f = _nearest(states, start, np.where(sizes > _ROUNDED, sizes, 1.0))
         size = float(np.linalg.norm(f))
         still = states.still_open(end) if size < _HOLDS else []
         if size < _HOLDS and not still:
             require_independent(dyn, end, everywhere=True)
             return end
         if size < least:
-            least, left, unit = size, f, scale
+            least, left = size, states.value(end)
     if least < _HOLDS:
         raise InputError(
             f"q: {model.name}: from {len(starts)} starts its loops close only with something open: "
@@ -675,7 +675,7 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> Array:
     raise InputError(
         f"constraints: no configuration satisfies them all, from {len(starts)} starts; it seems that "
         f"{_named(against, states)} {'contradict each other' if len(against) > 1 else 'cannot hold'}: the least "
-        f"that is left of them is {_residuals((unit * left)[against])}"
+        f"that is left of them is {_residuals(left[against])}"
     )
 
 

@@ -20,7 +20,7 @@ from mbkit._check import Array, finite_array, generator
 from mbkit._escape import html, terminal
 from mbkit._reproducible import DEPENDENT
 from mbkit.engines.base import Dynamics, at_time
-from mbkit.engines.constraint_manifold import manifold_of, refuse_unreachable, require_independent
+from mbkit.engines.constraint_manifold import manifold_of, require_independent
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian.system import Lagrangian
@@ -258,11 +258,7 @@ class _Balance:
         """Return a configuration on the constraints."""
         if self._manifold is None:
             return q
-        try:
-            return np.asarray(self._manifold.restored(q, self._zero))
-        except InputError:
-            refuse_unreachable(self._manifold.dyn, q)
-            raise
+        return np.asarray(self._manifold.restored(q, self._zero))
 
     def held(self, q: Array) -> tuple[Array, Array]:
         """Return the least τ that holds a configuration, which constraints must allow, and the multipliers with it."""
