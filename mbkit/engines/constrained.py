@@ -23,7 +23,7 @@ CONSISTENT: Final = 1e-8
 #: Part of accelerations that is rounding, of sums and of a solution.
 ROUNDING: Final = 1e-12
 #: Of a unit vector: the entries of rows that depend on each other.
-_TAKES_PART: Final = 0.1
+TAKES_PART: Final = 0.1
 QUANTITIES: Final = (
     "constraint_residual",
     "constraint_jacobian",
@@ -44,7 +44,7 @@ def singular_pose(who: str, name: str, rows: Sequence[str], J: Array) -> Numeric
     """Return the error of a pose at which rows J depend on each other, with those that take part."""
     # The vector of the smallest singular value says which.
     U, sizes, _ = np.linalg.svd(unit_rows(J))
-    part = ", ".join(row for row, x in zip(rows, U[:, -1], strict=True) if abs(x) > _TAKES_PART)
+    part = ", ".join(row for row, x in zip(rows, U[:, -1], strict=True) if abs(x) > TAKES_PART)
     return NumericalError(
         f"{who}: {name} is at a singular pose, where rows depend on each other ({part}; singular values from "
         f"{sizes[0]:.2g} down to {sizes[-1]:.2g}): accelerations and forces are not determined there; take a pose "
@@ -428,7 +428,7 @@ class Constrained:
 
     def _pulled(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the consistent states near the ends of a step."""
-        return self._states_held.pulled(self, t, q, v)  # type: ignore[no-any-return]  # by name
+        return self._states_held.manifold_of(self).at(t).pulled(q, v)  # type: ignore[no-any-return]  # by name
 
     def _onto_constraints(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the states after one step of Newton's onto the constraints, of stages near a singular pose."""

@@ -192,38 +192,25 @@ class Manifold:
     def check(self, q: Array, v: Array) -> None:
         """Refuse an inconsistent state, of one or a batch, with the residuals (InputError)."""
         states = np.atleast_2d(q), np.atleast_2d(v)
-        suspects = range(len(states[0])) if self.dyn.samples is not None else self._inconsistent(*states)
-        for k, one_q, one_v in ((k, states[0][k], states[1][k]) for k in suspects):
-            terms = self.member(k)._terms(one_q, one_v)
-            for name, what, residual, x in (("q0", "f", terms.f, one_q), ("v0", "J v + c", terms.rate, one_v)):
-                scale = CONSISTENT * terms.scale[: len(residual)] * max(1.0, float(np.abs(x).max()))
-                if not (np.abs(residual) <= scale).all():
-                    where = "" if q.ndim == 1 else f" of state {k}"
-                    closed = closed_near(self.member(k).dyn, one_q)
-                    raise InputError(
-                        f"{name}: the constraints of {self.dyn.model.name} ask for {what} = 0, which is "
-                        f"{_residuals(residual)}{where}; project(q0, v0) returns the nearest consistent state; {closed}"
-                    )
-        if self.dyn.samples is None:
-            f, J, ways, by_time = self.call("all_rows", states[0])
-            left = np.concatenate([np.abs(f), np.abs(J @ states[1][..., None] + by_time)], axis=1)
-            suspects = np.flatnonzero((left > CONSISTENT).any(axis=(1, 2)) | (ways < 0).any(axis=(1, 2))).tolist()
-            for k in suspects:
-                if still := self.still_open(states[0][k], states[1][k]):
-                    where = "" if q.ndim == 1 else f" of state {k}"
-                    closed = closed_near(self.dyn, states[0][k])
-                    raise InputError(f"q0: {self.dyn.model.name} is open there{where}: {', '.join(still)}; {closed}")
-
-    def _inconsistent(self, q: Array, v: Array) -> list[int]:
-        """Return which states of a batch may be inconsistent."""
-        f, J, _, rate, *_ = self.call("constraint", q, v)
-        scale = _scale(J)
-        bad = np.zeros(len(q), dtype=bool)
-        for residual, x in ((f, q), (rate, v)):
-            size = np.maximum(1.0, np.abs(x).max(axis=1))[:, None]
-            rows = residual[..., 0]
-            bad |= ~(np.abs(rows) <= CONSISTENT * scale[:, : rows.shape[1]] * size).all(axis=1)
-        return [int(k) for k in np.flatnonzero(bad)]
+        f, J, _, rate, *_ = self.call("constraint", *states)
+        rows = CONSISTENT * _scale(J)
+        for name, what, left, x in zip(("q0", "v0"), ("f", "J v + c"), (f[..., 0], rate[..., 0]), states, strict=True):
+            most = rows[:, : left.shape[1]] * np.maximum(1.0, np.abs(x).max(axis=1))[:, None]
+            for k in np.flatnonzero(~(np.abs(left) <= most).all(axis=1)).tolist():
+                where = "" if q.ndim == 1 else f" of state {k}"
+                closed = closed_near(self.member(k).dyn, states[0][k])
+                raise InputError(
+                    f"{name}: the constraints of {self.dyn.model.name} ask for {what} = 0, which is "
+                    f"{_residuals(left[k])}{where}; project(q0, v0) returns the nearest consistent state; {closed}"
+                )
+        f, J, ways, by_time = self.call("all_rows", states[0])
+        left = np.concatenate([np.abs(f), np.abs(J @ states[1][..., None] + by_time)], axis=1)
+        for k in np.flatnonzero((left > CONSISTENT).any(axis=(1, 2)) | (ways < 0).any(axis=(1, 2))).tolist():
+            own = self.member(k)
+            if still := own.still_open(states[0][k], states[1][k]):
+                where = "" if q.ndim == 1 else f" of state {k}"
+                closed = closed_near(own.dyn, states[0][k])
+                raise InputError(f"q0: {self.dyn.model.name} is open there{where}: {', '.join(still)}; {closed}")
 
     def doubtful(self, q: Array) -> Array:
         """Return, for each of a batch, whether the constraints may depend on each other there."""
@@ -436,11 +423,6 @@ def explicit_step(
         return None if careful is None else careful[:2]
     which = near[..., None]
     return np.where(which, careful[0], q1), np.where(which, careful[1], w1)
-
-
-def pulled(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-    """Return the consistent states at a time that are near the ends of a step."""
-    return manifold_of(dyn).at(t).pulled(q, v)
 
 
 def projected(dyn: Dynamics, q: Array, v: Array, hold: Sequence[str] = ()) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from mbkit._check import Array
 from mbkit._reproducible import singular_values
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_times, first_names
+from mbkit.engines.constrained import TAKES_PART
 
 if TYPE_CHECKING:
     from mbkit.engines.constraint_manifold import Manifold
@@ -31,8 +32,6 @@ LOOSEST: Final = 1e-9
 _AHEAD: Final = 4
 #: Steps' ends that decide on one interval.
 _WINDOW: Final = 4
-#: Of a unit vector: the entries of the constraints that depend on each other.
-_TAKES_PART: Final = 0.1
 #: Of the rows' size, 1/s: what typed digits leave of a velocity that is zero.
 _STILL: Final = 1e-7
 #: Of what γ can be at velocities of this size: its rest at one that stays on a branch to the digits of a loose run.
@@ -114,7 +113,7 @@ class Passage:
     @property
     def rows(self) -> list[int]:
         """Which rows depend on each other."""
-        return [int(k) for k in np.flatnonzero(np.abs(self._lost).max(axis=1) > _TAKES_PART)]
+        return [int(k) for k in np.flatnonzero(np.abs(self._lost).max(axis=1) > TAKES_PART)]
 
     @cached_property
     def undetermined(self) -> str:
@@ -290,7 +289,7 @@ class SingularPoses:
         within = roots[np.isreal(roots) & (roots.real >= 0) & (roots.real <= middle[2])].real
         if len(within):
             nearest = 1 if s1 < s2 else 2
-            self._rows = np.flatnonzero(np.abs(np.linalg.svd(self._seen[nearest][2])[0][:, -1]) > _TAKES_PART).tolist()
+            self._rows = np.flatnonzero(np.abs(np.linalg.svd(self._seen[nearest][2])[0][:, -1]) > TAKES_PART).tolist()
             self.times.append(times[1] + float(within[0]))
 
     def describe(self) -> str:
