@@ -166,8 +166,6 @@ class Constraints:
         Of the rows that say something, such as ``"loop 'pin' x"``.
     independent : tuple of int
         Which of these rows the equation is made of; the others follow from them where all loops are closed.
-    closed : (nq,) array or None
-        A configuration at which all loops are closed, if one was found.
     ways : casadi.SX
         One number for each loop, negative where its frames point opposite ways, though its rows are zero there; then
         one for each disc, negative where it lies flat.
@@ -181,7 +179,7 @@ class Constraints:
         choice = self.choice = choose_rows(kin.model)
         kept = [rows[i] for i in choice.kept]
         self.names = tuple(row.name for row in kept)
-        self.independent, self.closed = choice.independent, choice.closed
+        self.independent = choice.independent
         self._independent_of_every = tuple(choice.kept[i] for i in choice.independent)
         self.ways = _ways(kin)
         turned = kin.qdot if kin.model.quaternions else None
@@ -267,6 +265,11 @@ class RowChoice:
     independent: tuple[int, ...]
     names: tuple[str, ...]
     closed: Array | None = field(default=None, compare=False)
+
+    @property
+    def independent_names(self) -> tuple[str, ...]:
+        """Names of the independent rows."""
+        return tuple(self.names[i] for i in self.independent)
 
     @property
     def redundant(self) -> tuple[int, ...]:
@@ -466,8 +469,6 @@ class ConstraintQuantities:
     all_constraints: Any
     #: Numbers that are negative where the frames of a loop point opposite ways, or a disc lies flat.
     loop_ways: Any = ca.SX(0, 1)
-    #: A configuration at which all loops are closed, if one is known.
-    closed_configuration: Array | None = None
     model: Model
     q: ca.SX
     v: ca.SX
@@ -485,6 +486,12 @@ class ConstraintQuantities:
     def independent_multipliers(self) -> Any:
         """λ of the independent rows."""
         return self._constrained[1]
+
+    @property
+    def row_choice(self) -> RowChoice:
+        """Which of all rows are independent: each."""
+        c = self.constraints
+        return RowChoice((every := tuple(range(len(c.names)))), c.positions, every, c.names)
 
     def _spread(self, multipliers: Any) -> Any:
         """Return the multipliers of all rows; none is redundant."""
@@ -584,14 +591,9 @@ class ConstrainedMotion(ConstraintQuantities):
         return self.constraint_rows.ways
 
     @property
-    def closed_configuration(self) -> Array | None:  # type: ignore[override]  # read only
-        """A configuration at which all loops are closed, if one was found."""
-        return self.constraint_rows.closed
-
-    @property
-    def independent_constraints(self) -> tuple[int, ...]:
+    def row_choice(self) -> RowChoice:
         """Which of all rows are independent."""
-        return self.constraint_rows.independent
+        return self.constraint_rows.choice
 
     @cached_property
     def constraint_factors(self) -> ConstraintFactors:

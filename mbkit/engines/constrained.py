@@ -168,7 +168,7 @@ class Constrained:
             # Numbers that overflow say nothing of the pose.
             return
         if dependent(unit_rows(rows[own, :-1])):
-            raise singular_pose(self.engine, self.model.name, [names[i] for i in own], rows[own, :-1])
+            raise singular_pose(self.engine, self.model.name, choice.independent_names, rows[own, :-1])
         lost = list(choice.redundant)
         rows[:, -1] /= max(1.0, float(np.abs(rows[:, -1]).max(initial=0.0)))
         rows = unit_rows(rows)

@@ -154,7 +154,7 @@ class Manifold:
         """
         f, J, ways, by_time = self.call("all_rows", q)
         rates = [] if v is None else [(J @ v + by_time[:, 0], v, " per second")]
-        every, kept = self.equations.all_constraints.names, np.array(self.equations.independent_constraints, dtype=int)
+        every, kept = self.equations.all_constraints.names, np.array(self.equations.row_choice.independent, dtype=int)
         rows = []
         for left, x, unit in ((f[:, 0], q, ""), *rates):
             scale = np.maximum(np.abs(J[: len(left)]).sum(axis=1), 1.0) * max(1.0, float(np.abs(x).max(initial=0.0)))
@@ -540,18 +540,18 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
     names, equations = manifold.equations.all_constraints.names, manifold.equations
     held = equations.all_constraints.positions
     if q is None:
-        q = equations.closed_configuration
+        q = equations.row_choice.closed
         if q is None and model.has_bodies:
             # No rank is that of a mechanism whose loops never close.
             refuse_unreachable(dyn)
         q = manifold.dyn.model.neutral() if q is None else q
-        independent: Collection[int] = equations.independent_constraints
+        independent: Collection[int] = equations.row_choice.independent
     else:
         if still := manifold.still_open(q):
             raise InputError(f"q: {model.name} is open there: {', '.join(still)}; {closed_near(manifold.dyn, q)}")
         # The digits that rounding left out of a closed pose tell dependent rows from nearly dependent ones.
         q = manifold.restored(q, np.zeros(model.nv))
-        J, chosen = manifold.all_rows(q), equations.independent_constraints
+        J, chosen = manifold.all_rows(q), equations.row_choice.independent
         independent, _ = independent_rows(J, held)
         if len(chosen) == len(independent) == len(independent_rows(J[list(chosen)])[0]):
             independent = chosen
@@ -611,7 +611,7 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
 def _require_redundant(manifold: Manifold, q: Array) -> None:
     """Refuse a configuration at which rows that are redundant elsewhere are not (InputError)."""
     equations = manifold.equations
-    names, independent = equations.all_constraints.names, equations.independent_constraints
+    names, independent = equations.all_constraints.names, equations.row_choice.independent
     if len(names) == len(independent):
         return
     here, _ = independent_rows(manifold.all_rows(q), equations.all_constraints.positions)

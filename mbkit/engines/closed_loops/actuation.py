@@ -139,12 +139,12 @@ class Actuation(Constrained):
     def _row_choice(self) -> RowChoice:
         """Which rows say something, and which of those are independent."""
         # The import loads CasADi.
-        from mbkit.derivation.constraints import RowChoice, choose_rows
+        from mbkit.derivation.constraints import choose_rows
 
         if self.model.has_bodies:
             return choose_rows(self.model)
-        every = tuple(range(len(self.constraint_names)))
-        return RowChoice(every, len(every) - len(self.velocity_constraint_names), every, self.constraint_names)
+        choice: RowChoice = self._states_held.manifold_of(self).equations.row_choice
+        return choice
 
     def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Array:
         """Return τ and λ at one state, from the engine's own terms by LAPACK."""
@@ -187,8 +187,7 @@ class Actuation(Constrained):
         """Refuse accelerations that break the constraints."""
         most = _CONSISTENT * np.maximum(sizes, 1.0) * max(1.0, float(np.abs(a).max(initial=0.0)))
         if not (np.abs(rates) <= most).all():
-            names = [self.constraint_names[i] for i in self._row_choice.independent]
-            rows = zip(names, rates, most, strict=True)
+            rows = zip(self._row_choice.independent_names, rates, most, strict=True)
             left = ", ".join(f"{name} by {x:.3g}" for name, x, high in rows if not abs(x) <= high)
             raise InputError(
                 f"a: the constraints of {self.model.name} ask for J a + γ = 0, which is missed: {left}; "
@@ -200,8 +199,7 @@ class Actuation(Constrained):
         model, n = self.model, self.model.nv
         scaled = unit_rows(J)
         if dependent(scaled):
-            names = [self.constraint_names[i] for i in self._row_choice.independent]
-            raise singular_pose(self.engine, model.name, names, J)
+            raise singular_pose(self.engine, model.name, self._row_choice.independent_names, J)
         others = [i for i in range(n) if i not in which]
         if not others:
             return

@@ -56,15 +56,13 @@ class ConsistentStates:
         return (q[0], v[0]) if size is None else (q, v)
 
     def _drawn(self, rng: np.random.Generator) -> tuple[Array, Array]:
-        dyn = self.manifold.dyn
-        closed = self.manifold.equations.closed_configuration
+        dyn, closed = self.manifold.dyn, self.manifold.equations.row_choice.closed
         well = _WELL * (1.0 if closed is None else self.manifold.apartness(closed))
         for k in range(_DRAWS):
             q, v = random_state(dyn.model, rng, None)
             if k >= _ANYWHERE:
                 # Of many loops few configurations are near a closed one: nearer and nearer to one that is known.
-                model, known = dyn.model, self.manifold.equations.closed_configuration
-                known = model.neutral() if known is None else known
+                model, known = dyn.model, dyn.model.neutral() if closed is None else closed
                 q = model.integrate(known, _NEARER ** (k - _ANYWHERE) * model.difference(known, q))
             state = flowed(self.manifold, q, v, well)
             # On some branches constraints depend on each other.

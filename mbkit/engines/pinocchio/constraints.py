@@ -294,7 +294,7 @@ class PinConstraints:
             ) from None
         B = np.linalg.solve(L, scaled.T)
         if dependent(unit_rows(B.T)):
-            raise singular_pose("pinocchio", self._model.name, [self.choice.names[i] for i in which], scaled)
+            raise singular_pose("pinocchio", self._model.name, self.choice.independent_names, scaled)
         Q, R = np.linalg.qr(B)
         # Refined once: of masses that differ by decades the factors lose digits of the rows.
         for _ in range(2):

@@ -145,11 +145,6 @@ class EnergyEquations(ConstraintQuantities, Equations):
         return self.constraints
 
     @property
-    def independent_constraints(self) -> tuple[int, ...]:
-        """All of them."""
-        return tuple(range(len(self.constraints.names)))
-
-    @property
     def constraint_forces(self) -> Any:
         """λ(q, v, τ) of the constraints."""
         return self._constrained[1]
