@@ -444,8 +444,8 @@ class Constrained:
         Parameters
         ----------
         q : (nq,) array_like, optional
-            Where the loops are closed, which is not looked at. By default some closed configuration at which most rows
-            are independent.
+            Where the loops are closed; an open one is refused (`InputError`). By default some closed configuration at
+            which most rows are independent.
 
         Returns
         -------

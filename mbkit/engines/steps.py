@@ -108,7 +108,8 @@ class Steps:
         Raises
         ------
         InputError
-            A wrong shape, state, force, time or step, or no time where the model depends on it.
+            A wrong shape, state, force, time or step, no time where the model depends on it, or a first step from a
+            state that breaks constraints.
         NumericalError
             The state after the step, or an acceleration on the way, is not finite.
         UnknownNameError
