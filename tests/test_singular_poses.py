@@ -8,12 +8,14 @@ from __future__ import annotations
 import math
 import warnings
 
+import mpmath as mp
 import numpy as np
 import pytest
 
 import mbkit as mb
 from mbkit import catalog
 from mbkit.errors import NumericalError
+from mbkit.simulate.singular_poses import at_singular_poses
 from validation import elliptic
 
 #: Methods that project, with a setting and the error that it leaves after a second.
@@ -363,3 +365,45 @@ def test_a_run_that_ends_at_a_pose_says_so_in_a_sentence() -> None:
         "bdf stopped past a singular pose, which a method of several steps leaves on any branch (method='rk853' on its"
     )
     assert said in told
+
+
+@pytest.mark.parametrize("apart", [2e-5, 1e-9])
+def test_a_pose_is_a_singular_one_where_that_keeps_more_digits(apart: float) -> None:
+    """A kite beside its line: the equation of motion loses eps over the distance, the branch's own formula the distance.
+
+    The reference is Lagrange's equation in one angle, with 40 digits.
+    """
+    lengths, b = (1.0, 2.0, 2.0), mb.ModelBuilder("kite")
+    for k, parent in enumerate(("world", "bar0", "bar1")):
+        b.add_body(f"bar{k}", mass=1.0, com=(lengths[k] / 2, 0, 0), inertia=(0.01, 0.1, 0.1))
+        place = {"axis": (0, -1, 0), "translation": (lengths[k - 1] if k else 0.0, 0, 0)}
+        b.add_joint(f"hinge{k}", "revolute", parent=parent, child=f"bar{k}", **place)
+    b.add_loop("pin", "point", body_a="bar2", body_b="world", translation_a=(2, 0, 0), translation_b=(1, 0, 0))
+    dyn = mb.dynamics(b.build(), "lagrangian")
+
+    def angles(t: mp.mpf) -> list[mp.mpf]:
+        """Return those of the bars from the ground: the apex is on the line that halves θ, 2 m from the others."""
+        x = mp.sqrt(4 - mp.sin(t / 2) ** 2) + mp.cos(t / 2)
+        x, z = x * mp.cos(t / 2), x * mp.sin(t / 2)
+        return [t, mp.atan2(z - mp.sin(t), x - mp.cos(t)), mp.atan2(-z, 1 - x)]
+
+    def centres(t: mp.mpf) -> list[mp.mpf]:
+        out, at = [], mp.mpc(0)
+        for length, angle in zip(lengths, angles(t), strict=True):
+            out += [mp.re(at + length / 2 * mp.expj(angle)), mp.im(at + length / 2 * mp.expj(angle))]
+            at += length * mp.expj(angle)
+        return out
+
+    def along(f, order: int) -> list[mp.mpf]:
+        return [mp.diff(lambda t, k=k: f(t)[k], mp.mpf(apart), order) for k in range(len(f(mp.mpf(apart))))]
+
+    with mp.workdps(40):
+        (w, u), (dw, du) = ([along(f, n) for f in (angles, centres)] for n in (1, 2))
+        tenth, height = mp.mpf(0.1), sum(u[1::2])
+        inertia = tenth * mp.fdot(w, w) + mp.fdot(u, u)
+        rate = -(mp.mpf(9.81) * height + tenth * mp.fdot(w, dw) + mp.fdot(u, du)) / inertia
+        q, v = (np.diff([0, *map(float, x)]) for x in (angles(mp.mpf(apart)), w))
+        exact = np.diff([0, *(float(a * rate + c) for a, c in zip(w, dw, strict=True))])
+    (here,), (a,), _ = at_singular_poses(dyn, 0.0, q[None], v[None], np.zeros(3))
+    a = a if here else dyn.forward_dynamics(q, v, np.zeros(3))
+    assert np.abs(a - exact).max() < 1e-9 * np.abs(exact).max()
