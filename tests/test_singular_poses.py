@@ -369,7 +369,7 @@ def test_a_run_that_ends_at_a_pose_says_so_in_a_sentence() -> None:
 
 @pytest.mark.parametrize("apart", [2e-5, 1e-9])
 def test_a_pose_is_a_singular_one_where_that_keeps_more_digits(apart: float) -> None:
-    """A kite beside its line: the equation of motion loses eps over the distance, the branch's own formula the distance.
+    """A kite beside its line: the equation loses eps over the distance, the branch's own formula the distance.
 
     The reference is Lagrange's equation in one angle, with 40 digits.
     """

@@ -306,8 +306,8 @@ class PinConstraints:
             a = a + across * np.linalg.solve(L.T, x)
             forces = forces + np.linalg.solve(R, z - along) / sizes
         lost = list(self.choice.redundant)
-        a = a + (float(off_branch(rows.J[lost], rows.gamma[lost], a, force, M)) if lost else 0.0)
-        return a, spread(J, rows.J, forces) + 0.0 * a.sum()
+        doubt = float(off_branch(rows.J[lost], rows.gamma[lost], a, force, M)) if lost else 0.0
+        return a + doubt, spread(J, rows.J, forces) + doubt
 
 
 class PinocchioConstrained(RowsOfFrames):
