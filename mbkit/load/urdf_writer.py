@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from textwrap import indent
 from typing import Any, Final
 
@@ -11,20 +11,21 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
-from mbkit.errors import UnsupportedError
 from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Joint, Model
+from mbkit.model.elements.kinds import joint_types
+from mbkit.model.elements.paths import Path
 
 _TYPES: Final = {k: k for k in ("fixed", "revolute", "continuous", "prismatic", "planar")} | {"free": "floating"}
+_CARRIED: Final = "gravity mimic joint.damping joint.friction joint.limit joint.velocity_limit joint.effort_limit"
+URDF: Final = Path("urdf", "URDF cannot say of", joint_types(*_TYPES) | {*_CARRIED.split()})
 # Stands for no limit: the largest number that every reader reads.
 _OPEN: Final = 1e308
 
 
 def urdf_text(model: Model, comment: str) -> str:
     """Return a description as URDF, or raise `UnsupportedError` with every part that URDF does not have."""
-    faults = list(_unsupported(model))
-    if faults:
-        raise UnsupportedError(f"URDF cannot say of {model.name}: {'; '.join(faults)}")
+    URDF.admit(model)
     joints = {j.name for j in model.joints}
     parts = [_element("link", {"name": "world"}), *map(_link, model.bodies), *map(_joint, model.joints)]
     for frame in model.frames:
@@ -44,34 +45,6 @@ def _element(tag: str, attributes: Mapping[str, Any], *inside: str) -> str:
     head = tag + "".join(f" {k}={xml_attribute(v)}" for k, v in texts.items())
     lines = "".join(indent(text, "  ") + "\n" for text in inside)
     return f"<{head}>\n{lines}</{tag}>" if inside else f"<{head}/>"
-
-
-def _unsupported(model: Model) -> Iterator[str]:
-    for joint in model.joints:
-        item = f"joint {joint.name!r}"
-        if joint.kind not in _TYPES:
-            # What follows another type is told with it.
-            if not joint.mimic:
-                yield f"{item} is {'a ball joint' if joint.kind == 'ball' else joint.kind.replace('_', '-')}"
-            continue
-        if joint.armature.any():
-            yield f"{item} has armature"
-        if joint.stiffness.any():
-            yield f"{item} has a spring"
-        if joint.sticks:
-            yield f"{item} has stiction above its friction"
-        if joint.type.nv > 1 and (joint.damping.any() or joint.friction.any()):
-            yield f"{item} is {joint.kind} and has damping or friction"
-        limits = joint.lower, joint.upper, joint.velocity_limit, joint.effort_limit
-        if joint.type.nv > 1 and any(np.isfinite(x).any() for x in limits):
-            yield f"{item} is {joint.kind} and has limits"
-    yield from (f"spring {s.name!r} between two points" for s in model.springs)
-    yield from (f"coupling {c.name!r} between joints" for c in model.couplings)
-    yield from (f"loop {x.name!r}" for x in model.loops)
-    yield from (f"coupler {x.name!r}" for x in model.couplers)
-    yield from (f"joint {p.joint!r} is moved in time" for p in model.prescribed)
-    yield from map(str, model.forces)
-    yield from (f"no slip {x.name!r}" for x in model.no_slip)
 
 
 def _numbers(values: Any) -> str:

@@ -29,9 +29,10 @@ import numpy as np
 
 from mbkit._check import Array, real, shown
 from mbkit._escape import html, terminal
-from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.errors import InputError, NumericalError
 from mbkit.model import manifold
 from mbkit.model.description import Description
+from mbkit.model.elements.paths import Path
 from mbkit.model.parts import Body, Joint, _Frozen
 from mbkit.spatial import skew
 
@@ -259,18 +260,20 @@ def energy_regressor(model: Description, q: Array, v: Array, gravity: Array) -> 
     return np.hstack(kinetic), np.hstack(potential)
 
 
+#: Forces are known, and do not count.
+BASE_PARAMETERS: Final = Path(
+    "base parameters",
+    "base parameters: expected a tree of free joints, got of",
+    frozenset(["q", "T", "V", "loss", "jump", "force", "bound", "t"]),
+)
+
+
 def base_parameters(model: Description, tolerance: float) -> BaseParameters:
     """Return the base parameters of a model with bodies; see `Model.base_parameters`."""
     tolerance = real("tolerance", tolerance, positive=True)
     if tolerance >= 1:
         raise InputError(f"tolerance: expected a number below 1, got {tolerance:g}")
-    whats = {"loops": "loops", "prescribed": "prescribed motions", "no_slip": "contacts without slip"}
-    for feature, what in whats.items():
-        if getattr(model, feature):
-            raise UnsupportedError(
-                f"base parameters: expected a tree of free joints, got {what} in {model.name}; "
-                f"model.without({feature!r}) is its tree"
-            )
+    BASE_PARAMETERS.admit(model)
     model.require_values("base parameters")
     bodies = [model.body(joint.child) for joint in model.tree]
     names = standard_names(model)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import chain, count, pairwise
@@ -16,13 +16,14 @@ import numpy as np
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, ModelError, UnknownNameError
 from mbkit.model.elements.forces import Bushing, Force, GravityCompensation, drives, lost, needs_time
+from mbkit.model.elements.kinds import PART_KINDS, acts, kind
 from mbkit.model.elements.motion_laws import Motion, beyond, interval
 from mbkit.model.joint_types import KINDS
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
 from mbkit.model.parts import Body, Coupler, Frame, Joint, JointCoupling, Loop, NoSlip, PointSpring, read_only
 
 #: Attributes of a description that bind its coordinates or velocities to each other.
-CONSTRAINT_FEATURES: Final = ("loops", "couplers", "prescribed", "no_slip")
+CONSTRAINT_FEATURES: Final = tuple(dict.fromkeys(k.section for k in PART_KINDS.values() if k.does & {"row", "speed"}))
 
 
 #: Fields that came later than digests which users keep: without a value they are not in these.
@@ -76,46 +77,6 @@ class Needs:
     time: bool
     forces: bool = False
     no_slip: bool = False
-
-    @classmethod
-    def of(
-        cls,
-        gravity: Array,
-        joints: Iterable[Joint],
-        springs: Iterable[PointSpring],
-        couplings: Iterable[JointCoupling],
-        loops: Iterable[Loop],
-        prescribed: Iterable[Motion],
-        no_slip: Iterable[NoSlip] = (),
-        bound: Iterable[str] = (),
-        forces: Iterable[Force] = (),
-        couplers: Iterable[Coupler] = (),
-    ) -> Needs:
-        """Read the flags off the parts of a description.
-
-        `bound` names the attributes with parameters: a zero may have another value when it is evaluated.
-        """
-        joints, couplings, bound, forces = tuple(joints), tuple(couplings), frozenset(bound), tuple(forces)
-        between = *joints, *springs, *couplings
-
-        def present(name: str, parts: Iterable[Any]) -> bool:
-            return name in bound or any(np.any(getattr(p, name)) for p in parts)
-
-        return cls(
-            gravity="gravity" in bound or bool(np.any(gravity)),
-            springs=present("stiffness", between),
-            damping=present("damping", between),
-            armature=present("armature", (*joints, *couplings)),
-            friction=any(np.any(j.friction) or (j.stiction is not None and np.any(j.stiction)) for j in joints),
-            limits=any(np.any(np.isfinite([j.lower, j.upper])) for j in joints),
-            effort_limits=any(np.any(np.isfinite([j.effort_limit, j.velocity_limit])) for j in joints),
-            mimic=any(j.mimic is not None for j in joints),
-            loops=bool((*loops, *couplers)),
-            quaternions=any(j.type.quaternion is not None for j in joints),
-            time=bool(tuple(prescribed)) or any(f.of_time for f in forces),
-            forces=bool(forces),
-            no_slip=bool(tuple(no_slip)),
-        )
 
     def as_dict(self) -> dict[str, bool]:
         """Return the flags by name."""
@@ -430,13 +391,19 @@ class Description:
             raise InputError(f"{what}: {self.name}: {fault}; give a table that covers it, or other times")
 
     @cached_property
+    def acts(self) -> Mapping[str, tuple[str, ...]]:
+        """The kinds of parts that act, such as ``"joint.stiction"``, each with the names of its parts."""
+        return acts(self)
+
+    @cached_property
     def needs(self) -> Needs:
         """Features that this description needs from an engine."""
-        bound = (b.field for b in self.bindings)
-        held = self.loops, self.prescribed, self.no_slip
-        return Needs.of(
-            self.gravity, self.joints, self.springs, self.couplings, *held, bound, self.forces, self.couplers
-        )
+        words = {x for name in self.acts for k in (kind(name),) for x in (k.name, *k.features, *k.does)}
+        flags = {f.name: f.name in words for f in fields(Needs)}
+        flags |= {"limits": "joint.limit" in words, "time": "t" in words}
+        flags["effort_limits"] = not words.isdisjoint({"joint.velocity_limit", "joint.effort_limit"})
+        flags["quaternions"] = any(j.type.quaternion is not None for j in self.joints)
+        return Needs(**flags)
 
     @cached_property
     def digest(self) -> str:

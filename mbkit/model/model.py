@@ -23,15 +23,12 @@ from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, Unsupported
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
 from mbkit.model.description import CONSTRAINT_FEATURES, SERVOS, Description, expect_name
+from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.parameters import Parameter
-from mbkit.model.parts import Joint
 from mbkit.model.validation import check_substituted, model_faults
 
 #: Seeds that look like a number of states.
 _ROUND: Final = (100, 1_000, 10_000, 100_000, 1_000_000)
-_PER_VELOCITY: Final = {"damping": "damping", "springs": "stiffness", "armature": "armature", "friction": "friction"}
-#: Elements between joints or points, and the numbers that make them act.
-_ACTING: Final = {"springs": ("stiffness", "damping"), "couplings": ("stiffness", "damping", "armature")}
 #: Modules that evaluate runs, or states of their own.
 _OF_RUNS: Final = (
     *(f"mbkit.simulate.{x}" for x in ("integrate", "run_data", "sensitivity", "trajectory")),
@@ -39,7 +36,6 @@ _OF_RUNS: Final = (
 )
 #: rad: less than this beyond two turns a motion may have come in a step.
 _JUST_BEYOND: Final = 1.0
-_FEATURES: Final = (*_PER_VELOCITY, "gravity", "limits", "forces", *CONSTRAINT_FEATURES)
 
 
 _checked: Final = ContextVar("checked", default=True)
@@ -327,14 +323,17 @@ class Model(Description):
             Any of damping, springs, armature, friction, gravity, limits, loops, couplers, prescribed, forces, no_slip.
             Springs and damping are those of joints, point-to-point elements and couplings, armature that of joints
             and couplings; forces are those given by functions, with bushings and gravity compensation.
-            Couplers go with the loops.
+            Couplers go with the loops. Or kinds of `acts`, such as ``"joint.stiction"`` or ``"loop.revolute"``.
         """
         model = self
         for feature in features:
             expect_name("feature", feature)
-            if feature not in _FEATURES:
-                raise UnknownNameError("feature", feature, _FEATURES)
-            model = model._without(feature)
+            kinds = [k for k in PART_KINDS.values() if k.features]
+            if not (gone := [k for k in kinds if feature in (*k.features, k.name)]):
+                known = (x for k in kinds for x in ((k.name,) if "." in feature else k.features))
+                raise UnknownNameError("feature", feature, dict.fromkeys(known))
+            for kind in gone:
+                model = kind.removed(model)
         return model
 
     def lock(self, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike | None = None) -> Model:
@@ -499,33 +498,6 @@ class Model(Description):
                 raise UnknownNameError("parameter", name, self.parameters)
         return {name: real(f"parameter {name!r}", value) for name, value in values.items()}
 
-    def _without(self, feature: str) -> Model:
-        if feature in ("gravity", "forces", *CONSTRAINT_FEATURES):
-            gone = ("loops", "couplers") if feature == "loops" else (feature,)
-            empty: Any = {name: np.zeros(3) if name == "gravity" else () for name in gone}
-            if feature == "forces" and self.rotors:
-                empty["forces"] = tuple(f for f in self.forces if getattr(f, "body", "") in self.rotors)
-            return replace(self, bindings=tuple(b for b in self.bindings if b.where not in gone), **empty)
-        if feature == "limits":
-            return replace(self, joints=tuple(_unlimited(j) for j in self.joints))
-        name = _PER_VELOCITY[feature]
-        more: Any = {"stiction": None, "stribeck_velocity": None} if name == "friction" else {}
-        joints = tuple(replace(j, **{name: np.zeros(j.type.nv)} | more) for j in self.joints)
-        bindings = tuple(b for b in self.bindings if b.field != name)
-        changes: Any = {"joints": joints}
-        if name == "armature" and self.rotors:
-            massless: Any = {"mass": 0.0, "inertia": np.zeros((3, 3))}
-            changes["bodies"] = tuple(replace(b, **massless) if b.name in self.rotors else b for b in self.bodies)
-        for where, acting in _ACTING.items():
-            parts = getattr(self, where)
-            if name in acting:
-                parts = tuple(replace(p, **{name: 0.0}) for p in parts)
-            bound = {b.part for b in bindings if b.where == where and b.field in acting}
-            changes[where] = tuple(p for p in parts if p.name in bound or any(getattr(p, f) for f in acting))
-            names = {p.name for p in changes[where]}
-            bindings = tuple(b for b in bindings if b.where != where or b.part in names)
-        return replace(self, bindings=bindings, **changes)
-
     # Reading
 
     def __repr__(self) -> str:
@@ -566,9 +538,3 @@ def _states_of(model: Model) -> Any:
     """Return the consistent states of a model under constraints."""
     # By name: a description knows no derivation, and asks for it only here.
     return import_module("mbkit.engines.consistent.random_states").states_of(model)
-
-
-def _unlimited(joint: Joint) -> Joint:
-    """Return the joint without limits of any sort."""
-    open_q, open_v = np.full(joint.type.nq, np.inf), np.full(joint.type.nv, np.inf)
-    return replace(joint, lower=-open_q, upper=open_q, velocity_limit=open_v, effort_limit=open_v)

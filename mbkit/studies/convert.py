@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from mbkit.load import load
 from mbkit.load.urdf_writer import urdf_text
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
+from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.joint_numbers import owners
 from mbkit.studies._targets import with_values
 from mbkit.studies.explain.result import Cause
@@ -101,8 +101,6 @@ def convert(model: Model, to: str) -> Converted:
     expect_model(model)
     if to not in FORMATS:
         raise UnknownNameError("format", str(to), FORMATS)
-    if not model.has_bodies:
-        raise UnsupportedError(f"convert: {model.name} was written as energies and has no bodies to write")
     _check_names(model, to)
     model = with_values(model, "convert")
     return _to_mjcf(model) if to == "mjcf" else _to_urdf(model)
@@ -110,10 +108,7 @@ def convert(model: Model, to: str) -> Converted:
 
 def _check_names(model: Model, to: str) -> None:
     """Raise for names that XML 1.0 cannot hold, not even escaped."""
-    parts: Sequence[Any] = (
-        *(*model.bodies, *model.joints, *model.frames),
-        *(*model.springs, *model.couplings, *model.loops, *model.couplers, *model.no_slip),
-    )
+    parts = (p for section in KINDS_OF_PARTS for p in getattr(model, section))
     bad = [name for name in dict.fromkeys([model.name, *(p.name for p in parts)]) if not xml_holds(name)]
     if bad:
         names = ", ".join(map(repr, bad[:10])) + (f" and {len(bad) - 10} more" if len(bad) > 10 else "")
@@ -129,19 +124,9 @@ def _head(model: Model, check: str) -> str:
 
 
 def _to_mjcf(model: Model) -> Converted:
-    from mbkit.engines.mujoco.mjcf_writer import mjcf_text, read_back
+    from mbkit.engines.mujoco.mjcf_writer import MJCF, mjcf_text, read_back
 
-    notes = []
-    if model.layout.reduced:
-        notes.append("mimic joints are free joints with equality constraints, which MuJoCo keeps softly")
-    if model.needs.loops:
-        notes.append("loops are equality constraints, which MuJoCo keeps softly")
-    if model.needs.limits:
-        notes.append("MuJoCo acts on joint limits, softly, which mbkit's terms leave out")
-    if model.needs.friction:
-        notes.append("MuJoCo's dry friction is soft; mbkit's holds exactly at rest")
-    if any(np.isfinite(j.velocity_limit).any() for j in model.joints):
-        notes.append("MJCF has no velocity limits")
+    notes = [*MJCF.admit(model)]
     efforts = ((j.name, j.effort_limit[np.isfinite(j.effort_limit)]) for j in model.joints)
     if lost := [name for name, x in efforts if len(x) and (model.joint(name).type.nv > 1 or not x.all())]:
         notes.append(f"MJCF has no effort limits of zero or of several velocities at once: {', '.join(lost)}")

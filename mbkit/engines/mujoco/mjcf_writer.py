@@ -15,9 +15,10 @@ from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
 from mbkit.engines.mujoco.constraints import OF_JOINTS, OF_TENDON
 from mbkit.engines.mujoco.engine import MujocoDynamics
-from mbkit.engines.mujoco.model import JOINT_TYPES, Placed, by_mbkit, heard_warnings, mapped, not_held, specified
+from mbkit.engines.mujoco.model import MUJOCO, Placed, by_mbkit, heard_warnings, mapped, specified
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Joint, Model
+from mbkit.model.elements.paths import Path
 
 _TYPES: Final = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
@@ -30,11 +31,40 @@ _OF_COUPLING: Final = ("stiffness", "damping", "armature")
 _LEAST: Final = 2e-15
 
 
+def _numbers_not_held(model: Model) -> Iterator[str]:
+    yield from MUJOCO.also(model)
+    for joint in model.joints:
+        parts = [joint.damping] if joint.kind == "ball" else np.split(joint.damping, 2) if joint.kind == "free" else []
+        if any(np.ptp(x) > 0 for x in parts):
+            yield f"joint {joint.name!r} is damped differently along its body axes"
+        elif joint.kind == "free" and joint.parent == "world" and np.ptp(joint.damping) > 0:
+            yield f"joint {joint.name!r} is damped differently in turning and in moving"
+    for coupling in model.couplings:
+        if coupling.armature and model.branched(coupling):
+            yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
+    yield from (f"{force}, which is no spring and no weight of MuJoCo's" for force in by_mbkit(model))
+    yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
+
+
+MJCF: Final = Path(
+    "mjcf",
+    "MJCF cannot say of",
+    MUJOCO.carries - {"joint.stiction", "force.joint", "force.frame", "force.of_time"},
+    MUJOCO.why,
+    {
+        "mimic": "mimic joints are free joints with equality constraints, which MuJoCo keeps softly",
+        "row": "loops are equality constraints, which MuJoCo keeps softly",
+        "joint.limit": "MuJoCo acts on joint limits, softly, which mbkit's terms leave out",
+        "joint.friction": "MuJoCo's dry friction is soft; mbkit's holds exactly at rest",
+        "joint.velocity_limit": "MJCF has no velocity limits",
+    },
+    also=_numbers_not_held,
+)
+
+
 def mjcf_text(model: Model, comment: str) -> str:
     """Return a description as MJCF, or raise `UnsupportedError` with all that MJCF cannot hold of it."""
-    faults = list(_unsupported(model))
-    if faults:
-        raise UnsupportedError(f"MJCF cannot say of {model.name}: {'; '.join(faults)}")
+    MJCF.admit(model)
     spec, placed, _ = specified(model)
     lines = [
         f"<mujoco model={xml_attribute(model.name)}>",
@@ -61,27 +91,6 @@ def read_back(model: Model, text: str) -> MujocoDynamics:
     if lost := [name for name, body in placed.bodies.items() if held[compiled.body(name).id] != body.gravcomp]:
         raise MbkitError(f"mujoco: gravity compensation of {lost[0]!r} reads back otherwise; please report this model")
     return MujocoDynamics.holding(model, mapped(compiled, model, placed.joints, placed.bodies, placed.absorbed))
-
-
-def _unsupported(model: Model) -> Iterator[str]:
-    for joint in model.joints:
-        name = f"joint {joint.name!r}"
-        # What follows another type is told with it.
-        if joint.kind not in JOINT_TYPES and not joint.mimic:
-            yield f"{name} is {joint.kind}{joint.type.instead and f' ({joint.type.instead})'}"
-        if joint.sticks:
-            yield f"{name} has stiction above its friction"
-        parts = [joint.damping] if joint.kind == "ball" else np.split(joint.damping, 2) if joint.kind == "free" else []
-        if any(np.ptp(x) > 0 for x in parts):
-            yield f"{name} is damped differently along its body axes"
-        elif joint.kind == "free" and joint.parent == "world" and np.ptp(joint.damping) > 0:
-            yield f"{name} is damped differently in turning and in moving"
-    for coupling in model.couplings:
-        if coupling.armature and model.branched(coupling):
-            yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
-    yield from not_held(model)
-    yield from (f"{force} (a function)" for force in by_mbkit(model))
-    yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
 
 
 def _attributes(**values: Any) -> str:

@@ -18,11 +18,13 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.base import STACKS, first_names, unknown_joint
+from mbkit.engines.base import STACKS
 from mbkit.engines.imported import unused
 from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.model import Body, Bushing, GravityCompensation, Joint, Model
+from mbkit.model.elements.kinds import joint_types
+from mbkit.model.elements.paths import Path
 from mbkit.model.validation import static_bodies
 
 if TYPE_CHECKING:
@@ -104,14 +106,7 @@ def build(
 
     Raises `UnsupportedError` for a joint or a body that MuJoCo cannot hold, and names it.
     """
-    if description.needs.loops and description.layout.reduced:
-        mimics = ", ".join(repr(j.name) for j in description.joints if j.mimic)
-        raise UnsupportedError(
-            f"mujoco: {description.name} has loops and mimic joints ({mimics}), which MuJoCo's own equations would "
-            "hold softly; the lagrangian engine reduces them, and mimic='free' loads independent joints"
-        )
-    if soft_friction:
-        _require_friction_loss(description)
+    (FRICTION_LOSS if soft_friction else MUJOCO).admit(description)
     spec, placed, disabled = specified(description, softness, soft_friction)
     if spheres:
         for name, body in placed.bodies.items():
@@ -148,45 +143,10 @@ class Placed:
     static: set[str]
 
 
-def _require_friction_loss(description: Model) -> None:
-    """Raise `UnsupportedError` for dry friction that MuJoCo's friction loss is not."""
-    curves = [j.name for j in description.joints if j.sticks]
-    why = (
-        f"no static friction and no Stribeck curve, which {first_names(map(repr, curves))} has"
-        if curves
-        else "a mimic joint is held softly by MuJoCo, and friction of its own would act on that"
-        if description.layout.reduced
-        else "its solver would answer for loops and friction at once"
-        if description.needs.loops
-        else ""
-    )
-    if why:
-        raise UnsupportedError(
-            f"soft_friction: MuJoCo's friction loss does not hold the dry friction of {description.name}: {why}; "
-            "leave soft_friction out for mbkit's exact law"
-        )
-
-
 def specified(
     description: Model, softness: Softness | None = None, soft_friction: bool = False
 ) -> tuple[Any, Placed, tuple[str, ...]]:
-    """Return the specification, not compiled yet, the places of the parts in it, and the features that are off.
-
-    Raises `UnsupportedError` for a joint or a loop of a kind that MuJoCo does not have, a prescribed motion, or an
-    unevenly damped free joint.
-    """
-    for fault in not_held(description):
-        raise UnsupportedError(
-            f"mujoco: {description.name}: {fault}; mbkit.dynamics(model, 'lagrangian') holds all of them exactly"
-        )
-    for joint in description.joints:
-        if joint.kind not in JOINT_TYPES:
-            raise unknown_joint("mujoco", joint)
-        if joint.kind == "free" and np.ptp(joint.damping[:3]) > 0:
-            raise UnsupportedError(
-                f"mujoco: free joint {joint.name!r} is damped differently along its body axes; "
-                "MuJoCo damps a free joint along world axes"
-            )
+    """Return the specification, not compiled yet, the places of the parts in it, and the features that are off."""
     spec = mujoco.MjSpec()
     spec.modelname = description.name
     compiler = spec.compiler
@@ -219,29 +179,6 @@ def specified(
     if soft_friction or description.needs.loops:
         _solve_to_rounding(spec, softness or Softness())
     return spec, placed, disabled
-
-
-def not_held(description: Model) -> Iterator[str]:
-    """Yield the loops, motions and contacts that are no equality of MuJoCo's, each with the reason."""
-    for loop in description.loops:
-        if loop.kind == "distance":
-            why = "MuJoCo's equality of a tendon's length leaves J̇ v out, which no stiffness makes up for"
-            yield f"loop {loop.name!r} is a rod (distance), and {why}"
-        elif loop.kind not in EQUALITIES:
-            yield f"loop {loop.name!r} is {loop.kind}, and MuJoCo has no such equality, only points and frames"
-    for coupler in description.couplers:
-        if coupler.curve.any():
-            why = "MuJoCo's equality of such joints leaves J̇ v out, which no stiffness makes up for"
-            yield f"coupler {coupler.name!r} is a curve, and {why}"
-    for motion in description.prescribed:
-        yield f"joint {motion.joint!r} is moved in time, and MuJoCo's equality of a joint holds a constant alone"
-    held = _held(description)
-    for force in held:
-        for joint in force.without:
-            if other := next((f for f in held if joint not in f.without and joint in description.moving(f.body)), None):
-                yield f"{force}, and that of {other.body!r} does; MuJoCo has one answer for each joint"
-    for part in description.no_slip:
-        yield f"no slip {part.name!r} ({part.kind}) holds velocities, and MuJoCo's equalities hold positions alone"
 
 
 #: Features that no smooth term needs, with their disable bits, and those that some models need.
@@ -291,6 +228,18 @@ def turning_springs(description: Model) -> dict[str, Bushing]:
         if (joint.parent == "world" or not free) and not any(x.any() for x in zeros):
             out.setdefault(joint.name, f)
     return out
+
+
+def _numbers_not_held(description: Model) -> Iterator[str]:
+    for joint in description.joints:
+        if joint.kind == "free" and np.ptp(joint.damping[:3]) > 0:
+            why = "MuJoCo damps a free joint along world axes"
+            yield f"free joint {joint.name!r} is damped differently along its body axes; {why}"
+    held = _held(description)
+    for force in held:
+        for name in force.without:
+            if other := next((f for f in held if name not in f.without and name in description.moving(f.body)), None):
+                yield f"{force}, and that of {other.body!r} does; MuJoCo has one answer for each joint"
 
 
 def by_mbkit(description: Model) -> list[Any]:
@@ -385,7 +334,41 @@ _OWN_STACKS: Final[dict[str, list[tuple[Any, Array, str]]]] = {
     "ball": [(_BALL, _Z, "")],
     "free": [(_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_SLIDE, _Z, ".z"), (_BALL, _Z, ".ball")],
 }
-JOINT_TYPES: Final = frozenset(STACKS) | frozenset(_OWN_STACKS)
+_NO_STIFFNESS: Final = "MuJoCo's equality of it leaves J̇ v out, which no stiffness makes up for"
+_CARRIED: Final = (
+    "gravity body.rotor mimic joint.stiction point.spring point.damper coupling.spring coupling.damper "
+    "coupling.armature coupler coupler.several force.joint force.frame force.bushing force.compensation "
+    "force.compensation.partial force.of_time bound"
+)
+_OF_JOINTS: Final = [f"joint.{x}" for x in ("armature", "spring", "damping", "friction")]
+MUJOCO: Final = Path(
+    "mujoco",
+    "mujoco:",
+    joint_types(*STACKS, *_OWN_STACKS)
+    | {*_CARRIED.split(), *_OF_JOINTS, *(f"{x}.several" for x in _OF_JOINTS), *(f"loop.{x}" for x in EQUALITIES)},
+    why={
+        "loop.distance": _NO_STIFFNESS,
+        "coupler.curve": _NO_STIFFNESS,
+        "speed": "MuJoCo's equalities hold positions alone",
+        "row": "MuJoCo has no such equality",
+    },
+    apart=(("row", "mimic", "MuJoCo's own equations would hold both softly; mimic='free' loads independent joints"),),
+    also=_numbers_not_held,
+    instead="mbkit.dynamics(model, 'lagrangian') holds all of them exactly",
+)
+FRICTION_LOSS: Final = Path(
+    "mujoco friction loss",
+    "soft_friction: MuJoCo's friction loss does not hold the dry friction of",
+    MUJOCO.carries - {"joint.stiction"},
+    {"joint.stiction": "MuJoCo has no static friction and no Stribeck curve", **MUJOCO.why},
+    apart=(
+        *MUJOCO.apart,
+        ("mimic", "jump", "a mimic joint is held softly by MuJoCo, and friction of its own would act on that"),
+        ("row", "jump", "its solver would answer for loops and friction at once"),
+    ),
+    also=_numbers_not_held,
+    instead="leave soft_friction out for mbkit's exact law",
+)
 
 
 def _stack(joint: Joint, at_origin: bool) -> list[tuple[Any, Array, str]]:

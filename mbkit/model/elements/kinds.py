@@ -1,0 +1,222 @@
+"""Kinds of parts: all that acts or binds in a model, each declared once.
+
+`Model.acts`, `needs` and `without` read this registry, and so do the gates of paths (`mbkit.model.elements.paths`).
+Joint types are kinds by themselves, such as ``"joint_type.revolute"``; so are those of `register_joint_type`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+
+from mbkit.errors import InputError, UnknownNameError
+from mbkit.model.elements.forces import Bushing, FrameForce, GravityCompensation, JointForce
+from mbkit.model.elements.motion_laws import MOTION_LAWS
+from mbkit.model.elements.references import KINDS_OF_PARTS
+from mbkit.model.joint_types import kind_of
+from mbkit.model.loops import LOOP_KINDS
+from mbkit.model.rolling import NO_SLIP_ROWS
+
+#: A `mbkit.model.description.Description`, a floor above.
+_Model = Any
+_Test = Callable[[_Model, Any], bool]
+#: Effects of a kind: coordinates, kinetic and potential energy, dissipation of a rate, a force that jumps with a
+#: velocity's sign, another force, a row of positions or of velocities, a limit that is data, dependence on the time.
+EFFECTS: Final = ("q", "T", "V", "loss", "jump", "force", "row", "speed", "bound", "t")
+_OF_TYPES: Final = "joint_type."
+#: Fields that are not zero where they do nothing.
+_NOTHING: Final = {"lower": -np.inf, **dict.fromkeys(("upper", "velocity_limit", "effort_limit"), np.inf)}
+_OPTIONAL: Final = ("stiction", "stribeck_velocity")
+#: Sections of parts that are nothing but numbers, and go with the last of them.
+_OF_NUMBERS: Final = ("springs", "couplings")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of part, as `register_kind` takes it; `does`, `numbers` and `features` are sets of words."""
+
+    name: str
+    section: str
+    words: str
+    does: frozenset[str]
+    numbers: frozenset[str]
+    features: tuple[str, ...]
+    at: _Test
+
+    def parts(self, model: _Model) -> tuple[Any, ...]:
+        """Return the parts of a model that are of this kind."""
+        parts = getattr(model, self.section) if self.section else (model,)
+        return tuple(p for p in parts if self.at(model, p))
+
+    def removed(self, model: _Model) -> Any:
+        """Return a model without this kind, and without the parameters of its numbers."""
+        gone = self.parts(model)
+        if not self.section:
+            left = tuple(b for b in model.bindings if b.where not in self.numbers)
+            return replace(model, bindings=left, **self._nothing(model)) if gone else model
+        others = {f for k in PART_KINDS.values() if k.section == self.section for f in k.numbers} - self.numbers
+        stays = has(self.section, *(others if self.section in _OF_NUMBERS else ()))
+        new = {p.name: replace(p, **self._nothing(p)) if self.numbers and stays(model, p) else None for p in gone}
+        left = tuple(
+            b
+            for b in model.bindings
+            if b.where != self.section or b.part not in new or (new[b.part] and b.field not in self.numbers)
+        )
+        parts = tuple(p for p in (new.get(x.name, x) for x in getattr(model, self.section)) if p)
+        return replace(model, bindings=left, **{self.section: parts}) if gone else model
+
+    def _nothing(self, part: Any) -> dict[str, Any]:
+        shapes = {f: np.shape(getattr(part, f)) for f in self.numbers}
+        return {f: None if f in _OPTIONAL else np.full(shape, _NOTHING.get(f, 0.0)) for f, shape in shapes.items()}
+
+
+#: Kinds by name, in the order of registration; `kind` also knows those of joint types.
+PART_KINDS: Final[dict[str, Kind]] = {}
+
+
+def register_kind(
+    section: str, name: str, words: str, does: str = "", numbers: str = "", features: str = "", at: _Test | None = None
+) -> Kind:
+    """Make a kind of part known, and return it: a path that does not carry it refuses it by its words.
+
+    Parameters
+    ----------
+    section : str
+        Attribute of a description with its parts; empty for the description itself.
+    name : str
+        Such as ``"joint.stiction"``; ``"a.b"`` is a finer kind of ``"a"``.
+    words : str
+        A clause on one part ``p``, such as ``"joint {p.name!r} has armature"``.
+    does : str
+        Some of `EFFECTS`. A path that carries all of them carries the kind: give them where the laws of energies,
+        forces and rows have its formula. With none, only paths that name the kind carry it.
+    numbers : str
+        Fields that come to nothing when it is taken out; without any the part goes.
+    features : str
+        Words by which `Model.without` takes it out, beside its name; without any it stays.
+    at : callable, optional
+        ``at(model, part)``: whether the part is of this kind. By default each is, or each with such a number.
+
+    Raises
+    ------
+    InputError
+        A name that is taken, or a section or an effect that does not exist.
+    """
+    if name in PART_KINDS or name.startswith(_OF_TYPES):
+        raise InputError(f"kind {name!r}: expected a name that no other kind has")
+    if section not in ("", *KINDS_OF_PARTS) or not {*does.split()} <= {*EFFECTS}:
+        expected = f"a section of {KINDS_OF_PARTS} and effects of {EFFECTS}"
+        raise InputError(f"kind {name!r}: expected {expected}, got {section!r} and {does!r}")
+    sets = frozenset(does.split()), frozenset(numbers.split()), tuple(features.split())
+    PART_KINDS[name] = Kind(name, section, words, *sets, at or has(section, *numbers.split()))
+    return PART_KINDS[name]
+
+
+@cache
+def _of_joint_type(name: str) -> Kind:
+    type_ = kind_of(name)
+    words = f"is a {name.replace('_', '-')} joint" if type_.built_in else f"is {name}"
+    words = f"joint {{p.name!r}} {words}" + (f" ({type_.instead})" if type_.instead else "")
+    return Kind(_OF_TYPES + name, "joints", words, frozenset("q"), frozenset(), (), lambda _, j: bool(j.kind == name))
+
+
+def joint_types(*names: str) -> frozenset[str]:
+    """Return the names of the kinds of joint types."""
+    return frozenset(_OF_TYPES + name for name in names)
+
+
+def kind(name: str) -> Kind:
+    """Return the kind of this name, also that of a joint type."""
+    if name not in PART_KINDS and not name.startswith(_OF_TYPES):
+        raise UnknownNameError("kind", name, PART_KINDS)
+    return PART_KINDS.get(name) or _of_joint_type(name.removeprefix(_OF_TYPES))
+
+
+def acts(model: _Model) -> Mapping[str, tuple[str, ...]]:
+    """Return the kinds that act in a model by name, each with the names of its parts."""
+    kinds = (*PART_KINDS.values(), *map(_of_joint_type, dict.fromkeys(j.kind for j in model.joints)))
+    return MappingProxyType({k.name: names for k in kinds if (names := tuple(p.name for p in k.parts(model)))})
+
+
+def has(section: str, *fields: str) -> _Test:
+    """Return the test for a number among these fields that does something, or that a parameter may make do so."""
+
+    def at(model: _Model, part: Any) -> bool:
+        given = ((f, getattr(part, f)) for f in fields)
+        if not fields or any(x is not None and np.any(x != _NOTHING.get(f, 0.0)) for f, x in given):
+            return True
+        own = (section, part.name) if section else (fields[0], "")
+        return any((b.where, b.part) == own and b.field in fields for b in model.bindings)
+
+    return at
+
+
+def _named(kind: str) -> _Test:
+    return lambda _, part: bool(part.kind == kind)
+
+
+def _of_class(cls: type) -> _Test:
+    return lambda _, part: type(part) is cls
+
+
+def _several(at: _Test) -> _Test:
+    return lambda model, joint: joint.type.nv > 1 and at(model, joint)
+
+
+def _holds_weight(model: _Model, force: Any) -> bool:
+    return type(force) is GravityCompensation and force.body not in model.rotors
+
+
+register_kind("", "energies", "{p.name} was written as energies and has no bodies", at=lambda m, _: not m.has_bodies)
+register_kind("", "gravity", "gravity", "V", "gravity", "gravity")
+# Armature of a free joint is a body, whose weight a compensation holds.
+_WORDS, _AT = "body {p.name!r} is armature of a free joint", lambda m, b: b.name in m.rotors and b.mass > 0
+register_kind("bodies", "body.rotor", _WORDS, "T", "mass inertia", "armature", _AT)
+_AT, _FRICTION = lambda _, j: j.mimic is not None, "friction stiction stribeck_velocity"
+register_kind("joints", "mimic", "joint {p.name!r} follows {p.mimic.joint!r}", "q", at=_AT)
+for _name, _what, _does, _numbers, _feature in (
+    ("armature", "armature", "T", "armature", "armature"),
+    ("spring", "a spring", "V", "stiffness", "springs"),
+    ("damping", "damping", "loss", "damping", "damping"),
+    ("friction", "dry friction", "jump", _FRICTION, "friction"),
+    ("limit", "limits", "bound", "lower upper", "limits"),
+    ("velocity_limit", "limits of velocity", "bound", "velocity_limit", "limits"),
+    ("effort_limit", "limits of effort", "bound", "effort_limit", "limits"),
+):
+    _of_joints = partial(register_kind, "joints", does=_does, numbers=_numbers, features=_feature)
+    _at = _of_joints(f"joint.{_name}", f"joint {{p.name!r}} has {_what}").at
+    _of_joints(f"joint.{_name}.several", f"joint {{p.name!r}} is {{p.kind}} and has {_what}", at=_several(_at))
+_WORDS = "joint {p.name!r} has stiction above its friction"
+register_kind("joints", "joint.stiction", _WORDS, "jump", _FRICTION, "friction", lambda _, j: j.sticks)
+for _section, _name, _words in (
+    ("springs", "point", " {p.name!r} between two points"),
+    ("couplings", "coupling", " on coupling {p.name!r} of joints"),
+):
+    register_kind(_section, f"{_name}.spring", "spring" + _words, "V", "stiffness", "springs")
+    register_kind(_section, f"{_name}.damper", "damper" + _words, "loss", "damping", "damping")
+register_kind("couplings", "coupling.armature", "armature" + _words, "T", "armature", "armature")
+for _name in LOOP_KINDS:
+    register_kind("loops", f"loop.{_name}", "loop {p.name!r} is {p.kind}", "row", "", "loops", _named(_name))
+_coupler = partial(register_kind, "couplers", does="row", features="loops couplers")
+_coupler("coupler", "coupler {p.name!r}")
+_coupler("coupler.curve", "coupler {p.name!r} is a curve", at=lambda _, c: c.curve.any())
+_coupler("coupler.several", "coupler {p.name!r} has several leaders", at=lambda _, c: len(c.leaders) > 1)
+_motion = partial(register_kind, "prescribed", does="row t", features="prescribed")
+for _law in MOTION_LAWS:
+    _name = _law.__name__.removesuffix("Motion").lower()
+    _motion(f"motion.{_name}", "joint {p.joint!r} is moved in time", at=_of_class(_law))
+for _name, (_rows, _) in NO_SLIP_ROWS.items():
+    _WORDS, _does = "no slip {p.name!r} ({p.kind}) holds velocities", "row speed" if _rows else "speed"
+    register_kind("no_slip", f"no_slip.{_name}", _WORDS, _does, "", "no_slip", _named(_name))
+_force = partial(register_kind, "forces", words="{p}", features="forces")
+_force("force.joint", does="V force", at=_of_class(JointForce))
+_force("force.frame", does="V force", at=_of_class(FrameForce))
+_force("force.bushing", does="V loss force", at=_of_class(Bushing))
+_force("force.compensation", does="V", at=_holds_weight)
+_force("force.compensation.partial", does="force", at=lambda m, f: _holds_weight(m, f) and bool(f.without))
+_force("force.of_time", does="t", at=lambda _, f: f.of_time)

@@ -1,0 +1,98 @@
+"""Paths: all that a model goes through, each with the kinds of parts that it carries; it refuses the others by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from mbkit.errors import InputError, UnsupportedError
+from mbkit.model.elements.kinds import EFFECTS, Kind, kind
+
+#: A `mbkit.model.description.Description`, a floor above.
+_Model = Any
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """A path of a model, such as an engine, a file format or a kind of run, and its gate. It registers itself.
+
+    Attributes
+    ----------
+    name : str
+        Key in `PATHS`.
+    words : str
+        Begin of a refusal; the model's name follows.
+    carries : frozenset of str
+        Names of kinds, and effects: ``"V"`` and ``"t"`` stand for all kinds that have these effects alone.
+    why : mapping of str to str
+        Reasons for refusals, by kind or effect; the first one counts.
+    notes : mapping of str to str
+        Notes on what is carried otherwise, or left out, by kind or effect. A kind with a note is not refused.
+    apart : tuple of (str, str, str)
+        Two kinds or effects that it does not carry together, and why.
+    also : callable
+        ``also(model)`` yields further faults, which depend on numbers.
+    instead : str
+        Remedies, beside `Model.without`.
+    """
+
+    name: str
+    words: str
+    carries: frozenset[str]
+    why: Mapping[str, str] = field(default_factory=dict)
+    notes: Mapping[str, str] = field(default_factory=dict)
+    apart: tuple[tuple[str, str, str], ...] = ()
+    also: Callable[[_Model], Iterable[str]] = lambda _: ()
+    instead: str = ""
+
+    def __post_init__(self) -> None:
+        for name in {*self.carries, *self.why, *self.notes, *(x for *two, _ in self.apart for x in two)} - {*EFFECTS}:
+            kind(name)
+        if PATHS.setdefault(self.name, self) is not self:
+            raise InputError(f"path {self.name!r}: expected a name that no other path has")
+
+    def takes(self, kind: Kind) -> bool:
+        """Return whether it carries a kind, or leaves it out with a note."""
+        return kind.name in {*self.carries, *self.notes} or (bool(kind.does) and kind.does <= self.carries)
+
+    def admit(self, model: _Model) -> tuple[str, ...]:
+        """Return the notes on a model; raise `UnsupportedError` with every part that the path does not carry."""
+        if refusal := self.refuses(model):
+            raise UnsupportedError(refusal)
+        kinds = [kind(name) for name in model.acts]
+        return tuple(text for key, text in self.notes.items() if any(_is(k, key) for k in kinds))
+
+    def refuses(self, model: _Model) -> str:
+        """Return why the path does not carry a model, with every part; empty where it does."""
+        kinds = [kind(name) for name in model.acts]
+        lost = [k for k in kinds if not self.takes(k)]
+        faults = dict.fromkeys([*self._refused(model, lost), *self._together(model, kinds), *self.also(model)])
+        features = ", ".join(dict.fromkeys(repr(k.features[-1]) for k in lost if k.features))
+        remedies = self.instead, f"model.without({features}) leaves them out" if features else ""
+        return f"{self.words} {model.name}: {'; '.join(filter(None, (*faults, *remedies)))}" if faults else ""
+
+    def _refused(self, model: _Model, lost: list[Kind]) -> Iterator[str]:
+        leaders = {p.name for k in lost if "q" in k.does for p in k.parts(model)}
+        for k in lost:
+            why = next((f", and {text}" for key, text in self.why.items() if _is(k, key)), "")
+            # A part is told of by its finest kind, and what follows another joint with that.
+            finer = [x for x in lost if x.name.startswith(k.name + ".")]
+            for p in k.parts(model):
+                follows = "q" in k.does and p.mimic and p.mimic.joint in leaders
+                if not follows and not any(x.at(model, p) for x in finer):
+                    yield k.words.format(p=p) + why
+
+    def _together(self, model: _Model, kinds: list[Kind]) -> Iterator[str]:
+        for *two, why in self.apart:
+            first = [next((k for k in kinds if _is(k, x)), None) for x in two]
+            if all(first):
+                yield ", while ".join(k.words.format(p=k.parts(model)[0]) for k in first if k) + f": {why}"
+
+
+#: Paths by name.
+PATHS: Final[dict[str, Path]] = {}
+
+
+def _is(kind: Kind, key: str) -> bool:
+    return key == kind.name or key in kind.does

@@ -1,0 +1,513 @@
+"""Every kind of part on every path: right to rounding, or refused by the part's name.
+
+Random models have two to five kinds; their truth is `tests.plain_mechanics`, NumPy alone. A path that forgets a part
+gives another acceleration, motion or energy, and fails here; a refusal has to name one of the parts that the model has.
+
+Then each kind alone goes through each gate. A kind without an example and a path without a check fail the suite.
+"""
+
+# ruff: noqa: ARG001, ARG005  # all parts and all paths are called alike
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.codegen.c_source import export_c
+from mbkit.errors import InputError, MbkitWarning, UnknownNameError, UnsupportedError
+from mbkit.lagrangian import from_model, program
+from mbkit.model.elements.kinds import PART_KINDS, Kind, kind, register_kind
+from mbkit.model.elements.paths import PATHS as GATES
+from mbkit.model.elements.paths import Path as Gate
+from tests.plain_mechanics import TIP, Case, random_case
+
+ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake", "oracle")
+#: Sums of a few hundred rounded terms, and second differences of the reference's rows.
+CLOSE = 1e-9
+CASES = range(200)
+
+
+def dynamics(case: Case, model: mb.Model | None = None, engine: str = "lagrangian") -> mb.Dynamics:
+    model = case.model() if model is None else model
+    options = {"compile": False} if engine == "lagrangian" else {}
+    dyn = mb.dynamics(model, engine, **options)
+    return dyn.at(**{model.time_parameter: case.t}) if model.time_parameter else dyn
+
+
+def assert_close(got: np.ndarray, wanted: np.ndarray, close: float = CLOSE) -> None:
+    assert np.shape(got) == np.shape(wanted)
+    assert np.abs(got - wanted).max() < close * max(1.0, np.abs(wanted).max())
+
+
+def expected(case: Case) -> np.ndarray:
+    return case.acceleration(case.t, case.q, case.v, case.tau)
+
+
+# Paths: each returns what is compared, or raises UnsupportedError.
+
+
+def on_engine(engine: str) -> Callable[[Case, Path], None]:
+    def check(case: Case, folder: Path) -> None:
+        dyn = dynamics(case, engine=engine)
+        a = dyn.forward_dynamics(case.q, case.v, case.tau)
+        if dyn.soft_constraints and any(p.rows for p in case.parts):
+            # MuJoCo's constraints are soft; its law, which its solver reaches, becomes the rigid one.
+            law = dyn.constraint_law(case.q, case.v, case.tau)
+            assert_close(a, law.acceleration)
+            a = law.rigid
+        assert_close(a, expected(case))
+        one = dyn.potential_energy(case.q) - dyn.potential_energy(0 * case.q)
+        assert_close(np.array(one), np.array(case.potential(case.q) - case.potential(0 * case.q)))
+
+    return check
+
+
+def by_from_model(case: Case, folder: Path) -> None:
+    driven = any(p.kind == "prescribed" for p in case.parts)
+    lag = from_model(case.model(), drives=driven)
+    dyn = lag.dynamics(options={"compile": False})
+    if dyn.model.time_parameter:
+        dyn = dyn.at(**{dyn.model.time_parameter: case.t})
+    assert_close(dyn.forward_dynamics(case.q, case.v, case.tau), expected(case))
+
+
+def by_program(case: Case, folder: Path) -> None:
+    names: dict = {}
+    text = program(case.model(), "forward_dynamics")
+    exec(text.python(), names)
+    more = [np.array([case.t])] if len(text.inputs) > 3 else []
+    assert_close(np.asarray(names["forward_dynamics"](case.q, case.v, case.tau, *more)), expected(case))
+
+
+def by_casadi(case: Case, folder: Path) -> None:
+    function = mb.dynamics(case.model(), "lagrangian").function("forward_dynamics")
+    more = [case.t] if function.n_in() > 3 else []
+    assert_close(function(case.q, case.v, case.tau, *more).full()[:, 0], expected(case))
+
+
+def by_c(case: Case, folder: Path) -> None:
+    made = export_c(case.model(), ["forward_dynamics"], name="case")
+    _, source = made.write(folder)
+    library = folder / "library.so"
+    subprocess.run(["cc", "-O0", "-shared", "-fPIC", str(source), "-o", str(library), "-lm"], check=True)
+    described = made.functions[0]
+    arguments = [case.q, case.v, case.tau, np.array([case.t])][: len(described.inputs)]
+    out = np.full(case.n, np.nan)
+    call = getattr(ctypes.CDLL(str(library)), described.name)
+    call.restype = None
+    call(*(np.ascontiguousarray(x).ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for x in (*arguments, out)))
+    assert_close(out, expected(case))
+
+
+def by_file(kind: str) -> Callable[[Case, Path], None]:
+    def check(case: Case, folder: Path) -> None:
+        model = case.model()
+        path = mb.convert(model, kind).write(folder / f"case.{'xml' if kind == 'mjcf' else 'urdf'}")
+        back = mb.load(path, gravity=model.gravity) if kind == "urdf" else mb.load(path)
+        # An MJCF keeps a mimic joint, as one that a coupler holds.
+        whole = len(case.G) if len(back.joint_names) > case.n else case.n
+        q, v, a = case.q, case.v, expected(case)
+        tau = np.concatenate([case.tau, np.zeros(whole - case.n)])
+        if whole > case.n:
+            q, v, a = case.G @ q + case.c, case.G @ v, case.G @ a
+        order = [int(name[1:]) for name in back.joint_names]
+        assert sorted(order) == list(range(whole))
+        assert_close(dynamics(case, back).forward_dynamics(q[order], v[order], tau[order]), a[order])
+
+    return check
+
+
+def by_explain(case: Case, folder: Path) -> None:
+    """The whole model beside the one without a part: the difference is seen, and explained by what differs."""
+    whole = case.model()
+    for part in case.parts:
+        without = case.model(kept=lambda x, part=part: x is not part)
+        out = mb.explain(whole, without)
+        assert not out.agree, f"explain does not see {part.kind}: {out.verdict}"
+        assert out.acting, f"explain has no cause for {part.kind}: {out.verdict}"
+        text = " ".join(f"{c.kind} {c.says}" for c in out.acting).lower()
+        assert any(w.lower() in text for w in part.words), f"{part.kind}: {text}"
+
+
+def by_lock(case: Case, folder: Path) -> None:
+    """A locked joint is one whose velocity and acceleration stay zero; energies are the whole model's."""
+    model = case.model()
+    k = case.n - 1
+    name = f"j{k}"
+    try:
+        locked = model.lock({name: case.q[k]})
+    except InputError as refusal:
+        # What is moved in time cannot stand still.
+        raise UnsupportedError(str(refusal)) from refusal
+    kept = [i for i in range(case.n) if f"j{i}" in locked.joint_names]
+    v = case.v * (np.arange(case.n) != k)
+    dyn = dynamics(case, locked)
+    # Where constraints bind the joint, what is left of them may hold more than this joint.
+    if not any(p.rows for p in case.parts):
+        wanted = case.acceleration(case.t, case.q, v, case.tau, hold=(k,))
+        assert_close(dyn.forward_dynamics(case.q[kept], v[kept], case.tau[kept]), wanted[kept])
+        whole = dynamics(case, model)
+        assert_close(np.array(dyn.potential_energy(case.q[kept])), np.array(whole.potential_energy(case.q)))
+        assert_close(np.array(dyn.kinetic_energy(case.q[kept], v[kept])), np.array(whole.kinetic_energy(case.q, v)))
+
+
+def by_join(case: Case, folder: Path) -> None:
+    """Beside a pendulum that nothing touches, the model moves as alone."""
+    b = mb.ModelBuilder("clock", gravity=case.model().gravity)
+    b.add_body("bob", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("pivot", "revolute", parent="world", child="bob", axis=(0, 1, 0))
+    for model in (mb.join(b.build(), case.model(), at="world"), mb.join(case.model(), b.build(), at="world")):
+        where = [model.joint_names.index(n) for n in case.model().joint_names]
+        q, v, tau = (np.zeros(model.nv) for _ in range(3))
+        q[where], v[where], tau[where] = case.q, case.v, case.tau
+        assert_close(dynamics(case, model).forward_dynamics(q, v, tau)[where], expected(case))
+
+
+def by_run(case: Case, folder: Path) -> None:
+    """A controller that is sampled beside a wrench, against the same steps in NumPy; energy and work balance."""
+    w, dt, hold, duration = np.array([0.5, -0.3, 0.2, 0.1, 0.2, -0.1]), 1e-3, 4e-3, 0.012
+    gain, last, each = 0.5 * np.arange(1, case.n + 1), len(case.kinds) - 1, round(hold / dt)
+
+    def torque(t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return case.tau - gain * v
+
+    def of_wrench(q: np.ndarray) -> np.ndarray:
+        return case.moving(last, TIP, q).T @ w[:3] + case.turning(last, q).T @ w[3:]
+
+    # Step by step, so that no stage looks into the next sample.
+    q, v, held = case.q, case.v, case.tau
+    for k in range(round(duration / dt)):
+        held = torque(0.0, q, v) if k % each == 0 else held
+        here = replace(case, t=case.t + k * dt, q=q, v=v)
+        q, v = here.rk4(dt, dt, lambda t, q, v, held=held: held + of_wrench(q))
+    dyn = dynamics(case)
+    run = mb.simulate(
+        dyn, case.q, case.v, duration, "rk4", dt=dt, t0=case.t, torque=torque, hold=hold,
+        wrenches={"tip": w}, wrench_axes="local_world_aligned",
+    )  # fmt: skip
+    assert run.stats.ended == "finished"
+    # Steps are pulled back onto constraints; the plain ones drift by the error of a step.
+    close = 1e-8 if any(p.rows for p in case.parts) else 1e-10
+    assert_close(run.q[-1], q, close)
+    assert_close(run.v[-1], v, close)
+    applied = run.wrenches()["tip"]
+    assert_close(applied, np.tile(w, (len(applied), 1)))
+    scale = max(1.0, np.abs(run.energy()).max(), np.abs(run.work()).max())
+    assert np.abs(run.power_balance()).max() < 1e-7 * scale
+
+
+PATHS: dict[str, Callable[[Case, Path], None]] = {
+    **{engine: on_engine(engine) for engine in ENGINES},
+    "from_model": by_from_model,
+    "program": by_program,
+    "casadi": by_casadi,
+    "c": by_c,
+    "urdf": by_file("urdf"),
+    "mjcf": by_file("mjcf"),
+    "explain": by_explain,
+    "lock": by_lock,
+    "join": by_join,
+    "run": by_run,
+}
+
+
+@pytest.mark.thorough(every=20)
+@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("seed", CASES)
+def test_a_path_is_right_or_refuses_a_part_by_name(seed: int, path: str, tmp_path: Path) -> None:
+    if path == "c" and shutil.which("cc") is None:
+        pytest.skip("no C compiler on PATH")
+    case = random_case(seed)
+    with warnings.catch_warnings(action="ignore", category=MbkitWarning):
+        refusal = ""
+        try:
+            PATHS[path](case, tmp_path)
+        except UnsupportedError as error:
+            refusal = str(error)
+    if path in GATES:
+        # Neither by accident nor in silence.
+        assert bool(refusal) == bool(GATES[path].refuses(case.model()))
+    # A model may be too large to be written out, whatever its parts.
+    words = (*case.words, "too many terms")
+    assert not refusal or any(word.lower() in refusal.lower() for word in words), refusal
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_a_hinge_that_a_loop_holds_may_have_stiction(engine: str) -> None:
+    """It rests whatever its friction is; its response to forces is rounding, of either sign."""
+    case = random_case(203)
+    assert_close(dynamics(case, engine=engine).forward_dynamics(case.q, case.v, case.tau), expected(case))
+
+
+# Each kind alone
+
+for file in sorted(Path(mb.__file__).parent.rglob("*.py")):
+    if "elements.paths import" in file.read_text(encoding="utf-8"):
+        import_module(".".join(file.relative_to(Path(mb.__file__).parent.parent).with_suffix("").parts))
+
+
+def with_joint(type_: str = "revolute", **numbers: object) -> Callable[[mb.ModelBuilder], None]:
+    def add(b: mb.ModelBuilder) -> None:
+        axis = {"axis": (0, 0.6, 0.8)} if type_ == "revolute" else {}
+        b.add_body("x", mass=0.7, com=(0.1, 0.2, -0.1), inertia=(0.1, 0.2, 0.25))
+        b.add_joint("x", type_, parent="b2", child="x", **axis, **numbers)
+
+    return add
+
+
+def with_loop(type_: str) -> Callable[[mb.ModelBuilder], None]:
+    return lambda b: b.add_loop("x", type_, body_a="world", body_b="b2", length=0.4 * (type_ == "distance"))
+
+
+def with_rotor(b: mb.ModelBuilder) -> None:
+    b.add_body("x", mass=0.3, inertia=0.3 * np.eye(3))
+    b.add_joint("to_x", "fixed", parent="b2", child="x")
+    b.add_gravity_compensation("x", 1.0)
+
+
+def with_spring(**numbers: float) -> Callable[[mb.ModelBuilder], None]:
+    return lambda b: b.add_spring("x", body_a="world", point_a=(1, 2, 3), body_b="b2", **numbers)
+
+
+def with_coupling(**numbers: float) -> Callable[[mb.ModelBuilder], None]:
+    return lambda b: b.add_coupling("x", {"j0": 1.5, "j1": -0.5}, **numbers)
+
+
+def with_coupler(leader: object = "j1", **numbers: object) -> Callable[[mb.ModelBuilder], None]:
+    return lambda b: b.add_coupler("x", "j0", leader, **numbers)
+
+
+NUMBERS = {
+    "armature": {"armature": 0.3},
+    "spring": {"stiffness": 2.0},
+    "damping": {"damping": 0.4},
+    "friction": {"friction": 0.2},
+    "limit": {"lower": -3.0, "upper": 3.0},
+    "velocity_limit": {"velocity_limit": 3.0},
+    "effort_limit": {"effort_limit": 3.0},
+}
+#: Every kind, alone on an arm of three hinges; its part has the name "x", or is joint "j0".
+EXAMPLES: dict[str, Callable[[mb.ModelBuilder], None] | None] = {
+    "energies": None,
+    "gravity": lambda b: None,
+    "body.rotor": with_rotor,
+    "mimic": with_joint(mimic=("j0", 0.7, 0.2)),
+    **{f"joint.{name}": with_joint(**x) for name, x in NUMBERS.items()},
+    **{f"joint.{n}.several": with_joint("planar", **{k: [y] * 3 for k, y in x.items()}) for n, x in NUMBERS.items()},
+    "joint.armature.several": with_joint("ball", armature=0.3),
+    "joint.stiction": with_joint(friction=0.2, stiction=0.4, stribeck_velocity=0.1),
+    "point.spring": with_spring(stiffness=3.0),
+    "point.damper": with_spring(damping=0.3),
+    "coupling.spring": with_coupling(stiffness=3.0),
+    "coupling.damper": with_coupling(damping=0.3),
+    "coupling.armature": with_coupling(armature=0.3),
+    **{f"loop.{x}": with_loop(x) for x in ("point", "frame", "revolute", "universal", "cylindrical", "prismatic")},
+    "loop.distance": with_loop("distance"),
+    "coupler": with_coupler(ratio=2.0),
+    "coupler.curve": with_coupler(curve=(0.3, 0.0, 0.0)),
+    "coupler.several": with_coupler(("j1", "j2"), ratio=(0.4, 0.7)),
+    "motion.prescribed": lambda b: b.prescribe("j0", rate=1.0),
+    "motion.formula": lambda b: b.prescribe("j0", lambda t: t**3),
+    "motion.spline": lambda b: b.prescribe("j0", ([0.0, 1.0, 2.0], [0.0, 0.4, 0.3])),
+    "no_slip.blade": lambda b: b.add_blade("x", body_a="b2", axis_a=(1, 0, 0)),
+    "no_slip.disc": lambda b: b.add_rolling("x", "disc", body_a="b2", radius=0.3, axis_a=(0, 1, 0)),
+    "no_slip.sphere": lambda b: b.add_rolling("x", "sphere", body_a="b2", radius=0.3),
+    "force.joint": lambda b: b.add_joint_force("x", "j0", lambda t, q, v: -(q**3) - v),
+    "force.frame": lambda b: b.add_force("x", "b2", force=(1.0, 2.0, 3.0)),
+    "force.bushing": lambda b: b.add_bushing("x", body_a="world", body_b="b2", stiffness=[1.0] * 6, damping=[0.1] * 6),
+    "force.compensation": lambda b: b.add_gravity_compensation("b2", 0.8),
+    "force.compensation.partial": lambda b: b.add_gravity_compensation("b2", 0.8, without=("j0",)),
+    "force.of_time": lambda b: b.add_joint_force("x", "j0", lambda t, q, v: ca.cos(t)),
+}
+
+
+def example(name: str) -> mb.Model:
+    if name == "energies":
+        return mb.lagrangian.systems.pendulum().model
+    b = mb.ModelBuilder("example", gravity=(0.7, -0.4, -9.81) if name == "gravity" else (0, 0, 0))
+    for k, parent in enumerate(("world", "b0", "b1")):
+        b.add_body(f"b{k}", mass=1.0 + k, com=(0.1, 0, -0.3), inertia=(0.1, 0.1, 0.02))
+        axis = (0.6, 0, 0.8) if k == 1 else (0, 1, 0)
+        b.add_joint(f"j{k}", "revolute", parent=parent, child=f"b{k}", axis=axis, translation=(0, 0.1, -0.5))
+    EXAMPLES[name](b)
+    return b.build()
+
+
+def accelerations(dyn: mb.Dynamics, names: tuple[str, ...], closed: bool) -> np.ndarray:
+    """Return the acceleration at one state, or M and h where constraints leave a state no freedom, by joint."""
+    dyn = dyn.at(t=0.3) if dyn.model.time_parameter else dyn
+    order = [dyn.model.velocity_names.index(n) for n in names]
+    x, v, tau = np.zeros((3, dyn.model.nv))
+    x[order], v[order], tau[order] = 0.1 * np.arange(1, 1 + len(x)), 0.2 + 0.1 * np.arange(len(x)), 0.3
+    q = dyn.model.integrate(dyn.model.neutral(), x)
+    if closed:
+        return np.vstack([dyn.mass_matrix(q)[np.ix_(order, order)], dyn.nle(q, v)[order], dyn.passive(q, v)[order]])
+    return dyn.forward_dynamics(q, v, tau)[order]
+
+
+def as_derived(model: mb.Model, *others: mb.Dynamics) -> None:
+    own = mb.dynamics(model, "lagrangian", compile=False)
+    wanted = accelerations(own, model.velocity_names, model.constrained)
+    for other in others:
+        assert_close(accelerations(other, model.velocity_names, model.constrained), wanted)
+
+
+def through_file(to: str) -> Callable[[mb.Model, Path], None]:
+    def check(model: mb.Model, folder: Path) -> None:
+        path = mb.convert(model, to).write(folder / f"x.{'xml' if to == 'mjcf' else 'urdf'}")
+        back = mb.load(path, **({"gravity": model.gravity} if to == "urdf" else {}))
+        if to == "mjcf" and model.layout.reduced:
+            # MJCF keeps the joint, as one that a coupler holds.
+            assert [x.joint for x in back.couplers] == ["x"]
+            return
+        as_derived(model, mb.dynamics(back, "lagrangian", compile=False))
+        # An MJCF has a planar joint as three.
+        if set(back.joint_names) == set(model.joint_names):
+            assert mb.explain(model, back).agree
+
+    return check
+
+
+def by_base_parameters(model: mb.Model, folder: Path) -> None:
+    """Torques of the bodies alone are linear in them."""
+    parts = ("damping", "friction", "springs", "armature", "forces")
+    names = model.base_parameters().names
+    bare = model.without(*(x for x in parts if getattr(model.needs, x)))
+    dyn, (q, v) = mb.dynamics(bare, "lagrangian", compile=False), bare.random_state(3)
+    Y = dyn.regressor(q, v, 0.3 * v, "base")
+    assert_close(Y @ bare.base_parameters().values, dyn.inverse_dynamics(q, v, 0.3 * v))
+    assert bare.base_parameters().names == names
+
+
+def on_mujoco(model: mb.Model, folder: Path) -> None:
+    as_derived(model, mb.dynamics(model, "mujoco"))
+
+
+def with_friction_loss(model: mb.Model, folder: Path) -> None:
+    """Its terms are those of the derivation; its friction is another one."""
+    soft = mb.dynamics(model, "mujoco", soft_friction=True)
+    own = mb.dynamics(model, "lagrangian", compile=False)
+    assert_close(*(accelerations(x, model.velocity_names, closed=True)[:-1] for x in (soft, own)))
+
+
+CHECKS: dict[str, Callable[[mb.Model, Path], None]] = {
+    "urdf": through_file("urdf"),
+    "mjcf": through_file("mjcf"),
+    "mujoco": on_mujoco,
+    "mujoco friction loss": with_friction_loss,
+    "base parameters": by_base_parameters,
+}
+
+
+def test_every_kind_has_an_example_and_every_path_a_check() -> None:
+    assert set(EXAMPLES) == set(PART_KINDS)
+    assert set(CHECKS) == set(GATES)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
+    model = example(name)
+    finer = name.rpartition(".")[0]
+    also = {"force.of_time": "force.joint", "joint.limit.several": "joint.limit", "joint.stiction": "joint.friction"}
+    wanted = {name, also.get(name, ""), finer} & {*PART_KINDS} - ({"gravity"} if name != "gravity" else set())
+    assert {k for k in model.acts if k in PART_KINDS} == wanted
+    types = {k.removeprefix("joint_type."): x for k, x in model.acts.items() if k.startswith("joint_type.")}
+    assert types == {t: tuple(j.name for j in model.joints if j.kind == t) for t in {j.kind for j in model.joints}}
+    if PART_KINDS[name].features:
+        assert name not in model.without(name).acts
+        for feature in PART_KINDS[name].features:
+            assert model.without(feature).digest == model.without(*wanted - {"mimic"}).digest
+    else:
+        assert name == "mimic" or name == "energies"
+
+
+@pytest.mark.parametrize("path", CHECKS)
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_gate_refuses_a_kind_by_name_or_the_path_is_right(name: str, path: str, tmp_path: Path) -> None:
+    gate, model = GATES[path], example(name)
+    refused = [kind(k) for k in model.acts if not gate.takes(kind(k))]
+    numbers = list(gate.also(model))
+    if not refused and not numbers:
+        CHECKS[path](model, tmp_path)
+        return
+    with pytest.raises(UnsupportedError) as told:
+        CHECKS[path](model, tmp_path)
+    text = str(told.value)
+    # Of several kinds of one part the finest is told.
+    assert all(
+        any(k.words.format(p=p) in text for k in refused if k.at(model, p)) for k in refused for p in k.parts(model)
+    )
+    assert all(x in text for x in numbers)
+    assert all(repr(k.features[-1]) in text for k in refused if k.features)
+
+
+# The registry and its readers
+
+
+def test_without_springs_of_joints_a_bushing_keeps_its_parameter() -> None:
+    b = mb.ModelBuilder.of(example("joint.spring"))
+    b.add_bushing("rubber", body_a="world", body_b="b2", stiffness=[mb.Parameter("k", 3.0)] * 6)
+    model = b.build()
+    less = model.without("springs")
+    assert dict(less.parameters) == {"k": 3.0}
+    assert less.forces == model.forces
+    assert not less.needs.springs
+    assert less.with_parameters(k=5.0).forces[0].stiffness[0, 0] == 5.0
+
+
+def test_of_friction_and_loops_one_kind_is_taken_out() -> None:
+    b = mb.ModelBuilder.of(example("joint.friction"))
+    b.add_loop("ring", "point", body_a="world", body_b="b2")
+    b.add_loop("rod", "distance", body_a="world", body_b="b1", length=0.4)
+    model = b.build()
+    assert [x.name for x in model.without("loop.distance").loops] == ["ring"]
+    assert model.without("joint.stiction") == model
+    assert model.acts["joint.friction"] == ("x",)
+    with pytest.raises(UnknownNameError, match=r"did you mean 'joint\.friction'"):
+        model.without("joint.frictoin")
+
+
+def test_base_parameters_refuse_a_coupler_by_name() -> None:
+    """It binds two joints, whose torques are those of the tree only with its multiplier."""
+    model = example("coupler")
+    q = np.zeros((20, 3))
+    for call in (
+        model.base_parameters,
+        lambda: model.regressor_columns("base"),
+        lambda: mb.identify(model, q, q, q, q),
+    ):
+        with pytest.raises(UnsupportedError, match=r"coupler 'x'.*without\('couplers'\)"):
+            call()
+
+
+@pytest.fixture
+def hook():
+    yield register_kind("joints", "joint.hook", "joint {p.name!r} has a hook", at=lambda _, j: j.name == "j0")
+    del PART_KINDS["joint.hook"]
+
+
+@pytest.mark.parametrize("path", CHECKS)
+def test_a_new_kind_is_refused_by_name_on_every_path(path: str, hook: Kind, tmp_path: Path) -> None:
+    with pytest.raises(UnsupportedError, match="joint 'j0' has a hook"):
+        CHECKS[path](example("gravity"), tmp_path)
+
+
+def test_kinds_and_paths_are_checked_where_they_are_made() -> None:
+    for section, name, does in (("joints", "mimic", "q"), ("wings", "wing", "V"), ("joints", "joint.x", "lift")):
+        with pytest.raises(InputError, match=f"kind '{name}'"):
+            register_kind(section, name, "", does)
+    with pytest.raises(InputError, match="path 'urdf'"):
+        Gate("urdf", "", frozenset())
+    with pytest.raises(UnknownNameError, match="did you mean 'gravity'"):
+        Gate("x", "", frozenset(["grvity"]))
+    assert "x" not in GATES
