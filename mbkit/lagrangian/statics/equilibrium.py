@@ -345,8 +345,7 @@ class _Balance:
             own, left = self._left(r, q, tau)
             if own <= 1e-3 or size == 0.0:
                 break
-            # What is little beside a stiff direction may be much of a soft one: on, as long as it gets less by half.
-            less = 0.5 if left <= 1e-3 else 1.0
+            # What is little beside a stiff direction may be much of a soft one: on, as long as it gets less.
             K = self._whole_stiffness(q, multipliers)
             if self._manifold is not None:
                 J = self._manifold.jacobian(q)
@@ -357,7 +356,7 @@ class _Balance:
             ahead = self.model.integrate(q, step[:nv]), multipliers + step[nv:]
             new = self.residual(*ahead, tau)
             new_size = float(np.linalg.norm(new))
-            if new_size < less * size and np.abs(step[:nv]).max() < 3.0:
+            if new_size < size and np.abs(step[:nv]).max() < 3.0:
                 (q, multipliers), r, size = ahead, new, new_size
                 damping = 0.0 if damping < 1e-9 else damping / 10
             elif left <= 1.0:
