@@ -460,7 +460,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         >>> by.q.shape, by.v.shape, by.tau.shape
         ((2, 2), (2, 2), (2, 2))
         """
-        self._require_motion(q, v, tau)
+        if self.model.constrained:
+            self._require_motion(q, v, tau)
         return ForwardDynamicsDerivatives(*self._derivatives("forward_dynamics_derivatives", q=q, v=v, tau=tau))
 
     def _derivatives(self, quantity: str, **arguments: ArrayLike) -> list[Array]:
