@@ -37,7 +37,7 @@ def measured(seed):
     """Return κ of a mechanism, and the error of each engine's accelerations; None where one refuses."""
     with mp.workdps(40):
         mechanism = Mechanism(seed)
-        exact, condition, free = mechanism.exact()
+        v, exact, condition, free = mechanism.exact(moving=True)
     model = mechanism.model()
     errors = {}
     for engine in ENGINES:
@@ -45,7 +45,7 @@ def measured(seed):
         plain = {"compile": False} if engine == "lagrangian" else {}
         try:
             dyn = mb.dynamics(model, engine, **plain)
-            a = dyn.forward_dynamics(mechanism.q, np.zeros(model.nv), mechanism.tau)
+            a = dyn.forward_dynamics(mechanism.q, v, mechanism.tau)
         except MbkitError:
             errors[engine] = None
             continue
