@@ -54,11 +54,14 @@ class Part:
     inertia: Callable[..., Any] = lambda *_: 0.0  # of (case, q), (n, n)
     force: Callable[..., Any] = lambda *_: 0.0  # of (case, t, q, v), (n,)
     rows: Callable[..., list[Any]] | None = None  # of (case, t, q)
+    #: Rows A of velocities alone, with A v = b, of (case, q); and b.
+    speeds: Callable[..., np.ndarray] | None = None
+    speed: float = 0.0
 
 
 @dataclass
 class Case:
-    """A chain of joints of one velocity, its parts, and a state that its constraints allow."""
+    """A chain or tree of joints of one velocity, its parts, and a state that its constraints allow."""
 
     seed: int
     kinds: list[str]
@@ -76,6 +79,11 @@ class Case:
     #: Full coordinates are G q + c; a joint that mimics another has none.
     G: np.ndarray
     c: np.ndarray
+    #: Link that each link hangs on, -1 for the world; empty for a chain.
+    parents: list[int] = field(default_factory=list)
+    #: Advance of each link that is a screw, m/rad.
+    pitch: dict[int, float] = field(default_factory=dict)
+    weight: np.ndarray = field(default_factory=lambda: GRAVITY)
 
     @property
     def n(self) -> int:
@@ -105,15 +113,23 @@ class Case:
 
     def poses(self, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         x = self.G @ q + self.c
-        R, p, out = np.eye(3), np.zeros(3), []
+        out: list[tuple[np.ndarray, np.ndarray]] = []
         for k, kind in enumerate(self.kinds):
+            i = self.parents[k] if self.parents else k - 1
+            R, p = out[i] if i >= 0 else (np.eye(3), np.zeros(3))
             p, R = p + R @ self.p[k], R @ self.R[k]
+            advance = 1.0 if kind == "prismatic" else self.pitch.get(k, 0.0)
+            p = p + R @ self.axes[k] * advance * x[k]
             if kind == "revolute":
                 R = R @ rotation(self.axes[k], x[k])
-            else:
-                p = p + R @ self.axes[k] * x[k]
             out.append((R, p))
         return out
+
+    def way(self, k: int) -> list[int]:
+        """Return the links from the world to link k, and it."""
+        if not self.parents:
+            return [*range(k + 1)]
+        return ([*self.way(self.parents[k])] if self.parents[k] >= 0 else []) + [k]
 
     def pose(self, body: str, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return (np.eye(3), np.zeros(3)) if body == "world" else self.poses(q)[int(body[1:])]
@@ -125,17 +141,20 @@ class Case:
     def turning(self, k: int, q: np.ndarray) -> np.ndarray:
         """Return the angular Jacobian of body k, (3, n); it stays exact for complex q."""
         J = np.zeros((3, len(self.kinds)), dtype=q.dtype)
-        for i, (R, _) in enumerate(self.poses(q)[: k + 1]):
+        poses = self.poses(q)
+        for i in self.way(k):
             if self.kinds[i] == "revolute":
-                J[:, i] = R @ self.axes[i]
+                J[:, i] = poses[i][0] @ self.axes[i]
         return J @ self.G
 
     def moving(self, k: int, at: Any, q: np.ndarray) -> np.ndarray:
         """Return the linear Jacobian of a point of body k, (3, n)."""
         J, x = np.zeros((3, len(self.kinds)), dtype=q.dtype), self.point(f"b{k}", at, q)
-        for i, (R, p) in enumerate(self.poses(q)[: k + 1]):
+        poses = self.poses(q)
+        for i in self.way(k):
+            R, p = poses[i]
             a = R @ self.axes[i]
-            J[:, i] = np.cross(a, x - p) if self.kinds[i] == "revolute" else a
+            J[:, i] = np.cross(a, x - p) + self.pitch.get(i, 0.0) * a if self.kinds[i] == "revolute" else a
         return J @ self.G
 
     # Equations
@@ -143,12 +162,14 @@ class Case:
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
         M = np.zeros((self.n, self.n), dtype=q.dtype)
         for k, (R, _) in enumerate(self.poses(q)):
+            if not self.mass[k]:
+                continue
             J, W = self.moving(k, self.com[k], q), self.turning(k, q)
             M = M + self.mass[k] * J.T @ J + W.T @ R @ self.I[k] @ R.T @ W
         return M + sum(part.inertia(self, q) for part in self.parts)
 
     def potential(self, q: np.ndarray) -> Any:
-        weight = sum(-m * GRAVITY @ self.point(f"b{k}", self.com[k], q) for k, m in enumerate(self.mass))
+        weight = sum(-m * self.weight @ self.point(f"b{k}", self.com[k], q) for k, m in enumerate(self.mass))
         return weight + sum(part.energy(self, q) for part in self.parts)
 
     def energy(self, q: np.ndarray, v: np.ndarray) -> float:
@@ -178,11 +199,27 @@ class Case:
 
             d = 1e-3
             bias = (8 * (rate(d) - rate(-d)) - (rate(2 * d) - rate(-2 * d))) / (12 * d)
+        for part in self.parts:
+            if part.speeds is not None:
+                J = np.vstack([J, part.speeds(self, q)])
+                bias = np.append(bias, np.imag(part.speeds(self, q + 1j * _STEP * v) @ v) / _STEP)
         for k in hold:
             J, bias = np.vstack([J, np.eye(self.n)[k]]), np.append(bias, 0.0)
         m = len(J)
         kkt = np.block([[self.mass_matrix(q), J.T], [J, np.zeros((m, m))]])
         return np.linalg.solve(kkt, np.concatenate([f, -bias]))[: self.n]
+
+    def allowed(self, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the velocities nearest to these that all rows allow."""
+        J, b = np.zeros((0, self.n)), np.zeros(0)
+        if any(part.rows for part in self.parts):
+            J = derivative(lambda x: self.rows(t, x), q)
+            b = -np.imag(self.rows(t + 1j * _STEP, q.astype(complex))) / _STEP
+        for part in self.parts:
+            if part.speeds is not None:
+                A = part.speeds(self, q)
+                J, b = np.vstack([J, A]), np.append(b, np.full(len(A), part.speed))
+        return v - np.linalg.pinv(J) @ (J @ v - b) if len(J) else v
 
     def rk4(self, duration: float, dt: float, tau: Callable[..., np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return the state after steps of the classical method, with the force as a function of (t, q, v)."""
@@ -370,7 +407,7 @@ def _prescribed(case: Case, rng: np.random.Generator) -> Part:
     )  # fmt: skip
 
 
-def loop_part(case: Case, rng: np.random.Generator, kind: str) -> Part:
+def loop_part(case: Case, rng: np.random.Generator, kind: str, name: str = "lp") -> Part:
     """Return a closure between the ground and the last body that is closed where the case stands."""
     last = f"b{len(case.kinds) - 1}"
     R_0, p_0 = case.pose(last, case.q)
@@ -403,9 +440,9 @@ def loop_part(case: Case, rng: np.random.Generator, kind: str) -> Part:
 
     def declare(b: mb.ModelBuilder) -> None:
         ends = {"rotation_a": R_A, "translation_a": p_A, "rotation_b": R_B, "translation_b": p_B}
-        b.add_loop("lp", kind, body_a="world", body_b=last, **ends, length=length)
+        b.add_loop(name, kind, body_a="world", body_b=last, **ends, length=length)
 
-    return Part(f"loop.{kind}", ("lp", "loop", "close"), declare, rows=rows)
+    return Part(f"loop.{kind}", (name, "loop", "close"), declare, rows=rows)
 
 
 LOOPS = {"point": 3, "distance": 1, "revolute": 5, "universal": 4, "cylindrical": 4, "prismatic": 5, "frame": 6}
@@ -459,8 +496,5 @@ def random_case(seed: int) -> Case:
             continue
         case.parts.append(PARTS[k](case, rng))
         wanted -= 1
-    if any(p.rows for p in case.parts):
-        J = derivative(lambda x: case.rows(case.t, x), case.q)
-        drift = np.imag(case.rows(case.t + 1j * _STEP, case.q.astype(complex))) / _STEP
-        case.v = case.v - np.linalg.pinv(J) @ (J @ case.v + drift)
+    case.v = case.allowed(case.t, case.q, case.v)
     return case

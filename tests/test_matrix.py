@@ -18,7 +18,6 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 
@@ -29,6 +28,9 @@ from mbkit.lagrangian import from_model, program
 from mbkit.model.elements.kinds import PART_KINDS, Kind, kind, register_kind
 from mbkit.model.elements.paths import PATHS as GATES
 from mbkit.model.elements.paths import Path as Gate
+from mbkit.model.joint_types import KINDS as JOINT_TYPES
+from tests import kind_examples
+from tests.kind_examples import EXAMPLES, TYPES
 from tests.plain_mechanics import TIP, Case, random_case
 
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake", "oracle")
@@ -256,91 +258,9 @@ for file in sorted(Path(mb.__file__).parent.rglob("*.py")):
         import_module(".".join(file.relative_to(Path(mb.__file__).parent.parent).with_suffix("").parts))
 
 
-def with_joint(type_: str = "revolute", **numbers: object) -> Callable[[mb.ModelBuilder], None]:
-    def add(b: mb.ModelBuilder) -> None:
-        axis = {"axis": (0, 0.6, 0.8)} if type_ == "revolute" else {}
-        b.add_body("x", mass=0.7, com=(0.1, 0.2, -0.1), inertia=(0.1, 0.2, 0.25))
-        b.add_joint("x", type_, parent="b2", child="x", **axis, **numbers)
-
-    return add
-
-
-def with_loop(type_: str) -> Callable[[mb.ModelBuilder], None]:
-    return lambda b: b.add_loop("x", type_, body_a="world", body_b="b2", length=0.4 * (type_ == "distance"))
-
-
-def with_rotor(b: mb.ModelBuilder) -> None:
-    b.add_body("x", mass=0.3, inertia=0.3 * np.eye(3))
-    b.add_joint("to_x", "fixed", parent="b2", child="x")
-    b.add_gravity_compensation("x", 1.0)
-
-
-def with_spring(**numbers: float) -> Callable[[mb.ModelBuilder], None]:
-    return lambda b: b.add_spring("x", body_a="world", point_a=(1, 2, 3), body_b="b2", **numbers)
-
-
-def with_coupling(**numbers: float) -> Callable[[mb.ModelBuilder], None]:
-    return lambda b: b.add_coupling("x", {"j0": 1.5, "j1": -0.5}, **numbers)
-
-
-def with_coupler(leader: object = "j1", **numbers: object) -> Callable[[mb.ModelBuilder], None]:
-    return lambda b: b.add_coupler("x", "j0", leader, **numbers)
-
-
-NUMBERS = {
-    "armature": {"armature": 0.3},
-    "spring": {"stiffness": 2.0},
-    "damping": {"damping": 0.4},
-    "friction": {"friction": 0.2},
-    "limit": {"lower": -3.0, "upper": 3.0},
-    "velocity_limit": {"velocity_limit": 3.0},
-    "effort_limit": {"effort_limit": 3.0},
-}
-#: Every kind, alone on an arm of three hinges; its part has the name "x", or is joint "j0".
-EXAMPLES: dict[str, Callable[[mb.ModelBuilder], None] | None] = {
-    "energies": None,
-    "gravity": lambda b: None,
-    "body.rotor": with_rotor,
-    "mimic": with_joint(mimic=("j0", 0.7, 0.2)),
-    **{f"joint.{name}": with_joint(**x) for name, x in NUMBERS.items()},
-    **{f"joint.{n}.several": with_joint("planar", **{k: [y] * 3 for k, y in x.items()}) for n, x in NUMBERS.items()},
-    "joint.armature.several": with_joint("ball", armature=0.3),
-    "joint.stiction": with_joint(friction=0.2, stiction=0.4, stribeck_velocity=0.1),
-    "point.spring": with_spring(stiffness=3.0),
-    "point.damper": with_spring(damping=0.3),
-    "coupling.spring": with_coupling(stiffness=3.0),
-    "coupling.damper": with_coupling(damping=0.3),
-    "coupling.armature": with_coupling(armature=0.3),
-    **{f"loop.{x}": with_loop(x) for x in ("point", "frame", "revolute", "universal", "cylindrical", "prismatic")},
-    "loop.distance": with_loop("distance"),
-    "coupler": with_coupler(ratio=2.0),
-    "coupler.curve": with_coupler(curve=(0.3, 0.0, 0.0)),
-    "coupler.several": with_coupler(("j1", "j2"), ratio=(0.4, 0.7)),
-    "motion.prescribed": lambda b: b.prescribe("j0", rate=1.0),
-    "motion.formula": lambda b: b.prescribe("j0", lambda t: t**3),
-    "motion.spline": lambda b: b.prescribe("j0", ([0.0, 1.0, 2.0], [0.0, 0.4, 0.3])),
-    "no_slip.blade": lambda b: b.add_blade("x", body_a="b2", axis_a=(1, 0, 0)),
-    "no_slip.disc": lambda b: b.add_rolling("x", "disc", body_a="b2", radius=0.3, axis_a=(0, 1, 0)),
-    "no_slip.sphere": lambda b: b.add_rolling("x", "sphere", body_a="b2", radius=0.3),
-    "force.joint": lambda b: b.add_joint_force("x", "j0", lambda t, q, v: -(q**3) - v),
-    "force.frame": lambda b: b.add_force("x", "b2", force=(1.0, 2.0, 3.0)),
-    "force.bushing": lambda b: b.add_bushing("x", body_a="world", body_b="b2", stiffness=[1.0] * 6, damping=[0.1] * 6),
-    "force.compensation": lambda b: b.add_gravity_compensation("b2", 0.8),
-    "force.compensation.partial": lambda b: b.add_gravity_compensation("b2", 0.8, without=("j0",)),
-    "force.of_time": lambda b: b.add_joint_force("x", "j0", lambda t, q, v: ca.cos(t)),
-}
-
-
 def example(name: str) -> mb.Model:
-    if name == "energies":
-        return mb.lagrangian.systems.pendulum().model
-    b = mb.ModelBuilder("example", gravity=(0.7, -0.4, -9.81) if name == "gravity" else (0, 0, 0))
-    for k, parent in enumerate(("world", "b0", "b1")):
-        b.add_body(f"b{k}", mass=1.0 + k, com=(0.1, 0, -0.3), inertia=(0.1, 0.1, 0.02))
-        axis = (0.6, 0, 0.8) if k == 1 else (0, 1, 0)
-        b.add_joint(f"j{k}", "revolute", parent=parent, child=f"b{k}", axis=axis, translation=(0, 0.1, -0.5))
-    EXAMPLES[name](b)
-    return b.build()
+    """Return a new model, which has not yet said what acts in it."""
+    return (EXAMPLES | TYPES)[name](name).model
 
 
 def accelerations(dyn: mb.Dynamics, names: tuple[str, ...], closed: bool) -> np.ndarray:
@@ -411,7 +331,18 @@ CHECKS: dict[str, Callable[[mb.Model, Path], None]] = {
 
 def test_every_kind_has_an_example_and_every_path_a_check() -> None:
     assert set(EXAMPLES) == set(PART_KINDS)
+    assert set(TYPES) == {f"joint_type.{x}" for x, type_ in JOINT_TYPES.items() if type_.built_in} | {"joint_type.beam"}
     assert set(CHECKS) == set(GATES)
+
+
+@pytest.mark.parametrize("name", EXAMPLES | TYPES)
+def test_an_example_moves_as_in_numpy(name: str) -> None:
+    x = kind_examples.example(name)
+    dyn = mb.dynamics(x.model, "lagrangian", compile=False)
+    dyn = dyn.at(**{x.model.time_parameter: x.t}) if x.model.time_parameter else dyn
+    assert_close(dyn.forward_dynamics(x.q, x.v, x.tau), x.accelerated())
+    assert_close(dyn.mass_matrix(x.q), x.mass_matrix(x.plain.q))
+    assert_close(np.array(dyn.potential_energy(x.q)), np.array(x.plain.potential(x.plain.q)))
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -419,8 +350,11 @@ def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
     model = example(name)
     finer = name.rpartition(".")[0]
     also = {"force.of_time": "force.joint", "joint.limit.several": "joint.limit", "joint.stiction": "joint.friction"}
-    wanted = {name, also.get(name, ""), finer} & {*PART_KINDS} - ({"gravity"} if name != "gravity" else set())
-    assert {k for k in model.acts if k in PART_KINDS} == wanted
+    wanted = {name, also.get(name, ""), finer} & {*PART_KINDS}
+    # What holds a weight has one.
+    weighs = {"gravity"} & {*model.acts}
+    assert not weighs or name == "gravity" or name.startswith(("body.rotor", "force.compensation"))
+    assert {k for k in model.acts if k in PART_KINDS} == wanted | weighs
     types = {k.removeprefix("joint_type."): x for k, x in model.acts.items() if k.startswith("joint_type.")}
     assert types == {t: tuple(j.name for j in model.joints if j.kind == t) for t in {j.kind for j in model.joints}}
     if PART_KINDS[name].features:
