@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from functools import cache
 from typing import Any
 
+import casadi as ca
 import mujoco
 import numpy as np
 import pytest
@@ -23,11 +24,15 @@ from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.load.shapes import MassProperties, together
 from mbkit.model import Body, Joint, Loop, Mimic, Model
+from mbkit.model.elements.formula import Formula
+from mbkit.model.elements.kinds import PART_KINDS
+from mbkit.model.model import unchecked
 from mbkit.studies.baseline.description import SECTIONS, changes, described
 from mbkit.studies.explain import hypotheses
-from mbkit.studies.explain.merged_model import merge
+from mbkit.studies.explain.merged_model import OTHERS, Tolerances, merge
 from mbkit.studies.importers.study import written
 from mbkit.testing import assert_same_dynamics
+from tests.kind_examples import EXAMPLES, TYPES, example
 from tests.random_trees import random_tree
 from tests.scenes import chain, hinge
 
@@ -567,8 +572,8 @@ def test_another_ratio_of_a_coupler_is_another_motion() -> None:
 
 def test_what_no_list_of_mistakes_knows_is_no_agreement(monkeypatch: pytest.MonkeyPatch) -> None:
     """The accelerations of the whole systems are compared, whatever parts are looked at one by one."""
-    known = [x for x in hypotheses._SECTIONS if x[0] not in ("couplers", "prescribed", "loops")]
-    monkeypatch.setattr(hypotheses, "_SECTIONS", tuple(known))
+    known = tuple(x for x in OTHERS if x not in ("couplers", "prescribed", "loops"))
+    monkeypatch.setattr(hypotheses, "OTHERS", known)
     moved = mb.catalog.four_bar()
     (loop,) = moved.loops
     longer = replace(moved, loops=(replace(loop, translation_b=loop.translation_b + np.array([0.01, 0, 0])),))
@@ -580,9 +585,7 @@ def test_what_no_list_of_mistakes_knows_is_no_agreement(monkeypatch: pytest.Monk
 
 
 def test_every_part_that_moves_something_is_compared() -> None:
-    parts = {section for section, *_ in hypotheses._SECTIONS}
-    # Forces by functions are refused: they have no numbers to match.
-    assert {f.name for f in fields(Model)} - SAYS == parts | {"gravity", "joints", "bodies", "forces"}
+    assert {f.name for f in fields(Model)} - SAYS == {*OTHERS} - {"frames"} | {"gravity", "joints", "bodies"}
     assert {*described(coupled(2.0))} <= {*SECTIONS}
     for name in ("four_bar", "rolling_disc", "bicycle"):
         assert {*described(mb.catalog.get(name)())} <= {*SECTIONS}
@@ -656,6 +659,64 @@ def test_slides_that_follow_each_other_in_another_order_are_an_order_and_no_exch
     assert not told.acts
 
 
+def pushed(joint: str = "j", shift: float = 0.0, formula: Callable[..., Any] | None = None) -> Model:
+    """Return two hinges and a fixed tool with forces; frames of the second body drawn `shift` away along its axis."""
+    moved = np.array([0.0, shift, 0.0])
+    ROD = {"mass": 1.0, "inertia": (0.1, 0.1, 0.01), "axis": (0, 1, 0)}
+    b = chain(
+        ROD | {"joint": f"{joint}0", "com": (0, 0, -0.5)},
+        ROD | {"joint": f"{joint}1", "com": (0, -shift, -0.5), "translation": moved - (0, 0, 1)},
+        {"kind": "fixed", "body": "tool", "mass": 0.3, "translation": (0.1, 0, -1) - moved},
+        name="pushed",
+    )
+    b.add_frame("tip", body="tool", translation=(0, 0.2, 0))
+    other = ca.SX.sym(f"{joint}1")
+    b.add_joint_force("motor", f"{joint}0", formula or (lambda t, q, v: -3 * q * other - v * ca.cos(t)))
+    b.add_force("push", "tip", force=(1.0, 0.0, 2.0), axes="local")
+    b.add_force("pull", "tool", force=(0.0, 0.0, -1.0), axes="world")
+    b.add_bushing("rubber", body_a="world", body_b="b1", translation_b=(0, 0, -0.5) - moved, stiffness=[3.0] * 6)
+    b.add_gravity_compensation("tool", 0.5)
+    return b.build()
+
+
+def test_forces_of_other_names_frames_and_formulas_are_the_same() -> None:
+    model, sym = pushed(), ca.SX.sym
+    for other in (pushed("hinge"), pushed(shift=0.2), pushed("hinge", 0.2)):
+        assert mb.explain(model, other).agree
+    assert mb.explain(model, pushed(formula=lambda t, q, v: -(v * ca.cos(t) + sym("j1") * 3 * q))).agree
+    (cause,) = mb.explain(model, pushed("hinge", formula=lambda t, q, v: -2 * q * sym("hinge1") - v * ca.cos(t))).acting
+    assert (cause.kind, cause.subject) == ("force", "force 'motor'")
+    # What is zero at t = 0 is told, and a place that is another one.
+    assert not mb.explain(model, pushed(formula=lambda t, q, v: -3 * q * sym("j1") - v * (ca.cos(t) + t))).agree
+    frame = replace(model.frames[0], translation=np.array([0.1, 0.2, 0]))
+    (cause,) = mb.explain(model, replace(model, frames=(frame,))).acting
+    assert (cause.subject, cause.says) == (
+        "frame 'tip'",
+        "frame 'tip': second has translation (0.2, 0.2, -1) for (0.1, 0.2, -1)",
+    )
+    with pytest.raises(AssertionError, match="force 'pull'"):
+        assert_same_dynamics(model, replace(model, forces=tuple(f for f in model.forces if f.name != "pull")))
+    assert mb.explain(mb.dynamics(model, "lagrangian", compile=False), mb.dynamics(model, "pinocchio")).agree
+
+
+@pytest.mark.parametrize("what", ["coupler", "motion", "force"])
+def test_what_binds_a_joint_that_one_side_has_alone_goes_with_it(what: str) -> None:
+    def arm(**last: Any) -> mb.ModelBuilder:
+        return chain(ROD, ROD | {"translation": (0, 0, -1)}, ROD | {"translation": (0, 0, -1)} | last, name="arm")
+
+    b = arm()
+    if what == "coupler":
+        b.add_coupler("gear", "j2", "j1", ratio=2.0)
+    elif what == "motion":
+        b.prescribe("j2", amplitude=0.3, frequency=2.0)
+    else:
+        b.add_joint_force("motor", "j0", lambda _t, q, _v: -q * ca.SX.sym("j2"))
+    sides = b.build(), arm(kind="fixed", axis=None).build()
+    for a, other in (sides, sides[::-1]):
+        (cause,) = mb.explain(a, other).acting
+        assert (cause.kind, cause.subject) == ("joint held still", "joint 'j2'")
+
+
 def rubbing(**numbers: float) -> Model:
     """Return two hinges, both with a friction of 1 and the second with these numbers."""
     b, parent = mb.ModelBuilder("rubbing"), "world"
@@ -693,6 +754,74 @@ def test_friction_at_rest_and_its_curve_are_compared(one, other, kind, apart) ->
         assert_same_dynamics(rubbing(**one), rubbing(**other))
     # A stiction that is the friction is none.
     assert mb.explain(rubbing(stiction=1.0), rubbing()).agree
+
+
+def changed_fields(part: Any, model: Model) -> Iterator[tuple[str, Any]]:
+    """Yield every field of a part with another value; a field that no rule knows is an error."""
+    others = {
+        "joint": [j.name for j in model.joints],
+        "leader": ["j2"],
+        "frame": ["b0", "b1"],
+        "axes": ["world", "local"],
+    }
+    others |= dict.fromkeys(("body", "body_a", "body_b", "parent"), tuple(b.name for b in model.bodies))
+    for f in fields(part):
+        x = getattr(part, f.name)
+        if f.name.startswith("rotation"):
+            yield f.name, x @ TURN
+        elif f.name in others and isinstance(x, str):
+            yield f.name, next(y for y in others[f.name] if y not in (x, getattr(part, "child", "")))
+        elif isinstance(x, (float, np.ndarray)):
+            known = np.isfinite(x)
+            yield f.name, np.where(known, 1.1 * np.where(known, x, 0) + 0.05 * (x == 0), 4.0)
+        elif isinstance(x, Formula):
+            twice = ("twice", (x.outputs[0],), 0.0)
+            yield f.name, replace(x, operations=(*x.operations, twice), outputs=(len(x.operations), *x.outputs[1:]))
+        elif isinstance(x, Mimic):
+            yield from ((f.name, replace(x, **{n: y})) for n, y in changed_fields(x, model))
+        elif f.name in ("joints", "without", "leader"):
+            yield f.name, (*x, "j2")[-len(x or "1") :]
+        else:
+            assert f.name in ("name", "kind", "child", "symbols") or x is None, f.name
+
+
+@pytest.mark.parametrize("name", [*EXAMPLES, *TYPES])
+def test_each_field_of_each_kind_of_part_is_a_difference_that_makes_the_other(name: str) -> None:
+    """With all differences applied, one description is the other: to the last field, whatever it does."""
+    model = example(name).model
+    if not model.has_bodies:
+        return
+    with unchecked():
+        near, one = Tolerances.of(model, 1e-9), merge(model)
+        assert not hypotheses.differences(one, one, near)
+        parts = [(kind, p) for kind in OTHERS for p in getattr(one.model, kind)]
+        parts += [("joints", p) for p in one.model.joints if p.name == "x"] + [("bodies", one.model.bodies[-1])]
+        for kind, part in parts:
+            for field, value in changed_fields(part, one.model):
+                new = tuple(replace(part, **{field: value}) if p is part else p for p in getattr(one.model, kind))
+                other = replace(merge(model), model=replace(one.model, **{kind: new}))
+                changed = one
+                for h in hypotheses.differences(one, other, near):
+                    changed = h.apply(changed)
+                    assert h.says
+                if changed.model != other.model:
+                    # A spring that is not there has no rest, and a point no axes.
+                    loose = kind == "joints" and field == "rest" and not part.stiffness.any()
+                    assert loose or (field.startswith("rotation") and part.kind in ("point", "distance")), field
+                    assert changed is one
+
+
+@pytest.mark.thorough(every=5)
+@pytest.mark.parametrize("name", [name for name, kind in PART_KINDS.items() if kind.features])
+def test_a_kind_that_one_side_lacks_is_the_cause(name: str) -> None:
+    model = example(name).model
+    found = mb.explain(model, model.without(name))
+    assert mb.explain(model, model).agree
+    assert found.causes
+    assert found.explained
+    # Limits are data.
+    assert found.agree == (PART_KINDS[name].does == {"bound"})
+    assert all(c.acts for c in found.causes) == (not found.agree)
 
 
 def test_every_number_of_a_joint_and_a_frame_is_compared_or_named() -> None:

@@ -512,8 +512,6 @@ def test_what_does_not_know_forces_refuses_them_by_name() -> None:
     for form in ("mjcf", "urdf"):
         with pytest.raises(UnsupportedError, match="bushing 'rubber'"):
             mb.convert(MODEL.with_parameters(k=1.0, M=1.0), form)
-    with pytest.raises(UnsupportedError, match=r"without\('forces'\)"):
-        mb.explain(MODEL, MODEL)
 
 
 def test_drakes_own_integrators_refuse_forces_by_name() -> None:

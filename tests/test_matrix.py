@@ -320,12 +320,18 @@ def with_friction_loss(model: mb.Model, folder: Path) -> None:
     assert_close(*(accelerations(x, model.velocity_names, closed=True)[:-1] for x in (soft, own)))
 
 
+def by_explaining(model: mb.Model, folder: Path) -> None:
+    """A model is itself; `tests.test_causes` takes out each kind, and changes each field."""
+    assert mb.explain(model, model).agree
+
+
 CHECKS: dict[str, Callable[[mb.Model, Path], None]] = {
     "urdf": through_file("urdf"),
     "mjcf": through_file("mjcf"),
     "mujoco": on_mujoco,
     "mujoco friction loss": with_friction_loss,
     "base parameters": by_base_parameters,
+    "explain": by_explaining,
 }
 
 

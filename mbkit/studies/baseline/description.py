@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
@@ -21,13 +21,18 @@ from mbkit.load import load
 from mbkit.load.loader import find
 from mbkit.load.urdf_reader import read_links
 from mbkit.model import Model
+from mbkit.model.elements.editing import called
 from mbkit.model.elements.formula import Formula
+from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.studies._targets import resolved, resolved_options
 
 Part = dict[str, Any]
 #: Section -> part -> field -> number, text or list of numbers; a flat section has one part without name.
 Description = dict[str, dict[str, Part]]
 
+#: Kinds of parts whose section, or word for a part, is another one than theirs: files that users keep have these.
+_SECTION: Final = {"prescribed": "motions"}
+_NOUN: Final = {"prescribed": "prescribed motion of joint"}
 #: Section -> what its part is called; causes before their effects: a link's place before the body that it is part of.
 SECTIONS: Final = {
     "system": "",
@@ -36,16 +41,10 @@ SECTIONS: Final = {
     "energies": "",
     "links": "link",
     "places": "joint",
-    "frames": "frame",
-    "joints": "joint",
-    "bodies": "body",
-    "springs": "spring",
-    "couplings": "coupling",
-    "loops": "loop",
-    "couplers": "coupler",
-    "motions": "prescribed motion of joint",
-    "forces": "force",
-    "no_slip": "no slip",
+    **{
+        _SECTION.get(kind, kind): _NOUN.get(kind, called(kind))
+        for kind in (*reversed(KINDS_OF_PARTS[:3]), *KINDS_OF_PARTS[3:])
+    },
 }
 FLAT: Final = ("system", "parameters", "expressions", "energies")
 _UPPER: Final = ("upper", "velocity_limit", "effort_limit")
@@ -63,16 +62,8 @@ def described(model: Model) -> Description:
         "expressions": {
             "": {f"{b.field}{list(b.index) or ''} of {b.part}".strip(): str(b.expression) for b in model.bindings}
         },
-        "joints": _parts(model.joints),
+        **{_SECTION.get(kind, kind): {p.name: _part(p) for p in getattr(model, kind)} for kind in KINDS_OF_PARTS},
         "frames": _frames(model),
-        "bodies": _parts(model.bodies),
-        "springs": _parts(model.springs),
-        "couplings": _parts(model.couplings),
-        "loops": _parts(model.loops),
-        "couplers": _parts(model.couplers),
-        "motions": {m.joint: _part(m, "joint") for m in model.prescribed},
-        "forces": _parts(model.forces),
-        "no_slip": _parts(model.no_slip),
     }
     return {section: parts for section, parts in out.items() if any(parts.values())}
 
@@ -92,30 +83,27 @@ def _written(model: Model, parameters: Part) -> Description:
     }
 
 
-def _parts(parts: Iterable[Any]) -> dict[str, Part]:
-    return {part.name: _part(part, "name") for part in parts}
-
-
 def _frames(model: Model) -> dict[str, Part]:
     """Return the frames; one where another stands, as a fixed joint where its link, only says so."""
     out: dict[str, Part] = {}
     first: dict[str, str] = {}
     for frame in model.frames:
-        part = _part(frame, "name")
+        part = _part(frame)
         place = repr(part)
         out[frame.name] = {"same_as": first[place]} if place in first else part
         first.setdefault(place, frame.name)
     return out
 
 
-def _part(part: Any, name: str) -> Part:
+def _part(part: Any) -> Part:
     out: Part = {}
-    for f in fields(part):
+    # The first field is the name, but of what has the name of its body.
+    for f in fields(part)[part.name == getattr(part, fields(part)[0].name) :]:
         value = getattr(part, f.name)
         if f.name == "mimic":
             if value is not None:
                 out |= {"mimic": value.joint, "ratio": value.ratio, "offset": value.offset}
-        elif f.name != name:
+        else:
             plain = _plain(value[_TRIANGLE] if f.name == "inertia" else value)
             kept = f.name == "mass" or isinstance(value, (str, tuple))
             if kept or not np.array_equal(plain, default(f.name, plain)):

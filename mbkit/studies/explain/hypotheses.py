@@ -7,7 +7,7 @@ them can be added to the first description or removed from the second without th
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import partial
 from itertools import permutations, product
 from typing import Any, Final, NamedTuple
@@ -19,34 +19,38 @@ from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Joint, Mimic, Model
 from mbkit.model.changes.dry_friction import FrictionNumbers
-from mbkit.model.elements.formula import NUMPY
+from mbkit.model.description import CONSTRAINT_FEATURES
+from mbkit.model.elements.editing import called
+from mbkit.model.elements.forces import Force
+from mbkit.model.elements.formula import NUMPY, Formula
+from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
 from mbkit.model.parts import Coupler, Loop
 from mbkit.studies.explain.loop_differences import loop_differences, same_loop
-from mbkit.studies.explain.merged_model import LinkInBody, MergedModel, Tolerances, composite
+from mbkit.studies.explain.merged_model import OTHERS, LinkInBody, MergedModel, Tolerances, composite
 
-#: Kinds that act on the motion through no term, but through constraints.
-CONSTRAINTS: Final = frozenset({"loop", "coupler", "prescribed motion", "contact without slip"})
 _WATER: Final = 1000.0  # kg/m³
 _DEGREE: Final = np.pi / 180
 #: URDF's order of an inertia's six numbers, and MuJoCo's.
 _URDF: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _MJCF: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-#: Numbers per velocity, and what they are called.
-_NUMBERS: Final = {"armature": "armature", "damping": "damping", "friction": "friction", "stiffness": "spring"}
-#: Numbers of dry friction that a joint may lack.
-_OF_FRICTION: Final = {"stiction": "stiction", "stribeck_velocity": "Stribeck velocity"}
-_LIMITS: Final = ("lower", "upper", "velocity_limit", "effort_limit")
-_LOOPS: Final = "loops"
-#: Parts of the whole: section, key, kind of the difference, noun.
-_SECTIONS: Final = (
-    ("springs", "name", "point spring", "spring"),
-    ("couplings", "name", "joint coupling", "coupling"),
-    (_LOOPS, "name", "loop", "loop"),
-    ("couplers", "name", "coupler", "coupler"),
-    ("prescribed", "joint", "prescribed motion", "motion of"),
-    ("no_slip", "name", "contact without slip", "no slip"),
-)
+#: Kind of a difference, and noun, where they are not the description's word for a part; numbers of joints alike.
+_WORDS: Final = {
+    "springs": ("point spring", "spring"),
+    "couplings": ("joint coupling", "coupling"),
+    "prescribed": ("prescribed motion", "motion of"),
+    "no_slip": ("contact without slip", "no slip"),
+}
+_NUMBER: Final = {"stiffness": "spring", "stribeck_velocity": "Stribeck velocity"}
+#: Fields of a joint that have rules of their own, limits, which are told together, and the others.
+_PLACE: Final = ("name", "kind", "parent", "child", "rotation", "translation", "axes", "pitch", "mimic", "rest")
+_DATA: Final = {n for k in PART_KINDS.values() if k.section == "joints" and k.does == {"bound"} for n in k.numbers}
+BOUNDS: Final = tuple(f.name for f in fields(Joint) if f.name in _DATA)
+NUMBERS: Final = tuple(f.name for f in fields(Joint) if f.name not in (*_PLACE, *BOUNDS))
+#: Those of them that every joint has.
+OF_ALL: Final = tuple(f.name for f in fields(Joint) if f.name in NUMBERS and f.default is MISSING)
+#: Numbers that a sentence says all of.
+_FEW: Final = 9
 
 
 class Mistake(NamedTuple):
@@ -335,7 +339,7 @@ def joint_mistakes(joint: Joint) -> list[Mistake]:
         spatial.matrix_from_rpy(*np.remainder(factor * angles, 2 * np.pi)) for factor in (1 / _DEGREE, _DEGREE)
     )
     rows: list[tuple[str, str, dict[str, Any]]] = [
-        (kind, f"has no {kind}", {name: np.zeros(joint.type.nv)}) for name, kind in _NUMBERS.items()
+        (kind := _NUMBER.get(name, name), f"has no {kind}", {name: np.zeros(joint.type.nv)}) for name in OF_ALL
     ]
     if joint.mimic is not None:
         rows.append(("mimic", f"leaves it free, which follows {joint.mimic.joint!r}", {"mimic": None}))
@@ -405,23 +409,27 @@ def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> list[Mistake]:
             numbers = says.format(number_text(getattr(b, name)), number_text(getattr(a, name)))
             out += known(wanted) or [Mistake(kind, f"has the {kind} {numbers}", wanted)]
     out += _mimic_difference(a.mimic, b.mimic, near)
-    for name, kind in _NUMBERS.items():
-        ours, theirs = getattr(a, name), getattr(b, name)
-        if not near.numbers(ours, theirs):
-            rest = {"rest": b.rest} if name == "stiffness" else {}
-            out.append(Mistake(kind, _other_number(name, ours, theirs), {name: theirs} | rest))
-    laws = [FrictionNumbers.of([x]) for x in (a, b)]
-    for (name, kind), ours, theirs in zip(_OF_FRICTION.items(), *(x[1:] for x in laws), strict=True):
+    for name in NUMBERS:
+        ours, theirs = (_acting(name, x) for x in (a, b))
         # Without stiction, that is the friction, and no other difference.
         if not (near.numbers(ours, theirs) or getattr(a, name) is getattr(b, name) is None):
-            out.append(Mistake(kind, _other_number(kind, ours, theirs), {name: getattr(b, name)}))
+            kind = _NUMBER.get(name, name.replace("_", " "))
+            changed = {n: getattr(b, n) for n in (name, *(["rest"] if name == "stiffness" else []))}
+            out.append(Mistake(kind, _other_number(kind, ours, theirs), changed))
     if a.stiffness.any() and near.numbers(a.stiffness, b.stiffness) and not near.vector(a.rest, b.rest):
         says = f"has the spring at rest at {number_text(b.rest)}, not {number_text(a.rest)}"
         out.append(Mistake("spring", says, {"rest": b.rest}))
-    limits = {n: getattr(b, n) for n in _LIMITS if not near.numbers(getattr(a, n), getattr(b, n))}
+    limits = {n: getattr(b, n) for n in BOUNDS if not near.numbers(getattr(a, n), getattr(b, n))}
     if limits:
         out.append(Mistake("limits", _other_limits(a, limits), limits))
     return out
+
+
+def _acting(name: str, joint: Joint) -> Array:
+    """Return a number per velocity; of what a joint lacks that by which it then moves."""
+    law = FrictionNumbers.of([joint])
+    given: Array = {"stiction": law.bound, "stribeck_velocity": law.stribeck}.get(name, getattr(joint, name))
+    return given
 
 
 def _moved(name: str, a: Joint, b: Joint, near: Tolerances) -> Mistake:
@@ -457,7 +465,7 @@ def _mimic_difference(a: Mimic | None, b: Mimic | None, near: Tolerances) -> lis
 
 
 def _other_number(name: str, a: Array, b: Array) -> str:
-    what = "spring of stiffness" if name == "stiffness" else name
+    what = "spring of stiffness" if name == "spring" else name
     unit = ""
     for factor, says in ((_DEGREE, "per degree for per radian"), (1 / _DEGREE, "per radian for per degree")):
         if a.any() and np.allclose(b, factor * a, rtol=1e-9):
@@ -519,7 +527,7 @@ def _matter_differences(one: MergedModel, joint: Joint, other: MergedModel, near
 
 
 def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis]:
-    """Return the differences in gravity, springs, couplings and constraints."""
+    """Return the differences in gravity, and in all parts beside bodies and joints."""
     out = []
     if not near.vector(a.gravity, b.gravity, max(1.0, float(np.abs(a.gravity).max()))):
         says = f"has the gravity {number_text(b.gravity)} m/s² for {number_text(a.gravity)}"
@@ -529,25 +537,35 @@ def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis
             says = "has gravity with the other sign"
         mistake = Mistake("gravity", says, {"gravity": b.gravity})
         out.append(_hypothesis(mistake, "", lambda x, values: x.with_fields(**values), a, b))
-    for section, key, kind, what in _SECTIONS:
-        ours, theirs = ({getattr(x, key): x for x in getattr(m, section)} for m in (a, b))
-        if section == _LOOPS:
-            called = {x: y for x in ours if x not in theirs for y in theirs if same_loop(ours[x], theirs[y], near)}
-            others = ", ".join(f"{x!r} is {y!r}" for x, y in called.items())
-            out += [Hypothesis("renamed", "", f"calls loops otherwise: {others}")] if called else []
-            ours, theirs = _without(ours, called), _without(theirs, called.values())
+    for section in OTHERS:
+        ours, theirs = ({x.name: x for x in getattr(m, section)} for m in (a, b))
+        if section == "loops":
+            same = {x: y for x in ours if x not in theirs for y in theirs if same_loop(ours[x], theirs[y], near)}
+            others = ", ".join(f"{x!r} is {y!r}" for x, y in same.items())
+            out += [Hypothesis("renamed", "", f"calls loops otherwise: {others}")] if same else []
+            ours, theirs = _without(ours, same), _without(theirs, same.values())
         for name in dict.fromkeys([*ours, *theirs]):
             one, other = ours.get(name), theirs.get(name)
             if one is None or other is None or (says := _other_numbers(one, other, near)):
                 says = "lacks it" if other is None else "has it besides" if one is None else says
-                put = partial(_with_parts, section=section, key=key)
+                kind, what = words(section)
+                put = partial(_with_parts, section=section)
                 out.append(Hypothesis(kind, f"{what} {name!r}", says, put, {name: one}, {name: other}))
     return out
 
 
-def _with_parts(x: MergedModel, parts: Mapping[str, Any], section: str, key: str) -> MergedModel:
-    """Exchange springs, couplings or constraints by name; None takes one away."""
-    kept = [p for p in getattr(x.model, section) if getattr(p, key) not in parts]
+def words(section: str) -> tuple[str, str]:
+    """Return the kind of a difference in parts of this section, and the noun before a part's name."""
+    return _WORDS.get(section, (called(section), called(section)))
+
+
+#: Kinds of differences that act on the motion through no term, but through constraints.
+CONSTRAINTS: Final = frozenset(words(section)[0] for section in CONSTRAINT_FEATURES)
+
+
+def _with_parts(x: MergedModel, parts: Mapping[str, Any], section: str) -> MergedModel:
+    """Exchange parts of a kind by name; None takes one away."""
+    kept = [p for p in getattr(x.model, section) if p.name not in parts]
     return x.with_fields(**{section: (*kept, *(p for p in parts.values() if p is not None))})
 
 
@@ -559,11 +577,22 @@ def _other_numbers(a: Any, b: Any, near: Tolerances) -> str:
     """Return what differs between two parts of one name; empty where nothing does."""
     if isinstance(a, Loop):
         return ", and ".join(loop_differences(a, b, near))
-    if isinstance(a, Coupler) and not alike(a, b, near):
-        return f"has {_follows(b)} for {_follows(a)}"
     if type(a) in MOTION_LAWS:
         return "" if _same_motion(a, b, near) else "moves it otherwise"
-    return "" if alike(a, b, near) else "has other numbers for it"
+    if type(a) is not type(b):
+        return f"has another kind of it: {b} for {a}"
+    others = differing(a, b, near)
+    if isinstance(a, Coupler) and others:
+        return f"has {_follows(b)} for {_follows(a)}"
+    return f"has {', '.join(_change(n, getattr(a, n), getattr(b, n)) for n in others)}" if others else ""
+
+
+def _change(name: str, a: Any, b: Any) -> str:
+    what = name.replace("_", " ")
+    if isinstance(a, (str, tuple)):
+        return f"{what} {b!r} for {a!r}"
+    few = isinstance(a, float) or (isinstance(a, np.ndarray) and a.size <= _FEW)
+    return f"{what} {number_text(b)} for {number_text(a)}" if few else f"another {what}"
 
 
 def _follows(x: Coupler) -> str:
@@ -584,9 +613,30 @@ def _same_motion(a: Motion, b: Motion, near: Tolerances) -> bool:
     return near.vector(x, y, max(1.0, float(np.abs(x).max())))
 
 
-def alike(a: Any, b: Any, near: Tolerances) -> bool:
-    """Return whether all numbers and names of two parts are equal."""
-    return all(
-        near.point(x, y) if isinstance(x, np.ndarray) else near.number(x, y) if isinstance(x, float) else x == y
-        for x, y in zip(a._values(), b._values(), strict=True)
-    )
+def differing(a: Any, b: Any, near: Tolerances) -> list[str]:
+    """Return the fields in which two parts of one kind differ; of a force's formulas, by their values."""
+    names = [f.name for f in fields(a) if not (isinstance(a, Force) and f.name in ("symbols", "numbers"))]
+    return [n for n in names if not _same(n, _value(a, getattr(a, n)), _value(b, getattr(b, n)), near)]
+
+
+def _value(part: Any, field: Any) -> Any:
+    """Return a field, or the values of a formula at random arguments of many sizes, which each name has for itself."""
+    if not isinstance(field, Formula):
+        return field
+    rngs = {name: np.random.default_rng([*name.encode()]) for name in field.arguments}
+    at = {name: rng.standard_normal(64) * 10 ** rng.uniform(-2, 2, 64) for name, rng in rngs.items()}
+    with np.errstate(all="ignore"):
+        values = field(at | dict(zip(part.symbols, part.numbers, strict=True)), NUMPY)
+    known = np.nan_to_num([np.broadcast_to(x, 64) for x in values], posinf=0.0, neginf=0.0)
+    return known if known.any() else field
+
+
+def _same(name: str, a: Any, b: Any, near: Tolerances) -> bool:
+    if isinstance(a, float):
+        return near.number(a, b)
+    if not isinstance(a, np.ndarray) or a.shape != np.shape(b):
+        return bool(np.array_equal(a, b))
+    if name in ("formula", "potential"):
+        return bool(np.allclose(a, b, near.relative, near.relative))
+    lengths = name.startswith(("point", "translation"))
+    return near.point(a, b) if lengths else near.vector(a, b, float(np.abs([a, b]).max(initial=0.0)))

@@ -14,13 +14,22 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines.imported import unused
+from mbkit.engines.imported import joint_of, unused
 from mbkit.model import Body, Joint, Model
+from mbkit.model.elements.forces import Force, coordinate_arguments
 from mbkit.model.joint_types import FIXED, PRISMATIC
-from mbkit.model.parts import joint_of
 from mbkit.studies.explain.hypotheses import Hypothesis
-from mbkit.studies.explain.merged_model import FrameChange, MergedModel, Tolerances, merge, reattached
-from mbkit.studies.explain.terms import restricted, trimmed_couplings
+from mbkit.studies.explain.merged_model import (
+    OTHERS,
+    FrameChange,
+    MergedModel,
+    Tolerances,
+    merge,
+    reattached,
+    references,
+    with_names,
+)
+from mbkit.studies.explain.terms import fitting, restricted
 
 _NAME, _FRAME, _NUMBER, _KIND, _ALONE = 0.1, 0.25, 1.0, 3.0, 2.0
 #: Cost of an assignment that is not possible.
@@ -173,32 +182,19 @@ def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
             names[name] = unused(name, others)
             others.add(names[name])
     order = {m.a: k for k, m in enumerate(matching.pairs)}
-    renamed = [
-        replace(
-            j,
-            name=joints[j.name],
-            parent=bodies[j.parent],
-            child=bodies[j.child],
-            mimic=None if j.mimic is None else replace(j.mimic, joint=joints[j.mimic.joint]),
-        )
-        for j in b.model.joints
-    ]
-    renamed.sort(key=lambda j: order.get(j.name, len(order)))
     matter = {bodies[x.name]: x for x in b.model.bodies}
-    model = replace(
-        b.model,
-        joints=tuple(renamed),
-        bodies=tuple(replace(matter[j.child], name=j.child) for j in renamed),
-        springs=tuple(replace(s, body_a=bodies[s.body_a], body_b=bodies[s.body_b]) for s in b.model.springs),
-        couplings=tuple(replace(c, joints=tuple(joints.get(n, n) for n in c.joints)) for c in b.model.couplings),
-        loops=tuple(replace(x, body_a=bodies[x.body_a], body_b=bodies[x.body_b]) for x in b.model.loops),
-        couplers=tuple(
-            replace(x, joint=joints.get(x.joint, x.joint), leader=tuple(joints.get(n, n) for n in x.leaders))
-            for x in b.model.couplers
-        ),
-        prescribed=tuple(replace(p, joint=joints.get(p.joint, p.joint)) for p in b.model.prescribed),
-        no_slip=tuple(replace(x, body_a=bodies[x.body_a], body_b=bodies[x.body_b]) for x in b.model.no_slip),
-    )
+    named = [replace(with_names(j, bodies, joints, {}), name=joints[j.name]) for j in b.model.joints]
+    model = replace(b.model, joints=tuple(named))
+    coordinates = dict(zip(coordinate_arguments(b.model), coordinate_arguments(model), strict=True))
+
+    def renamed(part: Any) -> Any:
+        own = {*part.own(b.model), *part.symbols} if isinstance(part, Force) else coordinates
+        return with_names(part, bodies, joints, {x: y for x, y in coordinates.items() if x not in own})
+
+    parts: dict[str, Any] = {kind: tuple(map(renamed, getattr(b.model, kind))) for kind in OTHERS}
+    named.sort(key=lambda j: order.get(j.name, len(order)))
+    parts["bodies"] = tuple(replace(matter[j.child], name=j.child) for j in named)
+    model = replace(model, joints=tuple(named), **parts)
     return MergedModel(model, {bodies[name]: some for name, some in b.links.items()})
 
 
@@ -340,10 +336,7 @@ def _runs_of_slides(model: Model) -> list[list[str]]:
     on: dict[str, list[Joint]] = {}
     for joint in model.joints:
         on.setdefault(joint.parent, []).append(joint)
-    used = {f.body for f in model.frames}
-    ends: tuple[Any, ...] = (*model.springs, *model.loops, *model.no_slip)
-    for x in ends:
-        used |= {x.body_a, x.body_b}
+    used = {name for kind in OTHERS for part in getattr(model, kind) for name in next(references(part))}
     runs: list[list[str]] = []
     for joint in model.tree:
         before = runs[-1] if runs else []
@@ -377,8 +370,7 @@ def _held(model: Model, name: str) -> Model:
         joint_of(j.name, FIXED.name, j.parent, j.child, j.rotation, j.translation) if j.name in held else j
         for j in model.joints
     )
-    kept = {j.name for j in model.joints} - held
-    return replace(model, joints=joints, couplings=tuple(trimmed_couplings(model, kept)))
+    return fitting(model, joints=joints)
 
 
 def _count_differences(a: Model, b: Model, near: Tolerances) -> float:

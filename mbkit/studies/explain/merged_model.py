@@ -6,16 +6,22 @@ and each body knows its links.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties, together
-from mbkit.model import Body, Joint, Model
+from mbkit.model import Body, Frame, Joint, Mimic, Model
+from mbkit.model.elements.forces import FrameForce, by_functions
+from mbkit.model.elements.formula import Formula
+from mbkit.model.elements.references import _OF_BODIES, _OF_JOINTS, KINDS_OF_PARTS
 from mbkit.studies._targets import with_values
+
+#: Kinds of parts that are compared by their fields alone.
+OTHERS: Final = tuple(kind for kind in KINDS_OF_PARTS if kind not in ("bodies", "joints"))
 
 
 @dataclass(frozen=True)
@@ -141,9 +147,9 @@ class FrameChange:
 def merge(model: Model) -> MergedModel:
     """Return the description with links merged that are fixed together.
 
-    A parameter without a value is an error, the others take their values; frames are left out.
+    A parameter without a value is an error, the others take their values; frames on which no force acts are left out.
     """
-    model = with_values(model, "explain")
+    model = _with_own_frames(with_values(model, "explain"))
     bodies = {b.name: b for b in model.bodies}
     at = {"world": FrameChange("world")}
     links: dict[str, list[LinkInBody]] = {"world": []}
@@ -160,31 +166,67 @@ def merge(model: Model) -> MergedModel:
         links[here.body].append(LinkInBody(own.name, here.A, here.t, MassProperties(own.mass, own.com, own.inertia)))
     joints = tuple(moving[j.name] for j in model.joints if j.name in moving)
     matter = tuple(_body(j.child, composite(links[j.child])) for j in joints)
-    merged = replace(reattached(model, at), bodies=matter, joints=joints, frames=())
+    merged = replace(reattached(model, at), bodies=matter, joints=joints)
     return MergedModel(merged, {name: tuple(some) for name, some in links.items()})
 
 
+def _with_own_frames(model: Model) -> Model:
+    """Return the description with the forces by functions alone, and with the frames alone on which they act.
+
+    What holds weights acts on single links. The frame of a body becomes one that can stand elsewhere than the body's.
+    """
+    frames = {b.name: Frame(f"frame of {b.name}", b.name, np.eye(3), np.zeros(3)) for b in model.bodies}
+    frames |= {f.name: f for f in model.frames}
+    own = {f.name: frames[f.frame] for f in model.forces if isinstance(f, FrameForce)}
+    forces = (
+        with_names(f, {name: x.name for name, x in frames.items()}, {}, {}) if f.name in own else f
+        for f in by_functions(model)
+    )
+    return replace(model, forces=tuple(forces), frames=tuple({x.name: x for x in own.values()}.values()))
+
+
 def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
-    """Return the description with the ends of springs, loops and contacts in other frames."""
+    """Return the description with the places of parts beside bodies and joints in other frames."""
 
     def moved(part: Any) -> Any:
-        ends: dict[str, Any] = {}
-        for side in "ab":
-            change = changes[getattr(part, f"body_{side}")]
-            ends[f"body_{side}"] = change.body
-            for name in (f"point_{side}", f"translation_{side}"):
-                if hasattr(part, name):
-                    ends[name] = change.point(getattr(part, name))
-            if hasattr(part, f"rotation_{side}"):
-                ends[f"rotation_{side}"] = change.A @ getattr(part, f"rotation_{side}")
-            if hasattr(part, f"axis_{side}"):
-                ends[f"axis_{side}"] = change.A @ getattr(part, f"axis_{side}")
-        return replace(part, **ends)
+        names = {f.name for f in fields(part)}
+        for end in {"", "_a", "_b"} & {n.removeprefix("body") for n in names if n.startswith("body")}:
+            change = changes[getattr(part, f"body{end}")]
+            places = {n: getattr(part, n) for n in names & {f"{x}{end}" for x in ("translation", "point")}}
+            axes = {n: getattr(part, n) for n in names & {f"{x}{end}" for x in ("rotation", "axis")}}
+            new = {n: change.point(x) for n, x in places.items()} | {n: change.A @ x for n, x in axes.items()}
+            part = replace(part, **new, **{f"body{end}": change.body})
+        return part
 
-    parts: dict[str, Any] = {
-        where: tuple(map(moved, getattr(model, where))) for where in ("springs", "loops", "no_slip")
-    }
+    parts: dict[str, Any] = {kind: tuple(map(moved, getattr(model, kind))) for kind in OTHERS}
     return replace(model, **parts)
+
+
+def with_names(part: Any, bodies: Mapping[str, str], joints: Mapping[str, str], arguments: Mapping[str, str]) -> Any:
+    """Return a part with other names for the bodies and joints that it refers to, and in its formulas."""
+    new: dict[str, Any] = {}
+    for name, value in ((f.name, getattr(part, f.name)) for f in fields(part)):
+        names = bodies if name in _OF_BODIES else joints if name in _OF_JOINTS else {}
+        if names:
+            new[name] = names.get(value, value) if isinstance(value, str) else tuple(names.get(x, x) for x in value)
+        elif isinstance(value, Mimic):
+            new[name] = replace(value, joint=joints[value.joint])
+        elif isinstance(value, Formula):
+            new[name] = replace(value, arguments=tuple(arguments.get(x, x) for x in value.arguments))
+    return replace(part, **new)
+
+
+def references(part: Any) -> Iterator[set[str]]:
+    """Yield the names of the bodies and frames, then those of the joints, that a part refers to."""
+    for names in (_OF_BODIES, _OF_JOINTS):
+        given = (getattr(part, name, ()) for name in names)
+        yield {x for value in given for x in ((value,) if isinstance(value, str) else value)}
+
+
+def with_common_frames(*sides: MergedModel) -> Iterator[MergedModel]:
+    """Yield the descriptions with each other's frames, so that forces can be exchanged."""
+    frames = {f.name: f for side in sides for f in side.model.frames}
+    yield from (x.with_fields(frames=tuple((frames | {f.name: f for f in x.model.frames}).values())) for x in sides)
 
 
 def composite(links: Iterable[LinkInBody]) -> MassProperties:

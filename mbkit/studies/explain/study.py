@@ -10,9 +10,11 @@ import numpy as np
 
 from mbkit._check import count, real
 from mbkit.engines import Dynamics
-from mbkit.errors import InputError, UnsupportedError
+from mbkit.errors import InputError
 from mbkit.model import GravityCompensation, Model
-from mbkit.model.elements.forces import by_functions
+from mbkit.model.elements.kinds import EFFECTS
+from mbkit.model.elements.motion_laws import interval
+from mbkit.model.elements.paths import Path
 from mbkit.model.joint_numbers import owners
 from mbkit.model.model import unchecked
 from mbkit.studies.explain import terms
@@ -20,18 +22,22 @@ from mbkit.studies.explain.engine_differences import engine_causes
 from mbkit.studies.explain.hypotheses import (
     CONSTRAINTS,
     Hypothesis,
-    alike,
     differences,
+    differing,
     link_differences,
     links_in_common_axes,
     number_text,
 )
 from mbkit.studies.explain.joint_matching import Match, Matching, align_frames, reconcile_joint_sets, rename_joints
-from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge
+from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge, with_common_frames
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import WHOLE, Gap, Gaps, model_terms, states_of
 from mbkit.studies.results import to_plain
 
+#: Parts of any kind are compared by their fields.
+EXPLAIN: Final = Path("explain", "explain compares bodies and joints of", frozenset(EFFECTS))
+#: At which forces of the time are compared, s.
+_TIME: Final = 0.37
 #: Relative difference of numbers written with five digits.
 _ROUNDED: Final = 2e-5
 #: More differences than this may be summarized as rounding.
@@ -72,7 +78,7 @@ def explain(
     InputError
         An unusable argument, a parameter without a value, or a model in which nothing moves.
     UnsupportedError
-        A model that was written as energies or has forces by functions, or an engine without the mass matrix.
+        A model that was written as energies, or an engine without the mass matrix.
 
     Examples
     --------
@@ -88,7 +94,7 @@ def explain(
     real("tolerance", tolerance, positive=True)
     # Mistakes that are tried on a description may leave one that cannot be.
     with unchecked():
-        one, other = (x.without("forces") if x.forces else x for x in (model_a, model_b))
+        one, other = (replace(x, time=_moment(model_a, model_b)) for x in (model_a, model_b))
         sides = _Descriptions(one, other, names or _names(a, b), samples, seed, tolerance)
         out = sides.with_held(sides.explain(), model_a, model_b)
         if not isinstance(a, Dynamics) and not isinstance(b, Dynamics):
@@ -102,17 +108,16 @@ def _model(x: Model | Dynamics, which: str) -> Model:
         raise InputError(
             f"{which}: expected a Model or a Dynamics, got {type(x).__name__}; mbkit.load(...) returns a Model"
         )
-    if not model.has_bodies:
-        raise UnsupportedError(f"explain: {model.name} was written as energies and has no bodies to compare")
-    if by_functions(model) or (model.forces and isinstance(x, Dynamics)):
-        names = ", ".join(f.name for f in model.forces)
-        raise UnsupportedError(
-            f"explain: {model.name} has forces ({names}) by functions, which have no numbers to match, or engines that "
-            "hold weights are asked; explain model.without('forces')"
-        )
+    EXPLAIN.admit(model)
     if not model.nv:
         raise InputError(f"{which}: nothing moves in {model.name} (nv = 0), so there is nothing to explain")
     return model
+
+
+def _moment(*models: Model) -> float:
+    """Return a time at which nothing begins, and which the tables of motions have."""
+    intervals = [(_TIME, _TIME), *(interval(p) for x in models for p in x.prescribed)]
+    return min(max(first for first, _ in intervals), *(last for _, last in intervals))
 
 
 def _names(a: Model | Dynamics, b: Model | Dynamics) -> tuple[str, str]:
@@ -141,7 +146,7 @@ class _Descriptions:
             target, moved_frames = theirs, ()
         before = by_name or self._gaps(one.model, theirs.model)
         whole = self._whole(one.model, theirs.model) if before.worst <= self.tolerance else 0.0
-        one, target = links_in_common_axes(one, target, near)
+        one, target = with_common_frames(*links_in_common_axes(one, target, near))
         hypotheses = _summarized_differences(one, target, near) if one.model.nv else []
         changed = one
         for h in hypotheses:
@@ -202,15 +207,14 @@ class _Descriptions:
         for body in dict.fromkeys([*ours, *theirs]):
             held = [side.get(body) or GravityCompensation(body, 0.0) for side in (ours, theirs)]
             one, other = held
-            if near.number(one.fraction, other.fraction) and one.without == other.without:
+            if not (changed := differing(one, other, near)):
                 continue
             model = a if body in ours else b
             known = {j.name for j in model.joints}
             held = [replace(x, without=tuple(j for j in x.without if j in known)) for x in held]
             effects = self._gaps(*(replace(model, forces=(x,)) for x in held))
             says = f"holds {number_text(other.fraction)} of its weight for {number_text(one.fraction)}"
-            if near.number(one.fraction, other.fraction):
-                says = "holds its weight at other joints"
+            says = says if "fraction" in changed else "holds its weight at other joints"
             h = Hypothesis("gravity compensation", f"body {body!r}", says, a=one.fraction, b=other.fraction)
             causes.append(self._cause(h, effects.effects))
             if out.comparable:
@@ -312,7 +316,7 @@ def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) ->
 def _named_frames(a: Model, b: Model, near: Tolerances) -> Iterator[str]:
     """Yield the frames of one name and body that stand elsewhere on it; descriptions are compared without frames."""
     there = {(f.name, f.body): f for f in b.frames}
-    moved = [f.name for f in a.frames if not alike(f, there.get((f.name, f.body), f), near)]
+    moved = [f.name for f in a.frames if differing(f, there.get((f.name, f.body), f), near)]
     if moved:
         yield f"named frames that stand elsewhere, which changes no term: {', '.join(moved)}"
 

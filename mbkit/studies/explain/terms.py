@@ -12,11 +12,21 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, KnownDefectWarning, MbkitError, NonPhysicalWarning, NumericalError
+from mbkit.errors import (
+    InputError,
+    KnownDefectWarning,
+    MbkitError,
+    NonPhysicalWarning,
+    NumericalError,
+    UnsupportedError,
+)
 from mbkit.model import JointCoupling, Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw, FrictionNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
+from mbkit.model.elements.forces import coordinate_arguments
+from mbkit.model.model import unchecked
 from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
+from mbkit.studies.explain.merged_model import OTHERS, references
 
 #: Compared terms: name in tables, quantity, arguments.
 TERMS: Final = (("M", "mass_matrix", "q"), ("g", "gravity", "q"), ("nle", "nle", "qv"), ("passive", "passive", "qv"))
@@ -81,10 +91,13 @@ def states_of(model: Model, samples: int, seed: int) -> States:
 
 
 def model_terms(model: Model, at: States) -> Values:
-    """Return all terms of a description, by Pinocchio."""
-    still = [f for f in CONSTRAINT_FEATURES if getattr(model, f)]
+    """Return all terms of a description, by Pinocchio, or by the own derivation where that does not carry a part."""
+    tree = model.without(*(f for f in CONSTRAINT_FEATURES if getattr(model, f)))
     with warnings.catch_warnings(action="ignore", category=NonPhysicalWarning):
-        return evaluated(dynamics(model.without(*still)), at)
+        try:
+            return evaluated(dynamics(tree), at)
+        except UnsupportedError:
+            return evaluated(LagrangianDynamics(tree, compile=False), at)
 
 
 def evaluated(dyn: Dynamics, at: States) -> Values:
@@ -190,20 +203,32 @@ def restricted(model: Model, joints: Collection[str]) -> Model:
     """Return the description with some joints alone and the bodies on them; mimic joints follow only these."""
     kept = [j for j in model.joints if j.name in joints]
     bodies = {j.child for j in kept}
-    here = bodies | {"world"}
-    return replace(
+    return fitting(
         model,
         joints=tuple(j if j.mimic is None or j.mimic.joint in joints else replace(j, mimic=None) for j in kept),
         bodies=tuple(b for b in model.bodies if b.name in bodies),
-        frames=(),
-        springs=tuple(s for s in model.springs if {s.body_a, s.body_b} <= here),
-        couplings=tuple(trimmed_couplings(model, joints)),
-        loops=tuple(x for x in model.loops if {x.body_a, x.body_b} <= here),
-        couplers=tuple(x for x in model.couplers if {x.joint, *x.leaders} <= set(joints)),
-        prescribed=tuple(p for p in model.prescribed if p.joint in joints),
-        no_slip=tuple(x for x in model.no_slip if {x.body_a, x.body_b} <= here),
         nonphysical=tuple(x for x in model.nonphysical if x[0] in bodies),
     )
+
+
+def fitting(model: Model, **fields: Any) -> Model:
+    """Return a description with other joints and bodies, and with the parts alone whose bodies and motion it has.
+
+    A coupling keeps the joints that move, the others standing at zero.
+    """
+    with unchecked():
+        tree = replace(model, **fields)
+    moving = {j.name for j in tree.joints if j.type.nv}
+    here = {"world", *(b.name for b in tree.bodies)}
+    here |= {f.name for f in tree.frames if f.body in here}
+    lost = coordinate_arguments(model).keys() - coordinate_arguments(tree).keys()
+
+    def fits(part: Any) -> bool:
+        bodies, joints = references(part)
+        return bodies <= here and joints <= moving and lost.isdisjoint(getattr(part, "arguments", ()))
+
+    parts: dict[str, Any] = {kind: tuple(filter(fits, getattr(model, kind))) for kind in OTHERS}
+    return replace(tree, **parts | {"couplings": tuple(trimmed_couplings(model, moving))})
 
 
 def trimmed_couplings(model: Model, joints: Collection[str]) -> Iterator[JointCoupling]:

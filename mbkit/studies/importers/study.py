@@ -46,7 +46,7 @@ from mbkit.model.joint_numbers import owners
 from mbkit.model.model import unchecked
 from mbkit.model.validation import listing
 from mbkit.studies import results
-from mbkit.studies.explain.hypotheses import angle_of, number_text
+from mbkit.studies.explain.hypotheses import BOUNDS, OF_ALL, angle_of, number_text
 from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_sets, rename_joints
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
@@ -57,11 +57,8 @@ from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserCompari
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import Worker, describe
 
-#: Fields of joints with numbers per velocity, and the stage in which they are compared.
-_NUMBERS: Final = {
-    **{name: name for name in ("armature", "damping", "friction")},
-    **dict.fromkeys(("lower", "upper", "velocity_limit", "effort_limit"), "limits"),
-}
+#: Fields of joints, and the stage in which they are compared.
+_NUMBERS: Final = dict(zip(OF_ALL, OF_ALL, strict=True)) | dict.fromkeys(BOUNDS, "limits")
 
 #: The least tolerance of an importer that holds single precision. Of robots that Newton reads rightly, M of tiago_pro
 #: is off by most: 9e-6, 150 times its unit roundoff.
