@@ -133,7 +133,7 @@ def _every_row(kin: Kinematics, time: Any) -> Iterator[_Row]:
     for motion in model.prescribed:
         (at,) = kin.coordinates(model.joint(motion.joint))
         numbers = casadi_arithmetic(kin.values.number)
-        path = MOTION_LAWS[type(motion)].path(motion, kin.values.prescribed[motion.joint], time, numbers)
+        path = MOTION_LAWS[type(motion)](motion, kin.values.prescribed[motion.joint], time, numbers)
         yield _Row(motion.joint, f"motion of {motion.joint!r}", at - path)
     for part in model.no_slip:
         for moves, texts, found in zip((False, True), NO_SLIP_ROWS[part.kind], _contact_rows(kin, part), strict=True):

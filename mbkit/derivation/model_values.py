@@ -8,16 +8,15 @@ from __future__ import annotations
 
 from functools import lru_cache
 from types import SimpleNamespace
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import InputError
-from mbkit.model import Coupler, Frame, Joint, Model, NoSlip
-from mbkit.model.elements.forces import Bushing, FrameForce, GravityCompensation, JointForce
-from mbkit.model.elements.motion_laws import MOTION_LAWS
+from mbkit.model import Coupler, Frame, Model, NoSlip
+from mbkit.model.parts import numbers
 from mbkit.model.rolling import tangents
 
 # CasADi's operators first search a conversion of their operands, some 15 µs each; `SX.binary` takes 2, and 4 with a
@@ -97,28 +96,6 @@ def cos(x: Any) -> Any:
 
 Constants = Literal["literal", "symbols"]
 
-_BODY: Final = ("mass", "com", "inertia")
-_PLACE: Final = ("rotation", "translation")
-_JOINT: Final = (*_PLACE, "axes", "pitch", "armature", "damping", "stiffness", "rest", "friction")
-#: Of dry friction, where they are given.
-_FRICTION: Final = ("stiction", "stribeck_velocity")
-_MIMIC: Final = ("ratio", "offset")
-_COUPLING: Final = ("factors", "stiffness", "rest_length", "damping", "armature")
-_SPRING: Final = ("point_a", "point_b", "stiffness", "rest_length", "damping")
-_LOOP: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "length")
-_BUSHING: Final = ("rotation_a", "translation_a", "rotation_b", "translation_b", "stiffness", "damping", "numbers")
-_FORCES: Final[dict[type, tuple[str, ...]]] = {
-    JointForce: ("numbers",),
-    FrameForce: ("numbers",),
-    Bushing: _BUSHING,
-    GravityCompensation: ("fraction",),
-}
-_NO_SLIP: Final = ("translation_a", "axis_a", "translation_b", "axis_b", "radius", "speed")
-_COUPLER: Final = ("ratio", "offset", "curve")
-# A one in these keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum of literal masses could be divided
-# by, and its quotient be rounded to double.
-_DIRECTIONS: Final = frozenset({"rotation", "axes", "rotation_a", "rotation_b", "axis_a", "axis_b", "tangents"})
-
 
 def is_zero(value: Any) -> bool:
     """Return whether a number of the model is zero for good, and not a symbol."""
@@ -168,24 +145,22 @@ class Values:
             for b in model.bindings
         }
         self._read_parts(model)
-        self.prescribed = {
-            p.joint: self._read("prescribed", p.joint, p, MOTION_LAWS[type(p)].numbers) for p in model.prescribed
-        }
+        self.prescribed = {p.joint: self._read("prescribed", p) for p in model.prescribed}
         # Of what is evaluated later too: the constants are an argument that must not grow.
         for x in (number for part in (*model.forces, *model.prescribed) for number in part.constants):
             self._scalar(x)
 
     def _read_parts(self, model: Model) -> None:
-        self.gravity = self._read("gravity", "", model, ("gravity",)).gravity
-        self.bodies = {b.name: self._read("bodies", b.name, b, _BODY) for b in model.bodies}
-        self.joints = {j.name: self._joint(j) for j in model.joints}
-        self.springs = {s.name: self._read("springs", s.name, s, _SPRING) for s in model.springs}
-        self.couplings = {c.name: self._read("couplings", c.name, c, _COUPLING) for c in model.couplings}
-        self.loops = {x.name: self._read("loops", x.name, x, _LOOP) for x in model.loops}
-        self.forces = {f.name: self._read("forces", f.name, f, _FORCES[type(f)]) for f in model.forces}
+        self.gravity = self._entries(("gravity", "", "gravity"), (), model.gravity)
+        self.bodies = {b.name: self._read("bodies", b) for b in model.bodies}
+        self.joints = {j.name: self._read("joints", j) for j in model.joints}
+        self.springs = {s.name: self._read("springs", s) for s in model.springs}
+        self.couplings = {c.name: self._read("couplings", c) for c in model.couplings}
+        self.loops = {x.name: self._read("loops", x) for x in model.loops}
+        self.forces = {f.name: self._read("forces", f) for f in model.forces}
         self.no_slip = {x.name: self._contact(x) for x in model.no_slip}
         self.couplers = {x.name: self._coupler(x) for x in model.couplers}
-        self._frames = {f.name: self._read("frames", f.name, f, _PLACE) for f in model.frames}
+        self._frames = {f.name: self._read("frames", f) for f in model.frames}
 
     @property
     def constants(self) -> Any:
@@ -205,35 +180,30 @@ class Values:
 
     def frame(self, frame: Frame) -> Any:
         """Return a frame's rotation and translation; a body's own has zeros and ones only."""
-        return self._frames.get(frame.name) or self._read("frames", frame.name, frame, _PLACE)
-
-    def _joint(self, joint: Joint) -> Any:
-        values = self._read("joints", joint.name, joint, _JOINT)
-        given = [name for name in _FRICTION if getattr(joint, name) is not None]
-        values.__dict__.update(self._read("joints", joint.name, joint, tuple(given)).__dict__)
-        if joint.mimic:
-            values.__dict__.update(self._read("joints", joint.name, joint.mimic, _MIMIC).__dict__)
-        return values
+        return self._frames.get(frame.name) or self._read("frames", frame)
 
     def _contact(self, part: NoSlip) -> Any:
-        values = self._read("no_slip", part.name, part, _NO_SLIP)
-        values.tangents = self._entries(("no_slip", part.name, "tangents"), (), tangents(part.axis_b))
+        values, place = self._read("no_slip", part), ("no_slip", part.name, "tangents")
+        values.tangents = self._entries(place, (), tangents(part.axis_b), direction=True)
         return values
 
     def _coupler(self, part: Coupler) -> Any:
-        values = self._read("couplers", part.name, part, _COUPLER)
+        values = self._read("couplers", part)
         values.ratios = values.ratio if isinstance(values.ratio, list) else [values.ratio]
         return values
 
-    def _read(self, where: str, part: str, source: Any, fields: tuple[str, ...]) -> Any:
-        return SimpleNamespace(**{f: self._entries((where, part, f), (), getattr(source, f)) for f in fields})
+    def _read(self, where: str, part: Any) -> Any:
+        given = ((name, rule.direction, x) for name, rule, x in numbers(part) if rule.acts)
+        return SimpleNamespace(**{name: self._entries((where, part.name, name), (), x, at) for name, at, x in given})
 
-    def _entries(self, place: tuple[str, str, str], index: tuple[int, ...], value: Any) -> Any:
+    def _entries(self, place: tuple[str, str, str], index: tuple[int, ...], value: Any, direction: bool = False) -> Any:
         if np.ndim(value):
-            return [self._entries(place, (*index, i), x) for i, x in enumerate(value)]
+            return [self._entries(place, (*index, i), x, direction) for i, x in enumerate(value)]
         if (*place, index) in self._bound:
             return self._bound[*place, index]
-        return self._scalar(float(value), direction=place[-1] in _DIRECTIONS)
+        # A one of a direction keeps a planar arm planar. Elsewhere a one is worth a symbol: a sum of literal masses
+        # could be divided by, and its quotient be rounded to double.
+        return self._scalar(float(value), direction)
 
     def _scalar(self, value: float, direction: bool = False) -> Any:
         if not self._symbolic or value == 0.0 or (direction and abs(value) == 1.0):

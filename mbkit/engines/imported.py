@@ -19,7 +19,7 @@ from mbkit.errors import LoadError, ModelError, UnsupportedError
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.load.xml_reader import unused as unused
 from mbkit.model import Body, Coupler, Joint, Loop, Model, ModelBuilder
-from mbkit.model.joint_types import kind_of
+from mbkit.model.parts import joint_of, numbers
 
 
 def reserved(name: str, names: set[str]) -> str:
@@ -93,18 +93,6 @@ class Imported:
     holds_mimics: str = ""
 
 
-def joint_of(
-    name: str, kind: str, parent: str, child: str, rotation: Array, translation: Array, **numbers: Any
-) -> Joint:
-    """Return a joint with these numbers; without them it has no axes, zeros, and open limits."""
-    nq, nv = kind_of(kind).nq, kind_of(kind).nv
-    values: dict[str, Any] = {"axes": np.empty((0, 3)), "pitch": 0.0}
-    values |= {"lower": np.full(nq, -np.inf), "upper": np.full(nq, np.inf)}
-    values |= {x: np.full(nv, np.inf) for x in ("velocity_limit", "effort_limit")}
-    values |= {x: np.zeros(nv) for x in ("armature", "damping", "friction", "stiffness", "rest")}
-    return Joint(name, kind, parent, child, rotation, translation, **values | numbers)
-
-
 class Parts:
     """Bodies and joints as they are read, with names that nothing else has."""
 
@@ -135,16 +123,15 @@ def checked(engine: str, model: Model) -> Model:
     """Return an importer's model; raise `UnsupportedError` where nothing moves in it or a number is not sound."""
     if not model.nv:
         raise UnsupportedError(f"{engine}: nothing moves in the model that it built from the file (nv = 0)")
-    joint_numbers = ("rotation", "translation", "axes", "pitch", "armature", "damping", "stiffness", "rest")
-    for what, part, names in (
-        *((f"body {x.name!r} with a", x, ("mass", "com", "inertia")) for x in model.bodies),
-        *((f"joint {x.name!r} with a", x, joint_numbers) for x in model.joints),
-        ("a", model, ("gravity",)),
-    ):
-        for name in names:
+    parts = (
+        *((f"body {x.name!r} with a", x) for x in model.bodies),
+        *((f"joint {x.name!r} with a", x) for x in model.joints),
+    )
+    for what, part in (*parts, ("a", model)):
+        for name, rule, value in numbers(part):
             # Not a number, or memory that nobody wrote to.
-            if not (np.abs(getattr(part, name)) <= _MAX_NUMBER).all():
-                raise UnsupportedError(f"{engine}: built {what} with an impossible {name}: {getattr(part, name)}")
+            if rule.acts and not (np.abs(value) <= _MAX_NUMBER).all():
+                raise UnsupportedError(f"{engine}: built {what} with an impossible {name}: {value}")
     return model
 
 

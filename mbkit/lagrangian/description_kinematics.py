@@ -26,7 +26,7 @@ from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 from mbkit.lagrangian.trig.shortest_form import number, shortest_form
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model, NoSlip
-from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
+from mbkit.model.elements.motion_laws import Motion
 from mbkit.model.joint_types import cross3
 from mbkit.model.loops import CROSSED, LOOP_ROWS, TURNING, WELDED, LoopEnds
 from mbkit.model.parts import Coupler, Loop, PointSpring
@@ -52,7 +52,7 @@ class _Numbers(Values):
 
     def motion(self, prescribed: Motion) -> Any:
         """Return the numbers of a motion, which a model of the same form need not have."""
-        return self._read("prescribed", prescribed.joint, prescribed, MOTION_LAWS[type(prescribed)].numbers)
+        return self._read("prescribed", prescribed)
 
     def _scalar(self, value: float, direction: bool = False) -> Any:  # noqa: ARG002
         return self._number(value)

@@ -73,7 +73,7 @@ def law(kin: SymbolicKinematics, part: Motion, t: sp.Symbol) -> sp.Expr:
         numbers.phase = read_angle(numbers.phase)
         if kin.model.joint(part.joint).type.angular:
             numbers.offset = read_angle(numbers.offset)
-    return sp.sympify(MOTION_LAWS[type(part)].path(part, numbers, t, SYMPY))
+    return sp.sympify(MOTION_LAWS[type(part)](part, numbers, t, SYMPY))
 
 
 def _pieces(numbers: Any, t: sp.Symbol) -> sp.Expr:

@@ -22,7 +22,7 @@ from mbkit.lagrangian.printer import ExpressionPrinter
 from mbkit.model import Model
 from mbkit.model.description import Needs
 from mbkit.model.joint_types import PRISMATIC
-from mbkit.model.parts import Body, Frame, Joint
+from mbkit.model.parts import Body, Frame, Joint, joint_of
 
 
 def energies_latex(form: EnergyForm) -> str:
@@ -42,10 +42,8 @@ def abstract_parts(names: Sequence[str]) -> tuple[tuple[Body, ...], tuple[Joint,
 
 
 def _coordinate(name: str, before: str) -> Joint:
-    fields: dict[str, Any] = dict.fromkeys(("upper", "velocity_limit", "effort_limit"), np.full(1, np.inf))
-    fields |= dict.fromkeys(("armature", "damping", "friction", "stiffness", "rest"), np.zeros(1))
-    fields |= {"rotation": np.eye(3), "translation": np.zeros(3), "axes": np.array([[1.0, 0.0, 0.0]]), "pitch": 0.0}
-    return Joint(name=name, kind=PRISMATIC.name, parent=before, child=name, lower=np.full(1, -np.inf), **fields)
+    axis = np.array([[1.0, 0.0, 0.0]])
+    return joint_of(name, PRISMATIC.name, before, name, np.eye(3), np.zeros(3), axes=axis)
 
 
 class EnergyModel(Model):

@@ -33,7 +33,7 @@ from mbkit.errors import InputError, NumericalError
 from mbkit.model import manifold
 from mbkit.model.description import Description
 from mbkit.model.elements.paths import Path
-from mbkit.model.parts import Body, Joint, _Frozen
+from mbkit.model.parts import Body, Joint, Numbers, _Frozen
 from mbkit.spatial import skew
 
 #: The ten standard parameters of a body, in the order of Khalil and Dombre, and the places of its inertia.
@@ -103,8 +103,8 @@ class BaseParameters(_Frozen):
     model: str
     names: tuple[str, ...]
     standard_names: tuple[str, ...]
-    standard: Array
-    matrix: Array
+    standard: Numbers
+    matrix: Numbers
 
     @property
     def count(self) -> int:

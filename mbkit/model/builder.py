@@ -22,7 +22,7 @@ from mbkit.model.joint_types import FIXED, KINDS, JointType, kind_of
 from mbkit.model.loops import LOOP_KINDS, LoopKind
 from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Expression, Number, nominal, split
-from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring
+from mbkit.model.parts import Body, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, NumberRule, PointSpring, rules_of
 from mbkit.model.rolling import ROLLING_KINDS, RollingKind
 from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
@@ -215,27 +215,23 @@ class ArgumentReader:
         return self.name(f"{item}: mimic joint", joint), numbers
 
 
-#: How the fields of parts are read.
+#: How fields of parts are read that are no numbers, and numbers with a meaning beside their shape.
 _READERS: Final[Mapping[str, Callable[[ArgumentReader, str, Any], Any]]] = {
     **dict.fromkeys(("parent", "child", "body", "body_a", "body_b", "joint"), ArgumentReader.name),
-    **dict.fromkeys(
-        ("com", "translation", "point_a", "point_b", "translation_a", "translation_b"), ArgumentReader.place
-    ),
-    **dict.fromkeys(("rotation_a", "rotation_b"), ArgumentReader.rotation),
-    **dict.fromkeys(("axis_a", "axis_b"), ArgumentReader.direction),
-    **dict.fromkeys(
-        ("mass", "pitch", "stiffness", "rest_length", "damping", "armature", "length", "radius", "speed"),
-        ArgumentReader.quantity,
-    ),
-    **dict.fromkeys(
-        ("ratio", "offset", "rate", "amplitude", "frequency", "phase", "fraction"), ArgumentReader.quantity
-    ),
     "inertia": ArgumentReader.inertia,
-    "curve": lambda read, name, value: read.quantities(name, value, 3),
     "joints": lambda read, name, value: tuple(read.name(name, x) for x in value),
     "leader": ArgumentReader.names,
     "factors": lambda read, name, value: read.quantities(name, value, len(value)),
 }
+
+
+def _reader(rule: NumberRule) -> Callable[[ArgumentReader, str, Any], Any]:
+    """Return how a number with this rule is read."""
+    if rule.direction:
+        return ArgumentReader.rotation if rule.shape == (3, 3) else ArgumentReader.direction
+    if rule.shape == (3,):
+        return ArgumentReader.place
+    return ArgumentReader.quantity if rule.shape == () else lambda read, name, value: read.quantities(name, value, 3)
 
 
 def _has_expressions(value: Any, depth: int = 3) -> bool:
@@ -683,7 +679,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
 
     def _add(
         self,
-        part: Callable[..., Any],
+        part: type,
         where: str,
         what: str,
         name: Any,
@@ -692,11 +688,13 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
     ) -> None:
         """Read a part's fields by `_READERS`, keep the bindings of its expressions, and add it."""
         name = self._read.name(f"{what} name", name)
-        numbers = self._numbers(where, name, **self._read_fields(f"{what} {name!r}", values), **ready)
+        numbers = self._numbers(where, name, **self._read_fields(part, f"{what} {name!r}", values), **ready)
         self._parts[where].append(part(name, **numbers))
 
-    def _read_fields(self, item: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        return {n: _READERS[n](self._read, f"{item}: {n}", x) for n, x in values.items()}
+    def _read_fields(self, part: type, item: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            n: (_READERS.get(n) or _reader(rules_of(part)[n]))(self._read, f"{item}: {n}", x) for n, x in values.items()
+        }
 
     def _holding(self) -> Model:
         return self._assemble(self._parts["joints"], self._bindings)

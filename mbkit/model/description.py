@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import chain, count, pairwise
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -18,22 +18,33 @@ from mbkit.errors import InputError, ModelError, UnknownNameError
 from mbkit.model.elements.forces import Bushing, Force, GravityCompensation, drives, lost, needs_time
 from mbkit.model.elements.kinds import PART_KINDS, acts, kind
 from mbkit.model.elements.motion_laws import Motion, beyond, interval
+from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.joint_types import KINDS
 from mbkit.model.parameters import Binding, Expression, Parameter, with_numbers
-from mbkit.model.parts import Body, Coupler, Frame, Joint, JointCoupling, Loop, NoSlip, PointSpring, read_only
+from mbkit.model.parts import (
+    Body,
+    Coupler,
+    Frame,
+    Joint,
+    JointCoupling,
+    Loop,
+    NoSlip,
+    NumberRule,
+    PointSpring,
+    _Frozen,
+    read_only,
+    rules_of,
+)
 
 #: Attributes of a description that bind its coordinates or velocities to each other.
 CONSTRAINT_FEATURES: Final = tuple(dict.fromkeys(k.section for k in PART_KINDS.values() if k.does & {"row", "speed"}))
 
 
-#: Fields that came later than digests which users keep: without a value they are not in these.
-_LATER: Final = ("stiction", "stribeck_velocity")
-
-
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         given = {f.name: getattr(value, f.name) for f in fields(value)}
-        return {name: _plain(x) for name, x in given.items() if x is not None or name not in _LATER}
+        optional = rules_of(type(value)) if isinstance(value, _Frozen) else ()
+        return {name: _plain(x) for name, x in given.items() if x is not None or name not in optional}
     if isinstance(value, np.ndarray):
         return [_plain(x) for x in value.tolist()]
     if isinstance(value, (list, tuple)):
@@ -256,7 +267,7 @@ class Description:
     """
 
     name: str
-    gravity: Array
+    gravity: Annotated[Array, NumberRule("m/s²", (3,), added=True)]
     bodies: tuple[Body, ...]
     joints: tuple[Joint, ...]
     frames: tuple[Frame, ...] = ()
@@ -268,7 +279,7 @@ class Description:
     nonphysical: tuple[tuple[str, str], ...] = ()
     bindings: tuple[Binding, ...] = ()
     source: str = ""
-    time: float = 0.0
+    time: Annotated[float, NumberRule("s", fixed="it is a parameter already, where the motion depends on it")] = 0.0
     couplers: tuple[Coupler, ...] = ()
     forces: tuple[Force, ...] = ()
     no_slip: tuple[NoSlip, ...] = ()
@@ -536,8 +547,7 @@ class Description:
                 part, [(b.field, b.index, x) for b, x in bindings if (b.where, b.part) == (where, name)]
             )
 
-        kinds = ("bodies", "joints", "frames", "springs", "couplings", *CONSTRAINT_FEATURES, "forces")
-        changes: dict[str, Any] = {kind: tuple(filled(kind, p, p.name) for p in getattr(self, kind)) for kind in kinds}
+        changes: dict[str, Any] = {k: tuple(filled(k, p, p.name) for p in getattr(self, k)) for k in KINDS_OF_PARTS}
         expressions = tuple(replace(b, expression=x) for b, x in bindings if isinstance(x, Expression))
         out: Self = replace(filled("gravity", self, ""), **changes, bindings=expressions)
         return out

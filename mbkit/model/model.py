@@ -429,7 +429,8 @@ class Model(Description):
         ----------
         *paths : str or Scale
             ``"body.mass"``, ``"body.com"``, ``"body.inertia"``, ``"joint.damping"``, ``"joint.armature"`` and other
-            numbers of bodies, joints, springs, couplings, loops, couplers and motions; ``"gravity"``; wildcards such as
+            numbers of bodies and of all that acts: ``"mount.stiffness.rz"`` and ``"mount.stiffness.x.y"`` of a bushing,
+            ``"force.k"`` of a constant ``k`` in its formula, ``"gear.ratio"``; ``"gravity"``; wildcards such as
             ``"*.damping"``.
             Each number becomes a parameter of its path's name with its present value; of a vector each component, as
             ``"body.com.x"``. A wildcard leaves out what is zero, and bodies that never move. `mbkit.scale` makes one

@@ -5,8 +5,13 @@ All lengths are metres, masses kilograms, angles radians. Arrays are read-only.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, Final
+from functools import cache
+from math import inf
+from operator import attrgetter
+from types import MappingProxyType
+from typing import Annotated, Any, Final, get_args, get_type_hints
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -24,6 +29,89 @@ _ONE: Final = np.eye(3)
 _TURNED: Final = 1e-6
 
 
+#: Names of the entries of an axis of three or six numbers.
+ENTRIES: Final = ("x", "y", "z", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True)
+class NumberRule:
+    """All that holds for a field with numbers; its annotation says it, as ``Annotated[float, NumberRule("kg")]``."""
+
+    #: Of a joint that of a turn, and that of a slide.
+    unit: str = ""
+    #: A text is an attribute of the part: how many, or the names of the entries. None stands for any shape.
+    shape: tuple[int | str, ...] | None = ()
+    least: float = -inf
+    #: Zero is none either, where the kind of part has this number.
+    positive: bool = False
+    #: The value with which it does nothing.
+    nothing: float = 0.0
+    #: A spread of variants is added, in its unit: its sign is free, and zero means nothing.
+    added: bool = False
+    #: Why it cannot be a free parameter; empty where it can.
+    fixed: str = ""
+    #: The equations have it; other numbers are data.
+    acts: bool = True
+    #: It is an orientation or an axis.
+    direction: bool = False
+    #: It may be None. A digest then lacks it, as those from before it was there do.
+    optional: bool = False
+
+    def entries(self, part: Any) -> tuple[Sequence[str], ...] | None:
+        """Return the names of a part's entries along each axis; None for any shape."""
+        if self.shape is None:
+            return None
+        sizes = [_attribute(x)(part) if isinstance(x, str) else x for x in self.shape]
+        # A single name, as of one leader, is that of a number.
+        return tuple(ENTRIES[:n] if isinstance(n, int) else n for n in sizes if not isinstance(n, str))
+
+
+_attribute = cache(attrgetter)
+_RULES: Final[dict[type, Mapping[str, NumberRule]]] = {}
+
+
+def rules_of(cls: type) -> Mapping[str, NumberRule]:
+    """Return the rules of a part's fields with numbers, by name and in their order.
+
+    Raises
+    ------
+    TypeError
+        A field with numbers that has no rule: no path would know what to do with it.
+    """
+    if cls not in _RULES:
+        hints, out = get_type_hints(cls, include_extras=True), {}
+        for name in (f.name for f in fields(cls)):
+            rules = [x for x in getattr(hints[name], "__metadata__", ()) if isinstance(x, NumberRule)]
+            if not rules and {hints[name], *get_args(hints[name])} & {float, Array}:
+                raise TypeError(f"{cls.__name__}.{name}: numbers without a NumberRule; annotate the field with one")
+            if rules:
+                out[name] = rules[0]
+        _RULES[cls] = MappingProxyType(out)
+    return _RULES[cls]
+
+
+def numbers(part: Any) -> Iterator[tuple[str, NumberRule, Any]]:
+    """Yield the name, rule and value of each number of a part, also of the joint that it mimics."""
+    for name, rule in rules_of(type(part)).items():
+        if (value := getattr(part, name)) is not None:
+            yield name, rule, value
+    if mimic := getattr(part, "mimic", None):
+        yield from numbers(mimic)
+
+
+_ORIENTED: Final = "orientations and axes are no parameters"
+_IS_DATA: Final = "it is data"
+_DRY: Final = "dry friction is a number in every engine, as set_joint sets it"
+OF_Q: Final = ("type.suffixes",)
+OF_V: Final = ("type.velocity_suffixes",)
+Numbers = Annotated[Array, NumberRule(shape=None)]
+Rotation = Annotated[Array, NumberRule(shape=(3, 3), fixed=_ORIENTED, direction=True)]
+Axis = Annotated[Array, NumberRule(shape=(3,), fixed=_ORIENTED, direction=True)]
+Place = Annotated[Array, NumberRule("m", (3,), added=True)]
+#: Constants of formulas, whose units these know.
+Constants = Annotated[Array, NumberRule(shape=("symbols",))]
+
+
 def _turns(R: Array) -> bool:
     """Return whether a matrix is a rotation; one of unknown numbers may be."""
     return not np.isfinite(R).all() or bool(np.abs(R @ R.T - _ONE).max() <= _TURNED and np.linalg.det(R) > 0)
@@ -39,36 +127,31 @@ class _Frozen:
     """Read-only arrays, equality by content, and pickling that keeps both."""
 
     def __post_init__(self) -> None:
-        for f in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
-            value = getattr(self, f.name)
-            if f.type not in ("Array", "float", "float | Array") and (f.type != "Array | None" or value is None):
+        for name, rule in rules_of(type(self)).items():
+            value = getattr(self, name)
+            if value is None and rule.optional:
                 continue
             try:
                 # + 0.0 makes one of the two zeros, which are equal and hash apart.
                 number = np.array(value, dtype=np.float64) + 0.0
             except (TypeError, ValueError):
-                raise self._fault(f"{f.name}: expected numbers, got {shown(value)}") from None
-            wanted = () if f.type == "float" else self._shape(f.name)
+                raise self._fault(f"{name}: expected numbers, got {shown(value)}") from None
+            entries = rule.entries(self)
+            wanted = None if entries is None else tuple(map(len, entries))
             if wanted is not None and number.shape != wanted:
-                raise self._fault(f"{f.name}: expected shape {wanted}, got {number.shape}")
-            if f.name.startswith("rotation") and not _turns(number):
-                raise self._fault(f"{f.name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
-            if f.name == "inertia" and np.abs(number - number.T).max() > _TURNED * np.abs(number).max():
+                raise self._fault(f"{name}: expected shape {wanted}, got {number.shape}")
+            if name.startswith("rotation") and not _turns(number):
+                raise self._fault(f"{name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
+            if name == "inertia" and np.abs(number - number.T).max() > _TURNED * np.abs(number).max():
                 raise self._fault("inertia is not symmetric; expected I = Iᵀ")
-            object.__setattr__(self, f.name, float(number) if wanted == () else read_only(number))
+            object.__setattr__(self, name, float(number) if wanted == () else read_only(number))
 
     def _fault(self, text: str) -> ModelError:
         what = type(self).__name__.lower()
         return ModelError(f"{what} {getattr(self, 'name', '')!r}" if hasattr(self, "name") else what, [text])
 
-    def _shape(self, name: str) -> tuple[int, ...] | None:
-        """Return the shape of an array; None where any will do."""
-        if name.startswith("rotation") or name == "inertia":
-            return 3, 3
-        return (3,) if name == "com" or name.startswith(("translation", "point_", "axis_")) else None
-
     def _values(self) -> tuple[Any, ...]:
-        return tuple(getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]
+        return tuple(getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]  # every subclass is a dataclass
 
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
@@ -99,9 +182,9 @@ class Body(_Frozen):
     """
 
     name: str
-    mass: float
-    com: Array
-    inertia: Array
+    mass: Annotated[float, NumberRule("kg", least=0.0, positive=True)]
+    com: Place
+    inertia: Annotated[Array, NumberRule("kg m²", (3, 3))]
 
     def __repr__(self) -> str:
         return f"<Body {self.name!r}: {self.mass:.4g} kg>"
@@ -119,14 +202,8 @@ class Mimic(_Frozen):
     """
 
     joint: str
-    ratio: float = 1.0
-    offset: float = 0.0
-
-
-_PER_VELOCITY: Final = (
-    *("velocity_limit", "effort_limit", "armature", "damping", "friction", "stiffness", "rest"),
-    *("stiction", "stribeck_velocity"),
-)
+    ratio: Annotated[float, NumberRule()] = 1.0
+    offset: Annotated[float, NumberRule("rad, m", added=True)] = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,22 +235,24 @@ class Joint(_Frozen):
     kind: str
     parent: str
     child: str
-    rotation: Array
-    translation: Array
-    axes: Array
-    pitch: float
-    lower: Array
-    upper: Array
-    velocity_limit: Array
-    effort_limit: Array
-    armature: Array
-    damping: Array
-    friction: Array
-    stiffness: Array
-    rest: Array
+    rotation: Rotation
+    translation: Place
+    axes: Annotated[Array, NumberRule(shape=("type.n_axes", 3), fixed=_ORIENTED, direction=True)]
+    pitch: Annotated[float, NumberRule("m/rad")]
+    lower: Annotated[Array, NumberRule("rad, m", OF_Q, nothing=-inf, fixed=_IS_DATA, acts=False)]
+    upper: Annotated[Array, NumberRule("rad, m", OF_Q, nothing=inf, fixed=_IS_DATA, acts=False)]
+    velocity_limit: Annotated[Array, NumberRule("rad/s, m/s", OF_V, least=0.0, nothing=inf, fixed=_IS_DATA, acts=False)]
+    effort_limit: Annotated[Array, NumberRule("N m, N", OF_V, least=0.0, nothing=inf, fixed=_IS_DATA, acts=False)]
+    armature: Annotated[Array, NumberRule("kg m², kg", OF_V, least=0.0)]
+    damping: Annotated[Array, NumberRule("N m s/rad, N s/m", OF_V, least=0.0)]
+    friction: Annotated[Array, NumberRule("N m, N", OF_V, least=0.0, fixed=_DRY)]
+    stiffness: Annotated[Array, NumberRule("N m/rad, N/m", OF_V, least=0.0)]
+    rest: Annotated[Array, NumberRule("rad, m", OF_V, added=True)]
     mimic: Mimic | None = None
-    stiction: Array | None = None
-    stribeck_velocity: Array | None = None
+    stiction: Annotated[Array | None, NumberRule("N m, N", OF_V, least=0.0, fixed=_DRY, optional=True)] = None
+    stribeck_velocity: Annotated[Array | None, NumberRule("rad/s, m/s", OF_V, least=0.0, fixed=_DRY, optional=True)] = (
+        None
+    )
 
     def __repr__(self) -> str:
         follows = f", follows {self.mimic.joint!r}" if self.mimic else ""
@@ -189,17 +268,20 @@ class Joint(_Frozen):
         """Whether its friction at rest may be above that of motion."""
         return self.stiction is not None and bool((self.stiction > self.friction).any())
 
-    def _shape(self, name: str) -> tuple[int, ...] | None:
-        type_ = self.type
-        if name == "axes":
-            return type_.n_axes, 3
-        if name in ("lower", "upper"):
-            return (type_.nq,)
-        return (type_.nv,) if name in _PER_VELOCITY else super()._shape(name)
-
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
         # Another process may not have registered the type.
         return (type(self), self._values()) if self.type.built_in else (_of_type, (self.type, self._values()))
+
+
+def joint_of(
+    name: str, kind: str, parent: str, child: str, rotation: Array, translation: Array, **numbers: Any
+) -> Joint:
+    """Return a joint with these numbers; its others do nothing, and without them it has no axes."""
+    sizes, values = {OF_Q: kind_of(kind).nq, OF_V: kind_of(kind).nv}, dict[str, Any](axes=np.empty((0, 3)), pitch=0.0)
+    for field_, rule in rules_of(Joint).items():
+        if rule.shape in sizes and not rule.optional:
+            values[field_] = np.full(sizes[rule.shape], rule.nothing)
+    return Joint(name, kind, parent, child, rotation, translation, **values | numbers)
 
 
 def _of_type(joint_type: JointType, values: tuple[Any, ...]) -> Joint:
@@ -220,8 +302,8 @@ class Frame(_Frozen):
 
     name: str
     body: str
-    rotation: Array
-    translation: Array
+    rotation: Rotation
+    translation: Annotated[Array, NumberRule("m", (3,), added=True, fixed="set_frame takes a Parameter for it")]
 
     def __repr__(self) -> str:
         return f"<Frame {self.name!r} on {self.body!r}>"
@@ -246,20 +328,17 @@ class PointSpring(_Frozen):
 
     name: str
     body_a: str
-    point_a: Array
+    point_a: Place
     body_b: str
-    point_b: Array
-    stiffness: float
-    rest_length: float
-    damping: float
+    point_b: Place
+    stiffness: Annotated[float, NumberRule("N/m", least=0.0)]
+    rest_length: Annotated[float, NumberRule("m", least=0.0)]
+    damping: Annotated[float, NumberRule("N s/m", least=0.0)]
 
     @property
     def needs_direction(self) -> bool:
         """Whether the force is undefined where the two points meet."""
         return self.damping != 0 or (self.stiffness != 0 and self.rest_length != 0)
-
-
-_OF_COUPLING: Final = ("stiffness", "rest_length", "damping", "armature")
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,11 +360,11 @@ class JointCoupling(_Frozen):
 
     name: str
     joints: tuple[str, ...]
-    factors: Array
-    stiffness: float
-    rest_length: float
-    damping: float
-    armature: float
+    factors: Annotated[Array, NumberRule(shape=("joints",))]
+    stiffness: Annotated[float, NumberRule("N m/rad, N/m", least=0.0)]
+    rest_length: Annotated[float, NumberRule("rad, m")]
+    damping: Annotated[float, NumberRule("N m s/rad, N s/m", least=0.0)]
+    armature: Annotated[float, NumberRule("kg m², kg", least=0.0)]
 
     @property
     def length(self) -> str:
@@ -294,8 +373,8 @@ class JointCoupling(_Frozen):
         return " + ".join(terms).replace("+ -", "- ")
 
     def __str__(self) -> str:
-        numbers = [f"{n.replace('_', ' ')} {x:g}" for n in _OF_COUPLING if (x := getattr(self, n))]
-        return f"coupling {self.name!r} on {self.length or 'no joint'}: {', '.join(numbers) or 'it exerts no force'}"
+        given = [f"{n.replace('_', ' ')} {x:g}" for n, _, x in numbers(self) if n != "factors" and x]
+        return f"coupling {self.name!r} on {self.length or 'no joint'}: {', '.join(given) or 'it exerts no force'}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,12 +396,12 @@ class Loop(_Frozen):
     name: str
     kind: str
     body_a: str
-    rotation_a: Array
-    translation_a: Array
+    rotation_a: Rotation
+    translation_a: Place
     body_b: str
-    rotation_b: Array
-    translation_b: Array
-    length: float = 0.0
+    rotation_b: Rotation
+    translation_b: Place
+    length: Annotated[float, NumberRule("m", least=0.0, positive=True)] = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,9 +427,9 @@ class Coupler(_Frozen):
     name: str
     joint: str
     leader: str | tuple[str, ...]
-    ratio: float | Array = 1.0
-    offset: float = 0.0
-    curve: Array = field(default_factory=lambda: np.zeros(3))
+    ratio: Annotated[float | Array, NumberRule(shape=("leader",))] = 1.0
+    offset: Annotated[float, NumberRule("rad, m", added=True)] = 0.0
+    curve: Annotated[Array, NumberRule(shape=("_powers",))] = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         if not all(isinstance(x, str) for x in (self.leader if isinstance(self.leader, tuple) else (self.leader,))):
@@ -362,6 +441,9 @@ class Coupler(_Frozen):
             # One leader has one form: equal parts are equal, whoever wrote them.
             object.__setattr__(self, "leader", self.leader[0])
             object.__setattr__(self, "ratio", float(self.ratios[0]))
+
+    #: Of the leader, which `curve` has.
+    _powers = ("2", "3", "4")
 
     @property
     def leaders(self) -> tuple[str, ...]:
@@ -384,11 +466,6 @@ class Coupler(_Frozen):
         curve = self.polynomial
         return float(curve(first) + ratios @ others), np.array([curve.deriv()(first), *ratios])
 
-    def _shape(self, name: str) -> tuple[int, ...] | None:
-        if name == "ratio":
-            return () if isinstance(self.leader, str) else (len(self.leader),)
-        return (3,) if name == "curve" else super()._shape(name)
-
 
 @dataclass(frozen=True, eq=False)
 class Prescribed(_Frozen):
@@ -404,11 +481,11 @@ class Prescribed(_Frozen):
     """
 
     joint: str
-    offset: float = 0.0
-    rate: float = 0.0
-    amplitude: float = 0.0
-    frequency: float = 0.0
-    phase: float = 0.0
+    offset: Annotated[float, NumberRule("rad, m", added=True)] = 0.0
+    rate: Annotated[float, NumberRule("rad/s, m/s", added=True)] = 0.0
+    amplitude: Annotated[float, NumberRule("rad, m")] = 0.0
+    frequency: Annotated[float, NumberRule("rad/s")] = 0.0
+    phase: Annotated[float, NumberRule("rad", added=True)] = 0.0
 
     #: Of a formula; numbers that are attributes do not count.
     constants = ()
@@ -448,13 +525,13 @@ class NoSlip(_Frozen):
     name: str
     kind: str
     body_a: str
-    translation_a: Array
-    axis_a: Array
+    translation_a: Place
+    axis_a: Axis
     body_b: str
-    translation_b: Array
-    axis_b: Array
-    radius: float = 0.0
-    speed: float = 0.0
+    translation_b: Place
+    axis_b: Axis
+    radius: Annotated[float, NumberRule("m", least=0.0, positive=True)] = 0.0
+    speed: Annotated[float, NumberRule("m/s")] = 0.0
 
     def __str__(self) -> str:
         size = f" of radius {self.radius:g} m" if self.radius else f" at {self.speed:g} m/s" if self.speed else ""

@@ -16,7 +16,7 @@ from mbkit.model.description import Description
 from mbkit.model.elements.forces import force_faults
 from mbkit.model.elements.motion_laws import motion_faults
 from mbkit.model.loops import held_directions
-from mbkit.model.parts import RESTING, Body, Joint, JointCoupling, Loop, NoSlip
+from mbkit.model.parts import RESTING, Body, Joint, JointCoupling, Loop, NoSlip, numbers
 from mbkit.model.rolling import LIES_FLAT, ROLLING_KINDS
 from mbkit.spatial import skew
 
@@ -48,6 +48,7 @@ def structure_faults(description: Description) -> Iterator[str]:
         names = [p.name for p in getattr(description, what)]
         one = {"bodies": "body", "no_slip": "no slip"}.get(what, what[:-1])
         yield from repeated_names(one, names)
+        yield from (fault for part in getattr(description, what) for fault in _negative(one, part))
         if one in ("body", "frame") and "world" in names:
             yield f"{one} 'world': that name is the ground's; choose another"
     known, suggestions = {b.name for b in bodies} | {"world"}, Suggestions()
@@ -69,7 +70,6 @@ def structure_faults(description: Description) -> Iterator[str]:
     for spring in description.springs:
         item = f"spring {spring.name!r}"
         yield from unknown(item, (spring.body_a, spring.body_b))
-        yield from _negative(item, spring, "stiffness", "rest_length", "damping")
         if spring.body_a == spring.body_b:
             yield f"{item}: both ends on {spring.body_a!r}; it would never act"
     for coupling in description.couplings:
@@ -114,11 +114,11 @@ def structure_faults(description: Description) -> Iterator[str]:
     yield from force_faults(description)
 
 
-def _negative(item: str, part: Any, *names: str) -> Iterator[str]:
-    for name in names:
-        value = getattr(part, name)
-        if np.any(value < 0):
-            yield f"{item}: {name} {value if np.ndim(value) else format(value, 'g')} is negative"
+def _negative(what: str, part: Any) -> Iterator[str]:
+    for name, rule, value in numbers(part):
+        # Numbers above zero have rules of their own, of the kinds of parts that have them.
+        if not rule.positive and np.any(value < rule.least):
+            yield f"{what} {part.name!r}: {name} {value if np.ndim(value) else format(value, 'g')} is negative"
 
 
 def _friction_faults(item: str, joint: Joint) -> Iterator[str]:
@@ -126,8 +126,6 @@ def _friction_faults(item: str, joint: Joint) -> Iterator[str]:
     given = [x for x in (joint.friction, bound, curve) if x is not None]
     if not all(np.isfinite(x).all() for x in given):
         yield f"{item}: dry friction: expected finite numbers; lock(...) holds a joint that nothing moves"
-    elif any(np.any(x < 0) for x in given[1:]):
-        yield f"{item}: stiction or stribeck_velocity is negative; expected 0 or more"
     elif bound is not None and np.any(bound < joint.friction):
         yield f"{item}: stiction {bound} is below the friction of motion, {joint.friction}; give at least that"
     elif curve is not None and bound is None:
@@ -145,7 +143,6 @@ def _joint_faults(joint: Joint) -> Iterator[str]:
         yield f"{item}: the world cannot be a child; swap parent and child"
     if np.any(joint.lower > joint.upper):
         yield f"{item}: lower limit {joint.lower} above upper limit {joint.upper}"
-    yield from _negative(item, joint, "armature", "damping", "friction", "stiffness", "velocity_limit", "effort_limit")
     yield from _friction_faults(item, joint)
     if type_.quaternion is not None and np.isfinite([x[type_.quaternion :] for x in (joint.lower, joint.upper)]).any():
         yield f"{item}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite"
@@ -170,7 +167,6 @@ def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterat
             yield f"{item}: unknown joint {name!r}" + (f"; did you mean {near[0]!r}?" if near else "")
         elif sizes[name] != 1:
             yield f"{item}: expected joints of one velocity, joint {name!r} has {sizes[name]}"
-    yield from _negative(item, coupling, "stiffness", "damping", "armature")
     if not np.any(coupling.factors):
         yield f"{item}: no joint has a factor other than zero; it would never act"
 

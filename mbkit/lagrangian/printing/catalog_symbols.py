@@ -17,6 +17,7 @@ from mbkit.errors import MbkitError
 from mbkit.lagrangian.energies.charts import chart_names
 from mbkit.load.urdf_reader import Snapper
 from mbkit.model import Expression, Model, Parameter
+from mbkit.model.parts import rules_of
 
 #: Textbook symbols of arguments whose symbol is not the usual one: argument=symbol, or three symbols of a vector.
 _SYMBOLS: Final = {
@@ -39,8 +40,6 @@ _LETTERS: Final = {
 }
 _LETTER: Final = re.compile(r"([A-Za-z]|alpha|beta|gamma|delta|theta|phi|psi)(_?\d+)?")
 _USUAL: Final = {"gravity": "g", "mass": "m", "length": "l", "stiffness": "k", "damping": "d", "inertia": "J"}
-#: Fields that a catalog's system has as the model has them.
-_LEFT_OUT: Final = ("lower", "upper", "velocity_limit", "effort_limit", "friction", "stiction", "stribeck_velocity")
 #: Two descriptions are the same where their numbers differ by rounding only.
 _SAME: Final = 1e-13
 
@@ -132,9 +131,10 @@ def _content(model: Model) -> tuple[list[Any], list[Any]]:
     numbers: list[Any] = [model.gravity]
     for where in ("bodies", "joints", "springs", "couplings", "loops"):
         for part in getattr(model, where):
-            held = {f.name: getattr(part, f.name) for f in fields(part) if f.name not in _LEFT_OUT}
-            numbers += [x for x in held.values() if isinstance(x, (float, np.ndarray))]
-            names += [(where, f, x) for f, x in held.items() if isinstance(x, (str, tuple)) or x is None]
+            held, rules = {f.name: getattr(part, f.name) for f in fields(part)}, rules_of(type(part))
+            # Data and dry friction are those of the model.
+            numbers += [held[f] for f, rule in rules.items() if rule.direction or not rule.fixed]
+            names += [(where, f, x) for f, x in held.items() if f not in rules]
     return names, numbers
 
 

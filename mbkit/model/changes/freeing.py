@@ -7,48 +7,45 @@ Smooth parameterization of rigid-body inertia, IEEE Robotics and Automation Lett
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mbkit._check import shown
+from mbkit._check import Array, shown
 from mbkit.errors import InputError, nearest
+from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Parameter
-from mbkit.model.parts import Body
+from mbkit.model.parts import ENTRIES, Body, Joint, NumberRule, numbers, rules_of
+from mbkit.model.rolling import ROLLING_KINDS
 from mbkit.model.validation import static_bodies
 
-_AXES: Final = ("x", "y", "z")
 SYMMETRIC: Final = (
     *(("xx", (0, 0)), ("xy", (0, 1)), ("xz", (0, 2))),
     *(("yy", (1, 1)), ("yz", (1, 2)), ("zz", (2, 2))),
 )
-#: Kind of parts -> numbers that act in the dynamics and may be free. Earlier kinds have a name for themselves.
-_FIELDS: Final = {
-    "bodies": ("mass", "com", "inertia"),
-    "joints": ("translation", "pitch", "armature", "damping", "stiffness", "rest", "ratio", "offset"),
-    "springs": ("stiffness", "rest_length", "damping", "point_a", "point_b"),
-    "couplings": ("stiffness", "rest_length", "damping", "armature"),
-    "loops": ("translation_a", "translation_b", "length"),
-    "couplers": ("ratio", "offset"),
-    "prescribed": ("offset", "rate", "amplitude", "frequency", "phase"),
-    "no_slip": ("translation_a", "translation_b", "radius", "speed"),
+#: Numbers of which not every part that has the field has one.
+_WHERE: Final[dict[str, Callable[[Model, Any], bool]]] = {
+    "pitch": lambda _, joint: joint.type.pitched,
+    "length": lambda _, loop: loop.kind == "distance",
+    "radius": lambda _, part: part.kind in ROLLING_KINDS,
+    "speed": lambda _, part: part.kind not in ROLLING_KINDS,
+    "curve": lambda _, coupler: len(coupler.leaders) == 1,
+    "fraction": lambda model, force: force.body not in model.rotors,
+    "stiffness": lambda _, part: not isinstance(part, Joint) or part.type.quaternion is None,
+    "rest": lambda _, joint: joint.type.quaternion is None,
 }
-#: What is data alone, or a parameter of no engine.
-_DATA: Final = ("friction", "lower", "upper", "velocity_limit", "effort_limit")
 _Entry = tuple[str, str, str, tuple[int, ...]]
 #: The ten numbers of a log-Cholesky factor, and the end of their path.
 TEN: Final = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
 LOG_CHOLESKY: Final = ".log_cholesky"
-#: Of loops, the length that a rod alone has.
-_ROD: Final = "distance"
 
 
 class Number(NamedTuple):
-    """A number of a model: its path, that of its vector, where it stands, and its value."""
+    """A number of a model: its path, that of its vector, where it stands, its value, and the rule of its field."""
 
     path: str
     whole: str
@@ -57,6 +54,7 @@ class Number(NamedTuple):
     field: str
     indices: tuple[tuple[int, ...], ...]
     value: float
+    rule: NumberRule
 
     @property
     def entries(self) -> tuple[_Entry, ...]:
@@ -112,45 +110,38 @@ def scale(*patterns: str, name: str | None = None) -> Scale:
 
 def numbers_of(model: Model) -> Iterator[Number]:
     """Yield all numbers of a model that may be free."""
-    yield from _entries("gravity", "gravity", "", "gravity", model.gravity, _AXES)
-    for where, fields in _FIELDS.items():
-        for part in getattr(model, where):
-            for field in fields:
-                yield from _of_part(where, part, field)
+    for where in ("gravity", *KINDS_OF_PARTS):
+        for part in (model,) if where == "gravity" else getattr(model, where):
+            name = "" if where == "gravity" else part.name
+            for field, rule, value in numbers(part):
+                if rule.fixed or (field in _WHERE and not _WHERE[field](model, part)):
+                    continue
+                whole = f"{name}.{field}" if name else field
+                for end, indices in _entries(part, field, rule, np.asarray(value)):
+                    x = float(np.asarray(value)[indices[0]])
+                    path = f"{name}.{end}" if field == "numbers" else f"{whole}.{end}" if end else whole
+                    # The whole of a bushing's matrix is its diagonal, and what is not zero.
+                    alone = field == "numbers" or (len(indices[0]) == 2 and "." in end and not x)
+                    yield Number(path, path if alone else whole, where, name, field, indices, x, rule)
 
 
-def _of_part(where: str, part: Any, field: str) -> Iterator[Number]:
-    path = f"{part.name}.{field}"
-    if where == "joints" and field in ("ratio", "offset"):
-        value = getattr(part.mimic, field) if part.mimic else None
-    elif (field == "pitch" and not part.type.pitched) or (field == "length" and part.kind != _ROD):
-        value = None
+def _entries(
+    part: Any, field: str, rule: NumberRule, value: Array
+) -> Iterator[tuple[str, tuple[tuple[int, ...], ...]]]:
+    """Yield the numbers of a field: the end of the path, and the indices at which it stands."""
+    if value.ndim == 2:
+        names, symmetric = ENTRIES[: len(value)], field == "inertia" or np.array_equal(value, value.T, equal_nan=True)
+        for i, k in np.ndindex(value.shape):
+            if i <= k or not symmetric:
+                end = names[i] + names[k] if field == "inertia" else names[i] if i == k else f"{names[i]}.{names[k]}"
+                yield end, ((i, k), (k, i)) if symmetric and i != k else ((i, k),)
+    elif field == "armature" and value.ndim and part.type.quaternion is not None:
+        # A rotor has the same inertia about every axis there.
+        yield "", tuple((i,) for i in range(len(value)))
+    elif value.ndim:
+        yield from ((end, ((i,),)) for ends in rule.entries(part) or () for i, end in enumerate(ends))
     else:
-        value = getattr(part, field, None)
-    if value is None:
-        return
-    if np.ndim(value) == 0:
-        yield Number(path, path, where, part.name, field, ((),), float(value))
-    elif field == "inertia":
-        for end, (i, k) in SYMMETRIC:
-            both = ((i, k),) if i == k else ((i, k), (k, i))
-            yield Number(f"{path}.{end}", path, where, part.name, field, both, float(value[i, k]))
-    else:
-        of_joint = where == "joints" and field != "translation"
-        if of_joint and part.type.quaternion is not None:
-            if field == "armature" and part.type.nv:
-                # A rotor has the same inertia about every axis there.
-                every = tuple((i,) for i in range(part.type.nv))
-                yield Number(path, path, where, part.name, field, every, float(value[0]))
-            if field in ("armature", "stiffness", "rest"):
-                return
-        ends = part.leaders if where == "couplers" else part.type.velocity_suffixes if of_joint else _AXES
-        yield from _entries(path, where, part.name, field, value, ends)
-
-
-def _entries(path: str, where: str, part: str, field: str, values: Any, ends: Iterable[str]) -> Iterator[Number]:
-    for i, (end, x) in enumerate(zip(ends, values, strict=True)):
-        yield Number(f"{path}.{end}" if end else path, path, where, part, field, ((i,),), float(x))
+        yield "", ((),)
 
 
 def chosen(model: Model, pattern: str) -> list[Number]:
@@ -179,11 +170,11 @@ def _still(model: Model, every: list[Number]) -> set[str]:
 def _nothing(model: Model, every: list[Number], pattern: str) -> str:
     name, _, field = pattern.rpartition(".")
     item = f"paths: {pattern!r} fits no number of {model.name}"
-    if field in _DATA:
-        why = "dry friction is a number in every engine, as set_joint sets it" if field == "friction" else "it is data"
+    every_part = (part for where in KINDS_OF_PARTS for part in getattr(model, where) if fnmatchcase(part.name, name))
+    if why := next((r[field].fixed for r in map(rules_of, map(type, every_part)) if field in r and r[field].fixed), ""):
         return f"{item}: {field} cannot be free: {why}"
     frame = next((f for f in model.frames if pattern.startswith(f"{f.name}.")), None)
-    if frame is not None and field.split(".")[0] in _FIELDS["bodies"]:
+    if frame is not None and field.split(".")[0] in rules_of(Body):
         end = pattern.removeprefix(f"{frame.name}.")
         return f"{item}: {frame.name!r} is a frame on body {frame.body!r}, which holds its inertia: {frame.body}.{end}"
     near = nearest(pattern, [x.path for x in every] + [x.whole for x in every])

@@ -25,13 +25,11 @@ from mbkit.model.joint_types import FIXED
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, nominal
-from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, PointSpring
+from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, PointSpring, joint_of
 from mbkit.model.poses import body_poses
 
 #: Of limits and of what is closed: digits of a typed number.
 _TYPED: Final = 1e-8
-#: Numbers of a joint that a fixed one has none of.
-_OF_MOTION: Final = ("pitch", "armature", "damping", "stiffness", "rest", "ratio", "offset")
 
 #: Coordinates of the locked joints by name, of those that follow too.
 Values = dict[str, Array]
@@ -188,22 +186,8 @@ def _fixed(joint: Joint, values: Values, bindings: list[Binding]) -> Joint:
         return joint
     R, p = (np.array(x, dtype=float) for x in joint.type.placement(np, joint, list(values[joint.name])))
     place = moved_by(np.eye(3), joint.rotation @ p, entries(joint, "joints", "translation", bindings))
-    bindings[:] = [b for b in bindings if (b.where, b.part) != ("joints", joint.name) or b.field not in _OF_MOTION]
-    empty = dict.fromkeys(
-        ("lower", "upper", "velocity_limit", "effort_limit", "armature", "damping", "friction", "stiffness", "rest"),
-        np.zeros(0),
-    )
-    still = replace(
-        joint,
-        kind=FIXED.name,
-        rotation=joint.rotation @ R,
-        axes=np.zeros((0, 3)),
-        pitch=0.0,
-        mimic=None,
-        stiction=None,
-        stribeck_velocity=None,
-        **empty,  # type: ignore[arg-type]  # arrays
-    )
+    bindings[:] = [b for b in bindings if (b.where, b.part) != ("joints", joint.name)]
+    still = joint_of(joint.name, FIXED.name, joint.parent, joint.child, joint.rotation @ R, joint.translation)
     return with_fields(still, "joints", {"translation": place}, bindings)  # type: ignore[no-any-return]  # a Joint
 
 

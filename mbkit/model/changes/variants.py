@@ -30,15 +30,10 @@ from mbkit.model.model import Model
 
 #: What a spread says of a path: a size, the ends of a uniform range, or a function of a generator and how many to draw.
 Spread = float | tuple[float, float] | Callable[[np.random.Generator, int], Any]
-#: Numbers whose sign is free and whose zero means nothing: a spread is a standard deviation in their units.
-_PLACES: Final = ("com", "translation", "translation_a", "translation_b", "point_a", "point_b", "rest", "offset")
-_ADDED: Final = (*_PLACES, "gravity", "rate", "phase")
 #: All ten numbers of a body together.
 _INERTIAL: Final = ".inertial"
 #: Beyond it one standard deviation is a factor of more than e: per cent are a common reason.
 _WIDE: Final = 1.0
-_NOT_NEGATIVE: Final = ("mass", "armature", "damping", "stiffness", "rest_length", "length", "radius")
-_POSITIVE: Final = ("mass", "length", "radius")
 #: Of a moment of inertia: rounding.
 _ROUNDED: Final = 1e-12
 _SHOWN: Final = 12
@@ -193,12 +188,13 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
         raise InputError(f"spread: expected a mapping from paths to spreads, got {shown(spread)}")
     values: dict[str, Array] = {}
     paths: list[Any] = []
+    added = {x.path for x in numbers_of(model) if x.rule.added}
     for path, how in spread.items():
         rng = np.random.default_rng([seed, zlib.crc32(str(path).encode())])
         # What leaves a double's range is told by name.
         with np.errstate(over="ignore", invalid="ignore"):
             drawn = _drawn(model, path, how, rng, size)
-        factor = drawn and not callable(how) and shape_of(how) == () and not {*str(path).split(".")} & {*_ADDED}
+        factor = drawn and not callable(how) and shape_of(how) == () and not {*drawn} <= added
         if factor and (away := real("spread", how)) > _WIDE:
             name, x = next(iter(drawn.items()))
             says = "is the standard deviation of the logarithm, in which 0.1 is about 10 %"
@@ -239,11 +235,10 @@ def _drawn(model: Model, path: Any, how: Spread, rng: np.random.Generator, size:
                 out |= _bodies_drawn(model, name, _size(item, how), rng, size, about_com=True)
                 numbers = [x for x in numbers if x not in six]
     for x in numbers:
-        added = x.field in _ADDED
-        if path != x.path and not (x.value or added or callable(how)) and shape_of(how) == ():
+        if path != x.path and not (x.value or x.rule.added or callable(how)) and shape_of(how) == ():
             # A factor leaves the zeros of a vector as they are.
             continue
-        out[x.path] = _numbers(f"{item}: {x.path}", x.value, how, rng, size, added=added)
+        out[x.path] = _numbers(f"{item}: {x.path}", x.value, how, rng, size, added=x.rule.added)
     return out
 
 
@@ -315,25 +310,31 @@ def _require_bodies_that_can_be(model: Model, values: Mapping[str, Array], scale
             drawn[x.path] = drawn.get(x.path, x.value) * values[one.name]
     for path, value in drawn.items():
         x, never = numbers[path], np.zeros(size, dtype=bool)
-        if x.field in _NOT_NEGATIVE and x.value >= 0:
-            never = value <= 0 if x.field in _POSITIVE and x.value > 0 else value < 0
+        if x.value >= x.rule.least:
+            never = value <= x.rule.least if x.rule.positive and x.value > x.rule.least else value < x.rule.least
         if len(bad := np.flatnonzero(never)):
             raise InputError(
-                f"spread: {path!r} is {'zero or ' * (x.field in _POSITIVE)}negative in {len(bad)} of {size} variants, "
+                f"spread: {path!r} is {'zero or ' * x.rule.positive}negative in {len(bad)} of {size} variants, "
                 f"such as {value[bad[0]]:.3g} in {bad[0]}; give a smaller spread, or a range that it can have"
             )
-    for body in model.bodies:
-        own = [x for path in drawn if (x := numbers[path]).part == body.name and x.field == "inertia"]
-        if not own:
-            continue
-        inertias = np.tile(body.inertia, (size, 1, 1))
+    matrices: dict[tuple[str, str, str], list[Any]] = {}
+    for x in (x for path in drawn if len((x := numbers[path]).indices[0]) == 2):
+        matrices.setdefault((x.where, x.part, x.field), []).append(x)
+    for (where, name, field), own in matrices.items():
+        nominal = next(getattr(part, field) for part in getattr(model, where) if part.name == name)
+        every = np.tile(nominal, (size, 1, 1))
         for x in own:
             for index in x.indices:
-                inertias[:, index[0], index[1]] = drawn[x.path]
-        trace = np.trace(inertias, axis1=1, axis2=2)
-        least = np.linalg.eigvalsh(0.5 * trace[:, None, None] * np.eye(3) - inertias)[:, 0]
+                every[:, index[0], index[1]] = drawn[x.path]
+        trace = np.trace(every, axis1=1, axis2=2)
+        if field == "inertia":
+            moments, says = 0.5 * trace[:, None, None] * np.eye(3) - every, "an inertia that no matter has"
+            instead = f"one number for {name + '.inertia'!r} draws inertias that can be"
+        else:
+            moments, says = 0.5 * (every + every.swapaxes(1, 2)), f"a {field} that drives the motion"
+            instead = "give a smaller spread"
+        least = np.linalg.eigvalsh(moments)[:, 0]
         if len(bad := np.flatnonzero(least < -_ROUNDED * np.abs(trace))):
             raise InputError(
-                f"spread: {body.name!r} has an inertia that no matter has in {len(bad)} of {size} variants, such as "
-                f"{bad[0]}; one number for {body.name + '.inertia'!r} draws inertias that can be"
+                f"spread: {name!r} has {says} in {len(bad)} of {size} variants, such as {bad[0]}; {instead}"
             )

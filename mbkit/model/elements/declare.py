@@ -54,7 +54,9 @@ class ElementBuilder:
     """Declares forces by functions, motions in time and couplers; `ModelBuilder` inherits it."""
 
     _read: Any
+    _parts: dict[str, list[Any]]
     _add: Callable[..., None]
+    _numbers: Callable[..., dict[str, Any]]
     add_body: Callable[..., None]
     add_joint: Callable[..., None]
 
@@ -323,11 +325,9 @@ class ElementBuilder:
         body = self._read.name("gravity compensation: body", body)
         name = GravityCompensation.named(body)
         joints = tuple(without) if isinstance(without, (list, tuple)) else (without,)
-        ready = {"without": tuple(self._read.name(f"{name}: without", x) for x in joints)}
-        self._add(
-            lambda _, **numbers: GravityCompensation(body, **numbers),
-            *("forces", "force", name, {"fraction": fraction}, ready),
-        )
+        fixed = tuple(self._read.name(f"{name}: without", x) for x in joints)
+        numbers = self._numbers("forces", name, fraction=self._read.quantity(f"force {name!r}: fraction", fraction))
+        self._parts["forces"].append(GravityCompensation(body, without=fixed, **numbers))
 
     def add_bushing(
         self,

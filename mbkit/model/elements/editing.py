@@ -16,7 +16,7 @@ from mbkit.model.elements.beams import OnBeam
 from mbkit.model.elements.forces import RATE
 from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on, moved_by, names_in, renamed
 from mbkit.model.parameters import Binding, Number, split
-from mbkit.model.parts import Frame, Mimic
+from mbkit.model.parts import OF_Q, OF_V, Frame, Joint, Mimic, rules_of
 
 _Vector = ArrayLike | Sequence[Number]
 _Numbers = ArrayLike | Sequence[Number] | Number
@@ -24,11 +24,8 @@ _Numbers = ArrayLike | Sequence[Number] | Number
 _CALLED: Final = {"bodies": "body", "prescribed": "prescribed", "forces": "force", "no_slip": "no slip"}
 #: Numbers up to which a note says them all.
 _FEW: Final = 3
-#: Arguments of joints that are limits or one number for each velocity.
-NUMBERS_OF_JOINTS: Final = (
-    *("lower", "upper", "velocity_limit", "effort_limit"),
-    *("armature", "damping", "friction", "stiffness", "rest", "stiction", "stribeck_velocity"),
-)
+#: Arguments of joints with a number for each coordinate or velocity.
+NUMBERS_OF_JOINTS: Final = tuple(n for n, rule in rules_of(Joint).items() if rule.shape in (OF_Q, OF_V))
 
 
 def called(kind: str) -> str:
@@ -405,7 +402,7 @@ class EditingBuilder:
         if part is None:
             return
         given = {n: x for n, x in values.items() if x is not None}
-        fields = self._read_fields(f"{called(kind)} {part.name!r}", given) | dict(ready or {})
+        fields = self._read_fields(type(part), f"{called(kind)} {part.name!r}", given) | dict(ready or {})
         self._change(kind, part, fields)
 
     def _change(self, kind: str, part: Any, fields: dict[str, Any]) -> None:

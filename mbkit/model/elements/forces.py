@@ -12,14 +12,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import nearest
 from mbkit.model.elements.formula import Formula
-from mbkit.model.parts import _Frozen, read_only
+from mbkit.model.parts import ENTRIES, Constants, NumberRule, Place, Rotation, _Frozen, read_only
 
 #: A `mbkit.model.description.Description`, a floor above.
 _Model = Any
@@ -27,9 +27,9 @@ _Model = Any
 RATE: Final = "_dot"
 TIME: Final = "t"
 #: Names of positions, and of what belongs to them, in formulas of forces on frames and of bushings.
-POINT: Final = ("x", "y", "z")
+POINT: Final = ENTRIES[:3]
 TWIST: Final = ("vx", "vy", "vz", "wx", "wy", "wz")
-DISPLACEMENT: Final = (*POINT, "rx", "ry", "rz")
+DISPLACEMENT: Final = ENTRIES
 #: Asymmetry of a stiffness that is no rounding.
 _ASYMMETRY: Final = 1e-12
 
@@ -112,7 +112,7 @@ class JointForce(Force):
     formula: Formula | None
     potential: Formula | None
     symbols: tuple[str, ...]
-    numbers: Array
+    numbers: Constants
 
     def positions(self, model: _Model) -> tuple[str, ...]:
         """Return q, or q_0, q_1, ..."""
@@ -157,7 +157,7 @@ class FrameForce(Force):
     formula: Formula | None
     potential: Formula | None
     symbols: tuple[str, ...]
-    numbers: Array
+    numbers: Constants
 
     def positions(self, model: _Model) -> tuple[str, ...]:  # noqa: ARG002  # the same of every model
         """Return x, y and z."""
@@ -203,17 +203,17 @@ class Bushing(Force):
 
     name: str
     body_a: str
-    rotation_a: Array
-    translation_a: Array
+    rotation_a: Rotation
+    translation_a: Place
     body_b: str
-    rotation_b: Array
-    translation_b: Array
-    stiffness: Array
-    damping: Array
+    rotation_b: Rotation
+    translation_b: Place
+    stiffness: Annotated[Array, NumberRule("N/m, N m/rad", (6, 6))]
+    damping: Annotated[Array, NumberRule("N s/m, N m s/rad", (6, 6))]
     formula: Formula | None
     potential: Formula | None
     symbols: tuple[str, ...]
-    numbers: Array
+    numbers: Constants
 
     @property
     def acts(self) -> bool:
@@ -264,7 +264,7 @@ class GravityCompensation(Force):
     """
 
     body: str
-    fraction: float
+    fraction: Annotated[float, NumberRule()]
     without: tuple[str, ...] = ()
 
     #: It has no formula.

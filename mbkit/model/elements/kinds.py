@@ -20,6 +20,7 @@ from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.joint_types import kind_of
 from mbkit.model.loops import LOOP_KINDS
+from mbkit.model.parts import rules_of
 from mbkit.model.rolling import NO_SLIP_ROWS
 
 #: A `mbkit.model.description.Description`, a floor above.
@@ -29,11 +30,6 @@ _Test = Callable[[_Model, Any], bool]
 #: velocity's sign, another force, a row of positions or of velocities, a limit that is data, dependence on the time.
 EFFECTS: Final = ("q", "T", "V", "loss", "jump", "force", "row", "speed", "bound", "t")
 _OF_TYPES: Final = "joint_type."
-#: Fields that are not zero where they do nothing.
-_NOTHING: Final = {"lower": -np.inf, **dict.fromkeys(("upper", "velocity_limit", "effort_limit"), np.inf)}
-_OPTIONAL: Final = ("stiction", "stribeck_velocity")
-#: Sections of parts that are nothing but numbers, and go with the last of them.
-_OF_NUMBERS: Final = ("springs", "couplings")
 
 
 @dataclass(frozen=True)
@@ -59,8 +55,9 @@ class Kind:
         if not self.section:
             left = tuple(b for b in model.bindings if b.where not in self.numbers)
             return replace(model, bindings=left, **self._nothing(model)) if gone else model
-        others = {f for k in PART_KINDS.values() if k.section == self.section for f in k.numbers} - self.numbers
-        stays = has(self.section, *(others if self.section in _OF_NUMBERS else ()))
+        kinds = [k.numbers for k in PART_KINDS.values() if k.section == self.section]
+        # Parts that are nothing but numbers go with the last of them.
+        stays = has(self.section, *(frozenset().union(*kinds) - self.numbers if all(kinds) else ()))
         new = {p.name: replace(p, **self._nothing(p)) if self.numbers and stays(model, p) else None for p in gone}
         left = tuple(
             b
@@ -71,8 +68,8 @@ class Kind:
         return replace(model, bindings=left, **{self.section: parts}) if gone else model
 
     def _nothing(self, part: Any) -> dict[str, Any]:
-        shapes = {f: np.shape(getattr(part, f)) for f in self.numbers}
-        return {f: None if f in _OPTIONAL else np.full(shape, _NOTHING.get(f, 0.0)) for f, shape in shapes.items()}
+        rules = [(f, rules_of(type(part))[f], getattr(part, f)) for f in self.numbers]
+        return {f: None if rule.optional else np.full(np.shape(x), rule.nothing) for f, rule, x in rules}
 
 
 #: Kinds by name, in the order of registration; `kind` also knows those of joint types.
@@ -147,8 +144,8 @@ def has(section: str, *fields: str) -> _Test:
     """Return the test for a number among these fields that does something, or that a parameter may make do so."""
 
     def at(model: _Model, part: Any) -> bool:
-        given = ((f, getattr(part, f)) for f in fields)
-        if not fields or any(x is not None and np.any(x != _NOTHING.get(f, 0.0)) for f, x in given):
+        given = ((rules_of(type(part))[f].nothing, getattr(part, f)) for f in fields)
+        if not fields or any(x is not None and np.any(x != nothing) for nothing, x in given):
             return True
         own = (section, part.name) if section else (fields[0], "")
         return any((b.where, b.part) == own and b.field in fields for b in model.bindings)
@@ -204,7 +201,7 @@ for _name in LOOP_KINDS:
     register_kind("loops", f"loop.{_name}", "loop {p.name!r} is {p.kind}", "row", "", "loops", _named(_name))
 _coupler = partial(register_kind, "couplers", does="row", features="loops couplers")
 _coupler("coupler", "coupler {p.name!r}")
-_coupler("coupler.curve", "coupler {p.name!r} is a curve", at=lambda _, c: c.curve.any())
+_coupler("coupler.curve", "coupler {p.name!r} is a curve", at=has("couplers", "curve"))
 _coupler("coupler.several", "coupler {p.name!r} has several leaders", at=lambda _, c: len(c.leaders) > 1)
 _motion = partial(register_kind, "prescribed", does="row t", features="prescribed")
 for _law in MOTION_LAWS:

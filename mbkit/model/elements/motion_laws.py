@@ -10,18 +10,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from math import inf
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.model.elements.formula import Arithmetic, Formula
-from mbkit.model.parts import Prescribed, _Frozen
+from mbkit.model.parts import Constants, NumberRule, Prescribed, _Frozen
 
 #: Of a table's end: what the rounding of a run's last time can be beyond it.
 _ROUNDING: Final = 1e-12
 #: Jump of x, x' or x'' between pieces of a spline, beside the largest value, from which it is no rounding.
 _JUMP: Final = 1e-6
+_TABLE: Final = NumberRule(shape=None, fixed="it is a table's")
 #: Comparisons of each evaluation grow with the knots: at so many a step takes some 0.1 ms.
 MOST_KNOTS: Final = 2000
 
@@ -53,7 +54,7 @@ class FormulaMotion(_OfJoint):
     joint: str
     formula: Formula
     symbols: tuple[str, ...]
-    numbers: Array
+    numbers: Constants
 
     @property
     def constants(self) -> tuple[float, ...]:
@@ -77,28 +78,13 @@ class SplineMotion(_OfJoint):
     """
 
     joint: str
-    knots: Array
-    coefficients: Array
+    knots: Annotated[Array, _TABLE]
+    coefficients: Annotated[Array, _TABLE]
     constants = ()
 
 
 #: A motion prescribed in time.
 Motion = Prescribed | FormulaMotion | SplineMotion
-
-
-class MotionLaw(NamedTuple):
-    """The properties of a law that other modules read.
-
-    Attributes
-    ----------
-    numbers : tuple of str
-        The attributes with numbers of the description, which may be symbols.
-    path : callable
-        ``path(part, values, t, arithmetic)`` returns the coordinate at time t, with `values` for these attributes.
-    """
-
-    numbers: tuple[str, ...]
-    path: Callable[[Any, Any, Any, Arithmetic], Any]
 
 
 def _harmonic(_: Prescribed, x: Any, t: Any, arithmetic: Arithmetic) -> Any:
@@ -131,17 +117,18 @@ def _of_pieces(_: SplineMotion, x: Any, t: Any, arithmetic: Arithmetic) -> Any:
     return out
 
 
-#: Class of a law -> what others ask of it.
-MOTION_LAWS: Final[dict[type, MotionLaw]] = {
-    Prescribed: MotionLaw(("offset", "rate", "amplitude", "frequency", "phase"), _harmonic),
-    FormulaMotion: MotionLaw(("numbers",), _of_formula),
-    SplineMotion: MotionLaw(("knots", "coefficients"), _of_pieces),
+#: Class of a law -> its function of the part, its numbers or what stands for them, the time and an arithmetic, which
+#: returns the coordinate.
+MOTION_LAWS: Final[dict[type, Callable[[Any, Any, Any, Arithmetic], Any]]] = {
+    Prescribed: _harmonic,
+    FormulaMotion: _of_formula,
+    SplineMotion: _of_pieces,
 }
 
 
 def position(part: Motion, t: Any, arithmetic: Arithmetic) -> Any:
     """Return the coordinate at a time, with the part's own numbers; of NumPy's arithmetic also at an array of times."""
-    return MOTION_LAWS[type(part)].path(part, part, t, arithmetic)
+    return MOTION_LAWS[type(part)](part, part, t, arithmetic)
 
 
 def interval(part: Motion) -> tuple[float, float]:

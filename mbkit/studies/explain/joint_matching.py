@@ -14,10 +14,11 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines.imported import joint_of, unused
+from mbkit.engines.imported import unused
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.forces import Force, coordinate_arguments
 from mbkit.model.joint_types import FIXED, PRISMATIC
+from mbkit.model.parts import joint_of
 from mbkit.studies.explain.hypotheses import Hypothesis
 from mbkit.studies.explain.merged_model import (
     OTHERS,
