@@ -697,6 +697,9 @@ def test_forces_of_other_names_frames_and_formulas_are_the_same() -> None:
     with pytest.raises(AssertionError, match="force 'pull'"):
         assert_same_dynamics(model, replace(model, forces=tuple(f for f in model.forces if f.name != "pull")))
     assert mb.explain(mb.dynamics(model, "lagrangian", compile=False), mb.dynamics(model, "pinocchio")).agree
+    loses = engine("other", passive=lambda _, *x: PinocchioDynamics(model.without("forces")).passive(*x))
+    told = mb.explain(PinocchioDynamics(model), loses(model))
+    assert [c.says for c in told.acting] == ["other has no forces"]
 
 
 @pytest.mark.parametrize("what", ["coupler", "motion", "force"])

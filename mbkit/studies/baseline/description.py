@@ -20,10 +20,11 @@ from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load import load
 from mbkit.load.loader import find
 from mbkit.load.urdf_reader import read_links
-from mbkit.model import Model
+from mbkit.model import Joint, Model
 from mbkit.model.elements.editing import called
 from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.references import KINDS_OF_PARTS
+from mbkit.model.parts import rules_of
 from mbkit.studies._targets import resolved, resolved_options
 
 Part = dict[str, Any]
@@ -47,7 +48,6 @@ SECTIONS: Final = {
     },
 }
 FLAT: Final = ("system", "parameters", "expressions", "energies")
-_UPPER: Final = ("upper", "velocity_limit", "effort_limit")
 _TRIANGLE: Final = np.triu_indices(3)
 
 
@@ -128,8 +128,8 @@ def default(field: str, like: Any) -> Any:
         return 1.0 if field == "ratio" else 0.0
     if field.startswith("rotation"):
         return [float(x) for x in np.eye(3).ravel()]
-    nothing = float("-inf") if field == "lower" else float("inf") if field in _UPPER else 0.0
-    return [nothing] * len(like)
+    rule = rules_of(Joint).get(field)
+    return [rule.nothing if rule else 0.0] * len(like)
 
 
 def moving_mass(description: Mapping[str, Mapping[str, Part]]) -> tuple[float, Array]:

@@ -21,6 +21,7 @@ from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, UnsupportedError
 from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Model
+from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.joint_numbers import owners
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.hypotheses import body_mistakes, joint_mistakes, number_text
@@ -291,9 +292,11 @@ class _Engines:
     def _linear(self) -> Iterator[_Trial]:
         """Yield quantities left out of the whole robot, and fits of gravity, armature and damping."""
         own, wanted = self._terms(self.model), self.wanted
-        for feature, kind in (("armature", "armature"), ("damping", "damping"), ("springs", "spring")):
-            if getattr(self.model.needs, feature):
-                yield _Trial(kind, "", f"has no {feature}", self._terms(self.model.without(feature)))
+        kinds = [
+            k for name, k in PART_KINDS.items() if name in self.model.acts and k.does <= {"T", "V", "loss", "force"}
+        ]
+        for feature in dict.fromkeys(x for k in kinds for x in k.features):
+            yield _Trial(feature.removesuffix("s"), "", f"has no {feature}", self._terms(self.model.without(feature)))
         units = [self._terms(replace(self.model, gravity=e)) for e in np.eye(3)]
         if all("g" in x for x in (*units, wanted)):
             A = np.array([x["g"].ravel() for x in units]).T

@@ -7,7 +7,7 @@ them can be added to the first description or removed from the second without th
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import permutations, product
 from typing import Any, Final, NamedTuple
@@ -23,9 +23,8 @@ from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.editing import called
 from mbkit.model.elements.forces import Force
 from mbkit.model.elements.formula import NUMPY, Formula
-from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
-from mbkit.model.parts import Coupler, Loop
+from mbkit.model.parts import Coupler, Loop, rules_of
 from mbkit.studies.explain.loop_differences import loop_differences, same_loop
 from mbkit.studies.explain.merged_model import OTHERS, LinkInBody, MergedModel, Tolerances, composite
 
@@ -42,13 +41,12 @@ _WORDS: Final = {
     "no_slip": ("contact without slip", "no slip"),
 }
 _NUMBER: Final = {"stiffness": "spring", "stribeck_velocity": "Stribeck velocity"}
-#: Fields of a joint that have rules of their own, limits, which are told together, and the others.
-_PLACE: Final = ("name", "kind", "parent", "child", "rotation", "translation", "axes", "pitch", "mimic", "rest")
-_DATA: Final = {n for k in PART_KINDS.values() if k.section == "joints" and k.does == {"bound"} for n in k.numbers}
-BOUNDS: Final = tuple(f.name for f in fields(Joint) if f.name in _DATA)
-NUMBERS: Final = tuple(f.name for f in fields(Joint) if f.name not in (*_PLACE, *BOUNDS))
+#: Numbers of a joint that are told together, and those that are compared one by one.
+BOUNDS: Final = tuple(name for name, rule in rules_of(Joint).items() if not rule.acts)
+_PLACE: Final = ("rotation", "translation", "axes", "pitch", "rest")
+NUMBERS: Final = tuple(name for name in rules_of(Joint) if name not in (*_PLACE, *BOUNDS))
 #: Those of them that every joint has.
-OF_ALL: Final = tuple(f.name for f in fields(Joint) if f.name in NUMBERS and f.default is MISSING)
+OF_ALL: Final = tuple(name for name in NUMBERS if not rules_of(Joint)[name].optional)
 #: Numbers that a sentence says all of.
 _FEW: Final = 9
 

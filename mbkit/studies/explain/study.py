@@ -55,9 +55,10 @@ def explain(
 ) -> Explanation:
     """Explain why two descriptions, or two engines, differ.
 
-    Every difference between the descriptions is named: armature, damping, friction and its curve, springs, gravity, a
-    lost, fused or changed body, inertia about the wrong point or in the wrong axes, a joint's place, axis,
-    zero or pitch, quaternion and joint order, mimic joints, velocity frames, a known defect of an engine.
+    Every difference between the descriptions is named, in each number of each kind of part, also of forces by
+    functions: armature, friction, springs, gravity, a lost, fused or changed body, inertia about the wrong point or in
+    the wrong axes, a joint's place, axis, zero or pitch, quaternion and joint order, mimic joints, velocity frames, a
+    known defect of an engine.
     Joints are matched by structure and name, and a mere choice of frames is no difference.
 
     The effect of each difference is measured: it is added alone to the first description, and removed alone from
