@@ -9,7 +9,7 @@ import sympy as sp
 
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.description_kinematics import SymbolicKinematics, exact, read_angle
-from mbkit.model.elements.forces import RATE, TIME, GravityCompensation, JointForce
+from mbkit.model.elements.forces import RATE, TIME, GravityCompensation, JointElement
 from mbkit.model.elements.formula import Arithmetic
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.parts import Prescribed
@@ -100,12 +100,12 @@ def acting(kin: SymbolicKinematics, t: sp.Symbol) -> tuple[sp.Expr, list[sp.Expr
     for force in model.forces:
         if isinstance(force, GravityCompensation) and not force.without:
             continue
-        if not isinstance(force, JointForce):
+        if not isinstance(force, JointElement):
             raise UnsupportedError(
                 f"{model.name}: {force} is no force at a joint, and is not written out in symbols; "
                 "mbkit.dynamics(model, 'lagrangian') has it, and model.without('forces') is the system without forces"
             )
-        joint, constants = model.joint(force.joint), kin.written.values.forces[force.name].numbers
+        joints, constants = [model.joint(x) for x in force.joints], kin.written.values.forces[force.name].numbers
         coordinates = [x for j in model.independent_joints for x in kin.described(j)]
         others = dict(
             zip(
@@ -114,8 +114,9 @@ def acting(kin: SymbolicKinematics, t: sp.Symbol) -> tuple[sp.Expr, list[sp.Expr
                 strict=True,
             )
         )
-        rates = kin.rates_of[joint.name]
-        own = dict(zip(force.own(model), (*kin.described(joint), *rates), strict=True))
+        rates = [x for j in joints for x in kin.rates_of[j.name]]
+        described = [x for j in joints for x in kin.described(j)]
+        own = dict(zip(force.own(model), (*described, *rates), strict=True))
         values = others | dict(zip(force.symbols, constants, strict=True)) | {TIME: t} | own
         if force.potential is not None:
             V += force.potential(values, SYMPY)[0]

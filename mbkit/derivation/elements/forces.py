@@ -20,7 +20,7 @@ from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, compensation_energies, dot3
 from mbkit.derivation.model_values import is_zero, scalar
-from mbkit.model.elements.forces import TIME, Bushing, Force, FrameForce, JointForce, coordinate_arguments
+from mbkit.model.elements.forces import TIME, Bushing, Force, FrameForce, JointElement, coordinate_arguments
 from mbkit.model.elements.formula import Formula
 
 #: Squares of 2 sin(|θ|/2) up to which asin has its series, of which so many terms leave 1e-38.
@@ -40,9 +40,9 @@ class _Port(NamedTuple):
     linear: tuple[Vector, Any, Any] | None = None
 
 
-def _of_joint(kin: Kinematics, force: JointForce) -> _Port:
-    joint = kin.model.joint(force.joint)
-    q, v = kin.coordinates(joint), kin.velocities(joint)
+def _of_joints(kin: Kinematics, force: JointElement) -> _Port:
+    joints = [kin.model.joint(name) for name in force.joints]
+    q, v = ([x for j in joints for x in of(j)] for of in (kin.coordinates, kin.velocities))
     return _Port(dict(zip(force.own(kin.model), (*q, *v), strict=True)), v)
 
 
@@ -97,7 +97,7 @@ def rotation_vector(R: list[Vector]) -> Vector:
 
 #: Class of an element that acts on rates -> what it acts on.
 _PORTS: Final[dict[type, Callable[[Kinematics, Any], _Port]]] = {
-    JointForce: _of_joint,
+    JointElement: _of_joints,
     FrameForce: _of_frame,
     Bushing: _of_bushing,
 }
@@ -120,7 +120,8 @@ class ElementForces:
     @cached_property
     def _ports(self) -> list[tuple[Force, _Port]]:
         forces = self._kin.model.forces
-        return [(force, _PORTS[type(force)](self._kin, force)) for force in forces if type(force) in _PORTS]
+        ports = [(f, next((_PORTS[c] for c in type(f).__mro__ if c in _PORTS), None)) for f in forces]
+        return [(force, port(self._kin, force)) for force, port in ports if port]
 
     def _evaluated(self, force: Force, port: _Port, formula: Formula) -> list[Any]:
         kin = self._kin

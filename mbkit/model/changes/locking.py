@@ -18,7 +18,15 @@ from mbkit._check import Array, batch_of, finite_array, hint_at_degrees, rows, s
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model.builder import shape_of
 from mbkit.model.description import expect_name
-from mbkit.model.elements.forces import RATE, Force, FrameForce, GravityCompensation, JointForce, coordinate_arguments
+from mbkit.model.elements.forces import (
+    RATE,
+    Force,
+    FrameForce,
+    GravityCompensation,
+    JointElement,
+    JointForce,
+    coordinate_arguments,
+)
 from mbkit.model.elements.formula import Formula, Operation
 from mbkit.model.elements.references import entries, moved_by, with_fields
 from mbkit.model.joint_types import FIXED
@@ -264,22 +272,45 @@ def _acting(model: Model, force: Force, values: Values) -> Iterator[Force]:
         return
     own = {*force.own(model), *force.symbols}
     others = coordinate_arguments(model)
-    if isinstance(force, JointForce) and force.joint in values:
-        if force.potential and (more := [x for x in force.potential.arguments if x in others and x not in own]):
-            raise InputError(
-                f"joints: the potential of force {force.name!r} at {force.joint!r} acts on {more[0]!r} too; remove it "
-                "or write it as a force"
-            )
-        if force.potential:
-            # A constant energy, on a body that it does not push.
-            place = dict(zip(force.positions(model), values[force.joint].tolist(), strict=True))
-            potential, body = _filled(force.potential, place), model.joint(force.joint).child
-            yield FrameForce(force.name, body, "local", None, potential, force.symbols, force.numbers)
-        return
     numbers = _locked_arguments(model, values)
     numbers = {name: x for name, x in numbers.items() if name not in own}
-    filled = {n: _filled(x, numbers) for n in ("formula", "potential") if (x := getattr(force, n)) is not None}
-    yield replace(force, **filled)  # type: ignore[type-var]  # every force is a dataclass
+    formulas = {n: _filled(x, numbers) for n in ("formula", "potential") if (x := getattr(force, n)) is not None}
+    if isinstance(force, JointElement) and not {*force.joints}.isdisjoint(values):
+        left = [name for name in force.joints if name not in values]
+        more = [x for x in force.potential.arguments if x in others and x not in own] if force.potential else []
+        if more or len(left) > 1:
+            what = f"the potential of force {force.name!r} at {force.joints[0]!r}" if more else str(force)
+            raise InputError(f"joints: {what} acts on {(more or left)[0]!r} too; remove it or write it as a force")
+        yield from _on_one(model, force, left, values, formulas)
+        return
+    changed = {n: x for n, x in formulas.items() if x is not getattr(force, n)}
+    yield replace(force, **changed)  # type: ignore[type-var]  # every force is a dataclass
+
+
+def _on_one(
+    model: Model, force: JointElement, left: list[str], values: Values, formulas: Mapping[str, Formula]
+) -> Iterator[Force]:
+    """Yield what is left of an element on joints: a force on the one that moves, or the energy where none does."""
+    q, v = iter(force.positions(model)), iter(force.velocities(model))
+    still, own, outputs = dict[str, float](), list[str](), list[int]()
+    for joint in map(model.joint, force.joints):
+        at, rates = [next(q) for _ in range(joint.type.nq)], [next(v) for _ in range(joint.type.nv)]
+        if joint.name in values:
+            still |= dict(zip(at, values[joint.name].tolist(), strict=True)) | dict.fromkeys(rates, 0.0)
+        else:
+            own, outputs = [*at, *rates], [force.velocities(model).index(x) for x in rates]
+    filled = {n: _filled(x, still) for n, x in formulas.items()}
+    if left:
+        alone = JointForce(force.name, left[0], None, None, force.symbols, force.numbers)
+        new = dict(zip(own, alone.own(model), strict=True))
+        for n, x in filled.items():
+            kept = tuple(x.outputs[k] for k in outputs) if n == "formula" else x.outputs
+            filled[n] = Formula(tuple(new.get(a, a) for a in x.arguments), x.operations, kept)
+        yield replace(alone, formula=filled.get("formula"), potential=filled.get("potential"))
+    elif "potential" in filled:
+        # A constant energy, on a body that it does not push.
+        body = model.joint(force.joints[0]).child
+        yield FrameForce(force.name, body, "local", None, filled["potential"], force.symbols, force.numbers)
 
 
 def _locked_arguments(model: Model, values: Values) -> dict[str, float]:

@@ -94,8 +94,35 @@ def _numbered(letter: str, n: int) -> tuple[str, ...]:
     return (letter,) if n == 1 else tuple(f"{letter}_{k}" for k in range(n))
 
 
+class JointElement(Force):
+    """An element on the velocities of joints: q and v of one, q_0, q_1, ... and v_0, v_1, ... of all in their order."""
+
+    joints: tuple[str, ...]
+
+    def positions(self, model: _Model) -> tuple[str, ...]:
+        """Return q, or q_0, q_1, ..."""
+        return _numbered("q", sum(model.joint(name).type.nq for name in self.joints))
+
+    def velocities(self, model: _Model) -> tuple[str, ...]:
+        """Return v, or v_0, v_1, ..."""
+        return _numbered("v", sum(model.joint(name).type.nv for name in self.joints))
+
+    def misplaced(self, model: _Model) -> Iterator[str]:
+        """Yield joints that are not there, and those that do not move."""
+        names = [j.name for j in model.joints]
+        for name in self.joints:
+            if name not in names:
+                yield _unknown("joint", name, names)
+            elif not model.joint(name).type.nv:
+                yield f"joint {name!r} is fixed, so that a force on it does nothing"
+
+    def __str__(self) -> str:
+        at = " and ".join(map(repr, self.joints))
+        return f"force {self.name!r} at joint {at}, of {_listed(self.arguments)}"
+
+
 @dataclass(frozen=True, eq=False)
-class JointForce(Force):
+class JointForce(JointElement):
     """A generalized force of a joint, one number per velocity, as a formula of q and v (of several, q_0, q_1, ...).
 
     Attributes
@@ -114,24 +141,10 @@ class JointForce(Force):
     symbols: tuple[str, ...]
     numbers: Constants
 
-    def positions(self, model: _Model) -> tuple[str, ...]:
-        """Return q, or q_0, q_1, ..."""
-        return _numbered("q", model.joint(self.joint).type.nq)
-
-    def velocities(self, model: _Model) -> tuple[str, ...]:
-        """Return v, or v_0, v_1, ..."""
-        return _numbered("v", model.joint(self.joint).type.nv)
-
-    def misplaced(self, model: _Model) -> Iterator[str]:
-        """Yield that there is no such joint, or that it does not move."""
-        names = [j.name for j in model.joints]
-        if self.joint not in names:
-            yield _unknown("joint", self.joint, names)
-        elif not model.joint(self.joint).type.nv:
-            yield f"joint {self.joint!r} is fixed, so that a force on it does nothing"
-
-    def __str__(self) -> str:
-        return f"force {self.name!r} at joint {self.joint!r}, of {_listed(self.arguments)}"
+    @property
+    def joints(self) -> tuple[str, ...]:  # type: ignore[override]  # it follows from the joint
+        """The joint."""
+        return (self.joint,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,7 +386,7 @@ def force_faults(model: _Model) -> Iterator[str]:
 
 def _symbol_faults(force: Force, own: tuple[str, ...], others: Mapping[str, Any]) -> Iterator[str]:
     # Of a joint named q, both are the same number.
-    same = {force.joint} & {*own} if isinstance(force, JointForce) else set()
+    same = {*force.joints} & {*own} if isinstance(force, JointElement) else set()
     for name in force.arguments:
         meanings = [
             text

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partialmethod
 from typing import Any, Final
 
 import numpy as np
@@ -52,6 +53,46 @@ class Formula:
             else:
                 done.append(arithmetic.operations[name](*(done[i] for i in operands)))
         return [done[i] for i in self.outputs]
+
+
+class _Recorded:
+    """A number whose sums, products, quotients and whole powers are written down."""
+
+    def __init__(self, operations: list[Operation], place: int) -> None:
+        self._operations, self.place = operations, place
+
+    def _new(self, name: str, *operands: int, value: float = 0.0) -> _Recorded:
+        self._operations.append((name, operands, value))
+        return _Recorded(self._operations, len(self._operations) - 1)
+
+    def number(self, x: Any) -> _Recorded:
+        """Return it, or a constant."""
+        return x if isinstance(x, _Recorded) else self._new("const", value=float(x))
+
+    def _with(self, x: Any, name: str, *, behind: bool = False) -> _Recorded:
+        pair = (self.number(x).place, self.place) if behind else (self.place, self.number(x).place)
+        return self._new(name, *pair)
+
+    def __neg__(self) -> _Recorded:
+        return self._new("neg", self.place)
+
+    def __pow__(self, n: int) -> _Recorded:
+        return self if n == 1 else self * self ** (n - 1)
+
+    __add__, __sub__ = partialmethod(_with, name="add"), partialmethod(_with, name="sub")
+    __mul__, __truediv__ = partialmethod(_with, name="mul"), partialmethod(_with, name="div")
+    __radd__, __rsub__ = partialmethod(_with, name="add", behind=True), partialmethod(_with, name="sub", behind=True)
+    __rmul__ = partialmethod(_with, name="mul", behind=True)
+    __rtruediv__ = partialmethod(_with, name="div", behind=True)
+
+
+def written(law: Callable[..., Any], *arguments: str) -> Formula:
+    """Return the formula of a law: a function of these numbers of sums, products, quotients and whole powers."""
+    operations: list[Operation] = [("input", (k,), 0.0) for k in range(len(arguments))]
+    own = [_Recorded(operations, k) for k in range(len(arguments))]
+    results = law(*own)
+    outputs = tuple(own[0].number(x).place for x in (results if isinstance(results, tuple) else (results,)))
+    return Formula(arguments, tuple(operations), outputs)
 
 
 @dataclass(frozen=True)

@@ -90,8 +90,9 @@ def register_kind(
     words : str
         A clause on one part ``p``, such as ``"joint {p.name!r} has armature"``.
     does : str
-        Some of `EFFECTS`. A path that carries all of them carries the kind: give them where the laws of energies,
-        forces and rows have its formula. With none, only paths that name the kind carry it.
+        Some of `EFFECTS`, or names of kinds, such as ``"force.joint"`` for an element with formulas. A path that
+        carries all of them carries the kind: give them where the laws of energies, forces and rows have its formula.
+        With none, only paths that name the kind carry it.
     numbers : str
         Fields that come to nothing when it is taken out; without any the part goes.
     features : str
@@ -106,8 +107,8 @@ def register_kind(
     """
     if name in PART_KINDS or name.startswith(_OF_TYPES):
         raise InputError(f"kind {name!r}: expected a name that no other kind has")
-    if section not in ("", *KINDS_OF_PARTS) or not {*does.split()} <= {*EFFECTS}:
-        expected = f"a section of {KINDS_OF_PARTS} and effects of {EFFECTS}"
+    if section not in ("", *KINDS_OF_PARTS) or not {*does.split()} <= {*EFFECTS, *PART_KINDS}:
+        expected = f"a section of {KINDS_OF_PARTS} and effects of {EFFECTS}, or kinds"
         raise InputError(f"kind {name!r}: expected {expected}, got {section!r} and {does!r}")
     sets = frozenset(does.split()), frozenset(numbers.split()), tuple(features.split())
     PART_KINDS[name] = Kind(name, section, words, *sets, at or has(section, *numbers.split()))

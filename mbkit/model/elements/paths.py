@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.model.elements.kinds import EFFECTS, Kind, kind
+from mbkit.model.elements.kinds import EFFECTS, PART_KINDS, Kind, kind
 
 #: A `mbkit.model.description.Description`, a floor above.
 _Model = Any
@@ -54,7 +54,12 @@ class Path:
 
     def takes(self, kind: Kind) -> bool:
         """Return whether it carries a kind, or leaves it out with a note."""
-        return kind.name in {*self.carries, *self.notes} or (bool(kind.does) and kind.does <= self.carries)
+        if kind.name in {*self.carries, *self.notes}:
+            return True
+        # What does the same as another kind is carried with that.
+        return bool(kind.does) and all(
+            x in self.carries or (x in PART_KINDS and self.takes(PART_KINDS[x])) for x in kind.does
+        )
 
     def admit(self, model: _Model) -> tuple[str, ...]:
         """Return the notes on a model; raise `UnsupportedError` with every part that the path does not carry."""

@@ -21,7 +21,6 @@ from mbkit.model import Joint, Mimic, Model
 from mbkit.model.changes.dry_friction import FrictionNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.editing import called
-from mbkit.model.elements.forces import Force
 from mbkit.model.elements.formula import NUMPY, Formula
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
 from mbkit.model.parts import Coupler, Loop, rules_of
@@ -613,7 +612,9 @@ def _same_motion(a: Motion, b: Motion, near: Tolerances) -> bool:
 
 def differing(a: Any, b: Any, near: Tolerances) -> list[str]:
     """Return the fields in which two parts of one kind differ; of a force's formulas, by their values."""
-    names = [f.name for f in fields(a) if not (isinstance(a, Force) and f.name in ("symbols", "numbers"))]
+    names = [f.name for f in fields(a)]
+    if "formula" in names:
+        names = [n for n in names if n not in ("symbols", "numbers")]
     return [n for n in names if not _same(n, _value(a, getattr(a, n)), _value(b, getattr(b, n)), near)]
 
 
