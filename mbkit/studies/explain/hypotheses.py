@@ -455,7 +455,7 @@ def _mimic_difference(a: Mimic | None, b: Mimic | None, near: Tolerances) -> lis
     if a is None or b is None:
         says = f"lets it follow {b.joint!r}, which is free" if b else f"leaves it free, which follows {a.joint!r}"  # type: ignore[union-attr]
         return [Mistake("mimic", says, {"mimic": b})]
-    if a.joint == b.joint and near.number(a.ratio, b.ratio) and abs(a.offset - b.offset) <= near.relative:
+    if abs(a.offset - b.offset) <= near.relative and not differing(replace(a, offset=b.offset), b, near):
         return []
     one, other = (f"{number_text(m.ratio)} {m.joint} + {number_text(m.offset)}" for m in (b, a))
     return [Mistake("mimic", f"lets it follow {one}, not {other}", {"mimic": b})]
