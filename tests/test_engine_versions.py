@@ -469,7 +469,7 @@ def test_forces_by_functions_are_added_and_no_own_run_leaves_them_out():
     for quantity in ("inverse_dynamics", "forward_dynamics"):
         value, truth = (getattr(d, quantity)([0.4], [0.3], [0.2]) for d in (dyn, oracle))
         assert value == pytest.approx(truth, rel=1e-12)
-    with pytest.raises(UnsupportedError, match="forces of pushed"):
+    with pytest.raises(UnsupportedError, match="all of pushed: force 'well'"):
         dyn.rollout([0.4], [0.3], 1e-3, 2)
 
 

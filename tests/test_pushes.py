@@ -127,6 +127,16 @@ def test_engines_agree_on_robots(robot: str, floating: bool, wrenches: Any, axes
         close(mb.simulate(mb.dynamics(model, engine), q, v, 0.1, **given), reference)
 
 
+@pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
+def test_a_wrench_on_a_closed_loop_is_its_generalized_force(engine: str) -> None:
+    dyn, own = (mb.dynamics(mb.catalog.slider_crank(), x) for x in (engine, "lagrangian"))
+    q, v = own.project([0.5, -0.2, -0.1], [1.0, 0.0, 0.0])
+    pushed = mb.simulate(dyn, q, v, 0.05, dt=1e-3, wrenches={"rod": WRENCH}, wrench_axes="world")
+    force = lambda _, q, __: own.jacobian(q, "rod", "world").T @ WRENCH  # noqa: E731
+    close(pushed, mb.simulate(dyn, q, v, 0.05, dt=1e-3, torque=force))
+    assert np.abs(pushed.power_balance()).max() < 1e-10
+
+
 @pytest.fixture(scope="module")
 def exact() -> Any:
     model = brick()

@@ -206,6 +206,7 @@ def test_what_is_no_engine_of_ones_own_is_refused(tmp_path):
         ("mine", "good", "expected a Package"),
         ("mine", good._replace(file="/nowhere.py"), "the path of the engine's file"),
         ("mine", good._replace(tested=()), "at least one version"),
+        ("mine", good._replace(steps={"fixed": STACKED["fixed"]}), "none of .*joint_type.ball"),
     ):
         with pytest.raises(InputError, match=match):
             register_remote_engine(name, package)

@@ -41,7 +41,8 @@ from mbkit.engines.regressors import Regressors
 from mbkit.engines.steps import Steps
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Frame, Joint, Model
-from mbkit.model.description import CONSTRAINT_FEATURES
+from mbkit.model.elements.kinds import EFFECTS
+from mbkit.model.elements.paths import Path
 from mbkit.model.rolling import LIES_FLAT
 
 if TYPE_CHECKING:
@@ -76,42 +77,31 @@ def first_names(texts: Iterable[str], more: str = " and {} more") -> str:
     return ", ".join(all_[:_MAX_NAMES]) + (more.format(len(all_) - _MAX_NAMES) if all_[_MAX_NAMES:] else "")
 
 
-def require_tree(
-    model: Model, user: str, why: str = "it takes the tree alone", features: Iterable[str] = CONSTRAINT_FEATURES
-) -> None:
-    """Raise `UnsupportedError` for a model with constraints, or with some kinds of them, in the name of a user."""
-    texts = {
-        "loops": "loop closures",
-        "couplers": "couplers",
-        "prescribed": "motions prescribed in time",
-        "no_slip": "blades or rolling contacts, which hold velocities",
-    }
-    for feature in features:
-        text, parts = texts[feature], getattr(model, feature)
-        if parts:
-            names = first_names((repr(x.name) for x in parts), ", ...")
-            raise UnsupportedError(
-                f"{user}: {model.name} has {text} ({names}), and {why}; mbkit.dynamics(model, 'lagrangian') solves it "
-                f"with them, and model.without({feature!r}) is the tree without them"
-            )
-
-
-def require_no_forces(model: Model, engine: str, forces: Any = None, *, holds_friction: bool = False) -> None:
-    """Raise `UnsupportedError` for a model with forces by functions or friction, in the name of own integrators.
-
-    They do not have `forces`, by default all of the model's; those of an engine that `holds_friction` have its own.
-    """
-    if model.needs.friction and not holds_friction:
-        raise UnsupportedError(
-            f"{engine}: its own integrators do not hold the dry friction of {model.name}; use a method that any engine "
-            "has, such as rk4, or model.without('friction')"
-        )
-    if forces := model.forces if forces is None else forces:
-        names = first_names((repr(f.name) for f in forces), ", ...")
-        raise UnsupportedError(
-            f"{engine}: its own integrators do not know the forces of {model.name} by functions ({names}); use a "
-            "method that any engine has, such as rk4, or model.without('forces')"
-        )
+_OF_JOINTS: Final = "joint.armature joint.spring joint.damping"
+_OF_FORCES: Final = "joint frame bushing compensation compensation.partial of_time"
+#: Kinds that stand beside the terms of any adapter, at least in part: what holds a rotor's weight is a force.
+BESIDE: Final = frozenset(
+    [
+        "body.rotor",
+        "joint.friction",
+        "joint.friction.several",
+        "joint.stiction",
+        *(f"force.{x}" for x in _OF_FORCES.split()),
+    ]
+)
+#: And what every adapter here carries of trees by itself.
+OF_TREES: Final = BESIDE.union(
+    _OF_JOINTS.split(),
+    (f"{x}.several" for x in _OF_JOINTS.split()),
+    ("gravity", "mimic", "point.spring", "point.damper", "bound"),
+)
+OF_COUPLINGS: Final = frozenset(["coupling.spring", "coupling.damper", "coupling.armature"])
+OF_ANY_ENGINE: Final = "use a method that any engine has, such as rk4"
+SOLVED: Final = "mbkit.dynamics(model, 'lagrangian') takes all of them"
+#: Engines of one's own, unless they have another path.
+OWN_ENGINE: Final = Path("own engine", "", OF_TREES | OF_COUPLINGS | {"q"}, instead=SOLVED)
+#: The own derivation, which goes through the laws of energies, forces and rows.
+DERIVATION: Final = Path("derivation", "", frozenset([*EFFECTS, "energies"]))
 
 
 def scalar(value: Array | float) -> Any:
@@ -144,10 +134,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     refuses: ClassVar[dict[str, str]] = {}
     #: Whether parameters may still be without values when the adapter is built.
     takes_parameters: ClassVar[bool] = False
-    #: Whether a model may be energies without bodies.
-    takes_written: ClassVar[bool] = False
-    #: Why it does not take loops and prescribed motions; empty where it does.
-    lacks_constraints: ClassVar[str] = "it takes the tree alone"
+    #: The kinds of parts that it carries.
+    path: Path = OWN_ENGINE
     #: The point about which it writes composite inertias, by quantity, or for all others by the empty name; of each
     #: joint its own origin by default. `mbkit.engines.frames_and_momenta` has the choices.
     inertias_about: ClassVar[dict[str, str]] = {}
@@ -171,15 +159,13 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     _inverse_dynamics_derivatives: Callable[..., Any]
 
     def __init__(self, model: Model) -> None:
-        if not model.has_bodies and not self.takes_written:
-            raise UnsupportedError(
-                f"{self.engine}: {model.name} was written as energies and has no bodies; "
-                "the lagrangian engine and the oracle take it"
-            )
+        self.path.admit(model, f"{self.engine}:")
+        self._take(model)
+
+    def _take(self, model: Model) -> None:
+        """Take a model, whatever its parts."""
         if not self.takes_parameters:
             model.require_values(self.engine)
-        if model.constrained and self.lacks_constraints:
-            require_tree(model, self.engine, self.lacks_constraints)
         #: Whether the first accelerations, and the first step, look whether their state satisfies the constraints.
         self.looks = self.unstepped = model.constrained and not self.soft_constraints
         self._lock: Any = fork_safe(threading.RLock()) if self._one_at_a_time else nullcontext()
@@ -663,7 +649,7 @@ class WrenchedDynamics(Dynamics):
     _bare: Dynamics
 
     def __init__(self, dyn: Dynamics, frames: tuple[Frame, ...], axes: str) -> None:
-        self._bare, self._acting = dyn, (frames, axes)
+        self._bare, self._acting, self.path = dyn, (frames, axes), dyn.path
         self.soft_constraints, self.soft_friction = dyn.soft_constraints, dyn.soft_friction
         super().__init__(dyn.model)
         self._forward_dynamics = dyn._method("forward_dynamics")
@@ -706,7 +692,7 @@ class MappedDynamics(FrameByFrame, Dynamics):
     def holding(cls, model: Model, compiled: Any) -> Self:
         """Return the dynamics of what the engine compiled of a model elsewhere."""
         out = object.__new__(cls)
-        Dynamics.__init__(out, model)
+        out._take(model)
         out._hold(compiled)
         return out
 
@@ -748,14 +734,6 @@ STACKS: Final[dict[str, Callable[[Joint], list[tuple[str, Array]]]]] = {
     "spherical_zyx": lambda _: [("revolute", axis) for axis in (_Z, _Y, _X)],
     "planar": lambda _: [("prismatic", _X), ("prismatic", _Y), ("revolute", _Z)],
 }
-
-
-def unknown_joint(engine: str, joint: Joint) -> UnsupportedError:
-    """Return the error for a joint of a type that an adapter has no counterpart of."""
-    return UnsupportedError(
-        f"{engine}: joint {joint.name!r} is {joint.kind}, a type that this engine does not have; "
-        f"the lagrangian engine takes every joint type{joint.type.instead and f', and {joint.type.instead}'}"
-    )
 
 
 def no_dynamics(value: Any, name: str = "dyn") -> InputError:

@@ -17,7 +17,7 @@ from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity
 from mbkit.derivation.least_constraint import has_squares
-from mbkit.engines.base import Dynamics, scalar
+from mbkit.engines.base import DERIVATION, Dynamics, scalar
 from mbkit.engines.elements.dry_friction import UNDER_FORCE
 from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.linearization import of_parameters, of_second_order
@@ -163,8 +163,8 @@ class LagrangianDynamics(Dynamics):
     derived = has_elements = True
     _one_at_a_time = False
     takes_parameters = True
-    takes_written = True
-    lacks_derivatives = lacks_constraints = ""
+    path = DERIVATION
+    lacks_derivatives = ""
 
     def __init__(
         self,

@@ -28,7 +28,7 @@ from mbkit.codegen.program import program
 from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.derivation.body_motion import BODY_QUANTITIES
 from mbkit.derivation.constraints import CONSTRAINT_FUNCTIONS
-from mbkit.engines.base import Dynamics, scalar
+from mbkit.engines.base import DERIVATION, Dynamics, scalar
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Joint, Model
@@ -112,9 +112,9 @@ class OracleDynamics(Dynamics):
     engine = "oracle"
     bits = 113
     has_elements = True
-    takes_written = True
     _one_at_a_time = False
-    lacks_derivatives = lacks_constraints = ""
+    path = DERIVATION
+    lacks_derivatives = ""
     refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}
 
     def __init__(

@@ -22,17 +22,13 @@ from pydrake.multibody.tree import MultibodyForces, MultibodyForces_
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.engines import closed_loops, loads, regressors
-from mbkit.engines.base import MappedDynamics, require_tree
+from mbkit.engines.base import MappedDynamics
 from mbkit.engines.constrained import QUANTITIES as CONSTRAINT_QUANTITIES
 from mbkit.engines.drake.bodies import DrakeBodies
-from mbkit.engines.drake.model import DrakeModel, build
+from mbkit.engines.drake.model import DRAKE, NO_CONSTRAINTS, SAP, DrakeModel, build
 from mbkit.errors import NumericalError
 from mbkit.model import Model
 
-#: Name of the method that runs loops.
-SAP: Final = "drake_sap"
-#: Drake 1.51: evaluating a continuous plant's accelerations with constraints is an error.
-NO_CONSTRAINTS: Final = "Drake's continuous plant has no constraints between bodies"
 _WITHOUT_LOOPS: Final = {
     **dict.fromkeys(
         (
@@ -60,7 +56,8 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
     """
 
     engine = "drake"
-    lacks_derivatives = lacks_constraints = ""
+    path = DRAKE
+    lacks_derivatives = ""
     soft_constraints = True
     _takes_wrenches = ("inverse_dynamics", "forward_dynamics")
     refuses: ClassVar[dict[str, str]] = {
@@ -71,7 +68,6 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        require_tree(model, "drake", "its plants have no constraint of velocities", ("no_slip",))
         if model.constrained:
             parts = {"model": model.name, "parts": model.constraint_parts}
             vars(self)["refuses"] = self.refuses | {k: why.format(**parts) for k, why in _WITHOUT_LOOPS.items()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -18,13 +18,19 @@ from pydrake.multibody import tree
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 
 from mbkit._check import Array
-from mbkit.engines.base import STACKS, unknown_joint
+from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, SOLVED, STACKS
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Joint, Model
+from mbkit.model.elements.kinds import joint_types
+from mbkit.model.elements.paths import Path
 from mbkit.model.parts import Loop, PointSpring
 from mbkit.model.validation import static_bodies
 
 _TURN: Final = 2 * np.pi
+#: Name of the method that runs loops.
+SAP: Final = "drake_sap"
+#: Drake 1.51: evaluating a continuous plant's accelerations with constraints is an error.
+NO_CONSTRAINTS: Final = "Drake's continuous plant has no constraints between bodies"
 
 
 @dataclass(frozen=True)
@@ -47,16 +53,9 @@ class DrakeModel:
 def build(description: Model, *, gravity: bool = True, bushings: bool = True, step: float = 0.0) -> DrakeModel:
     """Return the plant, with or without gravity and the springs that have no length at rest.
 
-    With a step, s, it is discrete and holds the loops; a continuous one is the tree alone.
-
-    Raises `UnsupportedError` for what Drake refuses or cannot hold, and names it.
+    With a step, s, it is discrete and holds the loops; a continuous one is the tree alone. Raises `UnsupportedError`
+    for numbers that Drake refuses, and names the part.
     """
-    if description.couplings:
-        names = ", ".join(repr(c.name) for c in description.couplings)
-        raise UnsupportedError(
-            f"drake: {description.name} has joint couplings ({names}); Drake has no spring, damper or rotor on a sum "
-            "of joint coordinates"
-        )
     # A step of zero makes it continuous: ẋ = f(x) and nothing else.
     plant = MultibodyPlant(step)
     if step:
@@ -71,18 +70,18 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True, st
     added = {joint.name: _add(plant, joint, bodies) for joint in description.joints}
     springs = [s for s in description.springs if bushings or s.rest_length > 0]
     bushings_ = tuple(x for spring in springs for x in _add_spring(plant, spring, bodies))
+    ends = dict(bodies)
+    if step and any("world" in (loop.body_a, loop.body_b) for loop in description.loops):
+        # Drake 1.51.1 ends the process where a constraint holds the world itself.
+        ends["world"] = plant.AddRigidBody("ground", tree.SpatialInertia.Zero())
+        plant.WeldFrames(plant.world_frame(), ends["world"].body_frame())
     for loop in description.loops if step else ():
         with _refusal(f"drake: refuses loop {loop.name!r}"):
-            CONSTRAINTS[loop.kind](plant, loop, bodies[loop.body_a], bodies[loop.body_b])
+            CONSTRAINTS[loop.kind](plant, loop, ends[loop.body_a], ends[loop.body_b])
     for coupler in description.couplers if step else ():
-        if coupler.curve.any():
-            raise UnsupportedError(f"drake: coupler {coupler.name!r} is a curve; Drake has fixed ratios alone")
-        (follower,), *leaders = (added[name] for name in (coupler.joint, *coupler.leaders))
-        if len(leaders) > 1:
-            several = ", ".join(map(repr, coupler.leaders))
-            raise UnsupportedError(f"drake: coupler {coupler.name!r} has the leaders {several}; Drake takes one alone")
+        (follower,), (leader,) = (added[name] for name in (coupler.joint, *coupler.leaders))
         with _refusal(f"drake: refuses coupler {coupler.name!r}"):
-            plant.AddCouplerConstraint(follower, *leaders[0], coupler.ratio, coupler.offset)
+            plant.AddCouplerConstraint(follower, leader, coupler.ratio, coupler.offset)
     with _refusal(f"drake: refuses {description.name}"):
         plant.Finalize()
     return mapped(plant, description, added, bodies, bushings_)
@@ -155,8 +154,6 @@ def _add(plant: Any, joint: Joint, bodies: dict[str, Any]) -> list[Any]:
     """Add a joint, as a stack where it has several real coordinates; return Drake's joints."""
     parent, child = bodies[joint.parent], bodies[joint.child]
     X_PJ = RigidTransform(RotationMatrix(np.array(joint.rotation)), joint.translation)
-    if joint.kind not in _STEPS:
-        raise unknown_joint("drake", joint)
     if joint.kind == "fixed":
         return [plant.AddJoint(tree.WeldJoint(joint.name, parent.body_frame(), child.body_frame(), X_PJ))]
     frame = plant.AddFrame(tree.FixedOffsetFrame(f"{joint.name}.fixed", parent, X_PJ))
@@ -181,10 +178,52 @@ _STEPS: Final[dict[str, Callable[[Joint], Sequence[tuple[str, Array]]]]] = {
 }
 
 
+def _numbers_not_held(model: Model) -> Iterator[str]:
+    for joint in model.joints:
+        parts = np.split(joint.damping, range(3, len(joint.damping), 3)) if joint.type.quaternion is not None else []
+        if any(np.ptp(x) > 0 for x in parts):
+            yield f"joint {joint.name!r} is damped differently along its body axes; Drake damps it evenly"
+        if joint.kind == "helical" and joint.stiffness.any():
+            yield f"joint {joint.name!r} has a spring, which Drake's screw joint cannot have"
+
+
+#: Its terms are those of the tree, whatever binds it in positions.
+DRAKE: Final = Path(
+    "drake",
+    "",
+    joint_types(*_STEPS) | OF_TREES - {"joint.armature.several"} | {"row", "t"},
+    dict.fromkeys(OF_COUPLINGS, "Drake has nothing on a sum of joint coordinates")
+    | {"speed": "its plants have no constraint of velocities", "joint.armature.several": "Drake has no rotor for it"},
+    also=_numbers_not_held,
+    instead=SOLVED,
+)
+#: Of a continuous plant.
+DRAKE_RUNS: Final = replace(
+    DRAKE,
+    name="drake runs",
+    words="drake: its integrators do not hold all of",
+    carries=DRAKE.carries - BESIDE - {"row", "t", "mimic"} - joint_types("ball"),
+    why={
+        "mimic": "Drake does not reduce it; load with mimic='free'",
+        "joint_type.ball": "its roll, pitch and yaw there end at a pole",
+        "coupler.curve": "Drake has fixed ratios alone",
+        "coupler.several": "Drake takes one alone",
+        "row": f"{NO_CONSTRAINTS}; method={SAP!r} runs loops in the discrete one",
+    },
+    instead=OF_ANY_ENGINE,
+)
+DRAKE_SAP: Final = replace(
+    DRAKE_RUNS,
+    name="drake sap",
+    words="drake: its discrete plant does not hold all of",
+    carries=DRAKE_RUNS.carries | {"coupler", *(f"loop.{x}" for x in CONSTRAINTS)},
+    why=DRAKE_RUNS.why | {"row": "Drake has no such constraint"},
+    instead=SOLVED,
+)
+
+
 def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at: Any, body: Any) -> Any:
     damping, axis = float(joint.damping[k]), np.array(axis)
-    if damping < 0:
-        raise UnsupportedError(f"drake: joint {joint.name!r} has a negative damping, which Drake refuses")
     if kind == "revolute":
         added = plant.AddJoint(tree.RevoluteJoint(name, at, body, axis, damping))
     elif kind == "prismatic":
@@ -199,8 +238,6 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
         actuator.set_default_gear_ratio(1.0)
     stiffness, rest = float(joint.stiffness[k]), float(joint.rest[k])
     if stiffness:
-        if kind not in ("revolute", "prismatic"):
-            raise UnsupportedError(f"drake: joint {joint.name!r} has a spring, which Drake's {kind} joint cannot have")
         spring = tree.RevoluteSpring if kind == "revolute" else tree.PrismaticSpring
         with _refusal(f"drake: refuses the spring of joint {joint.name!r}"):
             plant.AddForceElement(spring(added, rest, stiffness))
@@ -208,19 +245,10 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
 
 
 def _turning(joint: Joint, at: Any, body: Any) -> Any:
-    linear, angular = (joint.damping[:0], joint.damping) if joint.kind == "ball" else np.split(joint.damping, 2)
-    for values in (linear, angular):
-        if len(values) and np.ptp(values) > 0:
-            raise UnsupportedError(
-                f"drake: joint {joint.name!r} is damped differently along its body axes; Drake damps it evenly"
-            )
-    if joint.armature.any():
-        raise UnsupportedError(
-            f"drake: joint {joint.name!r} is {joint.kind} and has armature, which Drake has no rotor for"
-        )
+    angular, linear = float(joint.damping[-1]), float(joint.damping[0])
     if joint.kind == "ball":
-        return tree.BallRpyJoint(joint.name, at, body, float(angular[0]))
-    return tree.QuaternionFloatingJoint(joint.name, at, body, float(angular[0]), float(linear[0]))
+        return tree.BallRpyJoint(joint.name, at, body, angular)
+    return tree.QuaternionFloatingJoint(joint.name, at, body, angular, linear)
 
 
 def mapped(

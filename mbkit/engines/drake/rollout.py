@@ -7,7 +7,7 @@ dampers and constraints at its end: the run tends to that of rigid loops with th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,30 +16,15 @@ from pydrake.systems.framework import EventStatus
 
 from mbkit import _interrupt, spatial
 from mbkit._check import Array
-from mbkit.engines.base import first_names, require_no_forces
-from mbkit.engines.drake.engine import NO_CONSTRAINTS, SAP, DrakeDynamics
-from mbkit.engines.drake.model import CONSTRAINTS, DrakeModel, build
+from mbkit.engines.drake.engine import DrakeDynamics
+from mbkit.engines.drake.model import DRAKE_RUNS, DRAKE_SAP, DrakeModel, build
 from mbkit.errors import UnsupportedError
-from mbkit.model import Model
 
 
 class _PlantState:
-    """A state in a plant of a description, in the description's numbers.
-
-    Raises `UnsupportedError` for mimic joints, which Drake does not reduce, and ball joints, whose angles have a pole
-    there.
-    """
+    """A state in a plant of a description, in the description's numbers."""
 
     def __init__(self, dyn: DrakeDynamics, maps: DrakeModel) -> None:
-        require_no_forces(dyn.model, "drake")
-        if dyn.model.layout.reduced:
-            raise UnsupportedError("drake: its integrators know no mimic joints; load with mimic='free'")
-        for joint in dyn.model.joints:
-            if joint.kind == "ball":
-                raise UnsupportedError(
-                    f"drake: ball joint {joint.name!r} has roll, pitch and yaw there, which end at a pole; "
-                    "use a method that any engine has, such as rk853"
-                )
         self._dyn, self._layout, self._maps, self._plant = dyn, dyn.model.layout, maps, maps.plant
         self._context = maps.plant.CreateDefaultContext()
         self._force = maps.plant.get_applied_generalized_force_input_port()
@@ -88,11 +73,7 @@ class DrakeRun(_PlantState):
         v: Array,
         watch: Callable[[float], object],
     ) -> None:
-        if dyn.model.constrained:
-            raise UnsupportedError(
-                f"drake: {dyn.model.name} has constraints ({dyn.model.constraint_parts}), and {NO_CONSTRAINTS}; "
-                f"method={SAP!r} runs loops in the discrete one"
-            )
+        DRAKE_RUNS.admit(dyn.model)
         super().__init__(dyn, dyn.maps)
         self.put(q, v)
         simulator = Simulator(self._plant, self._context)
@@ -143,14 +124,10 @@ class DrakeRun(_PlantState):
 
 
 class DiscreteRun(_PlantState):
-    """Steps of the discrete plant of dt s, with the loops among its constraints.
-
-    Raises `UnsupportedError` for loops of a kind that Drake does not have and for prescribed motions, by name.
-    """
+    """Steps of the discrete plant of dt s, with the loops among its constraints."""
 
     def __init__(self, dyn: DrakeDynamics, dt: float) -> None:
-        if why := [*_no_counterpart(dyn.model)]:
-            raise UnsupportedError(f"drake: {'; '.join(why)}; mbkit.dynamics(model, 'lagrangian') has them all")
+        DRAKE_SAP.admit(dyn.model)
         super().__init__(dyn, build(dyn.model, step=dt))
 
     def step(self, q: Array, v: Array, tau: Array) -> tuple[Array, Array]:
@@ -160,12 +137,3 @@ class DiscreteRun(_PlantState):
         # What a simulator does at each period, without its clock.
         self._plant.ExecuteForcedEvents(self._context, publish=False)
         return self.state()
-
-
-def _no_counterpart(model: Model) -> Iterator[str]:
-    for loop in model.loops:
-        if loop.kind not in CONSTRAINTS:
-            yield f"loop {loop.name!r} is {loop.kind}, and Drake has no such constraint, only {', '.join(CONSTRAINTS)}"
-    if model.prescribed:
-        names = first_names(repr(x.name) for x in model.prescribed)
-        yield f"the motion of {names} is prescribed in time, which Drake's plant has no constraint for"

@@ -22,13 +22,21 @@ from mbkit._attributes import single_values
 from mbkit._check import Array, batch_of, count, real, shown
 from mbkit._warn import warn
 from mbkit.engines import known_defects, regressors
-from mbkit.engines.base import MappedDynamics, require_no_forces
+from mbkit.engines.base import MappedDynamics
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
 from mbkit.engines.constrained import off_by
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.mujoco.bodies import MujocoBodies
 from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopEnds, Softness, friction_law, law
-from mbkit.engines.mujoco.model import MujocoModel, build, by_mbkit, full_mass_matrix, heard_warnings
+from mbkit.engines.mujoco.model import (
+    FRICTION_LOSS,
+    MUJOCO,
+    MUJOCO_RUNS,
+    MujocoModel,
+    build,
+    full_mass_matrix,
+    heard_warnings,
+)
 from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
@@ -72,7 +80,6 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
     """
 
     engine = "mujoco"
-    lacks_constraints = ""
     soft_constraints = True
     _takes_wrenches = ("forward_dynamics",)
     # mj_comPos and mj_crb
@@ -100,12 +107,13 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         solimp: ArrayLike | None = None,
         soft_friction: bool = False,
     ) -> None:
-        super().__init__(model)
-        self.softness = Softness.of(solref, solimp)
         if not isinstance(soft_friction, (bool, np.bool_)):
             raise InputError(f"soft_friction: expected True or False, got {shown(soft_friction)}")
         # Without friction there is nothing to hold.
         self.soft_friction = bool(soft_friction) and model.needs.friction
+        self.path = FRICTION_LOSS if self.soft_friction else MUJOCO
+        super().__init__(model)
+        self.softness = Softness.of(solref, solimp)
         self._hold(build(model, softness=self.softness, soft_friction=self.soft_friction))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -452,17 +460,10 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         Raises
         ------
         UnsupportedError
-            For reduced mimic joints (MuJoCo would make them soft), and forces on a free joint's translation (MuJoCo
-            holds them in world axes), and forces given by functions, which MuJoCo does not know, and exact dry
-            friction.
+            For what MuJoCo does not hold: mimic joints, forces by functions and exact dry friction, and forces on a
+            free joint's translation, which MuJoCo holds in world axes.
         """
-        require_no_forces(self.model, "mujoco", by_mbkit(self.model), holds_friction=self.soft_friction)
-        if self._reduced:
-            names = ", ".join(j.name for j in self.model.joints if j.mimic)
-            raise UnsupportedError(
-                f"mujoco: native rollouts of mimic joints ({names}) would follow a soft equality, not the reduced "
-                "equations; load with mimic='free', or use method='rk4' on this engine"
-            )
+        MUJOCO_RUNS.admit(self.model.without("friction") if self.soft_friction else self.model)
         q0, v0 = self.model.check_q(q0, "q0"), self.model.check_v(v0, "v0")
         size = batch_of(q0=q0, v0=v0)
         if size is not None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import mujoco
@@ -18,7 +18,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.base import STACKS
+from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, SOLVED, STACKS
 from mbkit.engines.imported import unused
 from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness
 from mbkit.errors import MbkitError, UnsupportedError
@@ -102,11 +102,8 @@ def build(
     """Compile the description, with shapes to draw and sites of its frames where shapes are given, if only none.
 
     `soft_friction` leaves MuJoCo's friction loss on. `spheres` gives every body a sphere of 1 µm, to measure the cost
-    of geometry.
-
-    Raises `UnsupportedError` for a joint or a body that MuJoCo cannot hold, and names it.
+    of geometry. Raises `UnsupportedError` for a body that MuJoCo refuses, and names it.
     """
-    (FRICTION_LOSS if soft_friction else MUJOCO).admit(description)
     spec, placed, disabled = specified(description, softness, soft_friction)
     if spheres:
         for name, body in placed.bodies.items():
@@ -335,17 +332,11 @@ _OWN_STACKS: Final[dict[str, list[tuple[Any, Array, str]]]] = {
     "free": [(_SLIDE, _X, ".x"), (_SLIDE, _Y, ".y"), (_SLIDE, _Z, ".z"), (_BALL, _Z, ".ball")],
 }
 _NO_STIFFNESS: Final = "MuJoCo's equality of it leaves J̇ v out, which no stiffness makes up for"
-_CARRIED: Final = (
-    "gravity body.rotor mimic joint.stiction point.spring point.damper coupling.spring coupling.damper "
-    "coupling.armature coupler coupler.several force.joint force.frame force.bushing force.compensation "
-    "force.compensation.partial force.of_time bound"
-)
-_OF_JOINTS: Final = [f"joint.{x}" for x in ("armature", "spring", "damping", "friction")]
 MUJOCO: Final = Path(
     "mujoco",
-    "mujoco:",
+    "",
     joint_types(*STACKS, *_OWN_STACKS)
-    | {*_CARRIED.split(), *_OF_JOINTS, *(f"{x}.several" for x in _OF_JOINTS), *(f"loop.{x}" for x in EQUALITIES)},
+    | OF_TREES.union(OF_COUPLINGS, ["coupler", "coupler.several"], (f"loop.{x}" for x in EQUALITIES)),
     why={
         "loop.distance": _NO_STIFFNESS,
         "coupler.curve": _NO_STIFFNESS,
@@ -354,20 +345,29 @@ MUJOCO: Final = Path(
     },
     apart=(("row", "mimic", "MuJoCo's own equations would hold both softly; mimic='free' loads independent joints"),),
     also=_numbers_not_held,
-    instead="mbkit.dynamics(model, 'lagrangian') holds all of them exactly",
+    instead=SOLVED,
 )
-FRICTION_LOSS: Final = Path(
-    "mujoco friction loss",
-    "soft_friction: MuJoCo's friction loss does not hold the dry friction of",
-    MUJOCO.carries - {"joint.stiction"},
-    {"joint.stiction": "MuJoCo has no static friction and no Stribeck curve", **MUJOCO.why},
+FRICTION_LOSS: Final = replace(
+    MUJOCO,
+    name="mujoco friction loss",
+    words="soft_friction: MuJoCo's friction loss does not hold the dry friction of",
+    carries=MUJOCO.carries - {"joint.stiction"},
+    why={"joint.stiction": "MuJoCo has no static friction and no Stribeck curve", **MUJOCO.why},
     apart=(
         *MUJOCO.apart,
         ("mimic", "jump", "a mimic joint is held softly by MuJoCo, and friction of its own would act on that"),
         ("row", "jump", "its solver would answer for loops and friction at once"),
     ),
-    also=_numbers_not_held,
     instead="leave soft_friction out for mbkit's exact law",
+)
+MUJOCO_RUNS: Final = Path(
+    "mujoco runs",
+    "mujoco: its own integrators do not hold all of",
+    MUJOCO.carries
+    - (BESIDE - {"body.rotor", "force.bushing", "force.compensation", "force.compensation.partial"} | {"mimic"}),
+    {"mimic": "MuJoCo would hold it softly; load with mimic='free'"},
+    also=lambda model: map(str, by_mbkit(model)),
+    instead=OF_ANY_ENGINE,
 )
 
 

@@ -22,7 +22,7 @@ from mbkit.engines.elements.passive import JointPassive
 from mbkit.engines.frames_and_momenta import ALIGNED, WORLD
 from mbkit.engines.pinocchio.bodies import PinocchioBodies
 from mbkit.engines.pinocchio.constraints import PinConstraints, PinocchioConstrained
-from mbkit.engines.pinocchio.model import PinModel, PointSprings, build
+from mbkit.engines.pinocchio.model import PINOCCHIO, PinModel, PointSprings, build
 from mbkit.engines.pinocchio.regressors import PinRegressors
 from mbkit.engines.regressors import with_losses
 from mbkit.model import Model
@@ -145,7 +145,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
         "constraint_rate_gradient": "its derivatives are of trees; mbkit.dynamics(model, 'lagrangian') has this one",
     }
-    lacks_constraints = ""
+    path = PINOCCHIO
     _takes_wrenches = ("inverse_dynamics", "forward_dynamics")
     # computeMinverse
     inertias_about: ClassVar[dict[str, str]] = {"mass_matrix_inverse": WORLD}

@@ -15,9 +15,11 @@ import numpy as np
 import pinocchio as pin
 
 from mbkit._check import Array
-from mbkit.engines.base import unknown_joint
+from mbkit.engines.base import OF_COUPLINGS, OF_TREES, SOLVED
 from mbkit.engines.elements.passive import pull
 from mbkit.model import Body, Joint, Model, PointSpring
+from mbkit.model.elements.kinds import joint_types
+from mbkit.model.elements.paths import Path
 
 _X, _Y, _Z = np.eye(3)
 
@@ -41,7 +43,7 @@ class PinModel:
 
 
 def build(description: Model) -> PinModel:
-    """Return the description as Pinocchio holds it; `UnsupportedError` for a joint type that it does not have."""
+    """Return the description as Pinocchio holds it."""
     model = pin.Model()
     model.name = description.name
     model.gravity = pin.Motion(np.array(description.gravity), np.zeros(3))
@@ -53,8 +55,6 @@ def build(description: Model) -> PinModel:
     for joint in description.tree:
         carrier, R, p = bodies[joint.parent]
         R, p = R @ joint.rotation, p + R @ joint.translation
-        if joint.kind not in _STEPS:
-            raise unknown_joint("pinocchio", joint)
         if joint.type.nv:
             for suffix, motion in _STEPS[joint.kind](joint):
                 carrier = model.addJoint(carrier, motion, pin.SE3(R, p), joint.name + suffix)
@@ -113,6 +113,10 @@ _STEPS: Final[dict[str, Callable[[Joint], list[tuple[str, object]]]]] = {
     "planar": lambda _: [(".x", pin.JointModelPX()), (".y", pin.JointModelPY()), (".theta", pin.JointModelRZ())],
     "free": lambda _: [("", pin.JointModelFreeFlyer())],
 }
+#: Its rows are formulas of frames, alike for all of them.
+PINOCCHIO: Final = Path(
+    "pinocchio", "", joint_types(*_STEPS) | OF_TREES | OF_COUPLINGS | {"row", "speed", "t"}, instead=SOLVED
+)
 
 
 # Point-to-point springs and dampers on Pinocchio's kinematics.

@@ -8,13 +8,15 @@ and its dynamics. MuJoCo has no other constructor in all versions than its parse
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mbkit.engines.base import STACKS
-from mbkit.errors import UnsupportedError
+from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, SOLVED, STACKS
 from mbkit.model import Joint, Model
+from mbkit.model.elements.kinds import joint_types
+from mbkit.model.elements.paths import Path
 from mbkit.model.validation import static_bodies
 
 #: Joint type -> the joints that an engine has in its place, one after the other.
@@ -57,23 +59,26 @@ _OF_ALL: Final[dict[str, Callable[[Joint], list[dict[str, Any]]]]] = {
 #: The same where joints of several rotations are one joint of the engine, or a stack of them.
 ONE_BY_ONE: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _one)
 STACKED: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _stacked)
+SENT: Final = Path("sent", "", joint_types(*ONE_BY_ONE) | OF_TREES | OF_COUPLINGS, instead=SOLVED)
+NEWTON: Final = replace(SENT, name="newton", carries=SENT.carries - joint_types("helical"))
+_RUN: Final = SENT.carries - BESIDE - {"mimic"}
+_WHY: Final = {"mimic": "it would have to be reduced; load with mimic='free'"}
+REMOTE_RUNS: Final = Path("remote runs", "", _RUN, _WHY, instead=OF_ANY_ENGINE)
+#: Runs of engines that know no more than what acts on one joint.
+REMOTE_RUNS_OF_JOINTS: Final = replace(
+    REMOTE_RUNS, name="remote runs of joints", carries=_RUN - OF_COUPLINGS - {"point.spring", "point.damper"}
+)
 
 
-def travelling(engine: str, steps: Steps | None, model: Model) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
+def travelling(steps: Steps | None, model: Model) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
     """Return a description as an engine's file in `remote` takes it, and the engine's joints of each joint.
 
-    `steps` are the engine's joints in the place of each joint type; without them the description travels as MJCF.
-
-    Raises `UnsupportedError` for what the engine does not have, or what does not travel.
+    `steps` are the engine's joints in the place of each joint type; without them the description travels as MJCF,
+    with its refusals.
     """
     if steps is None:
         return _mjcf(model)
     static = static_bodies(model.joints)
-    for joint in model.joints:
-        if joint.kind not in steps:
-            raise UnsupportedError(
-                f"{engine} of other versions: joint {joint.name!r} is {joint.kind}, which is not sent"
-            )
     return {
         "gravity": model.gravity.tolist(),
         "bodies": {
@@ -104,8 +109,9 @@ def _mjcf(model: Model) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
     from mbkit.engines.mujoco.mjcf_writer import mjcf_text
     from mbkit.engines.mujoco.model import specified
 
-    # `Dynamics` adds these to an engine's own terms.
-    model = model.without("forces") if model.forces else model
+    # `Dynamics` adds these to an engine's own terms, also what holds the weight of armature.
+    model = model.without("forces", "friction")
+    model = replace(model, forces=(), bindings=tuple(b for b in model.bindings if b.where != "forces"))
     text = mjcf_text(model, "for another version")
     return {"text": text}, {name: tuple(own) for name, own in specified(model)[1].joints.items()}
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines.base import MappedDynamics, first_names, require_no_forces
+from mbkit.engines.base import MappedDynamics
 from mbkit.engines.elements.passive import JointPassive, pull
 from mbkit.engines.frames_and_momenta import ALIGNED, seen_from
-from mbkit.engines.versions.description import places, travelling
+from mbkit.engines.versions.description import REMOTE_RUNS, REMOTE_RUNS_OF_JOINTS, places, travelling
 from mbkit.engines.versions.engine_version import EngineVersion
 from mbkit.engines.versions.process import RemoteError, new_key, process_of
 from mbkit.errors import NumericalError, UnsupportedError
@@ -69,7 +69,7 @@ class VersionDynamics(MappedDynamics):
     """
 
     def __init__(self, model: Model, version: EngineVersion) -> None:
-        self.version = version
+        self.version, self.path = version, version.package.path
         super().__init__(model)
         self._convention = version.package.convention
         self._data, self._names = self._travelling()
@@ -131,7 +131,7 @@ class VersionDynamics(MappedDynamics):
 
     def _travelling(self) -> tuple[dict[str, Any], Mapping[str, Sequence[str]]]:
         """Return what is sent, and the engine's joints of each joint."""
-        return travelling(self.version.engine, self.version.package.steps, self.model)
+        return travelling(self.version.package.steps, self.model)
 
     def _build(self) -> None:
         """Send the model, to a process that does not hold it yet."""
@@ -302,9 +302,8 @@ class VersionDynamics(MappedDynamics):
     def rollout(self, q0: Array, v0: Array, dt: float, steps: int, method: str = "rk4") -> tuple[Array, Array]:
         """Return the states of a run by the engine's own integrator, (steps + 1, nq) and (steps + 1, nv).
 
-        Raises `UnsupportedError` for an engine without one, and for what its own run would leave out: forces by
-        functions, the reduction of mimic joints, and springs and dampers that only mbkit knows of. Raises
-        `NumericalError` for a run that is not finite.
+        Raises `UnsupportedError` for an engine without one, and for what its own run would leave out, such as forces
+        by functions, and springs that only mbkit knows of; `NumericalError` for a run that is not finite.
         """
         q, v = self.own_run(self.model.check_q(q0), self.model.check_v(v0), dt, steps, method)
         if not (np.isfinite(q).all() and np.isfinite(v).all()):
@@ -327,13 +326,10 @@ class VersionDynamics(MappedDynamics):
         run by an exception.
         """
         model = self.model
-        if model.layout.reduced:
-            raise UnsupportedError(f"{self.engine}: its own runs do not reduce mimic joints")
-        require_no_forces(model, self.engine)
+        path = REMOTE_RUNS if self._beside is None else REMOTE_RUNS_OF_JOINTS
+        path.admit(model, f"{self.engine}: its own runs do not hold all of")
         if not self.runs:
             raise UnsupportedError(f"{self.engine}: it has no rollout of its own here")
-        if self._beside is not None and (own := [*(x.name for x in model.springs), *(x.name for x in model.couplings)]):
-            raise UnsupportedError(f"{self.engine}: its own runs leave out {first_names(map(repr, own))}")
         x, u, _ = self._native(q0, v0)
         forces = None if tau is None else self._torques(tau, (*np.shape(q0)[:-1], steps, model.nv))
         parts, done, count = [(x[..., None, :], u[..., None, :])], 0, _FIRST_STEPS

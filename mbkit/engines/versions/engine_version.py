@@ -13,8 +13,10 @@ from packaging.version import Version
 from mbkit._check import WORLD, real
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.versions import environment
-from mbkit.engines.versions.description import ONE_BY_ONE, STACKED, Convention, Steps
+from mbkit.engines.versions.description import NEWTON, ONE_BY_ONE, SENT, STACKED, Convention, Steps
 from mbkit.errors import InputError, UnknownNameError
+from mbkit.model.elements import paths
+from mbkit.model.elements.kinds import joint_types
 
 _NAME: Final = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _VERSION: Final = re.compile(r"\d+(\.[0-9A-Za-z]+)*")
@@ -32,6 +34,8 @@ class Package(NamedTuple):
     convention : Convention
     steps : mapping, optional
         The engine's joints in the place of each joint type. None: it reads the MJCF that mbkit writes.
+    path : paths.Path
+        The kinds of parts that it carries; by default all that travels.
     bits : int
         Of the significand with which it computes: 53, or 24 in single precision.
     inertias_about : mapping
@@ -57,6 +61,7 @@ class Package(NamedTuple):
     seconds: float
     convention: Convention
     steps: Steps | None = None
+    path: paths.Path = SENT
     bits: int = 53
     inertias_about: Mapping[str, str] = {}
     tested: tuple[str, ...] = ()
@@ -104,7 +109,8 @@ PACKAGES: Final[dict[str, Package]] = {
     "newton": Package(
         *("newton", "newton", 680, 22),
         Convention(turned={"free": (0, 3), "ball": (0,)}),
-        {kind: step for kind, step in STACKED.items() if kind != "helical"},
+        STACKED,
+        NEWTON,
         bits=24,
         # Those of its own mass matrix are about each centre of mass, by Jacobians; its solver's are about the world's
         # origin.
@@ -230,7 +236,8 @@ def register_remote_engine(name: str, package: Package) -> None:
     A worker process and the command know it where a package names a module that calls this function in the entry
     point group ``"mbkit.engines"``.
 
-    Raises `InputError` for a name that another engine has, a file that is not there, or no tested version.
+    Raises `InputError` for a name that another engine has, a file that is not there, no tested version, or a
+    `path` with joint types that have no steps.
     """
     if not isinstance(package, Package):
         raise InputError(f"package: expected a Package, got {type(package).__name__}")
@@ -240,6 +247,8 @@ def register_remote_engine(name: str, package: Package) -> None:
         raise InputError(f"package.file: expected the path of the engine's file, got {package.file!r}")
     if not package.tested:
         raise InputError("package.tested: expected at least one version, got none")
+    if lost := joint_types(*STACKED) & package.path.carries - joint_types(*package.steps or STACKED):
+        raise InputError(f"package.path: expected steps of each type that it carries, got none of {sorted(lost)}")
     PACKAGES[name] = package
 
 

@@ -22,7 +22,7 @@ class Path:
     name : str
         Key in `PATHS`.
     words : str
-        Begin of a refusal; the model's name follows.
+        Begin of a refusal; the model's name follows. Empty for a path of several users, who give their own.
     carries : frozenset of str
         Names of kinds, and effects: ``"V"`` and ``"t"`` stand for all kinds that have these effects alone.
     why : mapping of str to str
@@ -40,7 +40,7 @@ class Path:
     name: str
     words: str
     carries: frozenset[str]
-    why: Mapping[str, str] = field(default_factory=dict)
+    why: dict[str, str] = field(default_factory=dict)
     notes: Mapping[str, str] = field(default_factory=dict)
     apart: tuple[tuple[str, str, str], ...] = ()
     also: Callable[[_Model], Iterable[str]] = lambda _: ()
@@ -61,21 +61,21 @@ class Path:
             x in self.carries or (x in PART_KINDS and self.takes(PART_KINDS[x])) for x in kind.does
         )
 
-    def admit(self, model: _Model) -> tuple[str, ...]:
+    def admit(self, model: _Model, words: str = "") -> tuple[str, ...]:
         """Return the notes on a model; raise `UnsupportedError` with every part that the path does not carry."""
-        if refusal := self.refuses(model):
+        if refusal := self.refuses(model, words):
             raise UnsupportedError(refusal)
         kinds = [kind(name) for name in model.acts]
         return tuple(text for key, text in self.notes.items() if any(_is(k, key) for k in kinds))
 
-    def refuses(self, model: _Model) -> str:
+    def refuses(self, model: _Model, words: str = "") -> str:
         """Return why the path does not carry a model, with every part; empty where it does."""
         kinds = [kind(name) for name in model.acts]
         lost = [k for k in kinds if not self.takes(k)]
         faults = dict.fromkeys([*self._refused(model, lost), *self._together(model, kinds), *self.also(model)])
         features = ", ".join(dict.fromkeys(repr(k.features[-1]) for k in lost if k.features))
         remedies = self.instead, f"model.without({features}) leaves them out" if features else ""
-        return f"{self.words} {model.name}: {'; '.join(filter(None, (*faults, *remedies)))}" if faults else ""
+        return f"{self.words or words} {model.name}: {'; '.join(filter(None, (*faults, *remedies)))}" if faults else ""
 
     def _refused(self, model: _Model, lost: list[Kind]) -> Iterator[str]:
         leaders = {p.name for k in lost if "q" in k.does for p in k.parts(model)}
