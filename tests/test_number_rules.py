@@ -225,3 +225,13 @@ def test_a_curve_that_a_parameter_may_bend_is_a_curve() -> None:
     b.add_coupler("gear", "k", "j", ratio=0.5, curve=(mb.Parameter("c", 0.0), 0.0, 0.0))
     assert b.build().acts["coupler.curve"] == ("gear",)
     assert PART_KINDS["coupler.curve"].numbers == frozenset()
+
+
+def test_a_bushing_that_a_parameter_may_damp_loses_energy() -> None:
+    def mounted(damping: object) -> mb.Model:
+        b = link("prismatic", axis=(1, 0, 0))
+        b.add_bushing("mount", body_a="world", body_b="link", stiffness=7.0, damping=damping)
+        return b.build()
+
+    assert mounted([mb.Parameter("d", 0.0)] + [0.0] * 5).loses_energy
+    assert not mounted(0.0).loses_energy

@@ -19,7 +19,7 @@ from mbkit.errors import LoadError, ModelError, UnsupportedError
 from mbkit.load.xml_reader import Element, Reader
 from mbkit.load.xml_reader import unused as unused
 from mbkit.model import Body, Coupler, Joint, Loop, Model, ModelBuilder
-from mbkit.model.parts import joint_of, numbers
+from mbkit.model.parts import numbers
 
 
 def reserved(name: str, names: set[str]) -> str:
@@ -106,8 +106,8 @@ class Parts:
         return reserved(name, self._names.setdefault(what, set()))
 
     def joint(self, *place: Any, **numbers: Any) -> None:
-        """Add a joint; arguments as of `joint_of`."""
-        self.joints.append(joint_of(*place, **numbers))
+        """Add a joint; arguments as of `Joint._of`."""
+        self.joints.append(Joint._of(*place, **numbers))
 
     def body(self, name: str, mass: float = 0.0, com: Array | None = None, inertia: Array | None = None) -> None:
         """Add a body; without numbers it has none of matter."""
@@ -123,15 +123,13 @@ def checked(engine: str, model: Model) -> Model:
     """Return an importer's model; raise `UnsupportedError` where nothing moves in it or a number is not sound."""
     if not model.nv:
         raise UnsupportedError(f"{engine}: nothing moves in the model that it built from the file (nv = 0)")
-    parts = (
-        *((f"body {x.name!r} with a", x) for x in model.bodies),
-        *((f"joint {x.name!r} with a", x) for x in model.joints),
-    )
-    for what, part in (*parts, ("a", model)):
+    part: Any
+    for part in (*model.bodies, *model.joints, model):
         for name, rule, value in numbers(part):
             # Not a number, or memory that nobody wrote to.
             if rule.acts and not (np.abs(value) <= _MAX_NUMBER).all():
-                raise UnsupportedError(f"{engine}: built {what} with an impossible {name}: {value}")
+                where = "" if part is model else f"{type(part).__name__.lower()} {part.name!r} with "
+                raise UnsupportedError(f"{engine}: built {where}an impossible {name}: {value}")
     return model
 
 

@@ -22,7 +22,7 @@ from mbkit.lagrangian.printer import ExpressionPrinter
 from mbkit.model import Model
 from mbkit.model.description import Needs
 from mbkit.model.joint_types import PRISMATIC
-from mbkit.model.parts import Body, Frame, Joint, joint_of
+from mbkit.model.parts import Body, Frame, Joint
 
 
 def energies_latex(form: EnergyForm) -> str:
@@ -43,7 +43,7 @@ def abstract_parts(names: Sequence[str]) -> tuple[tuple[Body, ...], tuple[Joint,
 
 def _coordinate(name: str, before: str) -> Joint:
     axis = np.array([[1.0, 0.0, 0.0]])
-    return joint_of(name, PRISMATIC.name, before, name, np.eye(3), np.zeros(3), axes=axis)
+    return Joint._of(name, PRISMATIC.name, before, name, np.eye(3), np.zeros(3), axes=axis)
 
 
 class EnergyModel(Model):

@@ -136,10 +136,8 @@ class ArgumentReader:
             return np.eye(3)
         return matrix
 
-    def limits(self, name: str, value: ArrayLike | None, n: int, default: float) -> Array:
-        """Return n numbers, which may be infinite; `default` for None."""
-        if value is None:
-            return np.full(n, default)
+    def limits(self, name: str, value: ArrayLike, n: int, default: float) -> Array:
+        """Return n numbers, which may be infinite; `default` after a fault."""
         try:
             array = real_array(name, value)
         except InputError:
@@ -369,40 +367,38 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         read = self._read
         name = read.name("joint name", name)
         item = f"joint {name!r}"
+        limits = lower, upper, velocity_limit, effort_limit
+        numbers: Sequence[Any] = *limits, armature, damping, friction, stiffness, rest, stiction, stribeck_velocity
         if not isinstance(kind, str) or kind not in KINDS:
             near = nearest(kind, KINDS) if isinstance(kind, str) else []
             read.faults.append(f"{item}: unknown kind {shown(kind)}; use one of {', '.join(near or KINDS)}")
             # The other faults of this call would follow from this one.
-            kind, axis, axis2, pitch, mimic = FIXED.name, None, None, 0.0, None
-            lower = upper = velocity_limit = effort_limit = stiction = stribeck_velocity = None
-            armature = damping = friction = stiffness = rest = 0.0
-        numbers = lower, upper, velocity_limit, effort_limit, armature, damping, friction, stiffness, rest
-        given: dict[str, Any] = dict(zip(NUMBERS_OF_JOINTS, (*numbers, stiction, stribeck_velocity), strict=True))
+            kind, axis, axis2, pitch, mimic, numbers = FIXED.name, None, None, 0.0, None, ()
+        given = dict[str, Any]((n, x) for n, x in zip(NUMBERS_OF_JOINTS, numbers, strict=False) if x is not None)
         given |= {"axes": (axis, axis2)} | ({} if mimic is None else {"mimic": mimic})
         turn = {"kind": kind, "rotation": read.orientation(item, rotation, rpy)}
         ready = turn | self._joint_fields(name, kind_of(kind), given)
         if (follows := ready.pop("mimic", None)) is not None:
             ready["mimic"] = Mimic(follows[0], **self._numbers("joints", name, **follows[1]))
         values = {"parent": parent, "child": child, "translation": translation, "pitch": pitch}
-        self._add(Joint, "joints", "joint", name, values, ready)
+        fields = self._numbers("joints", name, **self._read_fields(Joint, item, values), **ready)
+        self._parts["joints"].append(Joint._of(name, **fields))
 
     def _joint_fields(self, name: str, type_: JointType, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return what a joint's arguments say, by field; of a mimic the leader, and ratio and offset."""
         read, out = self._read, {}
         for field, x in given.items():
-            item = f"joint {name!r}: {field}"
+            item, rule = f"joint {name!r}: {field}", rules_of(Joint).get(field)
             if field == "axes":
                 out[field] = read.axes(f"joint {name!r}", type_, *x)
-            elif field in ("lower", "upper"):
-                out[field] = read.limits(item, x, type_.nq, -np.inf if field == "lower" else np.inf)
-            elif field.endswith("_limit"):
-                out[field] = read.limits(item, x, type_.nv, np.inf)
-            elif field in ("friction", "stiction", "stribeck_velocity"):
-                out[field] = x if x is None else read.array(item, x, (type_.nv,), each=True)
-            elif field != "mimic":
+            elif rule is None:
+                out |= {} if (follows := read.mimic(f"joint {name!r}", x)) is None else {field: follows}
+            elif not rule.acts:
+                out[field] = read.limits(item, x, type_.nq if field in ("lower", "upper") else type_.nv, rule.nothing)
+            elif rule.fixed:
+                out[field] = read.array(item, x, (type_.nv,), each=True)
+            else:
                 out[field] = read.quantities(item, x, type_.nv, each=True)
-            elif (follows := read.mimic(f"joint {name!r}", x)) is not None:
-                out[field] = follows
         return out
 
     def add_frame(

@@ -15,8 +15,8 @@ import numpy as np
 
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, ModelError, UnknownNameError
-from mbkit.model.elements.forces import Bushing, Force, GravityCompensation, drives, lost, needs_time
-from mbkit.model.elements.kinds import PART_KINDS, acts, kind
+from mbkit.model.elements.forces import Bushing, Force, GravityCompensation
+from mbkit.model.elements.kinds import PART_KINDS, acts, has, kind
 from mbkit.model.elements.motion_laws import Motion, beyond, interval
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.joint_types import KINDS
@@ -31,9 +31,7 @@ from mbkit.model.parts import (
     NoSlip,
     NumberRule,
     PointSpring,
-    _Frozen,
     read_only,
-    rules_of,
 )
 
 #: Attributes of a description that bind its coordinates or velocities to each other.
@@ -43,8 +41,7 @@ CONSTRAINT_FEATURES: Final = tuple(dict.fromkeys(k.section for k in PART_KINDS.v
 def _plain(value: Any) -> Any:
     if is_dataclass(value):
         given = {f.name: getattr(value, f.name) for f in fields(value)}
-        optional = rules_of(type(value)) if isinstance(value, _Frozen) else ()
-        return {name: _plain(x) for name, x in given.items() if x is not None or name not in optional}
+        return {name: _plain(x) for name, x in given.items() if name not in getattr(value, "_not_given", ())}
     if isinstance(value, np.ndarray):
         return [_plain(x) for x in value.tolist()]
     if isinstance(value, (list, tuple)):
@@ -367,7 +364,7 @@ class Description:
     @cached_property
     def time_parameter(self) -> str | None:
         """Name of the parameter that is the time; None where the equations do not depend on it."""
-        if not (self.prescribed or needs_time(self)):
+        if not (self.prescribed or any(f.of_time for f in self.forces)):
             return None
         taken = {p.name for b in self.bindings for p in b.expression.parameters()}
         return next(name for name in chain(("t", "time"), (f"t_{k}" for k in count())) if name not in taken)
@@ -383,12 +380,14 @@ class Description:
     @cached_property
     def driven_by_forces(self) -> bool:
         """Whether a force of the model may add energy, as one that is given by more than a potential does."""
-        return drives(self)
+        return any(f.drives for f in self.forces)
 
     @cached_property
     def loses_energy(self) -> bool:
         """Whether dampers, dry friction, or forces without a potential do work that no energy accounts for."""
-        return self.needs.damping or self.needs.friction or lost(self)
+        damped = has("forces", "damping")
+        lost = self.driven_by_forces or any(isinstance(f, Bushing) and damped(self, f) for f in self.forces)
+        return self.needs.damping or self.needs.friction or lost
 
     @cached_property
     def interval(self) -> tuple[float, float]:

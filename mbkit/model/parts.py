@@ -54,7 +54,7 @@ class NumberRule:
     acts: bool = True
     #: It is an orientation or an axis.
     direction: bool = False
-    #: It may be None. A digest then lacks it, as those from before it was there do.
+    #: It may be None.
     optional: bool = False
 
     def entries(self, part: Any) -> tuple[Sequence[str], ...] | None:
@@ -149,6 +149,11 @@ class _Frozen:
     def _fault(self, text: str) -> ModelError:
         what = type(self).__name__.lower()
         return ModelError(f"{what} {getattr(self, 'name', '')!r}" if hasattr(self, "name") else what, [text])
+
+    @property
+    def _not_given(self) -> set[str]:
+        """The optional numbers without a value; a digest lacks them, as those from before they were there do."""
+        return {n for n in rules_of(type(self)) if getattr(self, n) is None}
 
     def _values(self) -> tuple[Any, ...]:
         return tuple(getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]  # every subclass is a dataclass
@@ -268,20 +273,23 @@ class Joint(_Frozen):
         """Whether its friction at rest may be above that of motion."""
         return self.stiction is not None and bool((self.stiction > self.friction).any())
 
+    @classmethod
+    def _of(
+        cls, name: str, kind: str, parent: str, child: str, rotation: Array, translation: Array, **own: Any
+    ) -> Joint:
+        """Return a joint with these numbers; its others do nothing, and without them it has no axes."""
+        sizes, values = (
+            {OF_Q: kind_of(kind).nq, OF_V: kind_of(kind).nv},
+            dict[str, Any](axes=np.empty((0, 3)), pitch=0.0),
+        )
+        for field_, rule in rules_of(cls).items():
+            if rule.shape in sizes and not rule.optional:
+                values[field_] = np.full(sizes[rule.shape], rule.nothing)
+        return cls(name, kind, parent, child, rotation, translation, **values | own)
+
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
         # Another process may not have registered the type.
         return (type(self), self._values()) if self.type.built_in else (_of_type, (self.type, self._values()))
-
-
-def joint_of(
-    name: str, kind: str, parent: str, child: str, rotation: Array, translation: Array, **numbers: Any
-) -> Joint:
-    """Return a joint with these numbers; its others do nothing, and without them it has no axes."""
-    sizes, values = {OF_Q: kind_of(kind).nq, OF_V: kind_of(kind).nv}, dict[str, Any](axes=np.empty((0, 3)), pitch=0.0)
-    for field_, rule in rules_of(Joint).items():
-        if rule.shape in sizes and not rule.optional:
-            values[field_] = np.full(sizes[rule.shape], rule.nothing)
-    return Joint(name, kind, parent, child, rotation, translation, **values | numbers)
 
 
 def _of_type(joint_type: JointType, values: tuple[Any, ...]) -> Joint:

@@ -17,8 +17,6 @@ from mbkit.model.model import Model
 
 #: Kinds of parts that share one set of names each.
 _NAMED: Final = (("bodies", "frames"), *((kind,) for kind in KINDS_OF_PARTS if kind not in ("bodies", "frames")))
-#: Parts that may hang on the ground.
-_PLACED: Final = ("joints", "springs", "loops", "forces", "no_slip")
 
 
 def read_pose(name: str, pose: ArrayLike | None) -> tuple[Array, Array]:
@@ -48,7 +46,7 @@ def mounted(model: Model, pose: ArrayLike) -> Model:
         )
     bindings = list(model.bindings)
     parts: dict[str, Any] = {
-        kind: tuple(hung_on(x, kind, "world", R, p, bindings) for x in getattr(model, kind)) for kind in _PLACED
+        kind: tuple(hung_on(x, kind, "world", R, p, bindings) for x in getattr(model, kind)) for kind in KINDS_OF_PARTS
     }
     note = f"mounted at {np.round(p, 6).tolist()} m, roll, pitch, yaw {_degrees(R)} degrees"
     drawn_from = tuple(x.hung_on("world", R, p) for x in model.sources)

@@ -33,7 +33,7 @@ from mbkit.model.joint_types import FIXED
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, nominal
-from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, PointSpring, joint_of
+from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, PointSpring
 from mbkit.model.poses import body_poses
 
 #: Of limits and of what is closed: digits of a typed number.
@@ -195,7 +195,7 @@ def _fixed(joint: Joint, values: Values, bindings: list[Binding]) -> Joint:
     R, p = (np.array(x, dtype=float) for x in joint.type.placement(np, joint, list(values[joint.name])))
     place = moved_by(np.eye(3), joint.rotation @ p, entries(joint, "joints", "translation", bindings))
     bindings[:] = [b for b in bindings if (b.where, b.part) != ("joints", joint.name)]
-    still = joint_of(joint.name, FIXED.name, joint.parent, joint.child, joint.rotation @ R, joint.translation)
+    still = Joint._of(joint.name, FIXED.name, joint.parent, joint.child, joint.rotation @ R, joint.translation)
     return with_fields(still, "joints", {"translation": place}, bindings)  # type: ignore[no-any-return]  # a Joint
 
 

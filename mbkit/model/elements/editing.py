@@ -14,7 +14,7 @@ from mbkit._check import Array, shown
 from mbkit.errors import InputError, nearest
 from mbkit.model.elements.beams import OnBeam
 from mbkit.model.elements.forces import RATE
-from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on, moved_by, names_in, renamed
+from mbkit.model.elements.references import _OF_BODIES, KINDS_OF_PARTS, entries, hung_on, moved_by, names_in, renamed
 from mbkit.model.parameters import Binding, Number, split
 from mbkit.model.parts import OF_Q, OF_V, Frame, Joint, Mimic, rules_of
 
@@ -314,7 +314,7 @@ class EditingBuilder:
         for kind, parts in self._parts.items():
             for part in [*parts]:
                 own = part.name in joints if kind == "joints" else part.name in bodies and kind == "bodies"
-                refers = kind not in ("bodies", "joints") and _touches(part, kind, bodies, joints, frames)
+                refers = kind not in ("bodies", "joints") and _touches(part, bodies, joints, frames)
                 refers = refers or bool(gone & {*getattr(part, "arguments", ())} - {*getattr(part, "symbols", ())})
                 if own or refers:
                     parts.remove(part)
@@ -470,15 +470,11 @@ def _without(force: Any, joints: set[str]) -> Any:
     return replace(force, without=tuple(name for name in force.without if name not in joints))
 
 
-def _touches(part: Any, kind: str, bodies: set[str], joints: set[str], frames: set[str]) -> bool:
+def _touches(part: Any, bodies: set[str], joints: set[str], frames: set[str]) -> bool:
     """Return whether a part that is no body and no joint hangs on removed ones."""
-    if kind in ("couplings", "couplers", "prescribed"):
-        return bool(names_in(part) & joints)
-    if hasattr(part, "joint"):
-        return part.joint in joints
-    if hasattr(part, "frame"):
-        return part.frame in frames | bodies
-    return bool({getattr(part, side, None) for side in ("body", "body_a", "body_b")} & bodies)
+    return bool(
+        names_in(part, _OF_BODIES) & (bodies | frames) or names_in(part, ("joint", "leader", "joints")) & joints
+    )
 
 
 def _changes(part: Any, numbers: Mapping[str, Any], were_free: set[str], free: set[str]) -> Iterator[str]:

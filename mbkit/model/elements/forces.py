@@ -346,21 +346,6 @@ def by_functions(model: _Model) -> tuple[Force, ...]:
     return tuple(f for f in model.forces if not isinstance(f, GravityCompensation))
 
 
-def needs_time(model: _Model) -> bool:
-    """Return whether a force depends on the time."""
-    return any(f.of_time for f in model.forces)
-
-
-def drives(model: _Model) -> bool:
-    """Return whether a force may add energy."""
-    return any(f.drives for f in model.forces)
-
-
-def lost(model: _Model) -> bool:
-    """Return whether a force does work that no potential energy accounts for."""
-    return drives(model) or any(isinstance(f, Bushing) and f.damping.any() for f in model.forces)
-
-
 def force_faults(model: _Model) -> Iterator[str]:
     """Yield one sentence for each fault of the forces of a description."""
     names = Counter(f.name for f in model.forces)

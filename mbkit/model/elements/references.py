@@ -13,6 +13,7 @@ from mbkit.errors import UnknownNameError
 from mbkit.model.elements.forces import Force, coordinate_arguments
 from mbkit.model.elements.formula import Formula
 from mbkit.model.parameters import Binding, Expression, split
+from mbkit.model.parts import rules_of
 
 #: A `mbkit.model.description.Description`, a floor above.
 _Model = Any
@@ -28,9 +29,9 @@ _OF_JOINTS: Final = ("joint", "leader", "joints", "without")
 _SIDES: Final = {"parent": "", "body_a": "_a", "body_b": "_b"}
 
 
-def names_in(part: Any) -> set[str]:
-    """Return the names of the bodies, frames and joints that a part refers to."""
-    given = [getattr(part, n, ()) for n in (*_OF_BODIES, *_OF_JOINTS)]
+def names_in(part: Any, of: Iterable[str] = (*_OF_BODIES, *_OF_JOINTS)) -> set[str]:
+    """Return the names of the bodies, frames and joints that a part refers to, or those in some of its fields."""
+    given = [getattr(part, n, ()) for n in of]
     own = {x for value in given for x in ((value,) if isinstance(value, str) else value)}
     mimic = getattr(part, "mimic", None)
     return own | ({mimic.joint} if mimic else set())
@@ -120,10 +121,9 @@ def hung_on(part: Any, where: str, body: str, R: Array, p: Any, bindings: list[B
         if getattr(part, side, None) != "world":
             continue
         part = replace(part, **{side: body})
-        names = {f.name for f in fields(part)}
-        for name, of in ((f"rotation{end}", R), (f"axis{end}", R)):
-            if name in names:
-                part = replace(part, **{name: of @ getattr(part, name)})
+        names = rules_of(type(part)).keys()
+        for name in {f"rotation{end}", f"axis{end}"} & names:
+            part = replace(part, **{name: R @ getattr(part, name)})
         for name in {f"translation{end}", f"point{end}"} & names:
             point = moved_by(R, p, entries(part, where, name, bindings))
             part = with_fields(part, where, {name: point}, bindings)

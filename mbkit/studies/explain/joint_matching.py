@@ -18,7 +18,6 @@ from mbkit.engines.imported import unused
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.forces import Force, coordinate_arguments
 from mbkit.model.joint_types import FIXED, PRISMATIC
-from mbkit.model.parts import joint_of
 from mbkit.studies.explain.hypotheses import Hypothesis
 from mbkit.studies.explain.merged_model import (
     OTHERS,
@@ -368,7 +367,7 @@ def _held(model: Model, name: str) -> Model:
     """Return the description with a joint fixed at zero, and those that follow it."""
     held = {name} | {j.name for j in model.joints if j.mimic is not None and j.mimic.joint == name}
     joints = tuple(
-        joint_of(j.name, FIXED.name, j.parent, j.child, j.rotation, j.translation) if j.name in held else j
+        Joint._of(j.name, FIXED.name, j.parent, j.child, j.rotation, j.translation) if j.name in held else j
         for j in model.joints
     )
     return fitting(model, joints=joints)
