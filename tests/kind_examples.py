@@ -625,6 +625,16 @@ def _energies(name: str) -> Example:
     return Example(name, mb.lagrangian.systems.pendulum().model, c, a.joints, np.array([0.3]), ("bodies", "energies"))
 
 
+def _written(part: str) -> Callable[[str], Example]:
+    """Return the maker of an example's equations on paper, which have the same motion."""
+
+    def make(name: str) -> Example:
+        x = EXAMPLES[part](name)
+        return replace(x, model=mb.lagrangian.from_model(x.model).model, words=("energies", "bodies"))
+
+    return make
+
+
 NUMBERS: dict[str, dict[str, float]] = {
     "armature": {"armature": 0.3},
     "spring": {"stiffness": 2.0, "rest": 0.3},
@@ -636,6 +646,9 @@ NUMBERS: dict[str, dict[str, float]] = {
 }
 EXAMPLES: dict[str, Callable[[str], Example]] = {
     "energies": _energies,
+    "written.row": _written("loop.distance"),
+    "written.speed": _written("no_slip.blade"),
+    "written.t": _written("force.of_time"),
     "gravity": lambda name: arm(name, gravity=True).built(("gravity",)),
     "body.rotor": _rotor,
     "mimic": _mimic,

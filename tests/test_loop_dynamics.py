@@ -399,7 +399,7 @@ def test_power_of_drives_counts_in_the_balance() -> None:
 def test_what_would_be_the_trees_alone_is_refused() -> None:
     dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
     q = np.zeros(3)
-    with pytest.raises(UnsupportedError, match="operational_space: four_bar has loops"):
+    with pytest.raises(UnsupportedError, match=r"operational_space: .*four_bar: loop 'pin'"):
         mb.operational_space(dyn, q, "coupler")
     with pytest.raises(InputError, match="tau: expected the force under which four_bar moves"):
         dyn.joint_wrenches(q, q, q)

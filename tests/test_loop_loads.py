@@ -447,7 +447,7 @@ def test_coordinates_that_are_not_independent_are_refused() -> None:
     with pytest.raises(UnknownNameError):
         dyn.reduced_inertia(q, ["theta1", "elbow"])
     driven, at = closed_tree(1, "point", drive=True)
-    with pytest.raises(UnsupportedError, match="depend on the time"):
+    with pytest.raises(UnsupportedError, match=r"'j0' is moved in time.*N θ̇ alone.*without\('prescribed'\)"):
         mb.dynamics(driven).reduced_inertia(at, driven.coordinate_names[0])
 
 
@@ -499,7 +499,7 @@ def test_couplers_move_as_mimic_joints_do() -> None:
     assert load[1, 4] == pytest.approx(tau[0, 1] + oracle.constraint_forces(q[0], v[0], tau[0])[0], rel=1e-12)
     run = mb.simulate(dynamics(model, "lagrangian"), q[0], v[0], 0.2, dt=1e-3)
     assert np.abs(oracle.constraint_residual(run.q)).max() < 1e-14
-    with pytest.raises(UnsupportedError, match="geared has no loops"):
+    with pytest.raises(UnsupportedError, match="geared: it has no loops"):
         oracle.loop_wrenches(q, v, tau)
     assert not model.without("loops").couplers
     assert model.digest != geared(ratio=3.0).digest
@@ -601,7 +601,7 @@ def test_contacts_without_slip_have_forces_of_actuators_and_no_loads() -> None:
             assert off(dyn.forward_dynamics(q, v, forces.tau), a) < 1e-12
             assert not dyn.supports & {"joint_wrenches", "newton_euler_residual", "undetermined_loads"}
             for tau in (None, forces.tau):
-                with pytest.raises(UnsupportedError, match=r"contacts without slip.*whose forces act on bodies"):
+                with pytest.raises(UnsupportedError, match=r"no slip .* velocities, and its forces act on bodies"):
                     dyn.joint_wrenches(q, v, a, tau=tau)
-            with pytest.raises(UnsupportedError, match="contacts without slip, whose velocities lead to no path"):
+            with pytest.raises(UnsupportedError, match="holds velocities, and its velocities lead to no path"):
                 dyn.reduced_inertia(q, model.coordinate_names[0])

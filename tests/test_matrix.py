@@ -32,7 +32,7 @@ from mbkit.model.elements.kinds import PART_KINDS, Kind, kind, register_kind
 from mbkit.model.elements.paths import PATHS as GATES
 from mbkit.model.elements.paths import Path as Gate
 from mbkit.model.joint_types import KINDS as JOINT_TYPES
-from tests import kind_examples
+from tests import kind_examples, path_checks
 from tests.kind_examples import EXAMPLES, TYPES
 from tests.plain_mechanics import TIP, Case, random_case
 from tests.test_engine_versions import present
@@ -261,7 +261,9 @@ def test_a_hinge_that_a_loop_holds_may_have_stiction(engine: str) -> None:
 
 WITH_DRAKE = find_spec("pydrake") is not None
 for file in sorted(Path(mb.__file__).parent.rglob("*.py")):
-    if "elements.paths import" in file.read_text(encoding="utf-8") and (WITH_DRAKE or "drake" not in file.parts):
+    text = file.read_text(encoding="utf-8")
+    declares = "elements.paths import" in text or "elements import paths" in text
+    if declares and (WITH_DRAKE or "drake" not in file.parts):
         import_module(".".join(file.relative_to(Path(mb.__file__).parent.parent).with_suffix("").parts))
 
 
@@ -483,6 +485,7 @@ CHECKS: dict[str, Callable[[mb.Model, Path], None]] = {
     "remote runs of joints": by_a_run_of_joints,
     "base parameters": by_base_parameters,
     "explain": by_explaining,
+    **path_checks.CHECKS,
 }
 
 
@@ -526,6 +529,7 @@ def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
     model = example(name)
     finer = name.rpartition(".")[0]
     also = {"force.of_time": "force.joint", "joint.limit.several": "joint.limit", "joint.stiction": "joint.friction"}
+    also |= dict.fromkeys(("written.row", "written.speed", "written.t"), "energies")
     wanted = {name, also.get(name, ""), finer} & {*PART_KINDS}
     # What holds a weight has one.
     weighs = {"gravity"} & {*model.acts}
@@ -538,20 +542,21 @@ def test_a_kind_acts_alone_and_is_taken_out(name: str) -> None:
         for feature in PART_KINDS[name].features:
             assert model.without(feature).digest == model.without(*wanted - {"mimic"}).digest
     else:
-        assert name == "mimic" or name == "energies"
+        assert name in ("mimic", "energies", "written.row", "written.speed", "written.t")
 
 
 #: Beams have tests of their own.
 OF_TYPES = [(name, path) for name in TYPES if name != "joint_type.beam" for path in CHECKS if path in ON_ENGINES]
 
 
+@pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(("name", "path"), [*product(EXAMPLES, CHECKS), *OF_TYPES])
 def test_a_gate_refuses_a_kind_by_name_or_the_path_is_right(name: str, path: str, tmp_path: Path) -> None:
     gate, model = GATES[BELOW.get(path, path)], example(name)
     gate = gate if gate.refuses(model) else GATES[path]
     refused = [kind(k) for k in model.acts if not gate.takes(kind(k))]
-    numbers = list(gate.also(model))
-    if not refused and not numbers:
+    numbers, refusal = list(gate.also(model)), gate.refuses(model)
+    if not refusal:
         CHECKS[path](model, tmp_path)
         return
     with pytest.raises(UnsupportedError) as told:
@@ -562,6 +567,7 @@ def test_a_gate_refuses_a_kind_by_name_or_the_path_is_right(name: str, path: str
         any(k.words.format(p=p) in text for k in refused if k.at(model, p)) for k in refused for p in k.parts(model)
     )
     assert all(x in text for x in numbers)
+    assert refused or numbers or gate.asks[1] in text
     assert all(repr(k.features[-1]) in text for k in refused if k.features)
 
 

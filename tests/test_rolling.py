@@ -479,9 +479,9 @@ def test_loads_and_reduced_inertia_do_not_leave_contact_forces_out_in_silence() 
     still = np.zeros(9)
     for engine in ("lagrangian", "pinocchio", "oracle"):
         dyn = mb.dynamics(model, engine)
-        with pytest.raises(UnsupportedError, match=r"'rear', 'front'.*constraint_forces"):
+        with pytest.raises(UnsupportedError, match=r"'rear'.*'front'.*constraint_forces"):
             dyn.joint_wrenches(still, still, still, tau=still)
-        with pytest.raises(UnsupportedError, match=r"contacts without slip.*consistent_changes"):
+        with pytest.raises(UnsupportedError, match=r"holds velocities.*consistent_changes"):
             dyn.reduced_inertia(still, "lean")
 
 

@@ -25,7 +25,7 @@ from mbkit.derivation.body_motion import OF_FRAME, OF_WHOLE
 from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import held_at_rest
-from mbkit.model.description import CONSTRAINT_FEATURES
+from mbkit.model.elements import paths
 
 #: Quantity -> (name in C of its one output, its meaning).
 _OUTPUTS: Final = {
@@ -71,6 +71,13 @@ _INPUTS: Final = {
     "parameters": "parameters",
 }
 
+C_CODE: Final = paths.Path(
+    "c",
+    "a tree's program leaves out what holds",
+    paths.ALL - {"row", "speed"} | {"written.row", "written.speed"},
+    notes={"jump": held_at_rest},
+    instead="mbkit.lagrangian.from_model(model).model has them in its equations",
+)
 #: Data of a description that no function holds.
 _LEFT_OUT: Final = ("limits", "effort_limits")
 #: The comment at the head of the header.
@@ -126,7 +133,7 @@ def _declaration(f: CFunction, macro: str, nv: int) -> str:
     return f"{_comment(about)}\n{one_line};"
 
 
-def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_line: str) -> str:
+def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_line: str, notes: Iterable[str]) -> str:
     macro = prefix.upper()
     present = [need.replace("_", " ") for need, on in model.needs.as_dict().items() if on and need not in _LEFT_OUT]
     q_units, v_units = _units(model)
@@ -141,7 +148,6 @@ def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_lin
     for name, mimic in mimics:
         ratio, offset = ("(of the parameters)" if math.isnan(x) else repr(x) for x in (mimic.ratio, mimic.offset))
         followers += f"\n    {c_comment(name)} = {ratio} * {c_comment(mimic.joint)} + {offset}"
-    held = f"Note: {note}." if (note := held_at_rest(model)) else ""
     description = _DESCRIPTION.read_text(encoding="utf-8").format(
         first_line=first_line,
         model=model,
@@ -155,7 +161,7 @@ def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_lin
         macro=macro,
         parameters=parameters,
         followers=followers,
-        friction="".join(f"\n    {line}" for line in wrap(c_comment(held), 84)),
+        notes="".join(f"\n    {line}" for note in notes for line in wrap(c_comment(f"Note: {note}."), 84)),
     )
     sizes = {"NQ": model.nq, "NV": model.nv} | ({"NP": len(model.parameters)} if model.parameters else {})
     blocks = [
@@ -358,13 +364,7 @@ def export_c(
     for quantity in wanted:
         if quantity in OF_FRAME and not named:
             raise InputError(f"frames: {quantity} is of a frame; expected the names of some, got none")
-    for feature in CONSTRAINT_FEATURES:
-        if getattr(model, feature, ()):
-            paper = "mbkit.lagrangian.from_model(model).model with them, or " if feature != "no_slip" else ""
-            raise UnsupportedError(
-                f"{model.name} has {feature!r}, which C code of its tree leaves out; export {paper}"
-                f"model.without({feature!r})"
-            )
+    notes = C_CODE.admit(model)
     if not model.nv:
         raise UnsupportedError(f"{model.name} cannot be exported: no joint of it moves, and C has no empty arrays")
     prefix = c_identifier(model.name) if name is None else name
@@ -386,7 +386,7 @@ def export_c(
         name=prefix,
         digest=model.digest,
         functions=functions,
-        header=_header(prefix, model, functions, f"{written_by}; do not edit, export again."),
+        header=_header(prefix, model, functions, f"{written_by}; do not edit, export again.", notes),
         source=f'/* {written_by}; see {prefix}.h. */\n#include "{prefix}.h"\n{c_code(prefix, code)}',
         versions=versions,
     )

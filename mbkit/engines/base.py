@@ -20,7 +20,9 @@ from mbkit._attributes import ReadOnly, single_values
 from mbkit._check import Array, all_finite, batch_of, rows
 from mbkit._fork import fork_safe
 from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
-from mbkit.engines.closed_loops.reduced_inertia import IndependentMotion
+from mbkit.engines.closed_loops.actuation import ACTUATOR_FORCES
+from mbkit.engines.closed_loops.loop_loads import LOOP_LOADS
+from mbkit.engines.closed_loops.reduced_inertia import REDUCED_INERTIA, IndependentMotion
 from mbkit.engines.elements.dry_friction import UNDER_FORCE, DryFriction
 from mbkit.engines.frames_and_momenta import (
     ALIGNED,
@@ -63,6 +65,14 @@ _OF_BODIES: Final = frozenset(
     {*frames_and_momenta.QUANTITIES, *loads.QUANTITIES, *regressors.QUANTITIES, *closed_loops.OF_BODIES}
     - {"mass_matrix_inverse"}
 )
+#: Path of a quantity that not every model has.
+_GATES: Final = {
+    **dict.fromkeys(loads.OF_SINGLE_BODIES, loads.LOADS),
+    **dict.fromkeys(closed_loops.OF_BODIES, LOOP_LOADS),
+    **dict.fromkeys(constrained.QUANTITIES, constrained.ROWS),
+    "actuator_forces": ACTUATOR_FORCES,
+    "reduced_inertia": REDUCED_INERTIA,
+}
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
 #: Names in a list of an error message.
@@ -178,12 +188,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         following = loads.FOLLOWING | closed_loops.FOLLOWING
         needed = {x: following.get(x, x) for x in QUANTITIES}
         given = {x for x, y in needed.items() if y not in self.refuses and hasattr(self, f"_{y}")}
-        if not self.model.constrained:
-            given -= {*constrained.QUANTITIES, *closed_loops.QUANTITIES}
-        elif not self.model.loops:
-            given -= closed_loops.OF_BODIES
-        if self.model.forces or self.model.no_slip:
-            given = {x for x in given if not {x, needed[x]} & loads.OF_SINGLE_BODIES}
+        closed = {path for path in _GATES.values() if path.refuses(self.model)}
+        given = {x for x in given if not {_GATES.get(x), _GATES.get(needed[x])} & closed}
         return frozenset(given if self.model.has_bodies else given - _OF_BODIES)
 
     def __repr__(self) -> str:
@@ -531,12 +537,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         """Return the adapter's method for a quantity; raise `UnsupportedError` where it has none."""
         if quantity in _OF_BODIES:
             self.model.require_bodies(quantity)
-        if quantity in loads.OF_SINGLE_BODIES and (self.model.forces or self.model.no_slip):
-            which, feature = ("forces by functions", "forces") if self.model.forces else ("contacts", "no_slip")
-            raise UnsupportedError(
-                f"{self.engine} cannot give {quantity} of {self.model.name}: {which} are known by what they do to the "
-                f"motion, not to single bodies; model.without({feature!r}) has the loads without them"
-            )
+        if quantity in _GATES:
+            _GATES[quantity].admit(self.model, f"{quantity}: not known of")
         method = getattr(self, f"_{quantity}", None)
         if method is None or quantity in self.refuses:
             reason = self.refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of
 from mbkit._reproducible import dependent, unit_rows
 from mbkit._warn import warn
-from mbkit.errors import InputError, MbkitWarning, NumericalError, UnsupportedError
+from mbkit.errors import InputError, MbkitWarning, NumericalError
+from mbkit.model.elements.paths import ALL, Path
 
 if TYPE_CHECKING:
     from mbkit.model import Model
@@ -33,6 +34,8 @@ QUANTITIES: Final = (
     "constraint_forces",
     "generalized_constraint_force",
 )
+ASKED: Final = frozenset({"row", "speed"}), "it has no loops and no other constraints"
+ROWS: Final = Path("constraint rows", "", ALL, asks=ASKED)
 
 
 def off_by(error: float, exact: str) -> str:
@@ -108,13 +111,6 @@ class Constrained:
     def projects(self) -> bool:
         """Whether runs project their states onto constraints."""
         return self.model.constrained and not self.soft_constraints
-
-    def _bound(self, quantity: str, **states: ArrayLike) -> Array:
-        if not self.model.constrained:
-            raise UnsupportedError(f"{quantity}: {self.model.name} has no loops and no other constraints")
-        if "tau" in states:
-            self._look(states["q"])
-        return self._evaluate(quantity, **states)
 
     @property
     def _states_held(self) -> Any:
@@ -196,7 +192,7 @@ class Constrained:
         >>> bool(abs(dyn.constraint_residual(q)).max() < 1e-14)
         True
         """
-        return self._bound("constraint_residual", q=q)
+        return self._evaluate("constraint_residual", q=q)
 
     def constraint_jacobian(self, q: ArrayLike) -> Array:
         """Return J of all rows, with the rates J v + c; (m, nv) or (N, m, nv).
@@ -210,7 +206,7 @@ class Constrained:
         >>> J.shape, bool(abs(J @ v).max() < 1e-14)
         ((2, 3), True)
         """
-        return self._bound("constraint_jacobian", q=q)
+        return self._evaluate("constraint_jacobian", q=q)
 
     def constraint_rate(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return the rates J v + c of all rows, zero in a consistent state: ḟ, then A v - b; (m,) or (N, m).
@@ -223,7 +219,7 @@ class Constrained:
         >>> bool(abs(dyn.constraint_rate(q, v)).max() < 1e-14)
         True
         """
-        return self._bound("constraint_rate", q=q, v=v)
+        return self._evaluate("constraint_rate", q=q, v=v)
 
     def constraint_rate_gradient(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return the derivative of the rates J v + c by q, (m, nv) or (N, m, nv), on the own derivation and the oracle.
@@ -238,7 +234,7 @@ class Constrained:
         >>> dyn.constraint_rate_gradient(q, v).shape
         (2, 3)
         """
-        return self._bound("constraint_rate_gradient", q=q, v=v)
+        return self._evaluate("constraint_rate_gradient", q=q, v=v)
 
     def consistent_changes(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return the small changes of a consistent state that keep it consistent, as columns of N, (2 nv, k).
@@ -294,7 +290,7 @@ class Constrained:
         >>> bool(abs(dyn.constraint_jacobian(q) @ a + dyn.constraint_bias(q, v)).max() < 1e-12)
         True
         """
-        return self._bound("constraint_bias", q=q, v=v)
+        return self._evaluate("constraint_bias", q=q, v=v)
 
     def constraint_forces(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
         """Return the multipliers λ of all rows under the force τ, (m,) or (N, m).
@@ -310,7 +306,8 @@ class Constrained:
         >>> dyn.constraint_forces(q, v, [0.0] * 3).shape, len(dyn.constraint_names)
         ((2,), 2)
         """
-        return self._bound("constraint_forces", q=q, v=v, tau=tau)
+        self._look(q)
+        return self._evaluate("constraint_forces", q=q, v=v, tau=tau)
 
     def generalized_constraint_force(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
         """Return Jᵀ λ, the generalized force that keeps the constraints under τ; (nv,) or (N, nv).
@@ -323,7 +320,8 @@ class Constrained:
         >>> dyn.generalized_constraint_force(q, v, [0.0] * 3).shape
         (3,)
         """
-        return self._bound("generalized_constraint_force", q=q, v=v, tau=tau)
+        self._look(q)
+        return self._evaluate("generalized_constraint_force", q=q, v=v, tau=tau)
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:
         # Dry friction is in τ already.

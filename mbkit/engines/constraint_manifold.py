@@ -21,9 +21,9 @@ from mbkit.derivation.constraints import discs_of
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
-from mbkit.engines.constrained import CONSISTENT, singular_pose
+from mbkit.engines.constrained import CONSISTENT, ROWS, singular_pose
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
 from mbkit.model.manifold import random_state, shortened_steps
 
@@ -366,8 +366,7 @@ def _residuals(x: Array) -> str:
 
 def manifold_of(dyn: Dynamics) -> Manifold:
     """Return the consistent states of dynamics; those of another engine by the own derivation."""
-    if not dyn.model.constrained:
-        raise UnsupportedError(f"{dyn.model.name}: has no loops, no prescribed motions and no other constraints")
+    ROWS.admit(dyn.model, "consistent states: not known of")
     if isinstance(dyn, LagrangianDynamics):
         return Manifold(dyn)
     # Deriving costs more than most runs: once for each engine's object.

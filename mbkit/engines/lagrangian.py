@@ -26,6 +26,7 @@ from mbkit.engines.steps import momentum_step_slopes
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Joint, Model
+from mbkit.model.elements.paths import ALL, Path
 
 if TYPE_CHECKING:
     from mbkit.codegen.cuda.runs import CudaSteps
@@ -51,6 +52,9 @@ def _trimmed(quantity: BodyQuantity) -> Callable[[Array], Array]:
     return lambda x: x.reshape(*x.shape[:-2], x.shape[-2] // rows, rows, x.shape[-1])
 
 
+_ON_GPU: Final = ALL - {"jump", "force"} | {"force.joint", "force.frame", "force.compensation.partial"}
+_NO_ANGLE: Final = {"force.bushing": "its angles take an atan2, which a GPU's code does not have"}
+GPU: Final = Path("gpu under force", "", _ON_GPU, _NO_ANGLE, instead="copy them with numpy first")
 #: Quantities of three derivatives.
 _DERIVATIVES: Final = ("inverse_dynamics_derivatives", "forward_dynamics_derivatives")
 #: Three derivatives side by side, which `_TRIM` puts one behind the other.
@@ -365,11 +369,8 @@ class LagrangianDynamics(Dynamics):
     def _on_device(self, quantity: str, more: tuple[Any, ...], given: dict[str, Any]) -> Any:
         from mbkit.codegen.cuda.arrays import batch_on_device
 
-        if self.model.needs.friction and quantity in UNDER_FORCE:
-            raise UnsupportedError(
-                f"{quantity} with dry friction takes arrays of the host, not of a GPU; copy them with numpy first, or "
-                "take model.without('friction')"
-            )
+        if quantity in UNDER_FORCE:
+            GPU.admit(self.model, f"{quantity} takes arrays of the host, not of a GPU, for")
         names = tuple(map(_names, more))
         key = (quantity, *names) if quantity in _TRIM else (_STACKED, quantity)
         if key[0] == _STACKED and quantity not in _DERIVATIVES:

@@ -29,10 +29,12 @@ from mbkit.errors import InputError, NumericalError, UnknownNameError, Unsupport
 from mbkit.methods.registry import DEFAULT_METHOD, Method
 from mbkit.methods.small_motions import graded
 from mbkit.model import Model
+from mbkit.model.elements.paths import ALL, Path
 
 if TYPE_CHECKING:
     from typing import Literal
 
+LINEARIZE: Final = Path("linearize", "linearize: not known of", ALL)
 #: Quantities that `parameter_derivatives` differentiates.
 DIFFERENTIABLE: Final = (
     *("mass_matrix", "coriolis_matrix", "coriolis_force", "gravity", "nle", "passive"),
@@ -272,6 +274,7 @@ class LinearizationQuantities:
         >>> A.round(12).tolist(), B.round(12).tolist()
         ([[0.0, 1.0], [-19.62, 0.0]], [[0.0], [2.0]])
         """
+        LINEARIZE.admit(self.model)
         states, _ = self._states({"q": q, "v": v, "tau": tau})
         a, by_q, by_v, by_tau, _ = self._forward_slopes(**states)
         moving, fixed = tangent_rate(self.model, states["q"], states["v"])
@@ -345,16 +348,6 @@ class LinearizationQuantities:
 
         The columns of the derivatives are those by δq, δv, τ and the parameters.
         """
-        for has, feature in (
-            (self.model.constrained, "constraints"),
-            (self.model.time_parameter, "terms that depend on the time"),
-            (self.model.velocity_map, "quasi-velocities of its own"),
-        ):
-            if has:
-                raise UnsupportedError(
-                    f"{self.engine}: the derivative of a step of {self.model.name}, which has {feature}, is not known; "
-                    "linearize(q, v, tau).discretize(dt) holds the linear system's force"
-                )
         count = len(self.model.parameters) if parameters else 0
         size = max(1, _SLICE // max(1, 2 * self.model.nv * (3 * self.model.nv + count)))
         if q.ndim == 2 and len(q) > size:

@@ -20,6 +20,7 @@ from mbkit._check import Array, batch_of, rows
 from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, Parts, axes_named, momentum_rates
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Joint, Model, PointSpring
+from mbkit.model.elements.paths import Path
 from mbkit.model.parts import Loop
 
 #: Wrenches by the names of the frames on which they act.
@@ -29,6 +30,20 @@ QUANTITIES: Final = ("mass_matrix_inverse", "generalized_force", "joint_wrenches
 FOLLOWING: Final = {"newton_euler_residual": "joint_wrenches"}
 #: What needs the force on each body.
 OF_SINGLE_BODIES: Final = frozenset({"joint_wrenches", "undetermined_loads", "loads_under_force", "loads_of_motion"})
+_CARRIED: Final = (
+    "q loss jump row bound t gravity joint.spring joint.spring.several point.spring coupling.spring "
+    "joint.armature joint.armature.several coupling.armature"
+)
+_BY_FUNCTIONS: Final = "forces by functions are known by what they do to the motion, not to single bodies"
+LOADS: Final = Path(
+    "loads",
+    "",
+    frozenset(_CARRIED.split()),
+    why={
+        "speed": "its forces act on bodies beside those of loops; constraint_forces(q, v, tau) has them",
+        **dict.fromkeys(("force", "force.compensation", "body.rotor"), _BY_FUNCTIONS),
+    },
+)
 
 
 class Loads:

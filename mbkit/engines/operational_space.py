@@ -19,10 +19,17 @@ from mbkit._check import Array, arrays_shown, real
 from mbkit._warn import warn
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
-from mbkit.errors import InputError, NumericalError, SingularPoseWarning, UnsupportedError
+from mbkit.errors import InputError, NumericalError, SingularPoseWarning
+from mbkit.model.elements.paths import ALL, Path
 
 #: Rows of a task by name.
 _ROWS: Final = {"linear": (0, 1, 2), "angular": (3, 4, 5)}
+OPERATIONAL_SPACE: Final = Path(
+    "operational space",
+    "operational_space: not known of",
+    ALL - {"row", "speed", "energies"},
+    dict.fromkeys(("row", "speed"), "changes the inertia that a frame feels"),
+)
 
 
 @dataclass(frozen=True)
@@ -109,11 +116,7 @@ def operational_space(
     """
     if not isinstance(dyn, Dynamics):
         raise no_dynamics(dyn)
-    if dyn.model.constrained:
-        raise UnsupportedError(
-            f"operational_space: {dyn.model.name} has loops or other constraints, which change the inertia that a "
-            "frame feels; without('loops', 'prescribed') is its tree"
-        )
+    OPERATIONAL_SPACE.admit(dyn.model)
     if not isinstance(frame, str):
         raise InputError(f"frame: expected a name, got {type(frame).__name__}; stack the Jacobians of several")
     threshold = real("damping", damping)

@@ -7,7 +7,7 @@ solved for are differentiated by the implicit function theorem.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -23,10 +23,28 @@ from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method, explicit_method, method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model import Model
+from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import tangent_maps
 from mbkit.model.quaternions import Arithmetic
 
+
+def _quasi_velocities(model: Model) -> Iterator[str]:
+    if model.velocity_map is not None:
+        yield "it has quasi-velocities of its own"
+
+
+STEP_DERIVATIVE: Final = Path(
+    "derivative of a step",
+    "the derivative of a step is not known of",
+    ALL - {"row", "speed", "t", "jump"},
+    {
+        "jump": "its steps have no derivative where a joint stops or lets go",
+        "t": "terms that depend on the time have no slopes here",
+    },
+    also=_quasi_velocities,
+    instead="linearize(q, v, tau).discretize(dt) holds the linear system's force",
+)
 _EPS: Final = float(np.finfo(float).eps)
 #: Newton's iterations for the stages of an implicit method, at most, and the part of the numbers' size below which
 #: corrections that stop shrinking are rounding.
@@ -371,11 +389,7 @@ class _DualStages:
 
 def differentiable_method(model: Model, engine: str, name: object) -> Method:
     """Return the method of this name, if the derivative of its step is known."""
-    if model.needs.friction:
-        raise UnsupportedError(
-            f"{model.name} has dry friction: its steps have no derivative where a joint stops or lets go; "
-            "take model.without('friction'), or a smooth force, as by add_joint_force"
-        )
+    STEP_DERIVATIVE.admit(model)
     method = method_of(name)
     fixed = [m for m in METHODS.values() if m.kind == "fixed" and not m.dry_friction]
     known = [m.name for m in fixed if not m.engines or engine in m.engines]

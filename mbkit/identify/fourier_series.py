@@ -22,13 +22,20 @@ import numpy as np
 
 from mbkit._check import Array, count, generator, real
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, UnsupportedError
+from mbkit.errors import InputError
 from mbkit.identify.measurements import REST, moving
 from mbkit.model import Model
-from mbkit.model.base_parameters import PARAMETER_SETS, regressor_columns
+from mbkit.model.base_parameters import BASE_PARAMETERS, PARAMETER_SETS, regressor_columns
 from mbkit.model.builder import expect_model
+from mbkit.model.elements.paths import Path
 from mbkit.simulate.progress import Progress, ProgressFunction
 
+EXCITATION: Final = Path(
+    "excitation",
+    "excitation: expected a tree of free joints without quaternions, got of",
+    BASE_PARAMETERS.carries,
+    also=lambda model: (f"joint {x!r} has a quaternion, which is no Fourier series" for _, x in model.quaternions),
+)
 _BASE: Final = PARAMETER_SETS[1]
 #: Range of a coordinate without limits, to each side, rad or m, and largest speed without one, per second.
 _RANGE: Final = {True: np.pi, False: 1.0}
@@ -137,7 +144,7 @@ def excitation(
     ((501, 2), True)
     """
     expect_model(model)
-    model.require_bodies("excitation")
+    EXCITATION.admit(model)
     period, rate = real("duration", duration, positive=True), real("rate", rate, positive=True)
     harmonics, iterations = count("harmonics", harmonics, least=1), count("iterations", iterations)
     margin = real("margin", margin, nonnegative=True)
@@ -148,9 +155,6 @@ def excitation(
         raise InputError(
             f"rate: expected at least {least:g} Hz for {harmonics} harmonics of {period:g} s, got {rate:g}"
         )
-    if model.quaternions:
-        names = ", ".join(repr(name) for _, name in model.quaternions)
-        raise UnsupportedError(f"excitation: joint {names} has a quaternion, which is no Fourier series")
     search = _Search(model, period, harmonics, margin, bool(friction))
     rng = generator("seed", seed)
     with Progress(progress, "excitation") as reported:

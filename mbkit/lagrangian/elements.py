@@ -7,9 +7,8 @@ from typing import Any, Final
 
 import sympy as sp
 
-from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.description_kinematics import SymbolicKinematics, exact, read_angle
-from mbkit.model.elements.forces import RATE, TIME, GravityCompensation, JointElement
+from mbkit.model.elements.forces import RATE, TIME, JointElement
 from mbkit.model.elements.formula import Arithmetic
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion
 from mbkit.model.parts import Prescribed
@@ -88,23 +87,12 @@ def _pieces(numbers: Any, t: sp.Symbol) -> sp.Expr:
 
 
 def acting(kin: SymbolicKinematics, t: sp.Symbol) -> tuple[sp.Expr, list[sp.Expr]]:
-    """Return the potential of joint forces and of what holds weights, and the rest as one force along each coordinate.
-
-    Raises
-    ------
-    UnsupportedError
-        Forces on frames and bushings, which this form of the equations does not write out.
-    """
+    """Return the potential of joint forces and weights' compensations, and one force along each coordinate."""
     model = kin.model
     V, forces = kin.compensation_energy, [sp.Integer(0)] * model.nv
     for force in model.forces:
-        if isinstance(force, GravityCompensation) and not force.without:
-            continue
         if not isinstance(force, JointElement):
-            raise UnsupportedError(
-                f"{model.name}: {force} is no force at a joint, and is not written out in symbols; "
-                "mbkit.dynamics(model, 'lagrangian') has it, and model.without('forces') is the system without forces"
-            )
+            continue
         joints, constants = [model.joint(x) for x in force.joints], kin.written.values.forces[force.name].numbers
         coordinates = [x for j in model.independent_joints for x in kin.described(j)]
         others = dict(

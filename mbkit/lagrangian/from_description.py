@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, count
 from typing import Final, cast
@@ -30,6 +30,7 @@ from mbkit.model import Joint, Model
 from mbkit.model.changes.dry_friction import held_at_rest
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.beams import BeamEnd
+from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.elements.references import names_in
 
 #: Velocities up to which equations are written out.
@@ -123,7 +124,8 @@ def from_model(
         raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) gives one")
     if isinstance(model, EnergyModel):
         return cast("Lagrangian", model.form)
-    _check(model)
+    for note in PAPER.admit(model):
+        warn(f"{model.name}: {note}", MbkitWarning)
     q = _coordinates(model, coordinates)
     named = None
     if symbols or (symbols is None and not model.forces):
@@ -156,8 +158,6 @@ def from_model(
     stored, pushed = acting(kin, t)
     for rate, size in dry_friction(kin.written, sp.exp):
         pushed = [x - size * sp.sign(rate) * sp.diff(rate, w) for x, w in zip(pushed, v, strict=True)]
-    if held := held_at_rest(model):
-        warn(f"{model.name}: {held}", MbkitWarning)
     T, V, R, *constraints = (x.xreplace(put) for x in (T, V + stored, R, *(row for _, row in rows)))
     pushed, moving = ([x.xreplace(put) for x in found] for found in (pushed, moving))
     kept = [i for i in range(len(q)) if i not in moved]
@@ -222,23 +222,31 @@ def _weight(kin: SymbolicKinematics, used: set[str]) -> tuple[sp.Expr, dict[sp.S
     return g * tidy(V / exact(numbers[0])), {g: numbers[0]}
 
 
-def _check(model: Model) -> None:
+def _too_much(model: Model) -> Iterator[str]:
     turning = [j.name for j in model.independent_joints if not j.type.coordinate_velocities]
     held = [f for f in CONSTRAINT_FEATURES if f != "prescribed" and getattr(model, f)]
     if turning and held:
-        raise UnsupportedError(
-            f"{model.name}: joint {turning[0]!r} has velocities that are no coordinate's rate, and is not written out "
-            f"beside {' and '.join(held)}; write it as three joints of one coordinate each, or as spherical_zyx"
+        yield (
+            f"joint {turning[0]!r} has velocities that are no coordinate's rate, and is not written out beside "
+            f"{' and '.join(held)}; write it as three joints of one coordinate each, or as spherical_zyx"
         )
     if not model.nv:
-        raise UnsupportedError(f"{model.name}: no joint of it moves, so there is no equation")
+        yield "no joint of it moves, so there is no equation"
     bound = model.loops or model.prescribed
     most = _MOST_ROLLING if model.no_slip else _MOST_BOUND if bound else _MOST
     if model.nv > most:
-        raise UnsupportedError(
-            f"model: expected at most {most} coordinates to be written out, got {model.nv} coordinates of "
-            f"{model.name}; {INSTEAD_OF_WRITING}"
-        )
+        yield f"expected at most {most} coordinates to be written out, got {model.nv} coordinates"
+
+
+PAPER: Final = Path(
+    "paper",
+    "not written out:",
+    ALL - {"force"} | {"force.joint"},
+    {"force": "it is no force at a joint"},
+    notes={"jump": held_at_rest},
+    also=_too_much,
+    instead=INSTEAD_OF_WRITING,
+)
 
 
 def _time(used: set[str]) -> sp.Symbol:

@@ -35,7 +35,9 @@ from mbkit.model.parts import (
 )
 
 #: Attributes of a description that bind its coordinates or velocities to each other.
-CONSTRAINT_FEATURES: Final = tuple(dict.fromkeys(k.section for k in PART_KINDS.values() if k.does & {"row", "speed"}))
+CONSTRAINT_FEATURES: Final = tuple(
+    dict.fromkeys(k.section for k in PART_KINDS.values() if k.section and k.does & {"row", "speed"})
+)
 
 
 def _plain(value: Any) -> Any:

@@ -20,16 +20,22 @@ from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD, METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
+from mbkit.model.elements.paths import ALL, Path
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
 from mbkit.simulate.diagnostics.checks import diagnostics, massless_joints
 from mbkit.simulate.events import Event, as_events
-from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.problem import RUNS, IntegrationProblem
 from mbkit.simulate.progress import Progress, ProgressFunction
 from mbkit.simulate.result import SolverResult, Stats
 from mbkit.simulate.run_data import Acting, RunData, RunSettings
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
+_OTHERS: Final = f"use {DEFAULT_METHOD!r} or {ADAPTIVE_METHOD!r}"
+#: Methods without events and equal steps, at which a joint could stop or let go.
+SMOOTH_RUNS: Final = Path(
+    "runs without phases", "", ALL - {"jump"}, {"jump": "this method does not know dry friction"}, instead=_OTHERS
+)
 #: Smallest rtol of Taylor's method on the oracle, which computes with 113 bits.
 _LEAST_EXTENDED: Final = 1e-32
 #: Time of an evaluation from Python, in those in machine code.
@@ -160,16 +166,17 @@ def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
         raise UnsupportedError(
             f"{method.name}: solves exact dry friction, and {dyn.engine} was asked for its own; leave soft_friction out"
         )
+    native = method.kind == "native"
+    if not dyn.soft_friction and (native or not (method.events or problem.equal_steps)):
+        own = ", ".join(f"{name}={value}" for name, value in dyn.own_friction.items() if native)
+        soft = (
+            f" (mbkit.dynamics(model, {dyn.engine!r}, {own}) has dry friction of its own, which is soft)" if own else ""
+        )
+        SMOOTH_RUNS.admit(dyn.model, f"{method.name}{soft}: not known of")
+    elif not dyn.soft_friction:
+        RUNS.admit(dyn.model)
     if not dyn.model.needs.friction or dyn.soft_friction or method.dry_friction:
         return _solver(dyn, method, read)(problem)
-    native = method.kind == "native"
-    if native or not (method.events or problem.equal_steps):
-        own = ", ".join(f"{name}={value}" for name, value in dyn.own_friction.items() if native)
-        raise UnsupportedError(
-            f"{method.name}: does not know dry friction, which {dyn.model.name} has; use {DEFAULT_METHOD!r} or "
-            f"{ADAPTIVE_METHOD!r}, or model.without('friction')"
-            + (f"; mbkit.dynamics(model, {dyn.engine!r}, {own}) has that engine's own, which is soft" if own else "")
-        )
     from mbkit.simulate.solvers.friction.runs import run_in_phases
 
     return run_in_phases(problem, lambda phase: _solver(phase, method, read))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 
@@ -11,10 +12,16 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import InputError
 from mbkit.methods.registry import Tolerances
+from mbkit.model.elements.paths import ALL, Path
 from mbkit.simulate.events import Event
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.time_grid import Grid, Indices, check_room, check_save
 from mbkit.simulate.torque import Torque
+
+_TOO_MANY: Final = "joints at rest may leave too many rows; forward_dynamics has both, model.without('friction') runs"
+_APART: Final = ("jump", "row", _TOO_MANY), ("jump", "speed", _TOO_MANY)
+#: Runs whose friction is that of phases, or of the method.
+RUNS: Final = Path("runs", "simulate: not known of", ALL, apart=_APART)
 
 
 @dataclass(frozen=True, eq=False)

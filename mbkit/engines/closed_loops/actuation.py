@@ -20,9 +20,10 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit._reproducible import DEPENDENT, dependent, unit_rows
-from mbkit.engines.constrained import Constrained, singular_pose
-from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.engines.constrained import ASKED, Constrained, singular_pose
+from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Joint
+from mbkit.model.elements.paths import ALL, Path
 
 if TYPE_CHECKING:
     from mbkit.derivation.constraints import RowChoice
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 LEAST: Final = "least"
 #: Of a row's size times the acceleration's: what rounding and a few typed digits leave of a consistent one.
 _CONSISTENT: Final = 1e-8
+_OF_A_TREE: Final = "inverse_dynamics(q, v, a) is the force of the joints of a tree"
+ACTUATOR_FORCES: Final = Path("actuator forces", "actuator_forces: not known of", ALL, asks=ASKED, instead=_OF_A_TREE)
 
 
 class ActuatorForces(NamedTuple):
@@ -103,11 +106,7 @@ class Actuation(Constrained):
         >>> bool(np.allclose(tau, [3.0, 0.0, 0.0]))
         True
         """
-        if not self.model.constrained:
-            raise UnsupportedError(
-                f"actuator_forces: {self.model.name} has no loops and no other constraints; "
-                "inverse_dynamics(q, v, a) is the force of its joints"
-            )
+        ACTUATOR_FORCES.admit(self.model)
         self._require_motion(q, v)
         out = self._evaluate("actuator_forces", self._actuated(actuators), q=q, v=v, a=a)
         n = self.model.nv

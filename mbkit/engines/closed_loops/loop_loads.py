@@ -20,10 +20,11 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array
 from mbkit.engines.closed_loops.actuation import Actuation, spread
 from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, WORLD, axes_named
-from mbkit.engines.loads import Loads
-from mbkit.errors import InputError, UnsupportedError
+from mbkit.engines.loads import LOADS, Loads
+from mbkit.errors import InputError
 from mbkit.model import Frame, Joint, Model
-from mbkit.model.loops import LOOP_ROWS, LoopEnds
+from mbkit.model.elements.paths import Path
+from mbkit.model.loops import LOOP_KINDS, LOOP_ROWS, LoopEnds
 from mbkit.model.parts import Loop
 
 #: Of the forces' size: their rest after the constraints' own, up to which a motion is that of a force.
@@ -31,6 +32,9 @@ _MEANT: Final = 1e-8
 #: Singular values of J with rows of unit size below which a force in the loops moves nothing, and the part of a strain
 #: that counts. What closing a loop to rounding leaves is far below.
 _STRAIN: Final = 1e-7
+LOOP_LOADS: Final = Path(
+    "loads of loops", "", LOADS.carries, LOADS.why, asks=(frozenset(f"loop.{x}" for x in LOOP_KINDS), "it has no loops")
+)
 
 
 class UndeterminedLoads(NamedTuple):
@@ -99,8 +103,7 @@ class LoopLoads(Actuation, Loads):
         >>> load.shape
         (1, 6)
         """
-        if not self.model.loops:
-            raise UnsupportedError(f"loop_wrenches: {self.model.name} has no loops")
+        LOOP_LOADS.admit(self.model, "loop_wrenches: not known of")
         (first, last), out = (0, len(self.model.loops)), self._loaded((), q, v, None, tau, wrenches, axes)
         return self._only(out, first, last)
 
@@ -109,8 +112,8 @@ class LoopLoads(Actuation, Loads):
     ) -> Array:
         """Return the loads of joints of a mechanism whose motion is that of a force."""
         self.model.require_bodies("joint_wrenches")
-        # Contacts without slip are refused below, with a force or without.
-        if tau is None and not self.model.no_slip:
+        LOADS.admit(self.model, "joint_wrenches: not known of")
+        if tau is None:
             raise InputError(
                 f"tau: expected the force under which {self.model.name} moves, got none: a motion (q, v, a) does not "
                 "tell the forces in its loops; give joint_wrenches(..., tau=tau)"
@@ -121,13 +124,6 @@ class LoopLoads(Actuation, Loads):
     def _loaded(
         self, joints: tuple[Joint, ...], q: ArrayLike, v: ArrayLike, a: Any, tau: Any, wrenches: Any, axes: str
     ) -> Array:
-        if self.model.no_slip:
-            names = ", ".join(repr(x.name) for x in self.model.no_slip)
-            raise UnsupportedError(
-                f"loads of joints and loops: {self.model.name} has contacts without slip ({names}), whose forces act "
-                "on bodies beside those of loops; constraint_forces(q, v, tau) has them, and joint_wrenches of "
-                "model.without('no_slip') takes them as wrenches"
-            )
         self._require_motion(q, v, tau)
         states: dict[str, Any] = {"q": q, "v": v, "a": a, "tau": tau}
         frames: tuple[Frame, ...] = ()
@@ -243,13 +239,7 @@ class LoopLoads(Actuation, Loads):
         1
         """
         model = self.model
-        if not model.loops:
-            raise UnsupportedError(f"undetermined_loads: {model.name} has no loops")
-        if model.no_slip:
-            raise UnsupportedError(
-                f"undetermined_loads: {model.name} has contacts without slip, whose forces on single bodies are not "
-                "known; model.without('no_slip') has the loads without them"
-            )
+        LOOP_LOADS.admit(model, "undetermined_loads: not known of")
         q = model.check_q(q)
         if q.ndim > 1 or self.samples is not None:
             got = f"shape {q.shape}" if q.ndim > 1 else f"parameters of {self.samples} samples"

@@ -13,7 +13,7 @@ So derivatives come from terms that every engine has, and nothing is differenced
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,7 +21,21 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array
 from mbkit._reproducible import dependent, unit_rows
 from mbkit.engines.closed_loops.loop_loads import LoopLoads
-from mbkit.errors import InputError, NumericalError, UnsupportedError
+from mbkit.engines.constrained import ASKED
+from mbkit.errors import InputError, NumericalError
+from mbkit.model.elements.paths import ALL, Path
+
+#: Forces of the time leave the inertia as it is.
+REDUCED_INERTIA: Final = Path(
+    "reduced inertia",
+    "reduced_inertia: not known of",
+    (ALL - {"speed", "t"}) | {"force.of_time"},
+    {
+        "speed": "its velocities lead to no path of coordinates; consistent_changes(q, v) has the motions it allows",
+        "t": "velocities are not N θ̇ alone",
+    },
+    asks=(frozenset(["row"]), ASKED[1]),
+)
 
 
 class ReducedInertia(NamedTuple):
@@ -90,18 +104,7 @@ class IndependentMotion(LoopLoads):
         True
         """
         model = self.model
-        if not model.constrained:
-            raise UnsupportedError(f"reduced_inertia: {model.name} has no loops and no other constraints")
-        if model.no_slip:
-            raise UnsupportedError(
-                f"reduced_inertia: {model.name} has contacts without slip, whose velocities lead to no path of its "
-                "coordinates; consistent_changes(q, v) has the motions that they allow"
-            )
-        if model.time_parameter is not None:
-            raise UnsupportedError(
-                f"reduced_inertia: constraints of {model.name} depend on the time, so that its velocities are not "
-                "N θ̇ alone; model.without('prescribed') leaves its coordinates free"
-            )
+        REDUCED_INERTIA.admit(model)
         q = model.check_q(q)
         names = [coordinates] if isinstance(coordinates, str) else coordinates
         _, which = self._states_held.held_parts(model, names)

@@ -34,9 +34,9 @@ from mbkit._check import Array
 from mbkit._reproducible import dependent, unit_rows
 from mbkit.engines.closed_loops.actuation import spread
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
-from mbkit.engines.constrained import singular_pose
+from mbkit.engines.constrained import ROWS, singular_pose
 from mbkit.engines.pinocchio.model import PinModel
-from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.errors import NumericalError
 from mbkit.model import Model
 from mbkit.model.loops import LOOP_KINDS
 
@@ -326,8 +326,7 @@ class PinocchioConstrained(RowsOfFrames):
     @property
     def constraint_solver(self) -> str:
         """What gives accelerations under constraints: "constraintDynamics" or "LAPACK"."""
-        if not self.model.constrained:
-            raise UnsupportedError(f"constraint_solver: {self.model.name} has no loops and no other constraints")
+        ROWS.admit(self.model, "constraint_solver: not known of")
         return self._held.solver
 
     def _every_row(self, q: Array, v: Array) -> Rows:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ from sympy.printing.c import C99CodePrinter
 from sympy.printing.numpy import NumPyPrinter
 
 from mbkit._escape import c_comment, identifier, one_line, python_docstring, terminal
+from mbkit.codegen.c_source import C_CODE
 from mbkit.codegen.program import Operation
 from mbkit.codegen.program import program as operations_of
 from mbkit.derivation import FUNCTIONS, equations_of
@@ -25,8 +26,8 @@ from mbkit.lagrangian.elements import SYMPY
 from mbkit.lagrangian.energies.symbols import free_name
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned, folded
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import held_at_rest
 
+PROGRAM: Final = replace(C_CODE, name="program")
 #: Operations of a term from which on it gets a name of its own: a line of text has some 100 letters.
 _LONG: Final = 10
 _WIDTH: Final = 100
@@ -154,10 +155,7 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
         raise InputError(f"model: expected a Model, got {type(model).__name__}; one of T and V is its .model")
     if not isinstance(quantity, str) or quantity not in FUNCTIONS:
         raise UnknownNameError("quantity", str(quantity), FUNCTIONS)
-    if model.constrained:
-        raise UnsupportedError(
-            f"program: {model.name} has constraints ({model.constraint_parts}), which the terms of its tree leave out"
-        )
+    notes = PROGRAM.admit(model)
     if not model.nv:
         raise UnsupportedError(f"program: {model.name} has no joint that moves")
     function = equations_of(model).function(quantity)
@@ -187,7 +185,7 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
         known.append(x)
     (shape,), (out,) = operations.shapes, operations.outputs
     results = sp.ImmutableMatrix(*shape, lambda i, j: known[int(out[i, j])])
-    note = held_at_rest(model) if any(o.name == "sign" for o in operations.operations) else ""
+    note = "; ".join(notes) if any(o.name == "sign" for o in operations.operations) else ""
     return ProgramText(model.name, quantity, operations.arithmetic, inputs, tuple(terms), results, note)
 
 

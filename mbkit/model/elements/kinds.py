@@ -166,11 +166,22 @@ def _several(at: _Test) -> _Test:
     return lambda model, joint: joint.type.nv > 1 and at(model, joint)
 
 
+def _written_with(need: str, model: _Model, _: Any) -> bool:
+    return not model.has_bodies and bool(getattr(model.needs, need))
+
+
 def _holds_weight(model: _Model, force: Any) -> bool:
     return type(force) is GravityCompensation and force.body not in model.rotors
 
 
 register_kind("", "energies", "{p.name} was written as energies and has no bodies", at=lambda m, _: not m.has_bodies)
+_WRITTEN = (
+    ("row", "loops", "constraints"),
+    ("speed", "no_slip", "velocity constraints"),
+    ("t", "time", "terms that depend on the time"),
+)
+for _does, _need, _what in _WRITTEN:
+    register_kind("", f"written.{_does}", f"{{p.name}} has {_what}", _does, at=partial(_written_with, _need))
 register_kind("", "gravity", "gravity", "V", "gravity", "gravity")
 # Armature of a free joint is a body, whose weight a compensation holds.
 _WORDS, _AT = "body {p.name!r} is armature of a free joint", lambda m, b: b.name in m.rotors and b.mass > 0

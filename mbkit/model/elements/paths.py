@@ -27,8 +27,11 @@ class Path:
         Names of kinds, and effects: ``"V"`` and ``"t"`` stand for all kinds that have these effects alone.
     why : mapping of str to str
         Reasons for refusals, by kind or effect; the first one counts.
-    notes : mapping of str to str
-        Notes on what is carried otherwise, or left out, by kind or effect. A kind with a note is not refused.
+    notes : mapping of str to str or callable
+        Notes on what is carried otherwise, or left out, by kind or effect, or functions of the model that return them.
+        A kind with a note is not refused.
+    asks : (set of str, str)
+        Kinds and effects of which one has to act, and the fault of a model without.
     apart : tuple of (str, str, str)
         Two kinds or effects that it does not carry together, and why.
     also : callable
@@ -41,20 +44,22 @@ class Path:
     words: str
     carries: frozenset[str]
     why: dict[str, str] = field(default_factory=dict)
-    notes: Mapping[str, str] = field(default_factory=dict)
+    notes: Mapping[str, str | Callable[[_Model], str]] = field(default_factory=dict)
+    asks: tuple[frozenset[str], str] = (frozenset(), "")
     apart: tuple[tuple[str, str, str], ...] = ()
     also: Callable[[_Model], Iterable[str]] = lambda _: ()
     instead: str = ""
 
     def __post_init__(self) -> None:
-        for name in {*self.carries, *self.why, *self.notes, *(x for *two, _ in self.apart for x in two)} - {*EFFECTS}:
+        named = {*self.carries, *self.why, *self.notes, *self.asks[0], *(x for *two, _ in self.apart for x in two)}
+        for name in named - {*EFFECTS}:
             kind(name)
         if PATHS.setdefault(self.name, self) is not self:
             raise InputError(f"path {self.name!r}: expected a name that no other path has")
 
     def takes(self, kind: Kind) -> bool:
         """Return whether it carries a kind, or leaves it out with a note."""
-        if kind.name in {*self.carries, *self.notes}:
+        if kind.name in self.carries or kind.name in self.notes:
             return True
         # What does the same as another kind is carried with that.
         return bool(kind.does) and all(
@@ -65,14 +70,17 @@ class Path:
         """Return the notes on a model; raise `UnsupportedError` with every part that the path does not carry."""
         if refusal := self.refuses(model, words):
             raise UnsupportedError(refusal)
-        kinds = [kind(name) for name in model.acts]
-        return tuple(text for key, text in self.notes.items() if any(_is(k, key) for k in kinds))
+        kinds = [kind(name) for name in model.acts] if self.notes else []
+        notes = [text for key, text in self.notes.items() if any(_is(k, key) for k in kinds)]
+        return tuple(filter(None, (text if isinstance(text, str) else text(model) for text in notes)))
 
     def refuses(self, model: _Model, words: str = "") -> str:
         """Return why the path does not carry a model, with every part; empty where it does."""
         kinds = [kind(name) for name in model.acts]
         lost = [k for k in kinds if not self.takes(k)]
-        faults = dict.fromkeys([*self._refused(model, lost), *self._together(model, kinds), *self.also(model)])
+        asked, absent = self.asks
+        lacks = [absent] if absent and not any(_is(k, x) for k in kinds for x in asked) else []
+        faults = dict.fromkeys([*lacks, *self._refused(model, lost), *self._together(model, kinds), *self.also(model)])
         features = ", ".join(dict.fromkeys(repr(k.features[-1]) for k in lost if k.features))
         remedies = self.instead, f"model.without({features}) leaves them out" if features else ""
         return f"{self.words or words} {model.name}: {'; '.join(filter(None, (*faults, *remedies)))}" if faults else ""
@@ -95,6 +103,8 @@ class Path:
                 yield ", while ".join(k.words.format(p=k.parts(model)[0]) for k in first if k) + f": {why}"
 
 
+#: What paths carry that take all but kinds of no known effect.
+ALL: Final = frozenset({*EFFECTS, "energies"})
 #: Paths by name.
 PATHS: Final[dict[str, Path]] = {}
 

@@ -20,8 +20,9 @@ from mbkit.derivation.steps.constrained_midpoint import ConstrainedMidpoint
 from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import GUESS, LEAST, MOST, SMALL, Midpoint
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import FunctionError, UnsupportedError
+from mbkit.errors import FunctionError
 from mbkit.methods.registry import IMPLICIT_METHODS
+from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
@@ -31,6 +32,8 @@ from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
+_OTHERS: Final = f"{IMPLICIT_METHODS} are the implicit methods for it"
+SYMPLECTIC: Final = Path("symplectic runs", "implicit_midpoint: no form is kept of", ALL - {"speed"}, instead=_OTHERS)
 # With a torque function the iteration converges linearly.
 _WITH_FUNCTION: Final = 60
 _EPS: Final = float(np.finfo(float).eps)
@@ -88,11 +91,7 @@ def _poses(problem: IntegrationProblem, record: GridRecord) -> tuple[str, ...]:
 
 def midpoint_of(dyn: LagrangianDynamics) -> Midpoint:
     """Return the parts of a step of these dynamics; `UnsupportedError` for rows that hold velocities alone."""
-    if dyn.model.holds_velocities:
-        raise UnsupportedError(
-            f"implicit_midpoint: {dyn.model.name} has constraints of velocities, {dyn.velocity_constraint_names[0]} "
-            f"first, whose motion keeps no symplectic form; {IMPLICIT_METHODS} are the implicit methods for it"
-        )
+    SYMPLECTIC.admit(dyn.model)
     return (ConstrainedMidpoint if dyn.model.constrained else Midpoint)(dyn.equations)
 
 

@@ -14,7 +14,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.engines.elements.dry_friction import friction_forces
-from mbkit.errors import FunctionError, NumericalError, UnsupportedError
+from mbkit.errors import FunctionError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
@@ -32,11 +32,6 @@ _UNDECIDED: Final = "which joints rest cannot be decided"
 def run_moreau(problem: IntegrationProblem) -> SolverResult:
     """Step one state or a batch over the grid."""
     dyn = problem.dyn
-    if dyn.model.constrained:
-        raise UnsupportedError(
-            f"{problem.method}: {dyn.model.name} has loops or other constraints, which its step does not hold; take "
-            "another method, and model.without('friction')"
-        )
     record, reasons, evaluations = GridRecord(problem), dict[int, str](), 0
     compiled = dyn.derived and not problem.torque.callable and dyn.model.needs.friction
     compiled = compiled and getattr(dyn, "compiles_steps", False)

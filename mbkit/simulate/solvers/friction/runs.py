@@ -15,11 +15,11 @@ from scipy.optimize import brentq
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.errors import FunctionError, NumericalError, UnsupportedError
+from mbkit.errors import FunctionError, NumericalError
 from mbkit.methods.registry import method_of
 from mbkit.model.changes.dry_friction import names_of
 from mbkit.simulate.events import Followed, Hit
-from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.problem import RUNS, IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
 from mbkit.simulate.solvers.friction.phases import Friction, Phase
 from mbkit.simulate.time_grid import Grid
@@ -40,11 +40,7 @@ _UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
 def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
     """Integrate a problem with dry friction; `solver` gives that of smooth dynamics."""
     dyn = problem.dyn
-    if dyn.model.constrained:
-        raise UnsupportedError(
-            f"simulate: {dyn.model.name} has dry friction beside loops or other constraints, of which what rests may "
-            "leave too many; forward_dynamics has both, and model.without('friction') runs without friction"
-        )
+    RUNS.admit(dyn.model)
     walk = _fixed if problem.equal_steps is not None else _adaptive
     parts = []
     for i in range(len(problem.q)):

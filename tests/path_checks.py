@@ -1,0 +1,242 @@
+"""Checks of texts, quantities and runs on each kind's example: a refusal of the path's own, or the truth in NumPy."""
+
+# ruff: noqa: ARG001  # all checks are called alike
+from __future__ import annotations
+
+import ctypes
+import subprocess
+from collections.abc import Callable
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+import mbkit as mb
+from mbkit.codegen.c_source import C_CODE, export_c
+from mbkit.errors import NumericalError
+from mbkit.lagrangian import from_model, program
+from tests import kind_examples
+from tests.fake_cuda import fake_gpu
+from tests.kind_examples import EXAMPLES, Example
+from validation.gpu import on_device
+
+Check = Callable[[mb.Model, Path], None]
+#: Steps of a short run, and their number.
+_STEP, _STEPS = 1e-3, 5
+
+
+@cache
+def _names() -> dict[str, str]:
+    return {kind_examples.example(name).model.name: name for name in EXAMPLES}
+
+
+def case(model: mb.Model) -> tuple[Example, Any]:
+    """Return the example of a model, and the model's dynamics at its time."""
+    x, dyn = kind_examples.example(_names()[model.name]), mb.dynamics(model, "lagrangian", compile=False)
+    return x, dyn.at(**{model.time_parameter: x.t}) if model.time_parameter else dyn
+
+
+def close(got: Any, wanted: Any, most: float = 1e-9) -> None:
+    got, wanted = np.asarray(got), np.asarray(wanted)
+    assert got.shape == wanted.shape
+    assert np.abs(got - wanted).max(initial=0.0) < most * max(1.0, np.abs(wanted).max(initial=0.0))
+
+
+# Texts
+
+
+@cache
+def _library(folder: Path) -> Any:
+    """Return one library of all examples in C, as a compiler's start takes longer than they do."""
+    texts = []
+    for name in EXAMPLES:
+        model = kind_examples.example(name).model
+        if not C_CODE.refuses(model):
+            made = export_c(model, ["forward_dynamics"], name=name.replace(".", "_"))
+            _, source = made.write(folder)
+            texts.append(f'#include "{source}"')
+    (folder / "all.c").write_text("\n".join(texts), encoding="utf-8")
+    command = ["cc", "-w", "-O0", "-shared", "-fPIC", f"-I{folder}", "all.c", "-o", "all.so", "-lm"]
+    subprocess.run(command, check=True, cwd=folder)
+    return ctypes.CDLL(str(folder / "all.so"))
+
+
+def in_c(model: mb.Model, folder: Path) -> None:
+    export_c(model, ["forward_dynamics"])
+    x, name = case(model)[0], _names()[model.name].replace(".", "_")
+    call, out = getattr(_library(folder.parent), f"{name}_forward_dynamics"), np.full(x.model.nv, np.nan)
+    call.restype = None
+    numbers = [x.t if n == model.time_parameter else value for n, value in model.parameters.items()]
+    given = [np.array(y, dtype=float) for y in (x.q, x.v, x.tau, numbers)[: 3 + bool(numbers)]]
+    call(*(y.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for y in (*given, out)))
+    close(out, x.accelerated())
+
+
+def by_program(model: mb.Model, folder: Path) -> None:
+    text, names = program(model, "forward_dynamics"), dict[str, Any]()
+    x = case(model)[0]
+    exec(text.python(), names)
+    numbers = [np.array([x.t if n == model.time_parameter else value for n, value in model.parameters.items()])]
+    out = names["forward_dynamics"](x.q, x.v, x.tau, *numbers[: len(text.inputs) - 3])
+    close(np.ravel(out), x.accelerated())
+
+
+def on_paper(model: mb.Model, folder: Path) -> None:
+    if model.nv > 4:
+        # Equations of a ball or a plane behind three hinges take up to half a minute.
+        return
+    written = from_model(model, drives=bool(model.prescribed)).model
+    x = case(model)[0]
+    dyn = mb.dynamics(written, "lagrangian", compile=False)
+    dyn = dyn.at(**{written.time_parameter: x.t}) if written.time_parameter else dyn
+    # A quaternion is three angles there.
+    close(dyn.forward_dynamics(x.plain.q, x.v, x.tau), x.accelerated())
+
+
+# Quantities
+
+
+def by_loads(model: mb.Model, folder: Path) -> None:
+    """Every body's balance of forces and moments, with the loads of joints and loops."""
+    x, dyn = case(model)
+    under = (None, None, "local", None, x.tau) if model.constrained else (x.accelerated(),)
+    loads = dyn.joint_wrenches(x.q, x.v, *under)
+    assert len(loads) == sum(j.type.nv > 0 for j in model.joints)
+    close(dyn.newton_euler_residual(x.q, x.v, x.accelerated(), x.tau), np.zeros((len(model.bodies), 6)))
+
+
+def by_loop_loads(model: mb.Model, folder: Path) -> None:
+    x, dyn = case(model)
+    assert dyn.loop_wrenches(x.q, x.v, x.tau).shape == (len(model.loops), 6)
+    by_loads(model, folder)
+
+
+def by_rows(model: mb.Model, folder: Path) -> None:
+    """The rows hold at the state, and for the acceleration that they leave."""
+    x, dyn = case(model)
+    J, zero = dyn.constraint_jacobian(x.q), np.zeros(len(dyn.constraint_names))
+    close(dyn.constraint_residual(x.q), zero[: len(zero) - len(dyn.velocity_constraint_names)])
+    close(dyn.constraint_rate(x.q, x.v), zero)
+    close(J @ x.accelerated() + dyn.constraint_bias(x.q, x.v), zero)
+
+
+def by_actuators(model: mb.Model, folder: Path) -> None:
+    x, dyn = case(model)
+    tau, _ = dyn.actuator_forces(x.q, x.v, x.accelerated())
+    close(x.acceleration(x.t, x.plain.q, x.plain.v, tau), x.accelerated())
+
+
+def by_reduced_inertia(model: mb.Model, folder: Path) -> None:
+    """Half of it times squared rates is the energy of a motion that the rows allow."""
+    x, dyn = case(model)
+    degrees, energy = dyn.mobility(x.q).degrees_of_freedom, 0.5 * x.v @ x.mass_matrix(x.plain.q) @ x.v
+    for names in combinations(range(model.nv), degrees):
+        try:
+            J = dyn.reduced_inertia(x.q, [model.velocity_names[k] for k in names]).inertia
+        except NumericalError:
+            continue
+        close(0.5 * x.v[list(names)] @ J @ x.v[list(names)], energy)
+        return
+    raise AssertionError("no coordinates determine the others")
+
+
+def by_operational_space(model: mb.Model, folder: Path) -> None:
+    x, dyn = case(model)
+    space = mb.operational_space(dyn, x.q, "b2", rows=[0])
+    J = dyn.jacobian(x.q, "b2")[:1]
+    close(space.inertia, 1 / (J @ np.linalg.solve(x.mass_matrix(x.plain.q), J.T)))
+
+
+def by_linearizing(model: mb.Model, folder: Path) -> None:
+    """Against differences of the truth, along changes that keep the constraints."""
+    x, dyn = case(model)
+    n, h = model.nv, 1e-5
+    A, B, f, _ = dyn.linearize(x.q, x.v, x.tau)
+    changes = np.eye(2 * n)
+    if model.constrained:
+        J, G = dyn.constraint_jacobian(x.q), dyn.constraint_rate_gradient(x.q, x.v)
+        held = len(J) - len(dyn.velocity_constraint_names)
+        changes = scipy.linalg.null_space(np.block([[J[:held], np.zeros((held, n))], [G, J]]))
+    for z in changes.T:
+        ahead, back = (x.moved(s * z[:n], x.v + s * z[n:], x.tau) for s in (h, -h))
+        close(A[n:] @ z, (ahead - back) / (2 * h), 1e-6)
+    push = np.eye(n)
+    wanted = [x.moved(np.zeros(n), x.v, x.tau + e) - x.accelerated() for e in push]
+    if "jump" not in {word for name in model.acts for word in mb.model.elements.kinds.kind(name).does}:
+        close(B[n:], np.array(wanted).T.reshape(n, n))
+    close(f[n:], x.accelerated())
+
+
+def by_step_derivative(model: mb.Model, folder: Path) -> None:
+    x, dyn = case(model)
+    n, h, dt = model.nv, 1e-5, 0.01
+    A, B, _ = dyn.discretize(x.q, x.v, x.tau, dt)
+
+    def after(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return dyn.step(model.integrate(x.q, z[:n]), x.v + z[n : 2 * n], x.tau + z[2 * n :], dt)
+
+    for z, column in zip(np.eye(3 * n), np.hstack([A, B]).T, strict=True):
+        (q1, v1), (q0, v0) = after(h * z), after(-h * z)
+        close(column, np.concatenate([model.difference(q0, q1), v1 - v0]) / (2 * h), 1e-6)
+
+
+def on_a_gpu(model: mb.Model, folder: Path) -> None:
+    x = case(model)[0]
+    with fake_gpu():
+        dyn = mb.dynamics(model, "lagrangian", compile=True, device="cuda")
+        dyn = dyn.at(**{model.time_parameter: x.t}) if model.time_parameter else dyn
+        out = dyn.forward_dynamics(*(on_device(np.stack([y, y]), major=False) for y in (x.q, x.v, x.tau)))
+        close(np.asarray(out.numpy() if hasattr(out, "numpy") else out), [x.accelerated()] * 2)
+
+
+# Runs
+
+
+def by_running(method: str, most: float, **setting: Any) -> Check:
+    def check(model: mb.Model, folder: Path) -> None:
+        x, _ = case(model)
+        dyn = mb.dynamics(model, "lagrangian", compile=False)
+        duration = _STEPS * setting.get("dt", _STEP)
+        save = None if "dt" in setting else np.array([x.t, x.t + duration])
+        run = mb.simulate(dyn, x.q, x.v, duration, method, torque=x.tau, t0=x.t, save=save, **setting)
+        q, v = x.motion(np.array([0.0, duration]))
+        close(model.difference(q[-1], run.q[-1]), np.zeros(model.nv), most)
+        close(run.v[-1], v[-1], most)
+
+    return check
+
+
+def by_phases_and_moreau(model: mb.Model, folder: Path) -> None:
+    by_running("rk4", 1e-9, dt=_STEP)(model, folder)
+    by_running("moreau", 1e-6, dt=1e-6)(model, folder)
+
+
+def by_exciting(model: mb.Model, folder: Path) -> None:
+    """The motion is one: velocities are the rates of its coordinates."""
+    motion = mb.excitation(model, duration=2.0, harmonics=2, rate=200.0, iterations=1)
+    dt = motion.t[1]
+    close(motion.v[1:-1], (motion.q[2:] - motion.q[:-2]) / (2 * dt), 1e-3)
+    close(motion.a[1:-1], (motion.v[2:] - motion.v[:-2]) / (2 * dt), 1e-3)
+
+
+CHECKS: dict[str, Check] = {
+    "c": in_c,
+    "program": by_program,
+    "paper": on_paper,
+    "loads": by_loads,
+    "loads of loops": by_loop_loads,
+    "constraint rows": by_rows,
+    "actuator forces": by_actuators,
+    "reduced inertia": by_reduced_inertia,
+    "operational space": by_operational_space,
+    "linearize": by_linearizing,
+    "derivative of a step": by_step_derivative,
+    "gpu under force": on_a_gpu,
+    "symplectic runs": by_running("implicit_midpoint", 1e-6, dt=_STEP),
+    "runs": by_phases_and_moreau,
+    "runs without phases": by_running("cvodes", 1e-7, rtol=1e-10),
+    "excitation": by_exciting,
+}
