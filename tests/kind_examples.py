@@ -2,7 +2,7 @@
 
 Each is an arm with one such part, which has the name "x", or moves joint "j0". The truth is `tests.plain_mechanics` on
 coordinates of its own: a joint of several velocities is a stack of hinges and slides without mass, and a quaternion
-three angles. `tests.test_matrix` and ``python -m validation --only matrix`` share the examples.
+three angles. `tests.test_matrix` and `tests.kind_paths` share the examples.
 """
 
 # ruff: noqa: ARG001, ARG005  # all parts are called alike
@@ -73,6 +73,8 @@ class Example:
     #: Of each joint with coordinates its type, and where its coordinates begin among those of `plain`.
     joints: list[tuple[str, str, int]]
     tau: np.ndarray
+    #: Link of each body.
+    links: dict[str, int]
     #: What a refusal may call the part.
     words: tuple[str, ...] = ()
 
@@ -129,13 +131,30 @@ class Example:
         """Return v̇ at the example's state."""
         return self.acceleration(self.t, self.plain.q, self.plain.v, self.tau)
 
-    def moved(self, dx: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return v̇ beside the state: at q ⊕ E dx, with the same v or another one."""
-        x = self.plain.q + np.linalg.solve(self.rates(self.plain.q), dx)
-        return self.acceleration(self.t, x, np.linalg.solve(self.rates(x), v), tau)
+    def force(self, a: np.ndarray, bodies: bool = False) -> np.ndarray:
+        """Return τ that gives v̇ = a where no row holds; of the bodies alone, without what else acts."""
+        c = replace(self.plain, parts=[]) if bodies else self.plain
+        x, u, E = c.q, c.v, self.rates(c.q)
+        turning = np.imag(self.rates(x + 1j * _STEP * u)) / _STEP
+        dM = derivative(c.mass_matrix, x)
+        h = np.einsum("ijk,j,k->i", dM, u, u) - np.einsum("jki,j,k->i", dM, u, u) / 2
+        f = c.mass_matrix(x) @ np.linalg.solve(E, a - turning @ u) + h + derivative(c.potential, x)
+        return np.linalg.solve(E.T, f - c.loads(c.t, x, u))
 
-    def motion(self, times: np.ndarray, load: Callable[..., Any] | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return q and v at times after the start, by SciPy at 12 digits; the force is the model's, load(t, q, v)."""
+    def held(self) -> np.ndarray:
+        """Return J of all rows on the model's velocities, (m, n)."""
+        return self.plain.held(self.t, self.plain.q) @ np.linalg.inv(self.rates(self.plain.q))
+
+    def beside(self, direction: np.ndarray, bent: np.ndarray, s: float) -> Example:
+        """Return the example at a state that the rows allow to first order, s along two random directions."""
+        c = self.plain
+        rows = [p for p in c.parts if p.rows]
+        J = derivative(lambda x: c.rows(c.t, x), c.q) if rows else np.zeros((0, c.n))
+        x = c.q + s * (direction - np.linalg.pinv(J) @ (J @ direction))
+        return replace(self, plain=replace(c, q=x, v=c.allowed(c.t, x, c.v + s * bent)))
+
+    def flow(self, times: np.ndarray, load: Callable[..., Any] | None = None) -> np.ndarray:
+        """Return x and ẋ at times after the start, (k, 2n), by SciPy; the force is the model's, load(t, q, v)."""
         n = self.plain.n
 
         def rate(t: float, y: np.ndarray) -> np.ndarray:
@@ -144,12 +163,25 @@ class Example:
             tau = self.tau if load is None else load(t, self.position(x), E @ u)
             return np.concatenate([u, self.plain.acceleration(t, x, u, E.T @ tau)])
 
-        start = np.concatenate([self.plain.q, self.plain.v])
-        out = solve_ivp(rate, (self.t, self.t + times[-1]), start, "DOP853", self.t + times, rtol=1e-11, atol=1e-12).y.T
-        return (
-            np.array([self.position(y[:n]) for y in out]),
-            np.array([self.rates(y[:n]) @ y[n:] for y in out]),
-        )
+        y = np.concatenate([self.plain.q, self.plain.v])
+        ends = (self.t, self.t + times[-1])
+        return solve_ivp(rate, ends, y, "DOP853", self.t + np.asarray(times), rtol=1e-11, atol=1e-12).y.T
+
+    def state(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the model's q and v."""
+        x, u = np.split(y, 2)
+        return self.position(x), self.rates(x) @ u
+
+    @property
+    def tip(self) -> str:
+        """The last body."""
+        return list(self.links)[-1]
+
+    def jacobian(self, x: np.ndarray, body: str = "") -> np.ndarray:
+        """Return the Jacobian of a body's frame in world axes on the model's velocities, (6, n): linear, angular."""
+        k = self.links[body or self.tip]
+        J = np.vstack([self.plain.moving(k, (0, 0, 0), x), self.plain.turning(k, x)])
+        return J @ np.linalg.inv(self.rates(x))
 
 
 def _size(type_: str) -> int:
@@ -226,7 +258,7 @@ class Arm:
         model = self.builder.build()
         assert list(model.joint_names) == [j for j, *_ in self.joints]
         tau = 0.3 - 0.2 * (np.arange(c.n) % 4)
-        return Example(self.name, model, c, self.joints, tau, words)
+        return Example(self.name, model, c, self.joints, tau, {b: k for b, k in self.last.items() if k >= 0}, words)
 
     # Parts of the plain case
 
@@ -606,7 +638,7 @@ def _beam(name: str) -> Example:
     c = _Beam(**{f: getattr(a.case, f) for f in a.case.__dataclass_fields__})
     c.q, c.v = np.array([0.4, 0.1]), np.array([0.7, -0.5])
     joints = [("j0", "revolute", 0), (model.joint_names[1], "revolute", 1)]
-    return Example(name, model, c, joints, np.array([0.3, -0.2]), ("beam", "x"))
+    return Example(name, model, c, joints, np.array([0.3, -0.2]), {}, ("beam", "'x'"))
 
 
 class _Pendulum(Case):
@@ -622,7 +654,9 @@ class _Pendulum(Case):
 def _energies(name: str) -> Example:
     a = arm(name, 1)
     c = _Pendulum(**{f: getattr(a.case, f) for f in a.case.__dataclass_fields__})
-    return Example(name, mb.lagrangian.systems.pendulum().model, c, a.joints, np.array([0.3]), ("bodies", "energies"))
+    return Example(
+        name, mb.lagrangian.systems.pendulum().model, c, a.joints, np.array([0.3]), {}, ("bodies", "energies")
+    )
 
 
 def _written(part: str) -> Callable[[str], Example]:
@@ -686,8 +720,3 @@ TYPES: dict[str, Callable[[str], Example]] = {
 def example(name: str) -> Example:
     """Return the example of a kind of part or of a joint type."""
     return (EXAMPLES | TYPES)[name](name)
-
-
-def renewed(x: Example, **plain: Any) -> Example:
-    """Return an example with other numbers of its plain case."""
-    return replace(x, plain=replace(x.plain, **plain))

@@ -209,16 +209,17 @@ class Case:
         kkt = np.block([[self.mass_matrix(q), J.T], [J, np.zeros((m, m))]])
         return np.linalg.solve(kkt, np.concatenate([f, -bias]))[: self.n]
 
+    def held(self, t: float, q: np.ndarray) -> np.ndarray:
+        """Return J of all rows, (m, n)."""
+        J = derivative(lambda x: self.rows(t, x), q) if any(p.rows for p in self.parts) else np.zeros((0, self.n))
+        return np.vstack([J, *(p.speeds(self, q) for p in self.parts if p.speeds is not None)])
+
     def allowed(self, t: float, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return the velocities nearest to these that all rows allow."""
-        J, b = np.zeros((0, self.n)), np.zeros(0)
-        if any(part.rows for part in self.parts):
-            J = derivative(lambda x: self.rows(t, x), q)
-            b = -np.imag(self.rows(t + 1j * _STEP, q.astype(complex))) / _STEP
-        for part in self.parts:
-            if part.speeds is not None:
-                A = part.speeds(self, q)
-                J, b = np.vstack([J, A]), np.append(b, np.full(len(A), part.speed))
+        J = self.held(t, q)
+        drift = [] if not any(p.rows for p in self.parts) else np.imag(self.rows(t + 1j * _STEP, q.astype(complex)))
+        speeds = [p.speed for p in self.parts if p.speeds is not None for _ in p.speeds(self, q)]
+        b = np.concatenate([-np.asarray(drift) / _STEP, speeds])
         return v - np.linalg.pinv(J) @ (J @ v - b) if len(J) else v
 
     def rk4(self, duration: float, dt: float, tau: Callable[..., np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

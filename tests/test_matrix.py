@@ -34,6 +34,7 @@ from mbkit.model.elements.paths import Path as Gate
 from mbkit.model.joint_types import KINDS as JOINT_TYPES
 from tests import kind_examples, path_checks
 from tests.kind_examples import EXAMPLES, TYPES
+from tests.kind_paths import COLUMNS, ROWS, cell, registered
 from tests.plain_mechanics import TIP, Case, random_case
 from tests.test_engine_versions import present
 
@@ -569,6 +570,38 @@ def test_a_gate_refuses_a_kind_by_name_or_the_path_is_right(name: str, path: str
     assert all(x in text for x in numbers)
     assert refused or numbers or gate.asks[1] in text
     assert all(repr(k.features[-1]) in text for k in refused if k.features)
+
+
+# Each kind on each path: `tests.kind_paths`
+
+SOUND = ("right", "refused", "left out", "not asked")
+#: Cells that are refused without the part's name, or end otherwise.
+FAULTY = {
+    ("joint.stiction", "GPU (its driver replaced)"),
+    ("force.bushing", "GPU (its driver replaced)"),
+    ("point.damper", "pinocchio: derivatives"),
+    ("joint_type.free", "drake_sap"),
+}
+
+
+def test_every_gate_has_a_check_or_a_column() -> None:
+    assert set(registered()) <= {gate for c in COLUMNS.values() for gate in c.gates} | set(CHECKS)
+
+
+@pytest.mark.parametrize("path", COLUMNS)
+def test_a_cell_of_the_matrix_is_right_or_refused_by_name(path: str, tmp_path: Path) -> None:
+    if path == "C" and shutil.which("cc") is None:
+        pytest.skip("no C compiler on PATH")
+    name = ROWS[7 * list(COLUMNS).index(path) % len(ROWS)]
+    got = cell(name, path, tmp_path)
+    assert got.outcome in SOUND or (name, path) in FAULTY, (name, got)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("path", COLUMNS)
+def test_no_cell_of_the_matrix_is_silent(path: str, tmp_path: Path) -> None:
+    cells = {name: cell(name, path, tmp_path) for name in ROWS if (name, path) not in FAULTY}
+    assert {name: got for name, got in cells.items() if got.outcome not in SOUND} == {}
 
 
 # The registry and its readers

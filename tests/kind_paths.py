@@ -1,0 +1,878 @@
+"""Paths of a model as columns of the matrix: each returns how far a kind's example is from its truth in NumPy.
+
+A cell is "right" to an error, "refused" by the part's name, or "left out" with a note that has it; "silent", "unnamed"
+and "crash" are faults. `tests.test_matrix` runs some of the cells, and with ``--thorough`` all of them.
+"""
+
+# ruff: noqa: ARG001, ARG005  # all paths are called alike
+from __future__ import annotations
+
+import ctypes
+import pickle
+import subprocess
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import cache, partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import mbkit as mb
+from mbkit.codegen.c_source import export_c
+from mbkit.errors import MbkitError, MbkitWarning, UnsupportedError
+from mbkit.lagrangian import from_model, program
+from mbkit.methods.registry import METHODS
+from mbkit.model import Model
+from mbkit.model.elements.kinds import PART_KINDS, kind
+from mbkit.model.elements.paths import PATHS as GATES
+from mbkit.simulate import Event
+from tests.fake_cuda import fake_gpu
+from tests.kind_examples import EXAMPLES, TYPES, Example, example
+from tests.plain_mechanics import Part
+
+#: A cell's error, and the notes that say what was left out.
+Told = float | tuple[float, tuple[str, ...]]
+#: Sums of a few hundred rounded terms, and second differences of rows.
+CLOSE = 1e-9
+DURATION, STEP = 0.02, 1e-3
+STEP_OF_SLOPES = 0.01
+
+
+class NotAskedError(Exception):
+    """A path asks for something that an example does not have, such as a loop."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A path of a model, the gates that it passes, and its check."""
+
+    group: str
+    name: str
+    check: Callable[[Example, Path], Told]
+    close: float = CLOSE
+    gates: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What came of a kind on a path."""
+
+    outcome: str
+    error: float | None = None
+    text: str = ""
+
+
+COLUMNS: dict[str, Column] = {}
+
+
+def column(group: str, name: str, *gates: str, close: float = CLOSE, **more: Any) -> Callable[[Any], Any]:
+    """Register a check as a column."""
+
+    def add(check: Any) -> Any:
+        COLUMNS[name] = Column(group, name, partial(check, **more), close, gates)
+        return check
+
+    return add
+
+
+def registered() -> dict[str, Any]:
+    """Return all gates, once every module that has one is imported."""
+    top = Path(mb.__file__).parent
+    for file in sorted(top.rglob("*.py")):
+        if "elements.paths import" in file.read_text(encoding="utf-8"):
+            import_module(".".join(file.relative_to(top.parent).with_suffix("").parts))
+    return GATES
+
+
+def cell(name: str, path: str, folder: Path) -> Cell:
+    """Return what comes of an example on a path."""
+    out, gates = _cell(name, path, folder), [GATES[g] for g in COLUMNS[path].gates if g in GATES]
+    lost = any(g.refuses(example(name).model) for g in gates)
+    if gates and out.outcome in ("right", "refused", "left out") and lost != (out.outcome == "refused"):
+        return Cell("silent", out.error, f"its gate {'refuses' if lost else 'admits'} it; {out.text}")
+    return out
+
+
+def _cell(name: str, path: str, folder: Path) -> Cell:
+    x, col = example(name), COLUMNS[path]
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", MbkitWarning)
+        try:
+            out = col.check(x, folder)
+        except NotAskedError as error:
+            return Cell("not asked", text=str(error))
+        except MbkitError as error:
+            text = " ".join(str(error).split())
+            if not (isinstance(error, UnsupportedError) or path in ("lock", "its number as a parameter")):
+                return Cell("crash", text=text)
+            return Cell("refused" if _named(name, x, text) else "unnamed", text=text)
+        except Exception as error:
+            return Cell("crash", text=f"{type(error).__name__}: {' '.join(str(error).split())}")
+    error, notes = out if isinstance(out, tuple) else (out, ())
+    if error <= col.close:
+        return Cell("right", float(error))
+    texts = [str(w.message) for w in told if issubclass(w.category, MbkitWarning)]
+    named = (" ".join(note.split()) for note in (*notes, *texts) if _named(name, x, note))
+    text = next(named, "")
+    return Cell("left out" if text else "silent", float(error), text)
+
+
+def _named(name: str, x: Example, text: str) -> bool:
+    """Return whether a text has the words of one of the kinds that act, or of the example."""
+    words = [*x.words]
+    for k in map(kind, x.model.acts):
+        words += [k.words.format(p=p) for p in k.parts(x.model)]
+    low = text.lower()
+    own = "'x'" in text or any(w.lower() in low for w in words)
+    general = {"loop": "loop", "coupler": "coupler", "motion": "moved in time", "no_slip": "slip", "mimic": "mimic"}
+    more = (
+        name.split(".")[1].replace("_", " ") if "limit" in name else "",
+        general.get(name.partition(".")[0], ""),
+        name.split(".")[-1].replace("_", "-"),
+        name.split(".")[-1],
+    )
+    constraint = x.rows and "constraint" in low
+    return own or constraint or any(w and w in low for w in more)
+
+
+def off(got: Any, wanted: Any) -> float:
+    """Return the largest difference, relative to the largest number; infinity for other shapes."""
+    got, wanted = np.asarray(got, dtype=float), np.asarray(wanted, dtype=float)
+    if got.shape != wanted.shape or not np.isfinite(got).all():
+        return np.inf
+    return float(np.abs(got - wanted).max(initial=0.0) / max(1.0, np.abs(wanted).max(initial=0.0)))
+
+
+@cache
+def engine(name: str, which: str = "lagrangian", **options: Any) -> mb.Dynamics:
+    """Return an engine on an example, at its time."""
+    x = example(name)
+    return dynamics(x, x.model, which, **options)
+
+
+def dynamics(x: Example, model: Model, which: str = "lagrangian", **options: Any) -> mb.Dynamics:
+    options = {"compile": False} | options if which == "lagrangian" else options
+    dyn = mb.dynamics(model, which, **options)
+    return dyn.at(**{model.time_parameter: x.t}) if model.time_parameter else dyn
+
+
+#: Of joint types their coordinates, and where a quaternion begins.
+_QUATERNIONS = {"ball": (4, 0), "free": (7, 3), "universal": (2, -1), "planar": (3, -1), "spherical_zyx": (3, -1)}
+
+
+def aligned(q: np.ndarray, x: Example, like: np.ndarray) -> np.ndarray:
+    """Return q with the signs of quaternions as those of another one."""
+    q, at = np.array(q, dtype=float), 0
+    if q.shape != like.shape:
+        return q
+    for _, type_, _ in x.joints:
+        size, four = _QUATERNIONS.get(type_, (1, -1))
+        if four >= 0 and q[at + four : at + four + 4] @ like[at + four : at + four + 4] < 0:
+            q[at + four : at + four + 4] *= -1
+        at += size
+    return q
+
+
+# Engines
+
+
+def _forward(x: Example, folder: Path, which: str) -> Told:
+    dyn = engine(x.name, which)
+    a = dyn.forward_dynamics(x.q, x.v, x.tau)
+    wanted = x.accelerated()
+    if dyn.soft_constraints and x.rows:
+        # MuJoCo's constraints are soft; its law, which its solver reaches, becomes the rigid one.
+        law = dyn.constraint_law(x.q, x.v, x.tau)
+        return max(off(a, law.acceleration), off(law.rigid, wanted))
+    return off(a, wanted)
+
+
+def _inverse(x: Example, folder: Path, which: str) -> Told:
+    dyn, a = engine(x.name, which), 0.3 * x.v + 0.1
+    M = off(dyn.mass_matrix(x.q), x.mass_matrix(x.plain.q))
+    return max(M, off(dyn.inverse_dynamics(x.q, x.v, a), x.force(a)))
+
+
+def _energies(x: Example, folder: Path, which: str) -> Told:
+    dyn, c = engine(x.name, which), x.plain
+    other = 0.5 * c.q
+    one = dyn.potential_energy(x.q) - dyn.potential_energy(x.position(other))
+    kinetic = c.v @ c.mass_matrix(c.q) @ c.v / 2
+    return max(off(one, c.potential(c.q) - c.potential(other)), off(dyn.kinetic_energy(x.q, x.v), kinetic))
+
+
+def _frames(x: Example, folder: Path, which: str) -> Told:
+    if not x.links:
+        raise NotAskedError("no bodies")
+    dyn, J = engine(x.name, which), x.jacobian(x.plain.q)
+    return max(off(dyn.jacobian(x.q, x.tip), J), off(dyn.velocity(x.q, x.v, x.tip), J @ x.v))
+
+
+def _derivatives(x: Example, folder: Path, which: str) -> Told:
+    """Differences of the truth, along directions that rows allow."""
+    dyn = engine(x.name, which)
+    by_q, by_v, by_tau = dyn.forward_dynamics_derivatives(x.q, x.v, x.tau)
+    return max(_along(x, by_q, by_v), _by_force(x, by_tau))
+
+
+def _by_force(x: Example, by_tau: np.ndarray) -> float:
+    d = np.linspace(0.3, -0.4, len(x.tau))
+    two = (x.acceleration(x.t, x.plain.q, x.plain.v, x.tau + s * d) for s in (1, -1))
+    plus, minus = two
+    return off(by_tau @ d, (plus - minus) / 2)
+
+
+def differences(f: Callable[[float], np.ndarray], h: float = 1e-3) -> np.ndarray:
+    return np.asarray((8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h))
+
+
+def _along(x: Example, by_q: np.ndarray, by_v: np.ndarray) -> float:
+    return max(off(by_q @ dq + by_v @ dv, wanted) for dq, dv, wanted in _slopes(x.name))
+
+
+@cache
+def _slopes(name: str) -> list[tuple[np.ndarray, ...]]:
+    """Return changes of the state that the rows allow, and of the acceleration, by differences of the truth."""
+    x, rng = example(name), np.random.default_rng(3)
+    c, out = x.plain, []
+    for _ in range(2):
+        along, bent = rng.uniform(-1, 1, (2, c.n))
+
+        def path(s: float, along: np.ndarray = along, bent: np.ndarray = bent) -> Example:
+            return x.beside(along, bent, s)
+
+        ways = (lambda s: path(s).plain.q), (lambda s: path(s).v), (lambda s: path(s).accelerated())
+        dx, dv, wanted = map(differences, ways)
+        out.append((x.rates(c.q) @ dx, dv, wanted))
+    return out
+
+
+for _engine in ("lagrangian", "pinocchio", "mujoco", "drake", "oracle"):
+    for _what, _check, _close in (
+        ("accelerations", _forward, CLOSE),
+        ("M and inverse dynamics", _inverse, CLOSE),
+        ("energies", _energies, CLOSE),
+        ("frames", _frames, CLOSE),
+        ("derivatives", _derivatives, 1e-6),
+    ):
+        if _engine in ("lagrangian", "pinocchio", "oracle") or _what != "derivatives":
+            column(f"engine {_engine}", f"{_engine}: {_what}", close=_close, which=_engine)(_check)
+
+
+@column("engine mujoco", "mujoco: friction loss", "mujoco friction loss")
+def _friction_loss(x: Example, folder: Path) -> Told:
+    """Its terms are those of the derivation; its friction is another one."""
+    soft = mb.dynamics(x.model, "mujoco", soft_friction=True)
+    soft = soft.at(**{x.model.time_parameter: x.t}) if x.model.time_parameter else soft
+    h = soft.nle(x.q, x.v) - soft.mass_matrix(x.q) @ np.zeros(len(x.v))
+    return max(off(soft.mass_matrix(x.q), x.mass_matrix(x.plain.q)), off(h, engine(x.name, "oracle").nle(x.q, x.v)))
+
+
+# Quantities of the own derivation
+
+
+@column("quantities", "linearize", close=1e-6)
+def _linearize(x: Example, folder: Path) -> Told:
+    out, n = engine(x.name).linearize(x.q, x.v, x.tau), len(x.v)
+    return max(off(out.f, [*x.v, *x.accelerated()]), _along(x, out.A[n:, :n], out.A[n:, n:]), _by_force(x, out.B[n:]))
+
+
+@column("quantities", "derivative of a step", close=1e-6)
+def _step_derivative(x: Example, folder: Path) -> Told:
+    out = engine(x.name).discretize(x.q, x.v, x.tau, STEP_OF_SLOPES)
+    move, wanted = _slope(x.name)
+    return off(out.A @ move, wanted)
+
+
+@column("quantities", "sensitivities", close=1e-6)
+def _sensitivities(x: Example, folder: Path) -> Told:
+    out = mb.sensitivities(engine(x.name), x.q, x.v, STEP_OF_SLOPES, STEP_OF_SLOPES / 2, torque=x.tau)
+    move, wanted = _slope(x.name)
+    return off(out.state[-1] @ move, wanted)
+
+
+@cache
+def _slope(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return a change of the first state, (2n,), and what it makes of the end of a short motion."""
+    x = example(name)
+    c, (along, bent) = x.plain, np.random.default_rng(4).uniform(-1, 1, (2, x.plain.n))
+
+    def end(s: float) -> np.ndarray:
+        return x.beside(along, bent, s).flow([STEP_OF_SLOPES])[-1]
+
+    dq, dv = x.rates(c.q) @ along, differences(lambda s: x.beside(along, bent, s).v)
+    y, slope = end(0.0), differences(end, 1e-2)
+    moved = x.rates(y[: c.n]) @ slope[: c.n]
+    turned = differences(lambda s: x.state(y + s * slope)[1])
+    return np.concatenate([dq, dv]), np.concatenate([moved, turned])
+
+
+@column("quantities", "mass as a parameter")
+def _mass(x: Example, folder: Path) -> Told:
+    if not x.links:
+        raise NotAskedError("no bodies")
+    body, k = next(iter(x.links.items()))
+    k = 0 if body == "b0" and len(x.plain.mass) == 1 else k
+    model = x.model.with_free(f"{body}.mass")
+    dyn = dynamics(x, model).at(**{f"{body}.mass": 1.5 * x.plain.mass[k]})
+    mass = x.plain.mass.copy()
+    mass[k] *= 1.5
+    other = replace(x, plain=replace(x.plain, mass=mass))
+    return off(dyn.forward_dynamics(x.q, x.v, x.tau), other.accelerated())
+
+
+def _changed(x: Example, name: str) -> list[tuple[str, Model]]:
+    """Return models with one number of the part changed each, by the field's name, of those that a kind has."""
+    out = []
+    k = kind(name) if name in PART_KINDS or name[11:] in mb.model.KINDS else None
+    if k is None or not k.section:
+        return [("gravity", replace(x.model, gravity=1.1 * x.model.gravity))] if name == "gravity" else []
+    part = k.parts(x.model)[0]
+    for f in fields(part):
+        value = getattr(part, f.name)
+        if f.name == "velocity_limit" or isinstance(value, (str, bool)) or "rotation" in f.name or "axis" in f.name:
+            continue
+        if not (isinstance(value, (float, np.ndarray)) and np.size(value)):
+            continue
+        # A spline's pieces no longer fit, and a plane lies out of reach.
+        if (
+            f.name in ("axes", "coefficients", "knots", "translation_b")
+            or not np.isfinite(value).all()
+            or not np.any(value)
+        ):
+            continue
+        changed = replace(part, **{f.name: 1.1 * value})
+        parts = tuple(changed if p is part else p for p in getattr(x.model, k.section))
+        out.append((f.name, replace(x.model, **{k.section: parts})))
+    return out
+
+
+@column("quantities", "its number as a parameter")
+def _number(x: Example, folder: Path) -> Told:
+    """The model with the number typed is evaluated beside the one at another value."""
+    k = PART_KINDS.get(x.name)
+    numbers = k.numbers - {"lower", "upper", "velocity_limit", "effort_limit"} if k else frozenset()
+    if not numbers or not k.section:
+        raise NotAskedError("it has no numbers that act")
+    worst, part = 0.0, k.parts(x.model)[0]
+    if k.section == "bodies":
+        numbers = numbers - {"inertia"}
+    for name in sorted(numbers):
+        value = getattr(part, name)
+        if value is None or not np.any(value):
+            continue
+        free = x.model.with_free(f"{part.name}.{name}")
+        new = {p: 1.1 * float(v) for p, v in free.parameters.items() if p not in x.model.parameters and p != "t"}
+        typed = next(m for n, m in _changed(x, x.name) if n == name)
+        got = dynamics(x, free).at(**new).forward_dynamics(x.q, x.v, x.tau)
+        worst = max(worst, off(got, dynamics(x, typed).forward_dynamics(x.q, x.v, x.tau)))
+    return worst
+
+
+@column("quantities", "regressor")
+def _regressor(x: Example, folder: Path) -> Told:
+    if not x.links or x.name == "joint_type.beam":
+        raise NotAskedError("no rigid bodies of its own")
+    dyn, a = engine(x.name), 0.3 * x.v + 0.1
+    Y = dyn.regressor(x.q, x.v, a)
+    pi = []
+    for body in x.model.bodies:
+        m, c = body.mass, np.asarray(body.com)
+        I = np.asarray(body.inertia) + m * (c @ c * np.eye(3) - np.outer(c, c))
+        pi += [m, *(m * c), I[0, 0], I[0, 1], I[0, 2], I[1, 1], I[1, 2], I[2, 2]]
+    columns = x.model.regressor_columns()
+    order = ("m", "hx", "hy", "hz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
+    named = dict(zip((f"{b.name}.{s}" for b in x.model.bodies for s in order), pi, strict=True))
+    if not set(columns) <= set(named):
+        raise AssertionError(str(columns[:12]))
+    bare = x.force(a, bodies=True)
+    if x.name == "body.rotor":
+        # Its mass is a body's, with a weight.
+        bare = engine(x.name).mass_matrix(x.q) @ a + engine(x.name, "oracle").nle(x.q, x.v)
+    return off(Y @ [named[c] for c in columns], bare)
+
+
+@column("quantities", "base parameters", "base parameters")
+def _base_parameters(x: Example, folder: Path) -> Told:
+    base = x.model.base_parameters()
+    if x.name == "joint_type.beam":
+        raise NotAskedError("points of a beam")
+    a = 0.3 * x.v + 0.1
+    bare = x.force(a, bodies=True)
+    if x.name == "body.rotor":
+        bare = engine(x.name).mass_matrix(x.q) @ a + engine(x.name, "oracle").nle(x.q, x.v)
+    return off(engine(x.name).regressor(x.q, x.v, a, "base") @ base.values, bare)
+
+
+@column("quantities", "impact")
+def _impact(x: Example, folder: Path) -> Told:
+    M, J = x.mass_matrix(x.plain.q), x.held()
+    S, m, n = 0.3 * np.cos(np.arange(len(x.v))), len(J), len(x.v)
+    kkt = np.block([[M, -J.T], [J, np.zeros((m, m))]])
+    wanted = x.v + np.linalg.solve(kkt, [*S, *np.zeros(m)])[:n]
+    return off(mb.impact(engine(x.name), x.q, x.v, S).v, wanted)
+
+
+@column("quantities", "equilibrium")
+def _equilibrium(x: Example, folder: Path) -> Told:
+    if x.model.time_parameter or x.name == "no_slip.blade":
+        raise NotAskedError("it moves in time")
+    tau = np.asarray(mb.equilibrium(engine(x.name), holding=x.q).tau)
+    still = replace(x, plain=replace(x.plain, v=0 * x.plain.v))
+    return off(still.acceleration(x.t, x.plain.q, 0 * x.plain.v, tau), 0 * tau)
+
+
+@column("quantities", "operational space")
+def _operational(x: Example, folder: Path) -> Told:
+    if not x.links:
+        raise NotAskedError("no bodies")
+    J = x.jacobian(x.plain.q)
+    row = int(np.argmax(np.linalg.norm(J, axis=1)))
+    wanted = np.linalg.inv(J[[row]] @ np.linalg.solve(x.mass_matrix(x.plain.q), J[[row]].T))
+    return off(mb.operational_space(engine(x.name), x.q, x.tip, rows=[row]).inertia, wanted)
+
+
+@column("quantities", "loads of joints")
+def _loads(x: Example, folder: Path) -> Told:
+    rest = engine(x.name).newton_euler_residual(x.q, x.v, x.accelerated(), x.tau)
+    return off(rest, 0 * rest)
+
+
+@column("quantities", "loads of loops")
+def _loop_loads(x: Example, folder: Path) -> Told:
+    if not x.model.loops:
+        raise NotAskedError("no loop")
+    (wrench,), (loop,) = engine(x.name).loop_wrenches(x.q, x.v, x.tau), x.model.loops
+    F, T = loop.rotation_a @ wrench[:3], loop.rotation_a @ wrench[3:]
+    k = x.links[loop.body_b]
+    R, p = x.plain.poses(x.plain.q)[k]
+    lever = R.T @ (loop.translation_a - p)
+    own = -(x.plain.moving(k, lever, x.plain.q).T @ F + x.plain.turning(k, x.plain.q).T @ T)
+    return off(own, x.force(x.accelerated()) - x.tau)
+
+
+@column("quantities", "forces of actuators")
+def _actuators(x: Example, folder: Path) -> Told:
+    if not x.rows:
+        raise NotAskedError("no rows")
+    a = x.accelerated()
+    tau = engine(x.name).actuator_forces(x.q, x.v, a).tau
+    return off(x.acceleration(x.t, x.plain.q, x.plain.v, tau), a)
+
+
+@column("quantities", "reduced inertia")
+def _reduced(x: Example, folder: Path) -> Told:
+    J = x.held()
+    if not len(J) or len(J.T) - len(J) != 1:
+        raise NotAskedError("no mechanism of one degree of freedom")
+    N = np.linalg.svd(J)[2][-1]
+    k = int(np.argmax(abs(N)))
+    N = N / N[k]
+    own = engine(x.name).reduced_inertia(x.q, x.model.coordinate_names[k]).inertia
+    return off(own, N @ x.mass_matrix(x.plain.q) @ N)
+
+
+@column("quantities", "mobility")
+def _mobility(x: Example, folder: Path) -> Told:
+    return off(engine(x.name).mobility().degrees_of_freedom, x.plain.n - len(x.held()))
+
+
+@column("quantities", "GPU (its driver replaced)", close=1e-8)
+def _gpu(x: Example, folder: Path) -> Told:
+    with fake_gpu():
+        dyn = dynamics(x, x.model, compile=True, device="cuda")
+        return off(dyn.forward_dynamics(x.q[None], x.v[None], x.tau[None])[0], x.accelerated())
+
+
+# Runs
+
+_METHODS = {"lagrangian": [n for n, m in METHODS.items() if not m.engines or "lagrangian" in m.engines]}
+_METHODS["mujoco"] = [n for n, m in METHODS.items() if "mujoco" in m.engines]
+_METHODS["drake"] = [n for n, m in METHODS.items() if "drake" in m.engines]
+
+
+@cache
+def _truth(name: str) -> tuple[np.ndarray, np.ndarray]:
+    x = example(name)
+    return x.state(x.flow([DURATION])[-1])
+
+
+def _ended(run: mb.Trajectory) -> None:
+    if run.stats.ended != "finished":
+        raise RuntimeError(f"{run.stats.ended}: {run.stats.message}")
+
+
+def _run(x: Example, folder: Path, which: str, method: str) -> Told:
+    """The end of a run; of a fixed step that which steps of half the length lead to, by the method's order."""
+    dyn, told = engine(x.name, which), METHODS[method]
+    if dyn.soft_constraints and x.rows:
+        raise NotAskedError("its constraints are soft")
+    q, v = _truth(x.name)
+
+    def end(**more: Any) -> tuple[np.ndarray, np.ndarray]:
+        run = mb.simulate(dyn, x.q, x.v, DURATION, method, torque=x.tau, t0=x.t, doubt=False, **more)
+        _ended(run)
+        return aligned(run.q[-1], x, q), run.v[-1]
+
+    if method == "taylor" and len(x.plain.kinds) > 4:
+        raise NotAskedError("more than four joints take long to compile")
+    if told.kind == "adaptive":
+        return max(map(off, end(save=[x.t + DURATION]), (q, v)))
+    once, twice = end(dt=STEP), end(dt=STEP / 2)
+    f = 2 ** float(told.order or 1)
+    return max(off((f * b - a) / (f - 1), w) for a, b, w in zip(once, twice, (q, v), strict=True))
+
+
+def _close_of(method: str) -> float:
+    """Return what is close: steps of the first order leave an error of the second, and a tolerance is one of a step."""
+    told = METHODS[method]
+    return 1e-7 if told.order != 1 else 1e-5 if told.kind == "adaptive" else 1e-4
+
+
+for _which, _names in _METHODS.items():
+    for _method in _names:
+        column(
+            "runs" if _which == "lagrangian" else f"runs of {_which}",
+            _method, close=_close_of(_method),
+            which=_which, method=_method,
+        )(_run)  # fmt: skip
+
+
+@column("use of runs", "step", close=1e-8)
+def _steps(x: Example, folder: Path) -> Told:
+    dyn, (q, v) = engine(x.name), (x.q, x.v)
+    for k in range(round(DURATION / STEP)):
+        q, v = dyn.step(q, v, x.tau, STEP, t=x.t + k * STEP)
+    wanted = _truth(x.name)
+    return max(off(aligned(q, x, wanted[0]), wanted[0]), off(v, wanted[1]))
+
+
+@column("use of runs", "sampled control", close=1e-8)
+def _hold(x: Example, folder: Path) -> Told:
+    held, y, now = DURATION / 4, np.concatenate([x.plain.q, x.plain.v]), x
+    for _ in range(4):
+        sample = x.tau - 0.5 * now.v
+        y = now.flow([held], lambda t, q, v, sample=sample: sample)[-1]
+        q, u = np.split(y, 2)
+        now = replace(now, plain=replace(now.plain, q=q, v=u, t=now.t + held))
+    run = mb.simulate(
+        engine(x.name), x.q, x.v, DURATION, "rk4", STEP, torque=lambda t, q, v: x.tau - 0.5 * v, hold=held, t0=x.t
+    )
+    _ended(run)
+    wanted = x.state(y)
+    return max(off(aligned(run.q[-1], x, wanted[0]), wanted[0]), off(run.v[-1], wanted[1]))
+
+
+@cache
+def _kept(name: str) -> mb.Trajectory:
+    x = example(name)
+    return mb.simulate(engine(name), x.q, x.v, DURATION, "rk4", STEP, torque=x.tau, t0=x.t, doubt=False)
+
+
+@column("use of runs", "batch", close=1e-8)
+def _batch(x: Example, folder: Path) -> Told:
+    run = mb.simulate(
+        engine(x.name), np.stack([x.q] * 2), np.stack([x.v] * 2), DURATION, "rk4", STEP, torque=x.tau, t0=x.t,
+        save=[x.t + DURATION],
+    )  # fmt: skip
+    q, v = _truth(x.name)
+    return max(max(off(aligned(run.q[k, -1], x, q), q), off(run.v[k, -1], v)) for k in range(2))
+
+
+@column("use of runs", "events", close=1e-7)
+def _events(x: Example, folder: Path) -> Told:
+    """A velocity's value in the middle of the truth is crossed there."""
+    middle = x.state(x.flow([0.6 * DURATION])[-1])[1]
+    row = x.accelerated()
+    if np.abs(row).max() < 1e-6:
+        raise NotAskedError("nothing accelerates")
+    row = row / np.linalg.norm(row)
+    event = Event(lambda t, q, v: float(row @ (v - middle)), "there")
+    run = mb.simulate(engine(x.name), x.q, x.v, DURATION, "rk853", torque=x.tau, t0=x.t, events=event, doubt=False)
+    return abs(run.t[-1] - x.t - 0.6 * DURATION) / DURATION
+
+
+@column("use of runs", "save and load", close=1e-8)
+def _saved(x: Example, folder: Path) -> Told:
+    run = _kept(x.name)
+    run.save(folder / "run.npz")
+    back = mb.Trajectory.load(folder / "run.npz", x.model)
+    wanted = _truth(x.name)
+    same = max(off(back.energy(), run.energy()), off(back.work(), run.work()))
+    return max(same, off(aligned(back.q[-1], x, wanted[0]), wanted[0]), off(back.v[-1], wanted[1]))
+
+
+@column("use of runs", "energy and power balance", close=1e-7)
+def _power(x: Example, folder: Path) -> Told:
+    run, c = _kept(x.name), x.plain
+    y = x.flow([DURATION])[-1]
+    end = c.energy(*np.split(y, 2)) - c.energy(c.q, c.v)
+    scale = max(1.0, np.abs(run.energy()).max(), np.abs(run.work()).max())
+    return max(off(run.energy()[-1] - run.energy()[0], end), np.abs(run.power_balance()).max() / scale)
+
+
+@column("use of runs", "wrenches", close=1e-8)
+def _wrenches(x: Example, folder: Path) -> Told:
+    if not x.links:
+        raise NotAskedError("no bodies")
+    w = np.array([0.5, -0.3, 0.2, 0.1, 0.2, -0.1])
+
+    # The force follows the body, whose Jacobian is that of the plain coordinates.
+    def flow() -> np.ndarray:
+        part = Part("w", (), force=lambda c, t, q, u: (x.jacobian(q) @ x.rates(q)).T @ w)
+        return replace(x, plain=replace(x.plain, parts=[*x.plain.parts, part])).flow([DURATION])[-1]
+
+    q, v = x.state(flow())
+    run = mb.simulate(
+        engine(x.name), x.q, x.v, DURATION, "rk4", STEP, torque=x.tau, t0=x.t, wrenches={x.tip: w},
+        wrench_axes="local_world_aligned", doubt=False,
+    )  # fmt: skip
+    _ended(run)
+    return max(off(aligned(run.q[-1], x, q), q), off(run.v[-1], v), off(run.wrenches()[x.tip][-1], w))
+
+
+@column("use of runs", "picture")
+def _picture(x: Example, folder: Path) -> Told:
+    _kept(x.name).picture()
+    import matplotlib.pyplot as plt
+
+    plt.close("all")
+    return 0.0
+
+
+# Texts
+
+
+def _more(x: Example) -> list[np.ndarray]:
+    """Return the inputs beside q, v and τ: the time, or the values of parameters."""
+    values = {n: v for n, v in x.model.parameters.items() if n != x.model.time_parameter}
+    time = [x.t] if x.model.time_parameter else []
+    return [np.array([*map(float, values.values()), *time])] if values or time else []
+
+
+@column("texts", "function (CasADi)")
+def _casadi(x: Example, folder: Path) -> Told:
+    function = mb.dynamics(x.model, "lagrangian").function("forward_dynamics")
+    return off(function(x.q, x.v, x.tau, *_more(x)).full()[:, 0], x.accelerated())
+
+
+@column("texts", "C")
+def _c(x: Example, folder: Path) -> Told:
+    made = export_c(x.model, ["forward_dynamics"], name="case")
+    _, source = made.write(folder)
+    library = folder / f"{abs(hash(x.name))}.so"
+    subprocess.run(["cc", "-O0", "-shared", "-fPIC", str(source), "-o", str(library), "-lm"], check=True)
+    described = made.functions[0]
+    arguments = [x.q, x.v, x.tau, *_more(x)]
+    assert len(arguments) == len(described.inputs)
+    out = np.full(len(x.v), np.nan)
+    call = getattr(ctypes.CDLL(str(library)), described.name)
+    call.restype = None
+    call(*(np.ascontiguousarray(y).ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for y in (*arguments, out)))
+    return off(out, x.accelerated())
+
+
+@column("texts", "program text")
+def _program(x: Example, folder: Path) -> Told:
+    names: dict[str, Any] = {}
+    text = program(x.model, "forward_dynamics")
+    exec(text.python(), names)
+    out = np.atleast_1d(names["forward_dynamics"](x.q, x.v, x.tau, *_more(x)))
+    return off(out, x.accelerated())
+
+
+@column("texts", "equations on paper")
+def _paper(x: Example, folder: Path) -> Told:
+    if len(x.plain.kinds) > 4:
+        raise NotAskedError("more than four joints take minutes; the suite has random chains with every loop")
+    lag = from_model(x.model, **({"drives": True} if x.model.prescribed else {}))
+    dyn = lag.dynamics(options={"compile": False})
+    dyn = dyn.at(**{dyn.model.time_parameter: x.t}) if dyn.model.time_parameter else dyn
+    if dyn.model.nq != x.model.nq:
+        # Paper has angles in the place of a quaternion, as the plain case.
+        c, E = x.plain, x.rates(x.plain.q)
+        return off(dyn.forward_dynamics(c.q, c.v, E.T @ x.tau), c.acceleration(x.t, c.q, c.v, E.T @ x.tau))
+    return off(dyn.forward_dynamics(x.q, x.v, x.tau), x.accelerated())
+
+
+# Files
+
+
+def _file(x: Example, folder: Path, to: str) -> Told:
+    made = mb.convert(x.model, to)
+    path = made.write(folder / f"case.{'xml' if to == 'mjcf' else 'urdf'}")
+    back = mb.load(path, gravity=x.model.gravity) if to == "urdf" else mb.load(path)
+    q, v, tau, a = x.q, x.v, x.tau, x.accelerated()
+    if x.name == "mimic" and to == "mjcf":
+        # MJCF keeps a mimic joint, as one that a coupler holds.
+        c = x.plain
+        q, v, a, tau = c.G @ q + c.c, c.G @ v, c.G @ a, np.append(tau, 0.0)
+    if "x.ball.wx" in back.velocity_names:
+        # Slides along the frame of the parent, and a ball.
+        c = x.plain
+        R = x.rates(c.q)[:3, :3].T
+        acceleration = c.acceleration(x.t, c.q, c.v, x.rates(c.q).T @ tau)
+        v, tau, a = (np.concatenate(y) for y in ((c.v[:3], v[3:]), (R @ tau[:3], tau[3:]), (acceleration[:3], a[3:])))
+    own = [*x.model.velocity_names, "x"][: len(v)], [*x.model.coordinate_names, "x"][: len(q)]
+    for names, there in zip(own, (back.velocity_names, back.coordinate_names), strict=True):
+        if set(names) != set(there):
+            # A joint that became several keeps the order of its motions.
+            break
+        at = [names.index(n) for n in there]
+        if names is own[0]:
+            v, tau, a = v[at], tau[at], a[at]
+        else:
+            q = q[at]
+    found = back.acts
+    limits = [k for k in x.model.acts if "limit" in k and not k.endswith("several")]
+    notes = tuple(str(n) for n in getattr(made, "notes", ()))
+    if any(k not in found for k in limits):
+        return np.inf, notes
+    return off(dynamics(x, back).forward_dynamics(q, v, tau), a), notes
+
+
+column("files", "URDF and back", "urdf", to="urdf")(_file)
+column("files", "MJCF and back", "mjcf", to="mjcf")(_file)
+
+
+@column("files", "pickle and digest")
+def _pickle(x: Example, folder: Path) -> Told:
+    back = pickle.loads(pickle.dumps(x.model))
+    if back.digest != x.model.digest or back != x.model:
+        return np.inf
+    same = [name for name, other in _changed(x, x.name) if other.digest == x.model.digest]
+    if same:
+        raise AssertionError(f"the digest does not see {same}")
+    return off(dynamics(x, back).forward_dynamics(x.q, x.v, x.tau), x.accelerated())
+
+
+@column("files", "baseline")
+def _baseline(x: Example, folder: Path) -> Told:
+    """The model passes, and does not without the part."""
+    path = folder / "b.toml"
+    mb.baseline.record(x.model, path, ["lagrangian"], samples=1, force=True)
+    if not mb.baseline.check(x.model, path).passed:
+        return np.inf
+    if (less := _without(x)) is not None and mb.baseline.check(less, path).passed:
+        raise AssertionError(f"passes without {x.name}")
+    return 0.0
+
+
+# Changes of a model
+
+
+def _without(x: Example) -> Model | None:
+    k = PART_KINDS.get(x.name)
+    return x.model.without(x.name) if k and k.features else None
+
+
+@column("changes", "without")
+def _taken_out(x: Example, folder: Path) -> Told:
+    less = _without(x)
+    if less is None:
+        raise NotAskedError("it is no part that can be taken out")
+    parts = [] if x.name != "gravity" else x.plain.parts
+    weight = 0 * x.plain.weight if x.name == "gravity" else x.plain.weight
+    bare = replace(x, plain=replace(x.plain, parts=parts, weight=weight))
+    return off(mb.dynamics(less, "lagrangian", compile=False).forward_dynamics(x.q, x.v, x.tau), bare.accelerated())
+
+
+@column("changes", "lock")
+def _lock(x: Example, folder: Path) -> Told:
+    """A locked joint is one whose velocity and acceleration stay zero."""
+    name = next((j for j in ("j1", "j0") if j in x.model.joint_names), "")
+    k = next((i for j, _, i in x.joints if j == name), 0)
+    if not name or len(x.plain.q) - len(x.held()) < 2:
+        raise NotAskedError("nothing else moves")
+    held = Part("held", (), speeds=lambda c, q: np.eye(c.n)[k][None])
+    c = replace(x.plain, parts=[*x.plain.parts, held])
+    now = replace(x, plain=replace(c, v=c.allowed(c.t, c.q, c.v)))
+    position = x.q[list(x.model.coordinate_names).index(name)]
+    locked = x.model.lock({name: position})
+    at = [n in locked.velocity_names for n in x.model.velocity_names]
+    there = [n in locked.coordinate_names for n in x.model.coordinate_names]
+    got = dynamics(x, locked).forward_dynamics(x.q[there], now.v[at], x.tau[at])
+    return off(got, now.accelerated()[at])
+
+
+@column("changes", "join")
+def _join(x: Example, folder: Path) -> Told:
+    """Beside a pendulum that nothing touches, the model moves as alone."""
+    b = mb.ModelBuilder("clock", gravity=x.model.gravity)
+    b.add_body("bob", mass=1.0, com=(0, 0, -1), inertia=(0.1, 0.1, 0.1))
+    b.add_joint("pivot", "revolute", parent="world", child="bob", axis=(0, 1, 0))
+    worst = 0.0
+    for model in (mb.join(b.build(), x.model, at="world"), mb.join(x.model, b.build(), at="world")):
+        at = [model.velocity_names.index(n) for n in x.model.velocity_names]
+        there = [model.coordinate_names.index(n) for n in x.model.coordinate_names]
+        q, v, tau = np.zeros(model.nq), np.zeros(model.nv), np.zeros(model.nv)
+        q[there], v[at], tau[at] = x.q, x.v, x.tau
+        worst = max(worst, off(dynamics(x, model).forward_dynamics(q, v, tau)[at], x.accelerated()))
+    return worst
+
+
+@column("changes", "built anew")
+def _of(x: Example, folder: Path) -> Told:
+    back = mb.ModelBuilder.of(x.model).build()
+    return off(dynamics(x, back).forward_dynamics(x.q, x.v, x.tau), x.accelerated())
+
+
+@column("changes", "segments")
+def _segments(x: Example, folder: Path) -> Told:
+    """Beams alone become others; a hinge that moves as a whole body has their inertia."""
+    model = x.model.segmented(3)
+    if x.name == "joint_type.beam":
+        raise NotAskedError("a chain comes near with many segments; the page of numbers on beams has how near")
+    return off(dynamics(x, model).forward_dynamics(x.q, x.v, x.tau), x.accelerated())
+
+
+# Studies
+
+
+@column("studies", "explain: taken out")
+def _explained(x: Example, folder: Path) -> Told:
+    if (less := _without(x)) is None:
+        raise NotAskedError("it is no part that can be taken out")
+    out = mb.explain(x.model, less, samples=1)
+    if out.agree and PART_KINDS[x.name].does != {"bound"}:
+        return np.inf
+    text = " ".join(f"{c.kind} {c.says}" for c in out.causes)
+    if not _named(x.name, x, text):
+        raise AssertionError(f"not by name: {text}")
+    return 0.0
+
+
+@column("studies", "explain: each number")
+def _each_number(x: Example, folder: Path) -> Told:
+    changed = _changed(x, x.name)
+    if not changed:
+        raise NotAskedError("it has no numbers")
+    unseen = []
+    for name, other in changed:
+        moved = dynamics(x, other).forward_dynamics(x.q, x.v, x.tau)
+        acts = off(moved, x.accelerated()) > 1e-7
+        if acts and mb.explain(x.model, other, samples=1).agree:
+            unseen.append(name)
+    if unseen:
+        raise AssertionError(f"not seen: {unseen}")
+    return 0.0
+
+
+@column("studies", "lint")
+def _lint(x: Example, folder: Path) -> Told:
+    mb.lint(x.model)
+    return 0.0
+
+
+#: Rows and columns of the matrix.
+ROWS = (*EXAMPLES, *TYPES)
+#: What no column runs yet.
+NOT_YET = (
+    "remote engines and their versions", "engines' own importers (`compare_parsers`)", "identification from data",
+    "steady motion", "comparison of engines, work-precision and stress", "the film, the reports and the pytest plugin",
+    "second derivatives", "LaTeX read back as numbers", "pairs of kinds but in random chains of the suite",
+)  # fmt: skip
