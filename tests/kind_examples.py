@@ -172,6 +172,11 @@ class Example:
         x, u = np.split(y, 2)
         return self.position(x), self.rates(x) @ u
 
+    def motion(self, times: np.ndarray, load: Callable[..., Any] | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the model's q and v at times after the start."""
+        q, v = zip(*map(self.state, self.flow(times, load)), strict=True)
+        return np.array(q), np.array(v)
+
     @property
     def tip(self) -> str:
         """The last body."""

@@ -588,6 +588,7 @@ def test_every_gate_has_a_check_or_a_column() -> None:
     assert set(registered()) <= {gate for c in COLUMNS.values() for gate in c.gates} | set(CHECKS)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("path", COLUMNS)
 def test_a_cell_of_the_matrix_is_right_or_refused_by_name(path: str, tmp_path: Path) -> None:
     if path == "C" and shutil.which("cc") is None:
