@@ -131,6 +131,11 @@ class Example:
         """Return v̇ at the example's state."""
         return self.acceleration(self.t, self.plain.q, self.plain.v, self.tau)
 
+    def moved(self, dx: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        """Return v̇ beside the state: at q ⊕ dx, with the same v or another one."""
+        x = self.plain.q + np.linalg.solve(self.rates(self.plain.q), dx)
+        return self.acceleration(self.t, x, np.linalg.solve(self.rates(x), v), tau)
+
     def force(self, a: np.ndarray, bodies: bool = False) -> np.ndarray:
         """Return τ that gives v̇ = a where no row holds; of the bodies alone, without what else acts."""
         c = replace(self.plain, parts=[]) if bodies else self.plain
