@@ -169,8 +169,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     _inverse_dynamics_derivatives: Callable[..., Any]
 
     def __init__(self, model: Model) -> None:
-        self.path.admit(model, f"{self.engine}:")
         self._take(model)
+        self.path.admit(model, f"{self.engine}:")
 
     def _take(self, model: Model) -> None:
         """Take a model, whatever its parts."""
