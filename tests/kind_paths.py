@@ -693,9 +693,8 @@ def _paper(x: Example, folder: Path) -> Told:
     dyn = lag.dynamics(options={"compile": False})
     dyn = dyn.at(**{dyn.model.time_parameter: x.t}) if dyn.model.time_parameter else dyn
     if dyn.model.nq != x.model.nq:
-        # Paper has angles in the place of a quaternion, as the plain case.
-        c, E = x.plain, x.rates(x.plain.q)
-        return off(dyn.forward_dynamics(c.q, c.v, E.T @ x.tau), c.acceleration(x.t, c.q, c.v, E.T @ x.tau))
+        # Paper has angles in the place of a quaternion, as the plain case, and the velocities of the model.
+        return off(dyn.forward_dynamics(x.plain.q, x.v, x.tau), x.accelerated())
     return off(dyn.forward_dynamics(x.q, x.v, x.tau), x.accelerated())
 
 

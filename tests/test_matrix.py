@@ -10,6 +10,7 @@ Then each kind alone goes through each gate. A kind without an example and a pat
 from __future__ import annotations
 
 import ctypes
+import json
 import shutil
 import subprocess
 import warnings
@@ -37,6 +38,7 @@ from tests.kind_examples import EXAMPLES, TYPES
 from tests.kind_paths import COLUMNS, ROWS, cell, registered
 from tests.plain_mechanics import TIP, Case, random_case
 from tests.test_engine_versions import present
+from validation.matrix import takes
 
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake", "oracle")
 #: Sums of a few hundred rounded terms, and second differences of the reference's rows.
@@ -581,11 +583,21 @@ FAULTY = {
     ("force.bushing", "GPU (its driver replaced)"),
     ("point.damper", "pinocchio: derivatives"),
     ("joint_type.free", "drake_sap"),
+    ("written.speed", "equilibrium"),
+    ("written.t", "save and load"),
 }
 
 
 def test_every_gate_has_a_check_or_a_column() -> None:
     assert set(registered()) <= {gate for c in COLUMNS.values() for gate in c.gates} | set(CHECKS)
+
+
+def test_what_each_path_takes_is_as_recorded() -> None:
+    """A kind that a path carries no more is told: ``python -m validation.matrix takes`` records anew."""
+    recorded = json.loads((Path(__file__).parent.parent / "validation" / "matrix.json").read_text(encoding="utf-8"))
+    now = takes()
+    lost = {name: sorted({*kinds} - {*now.get(name, ())}) for name, kinds in recorded["takes"].items()}
+    assert {name: kinds for name, kinds in lost.items() if kinds} == {}
 
 
 @pytest.mark.thorough

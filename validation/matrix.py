@@ -1,0 +1,95 @@
+"""Every kind of part on every path: right to an error, refused by name, or left out with a note.
+
+The examples and their truth are `tests.kind_examples`, in NumPy alone; the paths are `tests.kind_paths`.
+``python -m validation.matrix takes`` writes anew only the kinds that each gate takes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from mbkit.model.elements.kinds import PART_KINDS, joint_types, kind
+from tests.kind_examples import TYPES
+from tests.kind_paths import COLUMNS, NOT_YET, ROWS, cell, registered
+from validation.stamp import results, stamp
+
+KINDS = ROWS
+PATHS = tuple(COLUMNS)
+PROCESSES = 2
+#: Characters of a refusal that are kept.
+MOST = 160
+SMOKE = {"KINDS": ("gravity", "loop.point"), "PATHS": ("lagrangian: accelerations", "URDF and back"), "PROCESSES": 0}
+#: Outcomes that are faults.
+FAULTS = ("silent", "unnamed", "crash")
+
+
+def row(name: str, paths: tuple[str, ...]) -> dict[str, Any]:
+    """Return the cells of a kind, and the seconds that each took."""
+    os.environ["MBKIT_COMPILE"] = "0"
+    cells, seconds = {}, {}
+    registered()
+    for path in paths:
+        begun = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            out = cell(name, path, Path(folder))
+            text = out.text.replace(f"{folder}/", "")
+        seconds[path] = round(time.perf_counter() - begun, 2)
+        cells[path] = [out.outcome, None if out.error is None else float(f"{out.error:.1e}"), text[:MOST]]
+    return {"kind": name, "cells": cells, "seconds": seconds}
+
+
+def takes() -> dict[str, list[str]]:
+    """Return the kinds that each gate takes."""
+    types = joint_types(*(x.removeprefix("joint_type.") for x in TYPES if not x.endswith("beam")))
+    kinds = [*PART_KINDS.values(), *map(kind, sorted(types))]
+    return {name: [k.name for k in kinds if gate.takes(k)] for name, gate in sorted(registered().items())}
+
+
+def rows() -> list[dict[str, Any]]:
+    """Return all rows; two processes share them."""
+    if not PROCESSES:
+        return [row(name, PATHS) for name in KINDS]
+    with ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")) as pool:
+        return list(pool.map(row, KINDS, [PATHS] * len(KINDS)))
+
+
+def main() -> int:
+    begun = time.perf_counter()
+    file = results("matrix.json")
+    if sys.argv[1:] == ["takes"]:
+        data = json.loads(file.read_text(encoding="utf-8")) | {"takes": takes()}
+    else:
+        found = rows()
+        counts = Counter(c[0] for r in found for c in r["cells"].values())
+        times = [r.pop("seconds") for r in found]
+        seconds = {path: round(sum(x[path] for x in times), 1) for path in PATHS}
+        data = stamp(__file__) | {
+            "counts": dict(counts),
+            "wall_s": round(time.perf_counter() - begun),
+            "columns": [{"group": COLUMNS[p].group, "name": p, "close": COLUMNS[p].close} for p in PATHS],
+            "seconds": seconds,
+            "not_yet": NOT_YET,
+            "without_column": sorted(set(registered()) - {g for c in COLUMNS.values() for g in c.gates}),
+            "takes": takes(),
+            "rows": found,
+        }
+        print(data["counts"])
+        for r in found:
+            for path, (outcome, error, text) in r["cells"].items():
+                if outcome in FAULTS:
+                    print(f"{r['kind']} on {path}: {outcome} {error} {text}")
+    file.write_text(json.dumps(data, ensure_ascii=False, separators=(",", ":")) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
