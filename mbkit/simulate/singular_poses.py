@@ -301,8 +301,8 @@ class SingularPoses:
         rows = " and ".join(names[k] for k in self._rows)
         return (
             f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
-            f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the tolerance, "
-            "and by more with implicit methods"
+            f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the "
+            "tolerance, and by more with implicit methods"
         )
 
 
