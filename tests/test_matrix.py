@@ -600,7 +600,6 @@ def test_what_each_path_takes_is_as_recorded() -> None:
     assert {name: kinds for name, kinds in lost.items() if kinds} == {}
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("path", COLUMNS)
 def test_a_cell_of_the_matrix_is_right_or_refused_by_name(path: str, tmp_path: Path) -> None:
     if path == "C" and shutil.which("cc") is None:
