@@ -73,6 +73,13 @@ def known(unknown: None) -> None:  # noqa: ARG001  # it has registered them
         PART_KINDS[f"force.{name}"] = replace(PART_KINDS[f"force.{name}"], does=frozenset(["force.joint"]))
 
 
+@pytest.mark.parametrize(("name", "path"), [*product(NAMES, PATHS)])
+def test_one_that_no_kind_has_is_refused_on_every_path(name, path) -> None:
+    assert f"is a {type(arm(name).forces[0]).__name__}, which no kind has" in PATHS[path].refuses(arm(name))
+    with pytest.raises(UnsupportedError, match="which no kind has"):
+        mb.convert(arm(name), "mjcf")
+
+
 @pytest.mark.usefixtures("unknown")
 @pytest.mark.parametrize(("name", "path"), [*product(NAMES, PATHS)])
 def test_on_its_first_day_every_path_refuses_it_by_name(name, path) -> None:

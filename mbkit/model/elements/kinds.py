@@ -6,7 +6,7 @@ Joint types are kinds by themselves, such as ``"joint_type.revolute"``; so are t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from types import MappingProxyType
@@ -139,6 +139,15 @@ def acts(model: _Model) -> Mapping[str, tuple[str, ...]]:
     """Return the kinds that act in a model by name, each with the names of its parts."""
     kinds = (*PART_KINDS.values(), *map(_of_joint_type, dict.fromkeys(j.kind for j in model.joints)))
     return MappingProxyType({k.name: names for k in kinds if (names := tuple(p.name for p in k.parts(model)))})
+
+
+def unregistered(model: _Model) -> Iterator[str]:
+    """Yield forces and motions of a class that no kind has: no path carries them."""
+    for section in ("forces", "prescribed"):
+        kinds = [k for k in PART_KINDS.values() if k.section == section and k.does != {"t"}]
+        for p in getattr(model, section):
+            if not (type(p) is GravityCompensation or any(k.at(model, p) for k in kinds)):
+                yield f"{p} is a {type(p).__name__}, which no kind has; register_kind makes it known"
 
 
 def has(section: str, *fields: str) -> _Test:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.model.elements.kinds import EFFECTS, PART_KINDS, Kind, kind
+from mbkit.model.elements.kinds import EFFECTS, PART_KINDS, Kind, kind, unregistered
 
 #: A `mbkit.model.description.Description`, a floor above.
 _Model = Any
@@ -80,6 +80,7 @@ class Path:
         lost = [k for k in kinds if not self.takes(k)]
         asked, absent = self.asks
         lacks = [absent] if absent and not any(_is(k, x) for k in kinds for x in asked) else []
+        lacks += unregistered(model)
         faults = dict.fromkeys([*lacks, *self._refused(model, lost), *self._together(model, kinds), *self.also(model)])
         features = ", ".join(dict.fromkeys(repr(k.features[-1]) for k in lost if k.features))
         remedies = self.instead, f"model.without({features}) leaves them out" if features else ""
