@@ -15,9 +15,10 @@ import pytest
 
 import mbkit as mb
 from mbkit.codegen.c_source import export_c
-from mbkit.errors import UnsupportedError
+from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian import from_model, program
 from mbkit.model import Model
+from mbkit.model.elements.formula import written
 from mbkit.model.elements.kinds import PART_KINDS, register_kind
 from mbkit.model.elements.paths import PATHS
 from tests.kinds_of_ones_own import HardeningSpring, RateDamper
@@ -71,6 +72,12 @@ def unknown() -> Iterator[None]:
 def known(unknown: None) -> None:  # noqa: ARG001  # it has registered them
     for name in NAMES:
         PART_KINDS[f"force.{name}"] = replace(PART_KINDS[f"force.{name}"], does=frozenset(["force.joint"]))
+
+
+@pytest.mark.parametrize("power", [0, -1, 0.5])
+def test_a_law_with_another_power_is_refused(power) -> None:
+    with pytest.raises(InputError, match="expected a whole number above zero"):
+        written(lambda q: q**power, "q")
 
 
 @pytest.mark.parametrize(("name", "path"), [*product(NAMES, PATHS)])

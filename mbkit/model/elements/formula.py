@@ -13,6 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from mbkit.errors import InputError
+
 #: Name of an operation, the earlier ones that it takes, and the value of a constant.
 Operation = tuple[str, tuple[int, ...], float]
 
@@ -77,6 +79,8 @@ class _Recorded:
         return self._new("neg", self.place)
 
     def __pow__(self, n: int) -> _Recorded:
+        if not (isinstance(n, int) and n > 0):
+            raise InputError(f"power: expected a whole number above zero in a law that is written down, got {n!r}")
         return self if n == 1 else self * self ** (n - 1)
 
     __add__, __sub__ = partialmethod(_with, name="add"), partialmethod(_with, name="sub")

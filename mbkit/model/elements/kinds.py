@@ -143,7 +143,7 @@ def acts(model: _Model) -> Mapping[str, tuple[str, ...]]:
 
 def unregistered(model: _Model) -> Iterator[str]:
     """Yield forces and motions of a class that no kind has: no path carries them."""
-    for section in ("forces", "prescribed"):
+    for section in (x for x in ("forces", "prescribed") if getattr(model, x)):
         kinds = [k for k in PART_KINDS.values() if k.section == section and k.does != {"t"}]
         for p in getattr(model, section):
             if not (type(p) is GravityCompensation or any(k.at(model, p) for k in kinds)):
