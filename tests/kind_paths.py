@@ -260,7 +260,8 @@ for _engine in ("lagrangian", "pinocchio", "mujoco", "drake", "oracle"):
         ("derivatives", _derivatives, 1e-6),
     ):
         if _engine in ("lagrangian", "pinocchio", "oracle") or _what != "derivatives":
-            column(f"engine {_engine}", f"{_engine}: {_what}", close=_close, which=_engine)(_check)
+            _gates = [f"{_engine} forward derivatives"] if _what == "derivatives" and _engine == "pinocchio" else []
+            column(f"engine {_engine}", f"{_engine}: {_what}", *_gates, close=_close, which=_engine)(_check)
 
 
 @column("engine mujoco", "mujoco: friction loss", "mujoco friction loss")
@@ -417,9 +418,9 @@ def _impact(x: Example, folder: Path) -> Told:
     return off(mb.impact(engine(x.name), x.q, x.v, S).v, wanted)
 
 
-@column("quantities", "equilibrium")
+@column("quantities", "equilibrium", "equilibrium")
 def _equilibrium(x: Example, folder: Path) -> Told:
-    if x.model.time_parameter or x.name == "no_slip.blade":
+    if x.model.time_parameter:
         raise NotAskedError("it moves in time")
     tau = np.asarray(mb.equilibrium(engine(x.name), holding=x.q).tau)
     still = replace(x, plain=replace(x.plain, v=0 * x.plain.v))
@@ -481,7 +482,7 @@ def _mobility(x: Example, folder: Path) -> Told:
     return off(engine(x.name).mobility().degrees_of_freedom, x.plain.n - len(x.held()))
 
 
-@column("quantities", "GPU (its driver replaced)", close=1e-8)
+@column("quantities", "GPU (its driver replaced)", "gpu", close=1e-8)
 def _gpu(x: Example, folder: Path) -> Told:
     with fake_gpu():
         dyn = dynamics(x, x.model, compile=True, device="cuda")

@@ -52,9 +52,20 @@ def _trimmed(quantity: BodyQuantity) -> Callable[[Array], Array]:
     return lambda x: x.reshape(*x.shape[:-2], x.shape[-2] // rows, rows, x.shape[-1])
 
 
+_NOT_ON_GPU: Final = {
+    "force.bushing": "its angles take an atan2, which a GPU's code does not have",
+    "joint.stiction": "its Stribeck curve takes an exp, which a GPU's code does not have",
+}
 _ON_GPU: Final = ALL - {"jump", "force"} | {"force.joint", "force.frame", "force.compensation.partial"}
-_NO_ANGLE: Final = {"force.bushing": "its angles take an atan2, which a GPU's code does not have"}
-GPU: Final = Path("gpu under force", "", _ON_GPU, _NO_ANGLE, instead="copy them with numpy first")
+GPU: Final = Path(
+    "gpu",
+    "device: not known of",
+    _ON_GPU | {"joint.friction", "joint.friction.several"},
+    _NOT_ON_GPU,
+    instead="use the CPU",
+)
+#: The host decides dry friction at rest.
+GPU_ARRAYS: Final = Path("gpu under force", "", _ON_GPU, instead="copy them with numpy first")
 #: Quantities of three derivatives.
 _DERIVATIVES: Final = ("inverse_dynamics_derivatives", "forward_dynamics_derivatives")
 #: Three derivatives side by side, which `_TRIM` puts one behind the other.
@@ -183,6 +194,8 @@ class LagrangianDynamics(Dynamics):
         self._chosen = None if elimination is None else _elimination(model, elimination)
         if compile is not None and not isinstance(compile, bool):
             raise InputError(f"compile: expected True, False or None, got {compile!r}")
+        if device is not None:
+            GPU.admit(model)
         self.device = None if device is None else _checked_device(device, compile)
         self.compile = (compile_by_default() or device is not None) if compile is None else compile
         self.threads = None if threads is None else count("threads", threads, least=1)
@@ -370,7 +383,7 @@ class LagrangianDynamics(Dynamics):
         from mbkit.codegen.cuda.arrays import batch_on_device
 
         if quantity in UNDER_FORCE:
-            GPU.admit(self.model, f"{quantity} takes arrays of the host, not of a GPU, for")
+            GPU_ARRAYS.admit(self.model, f"{quantity} takes arrays of the host, not of a GPU, for")
         names = tuple(map(_names, more))
         key = (quantity, *names) if quantity in _TRIM else (_STACKED, quantity)
         if key[0] == _STACKED and quantity not in _DERIVATIVES:

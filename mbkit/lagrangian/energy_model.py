@@ -139,8 +139,9 @@ class EnergyModel(Model):
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over the expressions and the values of the parameters."""
-        return _sha(self._expressions, *(f"{n}={x!r}" for n, x in self.parameters.items()))
+        """SHA-256 over the expressions and the values of the parameters, whatever the time is."""
+        values = {**self.parameters, **({self.time_parameter: 0.0} if self.time_parameter else {})}
+        return _sha(self._expressions, *(f"{n}={x!r}" for n, x in values.items()))
 
     @cached_property
     def form_digest(self) -> str:

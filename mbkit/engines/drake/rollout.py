@@ -133,7 +133,8 @@ class DiscreteRun(_PlantState):
     def step(self, q: Array, v: Array, tau: Array) -> tuple[Array, Array]:
         """Return q and v a step after a state, under a force."""
         self.put(q, v)
-        self.push(tau)
+        # A force on a free joint turns with its body, from step to step.
+        self._force.FixValue(self._context, self._dyn.to_drake(q, tau)[1])
         # What a simulator does at each period, without its clock.
         self._plant.ExecuteForcedEvents(self._context, publish=False)
         return self.state()

@@ -22,7 +22,14 @@ from mbkit.engines.elements.passive import JointPassive
 from mbkit.engines.frames_and_momenta import ALIGNED, WORLD
 from mbkit.engines.pinocchio.bodies import PinocchioBodies
 from mbkit.engines.pinocchio.constraints import PinConstraints, PinocchioConstrained
-from mbkit.engines.pinocchio.model import PINOCCHIO, PinModel, PointSprings, build
+from mbkit.engines.pinocchio.model import (
+    FORWARD_DERIVATIVES,
+    INVERSE_DERIVATIVES,
+    PINOCCHIO,
+    PinModel,
+    PointSprings,
+    build,
+)
 from mbkit.engines.pinocchio.regressors import PinRegressors
 from mbkit.engines.regressors import with_losses
 from mbkit.model import Model
@@ -118,19 +125,6 @@ def _sound(model: Model, unread: set[int]) -> Sound:
     return sound
 
 
-#: Joint types of which computeRNEADerivatives and computeABADerivatives of 4.1.0 are wrong (pinocchio#2053).
-_WRONG_DERIVATIVES: Final = ("universal", "spherical_zyx")
-
-
-#: What would be false of a model with loops or prescribed motions, and why.
-_WITHOUT_LOOPS: Final = {
-    "forward_dynamics_derivatives": (
-        f"computeConstraintDynamicsDerivatives of Pinocchio {pin.__version__} is not the derivative by q of "
-        "constraintDynamics; mbkit.dynamics(model, 'lagrangian') has it"
-    )
-}
-
-
 class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
     """Pinocchio's algorithms on a description.
 
@@ -153,9 +147,14 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
-        if model.constrained:
-            # Of this model alone, in the place of the class's.
-            vars(self)["refuses"] = self.refuses | _WITHOUT_LOOPS
+        given = {
+            "inverse_dynamics_derivatives": INVERSE_DERIVATIVES,
+            "forward_dynamics_derivatives": FORWARD_DERIVATIVES,
+        }
+        # Of this model alone, in the place of the class's.
+        vars(self)["refuses"] = self.refuses | {
+            name: why for name, path in given.items() if (why := path.refuses(model))
+        }
         self._pin: PinModel = build(model)
         self.pin_model = self._m = self._pin.model
         self._d = self._m.createData()
@@ -314,14 +313,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
     @cached_property
     def lacks_derivatives(self) -> str:
         """Why there are no derivatives of this model; empty where there are."""
-        instead = "mbkit.dynamics(model, 'lagrangian') has them"
-        if self.model.springs:
-            return f"springs between points are not part of Pinocchio's model; {instead}"
-        wrong = [j for j in self.model.joints if j.kind in _WRONG_DERIVATIVES]
-        if wrong:
-            names = ", ".join(f"{j.name!r} ({j.kind})" for j in wrong[:3])
-            return f"Pinocchio {pin.__version__} differentiates joint {names} wrongly; {instead}"
-        return ""
+        return self.refuses.get("inverse_dynamics_derivatives", "")
 
     def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
         passive = self._joint_passive

@@ -8,7 +8,7 @@ its coordinates (Pinocchio's own planar joint has four numbers and body velociti
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -116,6 +116,28 @@ _STEPS: Final[dict[str, Callable[[Joint], list[tuple[str, object]]]]] = {
 #: Its rows are formulas of frames, alike for all of them.
 PINOCCHIO: Final = Path(
     "pinocchio", "", joint_types(*_STEPS) | OF_TREES | OF_COUPLINGS | {"row", "speed", "t"}, instead=SOLVED
+)
+_BESIDE: Final = ("point.spring", "point.damper")
+#: Joint types of which computeRNEADerivatives and computeABADerivatives of 4.1.0 are wrong (pinocchio#2053).
+_WRONG: Final = joint_types("universal", "spherical_zyx")
+INVERSE_DERIVATIVES: Final = replace(
+    PINOCCHIO,
+    name="pinocchio derivatives",
+    words="not known of",
+    carries=PINOCCHIO.carries - _WRONG - {*_BESIDE},
+    why=dict.fromkeys(_WRONG, f"Pinocchio {pin.__version__} differentiates it wrongly")
+    | dict.fromkeys(_BESIDE, "Pinocchio's model has nothing between points"),
+    instead="mbkit.dynamics(model, 'lagrangian') has them",
+)
+_NO_DERIVATIVE: Final = (
+    f"computeConstraintDynamicsDerivatives of Pinocchio {pin.__version__} is not the derivative by q of "
+    "constraintDynamics"
+)
+FORWARD_DERIVATIVES: Final = replace(
+    INVERSE_DERIVATIVES,
+    name="pinocchio forward derivatives",
+    carries=INVERSE_DERIVATIVES.carries - {"row", "speed"},
+    why=INVERSE_DERIVATIVES.why | dict.fromkeys(("row", "speed"), _NO_DERIVATIVE),
 )
 
 

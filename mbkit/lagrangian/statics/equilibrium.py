@@ -9,7 +9,7 @@ with the forces F at frames, and λ where constraints act.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -25,6 +25,8 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.methods.small_motions import SmallMotion, small_motion
+from mbkit.model import Model
+from mbkit.model.elements.paths import ALL, Path
 
 #: Of the forces that balance: what rounding leaves of them.
 _BALANCED: Final = 1e-11
@@ -45,6 +47,15 @@ _SAME: Final = 1e-9
 #: Part of the terms of an exact derivative, and of differences, that rounding leaves.
 _EXACT: Final = 8 * float(np.finfo(float).eps)
 _DIFFERENCES: Final = 8 * float(np.finfo(float).eps) ** 0.8
+
+
+def _driven(model: Model) -> Iterator[str]:
+    # What depends on the time may still leave a system at rest, which the search finds out.
+    if model.constraints_do_work and model.time_parameter is None:
+        yield "its constraints prescribe a speed, at which nothing rests"
+
+
+EQUILIBRIUM: Final = Path("equilibrium", "equilibrium: not known of", ALL, also=_driven)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +158,8 @@ def equilibrium(
     InputError
         `tau` or `q0` beside `holding`, a wrong shape, forces that depend on the time, or a `holding` that constraints
         do not allow.
+    UnsupportedError
+        Constraints prescribe a speed.
     NumericalError
         No equilibrium; names the least remaining force and where it is.
 
@@ -175,6 +188,7 @@ def equilibrium(
         raise InputError("dynamics: its parameters have a value per sample; expected one value of each")
     if holding is not None and not (tau is None and q0 is None):
         raise InputError("holding: expected without q0 and tau, which are for finding a configuration")
+    EQUILIBRIUM.admit(dyn.model)
     model, balance = dyn.model, _Balance(dyn, {name: _wrench(name, x) for name, x in (forces or {}).items()})
     if holding is not None:
         q = model.check_q(finite_array("holding", holding, (model.nq,)), "holding")
