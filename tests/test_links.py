@@ -101,7 +101,7 @@ def kinetic_energy(model: mb.model.Model, links: Links) -> ca.Function:
                 inertia[i, j] = I[SYMMETRIC[i][j]]
         total += 0.5 * m * ca.dot(v, v) + ca.dot(h, ca.cross(v, w)) + 0.5 * ca.dot(w, ca.mtimes(inertia, w))
     for joint in model.joints:
-        rotors = zip(kin.values.joints[joint.name].armature, kin.velocities(joint), strict=True)
+        rotors = zip(kin.values.of(joint).armature, kin.velocities(joint), strict=True)
         total += sum(0.5 * rotor * rate * rate for rotor, rate in rotors)
     return ca.Function("T", [kin.q, kin.v], [total])
 

@@ -27,6 +27,7 @@ from mbkit.codegen.program import Operation, Program, program
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.errors import UnsupportedError
+from mbkit.model.rolling import discs_of
 
 # A compiler's time for more is no longer spent unasked: 34,000 operations take 9 s.
 _MAX_OPERATIONS: Final = 100_000
@@ -150,7 +151,7 @@ class TaylorSystem:
         # vanishes.
         kinks, model = sum(o.name in _KINKS for o in graph.operations), equations.model
         rows = len(equations.constraints.names) if model.constrained else 0  # type: ignore[attr-defined]  # written
-        self.kinked = kinks > len(model.quaternions) + rows + len(model.no_slip)
+        self.kinked = kinks > len(model.quaternions) + rows + len(discs_of(model))
         # Parameters stand first among the arguments behind tau.
         self.clock = list(model.parameters).index(model.time_parameter) if model.time_parameter else None
         self._nq, self._nv = graph.inputs[:2]

@@ -52,7 +52,7 @@ class BodyMotion:
 
     def _place(self, name: str) -> tuple[str, Any]:
         frame = self.model.frame(name)
-        return frame.body, self.kin.values.frame(frame)
+        return frame.body, self.kin.values.of(frame)
 
     def _origin(self, name: str) -> Vector:
         body, f = self._place(name)
@@ -150,12 +150,12 @@ class BodyMotion:
         """Mass, first moment and inertia of all that a body carries, about its origin."""
         kin, out = self.kin, {"world": Inertia()}
         for body in self.model.bodies:
-            values = kin.values.bodies[body.name]
+            values = kin.values.of(body)
             central = Inertia(0.0, [0.0] * 3, [values.inertia[i][j] for i in range(3) for j in range(i, 3)])
             out[body.name] = central + Inertia(values.mass).shifted(values.com)
         for joint in reversed(self.model.tree):
             R, _ = kin.placements[joint.name]
-            turned = out[joint.child].rotated([Matrix(kin.values.joints[joint.name].rotation), Matrix(R)])
+            turned = out[joint.child].rotated([Matrix(kin.values.of(joint).rotation), Matrix(R)])
             out[joint.parent] = out[joint.parent] + turned.shifted(kin.to_parent(joint, [0.0] * 3))
         return out
 
@@ -165,7 +165,7 @@ class BodyMotion:
         kin = self.kin
         out: dict[str, Pair] = {"world": ([0.0] * 3, [0.0] * 3)}
         for body in self.model.bodies:
-            values, (linear, angular) = kin.values.bodies[body.name], kin.twists[body.name]
+            values, (linear, angular) = kin.values.of(body), kin.twists[body.name]
             P = [values.mass * x for x in add(linear, cross3(angular, values.com))]
             out[body.name] = P, add(cross3(values.com, P), constant_times(values.inertia, angular))
         for joint in reversed(self.model.tree):
@@ -255,7 +255,7 @@ class BodyMotion:
         for body, force, moment in pushes:
             push(body, force, moment)
         for spring in self.model.springs:
-            values = kin.values.springs[spring.name]
+            values = kin.values.of(spring)
             ends = (spring.body_a, values.point_a), (spring.body_b, values.point_b)
             a, b = (kin.to_world(body, point) for body, point in ends)
             gap = [y - x for x, y in zip(a, b, strict=True)]

@@ -1,4 +1,4 @@
-"""Constraints of loops, of motions prescribed in time and of contacts without slip, as CasADi expressions.
+"""Constraints of loops, of motions in time and of contacts without slip, as CasADi expressions.
 
 Rows that hold positions, f(q, t) = 0, come first; behind them rows that hold velocities alone, A(q) v = b, which have
 no integral (non-holonomic). One form for all of them, with the multipliers λ::
@@ -36,11 +36,12 @@ from mbkit.derivation.mass_matrix_solve import ConstraintFactors, ConstraintTerm
 from mbkit.errors import InputError
 from mbkit.model import Model, NoSlip
 from mbkit.model.elements.motion_laws import MOTION_LAWS
+from mbkit.model.elements.references import called
 from mbkit.model.joint_types import cross3
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.manifold import integrate, random_state, shortened_steps
-from mbkit.model.parts import Loop
-from mbkit.model.rolling import LIES_FLAT, NO_SLIP_ROWS, Contact, contact
+from mbkit.model.parts import Coupler, Loop
+from mbkit.model.rolling import NO_SLIP_ROWS, Contact, contact, discs_of
 from mbkit.model.validation import sample_mass_matrix
 
 #: Of the accelerations along a redundant row: what a stage of a long step leaves on its branch, and no other
@@ -72,11 +73,11 @@ _BESIDE: Final = 3
 _ASIDE: Final = 0.2
 
 
-# Rows of loops, of prescribed motions and of contacts without slip
+# Rows of loops, of motions in time and of contacts without slip
 
 
 def _ends(kin: Kinematics, loop: Loop) -> LoopEnds:
-    values = kin.values.loops[loop.name]
+    values = kin.values.of(loop)
     both = kin.model.carrier(loop)
     sides = (
         (loop.body_a, values.translation_a, values.rotation_a),
@@ -98,7 +99,7 @@ class _Row(NamedTuple):
 
 def _contact(kin: Kinematics, part: NoSlip) -> Contact:
     """Return the contact of a part in the axes of the body that carries both its bodies."""
-    values, both = kin.values.no_slip[part.name], kin.model.carrier(part)
+    values, both = kin.values.of(part), kin.model.carrier(part)
     a, b = kin.carried_to(part.body_a, both, values.axis_a, 0.0), kin.carried_to(part.body_b, both, values.axis_b, 0.0)
     along = [kin.carried_to(part.body_b, both, row, 0.0) for row in values.tangents]
     return contact(part.kind, a, b, along, values.radius, lambda x: kin.length(ca.SX(x)))
@@ -106,7 +107,7 @@ def _contact(kin: Kinematics, part: NoSlip) -> Contact:
 
 def _contact_rows(kin: Kinematics, part: NoSlip) -> tuple[list[Any], list[Any]]:
     """Return the expressions of the rows that hold positions and of those that hold velocities."""
-    values, both, place = kin.values.no_slip[part.name], kin.model.carrier(part), _contact(kin, part)
+    values, both, place = kin.values.of(part), kin.model.carrier(part), _contact(kin, part)
     centre = kin.carried_to(part.body_a, both, values.translation_a, 1.0)
     ground = kin.carried_to(part.body_b, both, values.translation_b, 1.0)
     at = add(centre, place.offset)
@@ -121,24 +122,24 @@ def _rows(kin: Kinematics, time: Any) -> list[_Row]:
 
 
 def _every_row(kin: Kinematics, time: Any) -> Iterator[_Row]:
-    model = kin.model
-    for loop in model.loops:
-        names, rows = LOOP_ROWS[loop.kind]
-        for name, row in zip(names, rows(_ends(kin, loop)), strict=True):
-            yield _Row(loop.name, f"loop {loop.name!r} {name}", row)
-    for coupler in model.couplers:
-        at, *leading = (kin.coordinates(model.joint(name))[0] for name in (coupler.joint, *coupler.leaders))
-        follows = follower(kin.values.couplers[coupler.name], leading)
-        yield _Row(coupler.name, f"coupler {coupler.name!r}", at - follows)
-    for motion in model.prescribed:
-        (at,) = kin.coordinates(model.joint(motion.joint))
-        numbers = casadi_arithmetic(kin.values.number)
-        path = MOTION_LAWS[type(motion)](motion, kin.values.prescribed[motion.joint], time, numbers)
-        yield _Row(motion.joint, f"motion of {motion.joint!r}", at - path)
-    for part in model.no_slip:
-        for moves, texts, found in zip((False, True), NO_SLIP_ROWS[part.kind], _contact_rows(kin, part), strict=True):
-            for name, row in zip(texts, found, strict=True):
-                yield _Row(part.name, f"no slip {part.name!r} {name}", row, moves)
+    for part in kin.model.constraints:
+        item, values = f"{called(part.section)} {part.name!r}", kin.values.of(part)
+        if isinstance(part, Loop):
+            names, rows = LOOP_ROWS[part.kind]
+            named = zip(names, rows(_ends(kin, part)), strict=True)
+            yield from (_Row(part.name, f"{item} {name}", row) for name, row in named)
+        elif isinstance(part, NoSlip):
+            texts = NO_SLIP_ROWS[part.kind]
+            for moves, *both in zip((False, True), texts, _contact_rows(kin, part), strict=True):
+                yield from (_Row(part.name, f"{item} {name}", row, moves) for name, row in zip(*both, strict=True))
+        else:
+            leaders = part.leaders if isinstance(part, Coupler) else ()
+            at, *leading = (kin.coordinates(kin.model.joint(name))[0] for name in (part.joint, *leaders))
+            if isinstance(part, Coupler):
+                yield _Row(part.name, item, at - follower(values, leading))
+            else:
+                path = MOTION_LAWS[type(part)](part, values, time, casadi_arithmetic(kin.values.number))
+                yield _Row(part.name, f"motion of {part.name!r}", at - path)
 
 
 def _column(entries: Iterable[Any]) -> Any:
@@ -148,13 +149,8 @@ def _column(entries: Iterable[Any]) -> Any:
 def _ways(kin: Kinematics) -> Any:
     """Return numbers that are negative where a loop's frames point opposite ways, then where a disc lies flat."""
     loops = (_ends(kin, loop).way(loop.kind) for loop in kin.model.loops)
-    discs = (_contact(kin, x).reach / kin.values.no_slip[x.name].radius - _LIES for x in discs_of(kin.model))
+    discs = (_contact(kin, x).reach / kin.values.of(x).radius - _LIES for x in discs_of(kin.model))
     return _column((*loops, *discs))
-
-
-def discs_of(model: Model) -> list[NoSlip]:
-    """Return the parts that can lie flat."""
-    return [x for x in model.no_slip if x.kind in LIES_FLAT]
 
 
 class Constraints:
@@ -661,7 +657,7 @@ class ConstrainedMotion(ConstraintQuantities):
         loops = rows.loop_wrenches(multipliers)
         outside, own = [], []
         for loop, (force, moment) in zip(self.model.loops, loops, strict=True):
-            both, at = self.model.carrier(loop), self.kin.values.loops[loop.name]
+            both, at = self.model.carrier(loop), self.kin.values.of(loop)
             # At the same point on body b, which is a gap away from its frame.
             back = [-x for x in force], [-x - y for x, y in zip(moment, cross3(rows.gap(loop), force), strict=True)]
             for body, point, pair in (

@@ -376,4 +376,4 @@ class Equations:
 
 
 class ConstrainedEquations(ConstrainedMotion, Equations):
-    """The same with loops and prescribed motions."""
+    """The same with constraints."""

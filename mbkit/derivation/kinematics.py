@@ -76,7 +76,7 @@ class Kinematics:
         self._v_of: dict[str, Vector] = {}
         for joint in model.joints:
             if joint.mimic:
-                values, leader = self.values.joints[joint.name], joint.mimic.joint
+                values, leader = self.values.of(joint), joint.mimic.joint
                 leading = [scalar(self.q[i]) for i in _range(layout.q[leader])]
                 self._q_of[joint.name] = [values.ratio * x + values.offset for x in leading]
                 self._v_of[joint.name] = [values.ratio * scalar(self.v[i]) for i in _range(layout.v[leader])]
@@ -102,16 +102,13 @@ class Kinematics:
         return self._coupled(coupling, self._v_of)
 
     def _coupled(self, coupling: JointCoupling, of: dict[str, Vector]) -> Any:
-        factors = self.values.couplings[coupling.name].factors
+        factors = self.values.of(coupling).factors
         return sum((c * of[joint][0] for c, joint in zip(factors, coupling.joints, strict=True)), 0.0)
 
     @cached_property
     def placements(self) -> dict[str, tuple[Any, Vector]]:
         """(R_JC, p_JC_J) of every joint."""
-        return {
-            j.name: j.type.placement(self.formulas, self.values.joints[j.name], self._q_of[j.name])
-            for j in self.model.tree
-        }
+        return {j.name: j.type.placement(self.formulas, self.values.of(j), self._q_of[j.name]) for j in self.model.tree}
 
     @cached_property
     def twists(self) -> dict[str, tuple[Vector, Vector]]:
@@ -119,7 +116,7 @@ class Kinematics:
         out: dict[str, tuple[Vector, Vector]] = {"world": ([0.0] * 3, [0.0] * 3)}
         for joint in self.model.tree:
             linear, angular = out[joint.parent]
-            values = self.values.joints[joint.name]
+            values = self.values.of(joint)
             at_joint = add(linear, cross3(angular, values.translation))
             R, p = self.placements[joint.name]
             angular_J = constant_transposed_times(values.rotation, angular)
@@ -139,14 +136,14 @@ class Kinematics:
         """Return R_PC x + weight · p_PC: a point (weight 1), vector (0) or first moment (mass)."""
         R, p = self.placements[joint.name]
         in_J = add(_times(R, x), [weight * c for c in p])
-        values = self.values.joints[joint.name]
+        values = self.values.of(joint)
         in_P = constant_times(values.rotation, in_J)
         return add(in_P, [weight * c for c in values.translation])
 
     def from_parent(self, joint: Joint, x: Vector) -> Vector:
         """Return R_PCᵀ x of a vector."""
         R, _ = self.placements[joint.name]
-        return _transposed_times(R, constant_transposed_times(self.values.joints[joint.name].rotation, x))
+        return _transposed_times(R, constant_transposed_times(self.values.of(joint).rotation, x))
 
     def to_world(self, body: str, x: Vector, weight: float = 1.0) -> Vector:
         """Return a point (weight 1) or vector (weight 0) of a body in world axes."""
@@ -167,7 +164,7 @@ class Kinematics:
         out: Vector = [0.0] * 3
         while body != to:
             joint = self._carrier[body]
-            values = self.values.joints[joint.name]
+            values = self.values.of(joint)
             twist = joint.type.twist(self.formulas, values, self.coordinates(joint), self.velocities(joint))
             linear, angular = (self.carried_to(body, to, list(x), 0.0) for x in twist)
             origin = self.carried_to(body, to, [0.0] * 3, 1.0)
@@ -177,7 +174,7 @@ class Kinematics:
 
     def squared_length(self, spring: PointSpring) -> Any:
         """Return |p_AB|² of the points that a spring joins."""
-        values = self.values.springs[spring.name]
+        values = self.values.of(spring)
         a = self.to_world(spring.body_a, values.point_a)
         b = self.to_world(spring.body_b, values.point_b)
         gap = [y - x for x, y in zip(a, b, strict=True)]
@@ -228,17 +225,17 @@ def kinetic_energy(kin: Kinematics) -> Any:
     total = kin.zero
     for body in kin.model.bodies:
         linear, angular = kin.twists[body.name]
-        values = kin.values.bodies[body.name]
+        values = kin.values.of(body)
         at_com = add(linear, cross3(angular, values.com))
         if not is_zero(values.mass):
             total += 0.5 * values.mass * dot3(at_com, at_com)
         total += 0.5 * dot3(angular, constant_times(values.inertia, angular))
     for joint in kin.model.joints:
-        for rotor, rate in zip(kin.values.joints[joint.name].armature, kin.velocities(joint), strict=True):
+        for rotor, rate in zip(kin.values.of(joint).armature, kin.velocities(joint), strict=True):
             total += 0.5 * rotor * rate * rate
     for coupling in kin.model.couplings:
         rate = kin.coupled_rate(coupling)
-        total += 0.5 * kin.values.couplings[coupling.name].armature * rate * rate
+        total += 0.5 * kin.values.of(coupling).armature * rate * rate
     return total
 
 
@@ -252,7 +249,7 @@ def gravity_energy(kin: Kinematics, shares: Mapping[str, Any] | None = None) -> 
     moments: dict[str, list[Any]] = {"world": [0.0] * 3}
     masses: dict[str, Any] = {"world": 0.0}
     for body in model.bodies:
-        values = kin.values.bodies[body.name]
+        values = kin.values.of(body)
         mass = values.mass if shares is None else values.mass * shares.get(body.name, 0.0)
         moments[body.name] = [mass * c for c in values.com]
         masses[body.name] = mass
@@ -269,7 +266,7 @@ def compensation_energies(kin: Kinematics) -> dict[tuple[str, ...], Any]:
     shares: dict[tuple[str, ...], dict[str, Any]] = {}
     for f in kin.model.forces:
         if isinstance(f, GravityCompensation):
-            shares.setdefault(f.without, {})[f.body] = kin.values.forces[f.name].fraction
+            shares.setdefault(f.without, {})[f.body] = kin.values.of(f).fraction
     return {without: kin.zero - gravity_energy(kin, own) for without, own in shares.items()}
 
 
@@ -277,18 +274,18 @@ def spring_energy(kin: Kinematics) -> Any:
     """Return the energy stored in the springs of joints, of couplings and between points."""
     total = kin.zero
     for joint in kin.model.joints:
-        values = kin.values.joints[joint.name]
+        values = kin.values.of(joint)
         for k, stiffness in enumerate(values.stiffness):
             if not is_zero(stiffness):
                 stretch = kin.coordinates(joint)[k] - values.rest[k]
                 total += kin.half * stiffness * stretch * stretch
     for coupling in kin.model.couplings:
-        values = kin.values.couplings[coupling.name]
+        values = kin.values.of(coupling)
         if not is_zero(values.stiffness):
             stretch = kin.coupled_length(coupling) - values.rest_length
             total += kin.half * values.stiffness * stretch * stretch
     for spring in kin.model.springs:
-        values = kin.values.springs[spring.name]
+        values = kin.values.of(spring)
         if is_zero(values.stiffness):
             continue
         square = kin.squared_length(spring)
@@ -304,13 +301,13 @@ def dissipation(kin: Kinematics) -> Any:
     """Return Rayleigh's R = ½ Σ d v² + ½ Σ c (dl/dt)²."""
     total = kin.zero
     for joint in kin.model.joints:
-        for damping, rate in zip(kin.values.joints[joint.name].damping, kin.velocities(joint), strict=True):
+        for damping, rate in zip(kin.values.of(joint).damping, kin.velocities(joint), strict=True):
             total += kin.half * damping * rate * rate
     for coupling in kin.model.couplings:
         rate = kin.coupled_rate(coupling)
-        total += kin.half * kin.values.couplings[coupling.name].damping * rate * rate
+        total += kin.half * kin.values.of(coupling).damping * rate * rate
     for spring in kin.model.springs:
-        damping = kin.values.springs[spring.name].damping
+        damping = kin.values.of(spring).damping
         if not is_zero(damping):
             rate = kin.length_rate(kin.squared_length(spring))
             total += kin.half * damping * rate * rate
@@ -334,7 +331,7 @@ def friction_forces(kin: Kinematics) -> Any:
 def dry_friction(kin: Kinematics, exp: Callable[[Any], Any]) -> Iterator[tuple[Any, Any]]:
     """Yield the rate of each velocity with dry friction, and its f(|v|)."""
     for joint in kin.model.joints:
-        values, given = kin.values.joints[joint.name], FrictionNumbers.of([joint])
+        values, given = kin.values.of(joint), FrictionNumbers.of([joint])
         for k in np.flatnonzero(given.sliding + given.bound):
             rate, size = kin.velocities(joint)[k], values.friction[k]
             if given.stribeck[k]:

@@ -137,7 +137,7 @@ def squares(kin: Kinematics) -> Squares:
     turned: list[tuple[Any, Any]] = []
     for body in model.bodies:
         linear, angular = kin.twists[body.name]
-        own = values.bodies[body.name]
+        own = values.of(body)
         at_com = add(linear, cross3(angular, own.com))
         # The axes turn below the vector.
         centripetal = cross3(angular, at_com)
@@ -153,9 +153,9 @@ def squares(kin: Kinematics) -> Squares:
             rows += [(own.inertia[k][k], angular[k], 0.0) for k in range(3)]
             turned += [(angular[k], torque[k]) for k in range(3) if not is_zero(torque[k])]
     for joint in model.joints:
-        rotors = zip(values.joints[joint.name].armature, kin.velocities(joint), strict=True)
+        rotors = zip(values.of(joint).armature, kin.velocities(joint), strict=True)
         rows += [(rotor, rate, 0.0) for rotor, rate in rotors]
-    rows += [(values.couplings[c.name].armature, kin.coupled_rate(c), 0.0) for c in model.couplings]
+    rows += [(values.of(c).armature, kin.coupled_rate(c), 0.0) for c in model.couplings]
     # What nothing moves is a zero.
     rows = [row for row in rows if not is_zero(row[0]) and isinstance(row[1], ca.SX)]
     rates = ca.vertcat(ca.SX(0, 1), *(rate for _, rate, _ in rows))

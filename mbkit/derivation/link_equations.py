@@ -319,7 +319,7 @@ class LinkEquations(Equations):
 
 
 class ConstrainedLinkEquations(ConstrainedMotion, LinkEquations):
-    """The same with loops and prescribed motions."""
+    """The same with constraints."""
 
 
 def _size(x: Any) -> int:

@@ -162,7 +162,7 @@ class LinkMechanics:
 
     def coupling(self, coupling: JointCoupling) -> tuple[dict[int, Any], Any]:
         """Return the factors of a coupling's rate, by velocity index, and its armature."""
-        armature = self.kin.values.couplings[coupling.name].armature
+        armature = self.kin.values.of(coupling).armature
         if is_zero(armature):
             return {}, armature
         gradient = ca.jacobian(ca.SX(self.kin.coupled_rate(coupling)), self.kin.v)

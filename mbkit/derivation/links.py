@@ -41,7 +41,7 @@ from mbkit.derivation.rotations import (
     congruence,
     to_parent,
 )
-from mbkit.model import Joint
+from mbkit.model import Body, Joint
 from mbkit.model.joint_types import SingleMotion, cross3
 
 
@@ -184,7 +184,7 @@ class Links:
         self._literal = [Inertia() for _ in self.links]
         self._symbolic: list[Inertia | None] = [None for _ in self.links]
         for body in kin.model.bodies:
-            self._hold(body.name)
+            self._hold(body)
         if short:
             self._regroup()
         #: Whether all matter is in numbers.
@@ -252,7 +252,7 @@ class Links:
     def _carry(self, joint: Joint) -> tuple[int, Rows, Vector]:
         """Add the links of a joint, and return the place of its child."""
         parent, R, p = self._places[joint.parent]
-        values, kin = self.kin.values.joints[joint.name], self.kin
+        values, kin = self.kin.values.of(joint), self.kin
         number = _exact if _literal(*(x for row in R for x in row), *p, *values.translation) else _rounded
         own: Rotation = [Matrix([[number(x) for x in row] for row in R])]
         p_J = add([number(x) for x in p], to_parent(own, [number(x) for x in values.translation]))
@@ -298,7 +298,7 @@ class Links:
 
     def _carry_whole(self, joint: Joint, parent: int, R_J: Rows, p_J: Vector) -> tuple[int, Rows, Vector]:
         """Add a joint that is no chain of single motions as one link."""
-        kin, values = self.kin, self.kin.values.joints[joint.name]
+        kin, values = self.kin, self.kin.values.of(joint)
         q, v = kin.coordinates(joint), kin.velocities(joint)
         R, p = joint.type.placement(kin.formulas, values, q)
         link = Link(joint, parent, _factors(R_J, self._short), [_rounded(x) for x in p_J])
@@ -316,12 +316,12 @@ class Links:
         self._fixed.append((R_J, p_J))
         return len(self.links) - 1, _IDENTITY, [0.0] * 3
 
-    def _hold(self, body: str) -> None:
+    def _hold(self, body: Body) -> None:
         """Add a body's matter to its link; what the world holds moves nothing."""
-        index, R, p = self._places[body]
+        index, R, p = self._places[body.name]
         if index < 0:
             return
-        own = self.kin.values.bodies[body]
+        own = self.kin.values.of(body)
         entries = [own.inertia[i][j] for i in range(3) for j in range(i, 3)]
         literal = _literal(own.mass, *own.com, *entries, *(x for row in R for x in row), *p)
         number = _exact if literal else _rounded

@@ -211,7 +211,7 @@ class ConstraintTerms:
     def stiffening(self, M: Any) -> Any:
         """Return s > 0, (m, 1), so that W = M + Jᵀ diag(s) J has an inverse where M has it on J's null space.
 
-        With J v̇ prescribed, the term changes neither v̇ nor λ. s is the geometric mean of the sum's and the lightest
+        With J v̇ given, the term changes neither v̇ nor λ. s is the geometric mean of the sum's and the lightest
         coordinate's mass along a row: W keeps the digits of both, of a light rod in a loop as of a heavy body.
         """
         masses = ca.diag(M)

@@ -15,7 +15,8 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import InputError
-from mbkit.model import Coupler, Frame, Model, NoSlip
+from mbkit.model import Coupler, Model, NoSlip
+from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.parts import numbers
 from mbkit.model.rolling import tangents
 
@@ -118,8 +119,6 @@ class Values:
     Attributes
     ----------
     gravity : list of 3 scalars
-    bodies, joints, springs, couplings, loops, couplers, no_slip, prescribed, forces : dict of str to SimpleNamespace
-        By name; motions by that of their joint. A joint that mimics has `ratio` and `offset` too.
     named : dict of str to casadi.SX
         The parameters' symbols.
     parameters : (p, 1) casadi.SX
@@ -144,23 +143,13 @@ class Values:
             (b.where, b.part, b.field, b.index): b.expression.evaluate(lambda p: named[p.name], self._scalar)
             for b in model.bindings
         }
-        self._read_parts(model)
-        self.prescribed = {p.joint: self._read("prescribed", p) for p in model.prescribed}
-        # Of what is evaluated later too: the constants are an argument that must not grow.
-        for x in (number for part in (*model.forces, *model.prescribed) for number in part.constants):
-            self._scalar(x)
-
-    def _read_parts(self, model: Model) -> None:
+        self._of: dict[tuple[type, str], Any] = {}
         self.gravity = self._entries(("gravity", "", "gravity"), (), model.gravity)
-        self.bodies = {b.name: self._read("bodies", b) for b in model.bodies}
-        self.joints = {j.name: self._read("joints", j) for j in model.joints}
-        self.springs = {s.name: self._read("springs", s) for s in model.springs}
-        self.couplings = {c.name: self._read("couplings", c) for c in model.couplings}
-        self.loops = {x.name: self._read("loops", x) for x in model.loops}
-        self.forces = {f.name: self._read("forces", f) for f in model.forces}
-        self.no_slip = {x.name: self._contact(x) for x in model.no_slip}
-        self.couplers = {x.name: self._coupler(x) for x in model.couplers}
-        self._frames = {f.name: self._read("frames", f) for f in model.frames}
+        for part in (x for section in KINDS_OF_PARTS for x in getattr(model, section)):
+            self.of(part)
+            # Of what is evaluated later too: the constants are an argument that must not grow.
+            for x in getattr(part, "constants", ()):
+                self._scalar(x)
 
     @property
     def constants(self) -> Any:
@@ -178,23 +167,22 @@ class Values:
         """Return what stands for a number that is no part's."""
         return self._scalar(value)
 
-    def frame(self, frame: Frame) -> Any:
-        """Return a frame's rotation and translation; a body's own has zeros and ones only."""
-        return self._frames.get(frame.name) or self._read("frames", frame)
+    def of(self, part: Any) -> Any:
+        """Return the numbers of a part by their names; a frame of a body itself has zeros and ones only.
 
-    def _contact(self, part: NoSlip) -> Any:
-        values, place = self._read("no_slip", part), ("no_slip", part.name, "tangents")
-        values.tangents = self._entries(place, (), tangents(part.axis_b), direction=True)
-        return values
-
-    def _coupler(self, part: Coupler) -> Any:
-        values = self._read("couplers", part)
-        values.ratios = values.ratio if isinstance(values.ratio, list) else [values.ratio]
-        return values
-
-    def _read(self, where: str, part: Any) -> Any:
-        given = ((name, rule.direction, x) for name, rule, x in numbers(part) if rule.acts)
-        return SimpleNamespace(**{name: self._entries((where, part.name, name), (), x, at) for name, at, x in given})
+        A joint that mimics has `ratio` and `offset` too.
+        """
+        key = type(part), part.name
+        if key not in self._of:
+            given = [(name, rule.direction, x) for name, rule, x in numbers(part) if rule.acts]
+            if isinstance(part, NoSlip):
+                given.append(("tangents", True, tangents(part.axis_b)))
+            place = part.section, part.name
+            own = {name: self._entries((*place, name), (), x, fixed) for name, fixed, x in given}
+            if isinstance(part, Coupler):
+                own["ratios"] = own["ratio"] if isinstance(own["ratio"], list) else [own["ratio"]]
+            self._of[key] = SimpleNamespace(**own)
+        return self._of[key]
 
     def _entries(self, place: tuple[str, str, str], index: tuple[int, ...], value: Any, direction: bool = False) -> Any:
         if np.ndim(value):

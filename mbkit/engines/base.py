@@ -45,7 +45,7 @@ from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
-from mbkit.model.rolling import LIES_FLAT
+from mbkit.model.rolling import discs_of
 
 if TYPE_CHECKING:
     from mbkit.show import Kind
@@ -638,7 +638,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
                 f"; possible cause: a point spring with a damper or a rest length has no direction where "
                 f"its length is zero: {', '.join(springs[:_MAX_NAMES])}"
             )
-        discs = [repr(x.name) for x in self.model.no_slip if x.kind in LIES_FLAT]
+        discs = [repr(x.name) for x in discs_of(self.model)]
         if discs:
             return f"; possible cause: a disc that lies flat on its plane: {', '.join(discs[:_MAX_NAMES])}"
         return "; perhaps links without mass, or numbers so large that they overflow"

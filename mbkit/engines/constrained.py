@@ -69,7 +69,7 @@ def unwatched(*all_dynamics: Any) -> Iterator[None]:
 
 
 class Constrained:
-    """The part of `Dynamics` for models with loops, prescribed motions, blades, and wheels and spheres that roll.
+    """The part of `Dynamics` for models with loops, motions in time, blades, and wheels and spheres that roll.
 
     ::
 
@@ -80,9 +80,9 @@ class Constrained:
     rate J v + c, γ and λ have all m rows, in the order of `constraint_names`: c is ∂f/∂t of the first and -b of the
     others.
 
-    Rows of loops stand in the axes of the body that carries both ends; those of prescribed motions follow, then the
+    Rows of loops stand in the axes of the body that carries both ends; those of motions in time follow, then the
     heights of what rolls, then velocities. The multiplier of a point is the force on body a, that of a frame's turn the
-    torque on it, and that of a prescribed motion the force of its drive. That of a height is the normal force on what
+    torque on it, and that of a motion in time the force of its drive. That of a height is the normal force on what
     rolls, and those of its velocities are the forces of friction along these directions. A model without any raises
     `UnsupportedError`.
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit._reproducible import DEPENDENT, dependent, independent_rows, pivoted, singular_values, unit_rows
-from mbkit.derivation.constraints import discs_of
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
@@ -26,6 +25,7 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
 from mbkit.model.manifold import random_state, shortened_steps
+from mbkit.model.rolling import discs_of
 
 _EPS: Final = float(np.finfo(float).eps)
 #: Rounds of the projection's iterations.

@@ -114,7 +114,7 @@ class Steps:
             Axes of the wrenches, as in `generalized_force`.
         t : float or (N,) array_like
             Time at the start of the step, s: of each state of a batch, or of all. Required where time enters the
-            equation of motion, as by forces of t and motions prescribed in time; others do not use it.
+            equation of motion, as by forces of t and motions in time; others do not use it.
 
         Returns
         -------
@@ -137,7 +137,7 @@ class Steps:
 
         Notes
         -----
-        The state that a step leads to is projected onto loops and prescribed motions. On the lagrangian engine the
+        The state that a step leads to is projected onto constraints. On the lagrangian engine the
         step is the same machine code as in `mbkit.simulate`: microseconds for a state, and batches are shared among
         threads. The first step of a model compiles it. Other engines and ``compile=False`` evaluate the forward
         dynamics stage by stage, by the same formulas.

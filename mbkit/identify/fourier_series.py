@@ -134,7 +134,7 @@ def excitation(
     InputError
         A wrong argument; a rate that the harmonics outrun; a joint with no room between its limits.
     UnsupportedError
-        A model with quaternions, loops or prescribed motions, or without bodies.
+        A model with quaternions or constraints, or without bodies.
 
     Examples
     --------

@@ -92,7 +92,7 @@ def identify(
     InputError
         Wrong shapes, numbers that are not finite, fewer equations than parameters, an unknown prior.
     UnsupportedError
-        A model written as energies, one with loops or prescribed motions, or a package that is not installed.
+        A model written as energies, one with constraints, or a package that is not installed.
     NumericalError
         The solver found no consistent parameters.
 

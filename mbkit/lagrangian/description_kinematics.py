@@ -26,7 +26,6 @@ from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing
 from mbkit.lagrangian.trig.shortest_form import number, shortest_form
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model, NoSlip
-from mbkit.model.elements.motion_laws import Motion
 from mbkit.model.joint_types import cross3
 from mbkit.model.loops import CROSSED, LOOP_ROWS, TURNING, WELDED, LoopEnds
 from mbkit.model.parts import Coupler, Loop, PointSpring
@@ -47,19 +46,16 @@ class _Numbers(Values):
     """Every number of a model that enters its equations, as an arithmetic has it: `bound` ones, and `read` others."""
 
     def __init__(self, model: Model, bound: dict[Any, Any], read: Callable[[float], Any]) -> None:
-        self._bound, self._number = bound, read
-        self._read_parts(model)
-
-    def motion(self, prescribed: Motion) -> Any:
-        """Return the numbers of a motion, which a model of the same form need not have."""
-        return self._read("prescribed", prescribed)
+        # Parts are read where they are asked for: a motion need not be one of the model.
+        self._bound, self._number, self._of = bound, read, {}
+        self.gravity = self._entries(("gravity", "", "gravity"), (), model.gravity)
 
     def _scalar(self, value: float, direction: bool = False) -> Any:  # noqa: ARG002
         return self._number(value)
 
 
 class SymbolicKinematics(Kinematics):
-    """A model's kinematics in exact sums, with loops open and prescribed coordinates free; its energies in SymPy."""
+    """A model's kinematics in exact sums, with loops open and moved coordinates free; its energies in SymPy."""
 
     values: _Numbers
 
@@ -228,7 +224,7 @@ class SymbolicKinematics(Kinematics):
 
     @cached_property
     def written(self) -> WrittenKinematics:
-        """The same model's springs, dampers and prescribed motions, as the equations show them."""
+        """The same model's springs, dampers and motions, as the equations show them."""
         return WrittenKinematics(self)
 
     def shown(self, x: Any) -> sp.Expr:
@@ -332,7 +328,7 @@ _EPS: Final = 2.0**-52
 
 def coupled(kin: SymbolicKinematics, coupler: Coupler) -> sp.Expr:
     """Return q less what its leaders give it."""
-    x = kin.written.values.couplers[coupler.name]
+    x = kin.written.values.of(coupler)
     at, *leading = (kin.symbols_of[name][0] for name in (coupler.joint, *coupler.leaders))
     offset = read_angle(x.offset) if kin.model.joint(coupler.joint).type.angular and x.offset else x.offset
     higher = sum((c * leading[0] ** (k + 2) for k, c in enumerate(x.curve)), sp.Integer(0))
@@ -357,7 +353,7 @@ def read_angle(x: sp.Expr) -> sp.Expr:
 
 def rolling(kin: SymbolicKinematics, part: NoSlip) -> tuple[list[sp.Expr], list[sp.Expr]]:
     """Return the rows of a part without slip that hold positions, and those that hold velocities, in world axes."""
-    exact, x = kin.values.no_slip[part.name], kin.written.values.no_slip[part.name]
+    exact, x = kin.values.of(part), kin.written.values.of(part)
     ways = kin.way(part.body_a), kin.way(part.body_b)
 
     def vector(way: _Way, entries: Any, weight: int) -> Vector:
@@ -398,6 +394,13 @@ def rolling(kin: SymbolicKinematics, part: NoSlip) -> tuple[list[sp.Expr], list[
     return held, moving
 
 
+def written_rows(kin: SymbolicKinematics, part: Any) -> tuple[list[sp.Expr], list[sp.Expr]]:
+    """Return the rows of a loop, coupler or contact that hold positions, and those that hold velocities."""
+    if isinstance(part, NoSlip):
+        return rolling(kin, part)
+    return closure(kin, part) if isinstance(part, Loop) else [coupled(kin, part)], []
+
+
 # Loop closures of a model as holonomic constraints, in SymPy.
 #
 # Both ends are written in the axes of the last body that their ways to the ground share. So the rows hold the joints of
@@ -421,7 +424,7 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
     while a and b and a[-1] is b[-1]:
         a.pop()
         b.pop()
-    values, (names, rows_of) = kin.values.loops[loop.name], LOOP_ROWS[loop.kind]
+    values, (names, rows_of) = kin.values.of(loop), LOOP_ROWS[loop.kind]
     points = (kin.carried(a, values.translation_a, 1), kin.carried(b, values.translation_b, 1))
     turned = any(name in TURNING for name in names)
     frame_a, frame_b = (
@@ -438,7 +441,7 @@ def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
         rows += _in_plane(kin, loop, ends, axes[0] if axes else None, messages[-1])
     elif names == LOOP_ROWS["distance"][0]:
         # A sum of cosines has no quotients.
-        length = kin.written.values.loops[loop.name].length
+        length = kin.written.values.of(loop).length
         rows = [x / (2 * length) for x in _independent(kin, [held.excess()], messages)]
     else:
         rows = _independent(kin, rows_of(held), messages)

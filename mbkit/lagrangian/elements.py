@@ -64,8 +64,8 @@ SYMPY: Final = Arithmetic(
 
 
 def law(kin: SymbolicKinematics, part: Motion, t: sp.Symbol) -> sp.Expr:
-    """Return a prescribed motion as a function of the time."""
-    numbers = kin.written.values.motion(part)
+    """Return a motion in time as a function of it."""
+    numbers = kin.written.values.of(part)
     if hasattr(numbers, "knots"):
         return _pieces(numbers, t)
     if isinstance(part, Prescribed):
@@ -93,7 +93,7 @@ def acting(kin: SymbolicKinematics, t: sp.Symbol) -> tuple[sp.Expr, list[sp.Expr
     for force in model.forces:
         if not isinstance(force, JointElement):
             continue
-        joints, constants = [model.joint(x) for x in force.joints], kin.written.values.forces[force.name].numbers
+        joints, constants = [model.joint(x) for x in force.joints], kin.written.values.of(force).numbers
         coordinates = [x for j in model.independent_joints for x in kin.described(j)]
         others = dict(
             zip(

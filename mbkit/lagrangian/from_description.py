@@ -12,14 +12,7 @@ import sympy as sp
 from mbkit._warn import warn
 from mbkit.derivation.kinematics import dissipation, dry_friction, spring_energy
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
-from mbkit.lagrangian.description_kinematics import (
-    INSTEAD_OF_WRITING,
-    SymbolicKinematics,
-    closure,
-    coupled,
-    exact,
-    rolling,
-)
+from mbkit.lagrangian.description_kinematics import INSTEAD_OF_WRITING, SymbolicKinematics, exact, written_rows
 from mbkit.lagrangian.elements import acting, law
 from mbkit.lagrangian.energies.charts import chart_names, chart_velocities
 from mbkit.lagrangian.energy_model import EnergyModel
@@ -28,10 +21,10 @@ from mbkit.lagrangian.system import Lagrangian, QuasiLagrangian
 from mbkit.lagrangian.trig.simplify import tidy
 from mbkit.model import Joint, Model
 from mbkit.model.changes.dry_friction import held_at_rest
-from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.beams import BeamEnd
+from mbkit.model.elements.motion_laws import MOTION_LAWS, motions_of
 from mbkit.model.elements.paths import ALL, Path
-from mbkit.model.elements.references import names_in
+from mbkit.model.elements.references import _OF_BODIES, KINDS_OF_PARTS, names_in
 
 #: Velocities up to which equations are written out.
 _MOST: Final = 24
@@ -145,12 +138,10 @@ def from_model(
     weight, g = _weight(kin, {s.name for s in (*q, *v)}) if plain else (kin.gravity_energy, {})
     V = weight + spring_energy(kin.written)
     t = _time({*parameters, *(s.name for s in (*q, *v))})
-    moved = {model.layout.v[p.joint].start: law(kin, p, t) for p in model.prescribed}
-    rows = [(x.name, row) for x in model.loops for row in closure(kin, x)]
-    rows += [(x.name, coupled(kin, x)) for x in model.couplers]
-    touching = [(x.name, *rolling(kin, x)) for x in model.no_slip]
-    rows += [(name, row) for name, held, _ in touching for row in held]
-    moving = [row for _, _, found in touching for row in found]
+    moved = {model.layout.v[p.joint].start: law(kin, p, t) for p in motions_of(model)}
+    written = [(x.name, *written_rows(kin, x)) for x in model.constraints if type(x) not in MOTION_LAWS]
+    rows = [(name, row) for name, held, _ in written for row in held]
+    moving = [row for *_, found in written for row in found]
     if drives:
         rows += [(q[i].name, q[i] - x) for i, x in moved.items()]
         moved = {}
@@ -207,8 +198,8 @@ def _turned(model: Model, end: Joint) -> str:
                 return f"joint {joint.name!r}"
             beyond.add(joint.child)
     bodies = [f"body {b.name!r}" for b in model.bodies if b.name in beyond and (b.com.any() or b.inertia.any())]
-    acting = (x for kind in ("springs", "loops", "forces", "no_slip") for x in getattr(model, kind))
-    return [*bodies, *(repr(x.name) for x in acting if names_in(x) & beyond), ""][0]
+    acting = (x for kind in KINDS_OF_PARTS[3:] for x in getattr(model, kind))
+    return [*bodies, *(repr(x.name) for x in acting if names_in(x, _OF_BODIES) & beyond), ""][0]
 
 
 def _weight(kin: SymbolicKinematics, used: set[str]) -> tuple[sp.Expr, dict[sp.Symbol, float | None]]:
@@ -224,7 +215,7 @@ def _weight(kin: SymbolicKinematics, used: set[str]) -> tuple[sp.Expr, dict[sp.S
 
 def _too_much(model: Model) -> Iterator[str]:
     turning = [j.name for j in model.independent_joints if not j.type.coordinate_velocities]
-    held = [f for f in CONSTRAINT_FEATURES if f != "prescribed" and getattr(model, f)]
+    held = dict.fromkeys(x.section for x in model.constraints if type(x) not in MOTION_LAWS)
     if turning and held:
         yield (
             f"joint {turning[0]!r} has velocities that are no coordinate's rate, and is not written out beside "
@@ -232,8 +223,8 @@ def _too_much(model: Model) -> Iterator[str]:
         )
     if not model.nv:
         yield "no joint of it moves, so there is no equation"
-    bound = model.loops or model.prescribed
-    most = _MOST_ROLLING if model.no_slip else _MOST_BOUND if bound else _MOST
+    bound = model.loops or motions_of(model)
+    most = _MOST_ROLLING if model.holds_velocities else _MOST_BOUND if bound else _MOST
     if model.nv > most:
         yield f"expected at most {most} coordinates to be written out, got {model.nv} coordinates"
 

@@ -255,7 +255,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
 
     A faulty call is remembered and not raised: `build` reports all faults in one `ModelError`. Parts may be declared
     in any order; coordinates follow the order of the joints. Masses, lengths, inertias, constants of springs and
-    dampers, of prescribed motions, and gravity may be a `Parameter` or an expression of some.
+    dampers, of motions in time, and gravity may be a `Parameter` or an expression of some.
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         inertia : (3, 3) or (3,) array_like, optional
             About the centre of mass, in body axes (or its diagonal), kg m². Without it the body is a point mass.
         """
-        self._add(Body, "bodies", "body", name, {"mass": mass, "com": com, "inertia": inertia})
+        self._add(Body, "body", name, {"mass": mass, "com": com, "inertia": inertia})
 
     def add_joint(
         self,
@@ -412,7 +412,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
     ) -> None:
         """Name a frame that is fixed to a body, for poses and Jacobians."""
         R = self._read.orientation(f"frame {shown(name)}", rotation, rpy)
-        self._add(Frame, "frames", "frame", name, {"body": body, "translation": translation}, {"rotation": R})
+        self._add(Frame, "frame", name, {"body": body, "translation": translation}, {"rotation": R})
 
     def add_spring(
         self,
@@ -442,7 +442,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         """
         ends = {"body_a": body_a, "point_a": point_a, "body_b": body_b, "point_b": point_b}
         numbers = {"stiffness": stiffness, "rest_length": rest_length, "damping": damping}
-        self._add(PointSpring, "springs", "spring", name, ends | numbers)
+        self._add(PointSpring, "spring", name, ends | numbers)
 
     def add_coupling(
         self,
@@ -472,7 +472,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
             return
         numbers = {"rest_length": rest_length, "stiffness": stiffness, "damping": damping, "armature": armature}
         values = {"joints": [*factors], "factors": [*factors.values()], **numbers}
-        self._add(JointCoupling, "couplings", "coupling", name, values)
+        self._add(JointCoupling, "coupling", name, values)
 
     def add_loop(
         self,
@@ -510,7 +510,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
             kind = "point"
         a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
-        self._add(Loop, "loops", "loop", name, a | b | {"length": length}, {"kind": kind})
+        self._add(Loop, "loop", name, a | b | {"length": length}, {"kind": kind})
 
     def add_blade(
         self,
@@ -551,7 +551,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         a = {"body_a": body_a, "translation_a": translation_a, "axis_a": axis_a}
         b = {"body_b": body_b, "axis_b": axis_b, "speed": speed}
         ready = {"kind": "blade", "translation_b": np.zeros(3)}
-        self._add(NoSlip, "no_slip", "no slip", name, a | b, ready)
+        self._add(NoSlip, "no slip", name, a | b, ready)
 
     def add_rolling(
         self,
@@ -604,7 +604,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
             kind = "disc"
         a = {"body_a": body_a, "translation_a": translation_a, "axis_a": axis_a, "radius": radius}
         b = {"body_b": body_b, "translation_b": translation_b, "axis_b": axis_b}
-        self._add(NoSlip, "no_slip", "no slip", name, a | b, {"kind": kind})
+        self._add(NoSlip, "no slip", name, a | b, {"kind": kind})
 
     def note(self, text: str) -> None:
         """Add a sentence to the model's notes."""
@@ -675,8 +675,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
 
     def _add(
         self,
-        part: type,
-        where: str,
+        part: type[Any],
         what: str,
         name: Any,
         values: Mapping[str, Any],
@@ -684,8 +683,8 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
     ) -> None:
         """Read a part's fields by `_READERS`, keep the bindings of its expressions, and add it."""
         name = self._read.name(f"{what} name", name)
-        numbers = self._numbers(where, name, **self._read_fields(part, f"{what} {name!r}", values), **ready)
-        self._parts[where].append(part(name, **numbers))
+        numbers = self._numbers(part.section, name, **self._read_fields(part, f"{what} {name!r}", values), **ready)
+        self._parts[part.section].append(part(name, **numbers))
 
     def _read_fields(self, part: type, item: str, values: Mapping[str, Any]) -> dict[str, Any]:
         return {

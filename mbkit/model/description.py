@@ -392,6 +392,11 @@ class Description:
         return self.needs.damping or self.needs.friction or lost
 
     @cached_property
+    def constraints(self) -> tuple[Any, ...]:
+        """The parts that bind coordinates or velocities: loops, couplers, motions in time, contacts without slip."""
+        return tuple(x for section in CONSTRAINT_FEATURES for x in getattr(self, section))
+
+    @cached_property
     def interval(self) -> tuple[float, float]:
         """The times from and to which all prescribed motions are known, s; infinite without tables."""
         ends = [interval(p) for p in self.prescribed]

@@ -22,7 +22,7 @@ from mbkit._warn import warn
 from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, UnsupportedError
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
-from mbkit.model.description import CONSTRAINT_FEATURES, SERVOS, Description, expect_name
+from mbkit.model.description import SERVOS, Description, expect_name
 from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.parameters import Parameter
 from mbkit.model.validation import check_substituted, model_faults
@@ -89,23 +89,22 @@ class Model(Description):
     @property
     def constrained(self) -> bool:
         """Whether constraints bind the coordinates to each other, so that not every (q, v) is a state."""
-        return any(getattr(self, feature) for feature in CONSTRAINT_FEATURES)
+        return bool(self.constraints)
 
     @property
     def constraint_parts(self) -> str:
         """Names of the parts that bind its coordinates or velocities, for a message; its own where it is energies."""
-        parts = (x.name for feature in CONSTRAINT_FEATURES for x in getattr(self, feature))
-        return ", ".join(map(repr, parts)) or self.name
+        return ", ".join(repr(x.name) for x in self.constraints) or self.name
 
     @property
     def holds_velocities(self) -> bool:
         """Whether some constraints hold velocities alone, as contacts without slip do."""
-        return bool(self.no_slip)
+        return self.needs.no_slip
 
     @property
     def constraints_do_work(self) -> bool:
-        """Whether constraints may feed energy, as motions prescribed in time and blades with a speed do."""
-        return self.time_parameter is not None or any(x.speed for x in self.no_slip)
+        """Whether constraints may feed energy, as motions in time and blades with a speed do."""
+        return self.time_parameter is not None or any(getattr(x, "speed", 0.0) for x in self.constraints)
 
     def require_independent(self, q: Array) -> None:
         """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq), with the rows."""
@@ -237,7 +236,7 @@ class Model(Description):
         Raises
         ------
         UnsupportedError
-            A model written as energies, or one with loops or prescribed motions.
+            A model written as energies, or one with constraints.
         InputError
             A parameter of the model has no value.
         NumericalError
@@ -283,7 +282,7 @@ class Model(Description):
         InputError
             Another set of parameters.
         UnsupportedError
-            A model without bodies; for base parameters also one with loops or prescribed motions.
+            A model without bodies; for base parameters also one with constraints.
 
         Examples
         --------
@@ -357,7 +356,7 @@ class Model(Description):
             No joint of this name.
         InputError
             A joint without a coordinate of its own, a value beyond limits, a loop or a coupler that is open at these
-            values, a prescribed motion, and others that the message names.
+            values, a motion in time, and others that the message names.
 
         Examples
         --------

@@ -84,7 +84,7 @@ class Parameter(Expression):
     """A named number of a description, such as a mass that a study varies.
 
     It may stand for a mass, a centre of mass, an inertia, a length, a spring's or damper's constant, armature, a mimic
-    joint's ratio and offset, a number of a prescribed motion, or gravity. Not for orientations, axes and limits.
+    joint's ratio and offset, a number of a motion in time, or gravity. Not for orientations, axes and limits.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ class Binding:
     """One number of a part that is an expression of parameters."""
 
     where: str  # the description's attribute: "bodies", "joints", ... or "gravity"
-    part: str  # its name, of a prescribed motion its joint's; empty for gravity
+    part: str  # its name, of a motion its joint's; empty for gravity
     field: str  # its attribute; of a mimic joint also "ratio" and "offset"
     index: tuple[int, ...]  # of an entry of an array
     expression: Expression

@@ -186,6 +186,8 @@ class Body(_Frozen):
         About the centre of mass, in body axes, kg m².
     """
 
+    #: Attribute of a description that holds such parts.
+    section = "bodies"
     name: str
     mass: Annotated[float, NumberRule("kg", least=0.0, positive=True)]
     com: Place
@@ -236,6 +238,7 @@ class Joint(_Frozen):
         The largest dry friction at rest, that of motion without; and the velocity at which it falls to that.
     """
 
+    section = "joints"
     name: str
     kind: str
     parent: str
@@ -308,6 +311,7 @@ class Frame(_Frozen):
         R_BF and p_BF_B, m.
     """
 
+    section = "frames"
     name: str
     body: str
     rotation: Rotation
@@ -334,6 +338,7 @@ class PointSpring(_Frozen):
         N/m, m and N s/m.
     """
 
+    section = "springs"
     name: str
     body_a: str
     point_a: Place
@@ -366,6 +371,7 @@ class JointCoupling(_Frozen):
         SI units of the length l, which may be radians or metres.
     """
 
+    section = "couplings"
     name: str
     joints: tuple[str, ...]
     factors: Annotated[Array, NumberRule(shape=("joints",))]
@@ -401,6 +407,7 @@ class Loop(_Frozen):
         Of a rod between the points, m; zero for every other kind.
     """
 
+    section = "loops"
     name: str
     kind: str
     body_a: str
@@ -432,6 +439,7 @@ class Coupler(_Frozen):
         Coefficients of the second, third and fourth power of a single leader.
     """
 
+    section = "couplers"
     name: str
     joint: str
     leader: str | tuple[str, ...]
@@ -488,6 +496,7 @@ class Prescribed(_Frozen):
         rad/s and rad.
     """
 
+    section = "prescribed"
     joint: str
     offset: Annotated[float, NumberRule("rad, m", added=True)] = 0.0
     rate: Annotated[float, NumberRule("rad/s, m/s", added=True)] = 0.0
@@ -530,6 +539,7 @@ class NoSlip(_Frozen):
         Of a blade, m/s; zero for the others.
     """
 
+    section = "no_slip"
     name: str
     kind: str
     body_a: str

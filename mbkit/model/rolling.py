@@ -36,6 +36,11 @@ NO_SLIP_ROWS: Final[dict[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
 LIES_FLAT: Final = frozenset({"disc"})
 
 
+def discs_of(model: Any) -> list[Any]:
+    """Return the parts of a description that can lie flat."""
+    return [x for x in model.constraints if getattr(x, "kind", "") in LIES_FLAT]
+
+
 @dataclass(frozen=True)
 class Contact:
     """The contact point of a part without slip, in the axes in which its directions were given.

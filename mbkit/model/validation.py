@@ -15,6 +15,7 @@ from mbkit.model import manifold
 from mbkit.model.description import Description
 from mbkit.model.elements.forces import force_faults
 from mbkit.model.elements.motion_laws import motion_faults
+from mbkit.model.elements.references import KINDS_OF_PARTS, called
 from mbkit.model.loops import held_directions
 from mbkit.model.parts import RESTING, Body, Joint, JointCoupling, Loop, NoSlip, numbers
 from mbkit.model.rolling import LIES_FLAT, ROLLING_KINDS
@@ -44,11 +45,11 @@ def structure_faults(description: Description) -> Iterator[str]:
     velocities = sum(j.type.nv for j in joints)
     if velocities > _MAX_VELOCITIES:
         yield f"{velocities} velocities; expected up to {_MAX_VELOCITIES}, because M has their square"
-    for what in ("bodies", "joints", "frames", "springs", "couplings", "loops", "couplers", "no_slip"):
-        names = [p.name for p in getattr(description, what)]
-        one = {"bodies": "body", "no_slip": "no slip"}.get(what, what[:-1])
-        yield from repeated_names(one, names)
-        yield from (fault for part in getattr(description, what) for fault in _negative(one, part))
+    for one, parts in ((called(section), getattr(description, section)) for section in KINDS_OF_PARTS):
+        names = [p.name for p in parts]
+        # One motion for each joint is asked below, in words of its own.
+        yield from repeated_names(one, names) if one != "prescribed" else ()
+        yield from (fault for part in parts for fault in _negative(one, part))
         if one in ("body", "frame") and "world" in names:
             yield f"{one} 'world': that name is the ground's; choose another"
     known, suggestions = {b.name for b in bodies} | {"world"}, Suggestions()

@@ -21,7 +21,7 @@ from mbkit.errors import InputError, OutputError
 from mbkit.load import load
 from mbkit.model import Model
 from mbkit.model.elements.formula import NUMPY
-from mbkit.model.elements.motion_laws import position
+from mbkit.model.elements.motion_laws import motions_of, position
 from mbkit.show import movie, page
 from mbkit.show.scene import Kind, Scene, require_bodies
 
@@ -154,7 +154,7 @@ def animate(
     good = np.flatnonzero(np.isfinite(q).all(axis=1))
     if not len(good):
         raise InputError(f"{model.name}: the trajectory has no state with finite numbers, so nothing can be shown")
-    t, q = t[good], model.check_q(_with_prescribed(model, q[good], t[good]))
+    t, q = t[good], model.check_q(_with_motions(model, q[good], t[good]))
     filmed = path is not None and Path(path).suffix.lower() in movie.FILMS
     rate = real("fps", fps, positive=True) if filmed else _PAGE_RATE
     most = _FILM_FRAMES if filmed else _FRAMES
@@ -170,11 +170,11 @@ def animate(
     return view_of(model, q[which], t[which], path, shapes, triangles, fps=rate)
 
 
-def _with_prescribed(model: Model, q: Array, t: Array) -> Array:
+def _with_motions(model: Model, q: Array, t: Array) -> Array:
     """Return coordinates with those that move in time, where only the others are given."""
-    if q.shape[1] != model.nq - len(model.prescribed):
+    moved = {model.layout.q[x.joint].start: x for x in motions_of(model)}
+    if q.shape[1] != model.nq - len(moved):
         return q
-    moved = {model.layout.q[x.joint].start: x for x in model.prescribed}
     out = np.empty((len(q), model.nq))
     out[:, [i for i in range(model.nq) if i not in moved]] = q
     for i, x in moved.items():

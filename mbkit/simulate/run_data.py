@@ -152,7 +152,7 @@ class RunData:
         """Return ∫ (τ + τ_lost + Σ Jᵀ w)·v dt since the first state in J, shape (K,) or (N, K).
 
         τ_lost are the forces of dampers and of dry friction, those given by functions without a potential, and those of
-        constraints that do work: drives of motions prescribed in time, blades with a speed, soft loops. Of a system
+        constraints that do work: drives of motions in time, blades with a speed, soft loops. Of a system
         written as energies it holds what changes T + V beside its forces, as where a frame is moved.
 
         The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇; UnsupportedError

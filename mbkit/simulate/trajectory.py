@@ -177,7 +177,7 @@ class Trajectory(RunData):
             A file to write: ``.html``, ``.gif`` or ``.mp4``, or ``.png`` for the first state. Without one see
             `mbkit.show`.
         model : Model, optional
-            The description with the bodies, of the same coordinates in the same order; prescribed ones may be left
+            The description with the bodies, of the same coordinates in the same order; moved ones may be left
             out of the states. By default the run's own. A run of `mbkit.lagrangian.from_model`, such as one with
             loops, has energies without bodies, and needs the description that these came from.
         member : int

@@ -61,7 +61,7 @@ def start_state(model: Model, seed: int) -> tuple[Array, Array]:
     """Return a gentle start near the middle of the joints' ranges: a wild one measures chaos, not integrators."""
     q, v = state_within_limits(model, np.random.default_rng([seed, 1]), 0.1)
     if model.time_parameter is not None and model.constrained:
-        # A prescribed motion has the velocity that it has.
+        # A motion in time has the velocity that it has.
         return states_of(model).manifold.project(q, 0.1 * v)
     return q, 0.1 * v
 

@@ -48,14 +48,14 @@ def _of_joints(kin: Kinematics, force: JointElement) -> _Port:
 
 def _of_frame(kin: Kinematics, force: FrameForce) -> _Port:
     motion, frame = BodyMotion(kin, ca.SX(kin.model.nv, 1)), kin.model.frame(force.frame)
-    place = kin.to_world(frame.body, kin.values.frame(frame).translation)
+    place = kin.to_world(frame.body, kin.values.of(frame).translation)
     linear, angular = motion.velocity(force.frame, force.axes)
     rates = [*linear, *angular]
     return _Port(dict(zip(force.own(kin.model), (*place, *rates), strict=True)), rates)
 
 
 def _of_bushing(kin: Kinematics, bushing: Bushing) -> _Port:
-    values = kin.values.forces[bushing.name]
+    values = kin.values.of(bushing)
     both = kin.model.carrier(bushing)
 
     def carried(body: str, x: Vector, weight: float) -> Vector:
@@ -125,7 +125,7 @@ class ElementForces:
 
     def _evaluated(self, force: Force, port: _Port, formula: Formula) -> list[Any]:
         kin = self._kin
-        constants = dict(zip(force.symbols, kin.values.forces[force.name].numbers, strict=True))
+        constants = dict(zip(force.symbols, kin.values.of(force).numbers, strict=True))
         clock = kin.model.time_parameter
         time = {} if clock is None else {TIME: kin.values.named[clock]}
         return formula(self._others | constants | time | port.own, casadi_arithmetic(kin.values.number))

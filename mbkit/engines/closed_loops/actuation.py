@@ -65,7 +65,7 @@ class Actuation(Constrained):
     def actuator_forces(
         self, q: ArrayLike, v: ArrayLike, a: ArrayLike, actuators: str | Sequence[str] = LEAST
     ) -> ActuatorForces:
-        """Return the forces that make a motion under loops and prescribed motions, and the multipliers.
+        """Return the forces that make a motion under constraints, and the multipliers.
 
         The inverse of `forward_dynamics`: under this τ the acceleration is a. `inverse_dynamics` is the tree's, where
         every joint needs a force of its own.
@@ -83,7 +83,7 @@ class Actuation(Constrained):
         Returns
         -------
         ActuatorForces
-            With `tau` and `constraint_forces`. The multiplier of a prescribed motion is the force of its drive.
+            With `tau` and `constraint_forces`. The multiplier of a motion in time is the force of its drive.
 
         Raises
         ------

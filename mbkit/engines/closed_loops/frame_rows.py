@@ -7,7 +7,7 @@ are all that an engine hands over. A new kind of loop is a formula there, and no
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -19,12 +19,13 @@ from mbkit._check import Array
 from mbkit.codegen.backend import DERIVING
 from mbkit.codegen.interpreter import Machine
 from mbkit.model import Model
+from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
-from mbkit.model.parts import Loop, NoSlip
+from mbkit.model.parts import Coupler, Loop, NoSlip
 from mbkit.model.rolling import NO_SLIP_ROWS, contact, tangents
 
-#: Position, velocity and acceleration of each prescribed motion at a time.
-Laws = Sequence[Callable[[float], tuple[float, float, float]]]
+#: Position, velocity and acceleration of each motion at a time, by its name.
+Laws = Mapping[str, Callable[[float], tuple[float, float, float]]]
 
 
 @dataclass(frozen=True)
@@ -143,30 +144,20 @@ def contact_rows(part: NoSlip, a: MovingFrame, b: MovingFrame) -> tuple[Rows, Ro
     return rows[:first], rows[first:]
 
 
-def coupler_rows(model: Model, q: Array, v: Array) -> list[Rows]:
-    """Return the rows of couplers, from the description's q and v."""
+def coordinate_rows(model: Model, q: Array, v: Array, laws: Laws, time: float) -> list[Rows]:
+    """Return the rows of couplers and of motions at a time, from the description's q and v."""
     layout, out = model.layout, []
-    for x in model.couplers:
-        places = [layout.full_q[name].start for name in (x.joint, *x.leaders)]
+    for x in (x for x in model.constraints if type(x) in (Coupler, *MOTION_LAWS)):
+        places = [layout.full_q[name].start for name in (x.joint, *getattr(x, "leaders", ()))]
         at, *leading = layout.G_q[places] @ q + layout.offsets[places]
-        follows, slopes = x.follow(leading)
-        to = layout.coupler_row(x, slopes) @ layout.G
-        # A curve is of the first leader alone.
-        rate = layout.G[layout.full_v[x.leaders[0]].start] @ v
-        out.append(_row(at - follows, to, to @ v, -x.polynomial.deriv(2)(leading[0]) * rate**2))
+        if isinstance(x, Coupler):
+            follows, slopes = x.follow(leading)
+            to, along = layout.coupler_row(x, slopes) @ layout.G, 0.0
+            # A curve is of the first leader alone.
+            rate = layout.G[layout.full_v[x.leaders[0]].start] @ v
+            bend = x.polynomial.deriv(2)(leading[0]) * rate**2
+        else:
+            follows, along, bend = laws[x.name](time)
+            to = layout.G[layout.full_v[x.joint].start]
+        out.append(Rows(*(np.array([n]) for n in (at - follows, to, to @ v - along, -bend))))
     return out
-
-
-def motion_rows(model: Model, laws: Laws, time: float, q: Array, v: Array) -> list[Rows]:
-    """Return the rows of prescribed motions at a time, from the description's q and v."""
-    layout, out = model.layout, []
-    for x, law in zip(model.prescribed, laws, strict=True):
-        i, k = layout.full_q[x.joint].start, layout.full_v[x.joint].start
-        path, speed, rate = law(time)
-        to = layout.G[k]
-        out.append(_row(layout.G_q[i] @ q + layout.offsets[i] - path, to, to @ v - speed, -rate))
-    return out
-
-
-def _row(f: Any, J: Array, rate: Any, gamma: Any) -> Rows:
-    return Rows(np.array([f]), J[None], np.array([rate]), np.array([gamma]))

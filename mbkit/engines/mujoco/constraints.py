@@ -288,7 +288,7 @@ class LoopEnds:
         `columns` turns a Jacobian into the description's coordinates; `given` are q and v of the description.
         """
         # The import loads CasADi, which trees never need here.
-        from mbkit.engines.closed_loops.frame_rows import MovingFrame, Rows, coupler_rows, loop_rows
+        from mbkit.engines.closed_loops.frame_rows import MovingFrame, Rows, coordinate_rows, loop_rows
 
         def frame(p: Array, R: Array, body: int) -> MovingFrame:
             J, dJ = _jacobian(mujoco.mj_jac, m, d, p, body), _jacobian(mujoco.mj_jacDot, m, d, p, body)
@@ -298,7 +298,7 @@ class LoopEnds:
         for loop, (*ends, carrier) in zip(self._model.loops, self._placed, strict=True):
             a, b = (frame(d.site_xpos[s], d.site_xmat[s], m.site_bodyid[s]) for s in ends)
             parts.append(loop_rows(loop, a, b, frame(d.xpos[carrier], d.xmat[carrier], carrier)))
-        return Rows.stacked([*parts, *coupler_rows(self._model, *given)])
+        return Rows.stacked([*parts, *coordinate_rows(self._model, *given, {}, 0.0)])
 
 
 def _jacobian(of: Callable[..., None], m: Any, d: Any, p: Array, body: int) -> Array:

@@ -1,7 +1,7 @@
-"""Loops, prescribed motions and contacts without slip by Pinocchio. A part of `PinocchioDynamics`.
+"""Loops, motions in time and contacts without slip by Pinocchio. A part of `PinocchioDynamics`.
 
-`pinocchio.constraintDynamics` gives the accelerations where it can: every loop is a "point" or a "frame", no motion is
-prescribed, nothing rolls, as its constraints hold positions, no coupler holds joints, no joint mimics another, no
+`pinocchio.constraintDynamics` gives the accelerations where it can: every loop is a "point" or a "frame", nothing is
+moved in time, nothing rolls, as its constraints hold positions, no coupler holds joints, no joint mimics another, no
 coupling has an armature, and no row is redundant but those of a plane that does not move. It factors J M⁻¹ Jᵀ + μ and
 iterates (Carpentier, Budhiraja and Mansard 2021, Proximal and sparse resolution of constrained dynamic equations).
 Elsewhere the equation
@@ -38,11 +38,13 @@ from mbkit.engines.constrained import ROWS, singular_pose
 from mbkit.engines.pinocchio.model import PinModel
 from mbkit.errors import NumericalError
 from mbkit.model import Model
+from mbkit.model.elements.motion_laws import motions_of
 from mbkit.model.loops import LOOP_KINDS
+from mbkit.model.parts import Loop, NoSlip
 
 if TYPE_CHECKING:
     from mbkit.derivation.constraints import RowChoice
-    from mbkit.engines.closed_loops.frame_rows import MovingFrame, Rows
+    from mbkit.engines.closed_loops.frame_rows import Laws, MovingFrame, Rows
 
 #: Kinds of loops that Pinocchio's rigid constraints have.
 _RIGID: Final = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.CONTACT_6D}
@@ -57,6 +59,7 @@ _NO_PIVOT: Final = 1e3
 _AGREES: Final = 1e-11
 _ALIGNED: Final = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _LOCAL: Final = pin.ReferenceFrame.LOCAL
+_ONE: Final = np.eye(3)
 
 
 def _frame(m: Any, d: Any, G: Array | None, joint: int, X_JF: Any) -> MovingFrame:
@@ -84,28 +87,27 @@ class PinConstraints:
         self._model, self._m, self._d = model, maps.model, maps.model.createData()
         self._G, self._rotors, self._time = G, rotors, model.time
         self._still = np.zeros(self._m.nv)
-        #: Of each loop both ends and the body that carries both: joint and placement on it.
-        self._ends: list[list[tuple[int, Any]]] = []
-        #: Whether the body that carries both ends stands still.
-        self._grounded: list[bool] = []
-        for loop in model.loops:
-            both = model.carrier(loop)
-            sides = [(loop.body_a, loop.rotation_a, loop.translation_a)]
-            sides += [(loop.body_b, loop.rotation_b, loop.translation_b), (both, np.eye(3), np.zeros(3))]
-            placed = []
-            for body, R, p in sides:
-                joint, R_JB, p_JB = maps.bodies[body]
-                placed.append((joint, pin.SE3(R_JB @ R, p_JB + R_JB @ p)))
-            self._ends.append(placed)
-            self._grounded.append(placed[2][0] == 0)
-        #: Of each contact without slip the joint and the placement on both bodies.
-        self._touching: list[list[tuple[int, Any]]] = []
-        for x in model.no_slip:
-            ends = []
-            for body, p in ((x.body_a, x.translation_a), (x.body_b, x.translation_b)):
-                joint, R_JB, p_JB = maps.bodies[body]
-                ends.append((joint, pin.SE3(R_JB, p_JB + R_JB @ p)))
-            self._touching.append(ends)
+
+        def placed(body: str, p: Array, R: Array = _ONE) -> tuple[int, Any]:
+            """Return the joint of a place on a body, and its placement there."""
+            joint, R_JB, p_JB = maps.bodies[body]
+            return joint, pin.SE3(R_JB @ R, p_JB + R_JB @ p)
+
+        #: Both ends of each loop, and the body that carries both.
+        self._ends = [
+            (
+                placed(x.body_a, x.translation_a, x.rotation_a),
+                placed(x.body_b, x.translation_b, x.rotation_b),
+                placed(model.carrier(x), np.zeros(3)),
+            )
+            for x in model.loops
+        ]
+        #: Both bodies' points of each contact without slip.
+        self._touching = [
+            (x, placed(x.body_a, x.translation_a), placed(x.body_b, x.translation_b))
+            for x in model.constraints
+            if isinstance(x, NoSlip)
+        ]
 
     def at(self, time: float) -> PinConstraints:
         """Return the same at another time."""
@@ -146,7 +148,7 @@ class PinConstraints:
 
         m, d, held, moving = self._m, self._d, [], []
         with np.errstate(divide="ignore", invalid="ignore"):
-            for part, ends in zip(self._model.no_slip, self._touching, strict=True):
+            for part, *ends in self._touching:
                 own = contact_rows(part, *(_frame(m, d, self._G, *end) for end in ends))
                 held.append(own[0])
                 moving.append(own[1])
@@ -154,19 +156,18 @@ class PinConstraints:
 
     def all_rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
         """Return the rows of loops, couplers, motions and contacts; `given` are q and v of the description."""
-        from mbkit.engines.closed_loops.frame_rows import Rows, coupler_rows, motion_rows
+        from mbkit.engines.closed_loops.frame_rows import Rows, coordinate_rows
 
         loops = self.every(q, v)
         held, moving = self._contacts()
-        others = coupler_rows(self._model, *given), motion_rows(self._model, self._laws, self._time, *given)
-        return Rows.stacked([loops, *others[0], *others[1], *held, *moving])
+        others = coordinate_rows(self._model, *given, self._laws, self._time)
+        return Rows.stacked([loops, *others, *held, *moving])
 
     @cached_property
-    def _laws(self) -> list[Callable[[float], tuple[float, float, float]]]:
-        """Position, velocity and acceleration of each motion at a time."""
+    def _laws(self) -> Laws:
         from mbkit.derivation.elements.motions import law_rates
 
-        return [law_rates(x) for x in self._model.prescribed]
+        return {x.name: law_rates(x) for x in motions_of(self._model)}
 
     # Motion
 
@@ -174,15 +175,15 @@ class PinConstraints:
     def solver(self) -> str:
         """What gives the accelerations: "constraintDynamics", or "LAPACK" from Pinocchio's terms."""
         model = self._model
-        foreign = bool(model.prescribed or model.couplers or model.no_slip)
-        if foreign or any(x.kind not in _RIGID for x in model.loops) or model.layout.reduced or self._rotors:
+        rigid = all(isinstance(x, Loop) and x.kind in _RIGID for x in model.constraints)
+        if not rigid or model.layout.reduced or self._rotors:
             return "LAPACK"
         kept, independent = self.choice.kept, self.choice.independent
         first = 0
-        for loop, grounded in zip(model.loops, self._grounded, strict=True):
+        for loop, (*_, (carrier, _)) in zip(model.loops, self._ends, strict=True):
             last = first + LOOP_KINDS[loop.kind]
             # Of a plane that is carried along, what is redundant is so where the loop is closed, and not beside.
-            if not grounded and any(i not in kept for i in range(first, last)):
+            if carrier and any(i not in kept for i in range(first, last)):
                 return "LAPACK"
             first = last
         return "constraintDynamics" if len(independent) == len(kept) else "LAPACK"
@@ -283,7 +284,7 @@ class PinConstraints:
         sizes, scaled = np.where(sizes > 0, sizes, 1.0), unit_rows(scaled)
         if not np.isfinite(scaled).all() or not np.isfinite(force).all():
             raise NumericalError(f"pinocchio: the terms of {self._model.name} are not finite at this state")
-        # The rows in the metric of M and of themselves: M may have no inverse, and where J v̇ is prescribed they change
+        # The rows in the metric of M and of themselves: M may have no inverse, and where J v̇ is given they change
         # neither v̇ nor λ. Orthogonal factors lose digits with the condition, those of J M⁻¹ Jᵀ with its square.
         a, forces = np.zeros(n), np.zeros(k)
         try:

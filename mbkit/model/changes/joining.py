@@ -46,7 +46,7 @@ def mounted(model: Model, pose: ArrayLike) -> Model:
         )
     bindings = list(model.bindings)
     parts: dict[str, Any] = {
-        kind: tuple(hung_on(x, kind, "world", R, p, bindings) for x in getattr(model, kind)) for kind in KINDS_OF_PARTS
+        kind: tuple(hung_on(x, "world", R, p, bindings) for x in getattr(model, kind)) for kind in KINDS_OF_PARTS
     }
     note = f"mounted at {np.round(p, 6).tolist()} m, roll, pitch, yaw {_degrees(R)} degrees"
     drawn_from = tuple(x.hung_on("world", R, p) for x in model.sources)
@@ -122,7 +122,7 @@ def join(
         added.add_prefix(prefix)
     added._notes = [f"{prefix or arm.name}: {text}" for text in arm.notes]
     _require_other_names(base, added._parts, prefix)
-    place = entries(frame, "frames", "translation", base.bindings) + frame.rotation @ p
+    place = entries(frame, "translation", base.bindings) + frame.rotation @ p
     b._take(added, frame.body, frame.rotation @ R, place, frame.translation + frame.rotation @ p)
     b._name = base.name if name is None else b._read.name("name", name)
     b.note(f"joined: {arm.name} at {at!r}" + (f" with the prefix {prefix!r}" if prefix else ""))

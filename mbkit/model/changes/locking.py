@@ -28,12 +28,13 @@ from mbkit.model.elements.forces import (
     coordinate_arguments,
 )
 from mbkit.model.elements.formula import Formula, Operation
+from mbkit.model.elements.motion_laws import motions_of
 from mbkit.model.elements.references import entries, moved_by, with_fields
 from mbkit.model.joint_types import FIXED
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Expression, nominal
-from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, PointSpring
+from mbkit.model.parts import Coupler, Joint, JointCoupling, Loop, NoSlip, PointSpring
 from mbkit.model.poses import body_poses
 
 #: Of limits and of what is closed: digits of a typed number.
@@ -150,7 +151,7 @@ def _with_followers(model: Model, given: Values) -> Values:
             break
         ties.remove(tied)
         item = f"joints: coupler {tied.name!r}"
-        _require_numbers(model, "couplers", tied.name, item)
+        _require_numbers(model, tied, item)
         name = next((x for x in tied.leaders if x not in values), tied.joint)
         # Where the leader that is sought has no part in it.
         value, slopes = tied.follow([values[x][0] if x in values else 0.0 for x in tied.leaders])
@@ -169,9 +170,9 @@ def _with_followers(model: Model, given: Values) -> Values:
     return values
 
 
-def _require_numbers(model: Model, where: str, name: str, item: str) -> None:
+def _require_numbers(model: Model, part: Any, item: str) -> None:
     """Refuse a part with parameters, on whose values locked places or a closed loop would depend (InputError)."""
-    if free := [b for b in model.bindings if (b.where, b.part) == (where, name)]:
+    if free := [b for b in model.bindings if (b.where, b.part) == (part.section, part.name)]:
         raise InputError(
             f"{item} has a parameter, {free[0].expression}, on which the locked places would depend; give it with "
             "with_parameters first"
@@ -179,7 +180,7 @@ def _require_numbers(model: Model, where: str, name: str, item: str) -> None:
 
 
 def _refuse_driven(model: Model, values: Values) -> None:
-    if driven := [x.joint for x in model.prescribed if x.joint in values]:
+    if driven := [x.joint for x in motions_of(model) if x.joint in values]:
         raise InputError(f"joints: {driven[0]!r} is moved by a prescribed motion; remove it with without('prescribed')")
     for b in model.bindings:
         if b.where == "joints" and b.part in values and b.field in ("pitch", "ratio", "offset"):
@@ -193,10 +194,10 @@ def _fixed(joint: Joint, values: Values, bindings: list[Binding]) -> Joint:
     if joint.name not in values:
         return joint
     R, p = (np.array(x, dtype=float) for x in joint.type.placement(np, joint, list(values[joint.name])))
-    place = moved_by(np.eye(3), joint.rotation @ p, entries(joint, "joints", "translation", bindings))
+    place = moved_by(np.eye(3), joint.rotation @ p, entries(joint, "translation", bindings))
     bindings[:] = [b for b in bindings if (b.where, b.part) != ("joints", joint.name)]
     still = Joint._of(joint.name, FIXED.name, joint.parent, joint.child, joint.rotation @ R, joint.translation)
-    return with_fields(still, "joints", {"translation": place}, bindings)  # type: ignore[no-any-return]  # a Joint
+    return with_fields(still, {"translation": place}, bindings)  # type: ignore[no-any-return]  # a Joint
 
 
 def _still_springs(
@@ -205,12 +206,12 @@ def _still_springs(
     """Yield springs with the energies of those at locked joints alone, between bodies that these hold together."""
     held = list[tuple[str, Any, Any]]()
     for joint in (x for x in model.joints if x.name in values):
-        stiffness, rest = (entries(joint, "joints", name, model.bindings) for name in ("stiffness", "rest"))
+        stiffness, rest = (entries(joint, name, model.bindings) for name in ("stiffness", "rest"))
         # Stiff joints have a coordinate for each velocity.
         held += [(joint.name, k, float(x) - r) for k, x, r in zip(stiffness, values[joint.name], rest, strict=False)]
     for part in (x for x in model.couplings if {*x.joints} <= {*values}):
         fields = ("factors", "stiffness", "rest_length")
-        factors, stiffness, stretch = (entries(part, "couplings", name, model.bindings) for name in fields)
+        factors, stiffness, stretch = (entries(part, name, model.bindings) for name in fields)
         for name, factor in zip(part.joints, factors, strict=True):
             stretch = stretch - factor * float(values[name][0])
         held.append((part.joints[0], stiffness, stretch))
@@ -219,9 +220,9 @@ def _still_springs(
         if isinstance(stiffness, Expression) or isinstance(stretch, Expression) or stiffness * stretch:
             joint, none = fixed[name], np.zeros(3)
             spring = PointSpring(f"spring {k} of {name}", joint.parent, none, joint.child, none, 0.0, 0.0, 0.0)
-            ends = entries(joint, "joints", "translation", bindings), np.array([stretch, 0.0, 0.0], dtype=object)
+            ends = entries(joint, "translation", bindings), np.array([stretch, 0.0, 0.0], dtype=object)
             numbers = {"point_a": ends[0], "point_b": ends[1], "stiffness": stiffness}
-            yield with_fields(spring, "springs", numbers, bindings)
+            yield with_fields(spring, numbers, bindings)
 
 
 def _shortened(coupling: JointCoupling, values: Values, bindings: list[Binding]) -> JointCoupling | None:
@@ -231,14 +232,14 @@ def _shortened(coupling: JointCoupling, values: Values, bindings: list[Binding])
         return coupling
     if not moving:
         return None
-    factors = entries(coupling, "couplings", "factors", bindings)
-    rest = entries(coupling, "couplings", "rest_length", bindings)
+    factors = entries(coupling, "factors", bindings)
+    rest = entries(coupling, "rest_length", bindings)
     for k, name in enumerate(coupling.joints):
         if name in values and values[name][0]:
             rest = rest - factors[k] * float(values[name][0])
     fields = {"factors": factors[moving], "rest_length": rest}
     shorter = replace(coupling, joints=tuple(coupling.joints[k] for k in moving), factors=np.ones(len(moving)))
-    return with_fields(shorter, "couplings", fields, bindings)  # type: ignore[no-any-return]  # a coupling
+    return with_fields(shorter, fields, bindings)  # type: ignore[no-any-return]  # a coupling
 
 
 def _left(coupler: Coupler, values: Values, bindings: list[Binding]) -> Coupler | None:
@@ -246,8 +247,8 @@ def _left(coupler: Coupler, values: Values, bindings: list[Binding]) -> Coupler 
     moving = [x for x in coupler.leaders if x not in values]
     if not moving or (len(moving) == len(coupler.leaders) and coupler.joint not in values):
         return coupler if moving else None
-    ratios = dict(zip(coupler.leaders, np.atleast_1d(entries(coupler, "couplers", "ratio", bindings)), strict=True))
-    offset, joint = entries(coupler, "couplers", "offset", bindings), coupler.joint
+    ratios = dict(zip(coupler.leaders, np.atleast_1d(entries(coupler, "ratio", bindings)), strict=True))
+    offset, joint = entries(coupler, "offset", bindings), coupler.joint
     for name in coupler.leaders:
         if name in values:
             offset = offset + ratios[name] * float(values[name][0])
@@ -262,7 +263,7 @@ def _left(coupler: Coupler, values: Values, bindings: list[Binding]) -> Coupler 
     left = np.array([ratios[x] for x in moving])
     fields = {"ratio": left if len(left) > 1 else left[0], "offset": offset}
     shorter = replace(coupler, joint=joint, leader=tuple(moving), ratio=1.0)
-    return with_fields(shorter, "couplers", fields, bindings)  # type: ignore[no-any-return]  # a coupler
+    return with_fields(shorter, fields, bindings)  # type: ignore[no-any-return]  # a coupler
 
 
 def _acting(model: Model, force: Force, values: Values) -> Iterator[Force]:
@@ -352,10 +353,10 @@ def _closed_for_good(model: Model) -> tuple[list[Loop], list[str]]:
                 f"joints: locked there, loop {loop.name!r} is open by {size:.3g} and nothing moves it; take the values "
                 "of a state that project returns"
             )
-        _require_numbers(model, "loops", loop.name, f"joints: loop {loop.name!r}, which nothing moves then,")
+        _require_numbers(model, loop, f"joints: loop {loop.name!r}, which nothing moves then,")
         closed.append(loop)
         notes.append(f"loop {loop.name!r} is closed by the locked joints, and is gone")
-    for part in model.no_slip:
+    for part in (x for x in model.constraints if isinstance(x, NoSlip)):
         if not (model.moving(part.body_a) ^ model.moving(part.body_b)) & moves:
             raise InputError(f"joints: with them locked, nothing moves no slip {part.name!r}; remove it, or lock fewer")
     return closed, notes

@@ -11,7 +11,7 @@ from mbkit.errors import UnsupportedError
 from mbkit.model.builder import ModelBuilder
 from mbkit.model.elements.beams import BeamEnd
 from mbkit.model.elements.forces import RATE
-from mbkit.model.elements.references import entries, names_in
+from mbkit.model.elements.references import KINDS_OF_PARTS, entries, names_in
 from mbkit.model.joint_types import FIXED, REVOLUTE, UNIVERSAL
 from mbkit.model.model import Model
 from mbkit.model.parameters import nominal
@@ -50,9 +50,9 @@ def segmented(model: Model, segments: int) -> Model:
 def _numbers(model: Model, joint: Joint, points: list[Joint]) -> tuple[list[Any], Any, Any]:
     """Return EI of each plane, the damping time and the mass a metre, numbers or expressions."""
     beam: Any = joint.type
-    K = np.atleast_1d(entries(joint, "joints", "stiffness", model.bindings))
-    D = np.atleast_1d(entries(joint, "joints", "damping", model.bindings))
-    masses = [entries(model.body(p.child), "bodies", "mass", model.bindings) for p in points]
+    K = np.atleast_1d(entries(joint, "stiffness", model.bindings))
+    D = np.atleast_1d(entries(joint, "damping", model.bindings))
+    masses = [entries(model.body(p.child), "mass", model.bindings) for p in points]
     each = len(K) // len(beam.across)
     # Straight shapes of a string bend nowhere.
     bent = int(np.argmax(beam.squares[:each]))
@@ -77,7 +77,7 @@ def _require_free(model: Model, joint: Joint, points: list[Joint]) -> None:
     lost = {p.name for p in points}
     own = {*model.coordinate_names[model.layout.q[joint.name]]}
     own |= {name + RATE for name in own}
-    for kind in ("frames", "springs", "couplings", "loops", "couplers", "prescribed", "forces", "no_slip"):
+    for kind in KINDS_OF_PARTS[2:]:
         for part in getattr(model, kind):
             of_modes = {getattr(part, "joint", None), getattr(part, "leader", None), *getattr(part, "joints", ())}
             if names_in(part) & lost or joint.name in of_modes or own & {*getattr(part, "arguments", ())}:

@@ -112,7 +112,7 @@ class ElementBuilder:
         if law is None:
             if parameters is not None:
                 self._read.faults.append(f"prescribed {shown(joint)}: parameters without a law; give them as numbers")
-            self._add(Prescribed, "prescribed", "prescribed", joint, harmonic)
+            self._add(Prescribed, "prescribed", joint, harmonic)
             return
         item = f"prescribed {shown(joint)}"
         if given := [name for name, x in harmonic.items() if not _is_zero(x)]:
@@ -125,11 +125,11 @@ class ElementBuilder:
             return
         if pieces is not None:
             ready = {"knots": pieces[0], "coefficients": pieces[1]}
-            self._add(SplineMotion, "prescribed", "prescribed", joint, {}, ready)
+            self._add(SplineMotion, "prescribed", joint, {}, ready)
             return
         formulas, constants = self._formulas(item, parameters, law=((law, 1),), given={"law": (TIME,)})
         if formulas["law"] is not None:
-            self._add(FormulaMotion, "prescribed", "prescribed", joint, {}, {"formula": formulas["law"]} | constants)
+            self._add(FormulaMotion, "prescribed", joint, {}, {"formula": formulas["law"]} | constants)
 
     def add_coupler(
         self,
@@ -177,7 +177,7 @@ class ElementBuilder:
         """
         values = {"joint": joint, "leader": leader, "offset": offset, "curve": curve}
         ready = {"ratio": self._ratio(f"coupler {shown(name)}", leader, ratio)}
-        self._add(Coupler, "couplers", "coupler", name, values, ready)
+        self._add(Coupler, "coupler", name, values, ready)
 
     def _ratio(self, item: str, leader: Any, ratio: Any) -> Any:
         """Return a number or expression for one leader, an array of them for several."""
@@ -231,7 +231,7 @@ class ElementBuilder:
             item, parameters, formula=((force, None),), potential=((potential, 1),), given=given
         )
         joint = self._read.name(f"{item}: joint", joint)
-        self._add(JointForce, "forces", "force", name, {}, {"joint": joint} | formulas | constants)
+        self._add(JointForce, "force", name, {}, {"joint": joint} | formulas | constants)
 
     def add_force(
         self,
@@ -294,7 +294,7 @@ class ElementBuilder:
             given=given,
         )
         frame = self._read.name(f"{item}: frame", frame)
-        self._add(FrameForce, "forces", "force", name, {}, {"frame": frame, "axes": axes} | formulas | constants)
+        self._add(FrameForce, "force", name, {}, {"frame": frame, "axes": axes} | formulas | constants)
 
     def add_gravity_compensation(self, body: str, fraction: Number = 1.0, *, without: Sequence[str] = ()) -> None:
         """Hold a part of a body's weight by a force at its centre of mass, as MuJoCo's ``gravcomp`` does.
@@ -391,7 +391,7 @@ class ElementBuilder:
         matrices = {n: self._matrix(f"{item}: {n}", x) for n, x in (("stiffness", stiffness), ("damping", damping))}
         a = {"body_a": body_a, "rotation_a": rotation_a, "translation_a": translation_a}
         b = {"body_b": body_b, "rotation_b": rotation_b, "translation_b": translation_b}
-        self._add(Bushing, "forces", "bushing", name, a | b, matrices | formulas | constants)
+        self._add(Bushing, "bushing", name, a | b, matrices | formulas | constants)
 
     def add_beam(
         self,

@@ -14,23 +14,25 @@ from mbkit._check import Array, shown
 from mbkit.errors import InputError, nearest
 from mbkit.model.elements.beams import OnBeam
 from mbkit.model.elements.forces import RATE
-from mbkit.model.elements.references import _OF_BODIES, KINDS_OF_PARTS, entries, hung_on, moved_by, names_in, renamed
+from mbkit.model.elements.references import (
+    _OF_BODIES,
+    KINDS_OF_PARTS,
+    called,
+    entries,
+    hung_on,
+    moved_by,
+    names_in,
+    renamed,
+)
 from mbkit.model.parameters import Binding, Number, split
 from mbkit.model.parts import OF_Q, OF_V, Frame, Joint, Mimic, rules_of
 
 _Vector = ArrayLike | Sequence[Number]
 _Numbers = ArrayLike | Sequence[Number] | Number
-#: What a kind of part is called, where it is not the plural's singular.
-_CALLED: Final = {"bodies": "body", "prescribed": "prescribed", "forces": "force", "no_slip": "no slip"}
 #: Numbers up to which a note says them all.
 _FEW: Final = 3
 #: Arguments of joints with a number for each coordinate or velocity.
 NUMBERS_OF_JOINTS: Final = tuple(n for n, rule in rules_of(Joint).items() if rule.shape in (OF_Q, OF_V))
-
-
-def called(kind: str) -> str:
-    """Return the word for one part of a kind."""
-    return _CALLED.get(kind, kind.removesuffix("s"))
 
 
 class EditingBuilder:
@@ -283,7 +285,7 @@ class EditingBuilder:
             "fixed",
             parent=frame.body,
             child=name,
-            translation=moved_by(frame.rotation, entries(frame, "frames", "translation", self._bindings), place),
+            translation=moved_by(frame.rotation, entries(frame, "translation", self._bindings), place),
             rotation=frame.rotation @ R,
         )
         size = f" of {mass:g} kg" if isinstance(mass, (int, float)) else ""
@@ -378,7 +380,7 @@ class EditingBuilder:
         """Take the parts of another builder, with its ground at R, p on a body; `nominal` is p without parameters."""
         bindings = other._bindings
         for kind, parts in other._parts.items():
-            self._parts[kind] += [hung_on(x, kind, body, R, p, bindings) for x in parts]
+            self._parts[kind] += [hung_on(x, body, R, p, bindings) for x in parts]
         # There is one gravity.
         self._bindings += [b for b in bindings if b.where != "gravity"]
         self._odd |= other._odd

@@ -9,7 +9,6 @@ and velocity of the model that is not the element's own, ``"theta"`` and ``"thet
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
@@ -37,6 +36,7 @@ _ASYMMETRY: Final = 1e-12
 class Force(_Frozen):
     """What the elements share: the attributes `formula`, `potential`, `symbols` and `numbers`."""
 
+    section = "forces"
     name: str
     formula: Formula | None
     potential: Formula | None
@@ -348,8 +348,6 @@ def by_functions(model: _Model) -> tuple[Force, ...]:
 
 def force_faults(model: _Model) -> Iterator[str]:
     """Yield one sentence for each fault of the forces of a description."""
-    names = Counter(f.name for f in model.forces)
-    yield from (f"force {name!r}: declared {k} times; names must differ" for name, k in names.items() if k > 1)
     others = coordinate_arguments(model)
     for force in model.forces:
         item = f"bushing {force.name!r}" if isinstance(force, Bushing) else f"force {force.name!r}"

@@ -28,6 +28,7 @@ MOST_KNOTS: Final = 2000
 
 
 class _OfJoint(_Frozen):
+    section = "prescribed"
     joint: str
 
     @property
@@ -124,6 +125,11 @@ MOTION_LAWS: Final[dict[type, Callable[[Any, Any, Any, Arithmetic], Any]]] = {
     FormulaMotion: _of_formula,
     SplineMotion: _of_pieces,
 }
+
+
+def motions_of(model: Any) -> list[Any]:
+    """Return the motions among the constraints of a description."""
+    return [x for x in model.constraints if type(x) in MOTION_LAWS]
 
 
 def position(part: Motion, t: Any, arithmetic: Arithmetic) -> Any:

@@ -22,11 +22,18 @@ KINDS_OF_PARTS: Final = (
     *("bodies", "joints", "frames"),
     *("springs", "couplings", "loops", "couplers", "prescribed", "forces", "no_slip"),
 )
+#: The word for one of them, where it is not the plural's singular.
+_CALLED: Final = {"bodies": "body", "no_slip": "no slip"}
 #: Fields that name other parts.
 _OF_BODIES: Final = ("parent", "child", "body", "body_a", "body_b", "frame")
 _OF_JOINTS: Final = ("joint", "leader", "joints", "without")
 #: Bodies that a part hangs on, with the end of its fields' names.
 _SIDES: Final = {"parent": "", "body_a": "_a", "body_b": "_b"}
+
+
+def called(section: str) -> str:
+    """Return the word for one part of a kind."""
+    return _CALLED.get(section, section.removesuffix("s"))
 
 
 def names_in(part: Any, of: Iterable[str] = (*_OF_BODIES, *_OF_JOINTS)) -> set[str]:
@@ -82,9 +89,9 @@ def _with_names(part: Any, new: Callable[[str], str], arguments: Mapping[str, st
     return replace(part, **changes)
 
 
-def entries(part: Any, where: str, field: str, bindings: Iterable[Binding]) -> Any:
+def entries(part: Any, field: str, bindings: Iterable[Binding]) -> Any:
     """Return a field with its expressions in the place of their nominal numbers."""
-    own = [b for b in bindings if (b.where, b.part, b.field) == (where, part.name, field)]
+    own = [b for b in bindings if (b.where, b.part, b.field) == (part.section, part.name, field)]
     if not own:
         return getattr(part, field)
     value = np.array(getattr(part, field), dtype=object)
@@ -93,10 +100,11 @@ def entries(part: Any, where: str, field: str, bindings: Iterable[Binding]) -> A
     return value.item() if value.ndim == 0 else value
 
 
-def with_fields(part: Any, where: str, values: Mapping[str, Any], bindings: list[Binding]) -> Any:
+def with_fields(part: Any, values: Mapping[str, Any], bindings: list[Binding]) -> Any:
     """Return a part with other fields, numbers or expressions, and put the bindings of these into the list."""
-    numbers, new = split(where, part.name, dict(values))
-    bindings[:] = [b for b in bindings if (b.where, b.part) != (where, part.name) or b.field not in values]
+    place = part.section, part.name
+    numbers, new = split(*place, dict(values))
+    bindings[:] = [b for b in bindings if (b.where, b.part) != place or b.field not in values]
     bindings += new
     return replace(part, **numbers)
 
@@ -115,7 +123,7 @@ def moved_by(R: Array, p: Any, x: Any) -> Any:
     return out
 
 
-def hung_on(part: Any, where: str, body: str, R: Array, p: Any, bindings: list[Binding]) -> Any:
+def hung_on(part: Any, body: str, R: Array, p: Any, bindings: list[Binding]) -> Any:
     """Return a part with what hung on the ground hung on a body, where the ground has the pose R, p."""
     for side, end in _SIDES.items():
         if getattr(part, side, None) != "world":
@@ -125,6 +133,6 @@ def hung_on(part: Any, where: str, body: str, R: Array, p: Any, bindings: list[B
         for name in {f"rotation{end}", f"axis{end}"} & names:
             part = replace(part, **{name: R @ getattr(part, name)})
         for name in {f"translation{end}", f"point{end}"} & names:
-            point = moved_by(R, p, entries(part, where, name, bindings))
-            part = with_fields(part, where, {name: point}, bindings)
+            point = moved_by(R, p, entries(part, name, bindings))
+            part = with_fields(part, {name: point}, bindings)
     return part

@@ -21,9 +21,8 @@ from mbkit.load import load
 from mbkit.load.loader import find
 from mbkit.load.urdf_reader import read_links
 from mbkit.model import Joint, Model
-from mbkit.model.elements.editing import called
 from mbkit.model.elements.formula import Formula
-from mbkit.model.elements.references import KINDS_OF_PARTS
+from mbkit.model.elements.references import KINDS_OF_PARTS, called
 from mbkit.model.parts import rules_of
 from mbkit.studies._targets import resolved, resolved_options
 

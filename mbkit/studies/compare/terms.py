@@ -150,7 +150,7 @@ FORWARD_DYNAMICS: Final = "forward_dynamics"
 JOINT_LOADS: Final = "joint_wrenches"
 #: Quantities that depend on how an engine holds constraints.
 OF_CONSTRAINED_MOTION: Final = (FORWARD_DYNAMICS, JOINT_LOADS, "generalized_constraint_force")
-#: Of models with loops and prescribed motions. Jᵀ λ is unique where λ is not.
+#: Of models with constraints. Jᵀ λ is unique where λ is not.
 CONSTRAINT_TERMS: Final = (
     Term("f", "constraint_residual", ("q",), row_errors),
     Term("J", "constraint_jacobian", ("q",), row_errors),

@@ -20,9 +20,9 @@ from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Joint, Mimic, Model
 from mbkit.model.changes.dry_friction import FrictionNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
-from mbkit.model.elements.editing import called
 from mbkit.model.elements.formula import NUMPY, Formula
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
+from mbkit.model.elements.references import called
 from mbkit.model.parts import Coupler, Loop, rules_of
 from mbkit.studies.explain.loop_differences import loop_differences, same_loop
 from mbkit.studies.explain.merged_model import OTHERS, LinkInBody, MergedModel, Tolerances, composite

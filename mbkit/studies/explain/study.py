@@ -13,7 +13,6 @@ from mbkit.engines import Dynamics
 from mbkit.errors import InputError
 from mbkit.model import GravityCompensation, Model
 from mbkit.model.elements.kinds import EFFECTS
-from mbkit.model.elements.motion_laws import interval
 from mbkit.model.elements.paths import Path
 from mbkit.model.joint_numbers import owners
 from mbkit.model.model import unchecked
@@ -117,7 +116,7 @@ def _model(x: Model | Dynamics, which: str) -> Model:
 
 def _moment(*models: Model) -> float:
     """Return a time at which nothing begins, and which the tables of motions have."""
-    intervals = [(_TIME, _TIME), *(interval(p) for x in models for p in x.prescribed)]
+    intervals = [(_TIME, _TIME), *(x.interval for x in models)]
     return min(max(first for first, _ in intervals), *(last for _, last in intervals))
 
 

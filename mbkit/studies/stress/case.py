@@ -156,7 +156,7 @@ def problem_of(case: Case, value: float) -> Problem:
 
 
 def times_of(problem: Problem, measure: Measure) -> Array:
-    """Return the times at which a run is measured, s; prescribed steps end on them."""
+    """Return the times at which a run is measured, s; steps of a given size end on them."""
     parts = _PARTS[measure]
     if problem.dt is None:
         return np.linspace(0.0, problem.duration, parts + 1)
@@ -167,7 +167,7 @@ def times_of(problem: Problem, measure: Measure) -> Array:
 
 
 def step_of(problem: Problem, times: Array, dt: float) -> float:
-    """Return the step of fixed-step methods, s: prescribed, or `dt` shortened to end on the times."""
+    """Return the step of fixed-step methods, s: the given one, or `dt` shortened to end on the times."""
     if problem.dt is not None:
         return problem.dt
     interval = float(times[1])

@@ -227,12 +227,12 @@ class CaseSweep:
             rows=tuple(self._result_row(row, {p.dt for p in prepared} - {None}) for row in self._rows),
         )
 
-    def _result_row(self, row: _Row, prescribed: set[float | None]) -> Row:
+    def _result_row(self, row: _Row, given: set[float | None]) -> Row:
         unknown = row.stopped or OUT_OF_TIME
         cells = (row.cells.get(i, Measurement(value, "not run", note=unknown)) for i, value in enumerate(self.values))
         setting = row.setting
-        if prescribed and setting.startswith("dt"):
-            setting = f"dt {prescribed.pop():g} s" if len(prescribed) == 1 else "dt of the case"
+        if given and setting.startswith("dt"):
+            setting = f"dt {given.pop():g} s" if len(given) == 1 else "dt of the case"
         return Row(row.engine, row.method, tuple(cells), setting, row.theory)
 
 
