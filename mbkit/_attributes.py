@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -50,6 +51,11 @@ class ReadOnly:
             raise AttributeError(
                 f"{type(self).__name__!r} object has no attribute {name!r}{advice}", name=name, obj=self
             )
+
+
+def forwarded(path: str, doc: str) -> Any:
+    """Return a read-only attribute that is one of the object's parts', such as ``"equations.model"``."""
+    return property(attrgetter(path), doc=doc)
 
 
 def single_values(values: Mapping[str, Any]) -> Mapping[str, Any]:

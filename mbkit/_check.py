@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,8 @@ from mbkit._warn import warn
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 
 Array = NDArray[np.float64]
+K = TypeVar("K")
+V = TypeVar("V")
 _MAX_SUMMED: Final = 64
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 60, 120, 60
@@ -157,6 +159,14 @@ def shown(value: Any) -> str:
     except Exception:
         text = f"an object of type {type(value).__name__}"
     return text.encode("utf-8", "backslashreplace").decode()
+
+
+def by_key(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
+    """Return the values of each key, keys and values in their order."""
+    out: dict[K, list[V]] = {}
+    for key, value in pairs:
+        out.setdefault(key, []).append(value)
+    return out
 
 
 # Axes of six-vectors, and kinds of accelerations.

@@ -6,7 +6,8 @@ Every message names the argument or the body, says what was expected and what ca
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final
 
@@ -208,6 +209,20 @@ def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
     close = difflib.get_close_matches(name.lower(), lower, n=count, cutoff=0.6)
     inside = [k for k in lower if len(name) >= 3 and name.lower() in k and k not in close]
     return [lower[k] for k in (close + sorted(inside, key=len))[:count]]
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the end of a message that suggests the nearest known name; empty where none is near."""
+    return "".join(f"; did you mean {near!r}?" for near in nearest(name, known, 1))
+
+
+@contextmanager
+def writing(path: Any, advice: str = "choose a folder that exists") -> Iterator[None]:
+    """Raise `OutputError` that names a file where the system refuses to write it."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror or error}; {advice}") from error
 
 
 class Suggestions:

@@ -18,6 +18,7 @@ from typing import Final
 
 import numpy as np
 
+from mbkit._check import by_key
 from mbkit.codegen.llvm_ir import CALLS, OPERATIONS, Text, call, declarations, library, number
 from mbkit.codegen.program import Program
 
@@ -145,19 +146,14 @@ class Piece:
         self._names: dict[int, str] = {}
         self._pairs: dict[int, str] = {}
         self._pointers: dict[tuple[str, str, int], str] = {}
-        self._outputs: dict[int, list[tuple[int, int]]] = {}
         self._watched: list[str] = []
-        for i, out in enumerate(program.outputs):
-            for j, k in enumerate(out.ravel().tolist()):
-                if not _is_zero(program, k):
-                    self._outputs.setdefault(k, []).append((i, j))
+        stored = ((k, (i, j)) for i, out in enumerate(program.outputs) for j, k in enumerate(out.ravel().tolist()))
+        self._stored = by_key(stored)
+        self._outputs = {k: places for k, places in self._stored.items() if not _is_zero(program, k)}
 
     def store_zeros(self) -> None:
         """Store zeros like everything else, and not by a function of their own."""
-        for i, out in enumerate(self._program.outputs):
-            for j, k in enumerate(out.ravel().tolist()):
-                if _is_zero(self._program, k):
-                    self._outputs.setdefault(k, []).append((i, j))
+        self._outputs = self._stored
 
     def write(self, slots: dict[int, int], *, first: bool) -> None:
         """Write every operation of this piece, each result to where it is wanted."""

@@ -26,6 +26,7 @@ from typing import Any, Final, NamedTuple
 import casadi as ca
 import numpy as np
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit._reproducible import DEPENDENT, independent_rows
 from mbkit.derivation.body_motion import BodyMotion
@@ -371,8 +372,9 @@ def _chosen_rows(model: Model) -> RowChoice:
     anywhere = [random_state(model, rng, None)[0] for _ in range(_LOOKS)]
     kept = _with_something_to_say(numbers, anywhere)
     held, names = [i for i in kept if i < numbers.positions], tuple(numbers.names[i] for i in kept)
+    wide = (integrate(model, model.neutral(), rng.uniform(-3, 3, model.nv)) for _ in range(_STARTS))
     found: list[_Pose] = []
-    for start in (model.neutral(), *anywhere, *(_wide(model, rng) for _ in range(_STARTS))):
+    for start in (model.neutral(), *anywhere, *wide):
         q = numbers.closed(start, held)
         if q is None or not np.isfinite(numbers(q)[1]).all():
             continue
@@ -386,10 +388,6 @@ def _chosen_rows(model: Model) -> RowChoice:
         return RowChoice(tuple(kept), len(held), tuple(range(len(kept))), names)
     best = max(found, key=lambda x: x.least)
     return RowChoice(tuple(kept), len(held), best.rows, names, best.q)
-
-
-def _wide(model: Model, rng: np.random.Generator) -> Array:
-    return integrate(model, model.neutral(), rng.uniform(-3, 3, model.nv))
 
 
 def _with_something_to_say(numbers: _Numbers, poses: list[Array]) -> list[int]:
@@ -513,20 +511,9 @@ class ConstraintQuantities:
         out = ca.vertcat(tau, self._spread(multipliers), rates, ca.sqrt(ca.sum2(J**2)), left)
         return self.named("actuator_forces", ("q", "v", "a"), [self.q, self.v, self.a], out)
 
-    @property
-    def constraint_residual(self) -> Any:
-        """f(q, t) of the rows that hold positions."""
-        return self.all_constraints.value
-
-    @property
-    def constraint_jacobian(self) -> Any:
-        """J of all rows."""
-        return self.all_constraints.jacobian
-
-    @property
-    def constraint_rate(self) -> Any:
-        """J v + ∂f/∂t, then A v - b."""
-        return self.all_constraints.rate
+    constraint_residual = forwarded("all_constraints.value", "f(q, t) of the rows that hold positions.")
+    constraint_jacobian = forwarded("all_constraints.jacobian", "J of all rows.")
+    constraint_rate = forwarded("all_constraints.rate", "J v + ∂f/∂t, then A v - b.")
 
     @property
     def constraint_rate_gradient(self) -> Any:
@@ -539,10 +526,7 @@ class ConstraintQuantities:
         """D of q̇ = D(q) v."""
         return ca.jacobian(self.kin.qdot, self.v)  # type: ignore[attr-defined]  # of the equations
 
-    @property
-    def constraint_bias(self) -> Any:
-        """γ, with the rate's derivative J v̇ + γ."""
-        return self.all_constraints.gamma
+    constraint_bias = forwarded("all_constraints.gamma", "γ, with the rate's derivative J v̇ + γ.")
 
 
 class ConstrainedMotion(ConstraintQuantities):
@@ -571,25 +555,13 @@ class ConstrainedMotion(ConstraintQuantities):
         """All rows, and which of them are independent."""
         return Constraints(self.kin, self.time)
 
-    @property
-    def constraints(self) -> ConstraintTerms:
-        """The independent rows."""
-        return self.constraint_rows.terms
-
-    @property
-    def all_constraints(self) -> ConstraintTerms:
-        """All rows."""
-        return self.constraint_rows.all
-
-    @property
-    def loop_ways(self) -> Any:
-        """Numbers that are negative where the frames of a loop point opposite ways, or a disc lies flat."""
-        return self.constraint_rows.ways
-
-    @property
-    def row_choice(self) -> RowChoice:
-        """Which of all rows are independent."""
-        return self.constraint_rows.choice
+    constraints: ConstraintTerms = forwarded("constraint_rows.terms", "The independent rows.")
+    all_constraints: ConstraintTerms = forwarded("constraint_rows.all", "All rows.")
+    loop_ways = forwarded(
+        "constraint_rows.ways",
+        "Numbers that are negative where the frames of a loop point opposite ways, or a disc lies flat.",
+    )
+    row_choice: RowChoice = forwarded("constraint_rows.choice", "Which of all rows are independent.")
 
     @cached_property
     def constraint_factors(self) -> ConstraintFactors:
@@ -637,10 +609,7 @@ class ConstrainedMotion(ConstraintQuantities):
     def _spread(self, multipliers: Any) -> Any:
         return self.constraint_rows.spread(multipliers)
 
-    @property
-    def every_jacobian(self) -> Any:
-        """J of all rows, those that say nothing among them."""
-        return self.constraint_rows.every
+    every_jacobian = forwarded("constraint_rows.every", "J of all rows, those that say nothing among them.")
 
     def loads(self, joints: Sequence[str], frames: Sequence[str], axes: str, moved: bool) -> ca.Function:
         """Return (q, v, a, τ, wrenches) -> loads of joints, then of loops, (n, 6), and a last row of two forces.

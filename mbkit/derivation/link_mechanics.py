@@ -167,7 +167,8 @@ class LinkMechanics:
             return {}, armature
         gradient = ca.jacobian(ca.SX(self.kin.coupled_rate(coupling)), self.kin.v)
         entries = {i: scalar(gradient[0, i]) for i in range(self.kin.model.nv)}
-        return {i: _float(x) for i, x in entries.items() if not x.is_zero()}, armature
+        known = {i: x for i, x in entries.items() if not x.is_zero()}
+        return {i: float(x) if x.is_constant() else x for i, x in known.items()}, armature
 
 
 def rigid_times(inertia: Inertia, x: Vector) -> Vector:
@@ -204,10 +205,6 @@ def symmetric_times(A: Vector, x: Vector) -> Vector:
 def vanishes(x: Vector) -> bool:
     """Return whether all entries are zero for good."""
     return all(is_zero(c) for c in x)
-
-
-def _float(x: Any) -> Any:
-    return float(x) if x.is_constant() else x
 
 
 # M by composite bodies

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit._reproducible import DEPENDENT, dependent, independent_rows, pivoted, singular_values, unit_rows
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
@@ -121,10 +122,7 @@ class Manifold:
         """Return the states at a time."""
         return Manifold(at_time(self.dyn, t)) if self.dyn.model.time_parameter else self
 
-    @property
-    def equations(self) -> Any:
-        """The equations, with their `constraints`."""
-        return self.dyn.equations
+    equations = forwarded("dyn.equations", "The equations, with their `constraints`.")
 
     @property
     def names(self) -> tuple[str, ...]:

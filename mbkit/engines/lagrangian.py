@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array, count, finite_array, is_on_device, on_host, real
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable, has_compiler
 from mbkit.codegen.interpreter import Machine
@@ -347,7 +348,8 @@ class LagrangianDynamics(Dynamics):
         return out
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (self.model, self._batched, self.compile, self.threads, self._chosen, self.device)
+        options = {"compile": self.compile, "threads": self.threads, "elimination": self._chosen, "device": self.device}
+        return _restore, (self.model, self._batched, options)
 
     def _states(self, arguments: dict[str, ArrayLike]) -> tuple[dict[str, Array], int | None]:
         n = self.samples
@@ -420,10 +422,7 @@ class LagrangianDynamics(Dynamics):
     _constraint_forces, _constraint_rate_gradient = _term("constraint_forces"), _term("constraint_rate_gradient")
     _generalized_constraint_force = _term("generalized_constraint_force")
 
-    @property
-    def _mechanism(self) -> Any:
-        """The equations, of those with constraints."""
-        return self.equations
+    _mechanism = forwarded("equations", "The equations, of those with constraints.")
 
     def _every_jacobian(self, q: Array) -> Array:
         code = self.code("every_jacobian", make=lambda: self.equations.function("every_jacobian"))
@@ -610,15 +609,7 @@ for _name in BODY_QUANTITIES:
     setattr(LagrangianDynamics, f"_{_name}", _body_term(_name))
 
 
-def _restore(
-    model: Model,
-    batched: dict[str, Array],
-    compile: bool,  # noqa: A002  # as above
-    threads: int | None,
-    elimination: Elimination | None,
-    device: str | None = None,
-) -> LagrangianDynamics:
-    options: dict[str, Any] = {"compile": compile, "threads": threads, "elimination": elimination, "device": device}
+def _restore(model: Model, batched: dict[str, Array], options: dict[str, Any]) -> LagrangianDynamics:
     return LagrangianDynamics(model, **options).at(**batched)
 
 

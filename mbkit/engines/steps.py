@@ -7,7 +7,7 @@ solved for are differentiated by the implicit function theorem.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any, ClassVar, Final, NamedTuple
 
@@ -28,12 +28,6 @@ from mbkit.model.integration_space import Space
 from mbkit.model.manifold import tangent_maps
 from mbkit.model.quaternions import Arithmetic
 
-
-def _quasi_velocities(model: Model) -> Iterator[str]:
-    if model.velocity_map is not None:
-        yield "it has quasi-velocities of its own"
-
-
 STEP_DERIVATIVE: Final = Path(
     "derivative of a step",
     "the derivative of a step is not known of",
@@ -42,7 +36,7 @@ STEP_DERIVATIVE: Final = Path(
         "jump": "its steps have no derivative where a joint stops or lets go",
         "t": "terms that depend on the time have no slopes here",
     },
-    also=_quasi_velocities,
+    also=lambda model: () if model.velocity_map is None else ("it has quasi-velocities of its own",),
     instead="linearize(q, v, tau).discretize(dt) holds the linear system's force",
 )
 _EPS: Final = float(np.finfo(float).eps)

@@ -12,6 +12,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array, batch_of, real
 from mbkit._escape import html, one_line
 from mbkit.errors import UnknownNameError, UnsupportedError
@@ -37,13 +38,11 @@ def energies_latex(form: EnergyForm) -> str:
 def abstract_parts(names: Sequence[str]) -> tuple[tuple[Body, ...], tuple[Joint, ...]]:
     """Return massless bodies and prismatic joints of these names."""
     # One coordinate a joint, each on the one before: the pattern of a full mass matrix.
-    joints = tuple(_coordinate(name, before) for name, before in zip(names, ["world", *names], strict=False))
+    joints = tuple(
+        Joint._of(name, PRISMATIC.name, before, name, np.eye(3), np.zeros(3), axes=np.eye(3)[:1])
+        for name, before in zip(names, ["world", *names], strict=False)
+    )
     return tuple(Body(name, 0.0, np.zeros(3), np.zeros((3, 3))) for name in names), joints
-
-
-def _coordinate(name: str, before: str) -> Joint:
-    axis = np.array([[1.0, 0.0, 0.0]])
-    return Joint._of(name, PRISMATIC.name, before, name, np.eye(3), np.zeros(3), axes=axis)
 
 
 class EnergyModel(Model):
@@ -87,10 +86,7 @@ class EnergyModel(Model):
         """Name of the time, a parameter that simulation moves."""
         return self.form.time.name if self.form.time is not None else None
 
-    @property
-    def jumping_forces(self) -> tuple[str, ...]:
-        """Forces that jump where a velocity changes its sign."""
-        return self.form.jumps
+    jumping_forces: tuple[str, ...] = forwarded("form.jumps", "Forces that jump where a velocity changes its sign.")
 
     @property
     def constrained(self) -> bool:

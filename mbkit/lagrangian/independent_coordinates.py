@@ -17,6 +17,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit._escape import one_line
 from mbkit._reproducible import pivoted
@@ -56,10 +57,7 @@ class ReducedModel(Model):
 
     _time: str | None
 
-    @property
-    def time_parameter(self) -> str | None:
-        """Name of the time, where it enters."""
-        return self._time
+    time_parameter: str | None = forwarded("_time", "Name of the time, where it enters.")
 
 
 class Chart(NamedTuple):

@@ -10,6 +10,7 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array, real, rows
 from mbkit._escape import one_line
 from mbkit.engines import Dynamics, dynamics
@@ -143,9 +144,9 @@ class Lagrangian(EnergyForm):
 
         Of constraints' reactions on cyclic coordinates, momenta along sums of these on which none acts are added.
         """
-        found = hamilton.conserved_quantities(
-            self._given, self.conserved_momenta(), self.energy_function, self.velocities
-        )
+        momenta = {q: (f"p_{q.name}", p) for q, p in self.conserved_momenta().items()}
+        name = "E" if hamilton.is_energy(self._given) else "h"
+        found = hamilton.conserved_quantities(self._given, momenta, name, self.energy_function, self.velocities)
         return found if self.quasi is not None or not self.multiplier_symbols else (*found, *symmetry_momenta(self))
 
     @property
@@ -437,30 +438,14 @@ class QuasiLagrangian(Lagrangian):
         arguments |= {"velocities": quasi.rates, "forces": dict(zip(self.coordinates, forces, strict=True))}
         return Lagrangian(**arguments)
 
-    @property
-    def D(self) -> sp.ImmutableMatrix:
-        """D, (n, n), of q̇ = D w + e."""
-        return self.quasi.D
-
-    @property
-    def W(self) -> sp.ImmutableMatrix:
-        """D⁻¹, (n, n)."""
-        return self.quasi.W
-
-    @property
-    def drift(self) -> sp.ImmutableMatrix:
-        """The coordinates' rates where w is zero, e, (n, 1)."""
-        return self.quasi.drift
-
-    @property
-    def hamel_coefficients(self) -> sp.ImmutableDenseNDimArray:
-        """γ, (n, n, n), of `mbkit.lagrangian.reduction.quasi_equations`; ``hamel_coefficients[k, i, j]`` = γ^k_ij."""
-        return self.quasi.hamel_coefficients
-
-    @property
-    def input_forces(self) -> sp.ImmutableMatrix:
-        """Dᵀ u of the coordinates' inputs u, (n, 1)."""
-        return self.quasi.input_forces
+    D: sp.ImmutableMatrix = forwarded("quasi.D", "D, (n, n), of q̇ = D w + e.")
+    W: sp.ImmutableMatrix = forwarded("quasi.W", "D⁻¹, (n, n).")
+    drift: sp.ImmutableMatrix = forwarded("quasi.drift", "The coordinates' rates where w is zero, e, (n, 1).")
+    hamel_coefficients: sp.ImmutableDenseNDimArray = forwarded(
+        "quasi.hamel_coefficients",
+        "γ, (n, n, n), of `mbkit.lagrangian.reduction.quasi_equations`; ``hamel_coefficients[k, i, j]`` = γ^k_ij.",
+    )
+    input_forces: sp.ImmutableMatrix = forwarded("quasi.input_forces", "Dᵀ u of the coordinates' inputs u, (n, 1).")
 
     @cached_property
     def _equations(self) -> EquationsOfMotion:

@@ -18,7 +18,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._reproducible import length, product
-from mbkit.errors import nearest
+from mbkit.errors import did_you_mean
 from mbkit.load.xml_reader import MOST_BYTES, Element, Reader
 from mbkit.model.validation import listing
 
@@ -293,8 +293,7 @@ def _called(element: Element) -> str:
 
 @lru_cache(maxsize=1000)
 def _hint(name: str, known: frozenset[str]) -> str:
-    near = nearest(name[:60], sorted(known), 1)
-    return f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(sorted(known)) or 'none'}"
+    return did_you_mean(name[:60], sorted(known)) or f"; there are: {', '.join(sorted(known)) or 'none'}"
 
 
 @lru_cache(maxsize=1)

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array
+from mbkit._check import Array, by_key
 from mbkit.errors import LoadError, ModelError, UnsupportedError
 from mbkit.load.urdf_reader import BASE_JOINT, Snapper, UrdfFile, unbounded
 from mbkit.load.xml_reader import unused
@@ -103,9 +103,7 @@ class _Conversion:
 
     def build(self, nonphysical: Literal["error", "warn"]) -> Model:
         """Return the model, with notes on all decisions."""
-        odd: dict[str, list[tuple[str, str]]] = {}
-        for link, why in self.urdf.odd_links.items():
-            odd.setdefault(self.bodies[self._frame(link).parentJoint], []).append((link, why))
+        odd = by_key((self.bodies[self._frame(x[0]).parentJoint], x) for x in self.urdf.odd_links.items())
         healed = [f"{link} ({why})" for body, links in odd.items() for link, why in links if body not in self.suspects]
         mimics = [(j.name, j.mimic) for j in self.urdf.joints if j.mimic]
         notes = [*self.urdf.notes]

@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import spatial
-from mbkit._check import TWO_TURNS, Array
+from mbkit._check import TWO_TURNS, Array, by_key
 from mbkit._reproducible import turned
 from mbkit.errors import ModelError, Suggestions
 from mbkit.load import xml_reader
+from mbkit.load.mjcf_attributes import z_to
 from mbkit.load.xml_reader import Element, Reader, element_text, misspelt, unused
 from mbkit.model import Body, Mimic, Model, ModelBuilder, kind_of
 from mbkit.model.validation import body_fault, listing, repeated_names
@@ -153,15 +154,13 @@ def _check_tree(links: Sequence[str], joints: Sequence[UrdfJoint], floating_base
         read.faults += repeated_names(what, [n for n in names if n])
     known = dict.fromkeys(n for n in links if n)
     suggestions = Suggestions()
-    carriers: dict[str, list[UrdfJoint]] = {}
+    carriers = by_key((joint.child, joint) for joint in joints if joint.child in known)
     for joint in joints:
         for end in (joint.parent, joint.child):
             if end and end not in known:
                 near = suggestions.near(end, known)
                 hint = f"did you mean {near!r}?" if near else "add the link"
                 read.fault(f"joint {joint.name!r}: unknown link {end!r}; {hint}")
-        if joint.child in known:
-            carriers.setdefault(joint.child, []).append(joint)
     if not known:
         read.fault("no links; expected <link> elements")
     for link, several in carriers.items():
@@ -402,7 +401,7 @@ def _with_planes_turned(robot: Element, read: Reader) -> Element:
         if len(read.faults) > before or not normal.any() or not (normal[:2].any() or normal[2] < 0):
             children.append(e)
             continue
-        R = _from_z(normal / np.linalg.norm(normal))
+        R = z_to(normal)
         plane, back = unused(f"{child.attributes.get('link', '')}_plane", links), unused(f"{name}_back", joints)
         links.add(plane)
         joints.add(back)
@@ -432,16 +431,6 @@ def _with_planes_turned(robot: Element, read: Reader) -> Element:
             "of that body"
         )
     return replace(robot, children=children)
-
-
-def _from_z(normal: Array) -> Array:
-    """Return the shortest turn from z to a unit vector; from -z about x."""
-    x, y, z = normal
-    if z < 0 and not (x or y):
-        return np.diag([1.0, -1.0, -1.0])
-    K = spatial.skew(np.array([-y, x, 0.0]))
-    # Rodrigues' formula, with 1 / (1 + cos) for (1 - cos) / sin²: Murray, Li, Sastry 1994, eq. 2.14.
-    return np.asarray(np.eye(3) + K + K @ K / (1 + z))
 
 
 def _rpy(R: Array) -> str:

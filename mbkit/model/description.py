@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from mbkit._check import Array, shown
+from mbkit._check import Array, by_key, shown
 from mbkit.errors import InputError, ModelError, UnknownNameError
 from mbkit.model.elements.forces import Bushing, Force, GravityCompensation
 from mbkit.model.elements.kinds import PART_KINDS, acts, has, kind
@@ -442,9 +442,7 @@ class Description:
     @cached_property
     def tree(self) -> tuple[Joint, ...]:
         """All joints with every parent before its children, siblings as declared, depth first."""
-        by_parent: dict[str, list[Joint]] = {}
-        for joint in self.joints:
-            by_parent.setdefault(joint.parent, []).append(joint)
+        by_parent = by_key((joint.parent, joint) for joint in self.joints)
         out: list[Joint] = []
         stack = list(reversed(by_parent.get("world", [])))
         while stack:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array, finite_array, shown
 from mbkit.errors import ModelError
 from mbkit.model.joint_types import JointType, kind_of, register_joint_type
@@ -483,8 +484,16 @@ class Coupler(_Frozen):
         return float(curve(first) + ratios @ others), np.array([curve.deriv()(first), *ratios])
 
 
+class OfJoint(_Frozen):
+    """What a joint has one of, under the joint's name: a prescribed motion."""
+
+    section = "prescribed"
+    joint: str
+    name = forwarded("joint", "The joint's, which has one motion.")
+
+
 @dataclass(frozen=True, eq=False)
-class Prescribed(_Frozen):
+class Prescribed(OfJoint):
     """A coordinate moved in time: offset + rate t + amplitude sin(frequency t + phase).
 
     Attributes
@@ -496,7 +505,6 @@ class Prescribed(_Frozen):
         rad/s and rad.
     """
 
-    section = "prescribed"
     joint: str
     offset: Annotated[float, NumberRule("rad, m", added=True)] = 0.0
     rate: Annotated[float, NumberRule("rad/s, m/s", added=True)] = 0.0
@@ -506,11 +514,6 @@ class Prescribed(_Frozen):
 
     #: Of a formula; numbers that are attributes do not count.
     constants = ()
-
-    @property
-    def name(self) -> str:
-        """The joint's, which has one motion."""
-        return self.joint
 
 
 @dataclass(frozen=True, eq=False)

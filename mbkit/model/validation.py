@@ -9,8 +9,8 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from mbkit._check import Array
-from mbkit.errors import InputError, ModelError, Suggestions, nearest
+from mbkit._check import Array, by_key
+from mbkit.errors import InputError, ModelError, Suggestions, did_you_mean
 from mbkit.model import manifold
 from mbkit.model.description import Description
 from mbkit.model.elements.forces import force_faults
@@ -164,8 +164,7 @@ def _coupling_faults(coupling: JointCoupling, joints: Sequence[Joint]) -> Iterat
     item, sizes = f"coupling {coupling.name!r}", {j.name: j.type.nv for j in joints}
     for name in coupling.joints:
         if name not in sizes:
-            near = nearest(name, sizes)
-            yield f"{item}: unknown joint {name!r}" + (f"; did you mean {near[0]!r}?" if near else "")
+            yield f"{item}: unknown joint {name!r}{did_you_mean(name, sizes)}"
         elif sizes[name] != 1:
             yield f"{item}: expected joints of one velocity, joint {name!r} has {sizes[name]}"
     if not np.any(coupling.factors):
@@ -189,11 +188,7 @@ def _no_slip_faults(part: NoSlip) -> Iterator[str]:
 
 
 def _tree_faults(bodies: Sequence[Body], joints: Sequence[Joint]) -> Iterator[str]:
-    carriers: dict[str, list[Joint]] = {}
-    carried: dict[str, list[Joint]] = {}
-    for joint in joints:
-        carriers.setdefault(joint.child, []).append(joint)
-        carried.setdefault(joint.parent, []).append(joint)
+    carriers, carried = by_key((j.child, j) for j in joints), by_key((j.parent, j) for j in joints)
     for name, several in carriers.items():
         if len(several) > 1 and name != "world":
             names = ", ".join(repr(j.name) for j in several)
@@ -220,11 +215,7 @@ def _connected_bodies(carried: Mapping[str, Sequence[Joint]]) -> set[str]:
 
 def static_bodies(joints: Iterable[Joint]) -> set[str]:
     """Return the bodies that are fixed to the world, whose inertia cannot act."""
-    carried: dict[str, list[Joint]] = {}
-    for joint in joints:
-        if not joint.type.nv:
-            carried.setdefault(joint.parent, []).append(joint)
-    return _connected_bodies(carried) - {"world"}
+    return _connected_bodies(by_key((j.parent, j) for j in joints if not j.type.nv)) - {"world"}
 
 
 def _mimic_faults(joints: Sequence[Joint]) -> Iterator[str]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
+from mbkit._check import by_key
 from mbkit.report.document import Bullet, Span, Text
 from mbkit.studies.results import Refusal
 
@@ -35,13 +36,8 @@ def time_text(seconds: float) -> str:
     for scale, unit in _UNITS:
         # Half of the last digit shown, so that 999.6 ns is not "1000 ns".
         if size >= 0.9995 * scale:
-            return f"{_three(seconds / scale)} {unit}"
+            return f"{seconds / scale:.{0 if size >= 99.95 * scale else 1 if size >= 9.995 * scale else 2}f} {unit}"
     return "0 ns" if size < 5e-12 else f"{seconds * 1e9:.2f} ns"
-
-
-def _three(x: float) -> str:
-    size = abs(x)
-    return f"{x:.0f}" if size >= 99.95 else f"{x:.1f}" if size >= 9.995 else f"{x:.2f}"
 
 
 def count_text(x: float) -> str:
@@ -76,12 +72,9 @@ def brief(missing: Iterable[str]) -> str:
 
 def refusals(those: Iterable[Refusal]) -> list[Bullet]:
     """Return what engines could not do, those of one reason together."""
-    terms: dict[tuple[str, str], list[str]] = {}
-    for r in those:
-        terms.setdefault((r.engine, r.reason), []).extend([r.term] if r.term else [])
     out = []
-    for (engine, reason), names in terms.items():
-        of = f" ({', '.join(dict.fromkeys(names))})" if names else ""
+    for (engine, reason), names in by_key(((r.engine, r.reason), r.term) for r in those).items():
+        of = f" ({', '.join(dict.fromkeys(filter(None, names)))})" if any(names) else ""
         out.append(Bullet(f"{engine}{of}".strip(), reason))
     return out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mbkit._check import by_key
 from mbkit.report.document import Bullet, Column, Document, Items, Section, Span, Style, Table
 from mbkit.studies.lint.result import LIKELY, LOOK, SURE, UNSEEN, LintFinding, LintResult
 
@@ -12,9 +13,7 @@ _NAMED = 3
 
 def lint_view(result: LintResult) -> Document:
     """Return the document of a result; parts with the same finding share a line."""
-    groups: dict[tuple[str, ...], list[LintFinding]] = {}
-    for row in result.rows:
-        groups.setdefault((row.check, row.confidence, row.message, row.expected), []).append(row)
+    groups = by_key(((row.check, row.confidence, row.message, row.expected), row) for row in result.rows)
     columns = [
         Column("link or joint", lambda rows: Span(_names(rows), "mono")),
         Column("check", lambda rows: rows[0].check),

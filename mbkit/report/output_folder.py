@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from mbkit import _interrupt
-from mbkit.errors import OutputError
+from mbkit.errors import OutputError, writing
 from mbkit.studies.results import write_whole
 
 
@@ -72,10 +72,7 @@ def write(folder: Path, name: str, content: str | bytes, *, force: bool = False)
     path = folder / name
     with _interrupt.uninterrupted:
         check_replaceable(folder, name, force=force)
-        try:
+        with writing(path, "choose another folder with --out"):
             folder.mkdir(parents=True, exist_ok=True)
             write_whole(path, content if isinstance(content, bytes) else content.encode("utf-8", "backslashreplace"))
-        except OSError as error:
-            why = error.strerror or error
-            raise OutputError(f"cannot write {path}: {why}; choose another folder with --out") from error
     return path

@@ -10,7 +10,7 @@ import hashlib
 from datetime import datetime
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from mbkit._escape import terminal
 from mbkit.report.document import Document, Span, spans
@@ -52,7 +52,8 @@ def _environment() -> Environment:
         loader=PackageLoader("mbkit.report"),
         # Names come from files of strangers.
         autoescape=True,
-        finalize=_harmless,
+        # Control characters too; our own markup is of another type.
+        finalize=lambda value: terminal(value) if type(value) is str else value,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -74,8 +75,3 @@ def _cellsize(cell: list[Span]) -> str:
     """Return the class of a cell that is not to be broken, or that needs room, by the length of its text."""
     size = sum(len(span.text) for span in cell)
     return "nowrap " if size <= _SHORT else "long " if size > _LONG else ""
-
-
-def _harmless(value: Any) -> Any:
-    # Control characters too; our own markup is of another type.
-    return terminal(value) if type(value) is str else value

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
+from mbkit._check import by_key
 from mbkit.report.document import Bullet, Column, Document, Items, Section, Span, Table
 from mbkit.report.figures import stable_steps
 from mbkit.report.formatting import choice, error_text, time_text
@@ -82,13 +83,11 @@ class Overview:
     @property
     def left_out(self) -> list[tuple[str, str]]:
         """Names and reasons of the rows that never ran, those of one reason together."""
-        names: dict[str, list[str]] = {}
-        for line in self.lines:
-            if line.left_out:
-                reason = remarks(line.row.cells[0]) if line.row.cells else ""
-                reason = reason or HOW[line.outcomes[0] if line.outcomes else "not run"]
-                names.setdefault(reason, []).append(name_of(line.row))
-        return [(", ".join(alike), reason) for reason, alike in names.items()]
+        reasons = []
+        for line in (x for x in self.lines if x.left_out):
+            reason = remarks(line.row.cells[0]) if line.row.cells else ""
+            reasons.append((reason or HOW[line.outcomes[0] if line.outcomes else "not run"], name_of(line.row)))
+        return [(", ".join(alike), reason) for reason, alike in by_key(reasons).items()]
 
 
 def overview(result: StressResult) -> list[Overview]:
@@ -101,9 +100,7 @@ def overview(result: StressResult) -> list[Overview]:
 
 def families(cases: Iterable[Overview]) -> list[tuple[str, list[Overview]]]:
     """Return the cases by family: its title, and its cases."""
-    groups: dict[str, list[Overview]] = {}
-    for each in cases:
-        groups.setdefault(each.case.family, []).append(each)
+    groups = by_key((each.case.family, each) for each in cases)
     order = [*_FAMILIES, *groups]
     return [(name, groups[name]) for name in sorted(groups, key=order.index)]
 
@@ -195,22 +192,20 @@ class MethodLine:
 def methods(result: StressResult) -> list[MethodLine]:
     """Return every engine and method that ran, the one that was most often unbeaten first."""
     # Family, line, whether it held furthest, its time over the least of those that did.
-    scores: dict[tuple[str, str], list[tuple[str, Line, bool, float]]] = {}
+    scores: list[tuple[tuple[str, str], tuple[str, Line, bool, float]]] = []
     for case in filter(ranks, result.cases):
         ranked = stress.lines(case)
         most = max((x.reach for x in ranked), default=0)
         least = min((x.seconds for x in ranked if x.reach == most and x.seconds > 0), default=math.nan)
-        for x in ranked:
-            score = (case.family, x, x.reach == most > 0, x.seconds / least)
-            scores.setdefault((x.row.engine, x.row.method), []).append(score)
+        scores += [
+            ((x.row.engine, x.row.method), (case.family, x, x.reach == most > 0, x.seconds / least)) for x in ranked
+        ]
     out = []
-    for group in scores.values():
+    for group in by_key(scores).values():
         _, lines, ahead, factors = zip(*group, strict=True)
         if all(line.left_out for line in lines):
             continue
-        places: dict[str, list[bool]] = {}
-        for family, _, first, _ in group:
-            places.setdefault(family, []).append(first)
+        places = by_key((family, first) for family, _, first, _ in group)
         known = [x for x, first in zip(factors, ahead, strict=True) if first and math.isfinite(x)]
         line = MethodLine(
             lines[0].row,
@@ -306,9 +301,7 @@ class Rule(NamedTuple):
     @property
     def words(self) -> str:
         """The rule for a step, once where it is the same for every ω."""
-        by_words: dict[str, list[str]] = {}
-        for kind, bound in self.bounds.items():
-            by_words.setdefault(bound.words, []).append(kind)
+        by_words = by_key((bound.words, kind) for kind, bound in self.bounds.items())
         if len(by_words) == 1:
             return next(iter(by_words))
         return "; ".join(f"{words} ({', '.join(which)})" for words, which in by_words.items())
@@ -446,9 +439,6 @@ def content(result: StressResult) -> dict[str, Any]:
     cases = overview(result)
     swept = steps(cases)
     step_rules = rules(swept)
-    bars: dict[tuple[float, str], list[str]] = {}
-    for case in result.cases:
-        bars.setdefault((case.bar, case.why), []).append(case.name)
     return {
         "avoid": avoid(cases),
         "silences": silences(cases),
@@ -462,7 +452,7 @@ def content(result: StressResult) -> dict[str, Any]:
         "rules": step_rules,
         "kinds": list(dict.fromkeys(kind for rule in step_rules for kind in rule.bounds)),
         "step_figure": stable_steps([(o.case, o.lines) for o in swept]) if swept else None,
-        "bars": bars,
+        "bars": by_key(((case.bar, case.why), case.name) for case in result.cases),
     }
 
 

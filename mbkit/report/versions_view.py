@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from mbkit._check import by_key
 from mbkit.report.document import Bullet, Column, Document, Items, Paragraph, Section, Span, Table
 from mbkit.studies.versions.result import AWAY, REFUSED, Change, VersionRow, VersionsResult, digits_text
 
@@ -20,9 +21,7 @@ def versions_view(result: VersionsResult) -> Document:
     cells = [Column("robot", lambda row: row[0], group=True), Column("terms", lambda row: row[1])]
     cells += [Column(c.head, _cell(k + 2), right=True) for k, c in enumerate(columns[2:])]
     reasons = dict.fromkeys((r.robot, r.reason, r.version) for r in result.rows if r.reason)
-    grouped: dict[tuple[str, str], list[str]] = {}
-    for robot, reason, version in reasons:
-        grouped.setdefault((robot, reason), []).append(version)
+    grouped = by_key(((robot, reason), version) for robot, reason, version in reasons)
     notes = [Bullet(f"{robot}, {', '.join(of)}", reason) for (robot, reason), of in grouped.items()]
     return Document(
         name=result.engine,

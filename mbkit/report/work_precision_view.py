@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from mbkit._check import by_key
 from mbkit.report import document as doc
 from mbkit.report.figures import PAGE, image, page_style, svg
 from mbkit.report.formatting import brief, choice, count_text, error_text, model_facts, time_text
@@ -183,9 +184,7 @@ def view(result: WorkPrecision, target: str = "") -> doc.Document:
 
 def named(failed: Sequence[Refusal]) -> list[doc.Bullet]:
     """Return the methods that gave no curve, those of one reason together."""
-    of: dict[str, list[str]] = {}
-    for r in failed:
-        of.setdefault(r.reason, []).append(f"{r.engine} {r.term}".strip())
+    of = by_key((r.reason, f"{r.engine} {r.term}".strip()) for r in failed)
     return [doc.Bullet(", ".join(dict.fromkeys(names)), reason) for reason, names in of.items()]
 
 

@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import Array, by_key
 from mbkit.errors import LoadError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import about, read_mesh
@@ -59,10 +59,7 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
         raise ValueError(f"not readable: {error}") from None
     if not surfaces:
         raise ValueError("no triangles in it")
-    colors: dict[Color | None, list[Surface]] = {}
-    for surface in surfaces:
-        colors.setdefault(surface.color, []).append(surface)
-    return tuple(map(_joined, colors.values()))
+    return tuple(map(_joined, by_key((surface.color, surface) for surface in surfaces).values()))
 
 
 def _joined(surfaces: list[Surface]) -> Surface:

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from mbkit._check import Array, shown
+from mbkit._check import Array, by_key, shown
 from mbkit._warn import warn
 from mbkit.errors import InputError, LoadError, MbkitWarning, UnsupportedError
 from mbkit.load.mjcf_attributes import has_length, z_to
@@ -104,12 +104,9 @@ def stand_ins(model: Model, bodies: set[str]) -> list[Shape]:
     """Return capsules from joint to joint and boxes with the inertia of some bodies."""
     if not bodies:
         return []
-    ends: dict[str, list[Array]] = {}
-    for joint in model.joints:
-        ends.setdefault(joint.parent, []).append(joint.translation)
-    for loop in model.loops:
-        ends.setdefault(loop.body_a, []).append(loop.translation_a)
-        ends.setdefault(loop.body_b, []).append(loop.translation_b)
+    points = [(joint.parent, joint.translation) for joint in model.joints]
+    points += [x for y in model.loops for x in ((y.body_a, y.translation_a), (y.body_b, y.translation_b))]
+    ends = by_key(points)
     for body in model.bodies:
         if body.name not in ends:
             places = [f.translation for f in model.frames if f.body == body.name] + [body.com]
@@ -124,7 +121,9 @@ def stand_ins(model: Model, bodies: set[str]) -> list[Shape]:
         if body.name not in bodies:
             continue
         color = _BODIES[k % len(_BODIES)]
-        out += [_stick(body.name, p, radius, color, i) for i, p in enumerate(ends[body.name]) if has_length(p)]
+        for i, p in ((i, p) for i, p in enumerate(ends[body.name]) if has_length(p)):
+            size = (radius, float(np.linalg.norm(p)) / 2)
+            out.append(Shape(f"{body.name}.stick{i}", body.name, z_to(p), p / 2, "capsule", size, (), color))
         box = _box(body, *boxes[body.name], radius, longest, color)
         slides = body.name in moving and bool(moving[body.name].type.lengths)
         out += [box] if box is not None and (boxes[body.name][1].any() or not slides) else []
@@ -134,11 +133,6 @@ def stand_ins(model: Model, bodies: set[str]) -> list[Shape]:
             name = f"{body.name}.joint"
             out.append(Shape(name, body.name, np.eye(3), np.zeros(3), "sphere", (1.4 * radius,), (), _JOINT))
     return out
-
-
-def _stick(body: str, end: Array, radius: float, color: Color, number: int) -> Shape:
-    half = float(np.linalg.norm(end)) / 2
-    return Shape(f"{body}.stick{number}", body, z_to(end), end / 2, "capsule", (radius, half), (), color)
 
 
 def _box(body: Body, axes: Array, half: Array, radius: float, longest: float, color: Color) -> Shape | None:

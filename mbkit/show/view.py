@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, count, real, shown
 from mbkit._escape import one_line
-from mbkit.errors import InputError, OutputError
+from mbkit.errors import InputError, writing
 from mbkit.load import load
 from mbkit.model import Model
 from mbkit.model.elements.formula import NUMPY
@@ -57,10 +57,8 @@ class View:
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the page, and return where; OutputError where it cannot be written."""
         path = Path(path)
-        try:
+        with writing(path):
             path.write_text(self.html, encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror or error}; choose a folder that exists") from error
         return path
 
     def __repr__(self) -> str:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit import _check
-from mbkit._check import Array
+from mbkit._check import Array, by_key
 from mbkit._escape import csv_text, html, one_line
 from mbkit.engines import Dynamics
-from mbkit.errors import InputError, LoadError, MbkitWarning, OutputError, UnsupportedError
+from mbkit.errors import InputError, LoadError, MbkitWarning, UnsupportedError, writing
 from mbkit.methods.registry import AUTOMATIC_METHOD, METHODS, Method
 from mbkit.model import Model
 from mbkit.simulate.diagnostics.checks import CHECKED_TIMES, diagnostics
@@ -229,11 +229,9 @@ class Trajectory(RunData):
         # The number of a trajectory is a whole one.
         writer.writerows([int(row[0]), *row[1:]] if self.q.ndim == 3 else row for row in rows.tolist())
         text = stream.getvalue()
-        try:
-            if path is not None:
+        if path is not None:
+            with writing(path):
                 Path(path).write_text(text, encoding="utf-8", newline="")
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror or error}; choose a folder that exists") from error
         return text
 
     def _table(self) -> tuple[list[str], Array]:
@@ -256,10 +254,8 @@ class Trajectory(RunData):
         UnsupportedError
             pandas is not installed.
         """
-        try:
+        with _check.needed("pandas", "to_dataframe"):
             frames: Any = importlib.import_module("pandas")
-        except ImportError:
-            raise UnsupportedError("to_dataframe needs pandas, which is not installed; pip install pandas") from None
         header, rows = self._table()
         out = frames.DataFrame(rows, columns=header)
         return out.astype({"trajectory": int}) if self.q.ndim == 3 else out
@@ -295,11 +291,8 @@ class Trajectory(RunData):
         about["events"] = [(x.name, float(x.t), None if x.member is None else int(x.member)) for x in self.events]
         arrays |= {f"event_{name}": np.array([getattr(x, name) for x in self.events]) for name in "qv"}
         arrays["about"] = np.array(json.dumps(about))
-        try:
-            with open(path, "wb") as file:
-                np.savez_compressed(file, **arrays)
-        except OSError as error:
-            raise OutputError(f"cannot write {path}: {error.strerror or error}; choose a folder that exists") from error
+        with writing(path), open(path, "wb") as file:
+            np.savez_compressed(file, **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], model: Model) -> Trajectory:
@@ -350,12 +343,9 @@ class Trajectory(RunData):
 
     def _event_times(self) -> str:
         """Return the events' names and times, the first few of each name."""
-        times: dict[str, list[str]] = {}
-        for hit in self.events:
-            times.setdefault(hit.name, []).append(f"{hit.t:.6g}")
         return "; ".join(
             f"{name} at {', '.join(each[:_SHOWN])} s" + (f" ({len(each)})" if len(each) > _SHOWN else "")
-            for name, each in times.items()
+            for name, each in by_key((hit.name, f"{hit.t:.6g}") for hit in self.events).items()
         )
 
     def __repr__(self) -> str:

@@ -16,7 +16,7 @@ from mbkit._escape import xml_holds
 from mbkit._version import __version__
 from mbkit.engines import dynamics
 from mbkit.engines.registry import DERIVED
-from mbkit.errors import MbkitError, MbkitWarning, OutputError, UnknownNameError, UnsupportedError
+from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError, UnsupportedError, writing
 from mbkit.load import load
 from mbkit.load.urdf_writer import urdf_text
 from mbkit.model import Model
@@ -52,11 +52,8 @@ class Converted:
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write the text to a file, and return its path."""
         out = Path(path)
-        try:
-            with _interrupt.uninterrupted:
-                out.write_text(self.text, encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"cannot write {out}: {error.strerror}; the text itself is kept") from error
+        with writing(out, "the text itself is kept"), _interrupt.uninterrupted:
+            out.write_text(self.text, encoding="utf-8")
         return out
 
     def __repr__(self) -> str:

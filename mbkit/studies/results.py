@@ -28,7 +28,7 @@ import numpy as np
 from mbkit._escape import csv_text, html, markdown, one_line
 from mbkit._version import __version__
 from mbkit.engines.registry import ENGINES
-from mbkit.errors import InputError, OutputError
+from mbkit.errors import InputError, writing
 from mbkit.model import Model
 
 #: What JSON has for an infinite limit, where null stands for an unknown one.
@@ -306,12 +306,8 @@ def write_whole(path: Path, content: bytes, claim: Callable[[str], None] | None 
 
 def write(path: str | Path, text: str) -> None:
     """Write a text to a file, or raise `OutputError`."""
-    try:
+    with writing(path, "choose a folder that exists (the result itself is kept)"):
         Path(path).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(
-            f"cannot write {path}: {error.strerror or error}; choose a folder that exists (the result itself is kept)"
-        ) from error
 
 
 # The model, versions and processor, for every report.

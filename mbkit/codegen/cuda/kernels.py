@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from llvmlite import binding as llvm
 
+from mbkit._attributes import forwarded
 from mbkit.codegen import jit
 from mbkit.codegen.llvm_ir import CALLS, Text, declarations, library, number
 from mbkit.codegen.program import Program, program
@@ -112,10 +113,7 @@ class _Entry(Piece):
         self._made, self._text = made, Text(1, prefix)
         self.store_zeros()
 
-    @property
-    def lines(self) -> list[str]:
-        """The piece's instructions."""
-        return self._text.lines
+    lines: list[str] = forwarded("_text.lines", "The piece's instructions.")
 
     @staticmethod
     def parameters(made: Program) -> str:

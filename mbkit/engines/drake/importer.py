@@ -241,14 +241,11 @@ def _described(plant: Any, floating_base: bool) -> tuple[Model, DrakeModel, dict
         _add_body(parts, names[index], child, at[index])
         theirs[name] = [joint]
     # Coordinates stand in the order of Drake's velocities.
-    parts.joints.sort(key=lambda own: _first_velocity(*theirs[own.name]))
+    firsts = {n: int(x.velocity_start()) if x.num_velocities() else -1 for n, (x,) in theirs.items()}
+    parts.joints.sort(key=lambda own: firsts[own.name])
     model = parts.model("drake", np.array(plant.gravity_field().gravity_vector()))
     bodies = {name: plant.get_body(type(plant.world_body().index())(k)) for k, name in names.items()}
     return checked("drake", model), mapped(plant, model, theirs, bodies), at
-
-
-def _first_velocity(joint: Any) -> int:
-    return int(joint.velocity_start()) if joint.num_velocities() else -1
 
 
 def _in_order(plant: Any) -> list[Any]:

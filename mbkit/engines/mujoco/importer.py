@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import Array, by_key
 from mbkit.engines.imported import Beside, Imported, Parts, checked
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings, mapped, matrix_of
@@ -132,11 +132,8 @@ class _Read(MujocoDynamics):
 
 def _constraints(m: Any) -> list[str]:
     """Name the constraints, which are outside of all terms."""
-    kinds: dict[str, list[str]] = {}
-    for i, type_ in enumerate(m.eq_type):
-        kind = mujoco.mjtEq(int(type_)).name.removeprefix("mjEQ_").lower()
-        kinds.setdefault(kind, []).append(_called(m.eq(i), i))
-    out = []
+    types = (mujoco.mjtEq(int(type_)).name.removeprefix("mjEQ_").lower() for type_ in m.eq_type)
+    kinds, out = by_key((kind, _called(m.eq(i), i)) for i, kind in enumerate(types)), []
     for kind, names in kinds.items():
         what = "mimic joints are soft equality constraints" if kind == "joint" else f"{kind} constraints are soft"
         more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""

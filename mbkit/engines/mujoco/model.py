@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import Array, by_key
 from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, SOLVED, STACKS
 from mbkit.engines.imported import unused
 from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness
@@ -261,9 +261,7 @@ def _switch_off(spec: Any, description: Model, soft_friction: bool) -> tuple[str
 
 def _add_tree(spec: Any, description: Model) -> Placed:
     placed = Placed({"world": spec.worldbody}, {}, {}, set(), static_bodies(description.joints))
-    children: dict[str, list[Joint]] = {}
-    for joint in description.joints:
-        children.setdefault(joint.parent, []).append(joint)
+    children = by_key((joint.parent, joint) for joint in description.joints)
     sprung = {b for s in description.springs for b in (s.body_a, s.body_b)}
     sprung |= {b for loop in description.loops for b in (loop.body_a, loop.body_b)}
     # (MuJoCo parent, R, p) of the frame in which a joint stands, and the joints stacked on the way there, each with its

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit import spatial
+from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.elements.passive import JointPassive, pull
@@ -97,20 +98,13 @@ class VersionDynamics(MappedDynamics):
                 lacks |= dict.fromkeys(quantities, f"its file here has no function {needed}")
         vars(self)["refuses"] = lacks
 
-    @property
-    def engine(self) -> str:  # type: ignore[override]  # of this object
-        """Name of the engine with its version."""
-        return self.version.name
-
-    @property
-    def bits(self) -> int:  # type: ignore[override]  # of this object
-        """Of the significand with which it computes: 53, or 24 in single precision."""
-        return self.version.package.bits
-
-    @property
-    def inertias_about(self) -> Mapping[str, str]:  # type: ignore[override]  # of this object
-        """The point about which it writes composite inertias, by quantity."""
-        return self.version.package.inertias_about
+    engine = forwarded("version.name", "Name of the engine with its version.")
+    bits = forwarded(
+        "version.package.bits", "Of the significand with which it computes: 53, or 24 in single precision."
+    )
+    inertias_about = forwarded(
+        "version.package.inertias_about", "The point about which it writes composite inertias, by quantity."
+    )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.model, self.version)

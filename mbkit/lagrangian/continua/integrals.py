@@ -168,7 +168,10 @@ def read_shape(what: str, source: Any, x: sp.Symbol, ends: tuple[Any, ...]) -> S
     """
     lower, upper = ends
     out = expression(what, source).subs(x, lower + (upper - lower) * XI)
-    out = sp.expand(out) if out.is_polynomial(XI) else out.replace(_is_of_a_place, _inside)
+    if out.is_polynomial(XI):
+        out = sp.expand(out)
+    else:
+        out = out.replace(lambda e: bool(e.is_Function and not isinstance(e, sp.Piecewise)), _inside)
     left = out.free_symbols - {XI}
     if left:
         out = sp.simplify(out)
@@ -179,10 +182,6 @@ def read_shape(what: str, source: Any, x: sp.Symbol, ends: tuple[Any, ...]) -> S
             "ends alone: put numbers in first"
         )
     return Shape(out)
-
-
-def _is_of_a_place(e: sp.Expr) -> bool:
-    return bool(e.is_Function and not isinstance(e, sp.Piecewise))
 
 
 def _inside(e: sp.Expr) -> sp.Expr:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.constraints import ConstraintQuantities
@@ -70,15 +71,8 @@ class EnergyEquations(ConstraintQuantities, Equations):
         """Return Σ_jk γ^k_ij v_j p_k, which quasi-velocities add to the rate of a momentum."""
         return sum((turn * p[k] for k, turn in enumerate(self._turns)), ca.SX(self.model.nv, 1))
 
-    @property
-    def kinetic_energy(self) -> Any:
-        """T(q, v)."""
-        return self._T
-
-    @property
-    def potential_energy(self) -> Any:
-        """V(q)."""
-        return self._V
+    kinetic_energy = forwarded("_T", "T(q, v).")
+    potential_energy = forwarded("_V", "V(q).")
 
     @cached_property
     def gravity(self) -> Any:
@@ -90,10 +84,7 @@ class EnergyEquations(ConstraintQuantities, Equations):
         """Q - ∂R/∂v."""
         return self._Q - ca.gradient(self._R, self.v)
 
-    @property
-    def passive(self) -> Any:
-        """The same: springs are in V."""
-        return self.damping
+    passive = forwarded("damping", "The same: springs are in V.")
 
     @cached_property
     def energy_rate(self) -> Any:
@@ -139,10 +130,7 @@ class EnergyEquations(ConstraintQuantities, Equations):
     def _constrained(self) -> tuple[Any, Any]:
         return self.constraint_factors.motion(self.tau + self.generalized_force)
 
-    @property
-    def all_constraints(self) -> Any:
-        """The constraints, which are independent of each other."""
-        return self.constraints
+    all_constraints = forwarded("constraints", "The constraints, which are independent of each other.")
 
     @property
     def constraint_forces(self) -> Any:

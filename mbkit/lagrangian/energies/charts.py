@@ -26,8 +26,9 @@ _TURNS: Final = ("omega1", "omega2", "omega3")
 def chart_names(model: Model) -> list[str]:
     """Return names of coordinates on paper: the model's, and a chart's in place of those of ball and free joints."""
     out: list[str] = []
-    for joint, own in zip(model.independent_joints, _by_joint(model), strict=True):
-        k = joint.type.quaternion
+    names = iter(model.coordinate_names)
+    for joint in model.independent_joints:
+        own, k = [next(names) for _ in range(joint.type.nq)], joint.type.quaternion
         if k is not None:
             taken = {*out, *model.coordinate_names, *model.parameters}
             own = [free_name(x, taken) for x in _indexed(model, joint, (*joint.type.suffixes[:k], *_ANGLES))]
@@ -47,11 +48,6 @@ def chart_velocities(model: Model, coordinates: Sequence[sp.Symbol]) -> list[sp.
         used |= {s.name for s in rates}
         out += rates
     return out
-
-
-def _by_joint(model: Model) -> list[list[str]]:
-    names = iter(model.coordinate_names)
-    return [[next(names) for _ in range(j.type.nq)] for j in model.independent_joints]
 
 
 def _indexed(model: Model, joint: Joint, names: Sequence[str]) -> list[str]:

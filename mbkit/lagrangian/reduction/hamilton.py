@@ -106,20 +106,16 @@ def keeps_energy(system: EnergyForm) -> bool:
 
 
 def conserved_quantities(
-    system: EnergyForm, momenta: Mapping[sp.Symbol, sp.Expr], energy: sp.Expr, moving: tuple[sp.Symbol, ...]
-) -> tuple[ConservedQuantity, ...]:
-    """Return the conserved momenta, and the energy or Jacobi's integral if it is constant, in `moving` velocities."""
-    name = "E" if is_energy(system) else "h"
-    return _kept(system, {q: (f"p_{q.name}", p) for q, p in momenta.items()}, name, energy, moving)
-
-
-def _kept(
     system: EnergyForm,
     momenta: Mapping[sp.Symbol, tuple[str, sp.Expr]],
     name: str,
     energy: sp.Expr,
     moving: tuple[sp.Symbol, ...],
 ) -> tuple[ConservedQuantity, ...]:
+    """Return the conserved momenta, by coordinate, and the energy or Jacobi's integral, if constant, by its name.
+
+    They are in `moving` velocities or momenta.
+    """
     symbols = (system.coordinates, moving)
     out = [ConservedQuantity(p, x, f"momentum of {q.name}, which is cyclic", symbols) for q, (p, x) in momenta.items()]
     if keeps_energy(system):
@@ -275,7 +271,7 @@ class Hamiltonian(Printable):
         """Return the momenta of the cyclic coordinates, and H if it is constant, in coordinates and momenta."""
         symbols = dict(zip(self.coordinates, self.momenta, strict=True))
         momenta = {q: (symbols[q].name, symbols[q]) for q in conserved_momenta(self.system)}
-        return _kept(self.system, momenta, "H", self.H, self.momenta)
+        return conserved_quantities(self.system, momenta, "H", self.H, self.momenta)
 
     # Numbers
 

@@ -170,8 +170,8 @@ def nonholonomic_equations(system: EnergyForm, quasi_velocities: Any, form: str)
     if not system.multiplier_symbols:
         raise UnsupportedError(f"{system.name}: has no constraints; give them as velocity_constraints=[...]")
     frame = _Frame.of(system, quasi_velocities)
-    derive = {"Maggi": _maggi, "Hamel": _hamel, "Appell": _appell}[form]
-    return derive(system, frame, _Motion.of(system, frame))
+    derive, motion = {"Maggi": _maggi, "Hamel": _hamel, "Appell": _appell}[form], _Motion.of(system, frame)
+    return _made(system, frame, motion, derive(system, frame, motion))
 
 
 @dataclass(frozen=True)
@@ -283,23 +283,24 @@ class _Motion:
     rate: sp.Matrix
     bias: sp.Matrix
     force: sp.Matrix
+    accelerations: tuple[sp.Symbol, ...]  # ẇ
 
     @classmethod
     def of(cls, system: EnergyForm, frame: _Frame) -> _Motion:
         free = equations_of_motion(system)
+        named = dict(zip(system.velocities, system.accelerations, strict=True))
+        accelerations = tuple(named.get(w, velocity_of(w)) for w in frame.velocities)
         w = sp.Matrix(frame.velocities)
         rate = frame.N * w + frame.drift
         put = dict(zip(system.velocities, rate, strict=True))
         bias = _along(frame.N, system, rate) * w + _along(frame.drift, system, rate)
         inertial = (free.coriolis_matrix * sp.Matrix(system.velocities) + free.drift).subs(put, simultaneous=True)
-        return cls(free, rate, bias, free.mass_matrix * bias + inertial)
+        return cls(free, rate, bias, free.mass_matrix * bias + inertial, accelerations)
 
 
-def _made(system: EnergyForm, frame: _Frame, motion: _Motion, form: str, **fields: Any) -> NonholonomicEquations:
-    """Return the equations from M, C and d in w, with forces, reactions and kinematics."""
-    free, N = motion.equations, frame.N
-    named = dict(zip(system.velocities, system.accelerations, strict=True))
-    accelerations = tuple(named.get(w, velocity_of(w)) for w in frame.velocities)
+def _made(system: EnergyForm, frame: _Frame, motion: _Motion, fields: dict[str, Any]) -> NonholonomicEquations:
+    """Return the equations from M, C and d in w and their form, with forces, reactions and kinematics."""
+    free, N, accelerations = motion.equations, frame.N, motion.accelerations
     Q = free.forces.subs(dict(zip(system.velocities, motion.rate, strict=True)), simultaneous=True)
     whole = free.mass_matrix * (N * sp.Matrix(accelerations)) + motion.force + free.potential_gradient
     reactions = settled_matrix(frame.E.T * whole, (*frame.velocities, *accelerations))
@@ -310,7 +311,6 @@ def _made(system: EnergyForm, frame: _Frame, motion: _Motion, form: str, **field
         potential_gradient=settled_matrix(N.T * free.potential_gradient),
         forces=tidy_matrix(N.T * Q),
         system=system,
-        form=form,
         rates=system.velocities,
         N=N,
         E=frame.E,
@@ -322,7 +322,7 @@ def _made(system: EnergyForm, frame: _Frame, motion: _Motion, form: str, **field
     )
 
 
-def _maggi(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEquations:
+def _maggi(system: EnergyForm, frame: _Frame, motion: _Motion) -> dict[str, Any]:
     N, w = frame.N, frame.velocities
     M = motion.equations.mass_matrix
     slow = dict(zip(system.velocities, N * sp.Matrix(w), strict=True))
@@ -332,39 +332,24 @@ def _maggi(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEq
     rest = sp.zeros(len(w), 1)
     if any(frame.drift) or system.time is not None or any(motion.equations.drift):
         rest = N.T * motion.force - C * sp.Matrix(w)
-    return _made(
-        system,
-        frame,
-        motion,
-        "Maggi",
-        mass_matrix=settled_matrix(N.T * M * N),
-        coriolis_matrix=C,
-        drift=settled_matrix(rest, w),
-    )
+    d = settled_matrix(rest, w)
+    return {"form": "Maggi", "mass_matrix": settled_matrix(N.T * M * N), "coriolis_matrix": C, "drift": d}
 
 
-def _appell(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEquations:
-    maggi = _maggi(system, frame, motion)
-    wdot = sp.Matrix(maggi.accelerations)
+def _appell(system: EnergyForm, frame: _Frame, motion: _Motion) -> dict[str, Any]:
+    C, w, wdot = _maggi(system, frame, motion)["coriolis_matrix"], frame.velocities, sp.Matrix(motion.accelerations)
     a, M = frame.N * wdot, motion.equations.mass_matrix
     S = (a.T * M * a)[0] / 2 + (a.T * motion.force)[0]
-    slopes = sp.Matrix([S]).jacobian(maggi.accelerations).T
-    mass_matrix = settled_matrix(slopes.jacobian(maggi.accelerations))
-    at_rest = settled_matrix(slopes.subs(dict.fromkeys(maggi.accelerations, 0)), maggi.velocities)
-    return _made(
-        system,
-        frame,
-        motion,
-        "Gibbs and Appell",
-        mass_matrix=mass_matrix,
-        coriolis_matrix=maggi.coriolis_matrix,
-        drift=settled_matrix(at_rest - maggi.coriolis_matrix * sp.Matrix(frame.velocities), maggi.velocities),
-        # Of the shortest parts.
-        S=tidy((wdot.T * mass_matrix * wdot)[0] / 2) + tidy((wdot.T * at_rest)[0]),
-    )
+    slopes = sp.Matrix([S]).jacobian(motion.accelerations).T
+    M = settled_matrix(slopes.jacobian(motion.accelerations))
+    at_rest = settled_matrix(slopes.subs(dict.fromkeys(motion.accelerations, 0)), w)
+    d = settled_matrix(at_rest - C * sp.Matrix(w), w)
+    # Of the shortest parts.
+    S = tidy((wdot.T * M * wdot)[0] / 2) + tidy((wdot.T * at_rest)[0])
+    return {"form": "Gibbs and Appell", "mass_matrix": M, "coriolis_matrix": C, "drift": d, "S": S}
 
 
-def _hamel(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEquations:
+def _hamel(system: EnergyForm, frame: _Frame, _: _Motion) -> dict[str, Any]:
     r, used = len(frame.velocities), {s.name for s in (*symbols_of(system), *frame.velocities)}
     names = [free_name(f"{x}_", used) for x in (*frame.velocities, *(f"rate{k + 1}" for k in range(frame.E.cols)))]
     # In the first r equations no reaction stands.
@@ -377,16 +362,12 @@ def _hamel(system: EnergyForm, frame: _Frame, motion: _Motion) -> NonholonomicEq
     w, held_rates = form.velocities[:r], form.velocities[r:]
     back = {**dict.fromkeys(held_rates, sp.Integer(0)), **dict(zip(w, frame.velocities, strict=True))}
     # Only now: the momenta of A q̇ stand in Hamel's terms.
-    C, d = (x.subs(back, simultaneous=True) for x in (whole.coriolis_matrix[:r, :r], whole.drift[:r, :]))
-    return _made(
-        system,
-        frame,
-        motion,
-        "Boltzmann and Hamel",
-        mass_matrix=settled_matrix(whole.mass_matrix[:r, :r]),
-        coriolis_matrix=settled_matrix(C, frame.velocities),
-        drift=settled_matrix(d, frame.velocities),
+    C, d = (
+        settled_matrix(x.subs(back, simultaneous=True), frame.velocities)
+        for x in (whole.coriolis_matrix[:r, :r], whole.drift[:r, :])
     )
+    M = settled_matrix(whole.mass_matrix[:r, :r])
+    return {"form": "Boltzmann and Hamel", "mass_matrix": M, "coriolis_matrix": C, "drift": d}
 
 
 # Which rows are integrable
@@ -455,8 +436,9 @@ def integrability(system: EnergyForm) -> Integrability:
     spread, growth = [*frame], [len(frame)]
     new = frame
     while new and len(spread) < len(place):
-        brackets = [_bracket(x, y, place) for x in frame for y in new]
-        brackets = [x for x in brackets if any(e != 0 for e in x)]
+        # Lie brackets [x, y].
+        pairs = (y.jacobian(place) * x - x.jacobian(place) * y for x in frame for y in new)
+        brackets = [x for x in (pair.applyfunc(tidy) for pair in pairs) if any(e != 0 for e in x)]
         new = _independent(spread, brackets)
         spread += new
         if not new:
@@ -483,10 +465,6 @@ def _kernel(A: sp.ImmutableMatrix) -> list[sp.Matrix]:
             x[i] = value
         out.append(x.applyfunc(tidy))
     return out
-
-
-def _bracket(x: sp.Matrix, y: sp.Matrix, place: Sequence[sp.Symbol]) -> sp.Matrix:
-    return (y.jacobian(place) * x - x.jacobian(place) * y).applyfunc(tidy)
 
 
 def _independent(known: Sequence[sp.Matrix], more: Iterable[sp.Matrix]) -> list[sp.Matrix]:

@@ -165,7 +165,8 @@ class TrigPolynomial:
     @property
     def expression(self) -> sp.Expr:
         """The sum of a polynomial that has neither cosine nor sine."""
-        return sp.Add(*(_rational(x) * self.monomial(m) for (_, _, m), x in self.terms.items()))
+        terms = self.terms.items()
+        return sp.Add(*(sp.Rational(x.numerator, x.denominator) * self.monomial(m) for (_, _, m), x in terms))
 
     def monomial(self, exponents: Iterable[int]) -> sp.Expr:
         """Return a product of powers of the generators."""
@@ -196,10 +197,6 @@ def _put(
         multiples = tuple(-k for k in multiples)
         value = -value if kind else value
     gather(out, (kind, multiples, powers), value)
-
-
-def _rational(x: Fraction) -> sp.Rational:
-    return sp.Rational(x.numerator, x.denominator)
 
 
 # Exact division of sums of cosines and sines.

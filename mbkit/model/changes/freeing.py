@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mbkit._check import Array, shown
-from mbkit.errors import InputError, nearest
+from mbkit.errors import InputError, did_you_mean
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Parameter
@@ -177,9 +177,8 @@ def _nothing(model: Model, every: list[Number], pattern: str) -> str:
     if frame is not None and field.split(".")[0] in rules_of(Body):
         end = pattern.removeprefix(f"{frame.name}.")
         return f"{item}: {frame.name!r} is a frame on body {frame.body!r}, which holds its inertia: {frame.body}.{end}"
-    near = nearest(pattern, [x.path for x in every] + [x.whole for x in every])
-    if near:
-        return f"{item}; did you mean {near[0]!r}?"
+    if near := did_you_mean(pattern, [x.path for x in every] + [x.whole for x in every]):
+        return item + near
     zero = [x.whole for x in every if fnmatchcase(x.path, pattern) or fnmatchcase(x.whole, pattern)]
     if zero:
         return f"{item} that acts; without a wildcard, as in {zero[0]!r}, a zero becomes a parameter too"

@@ -20,10 +20,10 @@ from typing import Any, Final, overload
 
 import numpy as np
 
-from mbkit._check import Array, count, finite_array, real, shown
+from mbkit._check import Array, by_key, count, finite_array, real, shown
 from mbkit._escape import csv_text, html
 from mbkit._warn import warn
-from mbkit.errors import InputError, MbkitWarning, OutputError, UnsupportedError
+from mbkit.errors import InputError, MbkitWarning, UnsupportedError, writing
 from mbkit.model.builder import expect_model, shape_of
 from mbkit.model.changes.freeing import LOG_CHOLESKY, SYMMETRIC, Scale, chosen, log_cholesky, numbers_of, with_free
 from mbkit.model.model import Model
@@ -102,15 +102,11 @@ class Variants:
         """Write a table of what was drawn, a row a variant."""
         if not isinstance(path, (str, os.PathLike)):
             raise InputError(f"path: expected a path, got {shown(path)}")
-        try:
-            with Path(path).open("w", newline="", encoding="utf-8") as file:
-                write = csv.writer(file)
-                write.writerow(["variant", *map(csv_text, self.values)])
-                write.writerows(
-                    [k, *map(repr, row)] for k, row in enumerate(np.stack([*self.values.values()], 1).tolist())
-                )
-        except OSError as error:
-            raise OutputError(f"{path}: {error.strerror or error}") from None
+        rows = np.stack([*self.values.values()], 1).tolist()
+        with writing(path), Path(path).open("w", newline="", encoding="utf-8") as file:
+            write = csv.writer(file)
+            write.writerow(["variant", *map(csv_text, self.values)])
+            write.writerows([k, *map(repr, row)] for k, row in enumerate(rows))
 
     def _summary(self) -> list[tuple[str, str, str, str, str]]:
         nominal = self.model.parameters
@@ -317,10 +313,8 @@ def _require_bodies_that_can_be(model: Model, values: Mapping[str, Array], scale
                 f"spread: {path!r} is {'zero or ' * x.rule.positive}negative in {len(bad)} of {size} variants, "
                 f"such as {value[bad[0]]:.3g} in {bad[0]}; give a smaller spread, or a range that it can have"
             )
-    matrices: dict[tuple[str, str, str], list[Any]] = {}
-    for x in (x for path in drawn if len((x := numbers[path]).indices[0]) == 2):
-        matrices.setdefault((x.where, x.part, x.field), []).append(x)
-    for (where, name, field), own in matrices.items():
+    matrices = (x for path in drawn if len((x := numbers[path]).indices[0]) == 2)
+    for (where, name, field), own in by_key(((x.where, x.part, x.field), x) for x in matrices).items():
         nominal = next(getattr(part, field) for part in getattr(model, where) if part.name == name)
         every = np.tile(nominal, (size, 1, 1))
         for x in own:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, shown
-from mbkit.errors import InputError, nearest
+from mbkit.errors import InputError, did_you_mean
 from mbkit.model.elements.beams import OnBeam
 from mbkit.model.elements.forces import RATE
 from mbkit.model.elements.references import (
@@ -362,7 +362,7 @@ class EditingBuilder:
         for joint in self._parts["joints"]:
             if name in (joint.name, joint.child):
                 return f"; remove_joint({joint.name!r}) removes a joint and what it carries"
-        return f"; did you mean {near[0]!r}?" if (near := nearest(name, names)) else ""
+        return did_you_mean(name, names)
 
     def add_prefix(self, prefix: str) -> None:
         """Put a prefix before the names of all bodies, joints, frames and other parts; parameters keep theirs."""
@@ -438,16 +438,13 @@ class EditingBuilder:
         names = [x.name for x in self._parts[kind]]
         if name in names:
             return self._parts[kind][names.index(name)]
-        hint = ""
         if kind == "bodies" and (frame := next((f for f in self._parts["frames"] if f.name == name), None)):
             hint = (
                 f"; it is a frame on body {frame.body!r}, which holds its inertia: change that one, or hang something "
                 "on the frame with add_payload"
             )
-        elif near := nearest(name, names):
-            hint = f"; did you mean {near[0]!r}?"
-        elif not names:
-            hint = "; the model has none"
+        else:
+            hint = did_you_mean(name, names) if names else "; the model has none"
         self._read.faults.append(f"{what} {name!r}: there is none of this name{hint}")
         return None
 
@@ -459,8 +456,8 @@ class EditingBuilder:
         bodies = [b.name for b in self._parts["bodies"]]
         if isinstance(at, str) and at in (*bodies, "world"):
             return Frame(at, at, np.eye(3), np.zeros(3))
-        near = nearest(at, [f.name for f in self._parts["frames"]] + bodies) if isinstance(at, str) else []
-        hint = f"; did you mean {near[0]!r}?" if near else ""
+        known = [f.name for f in self._parts["frames"]] + bodies
+        hint = did_you_mean(at, known) if isinstance(at, str) else ""
         self._read.faults.append(f"{item}: at: unknown frame {shown(at)}{hint}")
         return None
 

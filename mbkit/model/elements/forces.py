@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.errors import nearest
+from mbkit.errors import did_you_mean
 from mbkit.model.elements.formula import Formula
 from mbkit.model.parts import ENTRIES, Constants, NumberRule, Place, Rotation, _Frozen, read_only
 
@@ -331,8 +331,7 @@ def _listed(names: tuple[str, ...]) -> str:
 
 
 def _unknown(what: str, name: str, names: list[str]) -> str:
-    near = nearest(name, names)
-    return f"unknown {what} {name!r}" + (f"; did you mean {near[0]!r}?" if near else "")
+    return f"unknown {what} {name!r}{did_you_mean(name, names)}"
 
 
 def coordinate_arguments(model: _Model) -> Mapping[str, tuple[bool, int]]:
@@ -383,10 +382,8 @@ def _symbol_faults(force: Force, own: tuple[str, ...], others: Mapping[str, Any]
         if len(meanings) > 1:
             yield f"symbol {name!r} stands for {' and '.join(meanings)}; rename one of them"
         elif not meanings:
-            near = nearest(name, [*own, *force.symbols, *others])
             yield (
                 f"unknown symbol {name!r}; there are {', '.join((TIME, *own))}, names of coordinates, and with "
-                f"{RATE!r} behind it those of velocities"
-                + (f"; did you mean {near[0]!r}?" if near else "")
-                + f"; a constant's value is given with parameters={{{name!r}: ...}}"
+                f"{RATE!r} behind it those of velocities{did_you_mean(name, [*own, *force.symbols, *others])}"
+                f"; a constant's value is given with parameters={{{name!r}: ...}}"
             )

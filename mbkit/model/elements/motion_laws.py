@@ -14,9 +14,10 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit.model.elements.formula import Arithmetic, Formula
-from mbkit.model.parts import Constants, NumberRule, Prescribed, _Frozen
+from mbkit.model.parts import Constants, NumberRule, OfJoint, Prescribed
 
 #: Of a table's end: what the rounding of a run's last time can be beyond it.
 _ROUNDING: Final = 1e-12
@@ -27,18 +28,8 @@ _TABLE: Final = NumberRule(shape=None, fixed="it is a table's")
 MOST_KNOTS: Final = 2000
 
 
-class _OfJoint(_Frozen):
-    section = "prescribed"
-    joint: str
-
-    @property
-    def name(self) -> str:
-        """The joint's, which has one motion."""
-        return self.joint
-
-
 @dataclass(frozen=True, eq=False)
-class FormulaMotion(_OfJoint):
+class FormulaMotion(OfJoint):
     """A coordinate moved by a formula of the time.
 
     Attributes
@@ -57,14 +48,11 @@ class FormulaMotion(_OfJoint):
     symbols: tuple[str, ...]
     numbers: Constants
 
-    @property
-    def constants(self) -> tuple[float, ...]:
-        """The numbers in the formula."""
-        return self.formula.constants
+    constants = forwarded("formula.constants", "The numbers in the formula.")
 
 
 @dataclass(frozen=True, eq=False)
-class SplineMotion(_OfJoint):
+class SplineMotion(OfJoint):
     """A coordinate moved by polynomials between knots: x = Σ_j coefficients[j, i] (t - knots[i])^(d - j).
 
     It is defined from the first knot to the last one.

@@ -11,6 +11,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit.methods.one_step import (
     FIRST_ROOT,
@@ -110,10 +111,7 @@ class RungeKuttaAttempts:
     def jacobians(self) -> int:
         return 0
 
-    @property
-    def approach(self) -> Approach:
-        """How near a singular pose the run is."""
-        return self._field.approach
+    approach: Approach = forwarded("_field.approach", "How near a singular pose the run is.")
 
     def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
         (member,) = which

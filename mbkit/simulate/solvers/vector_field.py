@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
@@ -70,15 +71,8 @@ class Field:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.time_parameter is not None
         self._approach, self._constrained = Approach(), own.projects
 
-    @property
-    def dyn(self) -> Dynamics:
-        """The dynamics of the members of the batch that go on."""
-        return self._own
-
-    @property
-    def projects(self) -> bool:
-        """Whether states are projected onto constraints."""
-        return self._constrained
+    dyn: Dynamics = forwarded("_own", "The dynamics of the members of the batch that go on.")
+    projects: bool = forwarded("_constrained", "Whether states are projected onto constraints.")
 
     @property
     def near_singular(self) -> bool:
@@ -99,10 +93,7 @@ class Field:
         if self._constrained and self._explicit and self.near is None:
             self._approach.saw(self._own, t, q, w if self._space is None else self._space.to_body_velocity(q, w))
 
-    @property
-    def approach(self) -> Approach:
-        """How near a singular pose the run is."""
-        return self._approach
+    approach: Approach = forwarded("_approach", "How near a singular pose the run is.")
 
     def _projected(self, onto: Projection, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a projection makes of one in the integrators' velocity."""
@@ -179,10 +170,7 @@ class Rates:
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
         self.why = ""
 
-    @property
-    def evaluations(self) -> int:
-        """Evaluations of the forward dynamics."""
-        return self._field.evaluations
+    evaluations: int = forwarded("_field.evaluations", "Evaluations of the forward dynamics.")
 
     def only(self, member: int) -> None:
         """Go on with this member of a batch."""

@@ -63,18 +63,15 @@ def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str
             # One step first: compiling it is not run time.
             quiet_simulate(engines[name], q0, v0, STEP, method, STEP)
             ours = quiet_simulate(engines[name], q0, v0, STEP * last, method, STEP)
-            amplified = max(_amplified(engines[x], theirs.q[: last + 1]) for x in (MUJOCO, name))
+            # How far their formulas for M amplify rounding along the run.
+            places = [(engines[x], theirs.q[k]) for x in (MUJOCO, name) for k in (0, (last + 1) // 2, last)]
+            amplified = max(dyn.mass_matrix_rounding(q) for dyn, q in places)
             grown = condition[: last + 1], last + 1 < len(condition)
             own.append((_row(engines[name], ours, theirs, *grown, amplified, note), ours))
         rows += _blamed(model, own)
     if model.needs.damping:
         rows.append(_implicit_damping(model, engines[MUJOCO], q0, v0))
     return tuple(rows)
-
-
-def _amplified(dyn: Dynamics, q: Array) -> float:
-    """Return how far an engine's formula for M amplifies rounding along a run: at its start, middle and end."""
-    return max(dyn.mass_matrix_rounding(q[k]) for k in (0, len(q) // 2, len(q) - 1))
 
 
 def _blamed(model: Model, own: Sequence[tuple[RolloutRow, Trajectory]]) -> Iterator[RolloutRow]:

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import Array, by_key
 from mbkit.model import Model
 from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.joint_numbers import dry_friction, owners, per_velocity
@@ -48,10 +48,7 @@ def _limits(model: Model) -> Finding | None:
         for kind, names in kinds.items()
     }
     # Kinds that the same joints have stand together.
-    alike: dict[tuple[str, ...], list[str]] = {}
-    for kind, joints in having.items():
-        if joints:
-            alike.setdefault(tuple(joints), []).append(kind)
+    alike = by_key((tuple(joints), kind) for kind, joints in having.items() if joints)
     parts = [f"{', '.join(some)} of {counted(len(joints), 'joint')}" for joints, some in alike.items()]
     if not parts:
         return None

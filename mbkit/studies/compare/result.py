@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
+from mbkit._check import by_key
 from mbkit._escape import one_line
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.constrained import off_by
@@ -252,10 +253,7 @@ class Comparison(ResultTable):
         missing = "".join(f"; {x}" for x in self.shortened)
         if self.passed:
             return f"{self.agreement()}{missing}"
-        known: dict[tuple[str, str], list[str]] = {}
-        for r in self.rows:
-            if r.defect:
-                known.setdefault((r.engine, r.defect), []).append(r.term)
+        known = by_key(((r.engine, r.defect), r.term) for r in self.rows if r.defect)
         parts = [f"{engine} differs in {', '.join(terms)}: {defect}" for (engine, defect), terms in known.items()]
         if self.only_known_defects:
             return f"{'; '.join(parts)}; all else agrees to {self.digits:.1f} digits{missing}"

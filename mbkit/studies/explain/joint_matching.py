@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import Array, by_key
 from mbkit.engines.imported import unused
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.forces import Force, coordinate_arguments
@@ -333,9 +333,7 @@ def _with_slides_in_order(a: Model, b: Model) -> Model:
 
 def _runs_of_slides(model: Model) -> list[list[str]]:
     """Return the slides that follow each other, without matter, turns or anything else between them."""
-    on: dict[str, list[Joint]] = {}
-    for joint in model.joints:
-        on.setdefault(joint.parent, []).append(joint)
+    on = by_key((joint.parent, joint) for joint in model.joints)
     used = {name for kind in OTHERS for part in getattr(model, kind) for name in next(references(part))}
     runs: list[list[str]] = []
     for joint in model.tree:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, Final
 
+from mbkit._check import by_key
 from mbkit._escape import one_line
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.terms import WHOLE, Gap
@@ -161,11 +162,8 @@ def effect(cause: Cause) -> str:
 
 def grouped(causes: Iterable[Cause]) -> list[tuple[str, str, str]]:
     """Return kind, sentence and effect of each cause; more than three of one kind are one line."""
-    by_kind: dict[tuple[str, bool], list[Cause]] = {}
-    for c in causes:
-        by_kind.setdefault((c.kind, c.acts), []).append(c)
     out = []
-    for (kind, _), some in by_kind.items():
+    for (kind, _), some in by_key(((c.kind, c.acts), c) for c in causes).items():
         if len(some) <= _MAX_LINES:
             out += [(kind, c.says, effect(c)) for c in some]
             continue

@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from mbkit._check import Array
+from mbkit._check import Array, by_key
 from mbkit.engines import Dynamics
 from mbkit.model import Body, Model
 from mbkit.model.joint_numbers import owners
@@ -296,11 +296,8 @@ def _power_of_ten(x: float) -> bool:
 @check
 def copied_inertia(at: Judged) -> Iterator[LintFinding]:
     """Find one inertia on several links of different shape or mass."""
-    groups: dict[tuple[str, ...], list[Body]] = defaultdict(list)
-    for body in at.bodies:
-        if not _placeholder(body):
-            groups[tuple(f"{x + 0.0:.9g}" for x in body.inertia[_UPPER])].append(body)
-    for group in groups.values():
+    bodies = (body for body in at.bodies if not _placeholder(body))
+    for group in by_key((tuple(f"{x + 0.0:.9g}" for x in b.inertia[_UPPER]), b) for b in bodies).values():
         if len(group) >= COPIES and any(_differ(a, b, at) for a, b in combinations(group, 2)):
             names = [body.name for body in group]
             says = f"the same inertia on {len(group)} links of different shape or mass: {listing(names, 6)}"

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from mbkit._check import by_key
 from mbkit._escape import one_line
 from mbkit.methods.registry import METHODS
 from mbkit.simulate.plotting.style import (
@@ -100,10 +101,8 @@ def figure(
 
 def _methods(curves: Sequence[Curve]) -> dict[str, list[Curve]]:
     """Return the curves of each panel, methods on most engines first."""
-    panels: dict[str, list[Curve]] = {}
-    for curve in curves:
-        if any(_drawable(p.seconds, p.error) for p in curve.points):
-            panels.setdefault(_SAME_FORMULA.get(curve.method, curve.method), []).append(curve)
+    drawn = (curve for curve in curves if any(_drawable(p.seconds, p.error) for p in curve.points))
+    panels = by_key((_SAME_FORMULA.get(curve.method, curve.method), curve) for curve in drawn)
     return dict(sorted(panels.items(), key=lambda item: -len(_engines(item[1]))))
 
 
