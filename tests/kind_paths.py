@@ -82,7 +82,8 @@ def registered() -> dict[str, Any]:
     """Return all gates, once every module that has one is imported."""
     top = Path(mb.__file__).parent
     for file in sorted(top.rglob("*.py")):
-        if "elements.paths import" in file.read_text(encoding="utf-8"):
+        text = file.read_text(encoding="utf-8")
+        if "elements.paths import" in text or "elements import paths" in text:
             import_module(".".join(file.relative_to(top.parent).with_suffix("").parts))
     return GATES
 
@@ -312,7 +313,7 @@ def _slope(name: str) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([dq, dv]), np.concatenate([moved, turned])
 
 
-@column("quantities", "mass as a parameter")
+@column("quantities", "mass as a parameter", "free numbers")
 def _mass(x: Example, folder: Path) -> Told:
     if not x.links:
         raise NotAskedError("no bodies")
@@ -352,7 +353,7 @@ def _changed(x: Example, name: str) -> list[tuple[str, Model]]:
     return out
 
 
-@column("quantities", "its number as a parameter")
+@column("quantities", "its number as a parameter", "free numbers")
 def _number(x: Example, folder: Path) -> Told:
     """The model with the number typed is evaluated beside the one at another value."""
     k = PART_KINDS.get(x.name)
@@ -781,7 +782,7 @@ def _taken_out(x: Example, folder: Path) -> Told:
     return off(mb.dynamics(less, "lagrangian", compile=False).forward_dynamics(x.q, x.v, x.tau), bare.accelerated())
 
 
-@column("changes", "lock")
+@column("changes", "lock", "lock")
 def _lock(x: Example, folder: Path) -> Told:
     """A locked joint is one whose velocity and acceleration stay zero."""
     name = next((j for j in ("j1", "j0") if j in x.model.joint_names), "")
@@ -799,7 +800,7 @@ def _lock(x: Example, folder: Path) -> Told:
     return off(got, now.accelerated()[at])
 
 
-@column("changes", "join")
+@column("changes", "join", "join")
 def _join(x: Example, folder: Path) -> Told:
     """Beside a pendulum that nothing touches, the model moves as alone."""
     b = mb.ModelBuilder("clock", gravity=x.model.gravity)
@@ -815,13 +816,13 @@ def _join(x: Example, folder: Path) -> Told:
     return worst
 
 
-@column("changes", "built anew")
+@column("changes", "built anew", "editing")
 def _of(x: Example, folder: Path) -> Told:
     back = mb.ModelBuilder.of(x.model).build()
     return off(dynamics(x, back).forward_dynamics(x.q, x.v, x.tau), x.accelerated())
 
 
-@column("changes", "segments")
+@column("changes", "segments", "segmented")
 def _segments(x: Example, folder: Path) -> Told:
     """Beams alone become others; a hinge that moves as a whole body has their inertia."""
     model = x.model.segmented(3)
@@ -862,7 +863,7 @@ def _each_number(x: Example, folder: Path) -> Told:
     return 0.0
 
 
-@column("studies", "lint")
+@column("studies", "lint", "lint")
 def _lint(x: Example, folder: Path) -> Told:
     mb.lint(x.model)
     return 0.0

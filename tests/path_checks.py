@@ -18,9 +18,11 @@ import mbkit as mb
 from mbkit.codegen.c_source import C_CODE, export_c
 from mbkit.errors import NumericalError
 from mbkit.lagrangian import from_model, program
+from mbkit.lagrangian.printing.summary import python_code
+from mbkit.model.elements.paths import PATHS
 from tests import kind_examples
 from tests.fake_cuda import fake_gpu
-from tests.kind_examples import EXAMPLES, Example
+from tests.kind_examples import EXAMPLES, TYPES, Example
 from validation.gpu import on_device
 
 Check = Callable[[mb.Model, Path], None]
@@ -30,7 +32,7 @@ _STEP, _STEPS = 1e-3, 5
 
 @cache
 def _names() -> dict[str, str]:
-    return {kind_examples.example(name).model.name: name for name in EXAMPLES}
+    return {kind_examples.example(name).model.name: name for name in EXAMPLES | TYPES}
 
 
 def case(model: mb.Model) -> tuple[Example, Any]:
@@ -192,6 +194,49 @@ def on_a_gpu(model: mb.Model, folder: Path) -> None:
         close(np.asarray(out.numpy() if hasattr(out, "numpy") else out), [x.accelerated()] * 2)
 
 
+# Pictures, and what is written on paper
+
+
+def by_showing(model: mb.Model, folder: Path) -> None:
+    """The bodies stand where NumPy has them, but for a turn of the scene."""
+    scene = mb.show(model, kind_examples.example(_names()[model.name]).q, folder / "x.html").scene
+    x = case(model)[0]
+    R, p = x.plain.poses(x.plain.q)[x.links[x.tip]]
+    up, at = scene.rotations[0, 0], scene.bodies.index(x.tip)
+    close(scene.rotations[0, at], up @ R)
+    close(scene.translations[0, at], up @ p)
+
+
+def by_constraint_law(model: mb.Model, folder: Path) -> None:
+    x = case(model)[0]
+    close(mb.dynamics(model, "mujoco").constraint_law(x.q, x.v, x.tau).rigid, x.accelerated())
+
+
+def as_a_module(model: mb.Model, folder: Path) -> None:
+    """A model that was written as energies, or is; bodies with rows come there as energies with rows."""
+    gate = PATHS["python module"]
+    if model.has_bodies and gate.refuses(model):
+        gate.admit(model)
+    if model.nv > 4:
+        return
+    x, names = case(model)[0], dict[str, Any]()
+    exec(python_code(model.form if not model.has_bodies else from_model(model)), names)
+    given = {"t": x.t} if model.time_parameter else {}
+    close(names["forward_dynamics"](x.plain.q, x.v, x.tau, **given), x.accelerated())
+
+
+def by_embedding(model: mb.Model, folder: Path) -> None:
+    gate = PATHS["embedded"]
+    if model.has_bodies and gate.refuses(model):
+        gate.admit(model)
+    if model.nv > 4:
+        return
+    x = case(model)[0]
+    lag = model.form if not model.has_bodies else from_model(model, drives=bool(model.prescribed))
+    run = mb.simulate(lag.embedded(), x.plain.q, x.v, 5e-3, "rk853", torque=x.tau, t0=x.t, save=[x.t + 5e-3])
+    close(run.v[-1], x.motion(np.array([0.0, 5e-3]))[1][-1], 1e-8)
+
+
 # Runs
 
 
@@ -232,6 +277,10 @@ CHECKS: dict[str, Check] = {
     "actuator forces": by_actuators,
     "reduced inertia": by_reduced_inertia,
     "operational space": by_operational_space,
+    "picture": by_showing,
+    "constraint law": by_constraint_law,
+    "python module": as_a_module,
+    "embedded": by_embedding,
     "linearize": by_linearizing,
     "derivative of a step": by_step_derivative,
     "gpu under force": on_a_gpu,

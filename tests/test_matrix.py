@@ -33,8 +33,9 @@ from mbkit.model.elements.kinds import PART_KINDS, Kind, kind, register_kind
 from mbkit.model.elements.paths import PATHS as GATES
 from mbkit.model.elements.paths import Path as Gate
 from mbkit.model.joint_types import KINDS as JOINT_TYPES
-from tests import kind_examples, path_checks
+from tests import kind_examples, kind_mutations, path_checks
 from tests.kind_examples import EXAMPLES, TYPES
+from tests.kind_mutations import seen
 from tests.kind_paths import COLUMNS, ROWS, cell, registered
 from tests.plain_mechanics import TIP, Case, random_case
 from tests.test_engine_versions import present
@@ -510,7 +511,13 @@ ON_ENGINES = ("derivation", "own engine", "pinocchio", "pinocchio derivatives")
 ON_ENGINES += ("drake", "drake runs", "drake sap", "mujoco", "mujoco runs")
 #: A run begins with its engine, whose gate is the first.
 BELOW = {"pinocchio derivatives": "pinocchio", "drake runs": "drake", "drake sap": "drake", "mujoco runs": "mujoco"}
-BELOW |= {"remote runs": "sent", "remote runs of joints": "sent"}
+BELOW |= {
+    "constraint law": "mujoco",
+    "python module": "paper",
+    "embedded": "paper",
+    "remote runs": "sent",
+    "remote runs of joints": "sent",
+}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -666,6 +673,14 @@ def hook():
 def test_a_new_kind_is_refused_by_name_on_every_path(path: str, hook: Kind, tmp_path: Path) -> None:
     with pytest.raises(UnsupportedError, match="joint 'j0' has a hook"):
         CHECKS[path](example("gravity"), tmp_path)
+
+
+@pytest.mark.parametrize("path", [name for name, c in COLUMNS.items() if not {*c.gates} <= {*CHECKS}])
+def test_a_new_kind_is_refused_by_name_in_a_column(path: str, hook: Kind, tmp_path: Path) -> None:
+    name = "joint.damping" if "number" in path else "gravity"
+    with seen(kind_mutations.new(name)):
+        got = cell(name, path, tmp_path)
+    assert (got.outcome, "joint 'j0' has a hook" in got.text) == ("refused", True), got
 
 
 def test_kinds_and_paths_are_checked_where_they_are_made() -> None:

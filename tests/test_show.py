@@ -424,7 +424,7 @@ def test_runs_with_loops_are_drawn_with_their_description(tmp_path: Path) -> Non
     model = mb.catalog.slider_crank()
     lag = mb.lagrangian.from_model(model)
     run = mb.simulate(lag.dynamics(), *lag.project([0.5, -0.2, 1.3], [1.0, 0.0, 0.0]), 0.2, "rk4", dt=1e-2)
-    with pytest.raises(UnsupportedError, match=r"has no bodies to draw; .*animate\(model=\.\.\.\)"):
+    with pytest.raises(UnsupportedError, match=r"has no bodies; .*animate\(model=\.\.\.\)"):
         run.animate(tmp_path / "a.html")
     with pytest.raises(UnsupportedError, match="written as energies"):
         mb.show(lag.model)

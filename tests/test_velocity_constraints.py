@@ -470,7 +470,7 @@ def test_what_velocity_constraints_cannot_have_is_refused() -> None:
     lag = sleigh()
     with pytest.raises(UnsupportedError, match="whose forces no H holds"):
         lag.hamiltonian()
-    with pytest.raises(UnsupportedError, match="velocity constraints, which bind no coordinates"):
+    with pytest.raises(UnsupportedError, match="velocity constraints, and these bind no coordinates"):
         lag.embedded()
     q, v = lag.project([0, 0, 0], [1, 0, 0.2])
     with pytest.raises(UnsupportedError, match="sleigh has velocity constraints"):

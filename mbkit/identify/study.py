@@ -119,7 +119,6 @@ def identify(
     [('rod2.hz', -1.0, -2.0)]
     """
     expect_model(model)
-    model.require_bodies("identify")
     for name, flag in (("physical", physical), ("friction", friction), ("armature", armature)):
         if not isinstance(flag, (bool, np.bool_)):
             raise InputError(f"{name}: expected True or False, got {shown(flag)}")

@@ -22,12 +22,22 @@ from mbkit._check import Array
 from mbkit._escape import one_line
 from mbkit._reproducible import pivoted
 from mbkit.engines.base import QUANTITIES, Dynamics
+from mbkit.engines.constrained import ASKED
 from mbkit.engines.constraint_manifold import Manifold, require_few
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian.energy_model import abstract_parts
 from mbkit.model import Model
+from mbkit.model.elements.paths import ALL, Path
 
+EMBEDDED: Final = Path(
+    "embedded",
+    "embedded: not known of",
+    ALL - {"speed"},
+    {"speed": "these bind no coordinates"},
+    asks=ASKED,
+    instead="mbkit.simulate(lag.dynamics(), ...) holds them by multipliers, and maggi() has equations without these",
+)
 _MOST: Final = 25
 #: Places from which the next one is searched: more than a step has stages.
 _PLACES: Final = 32
@@ -219,11 +229,7 @@ class Embedded:
         self.manifold, self.dynamics, self.independent = manifold, manifold.dyn, independent
         self.model = manifold.dyn.model
         form = manifold.equations.form
-        if form.velocity_constraints:
-            raise UnsupportedError(
-                f"embedded: {self.model.name} has velocity constraints, which bind no coordinates; "
-                "mbkit.simulate(lag.dynamics(), ...) holds them by multipliers, and maggi() has equations without these"
-            )
+        EMBEDDED.admit(self.model)
         rows = len(form.constraints)
         require_few(manifold)
         self.degrees = self.model.nv - rows

@@ -15,7 +15,7 @@ from mbkit._check import Array, real, rows
 from mbkit._escape import one_line
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.constraint_manifold import Manifold, manifold_of, projected, require_independent
-from mbkit.errors import NumericalError, UnsupportedError
+from mbkit.errors import NumericalError
 from mbkit.lagrangian.energies.energy_form import (
     EnergyForm,
     QuasiVelocities,
@@ -370,15 +370,10 @@ class Lagrangian(EnergyForm):
         if isinstance(independent, (str, sp.Basic)):
             independent = [independent]
         names = None if independent is None else tuple(name_of(x) for x in independent)
-        return Embedded(self._consistent(dyn), names)
+        return Embedded(manifold_of(dyn), names)
 
     def _manifold(self, t: float, values: Mapping[str, float]) -> Manifold:
-        return self._consistent(self._interpreted.at(**values) if values else self._interpreted).at(real("t", t))
-
-    def _consistent(self, dyn: Dynamics) -> Manifold:
-        if not self.multiplier_symbols:
-            raise UnsupportedError(f"{self.name}: has no constraints; give them as constraints=[...]")
-        return manifold_of(dyn)
+        return manifold_of(self._interpreted.at(**values) if values else self._interpreted).at(real("t", t))
 
     @cached_property
     def _interpreted(self) -> Dynamics:

@@ -254,7 +254,6 @@ class Model(Description):
                    0  rod2.hx
                   -1  rod2.hz
         """
-        self.require_bodies("base parameters")
         return base_parameters(self, tolerance)
 
     def regressor_columns(

@@ -11,14 +11,21 @@ import numpy as np
 
 from mbkit._check import Array, by_key, shown
 from mbkit._warn import warn
-from mbkit.errors import InputError, LoadError, MbkitWarning, UnsupportedError
+from mbkit.errors import InputError, LoadError, MbkitWarning
 from mbkit.load.mjcf_attributes import has_length, z_to
 from mbkit.model import Body, Model
+from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.poses import body_poses, inertia_box
 from mbkit.model.validation import listing
 from mbkit.show.surfaces import Color, thinned
 from mbkit.show.visuals import Shape, Visuals, read_visuals
 
+PICTURE: Final = Path(
+    "picture",
+    "show cannot draw",
+    OF_BODIES,
+    instead="a run of it is shown by animate(model=...) with a description of the same coordinates",
+)
 #: Kinds of shapes that can be asked for.
 Kind = Literal["visual", "collision", "sticks"]
 SHAPES: Final[tuple[Kind, ...]] = ("visual", "collision", "sticks")
@@ -66,7 +73,8 @@ def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
     """
     if kind not in SHAPES:
         raise InputError(f"shapes: expected one of {', '.join(SHAPES)}, got {shown(kind)}")
-    require_bodies(model)
+    PICTURE.admit(model)
+    model.require_values("show")
     found = Visuals()
     try:
         for which in () if kind == "sticks" or not model.sources else (kind, *(s for s in SHAPES[:2] if s != kind)):
@@ -88,16 +96,6 @@ def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
     if found.shapes or bodies:
         return found.shapes + stand_ins(model, bodies - {s.body for s in found.shapes})
     return stand_ins(model, {body.name for body in model.bodies})
-
-
-def require_bodies(model: Model) -> None:
-    """Raise unless the model has bodies, and all numbers have values."""
-    if not model.has_bodies:
-        raise UnsupportedError(
-            f"show: {model.name} was written as energies and has no bodies to draw; "
-            "a run of it is shown by animate(model=...) with a description of the same coordinates"
-        )
-    model.require_values("show")
 
 
 def stand_ins(model: Model, bodies: set[str]) -> list[Shape]:

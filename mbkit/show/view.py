@@ -23,7 +23,7 @@ from mbkit.model import Model
 from mbkit.model.elements.formula import NUMPY
 from mbkit.model.elements.motion_laws import motions_of, position
 from mbkit.show import movie, page
-from mbkit.show.scene import Kind, Scene, require_bodies
+from mbkit.show.scene import PICTURE, Kind, Scene
 
 #: Frames that a page and a film hold at most.
 _FRAMES: Final = 2000
@@ -135,7 +135,7 @@ def show(
         model = load(model, nonphysical="warn")
     if not isinstance(model, Model):
         raise InputError(f"model: expected a Model or a path, got {shown(model)}; a trajectory has animate()")
-    require_bodies(model)
+    PICTURE.admit(model)
     configurations = np.atleast_2d(model.neutral() if q is None else model.check_q(q))
     if len(configurations) > _FRAMES:
         raise InputError(f"q: expected at most {_FRAMES} configurations, got {len(configurations)}")
@@ -148,7 +148,7 @@ def animate(
     """Show a motion: configurations (K, nq) at times (K,) in s; for the arguments see `Trajectory.animate`."""
     if not isinstance(model, Model):
         raise InputError(f"model: expected a Model, got {shown(model)}")
-    require_bodies(model)
+    PICTURE.admit(model)
     good = np.flatnonzero(np.isfinite(q).all(axis=1))
     if not len(good):
         raise InputError(f"{model.name}: the trajectory has no state with finite numbers, so nothing can be shown")

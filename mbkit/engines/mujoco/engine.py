@@ -29,6 +29,7 @@ from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.mujoco.bodies import MujocoBodies
 from mbkit.engines.mujoco.constraints import ConstraintLaw, LoopEnds, Softness, friction_law, law
 from mbkit.engines.mujoco.model import (
+    CONSTRAINT_LAW,
     FRICTION_LOSS,
     MUJOCO,
     MUJOCO_RUNS,
@@ -38,7 +39,7 @@ from mbkit.engines.mujoco.model import (
     heard_warnings,
 )
 from mbkit.engines.mujoco.rollout import rollout
-from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, NumericalError, UnsupportedError
+from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, NumericalError
 from mbkit.model import Model
 
 if TYPE_CHECKING:
@@ -233,10 +234,8 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         >>> 0 < said.digits < 3
         True
         """
-        if not (self.model.needs.loops or self.soft_friction):
-            raise UnsupportedError(
-                f"constraint_law: {self.model.name} has no loops; dry friction is soft with soft_friction=True alone"
-            )
+        if not self.soft_friction:
+            CONSTRAINT_LAW.admit(self.model)
         q, v, tau = self.model.check_q(q), self.model.check_v(v), self.model.check_v(tau, "tau")
         if q.ndim > 1 or v.ndim > 1 or tau.ndim > 1:
             raise InputError(f"constraint_law: expected one state, got shapes {q.shape}, {v.shape}, {tau.shape}")

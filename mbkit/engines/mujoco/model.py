@@ -358,6 +358,12 @@ FRICTION_LOSS: Final = replace(
     ),
     instead="leave soft_friction out for mbkit's exact law",
 )
+CONSTRAINT_LAW: Final = replace(
+    MUJOCO,
+    name="constraint law",
+    words="constraint_law: not known of",
+    asks=(frozenset({"row"}), "it has no loops, and dry friction is soft with soft_friction=True alone"),
+)
 MUJOCO_RUNS: Final = Path(
     "mujoco runs",
     "mujoco: its own integrators do not hold all of",

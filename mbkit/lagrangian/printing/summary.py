@@ -12,11 +12,11 @@ from sympy.printing.numpy import NumPyPrinter
 
 from mbkit._escape import identifier, one_line, python_docstring
 from mbkit._version import __version__
-from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.energies.equations_of_motion import EquationsOfMotion, equations_of_motion, printed_equations
 from mbkit.lagrangian.printer import Abbreviations, ExpressionPrinter, folded, matrix, spread, written
 from mbkit.lagrangian.reduction.quasi_equations import QuasiEquationsOfMotion
 from mbkit.lagrangian.system import Lagrangian
+from mbkit.model.elements.paths import ALL, Path
 
 #: Operations of T above which C and the equations are left out of a page.
 _READABLE: Final = 1500
@@ -237,6 +237,7 @@ def _aligned(rows: list[str]) -> str:
 
 # The equations as a Python module that needs NumPy only
 
+MODULE: Final = Path("python module", "a Python module cannot say of", ALL - {"row", "speed"})
 #: Names that the module itself uses, beside Python's own.
 _RESERVED: Final = {"np", "q", "v", "tau", "t", "M", "h", "out", "given", "unknown", "parameters", "PARAMETERS"}
 _FUNCTIONS: Final = {"mass_matrix", "nonlinear", "forward_dynamics"}
@@ -248,8 +249,7 @@ def python_code(system: Lagrangian, note: str = "") -> str:
     Its functions take one state, and parameters by keyword. Constraints are refused (UnsupportedError). `note` says
     what the equations leave out.
     """
-    if system.multiplier_symbols:
-        raise UnsupportedError(f"{system.name}: a system with constraints cannot be written as a Python module yet")
+    MODULE.admit(system.model)
     e = system.equations()
     n = len(e.coordinates)
     no_inputs = dict.fromkeys(system.inputs.values(), sp.Integer(0))

@@ -16,6 +16,7 @@ import numpy as np
 
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, did_you_mean
+from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.model import Model
 from mbkit.model.parameters import Binding, Parameter
@@ -27,6 +28,7 @@ SYMMETRIC: Final = (
     *(("xx", (0, 0)), ("xy", (0, 1)), ("xz", (0, 2))),
     *(("yy", (1, 1)), ("yz", (1, 2)), ("zz", (2, 2))),
 )
+FREE: Final = Path("free numbers", "", OF_BODIES)
 #: Numbers of which not every part that has the field has one.
 _WHERE: Final[dict[str, Callable[[Model, Any], bool]]] = {
     "pitch": lambda _, joint: joint.type.pitched,
@@ -232,7 +234,7 @@ def _factored(model: Model, path: str, bound: Container[_Entry]) -> dict[_Entry,
 
 def with_free(model: Model, paths: Iterable[Any]) -> Model:
     """Return a model with free numbers, as `Model.with_free` says."""
-    model.require_bodies("with_free")
+    FREE.admit(model, "with_free: not known of")
     bound = {(b.where, b.part, b.field, b.index): b.expression for b in model.bindings}
     new: dict[_Entry, Any] = {}
     paths = tuple(paths)

@@ -12,9 +12,11 @@ from mbkit import spatial
 from mbkit._check import Array, shown
 from mbkit.errors import InputError
 from mbkit.model.builder import LONGEST, ModelBuilder, expect_model
+from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on
 from mbkit.model.model import Model
 
+JOIN: Final = Path("join", "join: not known of", OF_BODIES)
 #: Kinds of parts that share one set of names each.
 _NAMED: Final = (("bodies", "frames"), *((kind,) for kind in KINDS_OF_PARTS if kind not in ("bodies", "frames")))
 
@@ -109,7 +111,7 @@ def join(
     if not isinstance(prefix, str):
         raise InputError(f"prefix: expected text, got {shown(prefix)}")
     for model in (base, arm):
-        model.require_bodies("join")
+        JOIN.admit(model)
     frame = base.frame(at)
     R, p = read_pose("pose", pose)
     if at != "world" and (floating := [j.name for j in arm.joints if j.parent == "world" and j.type.floating]):

@@ -29,6 +29,7 @@ from mbkit.model.elements.forces import (
 )
 from mbkit.model.elements.formula import Formula, Operation
 from mbkit.model.elements.motion_laws import motions_of
+from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.elements.references import entries, moved_by, with_fields
 from mbkit.model.joint_types import FIXED
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
@@ -39,6 +40,8 @@ from mbkit.model.poses import body_poses
 
 #: Of limits and of what is closed: digits of a typed number.
 _TYPED: Final = 1e-8
+#: The energies, losses, forces and rows of what moves no more are written on what still does.
+LOCK: Final = Path("lock", "lock: not known of", OF_BODIES)
 
 #: Coordinates of the locked joints by name, of those that follow too.
 Values = dict[str, Array]
@@ -46,7 +49,7 @@ Values = dict[str, Array]
 
 def lock(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike | None) -> Model:
     """Return a model with joints fixed, as `Model.lock` says."""
-    model.require_bodies("lock")
+    LOCK.admit(model)
     given = _given(model, joints, q)
     values = _with_followers(model, given)
     _require_limits(model, values)

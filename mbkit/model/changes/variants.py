@@ -25,7 +25,16 @@ from mbkit._escape import csv_text, html
 from mbkit._warn import warn
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError, writing
 from mbkit.model.builder import expect_model, shape_of
-from mbkit.model.changes.freeing import LOG_CHOLESKY, SYMMETRIC, Scale, chosen, log_cholesky, numbers_of, with_free
+from mbkit.model.changes.freeing import (
+    FREE,
+    LOG_CHOLESKY,
+    SYMMETRIC,
+    Scale,
+    chosen,
+    log_cholesky,
+    numbers_of,
+    with_free,
+)
 from mbkit.model.model import Model
 
 #: What a spread says of a path: a size, the ends of a uniform range, or a function of a generator and how many to draw.
@@ -178,7 +187,7 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
     ((100, 6, 6), 6)
     """
     model = expect_model(robot, "robot")
-    model.require_bodies("variants")
+    FREE.admit(model, "variants: not known of")
     size, seed = count("size", size, least=1), count("seed", seed)
     if not isinstance(spread, Mapping) or not spread:
         raise InputError(f"spread: expected a mapping from paths to spreads, got {shown(spread)}")

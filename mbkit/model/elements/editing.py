@@ -14,6 +14,7 @@ from mbkit._check import Array, shown
 from mbkit.errors import InputError, did_you_mean
 from mbkit.model.elements.beams import OnBeam
 from mbkit.model.elements.forces import RATE
+from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.elements.references import (
     _OF_BODIES,
     KINDS_OF_PARTS,
@@ -29,6 +30,7 @@ from mbkit.model.parts import OF_Q, OF_V, Frame, Joint, Mimic, rules_of
 
 _Vector = ArrayLike | Sequence[Number]
 _Numbers = ArrayLike | Sequence[Number] | Number
+EDITED: Final = Path("editing", "ModelBuilder.of: not known of", OF_BODIES)
 #: Numbers up to which a note says them all.
 _FEW: Final = 3
 #: Arguments of joints with a number for each coordinate or velocity.
@@ -80,9 +82,9 @@ class EditingBuilder:
         >>> robot.notes[-1]
         "added payload 'load' of 2 kg at 'tool0'"
         """
-        if not callable(getattr(model, "require_bodies", None)):
+        if not hasattr(model, "acts"):
             raise InputError(f"model: expected a Model, got {type(model).__name__}; mbkit.load(...) makes one")
-        model.require_bodies("ModelBuilder.of")
+        EDITED.admit(model)
         out = cls(model.name)  # type: ignore[call-arg]  # the whole builder's
         out._gravity = model.gravity
         out._bindings = list(model.bindings)

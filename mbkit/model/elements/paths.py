@@ -72,7 +72,7 @@ class Path:
             raise UnsupportedError(refusal)
         kinds = [kind(name) for name in model.acts] if self.notes else []
         notes = [text for key, text in self.notes.items() if any(_is(k, key) for k in kinds)]
-        return tuple(filter(None, (text if isinstance(text, str) else text(model) for text in notes)))
+        return tuple(filter(None, dict.fromkeys(text if isinstance(text, str) else text(model) for text in notes)))
 
     def refuses(self, model: _Model, words: str = "") -> str:
         """Return why the path does not carry a model, with every part; empty where it does."""
@@ -106,6 +106,8 @@ class Path:
 
 #: What paths carry that take all but kinds of no known effect.
 ALL: Final = frozenset({*EFFECTS, "energies"})
+#: And what those carry that go by bodies.
+OF_BODIES: Final = ALL - {"energies"}
 #: Paths by name.
 PATHS: Final[dict[str, Path]] = {}
 

@@ -9,7 +9,7 @@ from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -23,12 +23,12 @@ from mbkit.errors import (
     MbkitWarning,
     ModelError,
     NonPhysicalWarning,
-    UnsupportedError,
 )
 from mbkit.load import xml_reader
 from mbkit.load.shapes import MassProperties, together
 from mbkit.load.urdf_reader import read_links
 from mbkit.model import Body, Model
+from mbkit.model.elements import paths
 from mbkit.model.validation import listing
 from mbkit.show.scene import SHAPES
 from mbkit.show.visuals import Shape, read_visuals
@@ -38,6 +38,12 @@ from mbkit.studies.lint.geometry import Geometry, geometry_of
 from mbkit.studies.lint.result import SURENESS, LintResult
 from mbkit.studies.results import provenance
 
+LINT: Final = paths.Path(
+    "lint",
+    "lint cannot judge",
+    paths.OF_BODIES,
+    notes=dict.fromkeys(("row", "speed"), "effort and damping: constraints share the forces"),
+)
 #: What the links of a body may differ by, as a whole, from the body itself.
 _SAME = 1e-6
 
@@ -95,10 +101,8 @@ def lint(
         model = _read(model, load)
     elif load:
         raise InputError(f"{', '.join(load)}: only for a name or a path; the model is loaded already")
-    if not model.has_bodies:
-        raise UnsupportedError(f"lint: {model.name} was written as energies and has no bodies to judge")
+    skipped = [*LINT.admit(model)]
     model = with_values(model, "lint")
-    skipped: list[str] = []
     links = _links(model)
     geometry = _geometry(links, skipped) if shapes else {}
     if not shapes:
@@ -177,9 +181,7 @@ def _geometry(links: Model, skipped: list[str]) -> dict[str, Geometry]:
 
 def _engine(model: Model, skipped: list[str]) -> Dynamics | None:
     try:
-        if model.constrained:
-            raise UnsupportedError("constraints share the forces")
-        return dynamics(model, PINOCCHIO)
+        return None if model.constrained else dynamics(model, PINOCCHIO)
     except MbkitError as error:
         skipped.append(f"effort and damping: {error}")
         return None

@@ -1,0 +1,136 @@
+"""Three mutations of each path, which its checks have to catch.
+
+*Dropped*: a gate that no longer takes a kind refuses it by name where the path is gone through, so the path asks its
+gate. *Admitted*: a gate lets a kind pass that it refuses, and the path is then wrong or ends with an error, so that the
+refusal is needed. *Removed*: the path sees a model without the part, and its truth has it, so that its check sees the
+part. `tests.test_mutations` runs some, and ``python -m validation.matrix`` all of them.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from unittest.mock import patch
+
+from mbkit.errors import UnsupportedError
+from mbkit.model.elements.kinds import PART_KINDS, Kind, kind
+from mbkit.model.elements.paths import PATHS as GATES
+from mbkit.model.elements.paths import Path as Gate
+from tests import kind_paths
+from tests.kind_examples import EXAMPLES, TYPES, Example
+from tests.kind_examples import example as known
+from tests.kind_paths import COLUMNS, _cell
+
+MUTATIONS = ("dropped", "admitted", "removed")
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """What came of a mutation of a kind on a path: "caught", "survives", or "without effect" by the path's quantity."""
+
+    mutation: str
+    kind: str
+    path: str
+    outcome: str
+    text: str = ""
+
+
+def checks() -> dict[str, kind_paths.Any]:
+    """Return the checks of gates by name, which import every path."""
+    from tests.test_matrix import CHECKS
+
+    return CHECKS
+
+
+@cache
+def _column_of(gate: str) -> str:
+    return next(name for name, c in COLUMNS.items() if gate in c.gates)
+
+
+def new(name: str) -> Example:
+    """Return a new example, whose model has not said yet what acts in it."""
+    return (EXAMPLES | TYPES)[name](name)
+
+
+@contextmanager
+def seen(x: Example) -> Iterator[None]:
+    """Let columns see an example in the place of its kind's own; their truths are kept."""
+
+    def forget() -> None:
+        kind_paths.engine.cache_clear()
+        kind_paths._kept.cache_clear()
+
+    forget()
+    with patch.object(kind_paths, "example", lambda name: x if name == x.name else known(name)):
+        yield
+    forget()
+
+
+def ends(path: str, x: Example, folder: Path, *, column: bool) -> tuple[str, str]:
+    """Return how a check ends: "right", "refused", or anything else, and its text."""
+    if column:
+        with seen(x):
+            out = _cell(x.name, path, folder)
+        return out.outcome, out.text
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            checks()[path](x.model, folder)
+        except UnsupportedError as error:
+            return "refused", str(error)
+        except Exception as error:
+            return "wrong", f"{type(error).__name__}: {error}"
+    return "right", ""
+
+
+def gone_through(gate: str, x: Example, folder: Path) -> tuple[str, str]:
+    if gate in checks():
+        return ends(gate, x, folder, column=False)
+    return ends(_column_of(gate), x, folder, column=True)
+
+
+def dropped(name: str, gate: str, folder: Path) -> Mutant | None:
+    """Take a kind out of a gate's set; None where it is not in it, or the path asks for more than the example has."""
+    own, x, takes = GATES[gate], new(name), Gate.takes
+    # The names of joint types of beams have their numbers.
+    gone = kind(next(k for k in x.model.acts if k.startswith(name)))
+    if not own.takes(gone) or own.refuses(x.model):
+        return None
+
+    def fewer(self: Gate, k: Kind) -> bool:
+        return not (self is own and k == gone) and takes(self, k)
+
+    with patch.object(Gate, "takes", fewer):
+        outcome, text = gone_through(gate, x, folder)
+    if outcome == "not asked":
+        return None
+    named = outcome == "refused" and any(gone.words.format(p=p) in text for p in gone.parts(x.model))
+    return Mutant("dropped", name, gate, "caught" if named else "survives", f"{outcome} {text}")
+
+
+def admitted(name: str, gate: str, folder: Path) -> Mutant | None:
+    """Let a model pass that a gate refuses; None where it takes the model."""
+    own, x, refuses = GATES[gate], new(name), Gate.refuses
+    if not own.refuses(x.model):
+        return None
+
+    def none(self: Gate, model: kind_paths.Any, words: str = "") -> str:
+        return "" if self is own else refuses(self, model, words)
+
+    with patch.object(Gate, "refuses", none):
+        outcome, text = gone_through(gate, x, folder)
+    if outcome == "not asked":
+        return None
+    return Mutant("admitted", name, gate, "survives" if outcome == "right" else "caught", f"{outcome} {text}")
+
+
+def removed(name: str, path: str, folder: Path, *, column: bool = True) -> Mutant | None:
+    """Take a part out of the model that a path sees, and is right with; None where it cannot be taken out."""
+    k, x = PART_KINDS.get(name), new(name)
+    if k is None or not k.features:
+        return None
+    outcome, text = ends(path, replace(x, model=k.removed(x.model)), folder, column=column)
+    return Mutant("removed", name, path, "survives" if outcome == "right" else "caught", f"{outcome} {text}")
