@@ -9,7 +9,7 @@ three angles. `tests.test_matrix` and `tests.kind_paths` share the examples.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -42,6 +42,8 @@ _STACKS: dict[str, tuple[tuple[str, Any], ...]] = {
         *(("revolute", _Z), ("revolute", _Y), ("revolute", _X)),
     ),
 }
+#: Axes of joint types with other ones than the first.
+AXES: dict[str, tuple[Any, ...]] = {"": ((0, 0.6, 0.8),), "universal": ((0, 0.6, 0.8), (1, 0, 0))}
 
 
 def _body_rates(q: np.ndarray) -> np.ndarray:
@@ -195,13 +197,13 @@ class Example:
 
 
 def _size(type_: str) -> int:
-    return len(_STACKS[type_]) if type_ != "fixed" else 0
+    return {"fixed": 0, "beam": 1}[type_] if type_ in ("fixed", "beam") else len(_STACKS[type_])
 
 
 class Arm:
     """Joints and bodies told twice: to a builder, and to the plain case."""
 
-    def __init__(self, name: str, *, gravity: bool = False) -> None:
+    def __init__(self, name: str, *, gravity: bool = False, rng: np.random.Generator | None = None) -> None:
         weight = GRAVITY if gravity else 0 * GRAVITY
         self.builder = mb.ModelBuilder(name.replace(".", "_").replace(" ", "_"), gravity=weight)
         none: list[Any] = []
@@ -210,18 +212,22 @@ class Arm:
             0, [], empty, [], empty, np.zeros(0), empty, [], none, np.zeros(0), np.zeros(0), np.zeros(0), TIME,
             np.zeros((0, 0)), np.zeros(0), [], {}, weight,
         )  # fmt: skip
-        self.name, self.last = name, {"world": -1}
+        self.name, self.last, self.rng = name, {"world": -1}, rng
         self.joints: list[tuple[str, str, int]] = []
+        #: First link and type of each joint.
+        self.link: dict[str, int] = {}
+        self.types: dict[str, str] = {}
 
     def add(
         self, joint: str, type_: str, parent: str, body: str, *, axes: tuple[Any, ...] = (_Y,), place: Any = (0, 0, 0),
         R: np.ndarray | None = None, mass: float = 1.0, com: Any = (0.1, 0, -0.3), inertia: Any = (0.1, 0.12, 0.05),
-        pitch: float = 0.0, mimic: tuple[str, float, float] | None = None, **numbers: Any,
+        mimic: tuple[str, float, float] | None = None, **numbers: Any,
     ) -> None:  # fmt: skip
         c, stack = self.case, _STACKS[type_]
         n, links, at = c.n, len(c.kinds), self.last[parent]
         where = {"rotation": np.eye(3) if R is None else R, "translation": place}
         one, two = (axes[0], axes[1]) if type_ == "universal" else (axes[0], None)
+        pitch = 0.2 if type_ == "helical" else 0.0
         named = type_ in ("revolute", "continuous", "prismatic", "helical", "universal")
         more = ({"axis": one} | ({"axis2": two} if two is not None else {})) if named else {}
         more |= {"pitch": pitch} if pitch else {}
@@ -242,20 +248,32 @@ class Arm:
             c.I.append(np.diag(inertia) if final else np.zeros((3, 3)))
             if pitch:
                 c.pitch[at] = pitch
-        self.last[body] = at
-        rows = np.zeros((len(stack), n))
+        self.last[body], self.link[joint], self.types[joint] = at, links, type_
+        rows, start = np.zeros((len(stack), n)), np.zeros(len(stack))
         if mimic:
-            rows[0, int(mimic[0][1:])] = mimic[1]
+            leader, ratio, offset = self.link[mimic[0]], *mimic[1:]
+            rows[0], start[0] = ratio * c.G[leader], ratio * c.c[leader] + offset
         free = 0 if mimic or type_ == "fixed" else len(stack)
         c.G = np.block([[c.G, np.zeros((links, free))], [rows, np.eye(len(stack), free)]])
-        c.c = np.append(c.c, np.array([mimic[2]]) if mimic else np.zeros(len(stack)))
+        c.c = np.append(c.c, start)
         k = np.arange(n, n + free)
-        c.q, c.v = np.append(c.q, 0.25 - 0.1 * (k % 5)), np.append(c.v, np.where(k % 2, -0.4, 0.5) + 0.07 * k)
+        q = 0.25 - 0.1 * (k % 5) if self.rng is None else self.rng.uniform(-0.8, 0.8, free)
+        c.q, c.v = np.append(c.q, q), np.append(c.v, np.where(k % 2, -0.4, 0.5) + 0.07 * k)
         if free:
             self.joints.append((joint, type_, n))
+        if numbers:
+            self.with_part(of_joint(joint, type_, links, numbers))
 
-    def index(self, joint: str) -> int:
-        return next(k for name, _, k in self.joints if name == joint)
+    def next(self, type_: str, parent: str, **numbers: Any) -> str:
+        """Add the joint and the body with the next number, and return the body's name."""
+        k = len(self.link)
+        self.add(f"j{k}", type_, parent, f"b{k}", **numbers)
+        return f"b{k}"
+
+    def hinge(self, k: int, parent: str) -> str:
+        """Add the k-th hinge of a limb, and return its body."""
+        axis = (0.6, 0, 0.8) if k % 3 == 1 else (0, 1, 0)
+        return self.next("revolute", parent, axes=(axis,), place=(0, 0.1, -0.5), mass=1.0 + k)
 
     def with_part(self, part: Part) -> None:
         self.case.parts.append(part)
@@ -266,7 +284,7 @@ class Arm:
         c = self.case
         c.v = c.allowed(c.t, c.q, c.v)
         model = self.builder.build()
-        assert list(model.joint_names) == [j for j, *_ in self.joints]
+        assert list(model.joint_names) == [j for j, *_ in self.joints], (model.joint_names, self.joints)
         tau = 0.3 - 0.2 * (np.arange(c.n) % 4)
         return Example(self.name, model, c, self.joints, tau, {b: k for b, k in self.last.items() if k >= 0}, words)
 
@@ -275,16 +293,18 @@ class Arm:
     def pose(self, body: str, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return (np.eye(3), np.zeros(3)) if body == "world" else self.case.poses(x)[self.last[body]]
 
+    def point(self, body: str, at: Any, x: np.ndarray) -> np.ndarray:
+        R, p = self.pose(body, x)
+        return p + R @ np.asarray(at)
+
     def moving(self, body: str, at: Any, x: np.ndarray) -> np.ndarray:
         return self.case.moving(self.last[body], at, x)
 
 
 def arm(name: str, hinges: int = 3, *, gravity: bool = False) -> Arm:
-    out = Arm(name, gravity=gravity)
+    out, body = Arm(name, gravity=gravity), "world"
     for k in range(hinges):
-        axis = (0.6, 0, 0.8) if k % 3 == 1 else (0, 1, 0)
-        parent = f"b{k - 1}" if k else "world"
-        out.add(f"j{k}", "revolute", parent, f"b{k}", axes=(axis,), place=(0, 0.1, -0.5), mass=1.0 + k)
+        body = out.hinge(k, body)
     return out
 
 
@@ -298,22 +318,25 @@ def with_joint(type_: str = "revolute", **numbers: Any) -> Callable[[str], Examp
         a = arm(name)
         place = {"mass": 0.7, "com": (0.1, 0.2, -0.1), "inertia": (0.1, 0.2, 0.25), "axes": ((0, 0.6, 0.8),)}
         a.add("x", type_, "b2", "x", **place, **numbers)
-        a.with_part(of_joint(a, type_, **numbers))
         return a.built()
 
     return make
 
 
-def of_joint(a: Arm, type_: str, **numbers: Any) -> Part:
-    """Return what numbers of joint "x" do, on its velocities E ẋ."""
-    if type_ == "fixed" or "mimic" in numbers:
-        return Part("x", ())
-    k, m = a.index("x"), _size(type_)
+def along(c: Case, x: np.ndarray, type_: str, link: int) -> np.ndarray:
+    """Return E with v = E ẋ of the joint whose links begin there: a ball's and a free body's are in its axes."""
+    E = c.G[link : link + _size(type_)]
+    at = np.flatnonzero(E[0])[0] if _size(type_) else 0
+    if type_ == "ball":
+        return _body_rates(x[at : at + 3]) @ E
+    if type_ == "free":
+        return np.vstack([_zyx(x[at + 3 : at + 6]).T @ E[:3], _body_rates(x[at + 3 : at + 6]) @ E[3:]])
+    return E
 
-    def E(c: Case, x: np.ndarray) -> np.ndarray:
-        out = np.zeros((m, c.n), dtype=x.dtype)
-        out[:, k : k + m] = _body_rates(x[k : k + 3]) if type_ == "ball" else np.eye(m)
-        return out
+
+def of_joint(joint: str, type_: str, link: int, numbers: dict[str, Any]) -> Part:
+    """Return what numbers of a joint do, on its velocities."""
+    m = _size(type_)
 
     def number(field: str) -> np.ndarray:
         return np.broadcast_to(np.asarray(numbers.get(field, 0.0), dtype=float), (m,))
@@ -322,242 +345,278 @@ def of_joint(a: Arm, type_: str, **numbers: Any) -> Part:
     s = number("stiction") if "stiction" in numbers else f
 
     def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        v = E(c, x) @ u
+        E = along(c, x, type_, link)
+        v = E @ u
         dry = f + (s - f) * np.exp(-((v / numbers.get("stribeck_velocity", 1.0)) ** 2))
-        return -E(c, x).T @ (damping * v + dry * np.sign(v))
-
-    return Part(
-        "x", (), force=force,
-        inertia=lambda c, x: E(c, x).T @ np.diag(number("armature")) @ E(c, x),
-        energy=lambda c, x: np.sum(stiffness * (x[k : k + m] - rest) ** 2) / 2,
-    )  # fmt: skip
-
-
-def _mimic(name: str) -> Example:
-    a = arm(name)
-    a.add("x", "revolute", "b2", "x", axes=((0, 0.6, 0.8),), mimic=("j0", 0.7, 0.2))
-    return a.built()
-
-
-def _rotor(name: str) -> Example:
-    """A body whose weight is held: its mass adds to T alone."""
-    a = arm(name, gravity=True)
-    a.builder.add_body("x", mass=0.3, inertia=0.3 * np.eye(3))
-    a.builder.add_joint("to_x", "fixed", parent="b2", child="x")
+        return -E.T @ (damping * v + dry * np.sign(v))
 
     def inertia(c: Case, x: np.ndarray) -> np.ndarray:
-        J, W = a.moving("b2", (0, 0, 0), x), c.turning(2, x)
-        return 0.3 * (J.T @ J + W.T @ W)
+        E = along(c, x, type_, link)
+        return E.T @ np.diag(number("armature")) @ E
 
-    a.with_part(Part("x", (), lambda b: b.add_gravity_compensation("x", 1.0), inertia=inertia))
-    return a.built()
+    def energy(c: Case, x: np.ndarray) -> Any:
+        return np.sum(stiffness * (c.G[link : link + m] @ x + c.c[link : link + m] - rest) ** 2) / 2
+
+    acting = {"force": force} if np.any([damping, f, s]) else {}
+    acting |= {"inertia": inertia} if np.any(number("armature")) else {}
+    return Part(joint, (), **acting, **({"energy": energy} if np.any(stiffness) else {}))
 
 
-def _compensation(without: tuple[str, ...] = ()) -> Callable[[str], Example]:
+@dataclass(frozen=True)
+class Site:
+    """Where a part of an arm stands: its name, a joint and others, and a body."""
+
+    name: str = "x"
+    joint: str = "j0"
+    others: tuple[str, ...] = ("j1", "j2")
+    body: str = "b2"
+
+
+def alone(
+    part: Callable[[Arm, Site], None], hinges: int = 3, *, gravity: bool = False, words: tuple[str, ...] = ()
+) -> Callable[[str], Example]:
+    """Return the maker of an arm with one part; without hinges the part begins at the world."""
+
     def make(name: str) -> Example:
-        a = arm(name, gravity=True)
-
-        def energy(c: Case, x: np.ndarray) -> Any:
-            return 0.8 * c.mass[2] * c.weight @ c.point("b2", c.com[2], x)
-
-        def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-            return -derivative(lambda y: energy(c, y), x) * [f"j{k}" not in without for k in range(3)]
-
-        acting = {"force": force} if without else {"energy": energy}
-        a.with_part(Part("x", (), lambda b: b.add_gravity_compensation("b2", 0.8, without=without), **acting))
-        return a.built()
+        a = arm(name, hinges, gravity=gravity)
+        part(a, Site() if hinges else Site(body="world"))
+        return a.built(words)
 
     return make
+
+
+def _mimic(a: Arm, at: Site) -> None:
+    a.add(at.name, "revolute", at.body, at.name, axes=((0, 0.6, 0.8),), mimic=(at.joint, 0.7, 0.2))
+
+
+def _rotor(a: Arm, at: Site) -> None:
+    """A body whose weight is held: its mass adds to T alone."""
+    a.builder.add_body(at.name, mass=0.3, inertia=0.3 * np.eye(3))
+    a.builder.add_joint(f"to_{at.name}", "fixed", parent=at.body, child=at.name)
+
+    def inertia(c: Case, x: np.ndarray) -> np.ndarray:
+        J, W = a.moving(at.body, (0, 0, 0), x), c.turning(a.last[at.body], x)
+        return 0.3 * (J.T @ J + W.T @ W)
+
+    a.with_part(Part(at.name, (), lambda b: b.add_gravity_compensation(at.name, 1.0), inertia=inertia))
+
+
+def _compensation(*, partial: bool = False) -> Callable[[Arm, Site], None]:
+    def part(a: Arm, at: Site) -> None:
+        k, without = a.last[at.body], (at.joint,) if partial else ()
+
+        def energy(c: Case, x: np.ndarray) -> Any:
+            return 0.8 * c.mass[k] * c.weight @ a.point(at.body, c.com[k], x)
+
+        def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+            left = [joint not in without for joint, type_, _ in a.joints for _ in range(_size(type_))]
+            return -derivative(lambda y: energy(c, y), x) * left
+
+        acting = {"force": force} if partial else {"energy": energy}
+        a.with_part(Part(at.name, (), lambda b: b.add_gravity_compensation(at.body, 0.8, without=without), **acting))
+
+    return part
 
 
 # Parts between bodies
 
 
-def _spring(stiffness: float = 0.0, damping: float = 0.0) -> Callable[[str], Example]:
-    def make(name: str) -> Example:
-        a, there = arm(name), np.array([1.0, 2.0, 3.0])
+def _spring(stiffness: float = 0.0, damping: float = 0.0) -> Callable[[Arm, Site], None]:
+    def part(a: Arm, at: Site) -> None:
+        there = np.array([1.0, 2.0, 3.0])
 
-        def length(c: Case, x: np.ndarray) -> Any:
-            return norm(c.point("b2", (0.1, 0, 0.2), x) - there)
+        def length(x: np.ndarray) -> Any:
+            return norm(a.point(at.body, (0.1, 0, 0.2), x) - there)
 
         def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-            J = derivative(lambda y: length(c, y), x)
+            J = derivative(length, x)
             return -damping * (J @ u) * J
 
-        ends = {"body_a": "world", "point_a": there, "body_b": "b2", "point_b": (0.1, 0, 0.2)}
+        ends = {"body_a": "world", "point_a": there, "body_b": at.body, "point_b": (0.1, 0, 0.2)}
         numbers = {"stiffness": stiffness, "rest_length": 0.5 if stiffness else 0.0, "damping": damping}
         a.with_part(
             Part(
-                "x",
+                at.name,
                 (),
-                lambda b: b.add_spring("x", **ends, **numbers),
-                energy=lambda c, x: stiffness / 2 * (length(c, x) - 0.5) ** 2,
+                lambda b: b.add_spring(at.name, **ends, **numbers),
+                energy=lambda c, x: stiffness / 2 * (length(x) - 0.5) ** 2,
                 force=force,
             )
         )
-        return a.built()
 
-    return make
+    return part
 
 
-def _coupling(**numbers: float) -> Callable[[str], Example]:
-    def make(name: str) -> Example:
-        a, row = arm(name), np.array([1.5, -0.5, 0.0])
-        k, d, i = (numbers.get(x, 0.0) for x in ("stiffness", "damping", "armature"))
+def _coupling(**numbers: float) -> Callable[[Arm, Site], None]:
+    def part(a: Arm, at: Site) -> None:
+        i, j = a.link[at.joint], a.link[at.others[0]]
+        k, d, m = (numbers.get(x, 0.0) for x in ("stiffness", "damping", "armature"))
+
+        def row(c: Case) -> np.ndarray:
+            return 1.5 * c.G[i] - 0.5 * c.G[j]
+
         a.with_part(
             Part(
-                "x",
+                at.name,
                 (),
-                lambda b: b.add_coupling("x", {"j0": 1.5, "j1": -0.5}, **numbers),
-                energy=lambda c, x: k / 2 * (row @ x) ** 2,
-                inertia=lambda c, x: i * np.outer(row, row),
-                force=lambda c, t, x, u: -d * (row @ u) * row,
+                lambda b: b.add_coupling(at.name, {at.joint: 1.5, at.others[0]: -0.5}, **numbers),
+                energy=lambda c, x: k / 2 * (row(c) @ x + 1.5 * c.c[i] - 0.5 * c.c[j]) ** 2,
+                inertia=lambda c, x: m * np.outer(row(c), row(c)),
+                force=lambda c, t, x, u: -d * (row(c) @ u) * row(c),
             )
         )
-        return a.built()
 
-    return make
+    return part
 
 
-def _bushing(name: str) -> Example:
-    a = arm(name)
+def _bushing(a: Arm, at: Site) -> None:
     k, d = np.arange(1.0, 7.0), 0.1 * np.arange(1.0, 7.0)
-    R_0, p_0 = a.pose("b2", a.case.q)
+    R_0, p_0 = a.pose(at.body, a.case.q)
     R_A, p_A = R_0 @ rotation(np.array([0.6, 0.0, 0.8]), 0.7), p_0 + np.array([0.1, -0.2, 0.1])
 
-    def displaced(c: Case, x: np.ndarray) -> np.ndarray:
-        R, p = c.poses(x)[2]
+    def displaced(x: np.ndarray) -> np.ndarray:
+        R, p = a.pose(at.body, x)
         B = R_A.T @ R
         angle = np.arccos((np.trace(B) - 1) / 2)
         turn = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
         return np.concatenate([R_A.T @ (p - p_A), turn * angle / (2 * np.sin(angle))])
 
     def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        J = derivative(lambda y: displaced(c, y), x)
+        J = derivative(displaced, x)
         return -J.T @ (d * (J @ u))
 
-    ends = {"body_a": "world", "rotation_a": R_A, "translation_a": p_A, "body_b": "b2"}
+    ends = {"body_a": "world", "rotation_a": R_A, "translation_a": p_A, "body_b": at.body}
     a.with_part(
         Part(
-            "x",
+            at.name,
             (),
-            lambda b: b.add_bushing("x", **ends, stiffness=k, damping=d),
-            energy=lambda c, x: np.sum(k * displaced(c, x) ** 2) / 2,
+            lambda b: b.add_bushing(at.name, **ends, stiffness=k, damping=d),
+            energy=lambda c, x: np.sum(k * displaced(x) ** 2) / 2,
             force=force,
         )
     )
-    return a.built()
 
 
-def _frame_force(name: str) -> Example:
-    a, F = arm(name), np.array([1.0, 2.0, 3.0])
+def _frame_force(a: Arm, at: Site) -> None:
+    F = np.array([1.0, 2.0, 3.0])
 
     def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        R, _ = c.poses(x)[2]
-        return c.moving(2, (0, 0, 0), x).T @ R @ F
+        return a.moving(at.body, (0, 0, 0), x).T @ a.pose(at.body, x)[0] @ F
 
-    a.with_part(Part("x", (), lambda b: b.add_force("x", "b2", force=F), force=force))
-    return a.built()
+    a.with_part(Part(at.name, (), lambda b: b.add_force(at.name, at.body, force=F), force=force))
 
 
-def _joint_force(name: str) -> Example:
-    a = arm(name)
-    unit = np.eye(3)[0]
+def _joint_force(a: Arm, at: Site) -> None:
+    """A force -q³ - v and the potential q⁴; of a quaternion's joint the force -v."""
+    k, type_ = a.link[at.joint], a.types[at.joint]
+    m, turns = _size(type_), type_ in ("ball", "free")
+    q, v = ca.SX.sym("q", m), ca.SX.sym("v", m)
+
+    def declare(b: mb.ModelBuilder) -> None:
+        if m == 1:
+            b.add_joint_force(at.name, at.joint, lambda t, q, v: -(q**3) - v, potential=lambda q: q**4)
+        else:
+            potential = {} if turns else {"potential": ca.sum1(q**4)}
+            b.add_joint_force(at.name, at.joint, -v if turns else -(q**3) - v, **potential)
+
+    def position(c: Case, x: np.ndarray) -> np.ndarray:
+        return 0.0 if turns else c.G[k : k + m] @ x + c.c[k : k + m]
+
+    def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        E = along(c, x, type_, k)
+        return -E.T @ (position(c, x) ** 3 + E @ u)
+
+    a.with_part(Part(at.name, (), declare, energy=lambda c, x: np.sum(position(c, x) ** 4), force=force))
+
+
+def _force_of_time(a: Arm, at: Site) -> None:
+    k, type_ = a.link[at.joint], a.types[at.joint]
+    m = _size(type_)
     a.with_part(
         Part(
-            "x",
+            at.name,
             (),
-            lambda b: b.add_joint_force("x", "j0", lambda t, q, v: -(q**3) - v, potential=lambda q: q**4),
-            energy=lambda c, x: x[0] ** 4,
-            force=lambda c, t, x, u: (-(x[0] ** 3) - u[0]) * unit,
+            lambda b: b.add_joint_force(at.name, at.joint, ca.vertcat(*[2 * ca.cos(3 * ca.SX.sym("t"))] * m)),
+            force=lambda c, t, x, u: 2 * np.cos(3 * t) * along(c, x, type_, k).sum(axis=0),
         )
     )
-    return a.built()
-
-
-def _force_of_time(name: str) -> Example:
-    a = arm(name)
-    a.with_part(
-        Part(
-            "x",
-            (),
-            lambda b: b.add_joint_force("x", "j0", lambda t, q, v: 2 * ca.cos(3 * t)),
-            force=lambda c, t, x, u: 2 * np.cos(3 * t) * np.eye(3)[0],
-        )
-    )
-    return a.built()
 
 
 # Rows
 
 
-def _loop(kind: str) -> Callable[[str], Example]:
-    def make(name: str) -> Example:
-        rng, n = np.random.default_rng(5), LOOPS[kind] + 1
-        a = Arm(name)
-        for k in range(n):
+def _loop(kind: str) -> Callable[[Arm, Site], None]:
+    """A limb that is closed at its end: what it hangs on stays free, and at the world one of its joints."""
+
+    def part(a: Arm, at: Site) -> None:
+        rng, parent = np.random.default_rng(5), at.body
+        for k in range(LOOPS[kind] + (parent == "world")):
             axis = rng.standard_normal(3)
             type_ = ("revolute", "prismatic")[k % 2]
             numbers = {"place": rng.uniform(-0.5, 0.5, 3), "R": rotation(_X, rng.uniform(-1, 1)), "mass": 1.0 + 0.2 * k}
-            axes = (axis / np.linalg.norm(axis),)
-            a.add(f"j{k}", type_, f"b{k - 1}" if k else "world", f"b{k}", axes=axes, **numbers)
-        a.with_part(loop_part(a.case, rng, kind, "x"))
-        return a.built()
+            parent = a.next(type_, parent, axes=(axis / np.linalg.norm(axis),), **numbers)
+        a.with_part(loop_part(a.case, rng, kind, at.name, parent, a.last[parent]))
 
-    return make
+    return part
 
 
-def _coupler(leaders: tuple[int, ...], ratio: Any, curve: float = 0.0) -> Callable[[str], Example]:
-    def make(name: str) -> Example:
-        a = arm(name)
-        q, r = a.case.q, np.broadcast_to(ratio, len(leaders))
-        free = [f"j{k}" for k in leaders]
-        start = q[0] - r @ q[[*leaders]] - curve * q[leaders[0]] ** 2
+def _coupler(leaders: int, ratio: Any, curve: float = 0.0) -> Callable[[Arm, Site], None]:
+    def part(a: Arm, at: Site) -> None:
+        free, r = at.others[:leaders], np.broadcast_to(ratio, leaders)
+        follower, led = a.link[at.joint], [a.link[x] for x in free]
+
+        def apart(c: Case, x: np.ndarray) -> Any:
+            y = c.G @ x + c.c
+            return y[follower] - r @ y[led] - curve * y[led[0]] ** 2
+
+        start = apart(a.case, a.case.q)
         given = {"ratio": ratio, "offset": start, "curve": (curve, 0.0, 0.0)}
         a.with_part(
             Part(
-                "x",
+                at.name,
                 (),
-                lambda b: b.add_coupler("x", "j0", free if len(free) > 1 else free[0], **given),
-                rows=lambda c, t, x: [x[0] - r @ x[[*leaders]] - curve * x[leaders[0]] ** 2 - start],
+                lambda b: b.add_coupler(at.name, at.joint, free if len(free) > 1 else free[0], **given),
+                rows=lambda c, t, x: [apart(c, x) - start],
             )
         )
-        return a.built()
 
-    return make
+    return part
 
 
-def _moved(kind: str) -> Callable[[str], Example]:
-    def make(name: str) -> Example:
-        a = arm(name)
-        start = a.case.q[0]
+def _moved(kind: str) -> Callable[[Arm, Site], None]:
+    def part(a: Arm, at: Site) -> None:
+        k, c = a.link[at.joint], a.case
+        start = c.G[k] @ c.q + c.c[k]
         table = CubicSpline([0.0, 1.0, 2.0], [start - 0.1, start + 0.4, start + 0.3], bc_type="natural")
         laws: dict[str, tuple[Callable[[Any], Any], Callable[[mb.ModelBuilder], None]]] = {
             "prescribed": (
                 lambda t: start - 0.2 + t + 0.3 * np.sin(2 * t + 0.1),
-                lambda b: b.prescribe("j0", offset=start - 0.2, rate=1.0, amplitude=0.3, frequency=2.0, phase=0.1),
+                lambda b: b.prescribe(at.joint, offset=start - 0.2, rate=1.0, amplitude=0.3, frequency=2.0, phase=0.1),
             ),
-            "formula": (lambda t: start - 0.05 + t**3, lambda b: b.prescribe("j0", lambda t: start - 0.05 + t**3)),
+            "formula": (
+                lambda t: start - 0.05 + t**3,
+                lambda b: b.prescribe(at.joint, lambda t: start - 0.05 + t**3),
+            ),
             "spline": (
                 lambda t: table.c[:, 0] @ [t**3, t**2, t, 1.0],
-                lambda b: b.prescribe("j0", ([0.0, 1.0, 2.0], table([0.0, 1.0, 2.0]))),
+                lambda b: b.prescribe(at.joint, ([0.0, 1.0, 2.0], table([0.0, 1.0, 2.0]))),
             ),
         }
         law, declare = laws[kind]
-        a.case.q[0] = law(TIME)
-        a.with_part(Part("x", (), declare, rows=lambda c, t, x: [x[0] - law(t)]))
-        return a.built(("'j0'",))
+        c.q[c.G[k] == 1] = law(TIME)
+        a.with_part(Part(at.name, (), declare, rows=lambda c, t, x: [c.G[k] @ x + c.c[k] - law(t)]))
 
-    return make
+    return part
 
 
-def _no_slip(kind: str) -> Callable[[str], Example]:
-    """A wheel, a ball or an edge at the end of an arm; the plane lies where its height is right."""
+def _no_slip(kind: str) -> Callable[[Arm, Site], None]:
+    """A wheel, a ball or an edge at the end of a limb; the plane lies where its height is right."""
 
-    def make(name: str) -> Example:
-        a, radius, axis = arm(name, 3 if kind == "blade" else 5), 0.3, np.array([0.0, 0.6, 0.8])
-        last = len(a.case.kinds) - 1
-        body, n = f"b{last}", np.array([0.0, 0.0, 1.0])
+    def part(a: Arm, at: Site) -> None:
+        radius, axis, body = 0.3, np.array([0.0, 0.6, 0.8]), at.body
+        for k in range((1 if kind == "blade" else 3) + 2 * (body == "world")):
+            body = a.hinge(k, body)
+        last, n = a.last[body], np.array([0.0, 0.0, 1.0])
 
         def contact(c: Case, x: np.ndarray) -> tuple[Any, np.ndarray]:
             """Return the height of the plane below the centre at contact, and the contact point from the centre."""
@@ -567,7 +626,7 @@ def _no_slip(kind: str) -> Callable[[str], Example]:
                 return radius, -radius * n
             return radius * norm(lowest), -radius * lowest / norm(lowest)
 
-        centre = a.case.point(body, (0, 0, 0), a.case.q)
+        centre = a.point(body, (0, 0, 0), a.case.q)
         floor = centre - contact(a.case, a.case.q)[0] * n
 
         def along(c: Case, x: np.ndarray) -> np.ndarray:
@@ -578,21 +637,20 @@ def _no_slip(kind: str) -> Callable[[str], Example]:
             return (J + np.stack([np.cross(w, r) for w in W.T], axis=-1))[:2]
 
         def height(c: Case, t: Any, x: np.ndarray) -> list[Any]:
-            return [n @ (c.point(body, (0, 0, 0), x) - floor) - contact(c, x)[0]]
+            return [n @ (a.point(body, (0, 0, 0), x) - floor) - contact(c, x)[0]]
 
         def declare(b: mb.ModelBuilder) -> None:
             if kind == "blade":
-                b.add_blade("x", body_a=body, axis_a=axis, speed=0.1)
+                b.add_blade(at.name, body_a=body, axis_a=axis, speed=0.1)
             else:
                 more = {"axis_a": axis} if kind == "disc" else {}
-                b.add_rolling("x", kind, body_a=body, radius=radius, translation_b=floor, **more)
+                b.add_rolling(at.name, kind, body_a=body, radius=radius, translation_b=floor, **more)
 
         height_row = None if kind == "blade" else height
         speed = 0.1 if kind == "blade" else 0.0
-        a.with_part(Part("x", (), declare, rows=height_row, speeds=along, speed=speed))
-        return a.built()
+        a.with_part(Part(at.name, (), declare, rows=height_row, speeds=along, speed=speed))
 
-    return make
+    return part
 
 
 # Joint types, and what no joint of one body is
@@ -603,52 +661,50 @@ def _of_type(type_: str) -> Callable[[str], Example]:
 
     def make(name: str) -> Example:
         a = Arm(name, gravity=True)
-        axes = ((0, 0.6, 0.8), (1, 0, 0)) if type_ == "universal" else ((0, 0.6, 0.8),)
-        more = {"pitch": 0.2} if type_ == "helical" else {}
-        a.add("x", type_, "world", "b0", axes=axes, mass=1.3, place=(0.1, 0.2, 0.3), R=rotation(_X, 0.4), **more)
+        a.add(
+            "x",
+            type_,
+            "world",
+            "b0",
+            axes=AXES.get(type_, AXES[""]),
+            mass=1.3,
+            place=(0.1, 0.2, 0.3),
+            R=rotation(_X, 0.4),
+        )
         a.add("j0", "revolute", "b0", "b1", axes=((0.8, 0, 0.6),), place=(0.2, -0.1, 0.3), mass=0.8)
         return a.built()
 
     return make
 
 
-class _Beam(Case):
-    """A hinge, and a beam of one shape √5 ξ² along y: closed form, with its shortening of second order."""
+def beam(a: Arm, at: Site) -> None:
+    """A beam of one shape √5 ξ² along y: closed form, with its shortening of second order."""
+    EI, density, k, n = 3.0, 0.8, a.last[at.body], a.case.n
+    xi, weights = np.polynomial.legendre.leggauss(12)
+    points = [*zip((xi + 1) / 2, density * weights / 2, strict=True)]
+    c = a.case
+    c.G, c.q, c.v = np.hstack([c.G, np.zeros((len(c.G), 1))]), np.append(c.q, 0.1), np.append(c.v, -0.5)
+    a.joints.append((at.name, "beam", n))
 
-    EI, density, length = 3.0, 0.8, 1.0
+    def places(x: np.ndarray, s: Any) -> np.ndarray:
+        return np.array([s - 10 / 3 * s**3 * x[n] ** 2, np.sqrt(5) * s**2 * x[n], 0 * s * x[n]])
 
-    def places(self, q: np.ndarray, s: Any) -> np.ndarray:
-        return np.array([s - 10 / 3 * s**3 * q[1] ** 2, np.sqrt(5) * s**2 * q[1], 0 * s * q[1]])
+    def inertia(c: Case, x: np.ndarray) -> Any:
+        M, (R, _) = np.zeros((c.n, c.n), dtype=x.dtype), c.poses(x)[k]
+        for s, mass in points:
+            J = c.moving(k, places(x, s), x)
+            J[:, n] += R @ np.array([-20 / 3 * s**3 * x[n], np.sqrt(5) * s**2, 0.0])
+            M = M + mass * J.T @ J
+        return M
 
-    def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        xi, w = np.polynomial.legendre.leggauss(12)
-        M = np.zeros((2, 2), dtype=q.dtype)
-        for s, weight in zip((xi + 1) / 2, w / 2, strict=True):
-            x, y, _ = self.places(q, s)
-            J = np.array([[-y, -20 / 3 * s**3 * q[1]], [x, np.sqrt(5) * s**2]])
-            M = M + self.density * weight * J.T @ J
-        # The hub, about its axis z, with its centre of mass at the axis.
-        return M + np.diag([0.05, 0.0])
+    def energy(c: Case, x: np.ndarray) -> Any:
+        return 10 * EI * x[n] ** 2 - sum(mass * c.weight @ a.point(at.body, places(x, s), x) for s, mass in points)
 
-    def potential(self, q: np.ndarray) -> Any:
-        xi, w = np.polynomial.legendre.leggauss(12)
-        R, weight = rotation(_Z, q[0]), 0.0
-        for s, part in zip((xi + 1) / 2, w / 2, strict=True):
-            weight = weight - self.density * part * self.weight @ (R @ self.places(q, s))
-        return weight + self.EI * 20 * q[1] ** 2 / 2
+    def declare(b: mb.ModelBuilder) -> None:
+        shapes = [Polynomial([0.0, 0.0, 1.0])]
+        b.add_beam(at.name, parent=at.body, length=1.0, stiffness=EI, density=density, shapes=shapes)
 
-
-def _beam(name: str) -> Example:
-    a = Arm(name, gravity=True)
-    a.add("j0", "revolute", "world", "b0", axes=((0, 0, 1),), mass=0.5, com=(0, 0, 0))
-    a.builder.add_beam(
-        "x", parent="b0", length=1.0, stiffness=_Beam.EI, density=_Beam.density, shapes=[Polynomial([0.0, 0.0, 1.0])]
-    )
-    model = a.builder.build()
-    c = _Beam(**{f: getattr(a.case, f) for f in a.case.__dataclass_fields__})
-    c.q, c.v = np.array([0.4, 0.1]), np.array([0.7, -0.5])
-    joints = [("j0", "revolute", 0), (model.joint_names[1], "revolute", 1)]
-    return Example(name, model, c, joints, np.array([0.3, -0.2]), {}, ("beam", "'x'"))
+    a.with_part(Part(at.name, (), declare, energy=energy, inertia=inertia))
 
 
 class _Pendulum(Case):
@@ -663,7 +719,7 @@ class _Pendulum(Case):
 
 def _energies(name: str) -> Example:
     a = arm(name, 1)
-    c = _Pendulum(**{f: getattr(a.case, f) for f in a.case.__dataclass_fields__})
+    c = _Pendulum(**{f.name: getattr(a.case, f.name) for f in fields(Case) if f.init})
     return Example(
         name, mb.lagrangian.systems.pendulum().model, c, a.joints, np.array([0.3]), {}, ("bodies", "energies")
     )
@@ -673,10 +729,13 @@ def _written(part: str) -> Callable[[str], Example]:
     """Return the maker of an example's equations on paper, which have the same motion."""
 
     def make(name: str) -> Example:
-        x = EXAMPLES[part](name)
-        return replace(x, model=mb.lagrangian.from_model(x.model).model, words=("energies", "bodies"))
+        return on_paper(EXAMPLES[part](name))
 
     return make
+
+
+def on_paper(x: Example) -> Example:
+    return replace(x, model=mb.lagrangian.from_model(x.model).model, words=("energies", "bodies"))
 
 
 NUMBERS: dict[str, dict[str, float]] = {
@@ -688,45 +747,62 @@ NUMBERS: dict[str, dict[str, float]] = {
     "velocity_limit": {"velocity_limit": 3.0},
     "effort_limit": {"effort_limit": 3.0},
 }
+SEVERAL: dict[str, tuple[str, dict[str, Any]]] = {
+    **{n: ("planar", {k: [y] * 3 for k, y in x.items()}) for n, x in NUMBERS.items()},
+    "armature": ("ball", NUMBERS["armature"]),
+    "damping": ("ball", NUMBERS["damping"]),
+}
+STICTION = {"friction": 0.2, "stiction": 0.4, "stribeck_velocity": 0.5}
+#: Parts that stand on an arm, alone or with others, by kind; those with gravity hold weights.
+PARTS: dict[str, Callable[[Arm, Site], None]] = {
+    "mimic": _mimic,
+    "point.spring": _spring(stiffness=3.0),
+    "point.damper": _spring(damping=0.3),
+    "coupling.spring": _coupling(stiffness=3.0),
+    "coupling.damper": _coupling(damping=0.3),
+    "coupling.armature": _coupling(armature=0.3),
+    "coupler": _coupler(1, 2.0),
+    "coupler.curve": _coupler(1, 1.0, 0.3),
+    "coupler.several": _coupler(2, (0.4, 0.7)),
+    **{f"motion.{x}": _moved(x) for x in ("prescribed", "formula", "spline")},
+    "force.joint": _joint_force,
+    "force.frame": _frame_force,
+    "force.bushing": _bushing,
+    "force.of_time": _force_of_time,
+}
+WEIGHTS: dict[str, Callable[[Arm, Site], None]] = {
+    "body.rotor": _rotor,
+    "force.compensation": _compensation(),
+    "force.compensation.partial": _compensation(partial=True),
+}
+#: Parts with a limb of their own.
+LIMBS: dict[str, Callable[[Arm, Site], None]] = {
+    **{f"loop.{x}": _loop(x) for x in LOOPS},
+    **{f"no_slip.{x}": _no_slip(x) for x in ("blade", "disc", "sphere")},
+}
 EXAMPLES: dict[str, Callable[[str], Example]] = {
     "energies": _energies,
     "written.row": _written("loop.distance"),
     "written.speed": _written("no_slip.blade"),
     "written.t": _written("force.of_time"),
     "gravity": lambda name: arm(name, gravity=True).built(("gravity",)),
-    "body.rotor": _rotor,
-    "mimic": _mimic,
     **{f"joint.{name}": with_joint(**x) for name, x in NUMBERS.items()},
-    **{f"joint.{n}.several": with_joint("planar", **{k: [y] * 3 for k, y in x.items()}) for n, x in NUMBERS.items()},
-    "joint.armature.several": with_joint("ball", armature=0.3),
-    "joint.damping.several": with_joint("ball", damping=0.4),
-    "joint.stiction": with_joint(friction=0.2, stiction=0.4, stribeck_velocity=0.5),
-    "point.spring": _spring(stiffness=3.0),
-    "point.damper": _spring(damping=0.3),
-    "coupling.spring": _coupling(stiffness=3.0),
-    "coupling.damper": _coupling(damping=0.3),
-    "coupling.armature": _coupling(armature=0.3),
-    **{f"loop.{x}": _loop(x) for x in LOOPS},
-    "coupler": _coupler((1,), 2.0),
-    "coupler.curve": _coupler((1,), 1.0, 0.3),
-    "coupler.several": _coupler((1, 2), (0.4, 0.7)),
-    **{f"motion.{x}": _moved(x) for x in ("prescribed", "formula", "spline")},
-    **{f"no_slip.{x}": _no_slip(x) for x in ("blade", "disc", "sphere")},
-    "force.joint": _joint_force,
-    "force.frame": _frame_force,
-    "force.bushing": _bushing,
-    "force.compensation": _compensation(),
-    "force.compensation.partial": _compensation(("j0",)),
-    "force.of_time": _force_of_time,
+    **{f"joint.{name}.several": with_joint(type_, **x) for name, (type_, x) in SEVERAL.items()},
+    "joint.stiction": with_joint(**STICTION),
+    **{k: alone(part, words=("'j0'",) if "motion" in k else ()) for k, part in PARTS.items()},
+    **{k: alone(part, gravity=True) for k, part in WEIGHTS.items()},
+    **{k: alone(part, 0) for k, part in LIMBS.items()},
 }
 #: Joint types are kinds by themselves; those of beams have names of their numbers.
 TYPES: dict[str, Callable[[str], Example]] = {
     **{f"joint_type.{x}": _of_type(x) for x in _STACKS},
-    "joint_type.beam": _beam,
+    "joint_type.beam": alone(lambda a, at: beam(a, replace(at, body="b0")), 1, gravity=True, words=("beam", "'x'")),
 }
+#: Examples of several kinds by name, of `tests.kind_pairs`.
+TOGETHER: dict[str, Callable[[str], Example]] = {}
 
 
 @cache
 def example(name: str) -> Example:
-    """Return the example of a kind of part or of a joint type."""
-    return (EXAMPLES | TYPES)[name](name)
+    """Return the example of a kind of part, of a joint type, or of several."""
+    return (EXAMPLES | TYPES | TOGETHER)[name](name)

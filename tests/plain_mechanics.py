@@ -84,6 +84,7 @@ class Case:
     #: Advance of each link that is a screw, m/rad.
     pitch: dict[int, float] = field(default_factory=dict)
     weight: np.ndarray = field(default_factory=lambda: GRAVITY)
+    _at: tuple[Any, Any] = field(default=(None, None), init=False, repr=False, compare=False)
 
     @property
     def n(self) -> int:
@@ -112,6 +113,10 @@ class Case:
     # Kinematics
 
     def poses(self, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return R and p of each link; those of the last q are kept."""
+        key = q.tobytes(), len(self.kinds)
+        if self._at[0] == key:
+            return self._at[1]
         x = self.G @ q + self.c
         out: list[tuple[np.ndarray, np.ndarray]] = []
         for k, kind in enumerate(self.kinds):
@@ -123,6 +128,7 @@ class Case:
             if kind == "revolute":
                 R = R @ rotation(self.axes[k], x[k])
             out.append((R, p))
+        self._at = key, out
         return out
 
     def way(self, k: int) -> list[int]:
@@ -140,21 +146,18 @@ class Case:
 
     def turning(self, k: int, q: np.ndarray) -> np.ndarray:
         """Return the angular Jacobian of body k, (3, n); it stays exact for complex q."""
-        J = np.zeros((3, len(self.kinds)), dtype=q.dtype)
-        poses = self.poses(q)
-        for i in self.way(k):
-            if self.kinds[i] == "revolute":
-                J[:, i] = poses[i][0] @ self.axes[i]
+        J, poses, way = np.zeros((3, len(self.kinds)), dtype=q.dtype), self.poses(q), self.way(k)
+        J[:, way] = np.stack([poses[i][0] @ self.axes[i] * (self.kinds[i] == "revolute") for i in way], axis=-1)
         return J @ self.G
 
     def moving(self, k: int, at: Any, q: np.ndarray) -> np.ndarray:
         """Return the linear Jacobian of a point of body k, (3, n)."""
-        J, x = np.zeros((3, len(self.kinds)), dtype=q.dtype), self.point(f"b{k}", at, q)
-        poses = self.poses(q)
-        for i in self.way(k):
-            R, p = poses[i]
-            a = R @ self.axes[i]
-            J[:, i] = np.cross(a, x - p) + self.pitch.get(i, 0.0) * a if self.kinds[i] == "revolute" else a
+        J, poses, way = np.zeros((3, len(self.kinds)), dtype=q.dtype), self.poses(q), self.way(k)
+        a = np.stack([poses[i][0] @ self.axes[i] for i in way])
+        arms = poses[k][1] + poses[k][0] @ np.asarray(at) - np.stack([poses[i][1] for i in way])
+        turns = np.array([[self.kinds[i] == "revolute"] for i in way])
+        advance = np.array([[self.pitch.get(i, 0.0)] for i in way])
+        J[:, way] = np.where(turns, np.cross(a, arms) + advance * a, a).T
         return J @ self.G
 
     # Equations
@@ -197,7 +200,7 @@ class Case:
                 step = s + 1j * _STEP
                 return np.imag(self.rows(t + step, q + step * v)) / _STEP
 
-            d = 1e-3
+            d = 3e-4
             bias = (8 * (rate(d) - rate(-d)) - (rate(2 * d) - rate(-2 * d))) / (12 * d)
         for part in self.parts:
             if part.speeds is not None:
@@ -408,10 +411,12 @@ def _prescribed(case: Case, rng: np.random.Generator) -> Part:
     )  # fmt: skip
 
 
-def loop_part(case: Case, rng: np.random.Generator, kind: str, name: str = "lp") -> Part:
-    """Return a closure between the ground and the last body that is closed where the case stands."""
-    last = f"b{len(case.kinds) - 1}"
-    R_0, p_0 = case.pose(last, case.q)
+def loop_part(
+    case: Case, rng: np.random.Generator, kind: str, name: str = "lp", body: str = "", link: int = -1
+) -> Part:
+    """Return a closure between the ground and a body, by default the last, that is closed where the case stands."""
+    last = body or f"b{len(case.kinds) - 1}"
+    R_0, p_0 = case.poses(case.q)[link]
     R_B, p_B = _turn(rng), rng.uniform(-0.3, 0.3, 3)
     R_A, p_A, length = R_0 @ R_B, p_0 + R_0 @ p_B, 0.0
     if kind == "distance":
@@ -425,7 +430,7 @@ def loop_part(case: Case, rng: np.random.Generator, kind: str, name: str = "lp")
         R_A = R_A @ rotation(np.array([1.0, 0.0, 0.0]), np.pi / 2)
 
     def rows(c: Case, t: Any, q: np.ndarray) -> list[Any]:
-        R, p = c.pose(last, q)
+        R, p = c.poses(q)[link]
         A, B, gap = R_A, R @ R_B, p + R @ p_B - p_A
         across, sideways = [A[:, 0] @ B[:, 2], A[:, 1] @ B[:, 2]], [A[:, 0] @ gap, A[:, 1] @ gap]
         welded = [A[:, 0] @ B[:, 1], A[:, 1] @ B[:, 2], A[:, 2] @ B[:, 0]]
