@@ -16,7 +16,7 @@ import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.model import Coupler
 from mbkit.studies.baseline.description import changes, described
-from mbkit.studies.importers.loops import WrittenLoops, coupler_differences
+from mbkit.studies.importers.loops import Written, coupler_differences
 from tests.random_trees import IN_MUJOCO, coupled, off, random_tree
 from tests.scenes import chain
 from tests.test_loops_pinocchio import against_34_digits
@@ -299,8 +299,7 @@ def test_an_epicyclic_train_on_paper(rows: str) -> None:
 
 def differ(a: Coupler, b: Coupler) -> list[tuple[float, str, str]]:
     names = {x: x for x in "abc"}
-    written = WrittenLoops(couplers=[a], every_coupler=[a])
-    return coupler_differences(written, mb.catalog.double_pendulum(), [b], names, 1e-12)
+    return coupler_differences(Written([a], [a]), mb.catalog.double_pendulum(), [b], names, 1e-12)
 
 
 def test_a_row_is_the_same_whichever_of_its_joints_is_called_the_first() -> None:

@@ -12,9 +12,11 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import ModelError
+from mbkit.model import Loop
+from mbkit.studies.explain.loop_differences import moved
 from mbkit.studies.explain.merged_model import Tolerances
 from mbkit.studies.importers import study
-from mbkit.studies.importers.loops import Closure, WrittenLoops, coupler_differences, difference, loop_differences
+from mbkit.studies.importers.loops import Written, coupler_differences, loop_differences
 from mbkit.studies.importers.result import ParserComparison, Stage
 
 BODY = '<inertial pos=".2 0 0" mass="1" diaginertia=".1 .1 .1"/>'
@@ -154,27 +156,27 @@ def pose(angle: float, *point: float) -> np.ndarray:
     return X
 
 
-def closure(kind: str, a: np.ndarray, b: np.ndarray) -> Closure:
-    return Closure("x", kind, ("", "j"), np.array([a, b]))
+def closure(kind: str, a: np.ndarray, b: np.ndarray) -> Loop:
+    return Loop("x", kind, "", a[:3, :3], a[:3, 3], "j", b[:3, :3], b[:3, 3])
 
 
 def test_either_end_counts_and_the_frame_in_which_a_weld_is_written_does_not() -> None:
     a, b = pose(0.3, 1, 2, 3), pose(-0.2, 0, 1, 0)
     other = pose(1.1, 0.4, -0.7, 0.2)
-    far, turn = difference(closure("frame", a, b), closure("frame", a @ other, b @ other))
+    far, turn = moved(closure("frame", a, b), closure("frame", a @ other, b @ other))
     assert max(far, turn) < 1e-15 * 10
-    assert difference(closure("frame", a, b), closure("frame", a @ pose(0.25, 0, 0, 0), b)) == pytest.approx(
+    assert moved(closure("frame", a, b), closure("frame", a @ pose(0.25, 0, 0, 0), b)) == pytest.approx(
         (0.0, 0.25), abs=1e-14
     )
     for ends in ((a @ pose(0, 0.5, 0, 0), b), (a, b @ pose(0, 0.5, 0, 0))):
         for kind in ("point", "frame"):
-            assert difference(closure(kind, a, b), closure(kind, *ends)) == pytest.approx((0.5, 0.0), abs=1e-14)
+            assert moved(closure(kind, a, b), closure(kind, *ends)) == pytest.approx((0.5, 0.0), abs=1e-14)
 
 
 def test_loops_are_paired_with_the_nearest_and_the_rest_is_named() -> None:
     near = Tolerances(1e-9, 1.0)
     one, two, off = (closure("point", pose(0, x, 0, 0), pose(0, x, 0, 0)) for x in (0.0, 1.0, 5.0))
-    written = WrittenLoops([one, two], [one, off, two])
+    written = Written([one, two], [one, off, two])
     assert not loop_differences(written, [two, one], near)
     assert [says for *_, says in loop_differences(written, [two], near)] == ["missing"]
     assert [says for *_, says in loop_differences(written, [off, two, one], near)] == ["inactive, read as active"]
@@ -212,7 +214,7 @@ def test_a_coupler_s_numbers_are_those_of_either_of_its_joints(swapped: bool) ->
     written = mb.model.Coupler("c", "a", "b", -0.5, 0.1)
     read = mb.model.Coupler("", "y", "x", -2.0, 0.2) if swapped else mb.model.Coupler("", "x", "y", -0.5, 0.1)
     names, plain = {"x": "a", "y": "b"}, mb.catalog.double_pendulum()
-    loops = WrittenLoops(couplers=[written], every_coupler=[written])
+    loops = Written([written], [written])
     assert coupler_differences(loops, plain, [read], names, 1e-12) == []
     for change in ({"ratio": read.ratio * (1 + 1e-6)}, {"offset": read.offset + 1e-6}):
         ((size, where, says),) = coupler_differences(loops, plain, [replace(read, **change)], names, 1e-9)
@@ -221,7 +223,7 @@ def test_a_coupler_s_numbers_are_those_of_either_of_its_joints(swapped: bool) ->
         assert "ratio" in says
     ((_, _, says),) = coupler_differences(loops, plain, [read, read], names, 1e-9)
     assert says == "not in the file"
-    off = WrittenLoops(every_coupler=[written])
+    off = Written(every=[written])
     ((_, _, says),) = coupler_differences(off, plain, [read], names, 1e-9)
     assert says == "inactive, read as active"
 
@@ -253,5 +255,5 @@ def test_mimic_joints_may_be_held_by_couplers_also_in_a_chain(tmp_path: Path) ->
     model, names = mb.load(path), {x: x for x in ("ja", "jb", "jc")}
     for ratio, offset, right in ((-0.5, 0.2, True), (0.5, 0.2, False), (-0.5, 0.3, False)):
         read = mb.model.Coupler("", "jc", "jb", ratio, offset)
-        some = coupler_differences(WrittenLoops(), model, [read], names, 1e-9)
+        some = coupler_differences(Written(), model, [read], names, 1e-9)
         assert [says for _, _, says in some] == ([] if right else ["other numbers than the file's mimic joints"])

@@ -85,11 +85,10 @@ class Imported:
     #: The importer's messages, and parts of its model that are in none of the terms.
     notes: tuple[str, ...]
     beside: tuple[Beside, ...] = ()
-    #: Points and frames of its bodies that the importer holds together, outside of all terms; where the engine does
-    #: not give them, why.
-    loops: tuple[Loop, ...] | str = ()
-    #: Fixed ratios of two coordinates that it holds, outside of all terms.
-    couplers: tuple[Coupler, ...] = ()
+    #: The loops and couplers that the importer holds, outside of all terms.
+    constraints: tuple[Loop | Coupler, ...] = ()
+    #: Why its loops are not among them, where the engine does not give them.
+    hidden: str = ""
     holds_mimics: str = ""
 
 

@@ -80,8 +80,8 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
         notes.append(f"{plant.num_constraints()} constraints, outside M and nle")
     # A plant counts its constraints, those of a URDF's mimic joints among them.
     other = plant.num_constraints() > (text.count("<mimic") if format_ == "urdf" else 0)
-    loops = "pydrake does not give the bodies and points of constraints" if other else ()
-    return Imported(model, dyn.terms, tuple(notes), loops=loops, holds_mimics=held)
+    hidden = "pydrake does not give the bodies and points of constraints" if other else ""
+    return Imported(model, dyn.terms, tuple(notes), hidden=hidden, holds_mimics=held)
 
 
 def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> ModelBuilder:

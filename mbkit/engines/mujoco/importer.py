@@ -70,9 +70,9 @@ class Described:
         """Return the reading, with the terms of the engine that holds it and what it said."""
         own = self._description
         beside = tuple(x._replace(without=own.without(x.key)) if x.key in own.parts else x for x in self._beside)
-        couplers = own.couplers()
-        held = "by soft equality constraints" if couplers else ""
-        return Imported(self.model, terms, (*self._constraints, *said), beside, own.loops(), couplers, held)
+        constraints = own.constraints()
+        held = "by soft equality constraints" if any(isinstance(x, Coupler) for x in constraints) else ""
+        return Imported(self.model, terms, (*self._constraints, *said), beside, constraints, "", held)
 
 
 def _floating(text: str) -> Any:
@@ -250,48 +250,42 @@ class _Description:
         tree = replace(self._tree, springs=springs, forces=held)
         return with_couplings(tree, [x for x in kept if isinstance(x, JointCoupling)])
 
-    def loops(self) -> tuple[Loop, ...]:
-        """Return the active equalities of two bodies or sites, in the bodies' axes."""
-        m, kinds = self.m, {int(mujoco.mjtEq.mjEQ_CONNECT): "point", int(mujoco.mjtEq.mjEQ_WELD): "frame"}
-        out = []
-        for i in self._equalities():
-            kind = kinds.get(int(m.eq_type[i]))
-            if kind is None:
-                continue
-            objects, data, still = (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])), np.array(m.eq_data[i]), np.eye(3)
-            if m.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:
-                ends = [(int(m.site_bodyid[s]), matrix_of(m.site_quat[s]), np.array(m.site_pos[s])) for s in objects]
-            elif kind == "point":
-                ends = [(objects[0], still, data[:3]), (objects[1], still, data[3:6])]
-            else:
-                # The relative pose is of the second body's axes, at its anchor.
-                ends = [(objects[0], matrix_of(data[6:10]), data[3:6]), (objects[1], still, data[:3])]
-            a, b = ((self.names[k], R, p - self.anchors[k]) for k, R, p in ends)
-            out.append(Loop(m.eq(i).name, kind, *a, *b))
-        return tuple(out)
+    def constraints(self) -> tuple[Loop | Coupler, ...]:
+        """Return the active equalities of bodies and sites, in the bodies' axes, and those of joints and tendons."""
+        off = self._off("EQUALITY") or self._off("CONSTRAINT")
+        active = [i for i in range(self.m.neq) if self.m.eq_active0[i] and not off]
+        return tuple(x for i in active if (x := self._loop(i) or self._coupler(i)))
 
-    def couplers(self) -> tuple[Coupler, ...]:
-        """Return the active equalities that hold joints, of joints and of tendons."""
-        m, out = self.m, []
-        names = {j: name for name, j in self.numbers.items()}
+    def _loop(self, i: int) -> Loop | None:
+        m, kinds = self.m, {int(mujoco.mjtEq.mjEQ_CONNECT): "point", int(mujoco.mjtEq.mjEQ_WELD): "frame"}
+        kind = kinds.get(int(m.eq_type[i]))
+        if kind is None:
+            return None
+        objects, data, still = (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])), np.array(m.eq_data[i]), np.eye(3)
+        if m.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:
+            ends = [(int(m.site_bodyid[s]), matrix_of(m.site_quat[s]), np.array(m.site_pos[s])) for s in objects]
+        elif kind == "point":
+            ends = [(objects[0], still, data[:3]), (objects[1], still, data[3:6])]
+        else:
+            # The relative pose is of the second body's axes, at its anchor.
+            ends = [(objects[0], matrix_of(data[6:10]), data[3:6]), (objects[1], still, data[:3])]
+        a, b = ((self.names[k], R, p - self.anchors[k]) for k, R, p in ends)
+        return Loop(m.eq(i).name, kind, *a, *b)
+
+    def _coupler(self, i: int) -> Coupler | None:
+        m, names = self.m, {j: name for name, j in self.numbers.items()}
         refs = {name: float(m.qpos0[m.jnt_qposadr[j]]) for name, j in self.numbers.items()}
         kinds = {int(mujoco.mjtEq.mjEQ_JOINT): lambda j: {j: 1.0}, int(mujoco.mjtEq.mjEQ_TENDON): self._row}
-        for i in self._equalities():
-            of = kinds.get(int(m.eq_type[i]))
-            if of is None:
-                continue
-            rows = [of(k) for k in (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])) if k >= 0]
-            sides = [{names[j]: x for j, x in row.items() if x} for row in rows]
-            held = coupled(sides, m.eq_data[i][:5].tolist(), refs) if all(sides) else ""
-            if not isinstance(held, str):
-                joint, leaders, ratios, offset, curve = held
-                out.append(Coupler(m.eq(i).name, joint, tuple(leaders), np.array(ratios), offset, np.array(curve)))
-        return tuple(out)
-
-    def _equalities(self) -> list[int]:
-        if self._off("EQUALITY") or self._off("CONSTRAINT"):
-            return []
-        return [i for i in range(self.m.neq) if self.m.eq_active0[i]]
+        of = kinds.get(int(m.eq_type[i]))
+        if of is None:
+            return None
+        rows = [of(k) for k in (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])) if k >= 0]
+        sides = [{names[j]: x for j, x in row.items() if x} for row in rows]
+        held = coupled(sides, m.eq_data[i][:5].tolist(), refs) if all(sides) else ""
+        if isinstance(held, str):
+            return None
+        joint, leaders, ratios, offset, curve = held
+        return Coupler(m.eq(i).name, joint, tuple(leaders), np.array(ratios), offset, np.array(curve))
 
     def _off(self, flag: str) -> bool:
         return bool(self.m.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")))

@@ -27,9 +27,10 @@ def read(text: str, format_: str, floating_base: bool = False, files: dict[str, 
     except Exception as error:
         raise UnsupportedError(f"pinocchio: {' '.join(str(error).split())}") from None
     described = _Description(raw)
-    loops = held if isinstance(held, str) else described.loops(held)
-    notes = (*_beside(raw), *([held] if isinstance(held, str) else []))
-    return Imported(checked("pinocchio", described.model), described.terms, notes, loops=loops)
+    hidden = held if isinstance(held, str) else ""
+    notes = (*_beside(raw), *([hidden] if hidden else []))
+    loops = () if isinstance(held, str) else described.loops(held)
+    return Imported(checked("pinocchio", described.model), described.terms, notes, (), loops, hidden)
 
 
 def _urdf(text: str, floating_base: bool) -> Any:

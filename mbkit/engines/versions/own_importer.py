@@ -70,10 +70,8 @@ class _Read(VersionDynamics):
         notes = [*said["notes"]]
         if said["loops"]:
             notes.append(f"joints that close a loop, in none of the terms: {', '.join(said['loops'])}")
-        couplers = tuple(Coupler(*x) for x in said["couplers"])
-        return Imported(
-            self.model, self.terms, tuple(notes), couplers=couplers, holds_mimics=said["holds"] * bool(couplers)
-        )
+        held = tuple(Coupler(*x) for x in said["mimics"])
+        return Imported(self.model, self.terms, tuple(notes), (), held, holds_mimics=said["holds"] * bool(held))
 
     def _travelling(self) -> tuple[dict[str, Any], Mapping[str, Sequence[str]]]:
         return {}, {j.name: (j.name,) for j in self.model.joints}

@@ -24,7 +24,7 @@ from mbkit.model.elements.formula import NUMPY, Formula
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
 from mbkit.model.elements.references import called
 from mbkit.model.parts import Coupler, Loop, rules_of
-from mbkit.studies.explain.loop_differences import loop_differences, same_loop
+from mbkit.studies.explain.loop_differences import angle_of, axis_times_sine, loop_differences, same_loop
 from mbkit.studies.explain.merged_model import OTHERS, LinkInBody, MergedModel, Tolerances, composite
 
 _WATER: Final = 1000.0  # kg/m³
@@ -84,15 +84,6 @@ class Hypothesis:
         """Return the hypothesis with fewer fields."""
         ours, theirs = ({k: x for k, x in (s or {}).items() if k not in names} for s in (self.ours, self.theirs))
         return replace(self, ours=ours, theirs=theirs)
-
-
-def angle_of(R: Array) -> float:
-    """Return the angle of a rotation, rad."""
-    return float(np.arctan2(np.linalg.norm(_axis_times_sine(R)), np.trace(R) - 1))
-
-
-def _axis_times_sine(R: Array) -> Array:
-    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
 
 
 def number_text(value: Any) -> str:
@@ -437,7 +428,7 @@ def _moved(name: str, a: Joint, b: Joint, near: Tolerances) -> Mistake:
         angle = angle_of(R)
         zero = a.type.axial and a.type.rotates and np.allclose(R @ a.axes[0], a.axes[0], atol=1e-9)
         if zero:
-            angle = float(np.copysign(angle, _axis_times_sine(R) @ a.axes[0]))
+            angle = float(np.copysign(angle, axis_times_sine(R) @ a.axes[0]))
         amount = f"{number_text(angle)} rad ({number_text(angle / _DEGREE)}°)"
         if zero:
             return Mistake("zero position", f"counts from {amount} further on", value)

@@ -37,6 +37,22 @@ def loop_differences(a: Loop, b: Loop, near: Tolerances) -> list[str]:
     return min((list(_differences(a, x, near)) for x in (b, exchanged(b))), key=len)
 
 
+def moved(a: Loop, b: Loop) -> tuple[float, float]:
+    """Return by how much the ends of `b` are moved and turned against those of `a`, of one kind, in m and rad."""
+    far = max(float(np.linalg.norm(x)) for x in _shifts(a, b).values())
+    return far, angle_of(_turn(a, b)) if a.kind in WELDED else 0.0
+
+
+def angle_of(R: Array) -> float:
+    """Return the angle of a rotation, rad."""
+    return float(np.arctan2(np.linalg.norm(axis_times_sine(R)), np.trace(R) - 1))
+
+
+def axis_times_sine(R: Array) -> Array:
+    """Return twice the axis of a rotation times the sine of its angle, (3,)."""
+    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+
+
 def _differences(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
     if a.kind != b.kind:
         yield f"closes it as {b.kind} for {a.kind}"
@@ -67,14 +83,17 @@ def _shifts(a: Loop, b: Loop) -> dict[str, Array]:
         return {side: x - axes[side] * along for side, x in out.items()}
     if a.kind == WELDED[0]:
         # Any point of two bodies that are welded may be called theirs.
-        return {"a": out["a"] - a.rotation_a @ a.rotation_b.T @ out["b"], "b": np.zeros(3)}
+        return {"a": out["a"] - b.rotation_a @ b.rotation_b.T @ out["b"], "b": np.zeros(3)}
     return out
 
 
+def _turn(a: Loop, b: Loop) -> Array:
+    return np.asarray((a.rotation_a @ a.rotation_b.T).T @ b.rotation_a @ b.rotation_b.T)
+
+
 def _turned(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
-    if a.kind in WELDED and not near.vector(a.rotation_a @ a.rotation_b.T, b.rotation_a @ b.rotation_b.T):
-        R = (a.rotation_a @ a.rotation_b.T).T @ b.rotation_a @ b.rotation_b.T
-        yield f"turns its ends by {_degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))} against each other"
+    if a.kind in WELDED and not near.vector(_turn(a, b), np.eye(3)):
+        yield f"turns its ends by {_degrees(angle_of(_turn(a, b)))} against each other"
     if a.kind not in (*HINGED, *SLIDING, CROSSED):
         return
     own, other = ([getattr(x, f"rotation_{side}")[:, 2] for side in "ab"] for x in (a, b))

@@ -185,20 +185,21 @@ def _with_own_frames(model: Model) -> Model:
     return replace(model, forces=tuple(forces), frames=tuple({x.name: x for x in own.values()}.values()))
 
 
+def attached(part: Any, changes: Mapping[str, FrameChange]) -> Any:
+    """Return a part with its places on bodies in other frames."""
+    names = {f.name for f in fields(part)}
+    for end in {"", "_a", "_b"} & {n.removeprefix("body") for n in names if n.startswith("body")}:
+        change = changes[getattr(part, f"body{end}")]
+        places = {n: getattr(part, n) for n in names & {f"{x}{end}" for x in ("translation", "point")}}
+        axes = {n: getattr(part, n) for n in names & {f"{x}{end}" for x in ("rotation", "axis")}}
+        new = {n: change.point(x) for n, x in places.items()} | {n: change.A @ x for n, x in axes.items()}
+        part = replace(part, **new, **{f"body{end}": change.body})
+    return part
+
+
 def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
     """Return the description with the places of parts beside bodies and joints in other frames."""
-
-    def moved(part: Any) -> Any:
-        names = {f.name for f in fields(part)}
-        for end in {"", "_a", "_b"} & {n.removeprefix("body") for n in names if n.startswith("body")}:
-            change = changes[getattr(part, f"body{end}")]
-            places = {n: getattr(part, n) for n in names & {f"{x}{end}" for x in ("translation", "point")}}
-            axes = {n: getattr(part, n) for n in names & {f"{x}{end}" for x in ("rotation", "axis")}}
-            new = {n: change.point(x) for n, x in places.items()} | {n: change.A @ x for n, x in axes.items()}
-            part = replace(part, **new, **{f"body{end}": change.body})
-        return part
-
-    parts: dict[str, Any] = {kind: tuple(map(moved, getattr(model, kind))) for kind in OTHERS}
+    parts: dict[str, Any] = {kind: tuple(attached(x, changes) for x in getattr(model, kind)) for kind in OTHERS}
     return replace(model, **parts)
 
 

@@ -7,113 +7,68 @@ them, and by their poses in the world where all coordinates are zero.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.load.xml_reader import Element
 from mbkit.model import Coupler, Loop, Mimic, Model
-from mbkit.studies.explain.hypotheses import angle_of
-from mbkit.studies.explain.merged_model import Tolerances
+from mbkit.studies.explain.loop_differences import exchanged, moved
+from mbkit.studies.explain.merged_model import FrameChange, Tolerances, attached
 
 #: What switches equalities off, by element.
 _SWITCHES: Final = {**dict.fromkeys(("equality", "connect", "weld"), ("active",)), "flag": ("equality", "constraint")}
 
 
-@dataclass(frozen=True)
-class Closure:
-    """A loop between the joints that carry its ends; joint "" is the world.
-
-    `ends` are their poses in the world where all coordinates are zero, (2, 4, 4).
-    """
-
-    name: str
-    kind: str
-    joints: tuple[str, str]
-    ends: Array
-
-    @property
-    def key(self) -> tuple[str, ...]:
-        """What two readings of one loop share."""
-        return self.kind, *sorted(self.joints)
-
-    def says(self) -> str:
-        """Return its name, or its kind where an importer gives none, and its joints."""
-        between = " and ".join(repr(x) if x else "the world" for x in self.joints)
-        return f"{self.name or f'a loop of {self.kind}s'} (between {between})"
-
-
-class WrittenLoops(NamedTuple):
+class Written(NamedTuple):
     """The loops and couplers that importers are compared with."""
 
-    active: Sequence[Closure] = ()
+    active: Sequence[Loop | Coupler] = ()
     #: With those that the file has switched off.
-    every: Sequence[Closure] = ()
+    every: Sequence[Loop | Coupler] = ()
     #: Why they are unknown; empty where they are known.
     faults: str = ""
-    couplers: Sequence[Coupler] = ()
-    every_coupler: Sequence[Coupler] = ()
 
 
-def closures(model: Model, loops: Sequence[Loop], names: Mapping[str, str] | None = None) -> list[Closure]:
-    """Return loops on the bodies of a description; `names` has other names for its joints."""
-    names = names or {}
-    poses, carriers = {"world": np.eye(4)}, {"world": ""}
-    for joint in model.tree:
-        poses[joint.child] = poses[joint.parent] @ _pose(joint.rotation, joint.translation)
-        still = joint.type.nv == 0
-        carriers[joint.child] = carriers[joint.parent] if still else names.get(joint.name, joint.name)
-    out = []
-    for x in loops:
-        joints = carriers[x.body_a], carriers[x.body_b]
-        ends = [
-            poses[x.body_a] @ _pose(x.rotation_a, x.translation_a),
-            poses[x.body_b] @ _pose(x.rotation_b, x.translation_b),
-        ]
-        # What no joint moves against each other is no loop.
-        if joints[0] != joints[1]:
-            order = (1, 0) if joints[0] > joints[1] else (0, 1)
-            out.append(Closure(x.name, x.kind, tuple(joints[k] for k in order), np.array([ends[k] for k in order])))  # type: ignore[arg-type]  # of two
-    return out
+def between_joints(model: Model, parts: Sequence[Any], names: Mapping[str, str] | None = None) -> list[Any]:
+    """Return loops of a description on the joints that carry their ends, and couplers as they are.
 
-
-def difference(a: Closure, b: Closure) -> tuple[float, float]:
-    """Return by how much the ends of b are moved and turned against those of a, in m and rad.
-
-    A weld binds two bodies in one relative pose. Which frame holds them there is free, so b's second frame is put on
-    a's before.
+    The ends' poses are those in the world, which is the joint "", where all coordinates are zero; `names` has other
+    names for joints. What no joint moves against each other is no loop.
     """
-    if a.kind == "point":
-        return float(np.linalg.norm((b.ends - a.ends)[:, :3, 3], axis=1).max()), 0.0
-    there = b.ends[0] @ _inverse(b.ends[1]) @ a.ends[1]
-    far = float(np.linalg.norm(there[:3, 3] - a.ends[0, :3, 3]))
-    return far, angle_of(a.ends[0, :3, :3].T @ there[:3, :3])
+    at = {"world": FrameChange("")}
+    for joint in model.tree:
+        placed = at[joint.parent].joint(joint)
+        carrier = (names or {}).get(joint.name, joint.name) if joint.type.nv else placed.parent
+        at[joint.child] = FrameChange(carrier, placed.rotation, t=placed.translation)
+    moved = [attached(x, at) if isinstance(x, Loop) else x for x in parts]
+    loops = [x for x in moved if isinstance(x, Loop) and x.body_a != x.body_b]
+    ordered = [exchanged(x) if x.body_a > x.body_b else x for x in loops]
+    return [*ordered, *(x for x in moved if isinstance(x, Coupler))]
 
 
-def loop_differences(written: WrittenLoops, read: Sequence[Closure], near: Tolerances) -> list[tuple[float, str, str]]:
+def loop_differences(written: Written, read: Sequence[Any], near: Tolerances) -> list[tuple[float, str, str]]:
     """Return by how much each loop differs, its name, and what differs in words; pairs are the nearest of a kind."""
     out: list[tuple[float, str, str]] = []
-    left = list(read)
-    pairs, lost = _paired(written.active, left)
+    active, inactive, left = ([x for x in some if isinstance(x, Loop)] for some in (*written[:2], read))
+    pairs, lost = _paired(active, left)
     for a, b in pairs:
-        far, turn = difference(a, b)
-        zero, moved, turned = np.zeros(3), np.array([far, 0.0, 0.0]), np.array([turn, 0.0, 0.0])
-        texts = [] if near.point(zero, moved) else [f"moved by {far:.3g} m"]
-        texts += [] if near.vector(zero, turned) else [f"turned by {turn:.3g} rad"]
+        far, turn = moved(a, b)
+        texts = [] if far <= near.relative * near.length else [f"moved by {far:.3g} m"]
+        texts += [] if turn <= near.relative else [f"turned by {turn:.3g} rad"]
         if texts:
-            out.append((max(far, turn), a.says(), " and ".join(texts)))
-    out += [(1.0, a.says(), "missing") for a in lost]
-    inactive = list(written.every)
-    _paired(written.active, inactive)
+            out.append((max(far, turn), _between(a), " and ".join(texts)))
+    out += [(1.0, _between(a), "missing") for a in lost]
+    _paired(active, inactive)
     wrong, _ = _paired(inactive, left)
-    out += [(1.0, a.says(), "inactive, read as active") for a, _ in wrong]
-    return out + [(1.0, b.says(), "not in the file") for b in left]
+    out += [(1.0, _between(a), "inactive, read as active") for a, _ in wrong]
+    return out + [(1.0, _between(b), "not in the file") for b in left]
 
 
 def coupler_differences(
-    written: WrittenLoops, file: Model, read: Sequence[Coupler], names: Mapping[str, str], tolerance: float
+    written: Written, file: Model, read: Sequence[Any], names: Mapping[str, str], tolerance: float
 ) -> list[tuple[float, str, str]]:
     """Return the same of couplers; `names` has the file's joint for each of the importer's.
 
@@ -123,9 +78,10 @@ def coupler_differences(
     left = [
         _ordered(replace(x, joint=names.get(x.joint, ""), leader=tuple(names.get(n, "") for n in x.leaders)))
         for x in read
+        if isinstance(x, Coupler)
     ]
-    inactive = list(map(_ordered, written.every_coupler))
-    for a in map(_ordered, written.couplers):
+    active, inactive = ([_ordered(x) for x in some if isinstance(x, Coupler)] for some in written[:2])
+    for a in active:
         _taken(a, inactive)
         if (b := _taken(a, left)) is None:
             out.append((1.0, _says(a), "missing"))
@@ -185,12 +141,21 @@ def _text(numbers: Array) -> str:
     return " ".join(f"{x:.6g}" for x in numbers)
 
 
-def _paired(some: Sequence[Closure], left: list[Closure]) -> tuple[list[tuple[Closure, Closure]], list[Closure]]:
-    """Pair closures with the nearest of `left`, which are taken out of it, and return those without a partner."""
-    waiting, pairs = list(some), list[tuple[Closure, Closure]]()
+def _between(x: Loop) -> str:
+    """Return a loop's name, or its kind where an importer gives none, and its joints."""
+    joints = " and ".join(repr(x) if x else "the world" for x in (x.body_a, x.body_b))
+    return f"{x.name or f'a loop of {x.kind}s'} (between {joints})"
+
+
+def _paired(some: Sequence[Loop], left: list[Loop]) -> tuple[list[tuple[Loop, Loop]], list[Loop]]:
+    """Pair loops with the nearest of `left`, which are taken out of it, and return those without a partner."""
+    waiting, pairs = list(some), list[tuple[Loop, Loop]]()
     while True:
         near = [
-            (sum(difference(a, b)), i, k) for i, a in enumerate(waiting) for k, b in enumerate(left) if a.key == b.key
+            (sum(moved(a, b)), i, k)
+            for i, a in enumerate(waiting)
+            for k, b in enumerate(left)
+            if (a.kind, a.body_a, a.body_b) == (b.kind, b.body_a, b.body_b)
         ]
         if not near:
             return pairs, waiting
@@ -202,13 +167,3 @@ def activated(root: Element) -> Element:
     """Return an MJCF with all its equalities active."""
     attributes = {k: x for k, x in root.attributes.items() if k not in _SWITCHES.get(root.tag, ())}
     return replace(root, attributes=attributes, children=[activated(x) for x in root.children])
-
-
-def _inverse(X: Array) -> Array:
-    return _pose(X[:3, :3].T, -X[:3, :3].T @ X[:3, 3])
-
-
-def _pose(R: Array, p: Array) -> Array:
-    X = np.eye(4)
-    X[:3, :3], X[:3, 3] = R, p
-    return X

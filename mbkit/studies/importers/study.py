@@ -7,7 +7,7 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import metadata
@@ -20,7 +20,7 @@ import numpy as np
 from mbkit._check import Array, count, real
 from mbkit._child_process import WorkerDiedError, WorkerStartError, WorkerTimeoutError
 from mbkit.engines.base import DOUBLE_BITS
-from mbkit.engines.imported import IMPORTERS, Beside, Imported, Importer, check_installed, reader
+from mbkit.engines.imported import IMPORTERS, Imported, Importer, check_installed, reader
 from mbkit.engines.registry import MUJOCO
 from mbkit.engines.versions import own_importer
 from mbkit.engines.versions.engine_version import EngineVersion, names_version
@@ -39,20 +39,21 @@ from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_reader import urdf_links
-from mbkit.model import Coupler, Loop, Model
+from mbkit.model import Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.model.elements.forces import by_functions
 from mbkit.model.joint_numbers import owners
 from mbkit.model.model import unchecked
 from mbkit.model.validation import listing
 from mbkit.studies import results
-from mbkit.studies.explain.hypotheses import BOUNDS, OF_ALL, angle_of, number_text
+from mbkit.studies.explain.hypotheses import BOUNDS, OF_ALL, number_text
 from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_sets, rename_joints
+from mbkit.studies.explain.loop_differences import angle_of
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
-from mbkit.studies.importers.loops import WrittenLoops, activated, closures, coupler_differences, loop_differences
+from mbkit.studies.importers.loops import Written, activated, between_joints, coupler_differences, loop_differences
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import Worker, describe
@@ -155,14 +156,13 @@ def _telling(version: EngineVersion, function: Callable[..., Any], *args: Any) -
         raise ImporterError(str(error).removeprefix(f"{version}: ")) from None
 
 
-def _read(
-    module: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes]
-) -> tuple[Model, tuple[str, ...], tuple[Beside, ...], tuple[Loop, ...] | str, tuple[Coupler, ...], str]:
+def _read(module: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes]) -> tuple[Any, ...]:
+    """Return what an importer holds but its terms."""
     global _held
     # The file before can be as large.
     _held = None
     _held = reader(module)(text, format_, floating_base, files)
-    return _held.model, _held.notes, _held.beside, _held.loops, _held.couplers, _held.holds_mimics
+    return _held.model, _held.notes, _held.beside, _held.constraints, _held.hidden, _held.holds_mimics
 
 
 def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
@@ -174,7 +174,7 @@ def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
 
 
 def stages(
-    reference: Model | Imported, loops: WrittenLoops, imported: Imported, samples: int, seed: int, tolerance: float
+    reference: Model | Imported, loops: Written, imported: Imported, samples: int, seed: int, tolerance: float
 ) -> tuple[Stage, ...]:
     """Compare an importer's model with the reference, from the tree to the terms, which its own engine computes."""
     described = reference.model if isinstance(reference, Imported) else reference
@@ -193,8 +193,7 @@ def stages(
             out.append(_missing("mimic", mimics, f"held {held}" if (held := imported.holds_mimics) else "left free"))
         out.append(_worst(name, some))
     back = {m.b: m.a for m in matching.pairs}
-    out.append(_loop_stage(loops, imported, back, near))
-    out.append(_coupler_stage(loops, described, imported, back, tolerance))
+    out += _constraint_stages(loops, described, imported, back, near)
     apart = Gaps(comparable=False)
     if not structural:
         at = states_of(one.model, samples, seed)
@@ -223,20 +222,16 @@ def _worst(name: str, some: list[tuple[float, str, str]]) -> Stage:
     return Stage(name, not some, size, where, f"{where}: {says}{more}" if some else "")
 
 
-def _loop_stage(loops: WrittenLoops, imported: Imported, names: Mapping[str, str], near: Tolerances) -> Stage:
-    """Compare an importer's loops with the file's; `names` has the file's joint for each of the importer's."""
-    if loops.faults or isinstance(imported.loops, str):
-        return Stage("loops", None, math.nan, "", loops.faults or str(imported.loops))
-    return _every("loops", loop_differences(loops, closures(imported.model, imported.loops, names), near))
-
-
-def _coupler_stage(
-    loops: WrittenLoops, file: Model, imported: Imported, names: Mapping[str, str], tolerance: float
-) -> Stage:
-    """Compare an importer's couplers with the file's."""
-    if loops.faults:
-        return Stage("couplers", None, math.nan, "", loops.faults)
-    return _every("couplers", coupler_differences(loops, file, imported.couplers, names, tolerance))
+def _constraint_stages(
+    written: Written, file: Model, imported: Imported, names: Mapping[str, str], near: Tolerances
+) -> Iterator[Stage]:
+    """Compare an importer's loops and couplers with the file's; `names` has the file's joint for each of its own."""
+    read = between_joints(imported.model, imported.constraints, names)
+    for name, faults, differences in (
+        ("loops", written.faults or imported.hidden, partial(loop_differences, written, read, near)),
+        ("couplers", written.faults, partial(coupler_differences, written, file, read, names, near.relative)),
+    ):
+        yield Stage(name, None, math.nan, "", faults) if faults else _every(name, differences())
 
 
 def _every(name: str, some: list[tuple[float, str, str]]) -> Stage:
@@ -495,7 +490,7 @@ def _compared(
     engine: str,
     imported: Imported,
     reference: Model | Imported,
-    loops: WrittenLoops,
+    loops: Written,
     label: str,
     asked: Mapping[str, Any],
 ) -> Parsed:
@@ -584,23 +579,18 @@ def _reference(
     return None, "", faults
 
 
-def _written_loops(stripped: Stripped, reference: Model | Imported | None, floating_base: bool) -> WrittenLoops:
+def _written_loops(stripped: Stripped, reference: Model | Imported | None, floating_base: bool) -> Written:
     """Return the loops that importers are compared with: of the file, else of the reading that is the reference."""
     if isinstance(reference, Imported):
-        if isinstance(reference.loops, str):
-            return WrittenLoops(faults=reference.loops)
-        return WrittenLoops(closures(reference.model, reference.loops), couplers=reference.couplers)
+        return Written(between_joints(reference.model, reference.constraints), faults=reference.hidden)
     if reference is None or stripped.format == "urdf":
-        return WrittenLoops()
+        return Written()
     try:
-        active, every = (
-            _written(replace(stripped, root=root), floating_base, loops=True)
-            for root in (stripped.root, activated(stripped.root))
-        )
+        roots = (replace(stripped, root=root) for root in (stripped.root, activated(stripped.root)))
+        active, every = (_written(x, floating_base, loops=True) for x in roots)
     except MbkitError as error:
-        return WrittenLoops(faults=f"mbkit does not read the loops: {error}")
-    some = closures(active, active.loops), closures(every, every.loops)
-    return WrittenLoops(*some, couplers=active.couplers, every_coupler=every.couplers)
+        return Written(faults=f"mbkit does not read the loops: {error}")
+    return Written(between_joints(active, active.constraints), between_joints(every, every.constraints))
 
 
 def _notes(stripped: Stripped) -> list[str]:

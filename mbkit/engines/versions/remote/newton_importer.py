@@ -113,7 +113,7 @@ class _Description:
         parents, children = m.joint_parent.numpy(), m.joint_child.numpy()
         masses, coms, inertias = (x.numpy().astype(float) for x in (m.body_mass, m.body_com, m.body_inertia))
         frames, names = {-1: _matrix(np.array([0, 0, 0, 0, 0, 0, 1.0]))}, {-1: "world"}
-        self.data: dict[str, Any] = {"bodies": [], "joints": [], "places": {}, "couplers": []}
+        self.data: dict[str, Any] = {"bodies": [], "joints": [], "places": {}, "mimics": []}
         self.data["holds"] = "by its solvers"
         self.data["gravity"] = m.gravity.numpy().astype(float).reshape(-1, 3)[0].tolist()
         own: dict[int, list[str]] = {}
@@ -230,7 +230,7 @@ class _Description:
         else:
             some = []
         for j, leader, offset, ratio in some:
-            self.data["couplers"].append(["", own[j][0], own[leader][0], ratio, offset])
+            self.data["mimics"].append(["", own[j][0], own[leader][0], ratio, offset])
 
 
 def _matrix(x: Any) -> Any:
