@@ -17,6 +17,7 @@ from mbkit.model.parts import rules_of
 
 #: A `mbkit.model.description.Description`, a floor above.
 _Model = Any
+_New = Callable[[str], str]
 #: Kinds of parts, as a description names them.
 KINDS_OF_PARTS: Final = (
     *("bodies", "joints", "frames"),
@@ -50,42 +51,38 @@ def renamed(model: _Model, prefix: str) -> tuple[dict[str, list[Any]], list[Bind
     def new(name: str) -> str:
         return name if name == "world" else prefix + name
 
-    others = coordinate_arguments(model)
-    parts = {
-        kind: [_with_names(part, new, _arguments(part, model, others, new)) for part in getattr(model, kind)]
+    arguments = {x: new(x) for x in coordinate_arguments(model)}
+    made = [
+        (kind, p, with_names(model, p, new, new, arguments, new))
         for kind in KINDS_OF_PARTS
-    }
+        for p in getattr(model, kind)
+    ]
     # Some names follow from others, as that of a gravity compensation from its body's.
-    names = {
-        (kind, old.name): part.name
-        for kind, made in parts.items()
-        for old, part in zip(getattr(model, kind), made, strict=True)
-    }
+    names = {(kind, old.name): part.name for kind, old, part in made}
+    parts = {kind: [part for own, _, part in made if own == kind] for kind in KINDS_OF_PARTS}
     return parts, [replace(b, part=names.get((b.where, b.part), b.part)) for b in model.bindings]
 
 
-def _arguments(part: Any, model: _Model, others: Iterable[str], new: Callable[[str], str]) -> dict[str, str]:
-    """Return the new names of the coordinates and velocities in a force's formulas."""
-    if not isinstance(part, Force):
-        return {}
-    try:
-        own = {*part.own(model), *part.symbols}
-    except UnknownNameError:
-        # A force on a joint that is not there, which is told where the model is built.
-        return {}
-    return {name: new(name) for name in part.arguments if name in others and name not in own}
-
-
-def _with_names(part: Any, new: Callable[[str], str], arguments: Mapping[str, str]) -> Any:
-    changes: dict[str, Any] = {}
-    for field in fields(part):
-        value = getattr(part, field.name)
-        if field.name == "name" or field.name in (*_OF_BODIES, *_OF_JOINTS):
-            changes[field.name] = new(value) if isinstance(value, str) else tuple(map(new, value))
-        elif field.name == "mimic" and value is not None:
-            changes["mimic"] = replace(value, joint=new(value.joint))
-        elif isinstance(value, Formula) and arguments:
-            changes[field.name] = replace(value, arguments=tuple(arguments.get(x, x) for x in value.arguments))
+def with_names(
+    model: _Model, part: Any, bodies: _New, joints: _New, arguments: Mapping[str, str], own: _New = str
+) -> Any:
+    """Return a part of a model with other names for what it refers to, also in formulas of forces, and for itself."""
+    given = {field.name: getattr(part, field.name) for field in fields(part)}
+    changes: dict[str, Any] = {"name": own(given["name"])} if "name" in given else {}
+    for new, of in ((bodies, _OF_BODIES), (joints, _OF_JOINTS)):
+        some = {n: given[n] for n in of if n in given}
+        changes |= {n: new(x) if isinstance(x, str) else tuple(map(new, x)) for n, x in some.items()}
+    if mimic := given.get("mimic"):
+        changes["mimic"] = replace(mimic, joint=joints(mimic.joint))
+    if isinstance(part, Force) and arguments:
+        try:
+            # Its own arguments stay.
+            names = {x: y for x, y in arguments.items() if x not in (*part.own(model), *part.symbols)}
+        except UnknownNameError:
+            # A force on a joint that is not there, which is told where the model is built.
+            names = {}
+        formulas = {n: x for n, x in given.items() if isinstance(x, Formula)}
+        changes |= {n: replace(x, arguments=tuple(names.get(a, a) for a in x.arguments)) for n, x in formulas.items()}
     return replace(part, **changes)
 
 

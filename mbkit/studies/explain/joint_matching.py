@@ -7,7 +7,7 @@ Siblings are assigned at the least total cost, and a match by names alone is use
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -16,19 +16,11 @@ import numpy as np
 from mbkit._check import Array, by_key
 from mbkit.engines.imported import unused
 from mbkit.model import Body, Joint, Model
-from mbkit.model.elements.forces import Force, coordinate_arguments
+from mbkit.model.elements.forces import coordinate_arguments
+from mbkit.model.elements.references import _OF_BODIES, names_in, with_names
 from mbkit.model.joint_types import FIXED, PRISMATIC
 from mbkit.studies.explain.hypotheses import Hypothesis
-from mbkit.studies.explain.merged_model import (
-    OTHERS,
-    FrameChange,
-    MergedModel,
-    Tolerances,
-    merge,
-    reattached,
-    references,
-    with_names,
-)
+from mbkit.studies.explain.merged_model import OTHERS, FrameChange, MergedModel, Tolerances, merge, reattached
 from mbkit.studies.explain.terms import fitting, restricted
 
 _NAME, _FRAME, _NUMBER, _KIND, _ALONE = 0.1, 0.25, 1.0, 3.0, 2.0
@@ -183,15 +175,14 @@ def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
             others.add(names[name])
     order = {m.a: k for k, m in enumerate(matching.pairs)}
     matter = {bodies[x.name]: x for x in b.model.bodies}
-    named = [replace(with_names(j, bodies, joints, {}), name=joints[j.name]) for j in b.model.joints]
+
+    def renamed(part: Any, arguments: Mapping[str, str], own: Callable[[str], str] = str) -> Any:
+        return with_names(b.model, part, lambda x: bodies.get(x, x), lambda x: joints.get(x, x), arguments, own)
+
+    named = [renamed(j, {}, joints.__getitem__) for j in b.model.joints]
     model = replace(b.model, joints=tuple(named))
     coordinates = dict(zip(coordinate_arguments(b.model), coordinate_arguments(model), strict=True))
-
-    def renamed(part: Any) -> Any:
-        own = {*part.own(b.model), *part.symbols} if isinstance(part, Force) else coordinates
-        return with_names(part, bodies, joints, {x: y for x, y in coordinates.items() if x not in own})
-
-    parts: dict[str, Any] = {kind: tuple(map(renamed, getattr(b.model, kind))) for kind in OTHERS}
+    parts: dict[str, Any] = {kind: tuple(renamed(x, coordinates) for x in getattr(b.model, kind)) for kind in OTHERS}
     named.sort(key=lambda j: order.get(j.name, len(order)))
     parts["bodies"] = tuple(replace(matter[j.child], name=j.child) for j in named)
     model = replace(model, joints=tuple(named), **parts)
@@ -334,7 +325,7 @@ def _with_slides_in_order(a: Model, b: Model) -> Model:
 def _runs_of_slides(model: Model) -> list[list[str]]:
     """Return the slides that follow each other, without matter, turns or anything else between them."""
     on = by_key((joint.parent, joint) for joint in model.joints)
-    used = {name for kind in OTHERS for part in getattr(model, kind) for name in next(references(part))}
+    used = {name for kind in OTHERS for part in getattr(model, kind) for name in names_in(part, _OF_BODIES)}
     runs: list[list[str]] = []
     for joint in model.tree:
         before = runs[-1] if runs else []

@@ -14,10 +14,9 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties, together
-from mbkit.model import Body, Frame, Joint, Mimic, Model
+from mbkit.model import Body, Frame, Joint, Model
 from mbkit.model.elements.forces import FrameForce, by_functions
-from mbkit.model.elements.formula import Formula
-from mbkit.model.elements.references import _OF_BODIES, _OF_JOINTS, KINDS_OF_PARTS
+from mbkit.model.elements.references import KINDS_OF_PARTS, with_names
 from mbkit.studies._targets import with_values
 
 #: Kinds of parts that are compared by their fields alone.
@@ -179,7 +178,7 @@ def _with_own_frames(model: Model) -> Model:
     frames |= {f.name: f for f in model.frames}
     own = {f.name: frames[f.frame] for f in model.forces if isinstance(f, FrameForce)}
     forces = (
-        with_names(f, {name: x.name for name, x in frames.items()}, {}, {}) if f.name in own else f
+        with_names(model, f, lambda name: frames[name].name, str, {}) if f.name in own else f
         for f in by_functions(model)
     )
     return replace(model, forces=tuple(forces), frames=tuple({x.name: x for x in own.values()}.values()))
@@ -201,27 +200,6 @@ def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
     """Return the description with the places of parts beside bodies and joints in other frames."""
     parts: dict[str, Any] = {kind: tuple(attached(x, changes) for x in getattr(model, kind)) for kind in OTHERS}
     return replace(model, **parts)
-
-
-def with_names(part: Any, bodies: Mapping[str, str], joints: Mapping[str, str], arguments: Mapping[str, str]) -> Any:
-    """Return a part with other names for the bodies and joints that it refers to, and in its formulas."""
-    new: dict[str, Any] = {}
-    for name, value in ((f.name, getattr(part, f.name)) for f in fields(part)):
-        names = bodies if name in _OF_BODIES else joints if name in _OF_JOINTS else {}
-        if names:
-            new[name] = names.get(value, value) if isinstance(value, str) else tuple(names.get(x, x) for x in value)
-        elif isinstance(value, Mimic):
-            new[name] = replace(value, joint=joints[value.joint])
-        elif isinstance(value, Formula):
-            new[name] = replace(value, arguments=tuple(arguments.get(x, x) for x in value.arguments))
-    return replace(part, **new)
-
-
-def references(part: Any) -> Iterator[set[str]]:
-    """Yield the names of the bodies and frames, then those of the joints, that a part refers to."""
-    for names in (_OF_BODIES, _OF_JOINTS):
-        given = (getattr(part, name, ()) for name in names)
-        yield {x for value in given for x in ((value,) if isinstance(value, str) else value)}
 
 
 def with_common_frames(*sides: MergedModel) -> Iterator[MergedModel]:

@@ -24,9 +24,10 @@ from mbkit.model import JointCoupling, Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw, FrictionNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.forces import coordinate_arguments
+from mbkit.model.elements.references import _OF_BODIES, _OF_JOINTS, names_in
 from mbkit.model.model import unchecked
 from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
-from mbkit.studies.explain.merged_model import OTHERS, references
+from mbkit.studies.explain.merged_model import OTHERS
 
 #: Compared terms: name in tables, quantity, arguments.
 TERMS: Final = (("M", "mass_matrix", "q"), ("g", "gravity", "q"), ("nle", "nle", "qv"), ("passive", "passive", "qv"))
@@ -224,8 +225,8 @@ def fitting(model: Model, **fields: Any) -> Model:
     lost = coordinate_arguments(model).keys() - coordinate_arguments(tree).keys()
 
     def fits(part: Any) -> bool:
-        bodies, joints = references(part)
-        return bodies <= here and joints <= moving and lost.isdisjoint(getattr(part, "arguments", ()))
+        fits = names_in(part, _OF_BODIES) <= here and names_in(part, _OF_JOINTS) <= moving
+        return fits and lost.isdisjoint(getattr(part, "arguments", ()))
 
     parts: dict[str, Any] = {kind: tuple(filter(fits, getattr(model, kind))) for kind in OTHERS}
     return replace(tree, **parts | {"couplings": tuple(trimmed_couplings(model, moving))})
