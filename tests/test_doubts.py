@@ -381,3 +381,17 @@ def test_texts_of_events_and_of_rounding_are_short():
     assert off_by(0.021, "those of rigid loops") == "2.1 % off those of rigid loops"
     idle = mb.model.JointCoupling("tendon", (), np.zeros(0), 0.0, 0.0, 0.0, 0.0)
     assert str(idle) == "coupling 'tendon' on no joint: it exerts no force"
+
+
+def test_soft_loops_are_doubted_in_each_run_of_one_engine():
+    """The warning comes once; the run's own check tells it each time, with how far the accelerations are off."""
+    model = mb.catalog.four_bar()
+    dyn = mb.dynamics(model, "mujoco")
+    tau = np.zeros(model.nv)
+    q, _ = dyn.project([1.1, -0.4, 0.7], tau)
+    rigid = mb.dynamics(model, "lagrangian").forward_dynamics(q, tau, tau)
+    off = np.linalg.norm(dyn.forward_dynamics(q, tau, tau) - rigid) / np.linalg.norm(rigid)
+    for _ in range(2):
+        (doubt,) = (x for x in mb.simulate(dyn, q, tau, 0.01, "rk4", dt=1e-3).check().doubts if "soft" in x)
+        assert f"{100 * off:.2g} %" in doubt
+    assert not mb.simulate(mb.dynamics(model, "lagrangian"), q, tau, 0.01, "rk4", dt=1e-3).check().doubts

@@ -237,15 +237,22 @@ class FakeWorker:
     """Answers as told: by (stage "case" or method, value), a result, or the stage and the exception."""
 
     def __init__(self, answers=()):
-        self.answers, self.stage = dict(answers), ""
+        self.answers, self.stage, self.generation, self._runs = dict(answers), "", 0, False
+
+    def end(self):
+        self._runs = False
 
     def call(self, function, _case, value, *args, **_limits):
+        self.generation, self._runs = self.generation + (not self._runs), True
         key = {prepare: "case", condition_number: "condition"}.get(function) or args[1]
         default = {"case": Prepared("known"), "condition": 1.0}.get(key, Measurement(value, "finished", 0.0))
         found = self.answers.get((key, value), default)
         self.stage = "run" if function is measure else ""
         if isinstance(found, tuple):
-            self.stage, error = found
+            self.stage, error, *later = found
+            if later and self.generation > 1:
+                return later[0]
+            self._runs = False
             raise error
         return found
 
@@ -278,6 +285,13 @@ def test_a_row_ends_where_more_would_only_cost():
     assert found["rk853"] == ["diverged", "finished", "finished", "finished"]
     twice = {("rk4", 1): Measurement(1, "refused"), ("rk4", 2): Measurement(2, "diverged")}
     assert ends(swept(twice))["rk4"] == ["refused", "diverged", "not run", "not run"]
+
+
+def test_a_call_that_ran_out_of_memory_in_an_old_process_is_made_in_a_new_one():
+    """Its outcome does not hang on what was measured before it."""
+    for error in (MemoryError(), WorkerDiedError("killed")):
+        found = swept({("rk4", 2): ("engine", error, Measurement(2, "finished", 0.0))})
+        assert ends(found)["rk4"] == ["finished"] * 4
 
 
 def test_an_engine_that_cannot_be_made_is_asked_once():

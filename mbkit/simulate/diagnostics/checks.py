@@ -16,6 +16,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS, at_time
+from mbkit.engines.constrained import ROUNDING, off_by
 from mbkit.errors import MbkitError
 from mbkit.methods.registry import ADAPTIVE_METHOD, AUTOMATIC_METHOD, SERIES_METHOD, Method, Tolerances
 from mbkit.methods.stability import companion
@@ -102,6 +103,8 @@ def diagnostics(
     matrices = [one.M for member in samples for one in member]
     if matrices and (method.mass_matrix or not dyn.derived or getattr(dyn, "elimination", "") != "least constraint"):
         checks.append(condition(matrices[-1:] if quick else matrices))
+    if not quick:
+        checks.append(softness(dyn, at_q[0, 0], at_v[0, 0]))
     checks.append(coordinate_magnitude(at_q, None if method.scaled_by_start else tolerances))
     if tolerances and method.scaled_by_start:
         checks.append(scale_growth(at_q, at_v, tolerances))
@@ -133,6 +136,15 @@ def _rushes(dyn: Dynamics, method: Method, h: float, q: Array, v: Array) -> bool
         max(np.abs(dyn.model.difference(x, q2)).max(), h * np.abs(v2 - y).max()) for x, y in ((q1, v1), (q, v))
     )
     return bool(off > _HALVES**method.order * moved)
+
+
+def softness(dyn: Dynamics, q: Array, v: Array) -> Iterator[str]:
+    """Yield how far MuJoCo's soft loops, or its soft friction, take accelerations off those of exact ones."""
+    law: Any = getattr(dyn, "constraint_law", None)
+    if law and (dyn.soft_friction or (dyn.model.needs.loops and dyn.soft_constraints)):
+        error = law(q, v, np.zeros(len(v))).error
+        if error > ROUNDING:
+            yield f"soft constraints: accelerations at the start are {off_by(error, 'those of exact ones')}"
 
 
 def _smooth(dyn: Dynamics) -> Dynamics:

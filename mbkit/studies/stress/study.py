@@ -131,10 +131,18 @@ class CaseSweep:
             return f"rtol {max(self.limits.rtol, kind.least):.0e}"
         return f"dt {self.limits.dt:g} s"
 
-    def _call(
+    def _call(self, worker: Worker, *call: Any, **stage_seconds: Any) -> Any:
+        """Return what a function answers for a value of the case, or the measurement of how the call ended."""
+        generation = worker.generation
+        answer = self._called(worker, *call, **stage_seconds)
+        if isinstance(answer, Measurement) and answer.end == "died" and worker.generation == generation:
+            # Calls before it may have left too little memory: a process of its own decides.
+            return self._called(worker, *call, **stage_seconds)
+        return answer
+
+    def _called(
         self, worker: Worker, value: float, function: Callable[..., Any], *arguments: object, **stage_seconds: float
     ) -> Any:
-        """Return what a function answers for a value of the case, or the measurement of how the call ended."""
         try:
             return worker.call(
                 function,
