@@ -63,54 +63,32 @@ if TYPE_CHECKING:
     from mbkit.studies.work_precision.study import work_precision as work_precision
 
 
-_HOME = {
-    "Dynamics": "mbkit.engines",
-    "Impact": "mbkit.engines.consistent.impacts",
-    "MbkitError": "mbkit.errors",
-    "Mimic": "mbkit.model",
-    "Model": "mbkit.model",
-    "ModelBuilder": "mbkit.model",
-    "OperationalSpace": "mbkit.engines.operational_space",
-    "Parameter": "mbkit.model",
-    "SteadyMotion": "mbkit.lagrangian.statics.steady_motion",
-    "Trajectory": "mbkit.simulate",
-    "compare": "mbkit.studies",
-    "compare_parsers": "mbkit.studies.importers",
-    "convert": "mbkit.studies.convert",
-    "dynamics": "mbkit.engines",
-    "engine": "mbkit.engines",
-    "equilibrium": "mbkit.lagrangian.statics.equilibrium",
-    "excitation": "mbkit.identify",
-    "explain": "mbkit.studies.explain",
-    "identify": "mbkit.identify",
-    "impact": "mbkit.engines.consistent.impacts",
-    "join": "mbkit.model.changes.joining",
-    "lint": "mbkit.studies.lint",
-    "load": "mbkit.load",
-    "operational_space": "mbkit.engines.operational_space",
-    "robots": "mbkit.load",
-    "scale": "mbkit.model.changes.freeing",
-    "sensitivities": "mbkit.simulate",
-    "steady_motion": "mbkit.lagrangian.statics.steady_motion",
-    "stress": "mbkit.studies",
-    "variants": "mbkit.model.changes.variants",
-    "versions": "mbkit.studies.versions",
-    "work_precision": "mbkit.studies",
+#: Names by the modules that hold them.
+_NAMES = {
+    "engines": "Dynamics dynamics engine",
+    "engines.consistent.impacts": "Impact impact",
+    "engines.operational_space": "OperationalSpace operational_space",
+    "errors": "MbkitError",
+    "identify": "excitation identify",
+    "lagrangian.statics.equilibrium": "equilibrium",
+    "lagrangian.statics.steady_motion": "SteadyMotion steady_motion",
+    "load": "load robots",
+    "model": "Mimic Model ModelBuilder Parameter",
+    "model.changes.freeing": "scale",
+    "model.changes.joining": "join",
+    "model.changes.variants": "variants",
+    "simulate": "Trajectory sensitivities",
+    "studies": "compare stress work_precision",
+    "studies.convert": "convert",
+    "studies.explain": "explain",
+    "studies.importers": "compare_parsers",
+    "studies.lint": "lint",
+    "studies.versions": "versions",
 }
+_HOME = {name: f"mbkit.{module}" for module, names in _NAMES.items() for name in names.split()}
 # `show` and `simulate` are called too; methods and events are in the second.
-_MODULES = {
-    "baseline": "mbkit.studies.baseline",
-    "catalog": "mbkit.catalog",
-    "engines": "mbkit.engines",
-    "errors": "mbkit.errors",
-    "lagrangian": "mbkit.lagrangian",
-    "model": "mbkit.model",
-    "show": "mbkit.show",
-    "simulate": "mbkit.simulate",
-    "spatial": "mbkit.spatial",
-    "studies": "mbkit.studies",
-    "testing": "mbkit.testing",
-}
+_OWN = "catalog engines errors lagrangian model show simulate spatial studies testing"
+_MODULES = {name: f"mbkit.{name}" for name in _OWN.split()} | {"baseline": "mbkit.studies.baseline"}
 
 __all__ = sorted([*_HOME, *_MODULES, "__version__"])
 

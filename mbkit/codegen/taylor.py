@@ -24,7 +24,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit._fork import fork_safe
 from mbkit.codegen.program import Operation, Program, program
-from mbkit.derivation.equations import Equations
+from mbkit.derivation.equations import Equations, kept
 from mbkit.derivation.mass_matrix_solve import elimination_size
 from mbkit.errors import UnsupportedError
 from mbkit.model.rolling import discs_of
@@ -220,12 +220,10 @@ class TaylorSystem:
                 integrator.pars[place] = arguments[which - 2][at]
 
 
+@kept
 def taylor_system(equations: Equations) -> TaylorSystem:
     """Return the Taylor system of equations, once for all dynamics that share them."""
-    if "series" not in equations.kept:
-        equations.kept["series"] = TaylorSystem(equations)
-    system: TaylorSystem = equations.kept["series"]
-    return system
+    return TaylorSystem(equations)
 
 
 def _functions(heyoka: Any) -> dict[str, Any]:

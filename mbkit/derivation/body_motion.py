@@ -21,11 +21,11 @@ from typing import Any, Final, NamedTuple
 
 import casadi as ca
 
-from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_times, constant_transposed_times, dot3
+from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_times, constant_transposed_times
 from mbkit.derivation.links import Inertia
 from mbkit.derivation.regressor import energy_regressor, momentum_regressor, torque_regressor
 from mbkit.derivation.rotations import SYMMETRIC, Matrix
-from mbkit.model.joint_types import cross3
+from mbkit.model.joint_types import cross3, dot3
 
 #: Linear and angular part.
 Pair = tuple[Vector, Vector]

@@ -18,7 +18,7 @@ which those with the least norm are given, and left out of the equation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from typing import Any, Final, NamedTuple
@@ -31,7 +31,7 @@ from mbkit._check import Array
 from mbkit._reproducible import DEPENDENT, independent_rows
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
-from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_transposed_times, follower
+from mbkit.derivation.kinematics import Kinematics, Vector, add, column, constant_transposed_times, follower
 from mbkit.derivation.least_constraint import hard_poses
 from mbkit.derivation.mass_matrix_solve import ConstraintFactors, ConstraintTerms, Factors, OrthogonalColumns
 from mbkit.errors import InputError
@@ -143,15 +143,17 @@ def _every_row(kin: Kinematics, time: Any) -> Iterator[_Row]:
                 yield _Row(part.name, f"motion of {part.name!r}", at - path)
 
 
-def _column(entries: Iterable[Any]) -> Any:
-    return ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for x in entries))
+def _terms(kin: Kinematics, time: Any, rows: list[_Row]) -> ConstraintTerms:
+    turned = kin.qdot if kin.model.quaternions else None
+    value, speeds = (column(row.value for row in rows if row.moves is moves) for moves in (False, True))
+    return ConstraintTerms(value, kin.q, kin.v, time, tuple(row.name for row in rows), turned, speeds)
 
 
 def _ways(kin: Kinematics) -> Any:
     """Return numbers that are negative where a loop's frames point opposite ways, then where a disc lies flat."""
     loops = (_ends(kin, loop).way(loop.kind) for loop in kin.model.loops)
     discs = (_contact(kin, x).reach / kin.values.of(x).radius - _LIES for x in discs_of(kin.model))
-    return _column((*loops, *discs))
+    return column((*loops, *discs))
 
 
 class Constraints:
@@ -179,16 +181,10 @@ class Constraints:
         self.independent = choice.independent
         self._independent_of_every = tuple(choice.kept[i] for i in choice.independent)
         self.ways = _ways(kin)
-        turned = kin.qdot if kin.model.quaternions else None
-
-        def terms(of: list[_Row]) -> ConstraintTerms:
-            value, speeds = (_column(row.value for row in of if row.moves is moves) for moves in (False, True))
-            return ConstraintTerms(value, kin.q, kin.v, time, tuple(row.name for row in of), turned, speeds)
-
-        self.every = terms(rows).jacobian
+        self.every = _terms(kin, time, rows).jacobian
         #: All rows that say something, and those of the equation.
-        self.all = terms(kept)
-        self.terms = self.all if not choice.redundant else terms([kept[i] for i in self.independent])
+        self.all = _terms(kin, time, kept)
+        self.terms = self.all if not choice.redundant else _terms(kin, time, [kept[i] for i in self.independent])
 
     def spread(self, multipliers: Any) -> Any:
         """Return the multipliers of all rows with the least norm whose force is that of the independent ones."""
@@ -286,9 +282,8 @@ class _Numbers:
         self.names = [row.name for row in rows]
         #: How many rows hold positions: the first ones.
         self.positions = sum(not row.moves for row in rows)
-        value, speeds = (_column(row.value for row in rows if row.moves is moves) for moves in (False, True))
-        c = ConstraintTerms(value, kin.q, kin.v, time, tuple(self.names), kin.qdot, speeds)
-        outs = [ca.densify(x) for x in (value, c.jacobian, c.by_time, _ways(kin))]
+        c = _terms(kin, time, rows)
+        outs = [ca.densify(x) for x in (c.value, c.jacobian, c.by_time, _ways(kin))]
         self._call = ca.Function("rows", [kin.q, kin.values.parameters], outs)
         # A parameter without a value has one that is as good as another.
         self._parameters = [1.0 if x is None else x for x in model.parameters.values()]

@@ -13,8 +13,9 @@ constraint (`mbkit.derivation.least_constraint`).
 
 from __future__ import annotations
 
-from functools import cached_property
-from typing import Any, Final, Literal, get_args
+from collections.abc import Callable
+from functools import cached_property, wraps
+from typing import Any, Final, Literal, TypeVar, get_args
 
 import casadi as ca
 import numpy as np
@@ -37,6 +38,8 @@ ELIMINATIONS: Final[tuple[Elimination, ...]] = get_args(Elimination)
 Acting = tuple[tuple[str, ...], str]
 NOTHING: Final[Acting] = ((), "")
 
+T = TypeVar("T")
+
 #: Name of each quantity -> the arguments of its function.
 FUNCTIONS: Final = {
     "mass_matrix": ("q",),
@@ -54,6 +57,20 @@ FUNCTIONS: Final = {
     "inverse_dynamics_derivatives": ("q", "v", "a"),
     "forward_dynamics_derivatives": ("q", "v", "tau"),
 }
+
+
+def kept(make: Callable[..., T]) -> Callable[..., T]:
+    """Keep what a function of equations returns with these, by its other arguments."""
+
+    @wraps(make)
+    def get(equations: Any, **options: Any) -> T:
+        key = (make.__name__, *options.items())
+        if key not in equations.kept:
+            equations.kept[key] = make(equations, **options)
+        out: T = equations.kept[key]
+        return out
+
+    return get
 
 
 class Equations:
@@ -112,7 +129,7 @@ class Equations:
         return ca.substitute(self.tau, ca.vertcat(self.q, self.force), ca.vertcat(q, force))
 
     @cached_property
-    def kept(self) -> dict[str, Any]:
+    def kept(self) -> dict[Any, Any]:
         """Derived things that integrators keep here by names of their own, for as long as the equations live."""
         return {}
 

@@ -28,7 +28,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from mbkit.derivation.kinematics import Vector, add, dot3
+from mbkit.derivation.kinematics import Vector, add
 from mbkit.derivation.link_mechanics import (
     LinkMechanics,
     dot6,
@@ -43,7 +43,7 @@ from mbkit.derivation.links import Inertia, Link
 from mbkit.derivation.mass_matrix_solve import reciprocal
 from mbkit.derivation.model_values import is_zero
 from mbkit.derivation.rotations import SYMMETRIC, Rotation, Rows, congruence, difference, two_sided
-from mbkit.model.joint_types import cross3
+from mbkit.model.joint_types import cross3, dot3
 
 #: Accelerations of carried velocities -> those of all, by velocity index.
 Unfold = Callable[[dict[int, Any]], list[Any]]

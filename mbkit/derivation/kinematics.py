@@ -6,7 +6,7 @@ description vanishes while the graph is built.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +17,7 @@ from mbkit.derivation import model_values
 from mbkit.derivation.model_values import Constants, Values, is_zero, scalar
 from mbkit.model import GravityCompensation, Joint, JointCoupling, Model
 from mbkit.model.changes.dry_friction import FrictionNumbers
-from mbkit.model.joint_types import cross3
+from mbkit.model.joint_types import cross3, dot3
 from mbkit.model.parts import PointSpring
 
 Vector = list[Any]
@@ -28,9 +28,9 @@ def add(a: Vector, b: Vector) -> Vector:
     return [x + y for x, y in zip(a, b, strict=True)]
 
 
-def dot3(a: Any, b: Any) -> Any:
-    """Return a · b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def column(entries: Iterable[Any]) -> Any:
+    """Return scalars as one column, which may be empty."""
+    return ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for x in entries))
 
 
 def constant_times(A: list[Vector], x: Vector) -> Vector:
@@ -75,14 +75,13 @@ class Kinematics:
         self._q_of: dict[str, Vector] = {}
         self._v_of: dict[str, Vector] = {}
         for joint in model.joints:
-            if joint.mimic:
-                values, leader = self.values.of(joint), joint.mimic.joint
-                leading = [scalar(self.q[i]) for i in _range(layout.q[leader])]
-                self._q_of[joint.name] = [values.ratio * x + values.offset for x in leading]
-                self._v_of[joint.name] = [values.ratio * scalar(self.v[i]) for i in _range(layout.v[leader])]
-            else:
-                self._q_of[joint.name] = [scalar(self.q[i]) for i in _range(layout.q[joint.name])]
-                self._v_of[joint.name] = [scalar(self.v[i]) for i in _range(layout.v[joint.name])]
+            own, values = joint.mimic.joint if joint.mimic else joint.name, self.values.of(joint)
+            q, v = (
+                [scalar(self.q[i]) for i in _range(layout.q[own])],
+                [scalar(self.v[i]) for i in _range(layout.v[own])],
+            )
+            self._q_of[joint.name] = [values.ratio * x + values.offset for x in q] if joint.mimic else q
+            self._v_of[joint.name] = [values.ratio * x for x in v] if joint.mimic else v
         self._carrier = {j.child: j for j in model.joints}
 
     def coordinates(self, joint: Joint) -> Vector:

@@ -26,11 +26,11 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_times, dot3
+from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_times
 from mbkit.derivation.mass_matrix_solve import Elimination, elimination_order, elimination_size, reciprocal
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model import Model
-from mbkit.model.joint_types import cross3
+from mbkit.model.joint_types import cross3, dot3
 from mbkit.model.manifold import random_state
 from mbkit.spatial import skew
 

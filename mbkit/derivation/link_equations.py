@@ -21,6 +21,7 @@ from mbkit._check import Array
 from mbkit.derivation.constraints import ConstrainedMotion
 from mbkit.derivation.equations import NOTHING, Acting, ConstrainedEquations, Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
+from mbkit.derivation.kinematics import column
 from mbkit.derivation.least_constraint import (
     LeastConstraint,
     hard_poses,
@@ -89,34 +90,31 @@ class LinkEquations(Equations):
         """The same in the description's own frames, with its constants to the last digit."""
         return LinkMechanics(Links(self.kin, short=False))
 
-    def _column(self, entries: list[Any]) -> Any:
-        return ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for x in entries))
-
     @cached_property
     def gravity(self) -> Any:
         """Forces that hold the system against gravity."""
-        return self._column(LinkMechanics(self.sound.tree, moving=False).forces())
+        return column(LinkMechanics(self.sound.tree, moving=False).forces())
 
     @cached_property
     def coriolis_force(self) -> Any:
         """C(q, v) v."""
-        return self._column(LinkMechanics(self.sound.tree, falling=False).forces())
+        return column(LinkMechanics(self.sound.tree, falling=False).forces())
 
     @cached_property
     def nle(self) -> Any:
         """C v + g."""
-        return self._column(self.sound.forces())
+        return column(self.sound.forces())
 
     @cached_property
     def inverse_dynamics(self) -> Any:
         """M a + C v + g - τ_passive."""
-        return self._column(self.sound.forces(self._scalars(self.a))) - self.passive
+        return column(self.sound.forces(self._scalars(self.a))) - self.passive
 
     @cached_property
     def sound(self) -> LinkMechanics:
         """The short frames, if inverse dynamics keeps its digits there with fewer operations; else the plain ones."""
         a = self._scalars(self.a)
-        exact, form = (self._column(mechanics.forces(a)) for mechanics in (self.plain, self.mechanics))
+        exact, form = (column(mechanics.forces(a)) for mechanics in (self.plain, self.mechanics))
         shorter = ca.n_nodes(form) < ca.n_nodes(exact)
         return self.mechanics if shorter and self._force_error(form, exact) < _MAX_FORCE_ERROR else self.plain
 
@@ -252,8 +250,8 @@ class LinkEquations(Equations):
         for (i, j), x in elimination.rest.items():
             M[place[i], place[j]] = M[place[j], place[i]] = x
         order = [place[k] for k in self.elimination_order if k in place]
-        y = solve(ca.sparsify(M), self._column([force[k] for k in carried]), order)
-        return self._column(unfold({k: scalar(y[i]) for k, i in place.items()}))
+        y = solve(ca.sparsify(M), column([force[k] for k in carried]), order)
+        return column(unfold({k: scalar(y[i]) for k, i in place.items()}))
 
     @cached_property
     def _derivatives(self) -> LinkDerivatives | None:
@@ -282,9 +280,9 @@ class LinkEquations(Equations):
         else:
             elimination = GaussElimination(self._elimination_frames)
             _, unfold = elimination.accelerations(self._scalars(self.tau + self.passive))
-            by_q, by_v = self._derivatives_at(self._derivatives, self._column(unfold({})))
+            by_q, by_v = self._derivatives_at(self._derivatives, column(unfold({})))
             inverse, factors = elimination.inverse_factors()
-            by_q, by_v, by_tau = implicit(self._column(inverse), self._matrix(factors), by_q, by_v)
+            by_q, by_v, by_tau = implicit(column(inverse), self._matrix(factors), by_q, by_v)
         return by_q, by_v, by_tau
 
     @cached_property
@@ -293,7 +291,7 @@ class LinkEquations(Equations):
         if self.least_constraint is not None:
             return super().mass_matrix_inverse
         inverse, factors = GaussElimination(self._elimination_frames).inverse_factors()
-        return implicit(self._column(inverse), self._matrix(factors))[0]
+        return implicit(column(inverse), self._matrix(factors))[0]
 
     @cached_property
     def _elimination_frames(self) -> LinkMechanics:
@@ -311,7 +309,7 @@ class LinkEquations(Equations):
     def _matrix(self, entries: Entries) -> Any:
         n = self.model.nv
         rows, columns = ([key[i] for key in entries] for i in (0, 1))
-        return ca.SX.triplet(rows, columns, self._column(list(entries.values())), n, n)
+        return ca.SX.triplet(rows, columns, column(list(entries.values())), n, n)
 
     @staticmethod
     def _scalars(x: Any) -> list[Any]:

@@ -28,7 +28,7 @@ from typing import Any, Final
 import casadi as ca
 import mpmath
 
-from mbkit.derivation.kinematics import Kinematics, Vector, add, dot3
+from mbkit.derivation.kinematics import Kinematics, Vector, add
 from mbkit.derivation.model_values import cos, is_zero, scalar, sin
 from mbkit.derivation.rotations import (
     SYMMETRIC,
@@ -42,7 +42,7 @@ from mbkit.derivation.rotations import (
     to_parent,
 )
 from mbkit.model import Body, Joint
-from mbkit.model.joint_types import SingleMotion, cross3
+from mbkit.model.joint_types import SingleMotion, cross3, dot3
 
 
 def _handedness(places: Sequence[int]) -> int:

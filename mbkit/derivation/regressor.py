@@ -21,10 +21,10 @@ from typing import Any, Final
 
 import casadi as ca
 
-from mbkit.derivation.kinematics import Kinematics, Vector, add, dot3
+from mbkit.derivation.kinematics import Kinematics, Vector, add
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model.base_parameters import PAIRS, STANDARD, RegressorColumns
-from mbkit.model.joint_types import cross3
+from mbkit.model.joint_types import cross3, dot3
 
 _SIZE: Final = len(STANDARD)
 _UNITS: Final[list[Vector]] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]

@@ -43,35 +43,28 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.system import Lagrangian as Lagrangian
     from mbkit.lagrangian.system import QuasiLagrangian as QuasiLagrangian
 
-_HOME = {
-    "AssumedModes": "mbkit.lagrangian.continua.assumed_modes",
-    "CanonicalEquations": "mbkit.lagrangian.reduction.hamilton",
-    "ConservedQuantity": "mbkit.lagrangian.reduction.hamilton",
-    "Continuum": "mbkit.lagrangian.continua.continuum",
-    "Embedded": "mbkit.lagrangian.independent_coordinates",
-    "EquationsOfMotion": "mbkit.lagrangian.energies.equations_of_motion",
-    "Equilibrium": "mbkit.lagrangian.statics.equilibrium",
-    "FieldEquations": "mbkit.lagrangian.continua.continuum",
-    "FreeBodies": "mbkit.lagrangian.statics.newton_euler",
-    "Hamiltonian": "mbkit.lagrangian.reduction.hamilton",
-    "ImpulseEquations": "mbkit.lagrangian.reduction.impulses",
-    "Integrability": "mbkit.lagrangian.reduction.nonholonomic",
-    "Lagrangian": "mbkit.lagrangian.system",
-    "NonholonomicEquations": "mbkit.lagrangian.reduction.nonholonomic",
-    "NormalModes": "mbkit.lagrangian.continua.ritz",
-    "ProgramText": "mbkit.lagrangian.printing.program_text",
-    "QuasiEquationsOfMotion": "mbkit.lagrangian.reduction.quasi_equations",
-    "QuasiLagrangian": "mbkit.lagrangian.system",
-    "Routhian": "mbkit.lagrangian.reduction.routh",
-    "beam": "mbkit.lagrangian.continua.beam",
-    "clamped_free": "mbkit.lagrangian.continua.beam",
-    "program": "mbkit.lagrangian.printing.program_text",
-    "from_model": "mbkit.lagrangian.from_description",
-    "from_particles": "mbkit.lagrangian.statics.virtual_work",
-    "newton_euler": "mbkit.lagrangian.statics.newton_euler",
-    "portrait": "mbkit.lagrangian.statics.portrait",
-    "generalized_force": "mbkit.lagrangian.statics.virtual_work",
+#: Names by the modules that hold them.
+_NAMES = {
+    "continua.assumed_modes": "AssumedModes",
+    "continua.beam": "beam clamped_free",
+    "continua.continuum": "Continuum FieldEquations",
+    "continua.ritz": "NormalModes",
+    "energies.equations_of_motion": "EquationsOfMotion",
+    "from_description": "from_model",
+    "independent_coordinates": "Embedded",
+    "printing.program_text": "ProgramText program",
+    "reduction.hamilton": "CanonicalEquations ConservedQuantity Hamiltonian",
+    "reduction.impulses": "ImpulseEquations",
+    "reduction.nonholonomic": "Integrability NonholonomicEquations",
+    "reduction.quasi_equations": "QuasiEquationsOfMotion",
+    "reduction.routh": "Routhian",
+    "statics.equilibrium": "Equilibrium",
+    "statics.newton_euler": "FreeBodies newton_euler",
+    "statics.portrait": "portrait",
+    "statics.virtual_work": "from_particles generalized_force",
+    "system": "Lagrangian QuasiLagrangian",
 }
+_HOME = {name: f"mbkit.lagrangian.{module}" for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = ["FUNCTIONS", "CSource", "Equations", "ForwardDynamicsDerivatives", "InverseDynamicsDerivatives", "export_c"]
 __all__ += ["systems", *_HOME]

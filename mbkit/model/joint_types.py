@@ -44,6 +44,11 @@ def cross3(a: Scalars, b: Scalars) -> list[Any]:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
+def dot3(a: Scalars, b: Scalars) -> Any:
+    """Return a · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
 def _about(m: Any, axis: Scalars, angle: Any) -> Rows:
     # Rodrigues with the diagonal as a² + (1 - a²) c: exact zeros and ones of an
     # axis along x, y or z stay exact and vanish from a symbolic graph.

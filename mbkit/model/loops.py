@@ -9,13 +9,9 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.model.joint_types import cross3
+from mbkit.model.joint_types import cross3, dot3
 
 Vector = list[Any]
-
-
-def _dot(a: Any, b: Any) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @dataclass(frozen=True)
@@ -32,11 +28,11 @@ class LoopEnds:
 
     def across(self) -> list[Any]:
         """Return the rows that keep frame b's z-axis along frame a's."""
-        return [_dot(self.a[0], self.b[2]), _dot(self.a[1], self.b[2])]
+        return [dot3(self.a[0], self.b[2]), dot3(self.a[1], self.b[2])]
 
     def sideways(self) -> list[Any]:
         """Return the gap across frame a's z-axis."""
-        return [_dot(self.a[0], self.gap), _dot(self.a[1], self.gap)]
+        return [dot3(self.a[0], self.gap), dot3(self.a[1], self.gap)]
 
     def turn(self) -> list[Any]:
         """Return ½ Σ b_k x a_k: the axis of the turn from frame b to frame a, times the sine of its angle."""
@@ -46,14 +42,14 @@ class LoopEnds:
     def way(self, kind: str) -> Any:
         """Return a number that is negative where the frames of a closed loop of this kind point opposite ways."""
         if kind in HINGED:
-            return _dot(self.a[2], self.b[2])
+            return dot3(self.a[2], self.b[2])
         if kind in WELDED:
-            return sum((_dot(a, b) for a, b in zip(self.a, self.b, strict=True)), 0.0)
+            return sum((dot3(a, b) for a, b in zip(self.a, self.b, strict=True)), 0.0)
         return 0.0
 
     def excess(self) -> Any:
         """Return the square of the distance less that of the rod's length."""
-        return _dot(self.gap, self.gap) - self.length * self.length
+        return dot3(self.gap, self.gap) - self.length * self.length
 
     def stretch(self) -> list[Any]:
         """Return the excess of the distance over the rod's length, to first order."""
@@ -72,7 +68,7 @@ LOOP_ROWS: Final[dict[str, tuple[tuple[str, ...], Callable[[LoopEnds], list[Any]
     "point": (_GAP, lambda e: list(e.gap)),
     "frame": ((*_GAP, *_TURN), lambda e: [*e.gap, *e.turn()]),
     "revolute": ((*_GAP, *_ACROSS), lambda e: [*e.gap, *e.across()]),
-    "universal": ((*_GAP, *_CROSSING), lambda e: [*e.gap, _dot(e.a[2], e.b[2])]),
+    "universal": ((*_GAP, *_CROSSING), lambda e: [*e.gap, dot3(e.a[2], e.b[2])]),
     "cylindrical": ((*_SIDEWAYS, *_ACROSS), lambda e: [*e.sideways(), *e.across()]),
     "prismatic": ((*_SIDEWAYS, *_TURN), lambda e: [*e.sideways(), *e.turn()]),
     "distance": (("length",), lambda e: e.stretch()),

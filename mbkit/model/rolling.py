@@ -20,7 +20,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._reproducible import length, product
-from mbkit.model.joint_types import cross3
+from mbkit.model.joint_types import cross3, dot3
 
 Vector = list[Any]
 RollingKind = Literal["disc", "sphere"]
@@ -66,11 +66,7 @@ class Contact:
         They come from the way of the centre, from a point of the plane, and from the velocity of the material point at
         the contact, both as body b sees them.
         """
-        return [_dot(gap, n) - self.reach for n in self.up], [_dot(velocity, t) - speed for t in self.along]
-
-
-def _dot(a: Vector, b: Vector) -> Any:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+        return [dot3(gap, n) - self.reach for n in self.up], [dot3(velocity, t) - speed for t in self.along]
 
 
 def _blade(a: Vector, b: Vector, tangents: list[Vector], radius: Any, length: Callable[[Any], Any]) -> Contact:  # noqa: ARG001
@@ -79,9 +75,9 @@ def _blade(a: Vector, b: Vector, tangents: list[Vector], radius: Any, length: Ca
 
 
 def _disc(a: Vector, n: Vector, tangents: list[Vector], radius: Any, length: Callable[[Any], Any]) -> Contact:  # noqa: ARG001
-    cosine = _dot(a, n)
+    cosine = dot3(a, n)
     lowest = [x - cosine * y for x, y in zip(n, a, strict=True)]
-    s = length(_dot(lowest, lowest))
+    s = length(dot3(lowest, lowest))
     forward = [x / s for x in cross3(a, n)]
     return Contact([-radius * x / s for x in lowest], radius * s, [n], [forward, cross3(n, forward)])
 

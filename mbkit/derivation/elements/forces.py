@@ -18,10 +18,11 @@ import casadi as ca
 
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
-from mbkit.derivation.kinematics import Kinematics, Vector, compensation_energies, dot3
+from mbkit.derivation.kinematics import Kinematics, Vector, compensation_energies
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model.elements.forces import TIME, Bushing, Force, FrameForce, JointElement, coordinate_arguments
 from mbkit.model.elements.formula import Formula
+from mbkit.model.joint_types import dot3
 
 #: Squares of 2 sin(|θ|/2) up to which asin has its series, of which so many terms leave 1e-38.
 _SMALL: Final = 1e-3

@@ -22,6 +22,7 @@ from typing import Any, Final
 import casadi as ca
 import numpy as np
 
+from mbkit.derivation.equations import kept
 from mbkit.derivation.mass_matrix_solve import ConstraintTerms
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.model.manifold import random_state
@@ -38,79 +39,73 @@ _ROUNDING: Final = 4e-16
 _POSES: Final = 8
 
 
+@kept
 def quick_projection(equations: Any) -> ca.Function:
     """Return (q, v, near, more) -> (q1, v1, far): the consistent state beside a step's end.
 
     The factors are those at the configuration `near`; far is 1 where one iteration leaves more than rounding.
     """
-    if "quick projection" not in equations.kept:
-        c: ConstraintTerms = equations.constraints
-        q, v, extra = equations.q, equations.v, equations.extra_arguments
-        near, by = ca.SX.sym("near", *q.shape), ca.SX.sym("by", *v.shape)
-        more, shift, change = [*extra.values()], _shift(equations), _change(equations)
-        du = ca.densify(shift(near, c.value, *more))
-        # To first order in the move: the rest is its square times the velocity.
-        rate = ca.substitute(c.rate + c.rate_along(by), by, du)
-        dv = change(near, rate, *more)
-        size, apart = ca.sumsqr(du), ca.sumsqr(q - near)
-        left = (size + ca.sumsqr(dv)) * (size + apart)
-        far = left > _LEFT**2 * (1 + ca.sumsqr(q) + ca.sumsqr(v))
-        outs = [_moved(equations, q, du), v + dv, far]
-        equations.kept["quick projection"] = ca.Function("quick_projection", [q, v, near, *more], outs)
-    out: ca.Function = equations.kept["quick projection"]
-    return out
+    c: ConstraintTerms = equations.constraints
+    q, v, extra = equations.q, equations.v, equations.extra_arguments
+    near, by = ca.SX.sym("near", *q.shape), ca.SX.sym("by", *v.shape)
+    more, shift, change = [*extra.values()], *(_change(equations, rows=n) for n in (c.positions, c.jacobian.shape[0]))
+    du = ca.densify(shift(near, c.value, *more))
+    # To first order in the move: the rest is its square times the velocity.
+    rate = ca.substitute(c.rate + c.rate_along(by), by, du)
+    dv = change(near, rate, *more)
+    size, apart = ca.sumsqr(du), ca.sumsqr(q - near)
+    left = (size + ca.sumsqr(dv)) * (size + apart)
+    far = left > _LEFT**2 * (1 + ca.sumsqr(q) + ca.sumsqr(v))
+    outs = [_moved(equations, q, du), v + dv, far]
+    return ca.Function("quick_projection", [q, v, near, *more], outs)
 
 
+@kept
 def thorough_projection(equations: Any, *, exact: bool = False) -> ca.Function:
     """Return (q, v, more) -> (q1, v1, far): the consistent state near a step's end, and 1 where it is too far.
 
     In more digits than double precision has, `exact` takes all iterations.
     """
     name = "thorough_projection" + ("_exact" if exact else "")
-    if name not in equations.kept:
-        q, v, extra = equations.q, equations.v, equations.extra_arguments
-        q1, v1, _, far = projection(equations, exact=exact)(q, v, ca.SX(v.shape[0], 1), *extra.values())
-        equations.kept[name] = ca.Function(name, [q, v, *extra.values()], [q1, v1, far])
-    out: ca.Function = equations.kept[name]
-    return out
+    q, v, extra = equations.q, equations.v, equations.extra_arguments
+    q1, v1, _, far = projection(equations, exact=exact)(q, v, ca.SX(v.shape[0], 1), *extra.values())
+    return ca.Function(name, [q, v, *extra.values()], [q1, v1, far])
 
 
+@kept
 def projection(equations: Any, *, exact: bool = False) -> ca.Function:
     """Return (q, v, moved, more) -> (q1, v1, moved1, far): some iterations onto the constraints from a step's end.
 
     They begin with q ⊕ moved and end with q1 = q ⊕ moved1; far is 1 where others would change more than rounding.
     """
     name = "projection" + ("_exact" if exact else "")
-    if name not in equations.kept:
-        c: ConstraintTerms = equations.constraints
-        q, v, extra = equations.q, equations.v, equations.extra_arguments
-        more, shift, change = [*extra.values()], _shift(equations), _change(equations)
-        rows = ca.Function("rows", [q, v, *more], [c.value, c.rate])
-        start = moved = ca.SX.sym("moved", *v.shape)
-        q1, v1 = _moved(equations, q, start), v
-        f, _ = rows(q1, v, *more)
-        # A residual of rounding stays: the factors of a singular pose nearby would make a change of state of it.
-        slopes = ca.sumsqr(c.jacobian)
-        left = ca.sumsqr(f) > _ROUNDING**2 * slopes * (1 + ca.sumsqr(q))
-        # What is left later is about the product of the last change and of the way from q, where the factors are, if
-        # rows bend as much as they slope.
-        for _ in range(_ITERATIONS):
-            by = shift(q, rows(q1, v, *more)[0], *more)
-            by = by if exact else ca.if_else(left, by, 0)
-            moved = moved + by
-            q1 = _moved(equations, q, moved)
-            left = ca.sumsqr(moved) * ca.sumsqr(by) > _LEFT**2 * (1 + ca.sumsqr(q1))
-        far, (_, rate) = left, rows(q1, v, *more)
-        left = ca.sumsqr(rate) > _ROUNDING**2 * slopes * ca.sumsqr(v)
-        for _ in range(_ITERATIONS):
-            by = change(q, rows(q1, v1, *more)[1], *more)
-            by = by if exact else ca.if_else(left, by, 0)
-            v1 = v1 + by
-            left = ca.sumsqr(moved) * ca.sumsqr(by) > _LEFT**2 * (1 + ca.sumsqr(v1))
-        far = ca.logic_or(far, left)
-        equations.kept[name] = ca.Function(name, [q, v, start, *more], [q1, v1, moved, far])
-    out: ca.Function = equations.kept[name]
-    return out
+    c: ConstraintTerms = equations.constraints
+    q, v, extra = equations.q, equations.v, equations.extra_arguments
+    more, shift, change = [*extra.values()], *(_change(equations, rows=n) for n in (c.positions, c.jacobian.shape[0]))
+    rows = ca.Function("rows", [q, v, *more], [c.value, c.rate])
+    start = moved = ca.SX.sym("moved", *v.shape)
+    q1, v1 = _moved(equations, q, start), v
+    f, _ = rows(q1, v, *more)
+    # A residual of rounding stays: the factors of a singular pose nearby would make a change of state of it.
+    slopes = ca.sumsqr(c.jacobian)
+    left = ca.sumsqr(f) > _ROUNDING**2 * slopes * (1 + ca.sumsqr(q))
+    # What is left later is about the product of the last change and of the way from q, where the factors are, if
+    # rows bend as much as they slope.
+    for _ in range(_ITERATIONS):
+        by = shift(q, rows(q1, v, *more)[0], *more)
+        by = by if exact else ca.if_else(left, by, 0)
+        moved = moved + by
+        q1 = _moved(equations, q, moved)
+        left = ca.sumsqr(moved) * ca.sumsqr(by) > _LEFT**2 * (1 + ca.sumsqr(q1))
+    far, (_, rate) = left, rows(q1, v, *more)
+    left = ca.sumsqr(rate) > _ROUNDING**2 * slopes * ca.sumsqr(v)
+    for _ in range(_ITERATIONS):
+        by = change(q, rows(q1, v1, *more)[1], *more)
+        by = by if exact else ca.if_else(left, by, 0)
+        v1 = v1 + by
+        left = ca.sumsqr(moved) * ca.sumsqr(by) > _LEFT**2 * (1 + ca.sumsqr(v1))
+    far = ca.logic_or(far, left)
+    return ca.Function(name, [q, v, start, *more], [q1, v1, moved, far])
 
 
 def _moved(equations: Any, q: Any, by: Any) -> Any:
@@ -118,48 +113,30 @@ def _moved(equations: Any, q: Any, by: Any) -> Any:
     return space.retract(q, space.to_integrator_velocity(q, by))
 
 
-def _shift(equations: Any) -> ca.Function:
-    """Return the same as `_change` for the rows that hold positions alone."""
-    k, rows = equations.constraints.positions, equations.constraints.jacobian.shape[0]
-    if k == rows:
-        return _change(equations)
-    if "shift" not in equations.kept:
-        own, extra = equations.constraint_factors, equations.extra_arguments
-        residual = ca.SX.sym("residual", k)
-        out = -own.change(residual, k)
-        equations.kept["shift"] = ca.Function("shift", [equations.q, residual, *extra.values()], [out])
-    shift: ca.Function = equations.kept["shift"]
-    return shift
-
-
-def _change(equations: Any) -> ca.Function:
+@kept
+def _change(equations: Any, *, rows: int) -> ca.Function:
     """Return (q, residual, more) -> the least change of velocities, in the metric of M, by which rows lose a residual.
 
-    Its factors are those of forward dynamics at q, which a program has once.
+    These are the first rows. The factors are those of forward dynamics at q, which a program has once.
     """
-    if "change" not in equations.kept:
-        own, extra = equations.constraint_factors, equations.extra_arguments
-        residual = ca.SX.sym("residual", equations.constraints.jacobian.shape[0])
-        out = -own.change(residual)
-        equations.kept["change"] = ca.Function("change", [equations.q, residual, *extra.values()], [out])
-    change: ca.Function = equations.kept["change"]
-    return change
+    own, extra = equations.constraint_factors, equations.extra_arguments
+    residual = ca.SX.sym("residual", rows)
+    out = -own.change(residual, rows)
+    return ca.Function(f"change_{rows}", [equations.q, residual, *extra.values()], [out])
 
 
+@kept
 def dependence(equations: Any) -> ca.Function:
     """Return (q, more) -> how nearly rows of J depend on each other.
 
     The largest ratio of a row's square at usual poses, in the metric of M, to that of its part beside the rows before
     it at q: infinite where a row follows from others or has no slope. Its root grows as the inverse of the distance.
     """
-    if "dependence" not in equations.kept:
-        left: Any = ca.SX(np.inf)
-        for square, usual in zip(equations.constraint_factors.rows.remainders, _largest(equations), strict=True):
-            left = ca.fmin(left, square / usual)
-        given = [equations.q, *equations.extra_arguments.values()]
-        equations.kept["dependence"] = ca.Function("dependence", given, [1.0 / left])
-    out: ca.Function = equations.kept["dependence"]
-    return out
+    left: Any = ca.SX(np.inf)
+    for square, usual in zip(equations.constraint_factors.rows.remainders, _largest(equations), strict=True):
+        left = ca.fmin(left, square / usual)
+    given = [equations.q, *equations.extra_arguments.values()]
+    return ca.Function("dependence", given, [1.0 / left])
 
 
 def _largest(equations: Any) -> list[float]:

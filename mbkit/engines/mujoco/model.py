@@ -158,7 +158,7 @@ def specified(
         if description.joint(name).kind == "free":
             # MuJoCo's spring of a free joint rests where the body is drawn.
             placed.bodies[spring.body_b].pos = np.array(spring.translation_a)
-            placed.bodies[spring.body_b].quat = _wxyz(spring.rotation_a)
+            placed.bodies[spring.body_b].quat = wxyz(spring.rotation_a)
     for force in _held(description):
         # A body without mass, within a stack, has no weight.
         if force.body in placed.bodies:
@@ -286,7 +286,7 @@ def _add_tree(spec: Any, description: Model) -> Placed:
             at[body.name] = (owner, R, p, stack)
             placed.absorbed.add(body.name)
             continue
-        new = placed.bodies[owner].add_body(name=body.name, pos=p, quat=_wxyz(R))
+        new = placed.bodies[owner].add_body(name=body.name, pos=p, quat=wxyz(R))
         placed.bodies[body.name] = new
         _give_inertia(new, body, description, placed)
         if len(stack) > 1 and any(stacked.kind == "prismatic" for stacked, _, _ in stack):
@@ -312,7 +312,7 @@ def _give_inertia(new: Any, body: Body, description: Model, placed: Placed) -> N
         moments, axes = np.linalg.eigh(inertia)
         axes = axes * np.sign(np.linalg.det(axes))
     new.explicitinertial = True
-    new.mass, new.ipos, new.iquat = body.mass, np.array(body.com), _wxyz(axes)
+    new.mass, new.ipos, new.iquat = body.mass, np.array(body.com), wxyz(axes)
     new.inertia = moments
     listed = {name for name, _ in description.nonphysical}
     low, middle, high = np.sort(moments)
@@ -437,7 +437,7 @@ def _add_loops(spec: Any, description: Model, placed: Placed, softness: Softness
         names = []
         for end, body, point, R in ends:
             names.append(f"loop{k}.{end}")
-            placed.bodies[body].add_site(name=names[-1], pos=np.array(point), quat=_wxyz(R))
+            placed.bodies[body].add_site(name=names[-1], pos=np.array(point), quat=wxyz(R))
         equality = spec.add_equality(name=loop.name, type=EQUALITIES[loop.kind], objtype=mujoco.mjtObj.mjOBJ_SITE)
         equality.name1, equality.name2 = names
         equality.solref, equality.solimp = softness.solref, softness.solimp
@@ -550,7 +550,8 @@ def mapped(
     return MujocoModel(model, q_index, v_index, tuple(free), ids, frozenset(absorbed), disabled)
 
 
-def _wxyz(R: Array) -> Array:
+def wxyz(R: Array) -> Array:
+    """Return a rotation as a quaternion in MuJoCo's order."""
     return np.roll(spatial.quaternion_from_matrix(R), 1)
 
 

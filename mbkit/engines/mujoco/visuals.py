@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import mujoco
-import numpy as np
 
-from mbkit import spatial
-from mbkit._check import Array
 from mbkit.engines.imported import reserved
+from mbkit.engines.mujoco.model import wxyz
 from mbkit.model import Model
 from mbkit.show import Shape
 
@@ -25,23 +23,19 @@ _TYPES: Final = {
 _GROUP: Final = 2
 
 
-def _wxyz(R: Array) -> Array:
-    return np.roll(spatial.quaternion_from_matrix(R), 1)
-
-
 def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes: Sequence[Shape]) -> None:
     """Add a site for each frame and geoms for the shapes; those on bodies that MuJoCo does not have are left out."""
     taken = {site.name for site in spec.sites}
     for frame in description.frames:
         if frame.body in bodies:
             name = reserved(frame.name, taken)
-            bodies[frame.body].add_site(name=name, pos=frame.translation, quat=_wxyz(frame.rotation))
+            bodies[frame.body].add_site(name=name, pos=frame.translation, quat=wxyz(frame.rotation))
     meshes: dict[int, str] = {}
     names: set[str] = set()
     for shape in shapes:
         if shape.body not in bodies:
             continue
-        look: dict[str, Any] = {"pos": shape.translation, "quat": _wxyz(shape.rotation), "group": _GROUP}
+        look: dict[str, Any] = {"pos": shape.translation, "quat": wxyz(shape.rotation), "group": _GROUP}
         look |= {"mass": 0.0, "contype": 0, "conaffinity": 0}
         body = bodies[shape.body]
         if shape.kind != "mesh":

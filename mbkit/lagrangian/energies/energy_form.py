@@ -397,15 +397,9 @@ def _rows(into: PlainSymbols, what: str, source: Any) -> tuple[sp.Expr, ...]:
         source = [source]
     if isinstance(source, (Mapping, set, frozenset)) or not isinstance(source, Iterable):
         raise InputError(f"{what}: expected a list of expressions, got {source!r}")
-    rows = list(source)
-    return tuple(_row(into, f"{what}[{k}]", c) for k, c in enumerate(rows))
-
-
-def _row(into: PlainSymbols, what: str, source: Any) -> sp.Expr:
-    """Return f of f = 0; of an equation its left side less its right side."""
-    if isinstance(source, sp.Equality):
-        return into(what, source.lhs) - into(what, source.rhs)
-    return into(what, source)
+    # Of an equation the left side less the right side.
+    sides = [(c.lhs, c.rhs) if isinstance(c, sp.Equality) else (c, 0) for c in source]
+    return tuple(into(f"{what}[{k}]", a) - into(f"{what}[{k}]", b) for k, (a, b) in enumerate(sides))
 
 
 def _inputs(
