@@ -106,11 +106,7 @@ class DryFrictionLaw:
 
 def names_of(model: Model) -> list[str]:
     """Return the names of the velocities with friction, each that of its joint or a numbered one."""
-    out = []
-    for joint in model.independent_joints:
-        part = model.layout.v[joint.name]
-        out += [joint.name if joint.type.nv == 1 else f"{joint.name} {k}" for k in range(part.stop - part.start)]
-    return out
+    return [j.name if j.type.nv == 1 else f"{j.name} {k}" for j in model.independent_joints for k in range(j.type.nv)]
 
 
 def held_at_rest(model: Model) -> str:
@@ -169,12 +165,9 @@ class Sliding:
                 Binding("forces", name, "numbers", (k,), Parameter(self.sides[int(rows[k])], 0.0)) for k in own
             ]
         bound = {(b.part, b.index): b for b in model.bindings if b.where == "joints" and b.field == "armature"}
+        of = [(joint, k) for joint in model.independent_joints for k in range(joint.type.nv)]
         for i, lock in self.locks.items():
-            joint, k = next(
-                (j, i - layout.v[j.name].start)
-                for j in model.independent_joints
-                if layout.v[j.name].start <= i < layout.v[j.name].stop
-            )
+            joint, k = of[i]
             held = bound.pop((joint.name, (k,)), None)
             own_number: Any = float(joint.armature[k]) if held is None else held.expression
             bindings.append(Binding("joints", joint.name, "armature", (k,), Parameter(lock, 0.0) + own_number))

@@ -50,14 +50,11 @@ def mounted(model: Model, pose: ArrayLike) -> Model:
     parts: dict[str, Any] = {
         kind: tuple(hung_on(x, "world", R, p, bindings) for x in getattr(model, kind)) for kind in KINDS_OF_PARTS
     }
-    note = f"mounted at {np.round(p, 6).tolist()} m, roll, pitch, yaw {_degrees(R)} degrees"
+    rpy = [round(float(x) + 0.0, 4) for x in np.degrees(spatial.rpy_from_matrix(R))]
+    note = f"mounted at {np.round(p, 6).tolist()} m, roll, pitch, yaw {rpy} degrees"
     drawn_from = tuple(x.hung_on("world", R, p) for x in model.sources)
     notes = (*model.notes, note)
     return replace(model, **parts, bindings=tuple(bindings), notes=notes, source="", drawn_from=drawn_from)
-
-
-def _degrees(R: Array) -> list[float]:
-    return [round(float(x) + 0.0, 4) for x in np.degrees(spatial.rpy_from_matrix(R))]
 
 
 def join(

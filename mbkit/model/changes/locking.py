@@ -69,13 +69,14 @@ def lock(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike |
     followers = ", ".join(name for name in values if name not in given)
     listed = ", ".join(f"{name} at {_short(x)}" for name, x in given.items())
     notes.insert(0, f"locked: {listed}" + (f"; with them {followers}" if followers else ""))
+    pairs = [(model.joint(name), x) for name, x in values.items()]
     out = replace(
         model,
         **parts,
         bindings=tuple(bindings),
         source="",
         drawn_from=model.sources,
-        locked=(*model.locked, *(_kept(model.joint(name), x) for name, x in values.items() if _free(model, name))),
+        locked=(*model.locked, *((j.name, tuple(x.tolist()), j.type.nv) for j, x in pairs if not j.mimic)),
     )
     closed, more = _closed_for_good(out)
     kept = tuple(x for x in out.loops if x not in closed)
@@ -84,16 +85,8 @@ def lock(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike |
     return replace(out, loops=kept, bindings=tuple(bindings), notes=(*out.notes, *notes, *more))
 
 
-def _kept(joint: Joint, x: Array) -> tuple[str, tuple[float, ...], int]:
-    return joint.name, tuple(x.tolist()), joint.type.nv
-
-
 def _short(x: Array) -> str:
     return f"{x[0]:g}" if len(x) == 1 else str(np.round(x, 6).tolist())
-
-
-def _free(model: Model, name: str) -> bool:
-    return model.joint(name).mimic is None
 
 
 def _given(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike | None) -> Values:
@@ -320,11 +313,9 @@ def _on_one(
 def _locked_arguments(model: Model, values: Values) -> dict[str, float]:
     out: dict[str, float] = {}
     for name, x in values.items():
-        if not _free(model, name):
-            continue
-        joint, first_q, first_v = model.joint(name), model.layout.q[name].start, model.layout.v[name].start
-        out |= {model.coordinate_names[first_q + k]: float(x[k]) for k in range(joint.type.nq)}
-        out |= {model.velocity_names[first_v + k] + RATE: 0.0 for k in range(joint.type.nv)}
+        # A joint that mimics has no names of its own.
+        out |= dict(zip(model.coordinate_names[model.layout.q[name]], x.tolist(), strict=False))
+        out |= {rate + RATE: 0.0 for rate in model.velocity_names[model.layout.v[name]]}
     return out
 
 

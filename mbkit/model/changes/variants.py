@@ -307,9 +307,8 @@ def _bodies_drawn(
 
 def _require_bodies_that_can_be(model: Model, values: Mapping[str, Array], scales: Sequence[Scale], size: int) -> None:
     """Refuse draws that no body, damper or spring can have (InputError)."""
-    drawn: dict[str, Array] = {}
     numbers = {x.path: x for x in numbers_of(model)}
-    drawn |= {path: values[path] for path in numbers if path in values}
+    drawn = {path: values[path] for path in numbers if path in values}
     for one in scales:
         for x in {x.path: x for pattern in one.patterns for x in chosen(model, pattern)}.values():
             drawn[x.path] = drawn.get(x.path, x.value) * values[one.name]
