@@ -1,4 +1,4 @@
-"""Small linear algebra that is the same on every processor: products, lengths, and which rows are independent.
+"""Small linear algebra that is the same on every processor: products, lengths, rows and what is held by them.
 
 BLAS sums in an order, and with fused operations, that are those of the processor. The digest of a description must not
 hang on the last bits of these, and a choice of rows must not hang on which of two equal ones they make the larger.
@@ -98,6 +98,41 @@ def unit_rows(J: Array) -> Array:
     """Return J with rows of unit size, (..., m, n), and zeros for a row whose slope is rounding of the others'."""
     size = np.linalg.norm(J, axis=-1, keepdims=True)
     return np.asarray(J / np.where(size > DEPENDENT * size.max(axis=-2, keepdims=True, initial=0.0), size, np.inf))
+
+
+def under_rows(M: Array, J: Array, force: Array, rate: Array, rounding: float = DEPENDENT) -> tuple[Array, Array, int]:
+    """Return x and λ of M x - Jᵀ λ = force, J x = rate, and how many rows are independent.
+
+    By orthogonal factors of the rows in the metric of M and of themselves: M may have no inverse, and where J x is
+    given they change neither x nor λ. These factors lose digits with the condition, those of J M⁻¹ Jᵀ with its square.
+    Of rows that depend on each other x is the nearest to their rates, and λ has the least norm.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        M has no inverse on what the rows leave free.
+    """
+    masses = np.abs(np.diag(M))
+    across = 1.0 / np.sqrt(np.where(masses > 0, masses, masses.max(initial=0.0) or 1.0))
+    sizes = np.linalg.norm(J * across, axis=1)
+    scaled, sizes = unit_rows(J * across), np.where(sizes > 0, sizes, 1.0)
+    L = np.linalg.cholesky(across[:, None] * M * across + scaled.T @ scaled)
+    U, s, V = np.linalg.svd(np.linalg.solve(L, scaled.T), full_matrices=False)
+    rank = int(np.count_nonzero(s > rounding * s.max(initial=0.0)))
+    U, s, V = U[:, :rank], s[:rank], V[:rank].T
+    x: Array = np.zeros(len(M))
+    multipliers: Array = np.zeros(len(J))
+    # Refined once: of masses that differ by decades the factors lose digits of the rows.
+    for _ in range(2):
+        rest = (rate - J @ x) / sizes
+        free = np.linalg.solve(L, across * (force - M @ x + J.T @ multipliers) + scaled.T @ rest)
+        along, z = U.T @ free, V.T @ rest / s
+        beside = free - U @ along
+        x = x + across * np.linalg.solve(L.T, beside - U @ (U.T @ beside) + U @ z)
+        multipliers = multipliers + V @ ((z - along) / s) / sizes
+    if rank < len(J):
+        multipliers = np.asarray(np.linalg.lstsq(J.T, J.T @ multipliers, rcond=rounding)[0])
+    return x, multipliers, rank
 
 
 def singular_values(J: Array) -> Array:

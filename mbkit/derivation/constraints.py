@@ -18,7 +18,7 @@ which those with the least norm are given, and left out of the equation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
 from typing import Any, Final, NamedTuple
@@ -32,7 +32,6 @@ from mbkit._reproducible import DEPENDENT, independent_rows
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, add, column, constant_transposed_times, follower
-from mbkit.derivation.least_constraint import hard_poses
 from mbkit.derivation.mass_matrix_solve import ConstraintFactors, ConstraintTerms, Factors, OrthogonalColumns
 from mbkit.errors import InputError
 from mbkit.model import Model, NoSlip
@@ -40,7 +39,7 @@ from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.elements.references import called
 from mbkit.model.joint_types import cross3
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
-from mbkit.model.manifold import integrate, random_state, shortened_steps
+from mbkit.model.manifold import closest_configuration, integrate, random_state
 from mbkit.model.parts import Coupler, Loop
 from mbkit.model.rolling import NO_SLIP_ROWS, Contact, contact, discs_of
 from mbkit.model.validation import sample_mass_matrix
@@ -56,19 +55,10 @@ _LIES: Final = 1e-6
 #: Configurations at which rows are looked at, and random starts from which a closed one is searched.
 _LOOKS: Final = 6
 _STARTS: Final = 12
-_STEPS: Final = 60
 #: Smallest eigenvalue of a mass matrix with a unit diagonal that still has an inverse of some digits.
 _SINGULAR: Final = 1e-9
-#: Eigenvalue up to which elimination loses more than some five digits, and how many times as large it has to be with
-#: constraints in the matrix for these to be worth their operations.
-_LOSES: Final = 1e-5
-_BETTER: Final = 1e3
-#: Remainder of the last independent row, of 1, at a closed configuration that is far from singular poses.
-_WELL: Final = 0.01
 #: Residual of a closed configuration, in terms of its rows' size; what is open by more closes elsewhere, or nowhere.
 _CLOSED: Final = 1e-13
-#: Steps of Newton's after that, which leave rounding alone.
-_POLISHED: Final = 2
 #: Poses beside a closed one, and how far they are away, rad or m.
 _BESIDE: Final = 3
 _ASIDE: Final = 0.2
@@ -293,31 +283,17 @@ class _Numbers:
         f, J, still, _ = self._call(q, self._parameters)
         return np.concatenate([np.array(f)[:, 0], np.array(still)[self.positions :, 0]]), np.array(J)
 
-    def closed(self, q: Array, kept: list[int], still: int | None = None) -> Array | None:
-        """Return a configuration near q where these rows are zero, by damped Gauss-Newton; None where it ends else.
+    def closed(self, q: Array, kept: list[int], still: Collection[int] = ()) -> Array | None:
+        """Return a configuration near q where these rows are zero; None where the search ends elsewhere."""
 
-        The velocity `still` moves nothing.
-        """
+        def rows(x: Array) -> tuple[Array, Array]:
+            f, J = self(x)
+            return f[kept], J[kept]
 
-        def terms(x: Array) -> tuple[float, tuple[Array, Array]]:
-            f, J = (rows[kept] for rows in self(x))
-            return float(np.linalg.norm(f)), (f, J)
-
-        def step(f: Array, J: Array) -> Array:
-            if still is not None:
-                J[:, still] = 0.0
-            return np.asarray(np.linalg.lstsq(J, -f, rcond=1e-10)[0])
-
-        q, size, _ = shortened_steps(self.model, q, terms, step, enough=_CLOSED, most=_STEPS)
-        # Dependent rows are told from nearly dependent ones by the last digits.
-        for _ in range(_POLISHED):
-            q = integrate(self.model, q, step(*terms(q)[1]))
-        size, (_, J) = terms(q)
-        # Long levers have large rows.
-        size /= max(1.0, float(np.abs(J).max(initial=0.0)))
+        q, size, _ = closest_configuration(self.model, q, np.eye(self.model.nv), rows, still)
         # Half a turn away the sine of a frame's angle is zero too, and its rows depend on each other.
         turned = np.array(self._call(q, self._parameters)[3])
-        return q if size < _CLOSED and (turned >= 0).all() else None
+        return q if size < _CLOSED * (1 + np.abs(q).max()) and (turned >= 0).all() else None
 
     def around(self, q: Array, kept: list[int], held: list[int]) -> Iterator[_Pose]:
         """Yield what the rows are at a closed pose, and at some beside it.
@@ -329,7 +305,7 @@ class _Numbers:
         free = np.linalg.svd(J)[2][len(independent_rows(J, len(held))[0]) :]
         moving = np.argsort(-np.linalg.norm(free, axis=0).round(6), kind="stable")[:_BESIDE] if len(free) else ()
         for i in moving:
-            x = self.closed(integrate(self.model, q, _ASIDE * np.eye(len(J.T))[i]), held, still=i)
+            x = self.closed(integrate(self.model, q, _ASIDE * np.eye(len(J.T))[i]), held, [i])
             if x is not None and np.isfinite(self(x)[1]).all():
                 yield _Pose(*independent_rows(self(x)[1][kept], len(held)), x)
 
@@ -367,22 +343,20 @@ def _chosen_rows(model: Model) -> RowChoice:
     anywhere = [random_state(model, rng, None)[0] for _ in range(_LOOKS)]
     kept = _with_something_to_say(numbers, anywhere)
     held, names = [i for i in kept if i < numbers.positions], tuple(numbers.names[i] for i in kept)
-    wide = (integrate(model, model.neutral(), rng.uniform(-3, 3, model.nv)) for _ in range(_STARTS))
-    found: list[_Pose] = []
-    for start in (model.neutral(), *anywhere, *wide):
+    for start in starts(model, rng, anywhere):
         q = numbers.closed(start, held)
-        if q is None or not np.isfinite(numbers(q)[1]).all():
-            continue
-        # On a branch rows may depend on each other at every pose: the rank is that of the poses around.
-        found += [max(numbers.around(q, kept, held), key=lambda x: (len(x.rows), x.least))]
-        # One that is far from singular poses; the search for others may end elsewhere on another processor.
-        if found[-1].least > _WELL:
-            break
-    if not found:
-        # The state that a user gives tells more: it is refused there, with the residual of each row.
-        return RowChoice(tuple(kept), len(held), tuple(range(len(kept))), names)
-    best = max(found, key=lambda x: x.least)
-    return RowChoice(tuple(kept), len(held), best.rows, names, best.q)
+        if q is not None and np.isfinite(numbers(q)[1]).all():
+            # On a branch rows may depend on each other at every pose: the rank is that of the poses around.
+            best = max(numbers.around(q, kept, held), key=lambda x: (len(x.rows), x.least))
+            return RowChoice(tuple(kept), len(held), best.rows, names, best.q)
+    # The state that a user gives tells more: it is refused there, with the residual of each row.
+    return RowChoice(tuple(kept), len(held), tuple(range(len(kept))), names)
+
+
+def starts(model: Model, rng: np.random.Generator, first: Iterable[Array] = ()) -> list[Array]:
+    """Return configurations from which closed ones are searched: the neutral one, the first ones, and random ones."""
+    far = (integrate(model, model.neutral(), rng.uniform(-3, 3, model.nv)) for _ in range(_STARTS))
+    return [model.neutral(), *first, *far]
 
 
 def _with_something_to_say(numbers: _Numbers, poses: list[Array]) -> list[int]:
@@ -561,23 +535,8 @@ class ConstrainedMotion(ConstraintQuantities):
     @cached_property
     def constraint_factors(self) -> ConstraintFactors:
         """Factors of M, or more careful ones where M would lose digits, and of J's rows in its metric."""
-        doubtful = self.elimination == "least constraint"
-        careful = singular_mass_matrix(self.model) or (doubtful and self._constraints_hold_what_mass_does_not())
+        careful = singular_mass_matrix(self.model)
         return ConstraintFactors(self.constraints, self.mass_matrix, self.elimination_order, careful=careful)
-
-    def _constraints_hold_what_mass_does_not(self) -> bool:
-        """Return whether W = M + Jᵀ diag(s) J of `ConstraintTerms` keeps digits that M loses at some hard pose.
-
-        Not where a joint locks, or a thin rod turns about its line: loops do not see that motion either.
-        """
-        given = [np.array(list(self.model.parameters.values()), dtype=np.float64)] if self.extra_arguments else []
-        weights = [ca.densify(x) for x in (self.mass_matrix, self.constraints.weight(self.mass_matrix))]
-        matrices = ca.Function("weights", [self.q, *self.extra_arguments.values()], weights)
-        for q in hard_poses(self.model, np.random.default_rng(0)):
-            mass, held = (_least_part(np.array(x)) for x in matrices(q, *given))
-            if mass < _LOSES and held > max(_BETTER * mass, _SINGULAR):
-                return True
-        return False
 
     @cached_property
     def _constrained(self) -> tuple[Any, Any]:

@@ -221,10 +221,9 @@ class ConstraintTerms:
         # Of a row without slope the term is zero.
         return ca.sqrt((heavy + _TINY) / (light + _TINY)) / (ca.sum2(squares) + _TINY)
 
-    def weight(self, M: Any, rows: int | None = None) -> Any:
-        """Return W = M + Jᵀ diag(s) J of `stiffening`, of all rows or of the first ones."""
-        J = self.jacobian[:rows, :]
-        return M + ca.mtimes(J.T, self.stiffening(M)[:rows, :] * J)
+    def weight(self, M: Any) -> Any:
+        """Return W = M + Jᵀ diag(s) J of `stiffening`."""
+        return M + ca.mtimes(self.jacobian.T, self.stiffening(M) * self.jacobian)
 
 
 class ConstraintFactors:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from mbkit._attributes import forwarded
 from mbkit._check import Array
-from mbkit._reproducible import DEPENDENT, dependent, independent_rows, pivoted, singular_values, unit_rows
+from mbkit._reproducible import dependent, independent_rows, pivoted, singular_values, under_rows, unit_rows
+from mbkit.derivation.constraints import starts
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.engines.base import Dynamics, at_time
@@ -25,14 +26,12 @@ from mbkit.engines.constrained import CONSISTENT, ROWS, singular_pose
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
-from mbkit.model.manifold import random_state, shortened_steps
+from mbkit.model.manifold import closest_configuration, least_change
 from mbkit.model.rolling import discs_of
 
 _EPS: Final = float(np.finfo(float).eps)
 #: Rounds of the projection's iterations.
 _ROUNDS: Final = 8
-# How far Newton's iteration may move a state before it is looked whether its factors are of rounding.
-_FLUNG: Final = 1e-4
 #: Of the largest singular value of J, the smallest one at a singular pose: there v̇ from the equation of motion loses as
 #: many digits, eps/σ, as that of the pose itself is off, σ. So it is no `DEPENDENT`, where no digit is left.
 AT_POSE: Final = float(np.sqrt(_EPS))
@@ -50,10 +49,7 @@ def _function(eq: Any, name: str) -> ca.Function:
         del inputs["v"]
         outputs = {"f": c.value, "J": c.jacobian}
     elif name == "constraint":
-        M = eq.mass_matrix
-        outputs = {"f": c.value, "J": c.jacobian, "by_time": c.by_time, "rate": c.rate, "W": c.weight(M), "M": M}
-        # That of positions alone.
-        outputs["V"] = c.weight(M, k)
+        outputs = {"f": c.value, "J": c.jacobian, "rate": c.rate, "M": eq.mass_matrix}
     elif name == "constraint_step":
         # q after a step of Newton's, and v consistent there.
         space, own = SymbolicSpace(eq.model), eq.constraint_factors
@@ -85,14 +81,12 @@ def _function(eq: Any, name: str) -> ca.Function:
 
 
 class _Terms(NamedTuple):
-    """Numbers at one state: f (k,), J (m, n), rates (m,), and weights (n, n): W of all rows, M, and V of positions."""
+    """Numbers at one state: f (k,), J (m, n), rates (m,), and M (n, n)."""
 
     f: Array
     J: Array
     rate: Array
-    W: Array
     M: Array
-    V: Array
 
     @property
     def scale(self) -> Array:
@@ -172,25 +166,20 @@ class Manifold:
         """Return J, (m, n) or (N, m, n)."""
         return self.call("constraint_rows", q)[1]
 
-    def position_jacobian(self, q: Array) -> Array:
-        """Return J of the rows that hold positions, (k, n) or (N, k, n)."""
-        f, J = self.call("constraint_rows", q)
-        return np.asarray(J[..., : f.shape[-2], :])
-
     def multipliers(self, q: Array, v: Array, tau: Array) -> Array:
         """Return λ, (m,) or (N, m)."""
         return np.asarray(self.call("multipliers", q, v, tau)[0][..., 0])
 
     def _terms(self, q: Array, v: Array) -> _Terms:
-        f, J, _, rate, W, M, V = self.call("constraint", q, v)
-        return _Terms(f[:, 0], J, rate[:, 0], W, M, V)
+        f, J, rate, M = self.call("constraint", q, v)
+        return _Terms(f[:, 0], J, rate[:, 0], M)
 
     # Consistency
 
     def check(self, q: Array, v: Array) -> None:
         """Refuse an inconsistent state, of one or a batch, with the residuals (InputError)."""
         states = np.atleast_2d(q), np.atleast_2d(v)
-        f, J, _, rate, *_ = self.call("constraint", *states)
+        f, J, rate, _ = self.call("constraint", *states)
         rows = CONSISTENT * _scale(J)
         for name, what, left, x in zip(("q0", "v0"), ("f", "J v + c"), (f[..., 0], rate[..., 0]), states, strict=True):
             most = rows[:, : left.shape[1]] * np.maximum(1.0, np.abs(x).max(axis=1))[:, None]
@@ -210,12 +199,6 @@ class Manifold:
                 closed = closed_near(own.dyn, states[0][k])
                 raise InputError(f"q0: {self.dyn.model.name} is open there{where}: {', '.join(still)}; {closed}")
 
-    def doubtful(self, q: Array) -> Array:
-        """Return, for each of a batch, whether the constraints may depend on each other there."""
-        if self.dyn.samples is not None or len(self.equations.all_constraints.names) > len(self.names):
-            return np.full(len(q), True)
-        return np.asarray(~(self.dependence(q) < _FLAT**-2))
-
     def member(self, k: int) -> Manifold:
         """Return the states of one sample of a batch of parameters; the same where there is none."""
         if self.dyn.samples is None:
@@ -227,19 +210,13 @@ class Manifold:
         """Return the consistent state beside one that has drifted a little, or of each of a batch.
 
         The formula is that of `mbkit.derivation.steps.onto_constraints`. A state that is far from the constraints or
-        not finite comes back as it is or as NaN. One at a singular pose, where the factors are of rounding, is pulled
-        by the rows that are independent there.
+        not finite comes back as it is or as NaN.
         """
         q1, v1, moved = q, v, np.zeros(v.shape)
         for _ in range(_ROUNDS):
             q1, v1, moved, far = (x[..., 0] for x in self.call("projection", q, v1, moved))
             if not far.any():
                 break
-        change = np.maximum(*(np.abs(x - x0).max(axis=-1) for x, x0 in ((q1, q), (v1, v))))
-        if bool((change <= _FLUNG).all()):
-            return q1, v1
-        for i in map(tuple, np.argwhere(self.at_pose(q) & ~(change <= _FLUNG))):
-            q1[i], v1[i] = self._pulled_at_pose(q[i], v[i])
         return q1, v1
 
     def beside(self, q: Array, v: Array) -> tuple[Array, Array]:
@@ -257,38 +234,26 @@ class Manifold:
         sizes = singular_values(self.jacobian(q))
         return np.asarray(sizes[..., -1] <= AT_POSE * sizes[..., 0])
 
-    def _pulled_at_pose(self, q: Array, v: Array) -> tuple[Array, Array]:
-        for _ in range(2):
-            x = self._terms(q, v)
-            scale = x.scale[: len(x.f)]
-            q = self.dyn.model.integrate(q, least_change(x.V, x.held / scale[:, None], -x.f / scale, AT_POSE))
-        x = self._terms(q, v)
-        return q, v + least_change(x.W, x.J / x.scale[:, None], -x.rate / x.scale, AT_POSE)
-
     def project(self, q: Array, v: Array, held: Collection[int] = ()) -> tuple[Array, Array]:
         """Return the nearest consistent state, in the metric of the mass matrix; `InputError` if none is consistent.
 
         The velocities `held`, and what they move, stay as they are.
         """
-        free = self._free(held)
-        x = self.restored(q, v, held)
-        M, model = self._terms(q, v).M[np.ix_(free, free)], self.dyn.model
+        free, x, model = self._free(held), self.restored(q, held), self.dyn.model
+        M = self._terms(q, v).M[np.ix_(free, free)]
         # Stationary: M (x - q) + Jᵀ μ = 0 with f(x) = 0.
         last, step = np.inf, np.zeros(model.nv)
         for _ in range(_MOST):
             terms = self._terms(x, v)
-            f, J = terms.f, terms.held[:, free]
-            K = np.block([[M, J.T], [J, np.zeros((len(J), len(J)))]])
-            away = np.concatenate([M @ model.difference(x, q)[free], -f])
-            step[free] = np.linalg.lstsq(K, away, rcond=1e-14)[0][: len(free)]
+            step[free] = under_rows(M, terms.held[:, free], M @ model.difference(x, q)[free], -terms.f)[0]
             size = float(np.linalg.norm(step))
             if size <= 1e-12 * (1 + float(np.linalg.norm(x))):
                 break
             # Where the constraints bend strongly, whole steps go to and fro about the foot.
-            x = self.restored(model.integrate(x, step if size < last else 0.5 * step), v, held)
+            x = self.restored(model.integrate(x, step if size < last else 0.5 * step), held)
             last = min(last, size)
         terms = self._terms(x, v)
-        v = v + least_change(terms.W, terms.J, -terms.rate, free=free)
+        v = v + least_change(terms.M, terms.J, -terms.rate, held)
         if not held and (still := self.still_open(x, v)):
             raise InputError(f"v: {model.name}: no velocity satisfies all constraints: open stay {', '.join(still)}")
         return x, v
@@ -299,13 +264,8 @@ class Manifold:
 
     def acceleration(self, q: Array, v: Array, a: Array, held: Collection[int] = ()) -> Array:
         """Return the nearest a with J a + γ = 0, in the metric of the mass matrix."""
-        free = self._free(held)
-        J, _, gamma, *_ = self.call("embedded", q, v)
-        W = self._terms(q, v).W
-        # Once more for what rounding leaves of large accelerations.
-        for _ in range(2):
-            a = a + least_change(W, J, -gamma[:, 0] - J @ a, free=free)
-        return a
+        J, _, gamma, M, _ = self.call("embedded", q, v)
+        return np.asarray(a + least_change(M, J, -gamma[:, 0] - J @ a, held))
 
     def _free(self, held: Collection[int]) -> Array:
         return np.setdiff1d(np.arange(self.dyn.model.nv), [*held]).astype(int)
@@ -331,31 +291,31 @@ class Manifold:
                 f"{_named(moving[lost], self)} has no slope or depends on other rows; hold other coordinates"
             )
 
-    def restored(self, q: Array, v: Array, held: Collection[int] = ()) -> Array:
+    def closest(self, q: Array, held: Collection[int] = ()) -> tuple[Array, float, Array]:
+        """Return where the search for f = 0 from q ends, the size of what is left in terms of the rows, and f there."""
+
+        def rows(x: Array) -> tuple[Array, Array]:
+            f, J = self.call("constraint_rows", x)
+            return f[:, 0], J[: len(f)]
+
+        M = self._terms(q, np.zeros(self.dyn.model.nv)).M
+        return closest_configuration(self.dyn.model, q, M, rows, held)
+
+    def restored(self, q: Array, held: Collection[int] = ()) -> Array:
         """Return a configuration with f = 0, by steps that are the least in the mass matrix's metric."""
-        free = self._free(held)
-
-        def terms(x: Array) -> tuple[float, tuple[_Terms]]:
-            rows = self._terms(x, v)
-            return float(np.linalg.norm(rows.f / rows.scale[: len(rows.f)])), (rows,)
-
-        def step(rows: _Terms) -> Array:
-            return least_change(rows.V, rows.held, -rows.f, free=free)
-
-        x, size, (rows,) = shortened_steps(self.dyn.model, q, terms, step, enough=4 * _EPS, most=_MOST)
-        if not size <= 1e-10 * (1 + float(np.abs(x).max())):
+        x, size, f = self.closest(q, held)
+        if not size <= _HOLDS * (1 + float(np.abs(x).max())):
             if not held:
                 refuse_unreachable(self.dyn, q)
             raise InputError(
-                f"q: {self.dyn.model.name} has no consistent state near it; f = {_residuals(rows.f)} is the "
-                "least reached"
+                f"q: {self.dyn.model.name} has no consistent state near it; f = {_residuals(f)} is the least reached"
             )
         if still := self.still_open(x):
             raise InputError(
                 f"q: {self.dyn.model.name}: near it the other rows close where these are open: {', '.join(still)}; "
                 "start nearer to a closed configuration"
             )
-        return np.asarray(x)
+        return x
 
 
 def _residuals(x: Array) -> str:
@@ -371,24 +331,6 @@ def manifold_of(dyn: Dynamics) -> Manifold:
     if _TWIN not in vars(dyn):
         vars(dyn)[_TWIN] = LagrangianDynamics(dyn.model)
     return Manifold(vars(dyn)[_TWIN])
-
-
-def least_change(W: Array, J: Array, change: Array, rounding: float = DEPENDENT, *, free: Array | None = None) -> Array:
-    """Return the x with J x = change that is the least in xᵀ W x; the nearest to it where J has dependent rows.
-
-    Only entries that are `free` are other than zero.
-    """
-    if free is not None and len(free) < len(W):
-        out = np.zeros(len(W))
-        out[free] = least_change(W[np.ix_(free, free)], J[:, free], change, rounding)
-        return out
-    try:
-        L = np.linalg.cholesky(W)
-    except np.linalg.LinAlgError:
-        L = np.eye(len(W))
-    A = np.linalg.solve(L, J.T).T
-    y = np.linalg.lstsq(A, change, rcond=rounding)[0]
-    return np.asarray(np.linalg.solve(L.T, y))
 
 
 #: take(near) -> (q1, w1, last): a step and the configuration of its last stage. Where it is near a singular pose, its
@@ -547,7 +489,7 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
         if still := manifold.still_open(q):
             raise InputError(f"q: {model.name} is open there: {', '.join(still)}; {closed_near(manifold.dyn, q)}")
         # The digits that rounding left out of a closed pose tell dependent rows from nearly dependent ones.
-        q = manifold.restored(q, np.zeros(model.nv))
+        q = manifold.restored(q)
         J, chosen = manifold.all_rows(q), equations.row_choice.independent
         independent, _ = independent_rows(J, held)
         if len(chosen) == len(independent) == len(independent_rows(J[list(chosen)])[0]):
@@ -561,9 +503,6 @@ def mobility(dyn: Dynamics, q: Array | None) -> Mobility:
 
 # Independence
 
-#: Random starts from which a consistent configuration is searched, and steps from each.
-_STARTS: Final = 12
-_STEPS: Final = 100
 #: Configurations near a pose at which J is evaluated too, and how far they are away, rad or m.
 _BESIDE: Final = 4
 _ASIDE: Final = 0.05
@@ -589,7 +528,6 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
     """
     manifold = manifold_of(dyn)
     require_few(manifold)
-    _require_redundant(manifold, q)
     rng = np.random.default_rng(0)
     beside = [dyn.model.integrate(q, _ASIDE * rng.standard_normal(dyn.model.nv)) for _ in range(_BESIDE)]
     sizes = np.max([np.linalg.norm(manifold.jacobian(x), axis=1) for x in (q, *beside)], axis=0)
@@ -605,21 +543,6 @@ def require_independent(dyn: Dynamics, q: Array, *, everywhere: bool = False) ->
     raise singular_pose("q", dyn.model.name, manifold.names, J)
 
 
-def _require_redundant(manifold: Manifold, q: Array) -> None:
-    """Refuse a configuration at which rows that are redundant elsewhere are not (InputError)."""
-    equations = manifold.equations
-    names, independent = equations.all_constraints.names, equations.row_choice.independent
-    if len(names) == len(independent):
-        return
-    here, _ = independent_rows(manifold.all_rows(q), equations.all_constraints.positions)
-    if len(here) > len(independent):
-        more = ", ".join(name for k, name in enumerate(names) if k not in independent)
-        raise InputError(
-            f"q: {manifold.dyn.model.name} has {len(here)} independent rows here and {len(independent)} where it can "
-            f"move, without {more}; start on the branch on which it moves"
-        )
-
-
 def closed_near(dyn: Dynamics, q: Array) -> str:
     """Return the nearest closed configuration found, for a message; an `InputError` where `refuse_unreachable` does."""
     return f"closed is q = {np.array2string(refuse_unreachable(dyn, q), precision=8, separator=', ', threshold=20)}"
@@ -631,42 +554,32 @@ def refuse_unreachable(dyn: Dynamics, q: Array | None = None) -> Array:
     The search starts at q, then at random configurations; the first closed one is returned.
     """
     states, model = manifold_of(dyn), dyn.model
-    rng = np.random.default_rng(0)
-    starts = [_far_out(model, float(rng.choice([1.0, 3.0])), rng) for _ in range(_STARTS)]
-    starts[:0] = [] if q is None else [q]
+    tried = [*([] if q is None else [q]), *starts(model, np.random.default_rng(0))]
     least, left = np.inf, np.zeros(states.equations.constraints.positions)
-    for start in starts:
-        sizes = np.linalg.norm(states.position_jacobian(start), axis=1)
-        end, f = _nearest(states, start, np.where(sizes > _ROUNDED, sizes, 1.0))
-        size = float(np.linalg.norm(f))
+    for start in tried:
+        end, size, f = states.closest(start)
         still = states.still_open(end) if size < _HOLDS else []
         if size < _HOLDS and not still:
             require_independent(dyn, end, everywhere=True)
             return end
         if size < least:
-            least, left = size, states.value(end)
+            least, left = size, f
     if least < _HOLDS:
         raise InputError(
-            f"q: {model.name}: from {len(starts)} starts its loops close only with something open: "
+            f"q: {model.name}: from {len(tried)} starts its loops close only with something open: "
             f"{', '.join(still) or 'rows that are redundant elsewhere'}; start nearer to a closed configuration"
         )
     against = np.flatnonzero(np.abs(left) > 1e-6 * np.abs(left).max())
     raise InputError(
-        f"constraints: no configuration satisfies them all, from {len(starts)} starts; it seems that "
+        f"constraints: no configuration satisfies them all, from {len(tried)} starts; it seems that "
         f"{_named(against, states)} {'contradict each other' if len(against) > 1 else 'cannot hold'}: the least "
         f"that is left of them is {_residuals(left[against])}"
     )
 
 
-def _far_out(model: Model, far: float, rng: np.random.Generator) -> Array:
-    """Return a random configuration, so many times as far from the neutral one."""
-    q, _ = random_state(model, rng, None)
-    return q if far == 1.0 else model.integrate(q, (far - 1) * model.difference(model.neutral(), q))
-
-
 def _explain(manifold: Manifold, starts: list[Array], scale: Array, sizes: Array) -> None:
     """Raise why J has dependent rows at and around the first start; return where it has full rank nearby."""
-    consistent = [x for x, f in (_nearest(manifold, q, scale) for q in starts) if np.linalg.norm(f) < _HOLDS]
+    consistent = [x for x, size, _ in map(manifold.closest, starts) if size < _HOLDS]
     if not consistent:
         refuse_unreachable(manifold.dyn, starts[0])
         return
@@ -684,22 +597,6 @@ def _explain(manifold: Manifold, starts: list[Array], scale: Array, sizes: Array
             f"{_reason(others, manifold, 'holds by itself')}; leave it out, as its multiplier is not determined, or "
             "start from another pose"
         )
-
-
-def _nearest(manifold: Manifold, q: Array, scale: Array) -> tuple[Array, Array]:
-    """Return where damped Gauss-Newton ends, and the scaled f there."""
-
-    def terms(x: Array) -> tuple[float, tuple[Array, Array]]:
-        f, J = manifold.call("constraint_rows", x)
-        unit = 1.0 / scale[: len(f)]
-        left = unit * f[:, 0]
-        return float(np.linalg.norm(left)), (left, unit[:, None] * J[: len(f)])
-
-    def step(f: Array, J: Array) -> Array:
-        return np.asarray(np.linalg.lstsq(J, -f, rcond=1e-12)[0])
-
-    q, _, (f, _) = shortened_steps(manifold.dyn.model, q, terms, step, enough=1e-13, most=_STEPS)
-    return q, f
 
 
 def _dependent(J: Array) -> tuple[Array, Array]:

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Final
+from collections.abc import Callable, Collection
+from typing import Final
 
 import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit._reproducible import DEPENDENT, under_rows
 from mbkit.errors import InputError
 from mbkit.model.description import Description
 
 #: Largest error of a caller's quaternion, in its norm or the square of that: rounding is accepted, a rotation that
 #: engines would read differently is not.
 NEAR_UNIT: Final = 1e-9
-#: Part of a Gauss-Newton step below which a residual that does not fall is at its least.
+#: Part of a Gauss-Newton step below which a residual that does not fall is at its least, and steps of a search.
 _SHORTEST: Final = 1e-6
+_MOST: Final = 60
+_EPS: Final = float(np.finfo(float).eps)
 
 
 def check_quaternions(model: Description, q: Array, name: str = "q") -> None:
@@ -167,33 +170,41 @@ def magnitude(*states: Array) -> float:
     return float(10.0 ** np.ceil(np.log10(largest))) if largest > _COMMON else 1.0
 
 
-def shortened_steps(
-    model: Description,
-    q: Array,
-    terms: Callable[[Array], tuple[float, tuple[Any, ...]]],
-    step: Callable[..., Array],
-    *,
-    enough: float,
-    most: int,
-) -> tuple[Array, float, tuple[Any, ...]]:
-    """Return where damped Gauss-Newton ends, with the size of the residual there and its terms.
+def least_change(W: Array, J: Array, change: Array, held: Collection[int] = (), rounding: float = DEPENDENT) -> Array:
+    """Return the x with J x = change that is the least in xᵀ W x; the nearest to it where J has dependent rows.
 
-    `terms` gives the size and what `step` takes: a change of q that would be the whole way if the rows were straight.
-    It is halved until the size falls. The search ends where the size is at most `enough`, relative to q's size where
-    that is above 1, after `most` steps, and where no step makes it smaller.
+    The entries `held` are zero.
     """
-    size, here = terms(q)
-    for _ in range(most):
-        if size <= enough * (1.0 + float(np.abs(q).max(initial=0.0))):
+    free, out = np.setdiff1d(np.arange(len(W)), [*held]).astype(int), np.zeros(len(W))
+    out[free] = under_rows(W[np.ix_(free, free)], J[:, free], np.zeros(len(free)), change, rounding)[0]
+    return out
+
+
+def closest_configuration(
+    model: Description, q: Array, W: Array, rows: Callable[[Array], tuple[Array, Array]], held: Collection[int] = ()
+) -> tuple[Array, float, Array]:
+    """Return where damped Gauss-Newton ends from q, with the size of what is left of rows, and the rows there.
+
+    `rows` gives f and J. A change of q is the least one in the metric of W, and the velocities `held` move nothing. It
+    is halved until the size falls, which is in units of what the rows at q change by with the coordinates. The search
+    ends at rounding, after `_MOST` steps, and where no step makes the size smaller.
+    """
+    f, J = rows(q)
+    sizes = np.abs(J).sum(axis=1)
+    scale = np.where(sizes > DEPENDENT * sizes.max(initial=0.0), sizes, 1.0)
+    size = float(np.linalg.norm(f / scale))
+    for _ in range(_MOST):
+        if size <= 4 * _EPS * (1.0 + float(np.abs(q).max(initial=0.0))):
             break
-        whole, length = step(*here), 1.0
+        whole, length = least_change(W, J, -f, held), 1.0
         while length > _SHORTEST:
             beyond = integrate(model, q, length * whole)
-            size_beyond, there = terms(beyond)
+            there = rows(beyond)
+            size_beyond = float(np.linalg.norm(there[0] / scale))
             if size_beyond < size:
                 break
             length *= 0.5
         else:
             break
-        q, size, here = beyond, size_beyond, there
-    return q, size, here
+        q, size, (f, J) = beyond, size_beyond, there
+    return q, size, f

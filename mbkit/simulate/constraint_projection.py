@@ -33,11 +33,10 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
         # Soft ones need no independence.
         return q, v
     poses, rates, why = np.atleast_2d(q), np.atleast_2d(v), ""
-    for k in map(int, np.flatnonzero(manifold.doubtful(poses)) if len(poses) > 1 else range(len(poses))):
-        own = manifold.member(k)
-        require_independent(own.dyn, poses[k], everywhere=True)
-        here = Passage(own, t, poses[k], rates[k])
-        if here.singular and here.undetermined:
+    require_independent(manifold.member(0).dyn, poses[0], everywhere=True)
+    for k in np.flatnonzero(manifold.at_pose(poses)).tolist():
+        here = Passage(manifold.member(k), t, poses[k], rates[k])
+        if here.undetermined:
             why = f"q0: {dyn.model.name} is {here.undetermined}; give another velocity, or start beside it"
     # One of a batch does not stop the others.
     if why and q.ndim == 1:

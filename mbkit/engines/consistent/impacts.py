@@ -12,17 +12,15 @@ Dynamics, ch. 6). Forces that stay finite have no part in it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, arrays_shown, batch_of, real, real_array, require_finite
-from mbkit._reproducible import DEPENDENT
+from mbkit._reproducible import independent_rows, under_rows
 from mbkit.engines.base import Dynamics, no_dynamics
 from mbkit.errors import InputError, NumericalError
-
-_TINY: Final = 1e-150
 
 
 @dataclass(frozen=True)
@@ -120,18 +118,13 @@ def impact(
     J, rate = np.zeros((*lead, 0, model.nv)), np.zeros((*lead, 0))
     if model.constrained:
         J, rate = dyn.constraint_jacobian(q), dyn.constraint_rate(q, v)
-    # Sums of the rows that are independent, and zeros for the others.
-    mixed, sizes, across = np.linalg.svd(J, full_matrices=False)
-    alone = sizes > DEPENDENT * sizes.max(axis=-1, keepdims=True, initial=0.0)
-    if redundant := J.shape[-2] > alone.sum(axis=-1).min(initial=model.nv):
-        J, rate = (alone * sizes)[..., None] * across, alone * (mixed.mT @ rate[..., None])[..., 0]
-    R = np.concatenate([G, J], axis=-2)
+    R, k = np.concatenate([G, J], axis=-2), G.shape[-2]
     wanted = np.concatenate([-(1 + e) * (G @ v[..., None])[..., 0], -rate], axis=-1)
-    change, P = _solved(model.name, M, R, given, wanted, np.concatenate([np.zeros(G.shape[:-1]), ~alone], axis=-1))
+    change, P = np.zeros(v.shape), np.zeros(wanted.shape)
+    for i in np.ndindex(lead):
+        change[i], P[i] = _solved(model.name, i, M[i], R[i], given[i], wanted[i], k)
     energy = 0.5 * np.einsum("...i,...ij,...j->...", change, M, 2 * v + change)
-    k = G.shape[-2]
-    reactions = (mixed @ P[..., k:, None])[..., 0] if redundant else P[..., k:]
-    return Impact(v + change, P[..., :k], reactions, float(energy) if not lead else energy)
+    return Impact(v + change, P[..., :k], P[..., k:], float(energy) if not lead else energy)
 
 
 def _rows(nv: int, jacobian: ArrayLike) -> Array:
@@ -145,30 +138,19 @@ def _rows(nv: int, jacobian: ArrayLike) -> Array:
     return G
 
 
-def _solved(name: str, M: Array, R: Array, force: Array, wanted: Array, empty: Array) -> tuple[Array, Array]:
-    """Return x and P of M x - Rᵀ P = force, R x = wanted; P is zero of rows that are `empty`, (..., k)."""
-    n, k = M.shape[-1], R.shape[-2]
-    K = np.zeros((*M.shape[:-2], n + k, n + k))
-    K[..., :n, :n], K[..., :n, n:], K[..., n:, :n] = M, R.swapaxes(-1, -2), R
-    K[..., n:, n:] = empty[..., None] * np.eye(k)
-    # Metres beside radians and grams beside tons: each unknown by its own size.
-    masses = np.sqrt(np.abs(np.einsum("...ii->...i", M)))
-    masses = np.where(masses > 0, masses, np.maximum(masses.max(axis=-1, keepdims=True, initial=0.0), _TINY))
-    moved = np.linalg.norm(R / masses[..., None, :], axis=-1)
-    scale = 1 / np.concatenate([masses, np.where(moved > 0, moved, 1.0)], axis=-1)
-    scaled = scale[..., :, None] * K * scale[..., None, :]
-    right = np.concatenate([force, wanted], axis=-1)
-    sizes = np.linalg.svd(scaled, compute_uv=False)
-    worst = sizes[..., -1] / sizes[..., 0] if n + k else np.ones(M.shape[:-2])
-    if np.any(worst < DEPENDENT):
-        where = "" if worst.ndim == 0 else f" of sample {int(np.argmin(worst))}"
+def _solved(
+    name: str, sample: tuple[int, ...], M: Array, R: Array, force: Array, wanted: Array, k: int
+) -> tuple[Array, Array]:
+    """Return x and P of M x - Rᵀ P = force, R x = wanted, of which the first k rows are a contact's."""
+    try:
+        x, P, rank = under_rows(M, R, force, wanted)
+        determined = rank == k + len(independent_rows(R[k:])[0])
+    except np.linalg.LinAlgError:
+        determined = False
+    if not determined:
+        where = f" of sample {sample[0]}" if sample else ""
         raise NumericalError(
             f"impact: rows of jacobian depend on each other or on the constraints of {name} at this pose{where}, or "
             "no mass moves with them; impulses are then undetermined: leave such a row out, or give every body a mass"
         )
-    x = np.zeros_like(right)
-    for _ in range(2):
-        left = right - (K @ x[..., None])[..., 0]
-        x = x + scale * np.linalg.solve(scaled, (scale * left)[..., None])[..., 0]
-    # P stands with the other sign in K.
-    return x[..., :n], -x[..., n:]
+    return x, P

@@ -9,11 +9,11 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._reproducible import unit_rows
-from mbkit.engines.constraint_manifold import Manifold, least_change, refuse_unreachable, require_independent
+from mbkit.engines.constraint_manifold import Manifold, refuse_unreachable, require_independent
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError
 from mbkit.model import Model
-from mbkit.model.manifold import random_state
+from mbkit.model.manifold import least_change, random_state
 
 #: Random states that are drawn, each of which may be too far from the constraints, and how many of them anywhere.
 _DRAWS: Final = 50
@@ -120,10 +120,7 @@ def flowed(manifold: Manifold, q: Array, v: Array, well: float) -> tuple[Array, 
         return None
     if not manifold.apartness(q) > well:
         return None
-    v1 = v
-    # Once more for what rounding leaves.
-    for _ in range(2):
-        x = manifold._terms(q, v1)
-        v1 = v1 + least_change(x.W, x.J, -x.rate)
+    x = manifold._terms(q, v)
+    v1 = v + least_change(x.M, x.J, -x.rate)
     good = np.linalg.norm(v1) <= _SLOPE * np.linalg.norm(v) and not manifold.still_open(q, v1)
     return (q, v1) if good else None

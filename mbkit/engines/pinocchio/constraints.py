@@ -31,7 +31,7 @@ import numpy as np
 import pinocchio as pin
 
 from mbkit._check import Array
-from mbkit._reproducible import dependent, unit_rows
+from mbkit._reproducible import under_rows
 from mbkit.engines.closed_loops.actuation import spread
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
 from mbkit.engines.constrained import ROWS, singular_pose
@@ -276,36 +276,16 @@ class PinConstraints:
 
         which = list(self.choice.independent)
         J, gamma = rows.J[which], rows.gamma[which]
-        n, k = len(M), len(J)
-        masses = np.abs(np.diag(M))
-        across = 1.0 / np.sqrt(np.where(masses > 0, masses, 1.0))
-        scaled = J * across
-        sizes = np.linalg.norm(scaled, axis=1)
-        sizes, scaled = np.where(sizes > 0, sizes, 1.0), unit_rows(scaled)
-        if not np.isfinite(scaled).all() or not np.isfinite(force).all():
+        if not np.isfinite(J).all() or not np.isfinite(force).all():
             raise NumericalError(f"pinocchio: the terms of {self._model.name} are not finite at this state")
-        # The rows in the metric of M and of themselves: M may have no inverse, and where J v̇ is given they change
-        # neither v̇ nor λ. Orthogonal factors lose digits with the condition, those of J M⁻¹ Jᵀ with its square.
-        a, forces = np.zeros(n), np.zeros(k)
         try:
-            L = np.linalg.cholesky(across[:, None] * M * across + scaled.T @ scaled)
+            a, forces, rank = under_rows(M, J, force, -gamma)
         except np.linalg.LinAlgError:
             raise NumericalError(
                 f"pinocchio: the mass matrix of {self._model.name} is singular on what its constraints leave free"
             ) from None
-        B = np.linalg.solve(L, scaled.T)
-        if dependent(unit_rows(B.T)):
-            raise singular_pose("pinocchio", self._model.name, self.choice.independent_names, scaled)
-        Q, R = np.linalg.qr(B)
-        # Refined once: of masses that differ by decades the factors lose digits of the rows.
-        for _ in range(2):
-            rate = -(gamma + J @ a) / sizes
-            free = np.linalg.solve(L, across * (force - M @ a + J.T @ forces) + scaled.T @ rate)
-            along, z = Q.T @ free, np.linalg.solve(R.T, rate)
-            left = free - Q @ along
-            x = left - Q @ (Q.T @ left) + Q @ z
-            a = a + across * np.linalg.solve(L.T, x)
-            forces = forces + np.linalg.solve(R, z - along) / sizes
+        if rank < len(J):
+            raise singular_pose("pinocchio", self._model.name, self.choice.independent_names, J)
         lost = list(self.choice.redundant)
         doubt = float(off_branch(rows.J[lost], rows.gamma[lost], a, force, M)) if lost else 0.0
         return a + doubt, spread(J, rows.J, forces) + doubt

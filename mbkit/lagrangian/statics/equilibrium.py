@@ -272,7 +272,7 @@ class _Balance:
         """Return a configuration on the constraints."""
         if self._manifold is None:
             return q
-        return np.asarray(self._manifold.restored(q, self._zero))
+        return np.asarray(self._manifold.restored(q))
 
     def held(self, q: Array) -> tuple[Array, Array]:
         """Return the least τ that holds a configuration, which constraints must allow, and the multipliers with it."""
