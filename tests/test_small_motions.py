@@ -92,6 +92,10 @@ def test_dry_friction_is_no_damping_of_small_motions(engine):
     b.add_joint("hinge", "revolute", parent="world", child="bob", axis=(0, 1, 0), friction=0.5, damping=0.1)
     rest = mb.equilibrium(mb.dynamics(b.build(), engine), [0.2])
     assert near(rest.eigenvalues, np.roots([1, 0.1, 9.81]), rel=1e-10)
+    (note,) = rest.notes
+    assert "dry friction" in note
+    assert note in str(rest)
+    assert not mb.equilibrium(mb.dynamics(b.build().without("friction"), engine), [0.2]).notes
 
 
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])

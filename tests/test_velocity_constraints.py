@@ -470,10 +470,10 @@ def test_what_velocity_constraints_cannot_have_is_refused() -> None:
     lag = sleigh()
     with pytest.raises(UnsupportedError, match="whose forces no H holds"):
         lag.hamiltonian()
-    with pytest.raises(UnsupportedError, match="velocity constraints, and these bind no coordinates"):
+    with pytest.raises(UnsupportedError, match=r"velocity_constraints\[0\] is .*, and these bind no coordinates"):
         lag.embedded()
     q, v = lag.project([0, 0, 0], [1, 0, 0.2])
-    with pytest.raises(UnsupportedError, match="sleigh has velocity constraints"):
+    with pytest.raises(UnsupportedError, match=r"sleigh has velocity constraints: velocity_constraints\[0\] is .*dot"):
         mb.simulate(lag.dynamics(), q, v, dt=0.1, duration=1, method="implicit_midpoint")
     with pytest.raises(UnsupportedError, match="has no constraints"):
         Lagrangian(m * xdot**2, 0, [x], parameters=[m]).maggi()

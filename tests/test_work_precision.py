@@ -268,6 +268,11 @@ def test_mimic_joints_are_free_where_mujocos_own_integrators_run():
     native = work_precision(model, ["mujoco"], ["mujoco_rk4"], steps=[0.05], repeats=1)
     assert native.facts["nq"] == 2
     assert "mimic joints free" in native.facts["notes"]
+    rubbed = chain(rod | {"friction": 0.1}, rod | {"mimic": mb.Mimic("j0", 1.0, 0.0)}).build()
+    reduced = work_precision(rubbed, ["pinocchio"], ["rk4"], steps=[0.05, 0.025], repeats=1)
+    assert reduced.facts["nq"] == 1
+    assert "without dry friction" in reduced.facts["notes"]
+    assert "mimic joints free" not in reduced.facts["notes"]
     other = work_precision(model, ["mujoco"], ["rk4"], steps=[0.05], repeats=1)
     assert other.facts["nq"] == 1
 

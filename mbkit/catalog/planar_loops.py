@@ -78,7 +78,7 @@ def four_bars(*, n: int = 2, length: Number = 1.0, mass: Number = 1.0, gravity: 
     The model's name is ``four_bars_2`` for two. Upright rod k = 0 ... n turns about (k length, 0, 0); coupler k hangs
     on the end of the rod before and is closed with rod k by the loop ``pin<k>``. 2 n + 1 coordinates, with one degree
     of freedom: ``theta0``, ``phi1``, ``theta1`` ... : the angle θ of each upright rod, and φ of each coupler from
-    the rod that carries it. At zero the rods stand up and the couplers lie along +x.
+    the rod that carries it. At zero the rods stand up and the coupler bars lie along +x.
 
     Notes
     -----

@@ -85,7 +85,7 @@ class Imported:
     #: The importer's messages, and parts of its model that are in none of the terms.
     notes: tuple[str, ...]
     beside: tuple[Beside, ...] = ()
-    #: The loops and couplers that the importer holds, outside of all terms.
+    #: What the importer holds by constraints, outside of all terms.
     constraints: tuple[Loop | Coupler, ...] = ()
     #: Why its loops are not among them, where the engine does not give them.
     hidden: str = ""

@@ -105,7 +105,7 @@ def load(
         otherwise.
     mimic : {"reduce", "free"}
         What a URDF's mimic joints become: functions of the joints they follow, without coordinates of their own, or
-        independent joints. An MJCF's equalities of joints are couplers, with the loops.
+        independent joints. An MJCF's equality of joints is a coupler, with the loops.
     nonphysical : {"error", "warn"}, optional
         What to do about inconsistent inertias: refuse them, or use them as written with a warning. By default robots
         by name warn, and files are refused. A negative mass is always refused.
@@ -115,8 +115,8 @@ def load(
         Whether an MJCF's meshes are read where a body has no other inertia, which MuJoCo's compiler then infers; with
         "never" such bodies are refused.
     loops : bool, path or sequence of Loop or dict
-        Whether an MJCF's active <connect> and <weld> elements become loops, and those of joints couplers,
-        which hold exactly; without, they are left out and noted, as others always are. Or loops
+        Whether an MJCF's active <connect> and <weld> elements become loops, and that of joints a coupler,
+        which holds exactly; without, they are left out and noted, as others always are. Or loops
         beside those of the file: dicts with the arguments of `ModelBuilder.add_loop`, `Loop` objects, or a TOML file
         with a table ``[[loop]]`` of these arguments for each. A URDF has no loops of its own. Their bodies may be
         frames too, such as links that were merged.

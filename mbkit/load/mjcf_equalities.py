@@ -215,7 +215,7 @@ class Equalities:
             b.add_coupler(name, joint, leaders, ratio=ratios, offset=offset, curve=curve)
         if self._couplers:
             held = listing([repr(x) for x in self._couplers], 6)
-            b.note(f"couplers of joints, held exactly where MuJoCo's are soft: {held}")
+            b.note(f"equalities of joints, held exactly where MuJoCo's are soft: {held}")
         if self._loops:
             b.note(f"loops, held exactly where MuJoCo's are soft: {listing([repr(x) for x in self._loops], 6)}")
         if self._soft:

@@ -8,6 +8,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.model.model import Model
+from mbkit.model.parts import Joint, rules_of
 
 
 class DryFriction(NamedTuple):
@@ -74,4 +75,5 @@ def owners(model: Model) -> list[str]:
 
 def _unit(model: Model, velocity: int) -> str:
     joint = [j for j in model.independent_joints for _ in range(j.type.nv)][velocity]
-    return "N or N m" if joint.type.nv > 1 else "N" if joint.type.lengths else "N m"
+    turn, slide = rules_of(Joint)["friction"].unit.split(", ")
+    return f"{slide} or {turn}" if joint.type.nv > 1 else slide if joint.type.lengths else turn

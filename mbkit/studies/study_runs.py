@@ -52,6 +52,17 @@ def require_motion(model: object, purpose: str) -> Model:
     return model
 
 
+def integrable(model: Model, *, native: bool = True) -> tuple[Model, list[str]]:
+    """Return a model that references by series and, where `native`, engines' own integrators hold, and what differs."""
+    notes = []
+    if model.needs.friction:
+        # No reference of series crosses its jumps, and no engine's own integrator holds it exactly.
+        model, notes = model.without("friction"), ["without dry friction"]
+    if native and model.layout.reduced:
+        model, notes = free_of_mimic(model), [*notes, "mimic joints free"]
+    return model, notes
+
+
 def free_of_mimic(model: Model) -> Model:
     """Return the model with its mimic joints independent: MuJoCo's own steps would make them soft."""
     return replace(model, joints=tuple(replace(j, mimic=None) for j in model.joints))

@@ -145,7 +145,7 @@ def contact_rows(part: NoSlip, a: MovingFrame, b: MovingFrame) -> tuple[Rows, Ro
 
 
 def coordinate_rows(model: Model, q: Array, v: Array, laws: Laws, time: float) -> list[Rows]:
-    """Return the rows of couplers and of motions at a time, from the description's q and v."""
+    """Return the rows of what follows joints or the time, from the description's q and v."""
     layout, out = model.layout, []
     for x in (x for x in model.constraints if type(x) in (Coupler, *MOTION_LAWS)):
         places = [layout.full_q[name].start for name in (x.joint, *getattr(x, "leaders", ()))]

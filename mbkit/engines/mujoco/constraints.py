@@ -46,7 +46,7 @@ _DEFAULT_SOLREF: Final = (0.02, 1.0)
 _DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
 #: MuJoCo's equality for each kind of loop that it holds.
 EQUALITIES: Final = {"point": mujoco.mjtEq.mjEQ_CONNECT, "frame": mujoco.mjtEq.mjEQ_WELD}
-#: And for couplers of one leader and of several, which are a tendon's joints.
+#: And for a coupler of one leader and one of several, which are a tendon's joints.
 OF_JOINTS: Final = mujoco.mjtEq.mjEQ_JOINT
 OF_TENDON: Final = mujoco.mjtEq.mjEQ_TENDON
 
@@ -283,7 +283,7 @@ class LoopEnds:
             self._placed.append((*(m.site(f"loop{k}.{end}").id for end in "ab"), bodies[carrier]))
 
     def rows(self, m: Any, d: Any, columns: Callable[[Array], Array], b0: Array, given: tuple[Array, Array]) -> Rows:
-        """Return all rows of loops and couplers at the state that is in, where MuJoCo's accelerations are b0.
+        """Return all rows at the state that is in, where MuJoCo's accelerations are b0.
 
         `columns` turns a Jacobian into the description's coordinates; `given` are q and v of the description.
         """

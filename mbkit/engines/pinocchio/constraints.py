@@ -155,7 +155,7 @@ class PinConstraints:
         return held, moving
 
     def all_rows(self, q: Array, v: Array, given: tuple[Array, Array]) -> Rows:
-        """Return the rows of loops, couplers, motions and contacts; `given` are q and v of the description."""
+        """Return the rows of all constraints; `given` are q and v of the description."""
         from mbkit.engines.closed_loops.frame_rows import Rows, coordinate_rows
 
         loops = self.every(q, v)

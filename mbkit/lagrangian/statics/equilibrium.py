@@ -55,7 +55,13 @@ def _driven(model: Model) -> Iterator[str]:
         yield "its constraints prescribe a speed, at which nothing rests"
 
 
-EQUILIBRIUM: Final = Path("equilibrium", "equilibrium: not known of", ALL, also=_driven)
+EQUILIBRIUM: Final = Path(
+    "equilibrium",
+    "equilibrium: not known of",
+    ALL,
+    notes={"jump": "dry friction, which holds a range of configurations, is left out"},
+    also=_driven,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +86,8 @@ class Equilibrium:
     name : str
     coordinates, velocities : tuple of str
         What the entries of q and of tau belong to.
+    notes : tuple of str
+        What of the model is left out.
     """
 
     q: Array
@@ -92,6 +100,7 @@ class Equilibrium:
     name: str
     coordinates: tuple[str, ...] = field(repr=False)
     velocities: tuple[str, ...] = field(repr=False)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("q", "tau", "multipliers", "frequencies", "eigenvalues"):
@@ -102,7 +111,7 @@ class Equilibrium:
     @property
     def _verdict(self) -> str:
         stability = {True: "stable", False: "unstable", None: "stability not decided by small motions"}[self.stable]
-        return f": equilibrium, {stability}; residual {self.residual:.2g}"
+        return "; ".join((f": equilibrium, {stability}", f"residual {self.residual:.2g}", *self.notes))
 
     def _rows(self, tau: str, multiplier: str) -> list[tuple[str, str]]:
         rows = [*zip(self.coordinates, self.q, strict=True)]
@@ -169,7 +178,7 @@ def equilibrium(
     equilibrium, not all. Stability is that of M δq̈ + D δq̇ + K δq = 0 on what constraints leave free. Where K is
     symmetric and D feeds no energy in, K's sign decides (Lagrange and Dirichlet, Kelvin and Tait); else the
     eigenvalues do. Each has a bound of its error from the rounding of M, D and K, entry by entry, whatever their units;
-    what the bound does not decide is None. Dry friction, which holds a range of configurations, is left out.
+    what the bound does not decide is None. `Equilibrium.notes` tell what is left out, such as dry friction.
 
     Examples
     --------
@@ -188,7 +197,7 @@ def equilibrium(
         raise InputError("dynamics: its parameters have a value per sample; expected one value of each")
     if holding is not None and not (tau is None and q0 is None):
         raise InputError("holding: expected without q0 and tau, which are for finding a configuration")
-    EQUILIBRIUM.admit(dyn.model)
+    notes = EQUILIBRIUM.admit(dyn.model)
     model, balance = dyn.model, _Balance(dyn, {name: _wrench(name, x) for name, x in (forces or {}).items()})
     if holding is not None:
         q = model.check_q(finite_array("holding", holding, (model.nq,)), "holding")
@@ -208,7 +217,7 @@ def equilibrium(
     motion = balance.small_motion(q, acting, multipliers)
     size = balance.size(balance.residual(q, multipliers, acting))
     names = model.name, model.coordinate_names, model.velocity_names
-    return Equilibrium(q, acting, size, multipliers, *motion, *names)
+    return Equilibrium(q, acting, size, multipliers, *motion, *names, notes)
 
 
 def _wrench(name: str, value: ArrayLike) -> Array:

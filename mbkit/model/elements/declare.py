@@ -1,4 +1,4 @@
-"""The part of `ModelBuilder` for elements: beams, couplers, and by functions forces, bushings and motions in time."""
+"""The part of `ModelBuilder` for elements: beams, what couples joints, and forces, bushings and motions by formula."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _is_zero(x: Any) -> bool:
 
 
 class ElementBuilder:
-    """Declares forces by functions, motions in time and couplers; `ModelBuilder` inherits it."""
+    """Declares forces by functions, motions in time and what couples joints; `ModelBuilder` inherits it."""
 
     _read: Any
     _parts: dict[str, list[Any]]

@@ -185,8 +185,8 @@ def _holds_weight(model: _Model, force: Any) -> bool:
 
 register_kind("", "energies", "{p.name} was written as energies and has no bodies", at=lambda m, _: not m.has_bodies)
 _WRITTEN = (
-    ("row", "loops", "constraints"),
-    ("speed", "no_slip", "velocity constraints"),
+    ("row", "loops", "constraints: constraints[0] is {p.form.constraints[0]!s:.80}"),
+    ("speed", "no_slip", "velocity constraints: velocity_constraints[0] is {p.form.velocity_constraints[0]!s:.80}"),
     ("t", "time", "terms that depend on the time"),
 )
 for _does, _need, _what in _WRITTEN:

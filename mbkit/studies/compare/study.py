@@ -51,7 +51,7 @@ from mbkit.studies.compare.terms import (
     states,
 )
 from mbkit.studies.results import Refusal, model_info
-from mbkit.studies.study_runs import free_of_mimic, require_motion
+from mbkit.studies.study_runs import integrable, require_motion
 from mbkit.studies.work_precision.study import work_precision
 
 #: Where a warning of a known defect goes on with the joints of this model.
@@ -339,20 +339,15 @@ def _beyond_terms(
     model: Model, engines: dict[str, Dynamics], seed: int, tell: Progress
 ) -> tuple[dict[str, Any], list[Refusal]]:
     """Return rollouts, run times and omissions; what fails is a refusal, and loses nothing else."""
-    moving, movers, note = model, engines, ""
-    if model.layout.reduced:
-        moving, note = free_of_mimic(model), "mimic joints free"
-    if model.needs.friction:
-        # What engines integrate themselves has no exact friction.
-        moving, note = moving.without("friction"), "; ".join(x for x in (note, "without dry friction") if x)
-    if moving is not model:
+    (moving, notes), movers = integrable(model), engines
+    if notes:
         movers, _, _, _ = _build(moving, tuple(engines), silent, compile=True)
     methods = {engine: shown for engine in movers if (shown := find_engine(engine).shown)}
     settings: dict[str, Any] = {"duration": _HORIZON, "repeats": _REPEATS, "seconds": _SECONDS, "work": _WORK}
     settings["progress"] = lambda fraction, text: tell(0.6 + 0.3 * fraction, text)
     by_time = partial(work_precision, moving, tuple(movers), methods, seed=seed, **settings)
     studies: list[tuple[float, str, str, Callable[[], Any]]] = [
-        (0.42, "rollouts", "rollouts", partial(rollouts, moving, movers, seed, note)),
+        (0.42, "rollouts", "rollouts", partial(rollouts, moving, movers, seed, "; ".join(notes))),
         (0.6, "precision", "error against run time", by_time),
     ]
     if model.has_bodies:

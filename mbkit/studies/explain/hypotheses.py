@@ -17,7 +17,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties
-from mbkit.model import Joint, Mimic, Model
+from mbkit.model import Body, Joint, Mimic, Model
 from mbkit.model.changes.dry_friction import FrictionNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.formula import NUMPY, Formula
@@ -223,14 +223,14 @@ def _body_differences(
     if not a.mass and not a.inertia.any():
         return [Mistake("added body", "has matter in it", vars(b))]
     out = []
-    for name, what, unit, same in (
-        ("mass", "mass", "kg", near.number(a.mass, b.mass)),
-        ("com", "centre of mass", "m", near.point(a.com, b.com)),
+    for name, what, same in (
+        ("mass", "mass", near.number(a.mass, b.mass)),
+        ("com", "centre of mass", near.point(a.com, b.com)),
     ):
         if not same:
             ours, theirs = getattr(a, name), getattr(b, name)
             wanted = replace(a, **{name: theirs})
-            says = f"has the {what} {number_text(ours)} -> {number_text(theirs)} {unit}"
+            says = f"has the {what} {number_text(ours)} -> {number_text(theirs)} {rules_of(Body)[name].unit}"
             fitting = (x for x in mistakes if near.mass_properties(replace(a, **x.fields), wanted))
             out.append(next(fitting, Mistake(what, says, {}))._replace(fields={name: theirs}))
     if not near.inertia(a.inertia, b.inertia, a.mass):

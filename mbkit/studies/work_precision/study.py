@@ -20,7 +20,7 @@ from mbkit.simulate.torque import TorqueFunction
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies._targets import methods_by_engine, numbers_of, with_values
-from mbkit.studies.study_runs import free_of_mimic, require_motion, start_state
+from mbkit.studies.study_runs import integrable, require_motion, start_state
 from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.reference import reference as compute_reference
 from mbkit.studies.work_precision.result import WorkPrecision
@@ -157,7 +157,8 @@ def work_precision(
     _check_executor(executor, torque)
     checkpoints = Checkpointer(progress, checkpoint)
     methods_of = methods_by_engine(engines, methods)
-    integrated = _integrated_model(model, methods_of)
+    native = any(METHODS[m].kind == "native" for names in methods_of.values() for m in names)
+    integrated, changed = integrable(with_values(model), native=native)
     asked = real("duration", duration, positive=True)
     steps = None if steps is None else numbers_of("steps", steps, positive=True)
     tolerances = None if tolerances is None else numbers_of("tolerances", tolerances, positive=True)
@@ -179,8 +180,6 @@ def work_precision(
     settings = plans(methods_of, float(problem.times[1]), steps, tolerances)
     sweep = Sweep(problem, settings, repeats, seed, budget, executor)
     facts = results.model_info(integrated)
-    changed = ["without dry friction"] if model.needs.friction else []
-    changed += ["mimic joints free"] if integrated is not model and model.layout.reduced else []
     facts["notes"] = [*facts["notes"], *changed]
     soft = [name for name in methods_of if model.constrained and find_engine(name).load().soft_constraints]
     if soft:
@@ -302,17 +301,6 @@ def _check_executor(executor: Executor | None, torque: object) -> None:
             raise InputError(
                 f"torque: cannot be sent to the executor's processes ({error}); define the function in a module"
             ) from None
-
-
-def _integrated_model(model: Model, pairs: Mapping[str, Sequence[str]]) -> Model:
-    """Return the model with parameters as numbers, and mimic joints free where MuJoCo's own integrators run.
-
-    Dry friction is left out: no reference of series crosses its jumps, and no engine's own integrator holds it.
-    """
-    model = with_values(model)
-    model = model.without("friction") if model.needs.friction else model
-    native = any(METHODS[m].kind == "native" for ms in pairs.values() for m in ms)
-    return free_of_mimic(model) if model.layout.reduced and native else model
 
 
 def _constant_torque(torque: ArrayLike | TorqueFunction | None, model: Model) -> Any:
