@@ -58,6 +58,11 @@ class NumberRule:
     #: It may be None.
     optional: bool = False
 
+    @property
+    def place(self) -> bool:
+        """Whether it is a point."""
+        return (self.unit, self.shape) == ("m", (3,))
+
     def entries(self, part: Any) -> tuple[Sequence[str], ...] | None:
         """Return the names of a part's entries along each axis; None for any shape."""
         if self.shape is None:

@@ -20,10 +20,11 @@ from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load import load
 from mbkit.load.loader import find
 from mbkit.load.urdf_reader import read_links
-from mbkit.model import Joint, Model
+from mbkit.model import Body, Joint, Loop, Model, NoSlip
+from mbkit.model.changes.freeing import SYMMETRIC
 from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.references import KINDS_OF_PARTS, called
-from mbkit.model.parts import rules_of
+from mbkit.model.parts import ENTRIES, OF_Q, PointSpring, rules_of
 from mbkit.studies._targets import resolved, resolved_options
 
 Part = dict[str, Any]
@@ -46,6 +47,8 @@ SECTIONS: Final = {
         for kind in (*reversed(KINDS_OF_PARTS[:3]), *KINDS_OF_PARTS[3:])
     },
 }
+#: Rules of numbers by field.
+_RULES: Final = {n: x for cls in (Model, Body, Joint, PointSpring, Loop, NoSlip) for n, x in rules_of(cls).items()}
 FLAT: Final = ("system", "parameters", "expressions", "energies")
 _TRIANGLE: Final = np.triu_indices(3)
 
@@ -127,8 +130,7 @@ def default(field: str, like: Any) -> Any:
         return 1.0 if field == "ratio" else 0.0
     if field.startswith("rotation"):
         return [float(x) for x in np.eye(3).ravel()]
-    rule = rules_of(Joint).get(field)
-    return [rule.nothing if rule else 0.0] * len(like)
+    return [_RULES[field].nothing if field in _RULES else 0.0] * len(like)
 
 
 def moving_mass(description: Mapping[str, Mapping[str, Part]]) -> tuple[float, Array]:
@@ -143,14 +145,12 @@ def moving_mass(description: Mapping[str, Mapping[str, Part]]) -> tuple[float, A
 _EPS: Final = float(np.finfo(float).eps)
 # Another release of a parser may add the same numbers in another order.
 _ROUNDINGS: Final = 64
-_XYZ: Final = ("x", "y", "z")
+_XYZ: Final = ENTRIES[:3]
 _ENTRIES: Final = {
-    **dict.fromkeys(("com", "translation", "translation_a", "translation_b", "point_a", "point_b", "gravity"), _XYZ),
-    "inertia": ("xx", "xy", "xz", "yy", "yz", "zz"),
-    "axes": (*_XYZ, "x of the second", "y of the second", "z of the second"),
+    **{name: _XYZ for name, rule in _RULES.items() if rule.shape == (3,)},
+    "inertia": tuple(name for name, _ in SYMMETRIC),
+    "axes": (*_XYZ, *(f"{x} of the second" for x in _XYZ)),
 }
-# Of these, zero is no size: an origin moved by 1e-17 m has not moved.
-_ABSOLUTE: Final = ("com", "translation", "rotation", "axes", "point", "lower", "upper")
 # A smaller turn is within the rounding of its sine.
 _TURNED: Final = 1e-7
 
@@ -269,7 +269,10 @@ def _turn(old: Array, new: Array) -> str:
 def _only_rounding(field: str, old: Array, new: Array) -> bool:
     if not (np.isfinite(old).all() and np.isfinite(new).all()):
         return False
-    size = max(float(np.linalg.norm(old)), 1.0 if field.startswith(_ABSOLUTE) else 0.0)
+    rule = _RULES.get(field)
+    # Of places, directions and limits zero is no size: an origin moved by 1e-17 m has not moved.
+    absolute = rule and (rule.direction or rule.place or rule.shape == OF_Q)
+    size = max(float(np.linalg.norm(old)), 1.0 if absolute else 0.0)
     return float(np.linalg.norm(new - old)) <= _ROUNDINGS * _EPS * size
 
 

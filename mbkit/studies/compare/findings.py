@@ -42,13 +42,9 @@ def _friction(model: Model, forces: Array) -> Finding | None:
 
 
 def _limits(model: Model) -> Finding | None:
-    kinds = {"position": ("lower", "upper"), "velocity": ("velocity_limit",), "effort": ("effort_limit",)}
-    having = {
-        kind: [j.name for j in model.joints if any(np.isfinite(getattr(j, name)).any() for name in names)]
-        for kind, names in kinds.items()
-    }
+    kinds = {"joint.limit": "position", "joint.velocity_limit": "velocity", "joint.effort_limit": "effort"}
     # Kinds that the same joints have stand together.
-    alike = by_key((tuple(joints), kind) for kind, joints in having.items() if joints)
+    alike = by_key((model.acts[kind], word) for kind, word in kinds.items() if kind in model.acts)
     parts = [f"{', '.join(some)} of {counted(len(joints), 'joint')}" for joints, some in alike.items()]
     if not parts:
         return None

@@ -23,7 +23,7 @@ from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.formula import NUMPY, Formula
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
 from mbkit.model.elements.references import called
-from mbkit.model.parts import Coupler, Loop, rules_of
+from mbkit.model.parts import Coupler, Loop, NumberRule, rules_of
 from mbkit.studies.explain.loop_differences import angle_of, axis_times_sine, loop_differences, same_loop
 from mbkit.studies.explain.merged_model import OTHERS, LinkInBody, MergedModel, Tolerances, composite
 
@@ -606,7 +606,8 @@ def differing(a: Any, b: Any, near: Tolerances) -> list[str]:
     names = [f.name for f in fields(a)]
     if "formula" in names:
         names = [n for n in names if n not in ("symbols", "numbers")]
-    return [n for n in names if not _same(n, _value(a, getattr(a, n)), _value(b, getattr(b, n)), near)]
+    rules = rules_of(type(a))
+    return [n for n in names if not _same(rules.get(n), _value(a, getattr(a, n)), _value(b, getattr(b, n)), near)]
 
 
 def _value(part: Any, field: Any) -> Any:
@@ -621,12 +622,12 @@ def _value(part: Any, field: Any) -> Any:
     return known if known.any() else field
 
 
-def _same(name: str, a: Any, b: Any, near: Tolerances) -> bool:
+def _same(rule: NumberRule | None, a: Any, b: Any, near: Tolerances) -> bool:
     if isinstance(a, float):
         return near.number(a, b)
     if not isinstance(a, np.ndarray) or a.shape != np.shape(b):
         return bool(np.array_equal(a, b))
-    if name in ("formula", "potential"):
+    if rule is None:
+        # Values of a formula.
         return bool(np.allclose(a, b, near.relative, near.relative))
-    lengths = name.startswith(("point", "translation"))
-    return near.point(a, b) if lengths else near.vector(a, b, float(np.abs([a, b]).max(initial=0.0)))
+    return near.vector(a, b, near.length if rule.place else float(np.abs([a, b]).max(initial=0.0)))
