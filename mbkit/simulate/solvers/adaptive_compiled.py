@@ -175,8 +175,7 @@ class CompiledAttempts:
 
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
         for place in [place for place, attempts in self._near.items() if attempts.passed]:
-            if not self._singular(place):
-                self._return(place)
+            self._return(place)
         out = [(place, steps) for place, attempts in self._near.items() for _, steps in attempts.advance()]
         if not self._active.any():
             return out
@@ -214,14 +213,6 @@ class CompiledAttempts:
         # The lane has no way to go.
         lane = self._outer.state[:, place]
         lane[self._row["end"]] = lane[self._row["t"]]
-
-    def _singular(self, place: int) -> bool:
-        """Return whether a step that ended where Python is would end near a singular pose."""
-        _, q, w, *_ = self._near[place].now
-        # An attempt of no length ends where it starts.
-        arena = self._beside(place)
-        arena.run(self._state(self.width, q[None], w[None]), self._log, 1, on=False)
-        return bool(np.isposinf(self._log[0, self._row["error"], 0]))
 
     def _return(self, place: int) -> None:
         """Go on in machine code from where Python is."""
