@@ -25,7 +25,7 @@ from mbkit.model.elements.kinds import PART_KINDS, Kind, kind
 from mbkit.model.elements.paths import Path as Gate
 from tests import kind_examples
 from tests.kind_examples import EXAMPLES, LIMBS, NUMBERS, PARTS, STICTION, TOGETHER, TYPES, WEIGHTS, Arm, Example, Site
-from tests.kind_paths import Cell, cell, registered
+from tests.kind_paths import COLUMNS, Cell, registered, told
 
 SEED, MOST_KINDS, CANDIDATES, ADDITIONS = 53, 6, 4, 10
 #: Paths that the models go along, and the gates of each.
@@ -52,6 +52,8 @@ PATHS: dict[str, tuple[str, ...]] = {
 IN_TURN = (
     *("sampled control", "wrenches", "energy and power balance", "events", "moreau", "rk853", "gauss4", "radau"),
     *("program text", "function (CasADi)", "join", "lock", "linearize", "impact"),
+    *("derivative of a step", "loads of joints", "loads of loops", "forces of actuators", "GPU (its driver replaced)"),
+    *("operational space", "mass as a parameter", "lagrangian: derivatives", "pinocchio: derivatives", "baseline"),
     *(f"{engine}: M and inverse dynamics" for engine in ("mujoco", "pinocchio", "drake")),
 )
 SOUND = ("right", "refused", "left out", "not asked")
@@ -141,7 +143,10 @@ class Plan:
         """Return the plan with the hinges that its parts ask for, and one that nothing holds."""
         leads = sum(s.leads for s in self.spots)
         lack = [s.asks - leads + s.leads for s in self.spots]
-        return replace(self, spots=(*self.spots, *[Spot()] * max(0, *lack, 1 - sum(s.free for s in self.spots))))
+        # A body's weight is held once.
+        lack += [1 - sum(s.free for s in self.spots)]
+        lack += [sum("compensation" in k for k in self.others) - sum(s.type != "fixed" for s in self.spots)]
+        return replace(self, spots=(*self.spots, *[Spot()] * max(0, *lack)))
 
     @property
     def acts(self) -> frozenset[str]:
@@ -226,7 +231,7 @@ def _sliding(a: Arm, rng: np.random.Generator) -> Example | None:
             (rates > 0.15).all() and (rates > 0.04 * np.abs(c.G[rub] @ c.acceleration(c.t, c.q, c.v, x.tau))).all()
         ):
             return x
-        c.v = c.allowed(c.t, c.q, rng.choice([-1.0, 1.0], c.n) * rng.uniform(0.4, 1.2, c.n))
+        c.v = c.allowed(c.t, c.q, rng.choice([-1.0, 1.0], c.n) * rng.uniform(0.4, 2.0, c.n))
     return None
 
 
@@ -439,8 +444,9 @@ def array() -> Array:
 
 
 def acts(model: mb.Model) -> frozenset[str]:
-    """Return the kinds that act in a model, a beam's by one name."""
-    return frozenset("joint_type.beam" if x.startswith("joint_type.beam_") else x for x in model.acts)
+    """Return the kinds that act in a model, a beam's by one name; coordinates of energies are of no joint."""
+    found = {"joint_type.beam" if x.startswith("joint_type.beam_") else x for x in model.acts}
+    return frozenset(x for x in found if model.has_bodies or not x.startswith("joint_type."))
 
 
 # Cells
@@ -460,8 +466,8 @@ def paths(name: str) -> tuple[str, ...]:
 
 def pair_cell(name: str, path: str, folder: Path) -> Cell:
     """Return what comes of a model on a path; a refusal has to name each part that the gate does not take."""
-    out, model = cell(name, path, folder), kind_examples.example(name).model
-    refusing = [gates[g] for g in PATHS.get(path, ()) if (gates := registered()) and gates[g].refuses(model)]
+    out, model, gates = told(name, path, folder), kind_examples.example(name).model, registered()
+    refusing = [gates[g] for g in {*PATHS.get(path, ()), *COLUMNS[path].gates} if gates[g].refuses(model)]
     if refusing and out.outcome in ("right", "left out"):
         return Cell("silent", out.error, f"the gate {refusing[0].name!r} refuses it")
     unnamed = [_unnamed(g, model, out.text) for g in refusing]
@@ -495,6 +501,7 @@ def summary(cells: Iterable[tuple[str, str, Cell]]) -> dict[str, Any]:
         "paths": [*PATHS],
         "in_turn": [*IN_TURN],
         "counts": dict(Counter(c.outcome for *_, c in cells)),
+        "cells": dict(Counter(p for _, p, _ in cells)),
         "faults": [
             [sorted(acts(kind_examples.example(n).model)), p, c.outcome, c.text[:160]]
             for n, p, c in cells

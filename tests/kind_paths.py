@@ -90,14 +90,15 @@ def registered() -> dict[str, Any]:
 
 def cell(name: str, path: str, folder: Path) -> Cell:
     """Return what comes of an example on a path."""
-    out, gates = _cell(name, path, folder), [GATES[g] for g in COLUMNS[path].gates if g in GATES]
+    out, gates = told(name, path, folder), [GATES[g] for g in COLUMNS[path].gates if g in GATES]
     lost = any(g.refuses(example(name).model) for g in gates)
     if gates and out.outcome in ("right", "refused", "left out") and lost != (out.outcome == "refused"):
         return Cell("silent", out.error, f"its gate {'refuses' if lost else 'admits'} it; {out.text}")
     return out
 
 
-def _cell(name: str, path: str, folder: Path) -> Cell:
+def told(name: str, path: str, folder: Path) -> Cell:
+    """Return what comes of an example on a path, whatever its gates."""
     x, col = example(name), COLUMNS[path]
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("ignore")
@@ -134,7 +135,7 @@ def _named(name: str, x: Example, text: str) -> bool:
 
 
 def _called(name: str, x: Example, low: str) -> bool:
-    general = {"loop": "loop", "coupler": "coupler", "motion": "moved in time", "no_slip": "slip", "mimic": "mimic"}
+    general = {"loop": "loop", "coupler": "coupler", "motion": "is moved", "no_slip": "slip", "mimic": "mimic"}
     more = (
         name.split(".")[1].replace("_", " ") if "limit" in name else "",
         general.get(name.partition(".")[0], ""),
@@ -451,15 +452,15 @@ def _loads(x: Example, folder: Path) -> Told:
 
 @column("quantities", "loads of loops")
 def _loop_loads(x: Example, folder: Path) -> Told:
-    if not x.model.loops:
-        raise NotAskedError("no loop")
+    if not x.model.loops or sum(bool(p.rows or p.speeds) for p in x.plain.parts) > 1:
+        raise NotAskedError("no loop, or other rows beside it")
     (wrench,), (loop,) = engine(x.name).loop_wrenches(x.q, x.v, x.tau), x.model.loops
     F, T = loop.rotation_a @ wrench[:3], loop.rotation_a @ wrench[3:]
     k = x.links[loop.body_b]
     R, p = x.plain.poses(x.plain.q)[k]
     lever = R.T @ (loop.translation_a - p)
     own = -(x.plain.moving(k, lever, x.plain.q).T @ F + x.plain.turning(k, x.plain.q).T @ T)
-    return off(own, x.force(x.accelerated()) - x.tau)
+    return off(np.linalg.solve(x.rates(x.plain.q).T, own), x.force(x.accelerated()) - x.tau)
 
 
 @column("quantities", "forces of actuators")

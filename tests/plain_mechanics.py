@@ -84,7 +84,7 @@ class Case:
     #: Advance of each link that is a screw, m/rad.
     pitch: dict[int, float] = field(default_factory=dict)
     weight: np.ndarray = field(default_factory=lambda: GRAVITY)
-    _at: tuple[Any, Any] = field(default=(None, None), init=False, repr=False, compare=False)
+    _at: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def n(self) -> int:
@@ -113,10 +113,10 @@ class Case:
     # Kinematics
 
     def poses(self, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return R and p of each link; those of the last q are kept."""
+        """Return R and p of each link; those of the last hundred q are kept, as terms are derived along the same."""
         key = q.tobytes(), len(self.kinds)
-        if self._at[0] == key:
-            return self._at[1]
+        if key in self._at:
+            return self._at[key]
         x = self.G @ q + self.c
         out: list[tuple[np.ndarray, np.ndarray]] = []
         for k, kind in enumerate(self.kinds):
@@ -128,7 +128,9 @@ class Case:
             if kind == "revolute":
                 R = R @ rotation(self.axes[k], x[k])
             out.append((R, p))
-        self._at = key, out
+        if len(self._at) > 100:
+            self._at.clear()
+        self._at[key] = out
         return out
 
     def way(self, k: int) -> list[int]:

@@ -31,7 +31,9 @@ PARTS = {
     "bodies": Part(20, ("bodies.json",), "motion, momentum, loads and M⁻¹ against 34 digits"),
     "bench_bodies": Part(2, ("bench_bodies.json",), "batches of motion, momentum and loads beside engines in a loop"),
     "readme_figure": Part(2, ("check_all.json",), "every robot of example-robot-data in three engines"),
-    "matrix": Part(4, ("matrix.json",), "every kind of part on every path: right, refused by name, or left out"),
+    "matrix": Part(
+        8, ("matrix.json",), "every kind of part on every path, and pairs: right, refused by name, or left out"
+    ),
     "published": Part(2, ("published_checks.json",), "published problems, to their printed digits"),
     "identification": Part(
         3, ("identification.json",), "identified parameters of two arms, and regressors beside Pinocchio"

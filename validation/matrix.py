@@ -1,7 +1,8 @@
 """Every kind of part on every path: right to an error, refused by name, or left out with a note.
 
 The examples and their truth are `tests.kind_examples`, in NumPy alone; the paths are `tests.kind_paths`.
-``python -m validation.matrix takes`` writes anew only the kinds that each gate takes.
+``python -m validation.matrix takes`` writes anew only the kinds that each gate takes, ``pairs`` only what became of
+the models of several kinds (`tests.kind_pairs`).
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from mbkit.model.elements.kinds import PART_KINDS, joint_types, kind
+from tests import kind_pairs
 from tests.kind_examples import TYPES
-from tests.kind_paths import COLUMNS, NOT_YET, ROWS, cell, registered
+from tests.kind_paths import COLUMNS, NOT_YET, ROWS, Cell, cell, registered
 from validation.stamp import results, stamp
 
 KINDS = ROWS
@@ -27,7 +29,14 @@ PATHS = tuple(COLUMNS)
 PROCESSES = 2
 #: Characters of a refusal that are kept.
 MOST = 160
-SMOKE = {"KINDS": ("gravity", "loop.point"), "PATHS": ("lagrangian: accelerations", "URDF and back"), "PROCESSES": 0}
+#: Of the models of several kinds one of so many.
+EACH = 1
+SMOKE = {
+    "KINDS": ("gravity", "loop.point"),
+    "PATHS": ("lagrangian: accelerations", "URDF and back"),
+    "PROCESSES": 0,
+    "EACH": 300,
+}
 #: Outcomes that are faults.
 FAULTS = ("silent", "unnamed", "crash")
 
@@ -62,11 +71,54 @@ def rows() -> list[dict[str, Any]]:
         return list(pool.map(row, KINDS, [PATHS] * len(KINDS)))
 
 
+def model_of_pairs(name: str) -> list[tuple[str, str, Cell, float]]:
+    """Return the cells of a model of several kinds, each with its path and the processor's seconds."""
+    os.environ["MBKIT_COMPILE"] = "0"
+    kind_pairs.names()
+    out = []
+    for path in kind_pairs.paths(name):
+        begun = time.process_time()
+        with tempfile.TemporaryDirectory() as folder:
+            got = kind_pairs.pair_cell(name, path, Path(folder))
+        out.append((name, path, got, time.process_time() - begun))
+    return out
+
+
+def pairs() -> dict[str, Any]:
+    """Return what became of the models that hold every pair of kinds."""
+    begun, asked = time.perf_counter(), kind_pairs.names()[::EACH]
+    if PROCESSES:
+        with ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")) as pool:
+            found = [x for part in pool.map(model_of_pairs, asked, chunksize=4) for x in part]
+    else:
+        found = [x for name in asked for x in model_of_pairs(name)]
+    seconds = Counter[str]()
+    for _, path, _, taken in found:
+        seconds[path] += taken
+    return kind_pairs.summary([x[:3] for x in found]) | {
+        "cpu_s": round(seconds.total()),
+        "wall_s": round(time.perf_counter() - begun),
+        "seconds": {path: round(x, 1) for path, x in seconds.items()},
+    }
+
+
+def told(data: dict[str, Any]) -> None:
+    """Print counts and faults."""
+    print(data["counts"], data["pairs"]["counts"], data["pairs"]["cpu_s"], "s for pairs")
+    for r in data["rows"]:
+        for path, (outcome, error, text) in r["cells"].items():
+            if outcome in FAULTS:
+                print(f"{r['kind']} on {path}: {outcome} {error} {text}")
+    for kinds, path, outcome, text in data["pairs"]["faults"]:
+        print(f"{', '.join(kinds)} on {path}: {outcome} {text}")
+
+
 def main() -> int:
     begun = time.perf_counter()
     file = results("matrix.json")
-    if sys.argv[1:] == ["takes"]:
-        data = json.loads(file.read_text(encoding="utf-8")) | {"takes": takes()}
+    made = {"takes": takes, "pairs": pairs}
+    if asked := [x for x in sys.argv[1:] if x in made]:
+        data = json.loads(file.read_text(encoding="utf-8")) | {x: made[x]() for x in asked}
     else:
         found = rows()
         counts = Counter(c[0] for r in found for c in r["cells"].values())
@@ -80,13 +132,10 @@ def main() -> int:
             "not_yet": NOT_YET,
             "without_column": sorted(set(registered()) - {g for c in COLUMNS.values() for g in c.gates}),
             "takes": takes(),
+            "pairs": pairs(),
             "rows": found,
         }
-        print(data["counts"])
-        for r in found:
-            for path, (outcome, error, text) in r["cells"].items():
-                if outcome in FAULTS:
-                    print(f"{r['kind']} on {path}: {outcome} {error} {text}")
+    told(data)
     file.write_text(json.dumps(data, ensure_ascii=False, separators=(",", ":")) + "\n", encoding="utf-8")
     return 0
 
