@@ -36,7 +36,7 @@ from mbkit.model.joint_types import KINDS as JOINT_TYPES
 from tests import kind_examples, kind_mutations, path_checks
 from tests.kind_examples import EXAMPLES, TYPES
 from tests.kind_mutations import seen
-from tests.kind_paths import COLUMNS, ROWS, cell, registered
+from tests.kind_studies import COLUMNS, ROWS, cell, registered
 from tests.plain_mechanics import TIP, Case, random_case
 from tests.test_engine_versions import present
 from validation.matrix import takes

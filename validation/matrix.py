@@ -21,7 +21,8 @@ from typing import Any
 from mbkit.model.elements.kinds import PART_KINDS, joint_types, kind
 from tests import kind_pairs
 from tests.kind_examples import TYPES
-from tests.kind_paths import COLUMNS, NOT_YET, ROWS, Cell, cell, registered
+from tests.kind_paths import Cell
+from tests.kind_studies import COLUMNS, NOT_YET, ROWS, cell, registered
 from validation.stamp import results, stamp
 
 KINDS = ROWS

@@ -38,6 +38,9 @@ TENDON_ARMATURE: Final = (
     "lagrangian and pinocchio engines have all of a c cᵀ"
 )
 
+#: Pinocchio's of quantities that begin so, for versions in environments of their own.
+OF_PINOCCHIO: Final = {"kinetic_": KINETIC_ENERGY, "coriolis": CORIOLIS}
+
 
 def announce(defect: str, where: str) -> None:
     """Warn, at the line that called the library, that a value is the engine's own and wrong."""

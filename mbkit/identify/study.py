@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,11 +19,22 @@ from mbkit.identify.measurements import REST, Equations, Measurements, Unknowns,
 from mbkit.identify.motion_noise import bias, motion_noise
 from mbkit.identify.result import Identification, IdentifiedParameter, Residual, Undetermined
 from mbkit.model import Model
-from mbkit.model.base_parameters import POWERS, length_of, standard_names
+from mbkit.model.base_parameters import BASE_PARAMETERS, POWERS, length_of, standard_names
 from mbkit.model.builder import expect_model
 from mbkit.model.changes.dry_friction import DryFrictionLaw
+from mbkit.model.elements.forces import GravityCompensation
 from mbkit.simulate.progress import Progress, ProgressFunction
 
+IDENTIFICATION: Final = replace(
+    BASE_PARAMETERS,
+    name="identification",
+    words="identify: not known of",
+    carries=BASE_PARAMETERS.carries - {"t"},
+    why={"t": "samples have no times"},
+    also=lambda m: (
+        f"{f}, which depends on masses that are sought" for f in m.forces if type(f) is GravityCompensation
+    ),
+)
 #: Standard deviations of bias from which on the user is warned.
 _BIASED = 3.0
 
@@ -92,7 +105,8 @@ def identify(
     InputError
         Wrong shapes, numbers that are not finite, fewer equations than parameters, an unknown prior.
     UnsupportedError
-        A model written as energies, one with constraints, or a package that is not installed.
+        A model written as energies, one with constraints, forces that depend on the time or on the masses, such as
+        gravity compensation, or a package that is not installed.
     NumericalError
         The solver found no consistent parameters.
 
@@ -119,6 +133,7 @@ def identify(
     [('rod2.hz', -1.0, -2.0)]
     """
     expect_model(model)
+    IDENTIFICATION.admit(model)
     for name, flag in (("physical", physical), ("friction", friction), ("armature", armature)):
         if not isinstance(flag, (bool, np.bool_)):
             raise InputError(f"{name}: expected True or False, got {shown(flag)}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Final
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._attributes import forwarded
 from mbkit._check import Array
+from mbkit.engines import known_defects
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.elements.passive import JointPassive, pull
 from mbkit.engines.frames_and_momenta import ALIGNED, seen_from
@@ -188,6 +189,26 @@ class VersionDynamics(MappedDynamics):
 
     def _force(self, f: Array) -> Array:
         return np.asarray(self._columns(f[..., None, :])[..., 0, :])
+
+    def _method(self, quantity: str) -> Callable[..., Any]:
+        if quantity.startswith(("coriolis", "kinetic")) and (defect := self._defects.get(quantity[:8])):
+            known_defects.announce(defect, f"joints of {self.model.name}")
+        return super()._method(quantity)
+
+    @cached_property
+    def _defects(self) -> dict[str, str]:
+        """The engine's known defects that a random state of this model shows, by the begin of a quantity."""
+        known = self.version.package.defects
+        if not known or not self.model.nv:
+            return {}
+        q, v = self.model.random_state(1)
+        M, h = self._mass_matrix(q), self._nle(q, v) - self._gravity(q)
+        size = float(np.abs(v) @ np.abs(M) @ np.abs(v))
+        off = {
+            "kinetic_": abs(self._kinetic_energy(q, v) - 0.5 * v @ M @ v) > 1e-11 * size,
+            "coriolis": np.abs(self._coriolis_force(q, v) - h).max() > 1e-9 * (np.abs(h).max() + size),
+        }
+        return {name: defect for name, defect in known.items() if off[name]}
 
     # The protocol.
 

@@ -12,6 +12,7 @@ from packaging.version import Version
 
 from mbkit._check import WORLD, real
 from mbkit.engines.frames_and_momenta import TREE
+from mbkit.engines.known_defects import OF_PINOCCHIO
 from mbkit.engines.versions import environment
 from mbkit.engines.versions.description import NEWTON, ONE_BY_ONE, SENT, STACKED, Convention, Steps
 from mbkit.errors import InputError, UnknownNameError
@@ -51,6 +52,8 @@ class Package(NamedTuple):
         Environment variables of its process; ``{environment}`` in one stands for the environment's folder.
     limit : float
         Seconds that one evaluation may take, compiling included.
+    defects : mapping
+        Its known defects by the begin of the quantity, "coriolis" or "kinetic_"; announced where a model shows them.
     importer : str
         Its file in `remote` that describes what its own importer reads; empty where there is none.
     """
@@ -69,6 +72,7 @@ class Package(NamedTuple):
     file: str = ""
     variables: Mapping[str, str] = {}
     limit: float = 60.0
+    defects: Mapping[str, str] = {}
     importer: str = ""
 
 
@@ -100,7 +104,7 @@ _MJX: Final = Package(
 #: Engines with a file of their own in `remote`.
 PACKAGES: Final[dict[str, Package]] = {
     "mujoco": Package("mujoco", "mujoco", 120, 11, _MUJOCO),
-    "pinocchio": Package("pin", "pinocchio", 430, 25, Convention(), ONE_BY_ONE),
+    "pinocchio": Package("pin", "pinocchio", 430, 25, Convention(), ONE_BY_ONE, defects=OF_PINOCCHIO),
     "drake": Package(
         *("drake", "pydrake.multibody.plant", 440, 20),
         Convention((6, 3, 4, 5, 0, 1, 2), (3, 4, 5, 0, 1, 2), (), {"free": (0, 3), "ball": (0,)}, 3),

@@ -1,0 +1,565 @@
+"""Columns of the matrix for files, other environments and studies; `tests.kind_paths` has the others, and the rules."""
+
+# ruff: noqa: ARG001, ARG005  # all paths are called alike
+from __future__ import annotations
+
+import ctypes
+import html
+import os
+import re
+import subprocess
+import tempfile
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+from unittest.mock import patch
+
+import mujoco
+import numpy as np
+from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+import mbkit as mb
+from mbkit.cli import cli
+from mbkit.codegen.c_source import export_c
+from mbkit.engines.imported import reader
+from mbkit.engines.oracle import OracleDynamics
+from mbkit.lagrangian import from_model
+from mbkit.lagrangian.printing.summary import SystemSummary
+from mbkit.model import Model
+from mbkit.model.elements.kinds import PART_KINDS
+from mbkit.report import compare_view
+from mbkit.report.page import render
+from mbkit.studies._targets import with_values
+from mbkit.studies.compare.study import Judge
+from mbkit.studies.compare.terms import TERMS, states
+from mbkit.studies.importers.loops import WrittenLoops, closures
+from mbkit.studies.importers.study import stages
+from mbkit.testing import assert_same_dynamics
+from tests import kind_examples
+from tests.kind_examples import EXAMPLES, Arm, Example, _size, example
+from tests.kind_paths import (
+    _QUATERNIONS,
+    CLOSE,
+    COLUMNS,
+    DURATION,
+    NOT_YET,
+    ROWS,
+    STEP,
+    NotAskedError,
+    Told,
+    _kept,
+    _more,
+    _without,
+    aligned,
+    cell,
+    column,
+    dynamics,
+    engine,
+    named,
+    off,
+    program_of,
+    registered,
+)
+from tests.plain_mechanics import Case, Part, derivative, rotation
+from tests.test_engine_versions import present
+from tests.written_math import assigned, lines_of_latex, lines_of_text, number, plain
+
+__all__ = ["COLUMNS", "NOT_YET", "ROWS", "cell", "registered"]
+
+# Engines in environments of their own
+
+
+@cache
+def _elsewhere(engine: str) -> Any:
+    """Return an engine whose environment is the present interpreter."""
+    os.environ.setdefault("MBKIT_ENVIRONMENTS", tempfile.mkdtemp())
+    return present(engine, {"pinocchio": "4.1.0", "mujoco": "4.0.0"}[engine])
+
+
+@cache
+def _sent(name: str, which: str) -> mb.Dynamics:
+    x = example(name)
+    dyn = mb.dynamics(x.model, _elsewhere(which))
+    return dyn.at(**{x.model.time_parameter: x.t}) if x.model.time_parameter else dyn
+
+
+def _remote(x: Example, folder: Path, which: str) -> Told:
+    dyn, a, c = _sent(x.name, which), 0.3 * x.v + 0.1, x.plain
+    inverse = off(dyn.inverse_dynamics(x.q, x.v, a), x.force(a))
+    M = off(dyn.mass_matrix(x.q), x.mass_matrix(c.q))
+    kinetic = off(dyn.kinetic_energy(x.q, x.v), c.v @ c.mass_matrix(c.q) @ c.v / 2)
+    other = x.position(0.5 * c.q)
+    one = dyn.potential_energy(x.q) - dyn.potential_energy(other)
+    potential = off(one, c.potential(c.q) - c.potential(0.5 * c.q))
+    return max(off(dyn.forward_dynamics(x.q, x.v, x.tau), x.accelerated()), M, inverse, kinetic, potential)
+
+
+column("other environments", "sent as data (Pinocchio)", "sent", which="pinocchio")(_remote)
+column("other environments", "sent as MJCF (MuJoCo)", "sent", which="mujoco")(_remote)
+
+
+@column("other environments", "own run there (MuJoCo)", close=1e-8)
+def _remote_run(x: Example, folder: Path) -> Told:
+    q, v = _sent(x.name, "mujoco").rollout(x.q, x.v, STEP, round(DURATION / STEP))
+    wanted = x.state(x.flow([DURATION], lambda t, q, v: 0 * v)[-1])
+    return max(off(aligned(q[-1], x, wanted[0]), wanted[0]), off(v[-1], wanted[1]))
+
+
+# Files in the engines' own importers
+
+
+def _written(model: Model, folder: Path, to: str, name: str = "case") -> tuple[Path, tuple[str, ...]]:
+    made = mb.convert(model, to)
+    return made.write(folder / f"{name}.{'xml' if to == 'mjcf' else 'urdf'}"), tuple(map(str, made.notes))
+
+
+def _in_steps(x: Example, of_model: np.ndarray, of_plain: np.ndarray, quaternions: bool = False) -> np.ndarray:
+    """Return numbers of joints in MuJoCo's order: those of a ball are the model's, all others the plain case's."""
+    out, at = [], 0
+    for _, type_, k in x.joints:
+        slides = 3 if type_ == "free" else 0
+        size = _QUATERNIONS.get(type_, (1, -1))[0] if quaternions else _size(type_)
+        ball = of_model[at + slides : at + size]
+        turned = [ball[3:], ball[:3]] if quaternions else [ball]
+        if type_ in ("ball", "free"):
+            out += [of_plain[k : k + slides], *turned]
+        else:
+            out += [of_plain[k : k + size]]
+        at += size
+    return np.concatenate(out)
+
+
+@column("files", "MJCF in MuJoCo alone", "mjcf", close=1e-8)
+def _in_mujoco(x: Example, folder: Path) -> Told:
+    """MuJoCo's own importer and solver, with hinges, slides and balls as its joints.
+
+    Accelerations without its soft constraints, the space of its rows, and the numbers of friction and limits.
+    """
+    path, notes = _written(x.model, folder, "mjcf")
+    m = mujoco.MjModel.from_xml_path(str(path))
+    d, c, E = mujoco.MjData(m), x.plain, x.rates(x.plain.q)
+    free = [p for p in c.parts if not p.rows] if "friction" not in x.name else []
+    bare = replace(x, plain=replace(c, parts=free))
+    acceleration = bare.plain.acceleration(x.t, c.q, c.v, E.T @ x.tau)
+    turning = np.imag(x.rates(c.q + 1e-30j * c.v)) / 1e-30
+    q, v = _in_steps(x, x.q, c.q, quaternions=True), _in_steps(x, x.v, c.v)
+    a, tau = _in_steps(x, E @ acceleration + turning @ c.v, acceleration), _in_steps(x, x.tau, E.T @ x.tau)
+    J = c.held(x.t, c.q)
+    if x.name == "mimic":
+        # It keeps the joint, as one that an equality holds.
+        q, v, a, tau = c.G @ q + c.c, c.G @ v, c.G @ a, np.append(tau, 0.0)
+        J = np.array([[0.7, 0.0, 0.0, -1.0]])
+    d.qpos, d.qvel, d.qfrc_applied = q, v, tau
+    mujoco.mj_forward(m, d)
+    held = d.efc_J.reshape(-1, m.nv)[: d.ne]
+    rows = off(*(np.linalg.pinv(z, rcond=1e-9) @ z for z in (held, J))) if len(J) or len(held) else 0.0
+    loss = np.zeros(m.nv)
+    if "friction" in x.name:
+        loss[3:] = 0.2
+    limits = x.model.joints[-1] if x.name.startswith("joint.limit") else None
+    bounds = 0.0 if limits is None else off(m.jnt_range[3:], np.stack([limits.lower, limits.upper], 1))
+    left = np.inf if "velocity_limit" in x.name else 0.0
+    if "effort_limit" in x.name:
+        left = off(m.jnt_actfrcrange[3:], [[-3.0, 3.0]] * (m.njnt - 3))
+    m.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    mujoco.mj_forward(m, d)
+    if x.name == "mimic":
+        # Its row is held by the multiplier of the exact one.
+        M = np.zeros((m.nv, m.nv))
+        mujoco.mj_fullM(m, d, M)
+        lam = (J @ d.qacc) / (J @ np.linalg.solve(M, J.T))
+        d.qacc -= np.linalg.solve(M, J.T) @ lam[0]
+    return max(off(d.qacc, a), rows, off(m.dof_frictionloss, loss), bounds, left), notes
+
+
+@column("files", "engines' own importers")
+def _importers(x: Example, folder: Path) -> Told:
+    """MuJoCo's reading of the file is ours, and that of a file without the part is not."""
+    path, notes = _written(x.model, folder, "mjcf")
+    back = mb.load(path)
+    loops = WrittenLoops(*[closures(back, back.loops)] * 2, couplers=back.couplers, every_coupler=back.couplers)
+    read = reader("mbkit.engines.mujoco.importer")
+    own = stages(back, loops, read(path.read_text(), "mjcf", False, {}), 2, 0, CLOSE)
+    if bad := [s for s in own if s.same is False]:
+        raise AssertionError(str(bad))
+    if (less := _without(x)) is not None:
+        other = read(_written(less, folder, "mjcf", "less")[0].read_text(), "mjcf", False, {})
+        if all(s.same is not False for s in stages(back, loops, other, 2, 0, CLOSE)):
+            return np.inf, notes
+    return 0.0
+
+
+# Texts
+
+
+@column("texts", "C: its header", "c")
+def _header(x: Example, folder: Path) -> Told:
+    """It names what the code holds, and what it leaves out."""
+    text = export_c(x.model, ["forward_dynamics"], name="case").header
+    k = PART_KINDS.get(x.name)
+    if not k or not k.features:
+        raise NotAskedError("it is no part that can be taken out")
+    holds = text.partition("Holds")[2].partition("Functions")[0]
+    if any(n.replace("_", " ") in holds for n in k.features):
+        return 0.0
+    return np.inf, (text.partition("Conventions")[2].partition("Calls")[0],)
+
+
+@column("texts", "program text and LaTeX, read", "program", close=1e-4)
+def _read_program(x: Example, folder: Path) -> Told:
+    """Both have six digits."""
+    text = program_of(x.name)
+    given = zip(text.inputs, (x.q, x.v, x.tau, *_more(x)), strict=True)
+    values = {str(s): float(z) for (_, symbols), y in given for s, z in zip(symbols, y, strict=True)}
+    worst = 0.0
+    for lines in (lines_of_text(str(text)), lines_of_latex(text.latex())):
+        out = assigned(lines, values)
+        worst = max(worst, off([y for n, y in out.items() if n.startswith("forward")], x.accelerated()))
+    return worst
+
+
+@column("texts", "program text in C", "program")
+def _program_in_c(x: Example, folder: Path) -> Told:
+    code = program_of(x.name).c()
+    if not set(re.findall(r"[a-z]\w*(?=\()|\?", code)) - {"forward_dynamics", "sin", "cos", "pow"} - {"gravity"}:
+        raise NotAskedError("it has no other functions than gravity's equations")
+    (folder / "p.c").write_text(code, encoding="utf-8")
+    subprocess.run(["cc", "-O0", "-shared", "-fPIC", "p.c", "-o", "p.so", "-lm"], check=True, cwd=folder)
+    out = np.full(len(x.v), np.nan)
+    given = (x.q, x.v, x.tau, *_more(x), out)
+    ctypes.CDLL(str(folder / "p.so")).forward_dynamics(*(y.ctypes.data_as(ctypes.c_void_p) for y in given))
+    return off(out, x.accelerated())
+
+
+class _Flat(Arm):
+    """An arm in a plane, whose equations are short."""
+
+    def add(self, joint: str, type_: str, *names: str, **numbers: Any) -> None:
+        axes = ((0, 1, 0), (1, 0, 0))
+        super().add(joint, type_, *names, **numbers | ({"axes": axes} if "axes" in numbers else {}))
+
+
+@column("texts", "equations of motion and LaTeX, read", "paper", close=1e-8)
+def _read_equations(x: Example, folder: Path) -> Told:
+    """Every equation holds at the true acceleration without a force, for some multipliers."""
+    k = PART_KINDS.get(x.name)
+    if len(x.plain.kinds) > 4 or (k and k.does == {"bound"}) or x.name.endswith(".several"):
+        raise NotAskedError("its equations are those of others, or fill pages")
+    if x.name in EXAMPLES and len(x.plain.kinds) > 2:
+        with patch.object(kind_examples, "Arm", _Flat):
+            x = EXAMPLES[x.name](x.name)
+    lag = from_model(x.model, **({"drives": True} if x.model.prescribed else {})) if x.model.has_bodies else None
+    if lag is None:
+        raise NotAskedError("it is written as energies")
+    e, c = lag.equations(), x.plain
+    a = x.acceleration(x.t, c.q, c.v, 0 * x.tau)
+    coordinates = c.q if len(e.coordinates) == c.n else x.q
+    symbols = (*e.coordinates, *e.velocities, *e.accelerations, *e.multipliers, *([lag.time] if lag.time else []))
+    given = [*coordinates, *x.v, *a, *(0.0 for _ in e.multipliers), *([x.t] if lag.time else [])]
+    if len(given) != len(symbols):
+        raise AssertionError(f"{symbols}")
+    values = {plain(str(s)): float(y) for s, y in zip(symbols, given, strict=True)}
+    values |= {str(s): float(y) for s, y in lag.parameters.items() if y is not None}
+    shown = SystemSummary(lag).text()
+    lines = lines_of_text(dedent(shown.partition("of motion:\n")[2].partition("\n\n")[0]))
+    worst = 0.0
+    for some in (lines, lines_of_latex(e.latex())):
+        rows = [line.partition("=") for line in some[: len(e.coordinates) + len(e.constraints)]]
+
+        def rest(more: dict[str, float], rows: Any = rows) -> np.ndarray:
+            return np.array([number(left, values | more) - number(right, values | more) for left, _, right in rows])
+
+        r, forces = rest({}), [plain(str(s)) for s in e.multipliers]
+        if forces:
+            columns = np.stack([rest({s: 1.0}) - r for s in forces], axis=1)
+            r = r - columns @ np.linalg.lstsq(columns, r, rcond=None)[0]
+        worst = max(worst, float(np.abs(r).max()))
+    return worst
+
+
+# Quantities
+
+
+def _place(x: Example, q: np.ndarray) -> np.ndarray:
+    """Return coordinates of the plain case from the model's."""
+    out, at = np.zeros(x.plain.n), 0
+    for _, type_, k in x.joints:
+        size, four = _QUATERNIONS.get(type_, (1, -1))
+        slides = max(four, 0)
+        out[k : k + slides] = q[at : at + slides]
+        if four < 0:
+            out[k : k + size] = q[at : at + size]
+        else:
+            turn = Rotation.from_quat(q[at + four : at + size])
+            out[k + slides : k + slides + 3] = turn.as_euler("ZYX")
+        at += size
+    return out
+
+
+@column("quantities", "second derivatives", close=1e-5)
+def _second(x: Example, folder: Path) -> Told:
+    """Second differences of the true torque along a line."""
+    k = PART_KINDS.get(x.name)
+    if k and {*k.does} & {"row", "speed", "bound"}:
+        raise NotAskedError("no torque of a motion is its own")
+    by = engine(x.name).inverse_dynamics_second_derivatives(x.q, x.v, 0.1 - 0.3 * x.v)
+    dq, dv, da = np.random.default_rng(8).uniform(-1, 1, (3, len(x.v)))
+
+    def torque(s: float) -> np.ndarray:
+        c = x.plain
+        q = _place(x, x.model.integrate(x.q, s * dq))
+        u = np.linalg.solve(x.rates(q), x.v + s * dv)
+        return replace(x, plain=replace(c, q=q, v=u)).force(0.1 - 0.3 * x.v + s * da)
+
+    h = 1e-2
+    ends = [torque(s * h) for s in (-2, -1, 0, 1, 2)]
+    wanted = np.array([-1, 16, -30, 16, -1]) @ np.array(ends) / (12 * h**2)
+    terms = ((by.qq, dq, dq, 1), (by.qv, dq, dv, 2), (by.vv, dv, dv, 1), (by.qa, dq, da, 2))
+    return off(sum(f * np.einsum("ijk,j,k", A, d, e) for A, d, e, f in terms), wanted)
+
+
+class _Cut(Case):
+    """A case whose last body is also moved along and about the world's axes, by six coordinates behind the others."""
+
+    def split(self, q: np.ndarray) -> tuple[Case, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the case, its coordinates, and of the others R and the axes of its three turns."""
+        n = self.G.shape[1]
+        base = Case(**vars(self) | {"q": self.q[:n], "v": self.v[:n]})
+        turns, axes = np.eye(3), []
+        for axis, angle in zip(np.eye(3), q[n + 3 :], strict=True):
+            axes.append(turns @ axis)
+            turns = turns @ rotation(axis, angle)
+        return base, q[:n], turns, np.stack(axes, axis=1)
+
+    def poses(self, q: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        base, x, turn, _ = self.split(q)
+        *out, (R, p) = base.poses(x)
+        return [*out, (turn @ R, p + q[len(x) : len(x) + 3])]
+
+    def turning(self, k: int, q: np.ndarray) -> np.ndarray:
+        base, x, turn, axes = self.split(q)
+        last = k == len(self.kinds) - 1
+        more = np.hstack([np.zeros((3, 3)), axes]) if last else np.zeros((3, 6))
+        return np.hstack([(turn if last else np.eye(3)) @ base.turning(k, x), more])
+
+    def moving(self, k: int, at: Any, q: np.ndarray) -> np.ndarray:
+        base, x, _, _ = self.split(q)
+        if k != len(self.kinds) - 1:
+            return np.hstack([base.moving(k, at, x), np.zeros((3, 6))])
+        origin = np.hstack([base.moving(k, (0, 0, 0), x), np.eye(3), np.zeros((3, 3))])
+        arm = self.poses(q)[k][0] @ np.asarray(at)
+        return origin + np.stack([np.cross(w, arm) for w in self.turning(k, q).T], axis=1)
+
+
+@column("quantities", "load of the last joint")
+def _load(x: Example, folder: Path) -> Told:
+    """The force and moment that keep the last body where its joint has it, by virtual displacements in all six ways."""
+    if not x.links:
+        raise NotAskedError("no bodies of its own")
+    c, n, still = x.plain, x.plain.n, np.zeros(6)
+    a = c.acceleration(x.t, c.q, c.v, x.rates(c.q).T @ x.tau)
+    cut = _Cut(**vars(c) | {"q": np.append(c.q, still), "v": np.append(c.v, still)})
+    dM, q, v = derivative(cut.mass_matrix, cut.q), cut.q, cut.v
+    h = np.einsum("ijk,j,k->i", dM, v, v) - np.einsum("jki,j,k->i", dM, v, v) / 2
+    f = cut.mass_matrix(q) @ np.append(a, still) + h + derivative(cut.potential, q) - cut.loads(x.t, q, v)
+    J = cut.held(x.t, q)
+    rest = f[:n] - x.rates(c.q).T @ x.tau
+    f = f - J.T @ np.linalg.lstsq(J[:, :n].T, rest, rcond=None)[0]
+    R, _ = c.poses(c.q)[x.links[x.tip]]
+    joint = [j.name for j in x.model.joints if j.child == x.tip] or None
+    motion = (None, None, "local", joint, x.tau) if x.model.constrained else (x.accelerated(), None, "local", joint)
+    own = engine(x.name).joint_wrenches(x.q, x.v, *motion)[0]
+    return off(own, [*(R.T @ f[n : n + 3]), *(R.T @ f[n + 3 :])])
+
+
+@column("quantities", "variants", close=CLOSE)
+def _variants(x: Example, folder: Path) -> Told:
+    """Bodies of other masses, all in one call, and each alone."""
+    if x.model.has_bodies and not x.links:
+        raise NotAskedError("no bodies of its own")
+    body, k = next(iter(x.links.items())) if x.links else ("x", 0)
+    k = 0 if body == "b0" and len(x.plain.mass) == 1 else k
+    many = mb.variants(x.model, {f"{body}.mass": 0.2}, size=2)
+    dyn = many.dynamics(compile=False)
+    dyn = dyn.at(**{x.model.time_parameter: x.t}) if x.model.time_parameter else dyn
+    got, worst = dyn.forward_dynamics(x.q, x.v, x.tau), 0.0
+    for i, value in enumerate(many.values[f"{body}.mass"]):
+        mass = x.plain.mass.copy()
+        mass[k] = value
+        wanted = replace(x, plain=replace(x.plain, mass=mass)).accelerated()
+        worst = max(worst, off(got[i], wanted))
+        worst = max(worst, off(dynamics(x, many[i]).forward_dynamics(x.q, x.v, x.tau), wanted))
+    return worst
+
+
+@column("use of runs", "film")
+def _film(x: Example, folder: Path) -> Told:
+    """Bodies stand where NumPy has them, with the vertical upwards."""
+    scene = _kept(x.name).animate(folder / "film.html", shapes="sticks").scene
+    y = x.flow([DURATION])[-1][: x.plain.n]
+    g = x.plain.weight
+    up = np.eye(3) if not g.any() else scene.rotations[0, 0]
+    worst = 0.0
+    for body, k in x.links.items():
+        R, p = x.plain.poses(y)[k]
+        at = scene.bodies.index(body)
+        worst = max(worst, off(scene.rotations[-1, at], up @ R), off(scene.translations[-1, at], up @ p))
+    return max(worst, off(up @ g, [0, 0, -np.linalg.norm(g)]) if g.any() else 0.0)
+
+
+# Studies
+
+
+@column("studies", "identification", "identification", close=1e-7)
+def _identified(x: Example, folder: Path) -> Told:
+    """Torques in NumPy of a heavier last body, and of a joint with numbers that the model lacks, are told."""
+    if x.model.has_bodies and not x.links:
+        raise NotAskedError("no bodies of its own")
+    rng, c = np.random.default_rng(7), x.plain
+    mass = c.mass.copy()
+    mass[x.links[x.tip]] *= 1.3
+    heavy = replace(x, plain=replace(c, mass=mass))
+
+    def sample() -> tuple[Any, ...]:
+        q, u, a = rng.uniform(-1, 1, (3, c.n))
+        y = replace(heavy, plain=replace(heavy.plain, q=q, v=u))
+        return y.q, y.v, a, y.force(a)
+
+    data = [np.array(z) for z in zip(*(sample() for _ in range(24)), strict=True)]
+    *states, tau = (z[:16] for z in data)
+    sought = x.name.rpartition(".several")[0] or x.name
+    more = {"friction": sought in ("joint.damping", "joint.friction"), "armature": x.name == "joint.armature"}
+    given = _without(x) if any(more.values()) else x.model
+    found, elsewhere = mb.identify(given, *states, tau, rest=0.0, **more), [z[16:] for z in data[:3]]
+    if any(more.values()):
+        # Numbers that are zero but for rounding, some of them negative, make no model.
+        Y = dynamics(x, given).regressor(*elsewhere, "base", **more)
+        return off(Y @ [p.value for p in found.parameters], data[3][16:])
+    return off(dynamics(x, found.model).inverse_dynamics(*elsewhere), data[3][16:])
+
+
+def _told(x: Example, text: str) -> float:
+    if not named(x.name, x, text):
+        raise AssertionError(f"not by name: {' '.join(text.split())[:300]}")
+    return 0.0
+
+
+@column("studies", "assert_same_dynamics")
+def _same(x: Example, folder: Path) -> Told:
+    assert_same_dynamics(x.model, x.model, samples=1)
+    if (less := _without(x)) is None:
+        raise NotAskedError("it is no part that can be taken out")
+    if PART_KINDS[x.name].does == {"bound"}:
+        assert_same_dynamics(x.model, less, samples=1)
+        return 0.0
+    try:
+        assert_same_dynamics(x.model, less, samples=1)
+    except AssertionError as error:
+        return _told(x, str(error))
+    return np.inf
+
+
+@column("studies", "mbkit diff of files")
+def _diff(x: Example, folder: Path) -> Told:
+    path, notes = _written(x.model, folder, "mjcf")
+    run = CliRunner().invoke(cli, ["diff", str(path), str(path)])
+    if run.exit_code:
+        raise AssertionError(run.output)
+    if (less := _without(x)) is None:
+        raise NotAskedError("it is no part that can be taken out")
+    run = CliRunner().invoke(cli, ["diff", str(path), str(_written(less, folder, "mjcf", "less")[0])])
+    if run.exit_code == 0:
+        return np.inf, notes
+    return _told(x, run.output)
+
+
+@column("studies", "check")
+def _check(x: Example, folder: Path) -> Told:
+    """Two engines agree with 34 digits; one that lacks the part does not, and the page has each refusal."""
+    untimed = patch("mbkit.studies.compare.study.interleaved", lambda calls: dict.fromkeys(calls, (1.0, 0.0)))
+    undrawn = patch("mbkit.report.figures.svg", lambda *_, **__: "")
+    with untimed, undrawn:
+        result = mb.compare(x.model, ("lagrangian", "pinocchio"), 1, terms_only=True)
+        if bad := [r.reason for r in result.rows if not r.passed and "known defect" not in r.reason]:
+            raise AssertionError(str(bad))
+        page = html.unescape(render(compare_view.view(result)))
+        if missing := [r.reason for r in result.refusals if not r.term and r.reason[:60] not in page]:
+            raise AssertionError(f"not on the page: {missing}")
+        if (less := _without(x)) is None or PART_KINDS[x.name].does == {"bound"}:
+            return 0.0
+        model, less = with_values(x.model), less if less.time_parameter else with_values(less)
+        study = Judge(model, {"less": dynamics(x, less)}, OracleDynamics(model), states(model, 1, 0), 1e-12)
+        study.terms = TERMS
+        rows, _ = study.rows(lambda *_: None)
+    return np.inf if all(r.passed for r in rows) else 0.0
+
+
+@column("studies", "work_precision", close=1e-9)
+def _work_precision(x: Example, folder: Path) -> Told:
+    """Errors against the exact motion from the time zero on, which the study begins at."""
+    c = x.plain
+    y = x.flow(np.array([-x.t]))[-1] if x.model.time_parameter else np.concatenate([c.q, c.v])
+    q, u = np.split(y, 2)
+    start = replace(x, plain=replace(c, q=q, v=u, t=0.0 if x.model.time_parameter else x.t))
+    if np.abs(start.accelerated()).max() + np.abs(start.v).max() < 1e-9:
+        raise NotAskedError("nothing moves")
+    times = np.linspace(0.0, DURATION, 11)
+    motion = dict(zip(times.tolist(), map(x.state, start.flow(times)), strict=True))
+    out = mb.work_precision(
+        x.model, ["lagrangian"], ["rk4"], duration=DURATION, steps=[STEP], repeats=1, torque=x.tau,
+        reference=lambda t: motion[t],
+    )  # fmt: skip
+    (curve,) = out.curves
+    return min(p.error for p in curve.points), tuple(out.facts["notes"])
+
+
+@column("studies", "steady motion", close=1e-8)
+def _steady(x: Example, folder: Path) -> Told:
+    """Where the first hinge turns steadily and all else rests, nothing accelerates."""
+    if x.name in EXAMPLES and x.model.has_bodies:
+        with patch.object(kind_examples, "Arm", _Flat):
+            x = EXAMPLES[x.name](x.name)
+    if not x.model.has_bodies or len(x.plain.kinds) > 4 or x.name.endswith("several"):
+        raise NotAskedError("it is written as energies, or its equations fill pages")
+    lag = from_model(x.model, **({"drives": True} if x.model.prescribed else {}))
+    cyclic = [str(q) for q in lag.cyclic_coordinates()]
+    if lag.time is None and not cyclic:
+        raise NotAskedError("no coordinate is cyclic")
+    out = mb.steady_motion(lag, rates=dict.fromkeys(cyclic, 2.0))
+    return off(x.acceleration(x.t, out.q, out.v, 0 * out.v), 0 * out.v)
+
+
+@column("use of runs", "at rest under dry friction", close=1e-8)
+def _sticking(x: Example, folder: Path) -> Told:
+    """Joint x stays at rest while the others move: the force that holds it is below its limit, in NumPy."""
+    if not x.model.needs.friction:
+        raise NotAskedError("no dry friction")
+    c, k = x.plain, x.plain.n - (3 if x.name.endswith("several") else 1)
+    at = np.arange(k, c.n)
+    rows = np.eye(c.n)[at]
+    v = np.where(np.arange(c.n) < k, 0.05 * c.v, 0.0)
+    tau = 0.05 * x.tau
+    held = Part("held", (), speeds=lambda c, q: rows)
+    other = replace(x, plain=replace(c, v=v, parts=[held]), tau=tau)
+    a = other.accelerated()
+    needed = replace(other, plain=replace(other.plain, parts=[])).force(a) - tau
+    assert np.abs(needed[at]).max() < 0.2
+    q1, v1 = other.state(other.flow([DURATION])[-1])
+    worst = 0.0
+    for method in ("rk4", "rk853", "auto", "gauss4", "dop853"):
+        run = mb.simulate(
+            engine(x.name),
+            x.q,
+            other.v,
+            DURATION,
+            method,
+            STEP if method in ("rk4", "gauss4") else None,
+            torque=tau,
+            t0=x.t,
+            save=None,
+        )
+        worst = max(worst, off(run.q[-1], q1), off(run.v[-1], v1))
+    return worst
