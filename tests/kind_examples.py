@@ -104,7 +104,7 @@ class Example:
             elif type_ == "free":
                 out += [x[k : k + 3], _quaternion(x[k + 3 : k + 6])]
             else:
-                out.append(x[k : k + _size(type_)])
+                out.append(x[k : k + size_of(type_)])
         return np.concatenate(out)
 
     @property
@@ -196,7 +196,7 @@ class Example:
         return J @ np.linalg.inv(self.rates(x))
 
 
-def _size(type_: str) -> int:
+def size_of(type_: str) -> int:
     return {"fixed": 0, "beam": 1}[type_] if type_ in ("fixed", "beam") else len(_STACKS[type_])
 
 
@@ -325,8 +325,8 @@ def with_joint(type_: str = "revolute", **numbers: Any) -> Callable[[str], Examp
 
 def along(c: Case, x: np.ndarray, type_: str, link: int) -> np.ndarray:
     """Return E with v = E ẋ of the joint whose links begin there: a ball's and a free body's are in its axes."""
-    E = c.G[link : link + _size(type_)]
-    at = np.flatnonzero(E[0])[0] if _size(type_) else 0
+    E = c.G[link : link + size_of(type_)]
+    at = np.flatnonzero(E[0])[0] if size_of(type_) else 0
     if type_ == "ball":
         return _body_rates(x[at : at + 3]) @ E
     if type_ == "free":
@@ -336,7 +336,7 @@ def along(c: Case, x: np.ndarray, type_: str, link: int) -> np.ndarray:
 
 def of_joint(joint: str, type_: str, link: int, numbers: dict[str, Any]) -> Part:
     """Return what numbers of a joint do, on its velocities."""
-    m = _size(type_)
+    m = size_of(type_)
 
     def number(field: str) -> np.ndarray:
         return np.broadcast_to(np.asarray(numbers.get(field, 0.0), dtype=float), (m,))
@@ -409,7 +409,7 @@ def _compensation(*, partial: bool = False) -> Callable[[Arm, Site], None]:
             return 0.8 * c.mass[k] * c.weight @ a.point(at.body, c.com[k], x)
 
         def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-            left = [joint not in without for joint, type_, _ in a.joints for _ in range(_size(type_))]
+            left = [joint not in without for joint, type_, _ in a.joints for _ in range(size_of(type_))]
             return -derivative(lambda y: energy(c, y), x) * left
 
         acting = {"force": force} if partial else {"energy": energy}
@@ -509,7 +509,7 @@ def _frame_force(a: Arm, at: Site) -> None:
 def _joint_force(a: Arm, at: Site) -> None:
     """A force -q³ - v and the potential q⁴; of a quaternion's joint the force -v."""
     k, type_ = a.link[at.joint], a.types[at.joint]
-    m, turns = _size(type_), type_ in ("ball", "free")
+    m, turns = size_of(type_), type_ in ("ball", "free")
     q, v = ca.SX.sym("q", m), ca.SX.sym("v", m)
 
     def declare(b: mb.ModelBuilder) -> None:
@@ -531,7 +531,7 @@ def _joint_force(a: Arm, at: Site) -> None:
 
 def _force_of_time(a: Arm, at: Site) -> None:
     k, type_ = a.link[at.joint], a.types[at.joint]
-    m = _size(type_)
+    m = size_of(type_)
     a.with_part(
         Part(
             at.name,

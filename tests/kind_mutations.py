@@ -61,8 +61,8 @@ def seen(x: Example) -> Iterator[None]:
     """Let columns see an example in the place of its kind's own; their truths are kept."""
 
     def forget() -> None:
-        kind_paths.engine.cache_clear()
-        kind_paths._kept.cache_clear()
+        for kept in (kind_paths.engine, kind_paths.kept, kind_paths.program_of):
+            kept.cache_clear()
 
     forget()
     with patch.object(kind_paths, "example", lambda name: x if name == x.name else known(name)):

@@ -171,7 +171,7 @@ def dynamics(x: Example, model: Model, which: str = "lagrangian", **options: Any
 
 
 #: Of joint types their coordinates, and where a quaternion begins.
-_QUATERNIONS = {"ball": (4, 0), "free": (7, 3), "universal": (2, -1), "planar": (3, -1), "spherical_zyx": (3, -1)}
+QUATERNIONS = {"ball": (4, 0), "free": (7, 3), "universal": (2, -1), "planar": (3, -1), "spherical_zyx": (3, -1)}
 
 
 def aligned(q: np.ndarray, x: Example, like: np.ndarray) -> np.ndarray:
@@ -180,7 +180,7 @@ def aligned(q: np.ndarray, x: Example, like: np.ndarray) -> np.ndarray:
     if q.shape != like.shape:
         return q
     for _, type_, _ in x.joints:
-        size, four = _QUATERNIONS.get(type_, (1, -1))
+        size, four = QUATERNIONS.get(type_, (1, -1))
         if four >= 0 and q[at + four : at + four + 4] @ like[at + four : at + four + 4] < 0:
             q[at + four : at + four + 4] *= -1
         at += size
@@ -579,7 +579,7 @@ def _hold(x: Example, folder: Path) -> Told:
 
 
 @cache
-def _kept(name: str) -> mb.Trajectory:
+def kept(name: str) -> mb.Trajectory:
     x = example(name)
     return mb.simulate(engine(name), x.q, x.v, DURATION, "rk4", STEP, torque=x.tau, t0=x.t, doubt=False)
 
@@ -609,7 +609,7 @@ def _events(x: Example, folder: Path) -> Told:
 
 @column("use of runs", "save and load", close=1e-8)
 def _saved(x: Example, folder: Path) -> Told:
-    run = _kept(x.name)
+    run = kept(x.name)
     run.save(folder / "run.npz")
     back = mb.Trajectory.load(folder / "run.npz", x.model)
     wanted = _truth(x.name)
@@ -619,7 +619,7 @@ def _saved(x: Example, folder: Path) -> Told:
 
 @column("use of runs", "energy and power balance", close=1e-7)
 def _power(x: Example, folder: Path) -> Told:
-    run, c = _kept(x.name), x.plain
+    run, c = kept(x.name), x.plain
     y = x.flow([DURATION])[-1]
     end = c.energy(*np.split(y, 2)) - c.energy(c.q, c.v)
     scale = max(1.0, np.abs(run.energy()).max(), np.abs(run.work()).max())
@@ -648,7 +648,7 @@ def _wrenches(x: Example, folder: Path) -> Told:
 
 @column("use of runs", "picture")
 def _picture(x: Example, folder: Path) -> Told:
-    _kept(x.name).picture()
+    kept(x.name).picture()
     import matplotlib.pyplot as plt
 
     plt.close("all")
@@ -658,7 +658,7 @@ def _picture(x: Example, folder: Path) -> Told:
 # Texts
 
 
-def _more(x: Example) -> list[np.ndarray]:
+def more_inputs(x: Example) -> list[np.ndarray]:
     """Return the inputs beside q, v and τ: the time, or the values of parameters."""
     values = {n: v for n, v in x.model.parameters.items() if n != x.model.time_parameter}
     time = [x.t] if x.model.time_parameter else []
@@ -668,7 +668,7 @@ def _more(x: Example) -> list[np.ndarray]:
 @column("texts", "function (CasADi)")
 def _casadi(x: Example, folder: Path) -> Told:
     function = mb.dynamics(x.model, "lagrangian").function("forward_dynamics")
-    return off(function(x.q, x.v, x.tau, *_more(x)).full()[:, 0], x.accelerated())
+    return off(function(x.q, x.v, x.tau, *more_inputs(x)).full()[:, 0], x.accelerated())
 
 
 @column("texts", "C")
@@ -678,7 +678,7 @@ def _c(x: Example, folder: Path) -> Told:
     library = folder / f"{abs(hash(x.name))}.so"
     subprocess.run(["cc", "-O0", "-shared", "-fPIC", str(source), "-o", str(library), "-lm"], check=True)
     described = made.functions[0]
-    arguments = [x.q, x.v, x.tau, *_more(x)]
+    arguments = [x.q, x.v, x.tau, *more_inputs(x)]
     assert len(arguments) == len(described.inputs)
     out = np.full(len(x.v), np.nan)
     call = getattr(ctypes.CDLL(str(library)), described.name)
@@ -696,7 +696,7 @@ def program_of(name: str) -> Any:
 def _program(x: Example, folder: Path) -> Told:
     names: dict[str, Any] = {}
     exec(program_of(x.name).python(), names)
-    out = np.atleast_1d(names["forward_dynamics"](x.q, x.v, x.tau, *_more(x)))
+    out = np.atleast_1d(names["forward_dynamics"](x.q, x.v, x.tau, *more_inputs(x)))
     return off(out, x.accelerated())
 
 
@@ -777,7 +777,7 @@ def _baseline(x: Example, folder: Path) -> Told:
     mb.baseline.record(x.model, path, ["lagrangian"], samples=1, force=True)
     if not mb.baseline.check(x.model, path).passed:
         return np.inf
-    if (less := _without(x)) is not None and mb.baseline.check(less, path).passed:
+    if (less := without_part(x)) is not None and mb.baseline.check(less, path).passed:
         raise AssertionError(f"passes without {x.name}")
     return 0.0
 
@@ -785,14 +785,14 @@ def _baseline(x: Example, folder: Path) -> Told:
 # Changes of a model
 
 
-def _without(x: Example) -> Model | None:
+def without_part(x: Example) -> Model | None:
     k = PART_KINDS.get(x.name)
     return x.model.without(x.name) if k and k.features else None
 
 
 @column("changes", "without")
 def _taken_out(x: Example, folder: Path) -> Told:
-    less = _without(x)
+    less = without_part(x)
     if less is None:
         raise NotAskedError("it is no part that can be taken out")
     parts = [] if x.name != "gravity" else x.plain.parts
@@ -855,7 +855,7 @@ def _segments(x: Example, folder: Path) -> Told:
 
 @column("studies", "explain: taken out")
 def _explained(x: Example, folder: Path) -> Told:
-    if (less := _without(x)) is None:
+    if (less := without_part(x)) is None:
         raise NotAskedError("it is no part that can be taken out")
     out = mb.explain(x.model, less, samples=1)
     if out.agree and PART_KINDS[x.name].does != {"bound"}:

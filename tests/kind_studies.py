@@ -39,29 +39,29 @@ from mbkit.studies.importers.loops import WrittenLoops, closures
 from mbkit.studies.importers.study import stages
 from mbkit.testing import assert_same_dynamics
 from tests import kind_examples
-from tests.kind_examples import EXAMPLES, Arm, Example, _size, example
+from tests.kind_examples import EXAMPLES, Arm, Example, example, size_of
 from tests.kind_paths import (
-    _QUATERNIONS,
     CLOSE,
     COLUMNS,
     DURATION,
     NOT_YET,
+    QUATERNIONS,
     ROWS,
     STEP,
     NotAskedError,
     Told,
-    _kept,
-    _more,
-    _without,
     aligned,
     cell,
     column,
     dynamics,
     engine,
+    kept,
+    more_inputs,
     named,
     off,
     program_of,
     registered,
+    without_part,
 )
 from tests.plain_mechanics import Case, Part, derivative, rotation
 from tests.test_engine_versions import present
@@ -79,15 +79,13 @@ def _elsewhere(engine: str) -> Any:
     return present(engine, {"pinocchio": "4.1.0", "mujoco": "4.0.0"}[engine])
 
 
-@cache
-def _sent(name: str, which: str) -> mb.Dynamics:
-    x = example(name)
+def _sent(x: Example, which: str) -> mb.Dynamics:
     dyn = mb.dynamics(x.model, _elsewhere(which))
     return dyn.at(**{x.model.time_parameter: x.t}) if x.model.time_parameter else dyn
 
 
 def _remote(x: Example, folder: Path, which: str) -> Told:
-    dyn, a, c = _sent(x.name, which), 0.3 * x.v + 0.1, x.plain
+    dyn, a, c = _sent(x, which), 0.3 * x.v + 0.1, x.plain
     inverse = off(dyn.inverse_dynamics(x.q, x.v, a), x.force(a))
     M = off(dyn.mass_matrix(x.q), x.mass_matrix(c.q))
     kinetic = off(dyn.kinetic_energy(x.q, x.v), c.v @ c.mass_matrix(c.q) @ c.v / 2)
@@ -103,7 +101,7 @@ column("other environments", "sent as MJCF (MuJoCo)", "sent", which="mujoco")(_r
 
 @column("other environments", "own run there (MuJoCo)", close=1e-8)
 def _remote_run(x: Example, folder: Path) -> Told:
-    q, v = _sent(x.name, "mujoco").rollout(x.q, x.v, STEP, round(DURATION / STEP))
+    q, v = _sent(x, "mujoco").rollout(x.q, x.v, STEP, round(DURATION / STEP))
     wanted = x.state(x.flow([DURATION], lambda t, q, v: 0 * v)[-1])
     return max(off(aligned(q[-1], x, wanted[0]), wanted[0]), off(v[-1], wanted[1]))
 
@@ -121,7 +119,7 @@ def _in_steps(x: Example, of_model: np.ndarray, of_plain: np.ndarray, quaternion
     out, at = [], 0
     for _, type_, k in x.joints:
         slides = 3 if type_ == "free" else 0
-        size = _QUATERNIONS.get(type_, (1, -1))[0] if quaternions else _size(type_)
+        size = QUATERNIONS.get(type_, (1, -1))[0] if quaternions else size_of(type_)
         ball = of_model[at + slides : at + size]
         turned = [ball[3:], ball[:3]] if quaternions else [ball]
         if type_ in ("ball", "free"):
@@ -185,7 +183,7 @@ def _importers(x: Example, folder: Path) -> Told:
     own = stages(back, loops, read(path.read_text(), "mjcf", False, {}), 2, 0, CLOSE)
     if bad := [s for s in own if s.same is False]:
         raise AssertionError(str(bad))
-    if (less := _without(x)) is not None:
+    if (less := without_part(x)) is not None:
         other = read(_written(less, folder, "mjcf", "less")[0].read_text(), "mjcf", False, {})
         if all(s.same is not False for s in stages(back, loops, other, 2, 0, CLOSE)):
             return np.inf, notes
@@ -212,7 +210,7 @@ def _header(x: Example, folder: Path) -> Told:
 def _read_program(x: Example, folder: Path) -> Told:
     """Both have six digits."""
     text = program_of(x.name)
-    given = zip(text.inputs, (x.q, x.v, x.tau, *_more(x)), strict=True)
+    given = zip(text.inputs, (x.q, x.v, x.tau, *more_inputs(x)), strict=True)
     values = {str(s): float(z) for (_, symbols), y in given for s, z in zip(symbols, y, strict=True)}
     worst = 0.0
     for lines in (lines_of_text(str(text)), lines_of_latex(text.latex())):
@@ -229,7 +227,7 @@ def _program_in_c(x: Example, folder: Path) -> Told:
     (folder / "p.c").write_text(code, encoding="utf-8")
     subprocess.run(["cc", "-O0", "-shared", "-fPIC", "p.c", "-o", "p.so", "-lm"], check=True, cwd=folder)
     out = np.full(len(x.v), np.nan)
-    given = (x.q, x.v, x.tau, *_more(x), out)
+    given = (x.q, x.v, x.tau, *more_inputs(x), out)
     ctypes.CDLL(str(folder / "p.so")).forward_dynamics(*(y.ctypes.data_as(ctypes.c_void_p) for y in given))
     return off(out, x.accelerated())
 
@@ -287,7 +285,7 @@ def _place(x: Example, q: np.ndarray) -> np.ndarray:
     """Return coordinates of the plain case from the model's."""
     out, at = np.zeros(x.plain.n), 0
     for _, type_, k in x.joints:
-        size, four = _QUATERNIONS.get(type_, (1, -1))
+        size, four = QUATERNIONS.get(type_, (1, -1))
         slides = max(four, 0)
         out[k : k + slides] = q[at : at + slides]
         if four < 0:
@@ -324,10 +322,16 @@ def _second(x: Example, folder: Path) -> Told:
 class _Cut(Case):
     """A case whose last body is also moved along and about the world's axes, by six coordinates behind the others."""
 
+    @classmethod
+    def of(cls, c: Case) -> _Cut:
+        still = np.zeros(6)
+        wide = np.hstack([c.G, np.zeros((len(c.G), 6))])
+        return cls(**vars(c) | {"q": np.append(c.q, still), "v": np.append(c.v, still), "G": wide})
+
     def split(self, q: np.ndarray) -> tuple[Case, np.ndarray, np.ndarray, np.ndarray]:
         """Return the case, its coordinates, and of the others R and the axes of its three turns."""
-        n = self.G.shape[1]
-        base = Case(**vars(self) | {"q": self.q[:n], "v": self.v[:n]})
+        n = self.n - 6
+        base = Case(**vars(self) | {"q": self.q[:n], "v": self.v[:n], "G": self.G[:, :n]})
         turns, axes = np.eye(3), []
         for axis, angle in zip(np.eye(3), q[n + 3 :], strict=True):
             axes.append(turns @ axis)
@@ -361,7 +365,7 @@ def _load(x: Example, folder: Path) -> Told:
         raise NotAskedError("no bodies of its own")
     c, n, still = x.plain, x.plain.n, np.zeros(6)
     a = c.acceleration(x.t, c.q, c.v, x.rates(c.q).T @ x.tau)
-    cut = _Cut(**vars(c) | {"q": np.append(c.q, still), "v": np.append(c.v, still)})
+    cut = _Cut.of(c)
     dM, q, v = derivative(cut.mass_matrix, cut.q), cut.q, cut.v
     h = np.einsum("ijk,j,k->i", dM, v, v) - np.einsum("jki,j,k->i", dM, v, v) / 2
     f = cut.mass_matrix(q) @ np.append(a, still) + h + derivative(cut.potential, q) - cut.loads(x.t, q, v)
@@ -398,7 +402,7 @@ def _variants(x: Example, folder: Path) -> Told:
 @column("use of runs", "film")
 def _film(x: Example, folder: Path) -> Told:
     """Bodies stand where NumPy has them, with the vertical upwards."""
-    scene = _kept(x.name).animate(folder / "film.html", shapes="sticks").scene
+    scene = kept(x.name).animate(folder / "film.html", shapes="sticks").scene
     y = x.flow([DURATION])[-1][: x.plain.n]
     g = x.plain.weight
     up = np.eye(3) if not g.any() else scene.rotations[0, 0]
@@ -432,7 +436,7 @@ def _identified(x: Example, folder: Path) -> Told:
     *states, tau = (z[:16] for z in data)
     sought = x.name.rpartition(".several")[0] or x.name
     more = {"friction": sought in ("joint.damping", "joint.friction"), "armature": x.name == "joint.armature"}
-    given = _without(x) if any(more.values()) else x.model
+    given = without_part(x) if any(more.values()) else x.model
     found, elsewhere = mb.identify(given, *states, tau, rest=0.0, **more), [z[16:] for z in data[:3]]
     if any(more.values()):
         # Numbers that are zero but for rounding, some of them negative, make no model.
@@ -450,7 +454,7 @@ def _told(x: Example, text: str) -> float:
 @column("studies", "assert_same_dynamics")
 def _same(x: Example, folder: Path) -> Told:
     assert_same_dynamics(x.model, x.model, samples=1)
-    if (less := _without(x)) is None:
+    if (less := without_part(x)) is None:
         raise NotAskedError("it is no part that can be taken out")
     if PART_KINDS[x.name].does == {"bound"}:
         assert_same_dynamics(x.model, less, samples=1)
@@ -468,7 +472,7 @@ def _diff(x: Example, folder: Path) -> Told:
     run = CliRunner().invoke(cli, ["diff", str(path), str(path)])
     if run.exit_code:
         raise AssertionError(run.output)
-    if (less := _without(x)) is None:
+    if (less := without_part(x)) is None:
         raise NotAskedError("it is no part that can be taken out")
     run = CliRunner().invoke(cli, ["diff", str(path), str(_written(less, folder, "mjcf", "less")[0])])
     if run.exit_code == 0:
@@ -488,7 +492,7 @@ def _check(x: Example, folder: Path) -> Told:
         page = html.unescape(render(compare_view.view(result)))
         if missing := [r.reason for r in result.refusals if not r.term and r.reason[:60] not in page]:
             raise AssertionError(f"not on the page: {missing}")
-        if (less := _without(x)) is None or PART_KINDS[x.name].does == {"bound"}:
+        if (less := without_part(x)) is None or PART_KINDS[x.name].does == {"bound"}:
             return 0.0
         model, less = with_values(x.model), less if less.time_parameter else with_values(less)
         study = Judge(model, {"less": dynamics(x, less)}, OracleDynamics(model), states(model, 1, 0), 1e-12)

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import entry_points
 from importlib.metadata import version as installed
@@ -26,7 +27,14 @@ from mbkit.engines.versions import environment, process
 from mbkit.engines.versions.dynamics import VersionDynamics
 from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion, made_of, versions_of
 from mbkit.engines.versions.remote import serve
-from mbkit.errors import EngineProcessError, InputError, MbkitError, UnknownNameError, UnsupportedError
+from mbkit.errors import (
+    EngineProcessError,
+    InputError,
+    KnownDefectWarning,
+    MbkitError,
+    UnknownNameError,
+    UnsupportedError,
+)
 from mbkit.studies._targets import engine_names
 from tests.random_trees import IN_MUJOCO, SOUND, random_tree
 
@@ -146,12 +154,14 @@ def test_terms_are_those_of_the_oracle(engine, name):
     oracle, rng = mb.dynamics(model, "oracle"), np.random.default_rng(0)
     q, v = model.random_state(rng, 3)
     states = q, v, rng.standard_normal(v.shape)
-    # Pinocchio's matrix and energy are known to be wrong for these.
+    # Pinocchio's matrix and energy are known to be wrong for these, which is told.
     wrong = {"universal": "coriolis_force", "springs": "kinetic_energy"}.get(name) if engine == "pinocchio" else None
     for term, arguments in TERMS.items():
-        value, truth = (getattr(d, term)(*states[:arguments]) for d in (dyn, oracle))
+        with warnings.catch_warnings(record=True, action="always", category=KnownDefectWarning) as told:
+            value, truth = (getattr(d, term)(*states[:arguments]) for d in (dyn, oracle))
         right = np.abs(value - truth).max() <= 1e-12 * max(1.0, np.abs(truth).max())
         assert right == (term != wrong), term
+        assert bool(told) == (term == wrong), term
     body = model.bodies[-1].name
     for quantity in (lambda d: d.jacobian(q, body), lambda d: d.pose(q, body)):
         assert np.abs(quantity(dyn) - quantity(oracle)).max() < 1e-12
