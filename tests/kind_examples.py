@@ -290,11 +290,11 @@ class Arm:
 
     # Parts of the plain case
 
-    def pose(self, body: str, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return (np.eye(3), np.zeros(3)) if body == "world" else self.case.poses(x)[self.last[body]]
+    def pose(self, body: str, x: np.ndarray, c: Case | None = None) -> tuple[np.ndarray, np.ndarray]:
+        return (np.eye(3), np.zeros(3)) if body == "world" else (c or self.case).poses(x)[self.last[body]]
 
-    def point(self, body: str, at: Any, x: np.ndarray) -> np.ndarray:
-        R, p = self.pose(body, x)
+    def point(self, body: str, at: Any, x: np.ndarray, c: Case | None = None) -> np.ndarray:
+        R, p = self.pose(body, x, c)
         return p + R @ np.asarray(at)
 
     def moving(self, body: str, at: Any, x: np.ndarray) -> np.ndarray:
@@ -395,7 +395,7 @@ def _rotor(a: Arm, at: Site) -> None:
     a.builder.add_joint(f"to_{at.name}", "fixed", parent=at.body, child=at.name)
 
     def inertia(c: Case, x: np.ndarray) -> np.ndarray:
-        J, W = a.moving(at.body, (0, 0, 0), x), c.turning(a.last[at.body], x)
+        J, W = c.moving(a.last[at.body], (0, 0, 0), x), c.turning(a.last[at.body], x)
         return 0.3 * (J.T @ J + W.T @ W)
 
     a.with_part(Part(at.name, (), lambda b: b.add_gravity_compensation(at.name, 1.0), inertia=inertia))
@@ -406,11 +406,13 @@ def _compensation(*, partial: bool = False) -> Callable[[Arm, Site], None]:
         k, without = a.last[at.body], (at.joint,) if partial else ()
 
         def energy(c: Case, x: np.ndarray) -> Any:
-            return 0.8 * c.mass[k] * c.weight @ a.point(at.body, c.com[k], x)
+            return 0.8 * c.mass[k] * c.weight @ a.point(at.body, c.com[k], x, c)
 
         def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-            left = [joint not in without for joint, type_, _ in a.joints for _ in range(size_of(type_))]
-            return -derivative(lambda y: energy(c, y), x) * left
+            out = -derivative(lambda y: energy(c, y), x)
+            for joint, type_, i in a.joints:
+                out[i : i + size_of(type_)] *= joint not in without
+            return out
 
         acting = {"force": force} if partial else {"energy": energy}
         a.with_part(Part(at.name, (), lambda b: b.add_gravity_compensation(at.body, 0.8, without=without), **acting))
@@ -425,11 +427,11 @@ def _spring(stiffness: float = 0.0, damping: float = 0.0) -> Callable[[Arm, Site
     def part(a: Arm, at: Site) -> None:
         there = np.array([1.0, 2.0, 3.0])
 
-        def length(x: np.ndarray) -> Any:
-            return norm(a.point(at.body, (0.1, 0, 0.2), x) - there)
+        def length(c: Case, x: np.ndarray) -> Any:
+            return norm(a.point(at.body, (0.1, 0, 0.2), x, c) - there)
 
         def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-            J = derivative(length, x)
+            J = derivative(lambda y: length(c, y), x)
             return -damping * (J @ u) * J
 
         ends = {"body_a": "world", "point_a": there, "body_b": at.body, "point_b": (0.1, 0, 0.2)}
@@ -439,7 +441,7 @@ def _spring(stiffness: float = 0.0, damping: float = 0.0) -> Callable[[Arm, Site
                 at.name,
                 (),
                 lambda b: b.add_spring(at.name, **ends, **numbers),
-                energy=lambda c, x: stiffness / 2 * (length(x) - 0.5) ** 2,
+                energy=lambda c, x: stiffness / 2 * (length(c, x) - 0.5) ** 2,
                 force=force,
             )
         )
@@ -474,15 +476,15 @@ def _bushing(a: Arm, at: Site) -> None:
     R_0, p_0 = a.pose(at.body, a.case.q)
     R_A, p_A = R_0 @ rotation(np.array([0.6, 0.0, 0.8]), 0.7), p_0 + np.array([0.1, -0.2, 0.1])
 
-    def displaced(x: np.ndarray) -> np.ndarray:
-        R, p = a.pose(at.body, x)
+    def displaced(c: Case, x: np.ndarray) -> np.ndarray:
+        R, p = a.pose(at.body, x, c)
         B = R_A.T @ R
         angle = np.arccos((np.trace(B) - 1) / 2)
         turn = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
         return np.concatenate([R_A.T @ (p - p_A), turn * angle / (2 * np.sin(angle))])
 
     def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        J = derivative(displaced, x)
+        J = derivative(lambda y: displaced(c, y), x)
         return -J.T @ (d * (J @ u))
 
     ends = {"body_a": "world", "rotation_a": R_A, "translation_a": p_A, "body_b": at.body}
@@ -491,7 +493,7 @@ def _bushing(a: Arm, at: Site) -> None:
             at.name,
             (),
             lambda b: b.add_bushing(at.name, **ends, stiffness=k, damping=d),
-            energy=lambda c, x: np.sum(k * displaced(x) ** 2) / 2,
+            energy=lambda c, x: np.sum(k * displaced(c, x) ** 2) / 2,
             force=force,
         )
     )
@@ -501,7 +503,7 @@ def _frame_force(a: Arm, at: Site) -> None:
     F = np.array([1.0, 2.0, 3.0])
 
     def force(c: Case, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        return a.moving(at.body, (0, 0, 0), x).T @ a.pose(at.body, x)[0] @ F
+        return c.moving(a.last[at.body], (0, 0, 0), x).T @ a.pose(at.body, x, c)[0] @ F
 
     a.with_part(Part(at.name, (), lambda b: b.add_force(at.name, at.body, force=F), force=force))
 
@@ -637,7 +639,7 @@ def _no_slip(kind: str) -> Callable[[Arm, Site], None]:
             return (J + np.stack([np.cross(w, r) for w in W.T], axis=-1))[:2]
 
         def height(c: Case, t: Any, x: np.ndarray) -> list[Any]:
-            return [n @ (a.point(body, (0, 0, 0), x) - floor) - contact(c, x)[0]]
+            return [n @ (a.point(body, (0, 0, 0), x, c) - floor) - contact(c, x)[0]]
 
         def declare(b: mb.ModelBuilder) -> None:
             if kind == "blade":
@@ -698,7 +700,7 @@ def beam(a: Arm, at: Site) -> None:
         return M
 
     def energy(c: Case, x: np.ndarray) -> Any:
-        return 10 * EI * x[n] ** 2 - sum(mass * c.weight @ a.point(at.body, places(x, s), x) for s, mass in points)
+        return 10 * EI * x[n] ** 2 - sum(mass * c.weight @ a.point(at.body, places(x, s), x, c) for s, mass in points)
 
     def declare(b: mb.ModelBuilder) -> None:
         shapes = [Polynomial([0.0, 0.0, 1.0])]

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import sympy as sp
 from click.testing import CliRunner
 
 import mbkit as mb
@@ -35,6 +36,7 @@ from mbkit.studies.compare.findings import findings
 from mbkit.studies.compare.terms import TERMS
 from mbkit.studies.compare.terms import states as study_states
 from mbkit.testing import assert_engines_agree
+from tests import kind_examples
 from tests.random_trees import random_tree
 from tests.scenes import chain, hinge
 
@@ -473,6 +475,23 @@ def test_what_was_left_out_would_show_if_it_mattered():
     assert abs(Variant(dyn, ("FRICTIONLOSS", "CONSTRAINT")).accelerations(q, v) - lean) > 0.1
     smooth = mb.dynamics(model.without("friction"))
     assert lean == pytest.approx(smooth.forward_dynamics(q, v, [0.0]), rel=1e-14)
+
+
+def test_energies_are_balanced_where_t_plus_v_is_what_forces_change():
+    """A constant force without a potential does work; on a turning hoop T + V changes without a force."""
+    x, v = sp.symbols("x xdot")
+    pushed = mb.lagrangian.Lagrangian(v**2 / 2, x**2, [x], [v], forces={x: 2}).model
+    result = mb.compare(pushed, ("lagrangian", "pinocchio"), 2, terms_only=True)
+    assert result.passed
+    assert {r.relative < 1e-12 for r in result.rows if r.term == "power balance"} == {True}
+    hoop = mb.lagrangian.systems.bead_on_hoop()
+    model = hoop.model.with_parameters(**{str(p): 1.0 for p in hoop.parameters})
+    for system in (model, mb.lagrangian.from_model(kind_examples.example("force.of_time").model).model):
+        result = mb.compare(system, ("lagrangian", "pinocchio"), 2, terms_only=True)
+        assert result.passed
+        assert [r.reason for r in result.refusals if r.term == "power balance"] == [
+            f"{system.name}: its energies depend on the time, or T has parts that are not of v²"
+        ]
 
 
 def test_one_engine_alone_agrees_with_the_reference():

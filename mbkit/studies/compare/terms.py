@@ -13,6 +13,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.frames_and_momenta import LOCAL
 from mbkit.engines.oracle import OracleDynamics
+from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 from mbkit.model.manifold import limits_box
 from mbkit.studies.compare.errors import (
@@ -167,16 +168,24 @@ def power_errors(dyn: Dynamics, oracle: OracleDynamics, at: States, scales: Scal
     """Return the errors of the power balance, dE/dt = (τ + τ_damping + Jᵀ λ) · v, with the engine's own acceleration.
 
     The rate of energy is differentiated exactly from T and V by the oracle; acceleration and damping are the engine's.
-    So it fails if either the engine's dynamics or the energies are wrong, whatever two engines agree on.
+    So it fails if either the engine's dynamics or the energies are wrong, whatever two engines agree on. Energies of
+    which T + V is not what forces change, by parts without velocities or by the time, are refused.
     """
+    model = dyn.model
+    if not model.has_bodies:
+        T, M = oracle.kinetic_energy(at.q, at.v), oracle.mass_matrix(at.q)
+        rest = np.abs(T - 0.5 * np.einsum("ki,kij,kj->k", at.v, M, at.v))
+        if model.needs.time or (rest > 1e-12 * (np.abs(T) + scales.inertial)).any():
+            raise UnsupportedError(f"{model.name}: its energies depend on the time, or T has parts that are not of v²")
     a = dyn.forward_dynamics(at.q, at.v, at.tau)
     still = np.zeros_like(at.v)
-    # Of functions without a potential, what acts at rest does work too.
-    damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, still) + dyn._lost_force(at.q, still)
+    # Of functions without a potential, what acts at rest does work too; springs written as energies are in V.
+    damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, still)
+    damping = damping + (dyn._lost_force(at.q, still) if model.has_bodies else dyn.passive(at.q, still))
     damping = damping + dyn._friction_beside_passive(at.q, at.v, at.tau)
     inertial, rate = oracle.inverse_dynamics(at.q, at.v, a), oracle.energy_rate(at.q, at.v, a)
     # Drives do work, and so do constraints that give way.
-    held = dyn.generalized_constraint_force(at.q, at.v, at.tau) if dyn.model.constrained else np.zeros_like(at.v)
+    held = dyn.generalized_constraint_force(at.q, at.v, at.tau) if model.constrained else np.zeros_like(at.v)
     e = np.abs(rate - np.sum((at.tau + damping + held) * at.v, axis=1))
     # M a is as large as M's norm lets it be, and that is where it is rounded.
     root = np.sqrt(scales.diagonal)
