@@ -131,7 +131,8 @@ def named(name: str, x: Example, text: str) -> bool:
     for k in map(kind, x.model.acts):
         words += [k.words.format(p=p) for p in k.parts(x.model)]
     low = text.lower()
-    if any(w.lower() in low for w in words) or "'x'" in text:
+    # A joint of several motions is several joints of a file.
+    if any(w.lower() in low for w in words) or "'x'" in text or "'x." in text:
         return True
     return any(_called(k, x, low) for k in ([name] if name in PART_KINDS or name in TYPES else x.model.acts))
 
