@@ -23,7 +23,7 @@ from mbkit.model.elements.paths import Path as Gate
 from tests import kind_paths
 from tests.kind_examples import EXAMPLES, TYPES, Example
 from tests.kind_examples import example as known
-from tests.kind_paths import COLUMNS, _cell
+from tests.kind_paths import COLUMNS, told
 
 MUTATIONS = ("dropped", "admitted", "removed")
 
@@ -74,7 +74,7 @@ def ends(path: str, x: Example, folder: Path, *, column: bool) -> tuple[str, str
     """Return how a check ends: "right", "refused", or anything else, and its text."""
     if column:
         with seen(x):
-            out = _cell(x.name, path, folder)
+            out = told(x.name, path, folder)
         return out.outcome, out.text
     with warnings.catch_warnings(action="ignore"):
         try:
