@@ -1,4 +1,4 @@
-"""What an identification returns: the parameters with their standard deviations, and the model with them."""
+"""The result of an identification: the parameters with their standard deviations, and the model with them."""
 
 from __future__ import annotations
 

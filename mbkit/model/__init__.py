@@ -1,4 +1,4 @@
-"""What a system is: frozen data and its builder. No engine is imported here."""
+"""A system as frozen data, and its builder. No engine is imported here."""
 
 from mbkit.model.base_parameters import BaseParameters
 from mbkit.model.builder import ModelBuilder

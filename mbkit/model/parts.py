@@ -490,7 +490,7 @@ class Coupler(_Frozen):
 
 
 class OfJoint(_Frozen):
-    """What a joint has one of, under the joint's name: a prescribed motion."""
+    """A motion of a joint in time, which has the joint's name: there is one."""
 
     section = "prescribed"
     joint: str

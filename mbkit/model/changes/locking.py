@@ -30,7 +30,7 @@ from mbkit.model.elements.forces import (
 from mbkit.model.elements.formula import Formula, Operation
 from mbkit.model.elements.motion_laws import motions_of
 from mbkit.model.elements.paths import OF_BODIES, Path
-from mbkit.model.elements.references import entries, moved_by, with_fields
+from mbkit.model.elements.references import called, entries, moved_by, with_fields
 from mbkit.model.joint_types import FIXED
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.model import Model
@@ -54,18 +54,16 @@ def lock(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike |
     values = _with_followers(model, given)
     _require_limits(model, values)
     _refuse_driven(model, values)
-    bindings, notes = list(model.bindings), []
+    bindings = list(model.bindings)
     parts: dict[str, Any] = {"joints": tuple(_fixed(j, values, bindings) for j in model.joints)}
     parts["springs"] = (*model.springs, *_still_springs(model, parts["joints"], values, bindings))
     parts["couplers"] = tuple(y for x in model.couplers if (y := _left(x, values, bindings)) is not None)
     couplings = [_shortened(x, values, bindings) for x in model.couplings]
     parts["couplings"] = tuple(x for x in couplings if x is not None)
     parts["forces"] = tuple(x for force in model.forces for x in _acting(model, force, values))
-    for kind in ("couplers", "couplings", "forces"):
-        names = {x.name for x in parts[kind]}
-        gone = [x.name for x in getattr(model, kind) if x.name not in names]
-        bindings = [b for b in bindings if b.where != kind or b.part in names]
-        notes += [f"{kind.removesuffix('s')} {name!r} acts on locked joints alone, and is gone" for name in gone]
+    there = {(x.section, x.name) for own in parts.values() for x in own}
+    gone = [x for kind in parts for x in getattr(model, kind) if (kind, x.name) not in there]
+    notes = [f"{called(x.section)} {x.name!r} acts on locked joints alone, and is gone" for x in gone]
     followers = ", ".join(name for name in values if name not in given)
     listed = ", ".join(f"{name} at {_short(x)}" for name, x in given.items())
     notes.insert(0, f"locked: {listed}" + (f"; with them {followers}" if followers else ""))
@@ -73,16 +71,14 @@ def lock(model: Model, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike |
     out = replace(
         model,
         **parts,
-        bindings=tuple(bindings),
+        bindings=tuple(b for b in bindings if b.where not in parts or (b.where, b.part) in there),
         source="",
         drawn_from=model.sources,
         locked=(*model.locked, *((j.name, tuple(x.tolist()), j.type.nv) for j, x in pairs if not j.mimic)),
     )
     closed, more = _closed_for_good(out)
     kept = tuple(x for x in out.loops if x not in closed)
-    left = {x.name for x in closed}
-    bindings = [b for b in out.bindings if b.where != "loops" or b.part not in left]
-    return replace(out, loops=kept, bindings=tuple(bindings), notes=(*out.notes, *notes, *more))
+    return replace(out, loops=kept, notes=(*out.notes, *notes, *more))
 
 
 def _short(x: Array) -> str:

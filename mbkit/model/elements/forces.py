@@ -34,7 +34,7 @@ _ASYMMETRY: Final = 1e-12
 
 
 class Force(_Frozen):
-    """What the elements share: the attributes `formula`, `potential`, `symbols` and `numbers`."""
+    """A force, with the attributes that all elements share: `formula`, `potential`, `symbols` and `numbers`."""
 
     section = "forces"
     name: str

@@ -61,7 +61,7 @@ class Path:
         """Return whether it carries a kind, or leaves it out with a note."""
         if kind.name in self.carries or kind.name in self.notes:
             return True
-        # What does the same as another kind is carried with that.
+        # A kind that does the same as another one is carried with that.
         return bool(kind.does) and all(
             x in self.carries or (x in PART_KINDS and self.takes(PART_KINDS[x])) for x in kind.does
         )
@@ -104,7 +104,7 @@ class Path:
                 yield ", while ".join(k.words.format(p=k.parts(model)[0]) for k in first if k) + f": {why}"
 
 
-#: What paths carry that take all but kinds of no known effect.
+#: Effects of paths that take all but kinds of no known effect.
 ALL: Final = frozenset({*EFFECTS, "energies"})
 #: And what those carry that go by bodies.
 OF_BODIES: Final = ALL - {"energies"}

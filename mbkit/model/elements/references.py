@@ -1,4 +1,4 @@
-"""What parts of a description refer to: other names for it, and another place for what hangs on the ground."""
+"""References of parts to bodies and joints: other names for these, and another place for what hangs on the ground."""
 
 from __future__ import annotations
 
