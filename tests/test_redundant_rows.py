@@ -525,6 +525,17 @@ def test_drives_that_contradict_each_other_are_named(engine: str, options: dict)
         assert ask == "random_state" or "by -1 per second" in str(told.value)
 
 
+@pytest.mark.parametrize(("engine", "options"), QUICK)
+@pytest.mark.parametrize("ask", ["forward_dynamics", "constraint_forces", "actuator_forces"])
+def test_accelerations_at_rates_that_contradict_each_other_are_refused(ask: str, engine: str, options: dict) -> None:
+    q, v = np.zeros(3), np.array([1.0, 1.0, -1.0])
+    ASKED[ask](mb.dynamics(driven(1.0, 1.0), engine, **options), q, v)
+    for lead in ((), (2,)):
+        dyn = mb.dynamics(driven(1.0, 2.0), engine, **options)
+        with pytest.raises(InputError, match=r"motion of 'hinge1' by -1 per second against .*motion of 'hinge0'"):
+            ASKED[ask](dyn, np.broadcast_to(q, (*lead, 3)), np.broadcast_to(v, (*lead, 3)))
+
+
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_run_along_which_drives_part_ends_by_name(compiled: bool) -> None:
     # With the same rate at first: ½ sin 2t and sin t.
@@ -534,6 +545,13 @@ def test_a_run_along_which_drives_part_ends_by_name(compiled: bool) -> None:
     # A compiled run said that it had finished, with NaN.
     assert not run.stats.finished
     assert np.isfinite(run.q).all()
+
+
+@pytest.mark.parametrize(("engine", "options"), [*QUICK, ("lagrangian", {})])
+def test_a_step_within_which_drives_part_is_refused_by_name(engine: str, options: dict) -> None:
+    dyn = mb.dynamics(driven(2.0, 1.0, (0.5, 1.0)), engine, **options)
+    with pytest.raises(NumericalError, match=r"'hinge1'.*contradicts.*'hinge0'"):
+        dyn.step(np.zeros(3), [1.0, 1.0, -1.0], np.zeros(3), 1e-3, "rk4", t=0.0)
 
 
 def test_blades_of_different_speeds_contradict_each_other() -> None:

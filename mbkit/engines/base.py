@@ -370,7 +370,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         >>> print(dyn.forward_dynamics([0.1, 0.2], [1.0, -2.0], [0.0, 0.0]).round(4))
         [ 1.2275 -5.5282]
         """
-        self._look(q)
+        self._look(q, v)
         if wrenches:
             frames, w = self._stacked_wrenches(wrenches)
             acting = frames, axes_named(axes)

@@ -141,14 +141,34 @@ class Constrained:
                 MbkitWarning,
             )
 
-    def _look(self, q: ArrayLike) -> None:
+    def _refuse_contradictory_rates(self, q: ArrayLike, v: ArrayLike) -> None:
+        """Refuse velocities at which rows ask for other rates than the rows that imply them do (InputError)."""
+        own, lost = list(self._row_choice.independent), list(self._row_choice.redundant)
+        q, v = (np.atleast_2d(x) for x in (q, v))
+        J, rates = self.constraint_jacobian(q), self.constraint_rate(q, v)
+        weights = J[:, lost] @ np.linalg.pinv(J[:, own])
+        # On another branch a row does not follow from the others, and accelerations tell.
+        follows = (
+            np.abs(weights @ J[:, own] - J[:, lost]).max(axis=-1) <= CONSISTENT * np.abs(J).max(axis=(1, 2))[:, None]
+        )
+        left = np.abs(rates[:, lost] - (weights @ rates[:, own, None])[..., 0])
+        broken = follows & (left > CONSISTENT * np.maximum(1.0, np.abs(v).max(axis=-1, keepdims=True)))
+        for k in np.flatnonzero(broken.any(axis=-1))[:1].tolist():
+            still = self._states_held.manifold_of(self).member(k).still_open(q[k % len(q)], v[k % len(v)])
+            raise InputError(
+                f"v: {self.model.name}: no velocity satisfies all constraints: open stay {', '.join(still)}"
+            )
+
+    def _look(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
         if self.looks:
             self._warn_of_open_states(q)
+            if v is not None and self._row_choice.redundant and np.isfinite(q).all() and np.isfinite(v).all():
+                self._refuse_contradictory_rates(q, v)
             self.looks = False
 
     def _require_motion(self, q: ArrayLike, v: ArrayLike | None = None, tau: ArrayLike | None = None) -> None:
         """Refuse a pose on another branch by its accelerations, under unit forces without τ (NumericalError)."""
-        self._look(q)
+        self._look(q, v)
         if self.soft_constraints or not self._row_choice.redundant:
             return
         still = np.zeros(self.model.nv)
@@ -306,7 +326,7 @@ class Constrained:
         >>> dyn.constraint_forces(q, v, [0.0] * 3).shape, len(dyn.constraint_names)
         ((2,), 2)
         """
-        self._look(q)
+        self._look(q, v)
         return self._evaluate("constraint_forces", q=q, v=v, tau=tau)
 
     def generalized_constraint_force(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
@@ -320,7 +340,7 @@ class Constrained:
         >>> dyn.generalized_constraint_force(q, v, [0.0] * 3).shape
         (3,)
         """
-        self._look(q)
+        self._look(q, v)
         return self._evaluate("generalized_constraint_force", q=q, v=v, tau=tau)
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:

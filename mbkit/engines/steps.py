@@ -200,8 +200,11 @@ class Steps:
             except _NotFiniteError as error:
                 good = error.args[0]
         if not good.all():
-            # A mass matrix that is singular at the start has a message of its own.
-            self.forward_dynamics(states["q"], states["v"], states["tau"])
+            # A mass matrix that is singular at the start has a message of its own, and so have drives that part.
+            clock = self.model.time_parameter
+            for own in (self, *([] if clock is None else [self.at(**{clock: self.model.time + h})])):
+                with unwatched(own):
+                    own.forward_dynamics(states["q"], states["v"], states["tau"])
             sample = f" in sample {int(np.argmin(good))}" if good.ndim else ""
             raise NumericalError(
                 f"{self.engine}: step of {self.model.name} by {chosen.name}: the state is not finite{sample} after "

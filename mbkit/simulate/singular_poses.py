@@ -96,19 +96,17 @@ def _slopes(manifold: Manifold, t: float, q: Array, v: Array) -> _Slopes:
 class Passage:
     """A motion at a singular pose: by which rows it is one, why it is not determined there, and its acceleration."""
 
-    def __init__(self, manifold: Manifold, t: float, q: Array, v: Array, *, singular: bool = False) -> None:
+    def __init__(self, manifold: Manifold, t: float, q: Array, v: Array) -> None:
         self._manifold = manifold
         from mbkit.engines.constraint_manifold import AT_POSE
 
         U, sizes, Vt = np.linalg.svd(manifold.jacobian(q))
-        rank = min(int(np.count_nonzero(sizes > AT_POSE * sizes[0])), len(U) - singular)
+        rank = min(int(np.count_nonzero(sizes > AT_POSE * sizes[0])), len(U) - 1)
         # Rows that are all zero have no size of their own.
         self._size = float(sizes[0]) or 1.0
-        #: Whether rows depend on each other.
-        self.singular = rank < len(U)
         self._lost, self._kept = U[:, rank:], U[:, :rank]
         self._free = Vt[rank:].T
-        self._slopes = _slopes(manifold, t, q, v) if self.singular and v.any() else None
+        self._slopes = _slopes(manifold, t, q, v) if v.any() else None
 
     @property
     def rows(self) -> list[int]:
@@ -169,7 +167,7 @@ def at_singular_poses(dyn: Dynamics, t: float, q: Array, v: Array, tau: Array) -
         return which, a, why
     for i in map(tuple, np.argwhere(which)):
         own = manifold.member(i[0]) if i else manifold
-        here = Passage(own, t, q[i], v[i], singular=True)
+        here = Passage(own, t, q[i], v[i])
         a[i] = here.acceleration(np.broadcast_to(tau, (*v.shape[:-1], tau.shape[-1]))[i])
         if here.undetermined:
             why = f"the motion is {here.undetermined}"
@@ -254,7 +252,7 @@ class SingularPoses:
         manifold = manifold_at(self._dyn, t)
         if manifold.at_pose(q):
             self.times.append(t)
-            self._rows = Passage(manifold, t, q, np.zeros(manifold.dyn.model.nv), singular=True).rows
+            self._rows = Passage(manifold, t, q, np.zeros(manifold.dyn.model.nv)).rows
 
     def saw(self, t: float, q: Array) -> None:
         """Take in the end of a step."""

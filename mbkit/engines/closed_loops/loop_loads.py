@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.engines.closed_loops.actuation import Actuation, spread
+from mbkit.engines.constrained import CONSISTENT
 from mbkit.engines.frames_and_momenta import ALIGNED, LOCAL, WORLD, axes_named
 from mbkit.engines.loads import LOADS, Loads
 from mbkit.errors import InputError
@@ -29,9 +30,6 @@ from mbkit.model.parts import Loop
 
 #: Of the forces' size: their rest after the constraints' own, up to which a motion is that of a force.
 _MEANT: Final = 1e-8
-#: Singular values of J with rows of unit size below which a force in the loops moves nothing, and the part of a strain
-#: that counts. What closing a loop to rounding leaves is far below.
-_STRAIN: Final = 1e-7
 LOOP_LOADS: Final = Path(
     "loads of loops", "", LOADS.carries, LOADS.why, asks=(frozenset(f"loop.{x}" for x in LOOP_KINDS), "it has no loops")
 )
@@ -248,14 +246,14 @@ class LoopLoads(Actuation, Loads):
         # Drives are single, and take no strain from each other.
         J = np.asarray(self._evaluate("every_jacobian", q=q))[:held]
         sizes = np.linalg.norm(J, axis=1)
-        scale = np.where(sizes > _STRAIN * sizes.max(initial=0.0), sizes, 1.0)
+        scale = np.where(sizes > CONSISTENT * sizes.max(initial=0.0), sizes, 1.0)
         U, singular, _ = np.linalg.svd(J / scale[:, None])
-        strains = U[:, int(np.count_nonzero(singular > _STRAIN)) :].T / scale
+        strains = U[:, int(np.count_nonzero(singular > CONSISTENT)) :].T / scale
         changed = np.zeros((len(self._joints(None)) + len(model.loops), 6), dtype=bool)
         X = {"world": np.eye(4)} | dict(zip((b.name for b in model.bodies), self.body_poses(q), strict=True))
         for strain in strains:
             loads = np.array([*self._strained(X, strain)])
-            changed |= np.abs(loads) > _STRAIN * np.abs(loads).max()
+            changed |= np.abs(loads) > CONSISTENT * np.abs(loads).max()
         return UndeterminedLoads(len(strains), changed[: -len(model.loops)], changed[-len(model.loops) :])
 
     def _strained(self, X: dict[str, Array], shares: Array) -> Iterator[Array]:

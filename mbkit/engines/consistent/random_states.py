@@ -9,6 +9,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit._reproducible import unit_rows
+from mbkit.derivation.constraints import choose_rows
 from mbkit.engines.constraint_manifold import Manifold, refuse_unreachable, require_independent
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, NumericalError
@@ -35,6 +36,9 @@ class ConsistentStates:
     """What a model asks of its constraints, by equations that are interpreted and derived once."""
 
     def __init__(self, model: Model) -> None:
+        if model.has_bodies:
+            # Copies at other times, at which drives may have parted, take it over.
+            choose_rows(model)
         self.manifold = Manifold(LagrangianDynamics(model, compile=False))
 
     def at(self, model: Model) -> ConsistentStates:
