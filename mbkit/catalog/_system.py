@@ -92,27 +92,18 @@ def _described(name: str, default: Any, fixed: bool) -> str:
     return f"{name} : {scalar if isinstance(default, float) else 'array_like'}\n    {unit}.\n"
 
 
-def positive(name: str, value: Number) -> Number:
-    """Return a number above zero, or an expression whose nominal value, if known, is above zero."""
-    return _signed(name, value, positive=True)
-
-
-def nonnegative(name: str, value: Number) -> Number:
-    """Return a number of at least zero, or an expression whose nominal value, if known, is at least zero."""
-    return _signed(name, value, nonnegative=True)
-
-
-def finite(name: str, value: Number) -> Number:
-    """Return a number of either sign, or an expression."""
-    return _signed(name, value)
-
-
-def _signed(name: str, value: Number, **sign: bool) -> Number:
+def finite(name: str, value: Number, **sign: bool) -> Number:
+    """Return a number, or an expression whose nominal value is one if it is known; of either sign without `sign`."""
     if not isinstance(value, Expression):
         return real(name, value, **sign)
     if known(value):
         real(name, nominal(value), **sign)
     return value
+
+
+#: The same above zero, and from zero on.
+positive: Callable[[str, Number], Number] = partial(finite, positive=True)
+nonnegative: Callable[[str, Number], Number] = partial(finite, nonnegative=True)
 
 
 def number(name: str, value: Any) -> float:

@@ -15,25 +15,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from mbkit.derivation.elements.arithmetic import BINARY, UNARY
 from mbkit.errors import UnsupportedError
 
-_NAMES_UNARY: Final = (
-    *("neg", "sq", "twice", "inv", "fabs", "sign", "not", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan"),
-    *("exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
-)
-_NAMES_BINARY: Final = (
-    *("add", "sub", "mul", "div", "pow", "hypot", "atan2", "fmin", "fmax"),
-    *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
-)
 #: CasADi's codes -> our names, of the operations that every backend knows.
-_UNARY: Final[dict[int, str]] = {getattr(ca, f"OP_{name.upper()}"): name for name in _NAMES_UNARY}
-_BINARY: Final[dict[int, str]] = {getattr(ca, f"OP_{name.upper()}"): name for name in _NAMES_BINARY} | {
-    ca.OP_CONSTPOW: "pow"
-}
+_UNARY: Final[dict[int, str]] = {getattr(ca, f"OP_{name.upper()}"): name for name in UNARY}
+_BINARY: Final[dict[int, str]] = {getattr(ca, f"OP_{name.upper()}"): name for name in BINARY} | {ca.OP_CONSTPOW: "pow"}
 
 
 class Operation(NamedTuple):
-    """One scalar operation: an input, a constant, or one of `_NAMES_UNARY` and `_NAMES_BINARY`.
+    """One scalar operation: an input, a constant, or one of `UNARY` and `BINARY`.
 
     Decisions are 1 or 0; if_else_zero is b where a is not 0, else 0. fmin and fmax propagate NaN; every comparison with
     NaN is false except ne, and in a logical operation NaN counts as true, as in C.

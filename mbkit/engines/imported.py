@@ -16,16 +16,9 @@ import numpy as np
 
 from mbkit._check import Array, finite_array
 from mbkit.errors import LoadError, ModelError, UnsupportedError
-from mbkit.load.xml_reader import Element, Reader
-from mbkit.load.xml_reader import unused as unused
+from mbkit.load.xml_reader import Element, Reader, reserved
 from mbkit.model import Body, Coupler, Joint, Loop, Model, ModelBuilder
 from mbkit.model.parts import numbers
-
-
-def reserved(name: str, names: set[str]) -> str:
-    """Return this name, or a longer one that is not among `names`, and add it to them."""
-    names.add(name := unused(name, names))
-    return name
 
 
 class Importer(NamedTuple):

@@ -220,7 +220,6 @@ class _Tree:
             higher[name] = (*rest_of, 0.0, 0.0)[:2]
         if joint.name in self.springs:
             values["stiffness"], values["damping"] = self.springs[joint.name]
-        rest = angle * read.number(element, "springref", item, 0.0) if joint.scalar else 0.0
         if joint.scalar:
             axis = values["axis"] = self.snap(joint.axis / length(joint.axis))
             if joint.ref and joint.kind == "hinge":
@@ -238,7 +237,7 @@ class _Tree:
                 self._add_weightless(joint, child, armature)
         yields = read.number(element, "springyield", item, 0.0)
         if values["stiffness"] or any(higher["stiffness"]):
-            values["rest"] = rest
+            values["rest"] = joint.rest
             scene.left_out["yield of a spring"] += bool(yields)
         kind, R = KINDS[joint.kind], self.snap(R)
         if not joint.scalar:
@@ -249,7 +248,7 @@ class _Tree:
             self.b.add_joint_force(
                 f"spring of {joint.name}",
                 joint.name,
-                potential=lambda q: k1 / 3 * (q - rest) ** 3 + k2 / 4 * (q - rest) ** 4,
+                potential=lambda q: k1 / 3 * (q - joint.rest) ** 3 + k2 / 4 * (q - joint.rest) ** 4,
             )
         if any(higher["damping"]) and "damper" not in self.off:
             self.b.add_joint_force(f"damper of {joint.name}", joint.name, _damper(joint, *higher["damping"]))

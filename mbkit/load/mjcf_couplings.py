@@ -20,7 +20,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
-from mbkit.load.xml_reader import LARGEST, Element, Reader, unused
+from mbkit.load.xml_reader import LARGEST, Element, Reader, reserved
 from mbkit.model import Joint, JointCoupling, Model, ModelBuilder, PointSpring
 from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.forces import RATE
@@ -241,9 +241,7 @@ class Transmissions:
             self._collect(child, inner)
 
     def _acting(self, element: Element, label: str, kind: str, number: int) -> _Acting:
-        name = unused(element.attributes.get("name") or f"{kind}{number}", self._names)
-        self._names.add(name)
-        return _Acting(label, name)
+        return _Acting(label, reserved(element.attributes.get("name") or f"{kind}{number}", self._names))
 
     # Tendons
 
@@ -270,7 +268,7 @@ class Transmissions:
         if first == last == -1.0:
             # The length of a path is measured once there is a tree.
             out.measured = any(k) and bool(out.path)
-            first = last = sum(factor * self._spring_reference(joint) for joint, factor in out.factors.items())
+            first = last = sum(factor * self._joints[joint].rest for joint, factor in out.factors.items())
         self._hold(out, element, item, c, k, first, last)
         own = full.attributes
         out.left_out += [f"{n} {own[n]}" for n, on in _TENDON_LIMITS.items() if n in own and own.get(on) != "false"]
@@ -304,11 +302,6 @@ class Transmissions:
             else:
                 branches[-1][1].append(site)
         return tuple((factor, tuple(points)) for factor, points in branches if len(points) > 1)
-
-    def _spring_reference(self, name: str) -> float:
-        joint = self._joints[name]
-        angle = self._scene.compiler.angle if joint.kind == "hinge" else 1.0
-        return angle * self._read.number(joint.element, "springref", f"joint {name!r}", 0.0)
 
     # Actuators
 
@@ -419,7 +412,7 @@ class Transmissions:
             for joint in body.joints:
                 at = model.layout.q[joint.name]
                 if joint.scalar:
-                    q[at] = self._spring_reference(joint.name)
+                    q[at] = joint.rest
                 elif joint.kind == "free":
                     q[at] = *body.pose.p, *spatial.quaternion_from_matrix(body.pose.R)
         return q

@@ -36,7 +36,7 @@ from mbkit.load.mjcf_attributes import (
 )
 from mbkit.load.shapes import NOTHING, SIZES, MassProperties, solid, together
 from mbkit.load.urdf_reader import BASE_JOINT
-from mbkit.load.xml_reader import MOST_ELEMENTS, Element, Reader, unused
+from mbkit.load.xml_reader import MOST_ELEMENTS, Element, Reader, reserved, unused
 from mbkit.model.validation import listing
 
 KINDS: Final = {"hinge": "revolute", "slide": "prismatic", "ball": "ball", "free": "free"}
@@ -55,7 +55,8 @@ class MjcfJoint:
     kind: str  # hinge, slide, ball or free
     anchor: Array
     axis: Array
-    ref: float  # its coordinate in the pose of the file, rad or m
+    ref: float = 0.0  # its coordinate in the pose of the file, rad or m
+    rest: float = 0.0  # its coordinate where its spring rests, rad or m
 
     @property
     def scalar(self) -> bool:
@@ -125,9 +126,7 @@ class Scene:
 
     def unused(self, kind: str, name: str) -> str:
         """Reserve and return this name, or a longer one that is free."""
-        name = unused(name, self.names[kind])
-        self.names[kind].add(name)
-        return name
+        return reserved(name, self.names[kind])
 
 
 # Copies
@@ -366,7 +365,7 @@ class _Attacher:
         for child in owner.children:
             if (child.tag, child.attributes.get("name")) in wanted:
                 yield child, childclass
-            yield from self._found(child, wanted, _class_inside(child, childclass), other)
+            yield from self._found(child, wanted, class_inside(child, childclass), other)
 
     def _add_shared(self, prefix: str, other: _Other, element: Element) -> None:
         """Add the defaults and meshes of a file, with a prefix."""
@@ -417,7 +416,7 @@ class _Prefixed:
             named = key in ("name", "class", "childclass", "mesh") or key.rstrip("12") in _NAMES
             if named and x not in ("", "world"):
                 own[key] = self.prefix + x
-        inner = _class_inside(element, childclass)
+        inner = class_inside(element, childclass)
         children = [self.of(e, inner) for e in element.children]
         return replace(element, attributes=own, children=children, file=self.other.file)
 
@@ -446,10 +445,10 @@ class _Prefixed:
             return text
 
 
-def _class_inside(element: Element, childclass: str | None) -> str | None:
-    """Return the class that reaches what is inside an element."""
-    own = element.attributes
-    return own.get("childclass", own.get("class", childclass) if element.tag == "frame" else childclass)
+def class_inside(element: Element, childclass: str | None) -> str | None:
+    """Return the class that reaches what is inside an element; MuJoCo takes a frame's class for its childclass."""
+    own, framed = element.attributes, element.tag in ("frame", "replicate")
+    return own.get("childclass", own.get("class", childclass) if framed else childclass)
 
 
 def _names(elements: Iterable[Element]) -> dict[str, set[str]]:
@@ -494,9 +493,7 @@ def frame_contents(
         if child.tag != "frame":
             yield child, X, childclass
             continue
-        # MuJoCo takes a frame's class for its childclass.
-        own = child.attributes.get("childclass", child.attributes.get("class"))
-        inner = scene.defaults.known(own, child) or childclass
+        inner = scene.defaults.known(class_inside(child, None), child) or childclass
         yield from frame_contents(child, X @ pose(child, scene.compiler, scene.read, item), inner, scene, item)
 
 
@@ -624,7 +621,7 @@ def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: 
     type_ = "free" if free else full.attributes.get("type", "hinge")
     if type_ not in KINDS:
         read.fault(f"{item}: type {type_[:40]!r}; expected one of {', '.join(KINDS)}", element)
-    joint = MjcfJoint(name, full, type_ if type_ in KINDS else "hinge", np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.0)
+    joint = MjcfJoint(name, full, type_ if type_ in KINDS else "hinge", np.zeros(3), np.array([0.0, 0.0, 1.0]))
     if joint.kind != "free":
         joint.anchor = X.p + product(X.R, np.array(read.numbers(full, "pos", item, count=3, default=(0, 0, 0))))
     if joint.scalar:
@@ -633,7 +630,8 @@ def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: 
             read.fault(f"{item}: axis is zero; expected a direction, such as 0 0 1", element)
             axis = joint.axis
         joint.axis = product(X.R, axis)
-        joint.ref = read.number(full, "ref", item, 0.0) * (scene.compiler.angle if joint.kind == "hinge" else 1.0)
+        unit = scene.compiler.angle if joint.kind == "hinge" else 1.0
+        joint.ref, joint.rest = (unit * read.number(full, name, item, 0.0) for name in ("ref", "springref"))
     return joint
 
 

@@ -16,7 +16,7 @@ from xml.sax.saxutils import escape
 from mbkit.errors import LoadError, ModelError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import Compiler, Defaults, mesh_assets, mesh_name, read_mesh
-from mbkit.load.mjcf_reader import add_free_base, counts
+from mbkit.load.mjcf_reader import add_free_base, class_inside, counts
 from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, element_text, unused, with_includes
 
 _FORMATS: Final = {"robot": "urdf", "mujoco": "mjcf"}
@@ -171,9 +171,7 @@ def _parts(owner: Element, childclass: str | None) -> Iterator[tuple[Element, st
     """Yield the children with their class, and those in <frame> and <replicate> elements."""
     for child in owner.children:
         if child.tag in ("frame", "replicate"):
-            # MuJoCo takes a frame's class for its childclass.
-            own = child.attributes
-            yield from _parts(child, own.get("childclass", own.get("class", childclass)))
+            yield from _parts(child, class_inside(child, childclass))
         else:
             yield child, childclass
 

@@ -24,7 +24,7 @@ from mbkit._reproducible import turned
 from mbkit.errors import ModelError, Suggestions
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import z_to
-from mbkit.load.xml_reader import Element, Reader, element_text, misspelt, unused
+from mbkit.load.xml_reader import Element, Reader, element_text, misspelt, reserved, unused
 from mbkit.model import Body, Mimic, Model, ModelBuilder, kind_of
 from mbkit.model.validation import body_fault, listing, repeated_names
 
@@ -402,9 +402,7 @@ def _with_planes_turned(robot: Element, read: Reader) -> Element:
             children.append(e)
             continue
         R = z_to(normal)
-        plane, back = unused(f"{child.attributes.get('link', '')}_plane", links), unused(f"{name}_back", joints)
-        links.add(plane)
-        joints.add(back)
+        plane, back = reserved(f"{child.attributes.get('link', '')}_plane", links), reserved(f"{name}_back", joints)
         origin = e.first("origin")
         placed = origin.attributes if origin is not None else {}
         turned = placed | {"rpy": _rpy(spatial.matrix_from_rpy(*rpy) @ R)}

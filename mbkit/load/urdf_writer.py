@@ -11,7 +11,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
-from mbkit.load.xml_reader import unused
+from mbkit.load.xml_reader import reserved
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.kinds import joint_types
 from mbkit.model.elements.paths import Path
@@ -32,8 +32,7 @@ def urdf_text(model: Model, comment: str) -> str:
         # Here a body's own frame cannot be another one.
         if frame.name == "world" or any(frame.name == b.name for b in model.bodies):
             continue
-        name = unused(f"{frame.name}_fixed", joints)
-        joints.add(name)
+        name = reserved(f"{frame.name}_fixed", joints)
         ends = _ends(frame.rotation, frame.translation, frame.body, frame.name)
         parts += [_element("link", {"name": frame.name}), _element("joint", {"name": name, "type": "fixed"}, *ends)]
     return _element("robot", {"name": model.name}, f"<!-- {xml_comment(comment)} -->", *parts) + "\n"

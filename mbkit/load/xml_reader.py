@@ -371,6 +371,12 @@ def unused(name: str, names: Container[object]) -> str:
     return name
 
 
+def reserved(name: str, names: set[str]) -> str:
+    """Return this name, or a longer one that is not among `names`, and add it to them."""
+    names.add(name := unused(name, names))
+    return name
+
+
 # MJCF in several files
 #
 # As in MuJoCo, the content of a file's root element replaces an <include>, a name is relative to the folder of the

@@ -15,6 +15,7 @@ from mbkit.report.document import Bullet, Column, Document, Items, Section, Span
 from mbkit.report.figures import stable_steps
 from mbkit.report.formatting import choice, error_text, time_text
 from mbkit.simulate.plotting.style import engine_index
+from mbkit.studies.results import counted
 from mbkit.studies.stress import measurements as stress
 from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
 from mbkit.studies.stress.measurements import CaseResult, Line, Measurement, Outcome, Row, name_of, place
@@ -140,7 +141,7 @@ def headline(result: StressResult) -> str:
     if all(cell.end == "not run" for _, row in result.rows() for cell in row.cells):
         return f"{stopped}nothing was run"
     counts = [[c.outcome(case.bar) for row in case.rows for c in row.cells].count("silent") for case in result.cases]
-    silent = f"{sum(counts)} silent failure{'s' * (sum(counts) != 1)} in {_of(sum(map(bool, counts)))}"
+    silent = f"{sum(counts)} silent failure{'s' * (sum(counts) != 1)} in {counted(sum(map(bool, counts)), 'case')}"
     return f"{stopped}{_leaders(result)}; {silent if sum(counts) else 'no silent failures'}"
 
 
@@ -149,14 +150,14 @@ def _leaders(result: StressResult) -> str:
     ranked = [c for c in ran if ranks(c)] or ran
     counts = Counter(name for case in ranked for name in _ahead(case))
     if not counts:
-        return f"nothing held in {_of(len(ranked))}"
+        return f"nothing held in {counted(len(ranked), 'case')}"
     most = max(counts.values())
     names = [name for name, count in counts.items() if count == most]
     if len(names) > _NAMED:
         names = [", ".join(names[:_NAMED]), f"{len(names) - _NAMED} more"]
     elif len(names) > 1:
         names = [", ".join(names[:-1]), names[-1]]
-    return f"{' and '.join(names)} held furthest, or as far as any, in {most} of {_of(len(ranked))}"
+    return f"{' and '.join(names)} held furthest, or as far as any, in {most} of {counted(len(ranked), 'case')}"
 
 
 def _ahead(case: CaseResult) -> list[str]:
@@ -167,10 +168,6 @@ def _ahead(case: CaseResult) -> list[str]:
     if case.measure == "terms":
         return [engine for engine, line in stress.best(case).items() if line.reach == most]
     return [name_of(line.row) for line in stress.lines(case) if line.reach == most]
-
-
-def _of(count: int) -> str:
-    return f"{count} case{'s' * (count != 1)}"
 
 
 # Which method for which kind of scene: how often none held further, and at what price.
@@ -522,7 +519,7 @@ def view(result: StressResult) -> Document:
         heading="Stiff and extreme: where each engine and method breaks",
         title="Stiff and extreme",
         verdict=headline(result),
-        sentence=f"{headline(result)}; {runs} runs of {_of(len(cases))}, each against a known truth",
+        sentence=f"{headline(result)}; {runs} runs of {counted(len(cases), 'case')}, each against a known truth",
         good=bool(result.complete and result.cases and not silent),
         marked=False,
         summary=f"{len(cases)} cases · {runs} runs · {time_text(result.seconds)}",

@@ -10,11 +10,12 @@ import casadi as ca
 from mbkit.derivation.model_values import scalar
 from mbkit.model.elements.formula import Arithmetic
 
-_UNARY: Final = (
+#: Operations of one number, and of two; CasADi calls them so too.
+UNARY: Final = (
     *("neg", "sq", "twice", "inv", "fabs", "sign", "not", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan"),
     *("exp", "expm1", "log", "log1p", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
 )
-_BINARY: Final = (
+BINARY: Final = (
     *("add", "sub", "mul", "div", "pow", "hypot", "atan2", "fmin", "fmax"),
     *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
 )
@@ -29,8 +30,8 @@ def _binary(code: int) -> Callable[[Any, Any], Any]:
 
 
 _OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
-    **{name: _unary(getattr(ca, f"OP_{name.upper()}")) for name in _UNARY},
-    **{name: _binary(getattr(ca, f"OP_{name.upper()}")) for name in _BINARY},
+    **{name: _unary(getattr(ca, f"OP_{name.upper()}")) for name in UNARY},
+    **{name: _binary(getattr(ca, f"OP_{name.upper()}")) for name in BINARY},
 }
 
 

@@ -18,8 +18,9 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array, by_key
 from mbkit.engines.imported import Beside, Imported, Parts, checked
+from mbkit.engines.mujoco.constraints import matrix_of
 from mbkit.engines.mujoco.engine import MujocoDynamics
-from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings, mapped, matrix_of
+from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings, mapped
 from mbkit.errors import UnsupportedError
 from mbkit.load.mjcf_couplings import with_couplings
 from mbkit.load.mjcf_equalities import coupled

@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any, Final
 import mujoco
 import numpy as np
 
-from mbkit import spatial
 from mbkit._check import Array, by_key
 from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, SOLVED, STACKS
-from mbkit.engines.imported import unused
-from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness
+from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness, matrix_of, wxyz
 from mbkit.errors import MbkitError, UnsupportedError
+from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Bushing, GravityCompensation, Joint, Model
 from mbkit.model.elements.kinds import joint_types
 from mbkit.model.elements.paths import Path
@@ -548,13 +547,3 @@ def mapped(
             free.append((q[0], v[0]))
     ids = {name: model.body(name).id for name in bodies if name != "world"} | {"world": 0}
     return MujocoModel(model, q_index, v_index, tuple(free), ids, frozenset(absorbed), disabled)
-
-
-def wxyz(R: Array) -> Array:
-    """Return a rotation as a quaternion in MuJoCo's order."""
-    return np.roll(spatial.quaternion_from_matrix(R), 1)
-
-
-def matrix_of(wxyz: Any) -> Array:
-    """Return the rotation matrix of a quaternion in MuJoCo's order."""
-    return spatial.matrix_from_quaternion(np.roll(np.asarray(wxyz, dtype=np.float64), -1))

@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import mujoco
 
-from mbkit.engines.imported import reserved
-from mbkit.engines.mujoco.model import wxyz
+from mbkit.engines.mujoco.constraints import wxyz
+from mbkit.load.xml_reader import reserved
 from mbkit.model import Model
 from mbkit.show import Shape
 

@@ -9,8 +9,8 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from mbkit.engines.imported import reserved
 from mbkit.engines.pinocchio.model import PinModel
+from mbkit.load.xml_reader import reserved
 from mbkit.show import Shape
 
 #: Kind -> coal's solid; boxes and heights are whole lengths there.

@@ -19,7 +19,7 @@ from mbkit.errors import InputError, MbkitWarning, UnknownNameError
 from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, require_inertia, split, warn_of_negative
 from mbkit.lagrangian.energies.symbols import (
     PlainSymbols,
-    acceleration_of,
+    accelerations_of,
     by_name,
     expression,
     free_name,
@@ -27,7 +27,6 @@ from mbkit.lagrangian.energies.symbols import (
     name_of,
     plain,
     undefined,
-    velocity_of,
 )
 from mbkit.lagrangian.trig.simplify import gradient, is_zero, settled, tidy, tidy_matrix
 
@@ -113,11 +112,7 @@ class EnergyForm:
         moving = {*self.coordinates, *self.velocities, *([self.time] if self.time else [])}
         self.inputs = _inputs(acting, moving | set(self.parameters), others)
         self.forces = sp.ImmutableMatrix([x if q not in self.inputs else 0 for q, x in acting.items()])
-        # A velocity of a name of its own, such as omega, has its derivative named after it.
-        self.accelerations = tuple(
-            acceleration_of(q) if w.name == velocity_of(q).name else velocity_of(w)
-            for q, w in zip(self.coordinates, self.velocities, strict=True)
-        )
+        self.accelerations = accelerations_of(self.coordinates, self.velocities)
         used = {s.name for s in (*moving, *self.parameters, *self.inputs.values(), *self.accelerations)}
         self.multiplier_symbols = tuple(
             sp.Symbol(free_name(f"lambda{k + 1}", used))

@@ -38,6 +38,12 @@ def free_name(name: str, used: Collection[str]) -> str:
     return name
 
 
+def accelerations_of(coordinates: Sequence[sp.Symbol], velocities: Sequence[sp.Symbol]) -> tuple[sp.Symbol, ...]:
+    """Return a symbol for each acceleration; a velocity of a name of its own, such as omega, has its derivative."""
+    pairs = zip(coordinates, velocities, strict=True)
+    return tuple(acceleration_of(q) if w.name == velocity_of(q).name else velocity_of(w) for q, w in pairs)
+
+
 class PlainSymbols:
     """The plain symbols of coordinates, velocities and time, and their dynamicsymbols.
 

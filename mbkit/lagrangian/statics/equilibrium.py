@@ -27,6 +27,7 @@ from mbkit.lagrangian.system import Lagrangian
 from mbkit.methods.small_motions import SmallMotion, small_motion
 from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
+from mbkit.model.parts import read_only
 
 #: Of the forces that balance: what rounding leaves of them.
 _BALANCED: Final = 1e-11
@@ -104,9 +105,7 @@ class Equilibrium:
 
     def __post_init__(self) -> None:
         for name in ("q", "tau", "multipliers", "frequencies", "eigenvalues"):
-            array = np.array(getattr(self, name))
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, read_only(np.array(getattr(self, name))))
 
     @property
     def _verdict(self) -> str:

@@ -16,9 +16,9 @@ import sympy as sp
 
 from mbkit._escape import terminal
 from mbkit.errors import InputError
-from mbkit.lagrangian.energies.symbols import PlainSymbols, acceleration_of, free_name, listed, velocity_of
+from mbkit.lagrangian.energies.symbols import PlainSymbols, accelerations_of, free_name
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
-from mbkit.lagrangian.statics.virtual_work import check_places, turning, vectors
+from mbkit.lagrangian.statics.virtual_work import read_bodies, turning
 from mbkit.lagrangian.trig.simplify import tidy, tidy_matrix
 
 
@@ -121,18 +121,9 @@ def newton_euler(
     >>> rod.loads()[sp.Symbol("F1y")]
     m*(2*g + l*(thetaddot*sin(theta) + thetadot**2*cos(theta)))/2
     """
-    into = PlainSymbols(coordinates, velocities, time)
-    R = vectors("positions", positions, into)
-    check_places("positions", R, into)
-    m = [into("masses", x) for x in listed("masses", [masses] if isinstance(masses, (int, float)) else masses)]
-    if len(m) != len(R):
-        raise InputError(f"masses: {len(m)} of them for {len(R)} positions; give one for each")
+    into, R, m, down = read_bodies(masses, positions, PlainSymbols(coordinates, velocities, time), gravity)
     turns = turning(into, len(m), inertias, angular_velocities)
-    own = [
-        acceleration_of(q) if w.name == velocity_of(q).name else velocity_of(w)
-        for q, w in zip(into.coordinates, into.velocities, strict=True)
-    ]
-    down = vectors("gravity", [gravity], into)[0] if gravity is not None else None
+    own = accelerations_of(into.coordinates, into.velocities)
     given = {
         "forces": _given("forces", forces, [len(x) for x in R], into),
         "torques": _given("torques", torques, [len(t[1]) if t else 0 for t in turns], into),
@@ -155,8 +146,6 @@ def newton_euler(
             speeds.append(v)
 
     for k, (mass, place) in enumerate(zip(m, R, strict=True)):
-        if down is not None and len(down) != len(place):
-            raise InputError(f"gravity: {len(down)} components, but positions[{k}] has {len(place)}")
         velocity = rate(sp.Matrix(place))
         force = given["forces"][k] + (mass * sp.Matrix(down) if down is not None else sp.zeros(len(place), 1))
         add(mass * rate(velocity), force, velocity, "F", k)
@@ -168,7 +157,7 @@ def newton_euler(
     return FreeBodies(
         coordinates=into.coordinates,
         velocities=into.velocities,
-        accelerations=tuple(own),
+        accelerations=own,
         inertial=sp.ImmutableMatrix(inertial),
         applied=sp.ImmutableMatrix(applied),
         reactions=tuple(names),

@@ -171,23 +171,14 @@ def from_particles(
     >>> print(lag.equations())
     l**2*m*thetaddot + g*l*m*sin(theta) = 0
     """
-    into = PlainSymbols(coordinates, velocities, time)
-    R = vectors("positions", positions, into)
-    check_places("positions", R, into)
-    # A single vector stands for one particle, of which the mass may stand alone.
-    m = [into("masses", x) for x in listed("masses", [masses] if isinstance(masses, (int, float)) else masses)]
-    _pairs("masses", m, "positions", R)
+    into, R, m, down = read_bodies(masses, positions, PlainSymbols(coordinates, velocities, time), gravity)
     T = [mass * sp.Add(*(_rate(x, into) ** 2 for x in place)) / 2 for mass, place in zip(m, R, strict=True)]
     T += [
         (w.T * A * w)[0] / 2 for turn in turning(into, len(m), inertias, angular_velocities) if turn for A, w in [turn]
     ]
     V = [into("potential", potential)]
-    if gravity is not None:
-        (down,) = vectors("gravity", [gravity], into)
-        for k, (mass, place) in enumerate(zip(m, R, strict=True)):
-            if len(down) != len(place):
-                raise InputError(f"gravity: {len(down)} components, but positions[{k}] has {len(place)}")
-            V.append(-mass * sp.Add(*(a * x for a, x in zip(down, place, strict=True))))
+    for mass, place in zip(m, R, strict=True) if down is not None else ():
+        V.append(-mass * sp.Add(*(a * x for a, x in zip(down or (), place, strict=True))))
     Q = {into("generalized", key): into(f"generalized[{key}]", x) for key, x in (generalized or {}).items()}
     if forces is not None and len(forces):
         _pairs("forces", forces, "positions", R, ", or None")
@@ -209,6 +200,24 @@ def from_particles(
         velocity_constraints=velocity_constraints,
         name=name,
     )
+
+
+def read_bodies(
+    masses: Any, positions: Any, into: PlainSymbols, gravity: Any
+) -> tuple[PlainSymbols, list[tuple[sp.Expr, ...]], list[sp.Expr], tuple[sp.Expr, ...] | None]:
+    """Return the symbols, places and masses of particles or bodies, and the acceleration of gravity or None."""
+    R = vectors("positions", positions, into)
+    check_places("positions", R, into)
+    # A single vector stands for one particle, of which the mass may stand alone.
+    m = [into("masses", x) for x in listed("masses", [masses] if isinstance(masses, (int, float)) else masses)]
+    _pairs("masses", m, "positions", R)
+    if gravity is None:
+        return into, R, m, None
+    (down,) = vectors("gravity", [gravity], into)
+    for k, place in enumerate(R):
+        if len(down) != len(place):
+            raise InputError(f"gravity: {len(down)} components, but positions[{k}] has {len(place)}")
+    return into, R, m, down
 
 
 def turning(

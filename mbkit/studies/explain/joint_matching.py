@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array, by_key
-from mbkit.engines.imported import unused
+from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.forces import coordinate_arguments
 from mbkit.model.elements.references import _OF_BODIES, names_in, with_names
