@@ -187,13 +187,13 @@ def _numbers_not_held(model: Model) -> Iterator[str]:
             yield f"joint {joint.name!r} has a spring, which Drake's screw joint cannot have"
 
 
-#: Its terms are those of the tree, whatever binds it in positions.
+#: Its terms are those of the tree, whatever binds it.
 DRAKE: Final = Path(
     "drake",
     "",
-    joint_types(*_STEPS) | OF_TREES - {"joint.armature.several"} | {"row", "t"},
+    joint_types(*_STEPS) | OF_TREES - {"joint.armature.several"} | {"row", "speed", "t"},
     dict.fromkeys(OF_COUPLINGS, "Drake has nothing on a sum of joint coordinates")
-    | {"speed": "its plants have no constraint of velocities", "joint.armature.several": "Drake has no rotor for it"},
+    | {"joint.armature.several": "Drake has no rotor for it"},
     also=_numbers_not_held,
     instead=SOLVED,
 )
@@ -202,12 +202,13 @@ DRAKE_RUNS: Final = replace(
     DRAKE,
     name="drake runs",
     words="drake: its integrators do not hold all of",
-    carries=DRAKE.carries - BESIDE - {"row", "t", "mimic"} - joint_types("ball"),
+    carries=DRAKE.carries - BESIDE - {"row", "speed", "t", "mimic"} - joint_types("ball"),
     why={
         "mimic": "Drake does not reduce it; load with mimic='free'",
         "joint_type.ball": "its roll, pitch and yaw there end at a pole",
         "coupler.curve": "Drake has fixed ratios alone",
         "coupler.several": "Drake takes one alone",
+        "speed": "its plants have no constraint of velocities",
         "row": f"{NO_CONSTRAINTS}; method={SAP!r} runs loops in the discrete one",
     },
     instead=OF_ANY_ENGINE,

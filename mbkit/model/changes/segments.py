@@ -11,14 +11,14 @@ from mbkit.errors import UnsupportedError
 from mbkit.model.builder import ModelBuilder
 from mbkit.model.elements.beams import BeamEnd
 from mbkit.model.elements.forces import RATE
-from mbkit.model.elements.paths import OF_BODIES, Path
+from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.elements.references import KINDS_OF_PARTS, entries, names_in
 from mbkit.model.joint_types import FIXED, REVOLUTE, UNIVERSAL
 from mbkit.model.model import Model
 from mbkit.model.parameters import nominal
 from mbkit.model.parts import Joint
 
-SEGMENTED: Final = Path("segmented", "segmented: not known of", OF_BODIES)
+SEGMENTED: Final = Path("segmented", "segmented: not known of", ALL)
 #: Of a segment's inertia, that about its own axis: a beam has none, and MuJoCo takes no body without.
 _ABOUT_AXIS: Final = 1e-6
 #: Stiffnesses of modes that belong to one EI, to rounding.
