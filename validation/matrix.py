@@ -2,7 +2,7 @@
 
 The examples and their truth are `tests.kind_examples`, in NumPy alone; the paths are `tests.kind_paths`.
 ``python -m validation.matrix takes`` writes anew only the kinds that each gate takes, ``pairs`` only what became of
-the models of several kinds (`tests.kind_pairs`).
+the models of several kinds (`tests.kind_pairs`), and ``mutations`` of the mutations of `tests.kind_mutations`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from mbkit.model.elements.kinds import PART_KINDS, joint_types, kind
-from tests import kind_pairs
+from tests import kind_mutations, kind_pairs
 from tests.kind_examples import TYPES
 from tests.kind_paths import Cell
 from tests.kind_studies import COLUMNS, NOT_YET, ROWS, cell, registered
@@ -62,6 +62,25 @@ def takes() -> dict[str, list[str]]:
     types = joint_types(*(x.removeprefix("joint_type.") for x in TYPES if not x.endswith("beam")))
     kinds = [*PART_KINDS.values(), *map(kind, sorted(types))]
     return {name: [k.name for k in kinds if gate.takes(k)] for name, gate in sorted(registered().items())}
+
+
+def mutations() -> dict[str, Any]:
+    """Return how many mutants each mutation of each path has, and the kinds whose mutants nothing notices."""
+    registered()
+    cells = json.loads(results("matrix.json").read_text(encoding="utf-8"))["rows"]
+    right = {(r["kind"], path) for r in cells for path, c in r["cells"].items() if c[0] == "right"}
+    out: dict[str, Any] = {}
+    for mutation in kind_mutations.MUTATIONS:
+        paths = PATHS if mutation == "removed" else sorted(set(registered()) - {"newton"})
+        found = out[mutation] = {"paths": len(paths), "left_out": [], "mutants": 0, "survive": {}}
+        for path in paths:
+            names = [name for name in KINDS if mutation != "removed" or (name, path) in right]
+            with tempfile.TemporaryDirectory() as folder:
+                got = [getattr(kind_mutations, mutation)(name, path, Path(folder)) for name in names]
+            found["mutants"] += sum(x is not None for x in got)
+            if kinds := [x.kind for x in got if x is not None and x.outcome == "survives"]:
+                found["survive"][path] = kinds
+    return out
 
 
 def rows() -> list[dict[str, Any]]:
@@ -117,9 +136,10 @@ def told(data: dict[str, Any]) -> None:
 def main() -> int:
     begun = time.perf_counter()
     file = results("matrix.json")
-    made = {"takes": takes, "pairs": pairs}
+    made = {"takes": takes, "pairs": pairs, "mutations": mutations}
+    before = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     if asked := [x for x in sys.argv[1:] if x in made]:
-        data = json.loads(file.read_text(encoding="utf-8")) | {x: made[x]() for x in asked}
+        data = before | {x: made[x]() for x in asked}
     else:
         found = rows()
         counts = Counter(c[0] for r in found for c in r["cells"].values())
@@ -134,6 +154,7 @@ def main() -> int:
             "without_column": sorted(set(registered()) - {g for c in COLUMNS.values() for g in c.gates}),
             "takes": takes(),
             "pairs": pairs(),
+            "mutations": before.get("mutations", {}),
             "rows": found,
         }
     told(data)
