@@ -348,6 +348,8 @@ def through_file(to: str) -> Callable[[mb.Model, Path], None]:
         # An MJCF has a planar joint as three.
         if set(back.joint_names) == set(model.joint_names):
             assert mb.explain(model, back).agree
+            # Limits are no dynamics.
+            assert {k for k in model.acts if "limit" in k} <= {*back.acts, *GATES[to].notes}
 
     return check
 
