@@ -477,7 +477,7 @@ def pair_cell(name: str, path: str, folder: Path) -> Cell:
 
 
 def _unnamed(gate: Gate, model: mb.Model, text: str) -> list[str]:
-    """Return the parts that a gate does not take, and that a text does not name."""
+    """Return the parts that a gate does not take and its refusal does not name; none where another gate spoke first."""
     lost = [k for k in map(kind, model.acts) if not gate.takes(k)]
     leaders = {p.name for k in lost if "q" in k.does for p in k.parts(model)}
     parts = [
@@ -485,7 +485,7 @@ def _unnamed(gate: Gate, model: mb.Model, text: str) -> list[str]:
     ]
     # Of several kinds of one part the finest is told.
     said = {id(p) for k, p in parts if k.words.format(p=p) in text}
-    return [k.words.format(p=p) for k, p in parts if id(p) not in said]
+    return [k.words.format(p=p) for k, p in parts if said and id(p) not in said]
 
 
 def summary(cells: Iterable[tuple[str, str, Cell]]) -> dict[str, Any]:
