@@ -264,12 +264,15 @@ def _read_equations(x: Example, folder: Path) -> Told:
     values |= {str(s): float(y) for s, y in lag.parameters.items() if y is not None}
     shown = SystemSummary(lag).text()
     lines = lines_of_text(dedent(shown.partition("of motion:\n")[2].partition("\n\n")[0]))
-    worst = 0.0
-    for some in (lines, lines_of_latex(e.latex())):
-        rows = [line.partition("=") for line in some[: len(e.coordinates) + len(e.constraints)]]
+    letters = [x.removeprefix("with ") for x in shown.splitlines() if x.startswith("with ")]
+    count, worst = len(e.coordinates) + len(e.constraints), 0.0
+    latex = lines_of_latex(e.latex())
+    for some, roots in ((lines, letters), (latex, latex[count:])):
+        rows, known = [line.partition("=") for line in some[:count]], assigned(roots, values)
 
-        def rest(more: dict[str, float], rows: Any = rows) -> np.ndarray:
-            return np.array([number(left, values | more) - number(right, values | more) for left, _, right in rows])
+        def rest(more: dict[str, float], rows: Any = rows, known: dict[str, float] = known) -> np.ndarray:
+            here = known | more
+            return np.array([number(left, here) - number(right, here) for left, _, right in rows])
 
         r, forces = rest({}), [plain(str(s)) for s in e.multipliers]
         if forces:
