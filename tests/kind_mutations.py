@@ -129,9 +129,11 @@ def dropped(name: str, gate: str, folder: Path) -> Mutant | None:
     own, x, takes = GATES[gate], new(name), Gate.takes
     # The names of joint types of beams have their numbers.
     gone = kind(next(k for k in x.model.acts if k.startswith(name)))
-    # MuJoCo's friction is not asked for where there is none, and energies are on paper already.
-    asked = {"mujoco friction loss": x.model.needs.friction, "paper": x.model.has_bodies}.get(gate, True)
-    if not (own.takes(gone) and asked) or own.refuses(x.model):
+    # MuJoCo's friction is not asked for where there is none, runs with friction go by phases, and energies are on paper
+    # already.
+    dry = x.model.needs.friction
+    asked = {"mujoco friction loss": dry, "symplectic runs": not dry, "paper": x.model.has_bodies}
+    if not (own.takes(gone) and asked.get(gate, True)) or own.refuses(x.model):
         return None
 
     def fewer(self: Gate, k: Kind) -> bool:
