@@ -26,6 +26,7 @@ from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedE
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import held_at_rest
 from mbkit.model.elements import paths
+from mbkit.model.elements.kinds import EFFECTS
 
 #: Quantity -> (name in C of its one output, its meaning).
 _OUTPUTS: Final = {
@@ -34,7 +35,7 @@ _OUTPUTS: Final = {
     "gravity": ("g", "gravity g(q), without springs"),
     "nle": ("nle", "C(q, v) v + g(q)"),
     "coriolis_force": ("Cv", "C(q, v) v"),
-    "passive": ("tau_passive", "forces of springs, dampers, dry friction and functions"),
+    "passive": ("tau_passive", f"forces of springs, dampers, {EFFECTS['jump']} and functions"),
     "inverse_dynamics": ("tau", "forces M a + C(q, v) v + g(q) - tau_passive(q, v)"),
     "forward_dynamics": ("a", "accelerations dv/dt = M^-1 (tau + tau_passive - C v - g)"),
     "kinetic_energy": ("T", "kinetic energy, J"),

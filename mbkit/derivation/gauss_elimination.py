@@ -6,7 +6,7 @@ ch. IV.8) ::
     Z = Σ_links ½ Aᵀ J A + Aᵀ b  +  Σ ½ ρ v̇²  -  f·v̇        A = X A_parent + S v̇ + c
 
 over v̇, where A = (a, ω̇) is the acceleration of a link's origin and its angular acceleration, J the link's inertia
-about the origin, b = (ω × (ω × h), ω × I ω), c the drift of the joint, ρ the armature and f the joints' forces.
+about the origin, b = (ω × (ω × h), ω × I ω), c the drift of the joint, ρ the rotors and f the joints' forces.
 Gravity accelerates the world by -g. Nothing but kinematics and the kinetic energy of acceleration enters.
 
 A link's acceleration depends on those above it through A_parent alone. So, from the leaves to the root, v̇ of a joint is
@@ -16,7 +16,7 @@ root to the leaves the accelerations follow. The work grows with the number of l
 articulated-body algorithm (Featherstone 2008, Rigid Body Dynamics Algorithms, ch. 7), in axes of the links, where the
 zeros of the axes are used.
 
-A velocity that several joints share, by mimicking or by the armature of a coupling, is carried as a further unknown
+A velocity that several joints share, by mimicking or by the rotor of a coupling, is carried as a further unknown
 until all its joints are below, and eliminated there. A velocity can also be carried to the root on purpose: carrying
 all gives M and the forces of v̇ = 0, by composite bodies.
 """
@@ -234,9 +234,9 @@ class GaussElimination:
         self._uses: Counter[int] = Counter(k for link in self.links for k, _ in link.columns)
         self._couplings: list[tuple[Any, dict[int, Any]]] = []
         for coupling in self._kin.model.couplings:
-            row, armature = mechanics.coupling(coupling)
+            row, rotor = mechanics.coupling(coupling)
             if row:
-                self._couplings.append((armature, row))
+                self._couplings.append((rotor, row))
                 self._uses.update(row.keys())
         self._levels = [Level() for _ in self.links]
         self._top = Level()
@@ -271,14 +271,14 @@ class GaussElimination:
 
     def _settled(self, function: GaussFunction, link: Link | None = None) -> list[Pivot]:
         """Eliminate the velocities of which every joint and coupling is in the function."""
-        for armature, row in list(self._couplings):
+        for rotor, row in list(self._couplings):
             if row.keys() <= function.K.keys():
-                self._couplings.remove((armature, row))
+                self._couplings.remove((rotor, row))
                 function.uses.update(row.keys())
                 for i, a in row.items():
                     for j, b in row.items():
                         if i <= j:
-                            function.raise_coupling(i, j, armature * a * b)
+                            function.raise_coupling(i, j, rotor * a * b)
         ready = [k for k in function.K if function.uses[k] == self._uses[k] and k not in self._carried]
         own = () if link is None else ((k, _unit(column)) for k, column in link.columns if self._uses[k] == 1)
         units = {k: place for k, place in own if place is not None}

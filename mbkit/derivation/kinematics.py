@@ -220,7 +220,7 @@ def _transposed_times(R: Any, x: Vector) -> Vector:
 
 
 def kinetic_energy(kin: Kinematics) -> Any:
-    """Return T = Σ ½ m |v_com|² + ½ ωᵀ I ω (König's theorem) + ½ Σ armature v² + ½ Σ armature (dl/dt)²."""
+    """Return T = Σ ½ m |v_com|² + ½ ωᵀ I ω (König's theorem) + ½ Σ ρ v² + ½ Σ ρ (dl/dt)², with the rotors ρ."""
     total = kin.zero
     for body in kin.model.bodies:
         linear, angular = kin.twists[body.name]
@@ -229,13 +229,18 @@ def kinetic_energy(kin: Kinematics) -> Any:
         if not is_zero(values.mass):
             total += 0.5 * values.mass * dot3(at_com, at_com)
         total += 0.5 * dot3(angular, constant_times(values.inertia, angular))
-    for joint in kin.model.joints:
-        for rotor, rate in zip(kin.values.of(joint).armature, kin.velocities(joint), strict=True):
-            total += 0.5 * rotor * rate * rate
-    for coupling in kin.model.couplings:
-        rate = kin.coupled_rate(coupling)
-        total += 0.5 * kin.values.of(coupling).armature * rate * rate
+    for rotor, rate in along_rates(kin, "T"):
+        total += 0.5 * rotor * rate * rate
     return total
+
+
+def along_rates(kin: Kinematics, effect: str) -> Iterator[tuple[Any, Any]]:
+    """Yield the numbers of joints and couplings with an effect, each with the rate along which it acts."""
+    parts: tuple[Joint | JointCoupling, ...] = (*kin.model.joints, *kin.model.couplings)
+    for part in parts:
+        rates = kin.velocities(part) if isinstance(part, Joint) else [kin.coupled_rate(part)]
+        for numbers in (getattr(kin.values.of(part), name) for name in part.adding_to(effect)):
+            yield from zip(numbers if isinstance(numbers, list) else [numbers], rates, strict=True)
 
 
 def gravity_energy(kin: Kinematics, shares: Mapping[str, Any] | None = None) -> Any:
@@ -299,12 +304,8 @@ def spring_energy(kin: Kinematics) -> Any:
 def dissipation(kin: Kinematics) -> Any:
     """Return Rayleigh's R = ½ Σ d v² + ½ Σ c (dl/dt)²."""
     total = kin.zero
-    for joint in kin.model.joints:
-        for damping, rate in zip(kin.values.of(joint).damping, kin.velocities(joint), strict=True):
-            total += kin.half * damping * rate * rate
-    for coupling in kin.model.couplings:
-        rate = kin.coupled_rate(coupling)
-        total += kin.half * kin.values.of(coupling).damping * rate * rate
+    for damping, rate in along_rates(kin, "loss"):
+        total += kin.half * damping * rate * rate
     for spring in kin.model.springs:
         damping = kin.values.of(spring).damping
         if not is_zero(damping):
@@ -314,17 +315,10 @@ def dissipation(kin: Kinematics) -> Any:
 
 
 def damping_forces(kin: Kinematics) -> Any:
-    """Return -∂R/∂v, and dry friction at speed."""
+    """Return -∂R/∂v, and -f(|v|) sign(v) by the law of `mbkit.model.changes.dry_friction`, which is zero at rest."""
     smooth = -ca.gradient(dissipation(kin), kin.v)
-    return smooth + friction_forces(kin) if kin.model.needs.friction else smooth
-
-
-def friction_forces(kin: Kinematics) -> Any:
-    """Return -f(|v|) sign(v) of each joint, by the law of `mbkit.model.changes.dry_friction`; zero at rest."""
-    total = ca.SX(kin.model.nv, 1)
-    for rate, size in dry_friction(kin, ca.exp):
-        total -= ca.gradient(rate, kin.v) * (size * ca.sign(rate))
-    return total
+    jumps = [ca.gradient(rate, kin.v) * (size * ca.sign(rate)) for rate, size in dry_friction(kin, ca.exp)]
+    return smooth - sum(jumps[1:], jumps[0]) if jumps else smooth
 
 
 def dry_friction(kin: Kinematics, exp: Callable[[Any], Any]) -> Iterator[tuple[Any, Any]]:

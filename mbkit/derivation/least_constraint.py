@@ -26,7 +26,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.derivation.kinematics import Kinematics, Vector, add, constant_times
+from mbkit.derivation.kinematics import Kinematics, Vector, add, along_rates, constant_times
 from mbkit.derivation.mass_matrix_solve import Elimination, elimination_order, elimination_size, reciprocal
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model import Model
@@ -152,10 +152,7 @@ def squares(kin: Kinematics) -> Squares:
             torque = cross3(angular, constant_times(own.inertia, angular))
             rows += [(own.inertia[k][k], angular[k], 0.0) for k in range(3)]
             turned += [(angular[k], torque[k]) for k in range(3) if not is_zero(torque[k])]
-    for joint in model.joints:
-        rotors = zip(values.of(joint).armature, kin.velocities(joint), strict=True)
-        rows += [(rotor, rate, 0.0) for rotor, rate in rotors]
-    rows += [(values.of(c).armature, kin.coupled_rate(c), 0.0) for c in model.couplings]
+    rows += [(rotor, rate, 0.0) for rotor, rate in along_rates(kin, "T")]
     # What nothing moves is a zero.
     rows = [row for row in rows if not is_zero(row[0]) and isinstance(row[1], ca.SX)]
     rates = ca.vertcat(ca.SX(0, 1), *(rate for _, rate, _ in rows))
@@ -359,12 +356,12 @@ def _rows(model: Model, q: Array) -> dict[str, Array]:
         jacobians[joint.child] = linear, angular
         body = model.body(joint.child)
         moments, axes = np.linalg.eigh(body.inertia)
-        rotors = np.broadcast_to(np.sqrt(joint.armature)[:, None] * G, (n, *G.shape))
+        added = np.broadcast_to(np.sqrt(joint.rotors)[:, None] * G, (n, *G.shape))
         moving = np.sqrt(body.mass) * (linear - skew(body.com) @ angular)
         turning = (np.sqrt(moments.clip(0.0)) * axes).T @ angular
-        out[joint.name] = np.concatenate([moving, turning, rotors], axis=1)
+        out[joint.name] = np.concatenate([moving, turning, added], axis=1)
     for coupling in model.couplings:
-        row = np.sqrt(coupling.armature) * layout.coupling_row(coupling) @ layout.G
+        row = np.sqrt(coupling.rotors) * layout.coupling_row(coupling) @ layout.G
         first = coupling.joints[0]
         out[first] = np.concatenate([out[first], np.broadcast_to(row, (n, 1, row.size))], axis=1)
     return out

@@ -154,21 +154,21 @@ class LinkMechanics:
                 wrenches[link.parent] = add(wrenches[link.parent], with_moment(x, link.translation))
         if a is not None:
             for coupling in self.kin.model.couplings:
-                row, armature = self.coupling(coupling)
+                row, rotor = self.coupling(coupling)
                 rate = sum((c * a[k] for k, c in row.items()), 0.0)
                 for k, c in row.items():
-                    out[k] = out[k] + armature * c * rate
+                    out[k] = out[k] + rotor * c * rate
         return out
 
     def coupling(self, coupling: JointCoupling) -> tuple[dict[int, Any], Any]:
-        """Return the factors of a coupling's rate, by velocity index, and its armature."""
-        armature = self.kin.values.of(coupling).armature
-        if is_zero(armature):
-            return {}, armature
+        """Return the factors of a coupling's rate, by velocity index, and its rotor."""
+        rotor = self.kin.values.of(coupling).rotors
+        if is_zero(rotor):
+            return {}, rotor
         gradient = ca.jacobian(ca.SX(self.kin.coupled_rate(coupling)), self.kin.v)
         entries = {i: scalar(gradient[0, i]) for i in range(self.kin.model.nv)}
         known = {i: x for i, x in entries.items() if not x.is_zero()}
-        return {i: float(x) if x.is_constant() else x for i, x in known.items()}, armature
+        return {i: float(x) if x.is_constant() else x for i, x in known.items()}, rotor
 
 
 def rigid_times(inertia: Inertia, x: Vector) -> Vector:
@@ -288,11 +288,11 @@ def mass_matrix(mechanics: LinkMechanics) -> Any:
         if link.parent >= 0:
             carried[link.parent] = carried[link.parent] + matter.in_parent(link)
     for coupling in mechanics.kin.model.couplings:
-        row, armature = mechanics.coupling(coupling)
+        row, rotor = mechanics.coupling(coupling)
         for i, a in row.items():
             for k, b in row.items():
                 if i <= k:
-                    add_entry(i, k, armature * a * b)
+                    add_entry(i, k, rotor * a * b)
     full = {place: x for (i, k), x in entries.items() if not is_zero(x) for place in ((i, k), (k, i))}
     rows, columns = ([place[i] for place in full] for i in (0, 1))
     return ca.SX.triplet(rows, columns, ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for x in full.values())), n, n)

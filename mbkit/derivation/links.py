@@ -281,7 +281,7 @@ class Links:
             unit = [0.0, 0.0, motion.advance, 0.0, 0.0, 1.0 if motion.turns else 0.0]
             link.columns = [(first + k, [ratio * x for x in unit])]
             link.rate = [x * v[k] for x in unit]
-            link.rotors = [values.armature[k] * ratio * ratio]
+            link.rotors = [values.rotors[k] * ratio * ratio]
             self.links.append(link)
             self._fixed.append((fixed, p_J))
             parent, R_J, p_J = index, _transposed(aligned), [0.0, 0.0, -slide if slide else 0.0]
@@ -311,7 +311,7 @@ class Links:
         linear, angular = joint.type.twist(kin.formulas, values, q, v)
         link.rate = [_rounded(x) for x in (*linear, *angular)]
         link.drift = _drift(link.rate, kin)
-        link.rotors = [x * ratio * ratio for x in values.armature]
+        link.rotors = [x * ratio * ratio for x in values.rotors]
         self.links.append(link)
         self._fixed.append((R_J, p_J))
         return len(self.links) - 1, _IDENTITY, [0.0] * 3

@@ -40,12 +40,12 @@ def elimination_size(model: Model) -> int:
         # Of two velocities that move one body, the later one's row has an entry.
         for i in moving[joint.child]:
             before[i] |= {j for j in moving[joint.child] if rank[j] <= rank[i]}
-    rotors = [c for c in model.couplings if c.armature or any(b.part == c.name for b in model.bindings)]
-    for coupling in rotors:
+    turned = [c for c in model.couplings if c.rotors or any(b.part == c.name for b in model.bindings)]
+    for coupling in turned:
         row = np.flatnonzero(model.layout.coupling_row(coupling) @ model.layout.G).tolist()
         for i in row:
             before[i] |= {j for j in row if rank[j] <= rank[i]}
-    if rotors:
+    if turned:
         # They couple branches: eliminating one velocity after the other fills in more entries.
         for k in sorted(rank, key=rank.__getitem__, reverse=True):
             for i in before[k] - {k}:

@@ -6,7 +6,7 @@ while the graph is built. With symbols it is an argument, so that the graph can 
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, reduce
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -103,6 +103,10 @@ def is_zero(value: Any) -> bool:
     return isinstance(value, float) and value == 0.0
 
 
+def _sum(a: Any, b: Any) -> Any:
+    return [x + y for x, y in zip(a, b, strict=True)] if isinstance(a, list) else a + b
+
+
 class Values:
     """Every number of a model that enters its equations.
 
@@ -170,7 +174,7 @@ class Values:
     def of(self, part: Any) -> Any:
         """Return the numbers of a part by their names; a frame of a body itself has zeros and ones only.
 
-        A joint that mimics has `ratio` and `offset` too.
+        A joint that mimics has `ratio` and `offset` too; `rotors` is what adds to T along rates.
         """
         key = type(part), part.name
         if key not in self._of:
@@ -181,6 +185,8 @@ class Values:
             own = {name: self._entries((*place, name), (), x, fixed) for name, fixed, x in given}
             if isinstance(part, Coupler):
                 own["ratios"] = own["ratio"] if isinstance(own["ratio"], list) else [own["ratio"]]
+            if turning := [own[name] for name, rule, _ in numbers(part) if rule.does == "T"]:
+                own["rotors"] = reduce(_sum, turning)
             self._of[key] = SimpleNamespace(**own)
         return self._of[key]
 

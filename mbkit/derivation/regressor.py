@@ -63,14 +63,14 @@ class _Motion:
 def torque_regressor(kin: Kinematics, a: ca.SX, columns: RegressorColumns) -> Any:
     """Return the matrix Y(q, v, a), nv rows, of the forces τ = Y π; a are the rates of v."""
     inertial = _by_velocity(kin, _motions(kin, columns.bodies, a), _Motion.wrenches, columns.bodies)
-    losses = [_columns_of(x, columns.friction) for x in (kin.v, ca.sign(kin.v))]
-    return ca.horzcat(inertial, *losses, _columns_of(a, columns.rotors))
+    own = columns.of_rates(loss=kin.v, jump=ca.sign(kin.v), T=a)
+    return ca.horzcat(inertial, *(_columns_of(*x) for x in own))
 
 
 def momentum_regressor(kin: Kinematics, columns: RegressorColumns) -> Any:
     """Return the matrix Y(q, v), nv rows, of the generalized momentum ∂T/∂v = Y π."""
     inertial = _by_velocity(kin, _motions(kin, columns.bodies), _Motion.momenta, columns.bodies)
-    return ca.horzcat(inertial, _columns_of(kin.v, columns.rotors))
+    return ca.horzcat(inertial, *(_columns_of(*x) for x in columns.of_rates(T=kin.v)))
 
 
 def energy_regressor(kin: Kinematics, columns: RegressorColumns) -> Any:
@@ -84,8 +84,8 @@ def energy_regressor(kin: Kinematics, columns: RegressorColumns) -> Any:
         if kind == len(heights):
             heights.append(-dot3(kin.values.gravity, kin.to_world(bodies[index], [0.0] * 3)))
         potential.append(heights[kind])
-    kinetic += [0.5 * kin.v[k] ** 2 for k in columns.rotors]
-    potential += [0.0] * len(columns.rotors)
+    rotors = [0.5 * v[k] ** 2 for v, which in columns.of_rates(T=kin.v) for k in which]
+    kinetic, potential = kinetic + rotors, potential + [0.0] * len(rotors)
     return ca.vertcat(_row(kinetic), _row(potential))
 
 

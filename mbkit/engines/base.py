@@ -43,7 +43,7 @@ from mbkit.engines.regressors import Regressors
 from mbkit.engines.steps import Steps
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Frame, Joint, Model
-from mbkit.model.elements.kinds import EFFECTS
+from mbkit.model.elements.kinds import EFFECTS, that_do
 from mbkit.model.elements.paths import Path
 from mbkit.model.rolling import discs_of
 
@@ -87,6 +87,8 @@ def first_names(texts: Iterable[str], more: str = " and {} more") -> str:
     return ", ".join(all_[:_MAX_NAMES]) + (more.format(len(all_) - _MAX_NAMES) if all_[_MAX_NAMES:] else "")
 
 
+#: Joints of several velocities that turn rotors.
+ROTORS_OF_SEVERAL: Final = "joint.armature.several"
 _OF_JOINTS: Final = "joint.armature joint.spring joint.damping"
 _OF_FORCES: Final = "joint frame bushing compensation compensation.partial of_time"
 #: Kinds that stand beside the terms of any adapter, at least in part: what holds a rotor's weight is a force.
@@ -508,7 +510,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if quantity in frames_and_momenta.OF_THE_WHOLE and self.model.rotors:
             return self._matter._without_friction(quantity)
         method = self._without_friction(quantity)
-        exact = self.model.needs.friction and not (self.soft_friction and quantity in UNDER_FORCE)
+        exact = "jump" in self.model.effects and not (self.soft_friction and quantity in UNDER_FORCE)
         return self._friction.beside(quantity, method, self) if exact else method
 
     def _of_sample(self, i: int) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
@@ -525,8 +527,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 
     @cached_property
     def _matter(self) -> Dynamics:
-        """The dynamics without armature, which is no matter."""
-        return self._of_model(self.model.without("armature"), "without armature")
+        """The dynamics of the bodies alone: what else adds to T is no matter."""
+        return self._of_model(self.model.without(*that_do("T")), "bodies alone")
 
     @cached_property
     def _friction(self) -> DryFriction:

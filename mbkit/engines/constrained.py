@@ -83,7 +83,7 @@ class Constrained:
     Rows of loops stand in the axes of the body that carries both ends; those of motions in time follow, then the
     heights of what rolls, then velocities. The multiplier of a point is the force on body a, that of a frame's turn the
     torque on it, and that of a motion in time the force of its drive. That of a height is the normal force on what
-    rolls, and those of its velocities are the forces of friction along these directions. A model without any raises
+    rolls, and those of its velocities are the forces that hold it along these directions. A model without any raises
     `UnsupportedError`.
 
     Accelerations of `forward_dynamics` hold the constraints, and `actuator_forces` and `joint_wrenches` have the forces
@@ -93,7 +93,7 @@ class Constrained:
     model: Model
     #: Whether the engine lets constraints give way: its states are those of its own equations, and none is projected.
     soft_constraints: bool = False
-    #: Options with which the engine holds dry friction by its own soft law, and whether it does.
+    #: Options with which the engine holds what jumps by its own soft law, and whether it does.
     own_friction: ClassVar[Mapping[str, Any]] = {}
     soft_friction: bool = False
     engine: ClassVar[str]
@@ -104,7 +104,7 @@ class Constrained:
     forward_dynamics: Callable[..., Array]
 
     def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
-        """Return the forces of dry friction in accelerations under τ, less those in `passive`; (N, nv)."""
+        """Return the forces that jump, in accelerations under τ, less those in `passive`; (N, nv)."""
         return np.zeros_like(v)
 
     @property
@@ -344,7 +344,7 @@ class Constrained:
         return self._evaluate("generalized_constraint_force", q=q, v=v, tau=tau)
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:
-        # Dry friction is in τ already.
+        # What jumps is in τ already.
         J, forces = self.constraint_jacobian(q), self._without_friction("constraint_forces")(q, v, tau)
         return (np.swapaxes(J, -1, -2) @ forces[..., None])[..., 0]
 

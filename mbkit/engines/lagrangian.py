@@ -252,8 +252,8 @@ class LagrangianDynamics(Dynamics):
                 starts = [start for start, _ in self.model.quaternions] if name in _TRIM else None
                 named = self.form, *map(str, key)
                 code = executable(named, derive, compile=self.compile, device=self.device, quaternions=starts)
-            # At rest, dry friction is decided outside of machine code, and has no derivative.
-            undecided = self.model.needs.friction and {name, *extra} & {*UNDER_FORCE, _DERIVATIVES[1]}
+            # At rest, a force that jumps is decided outside of machine code, and has no derivative.
+            undecided = "jump" in self.model.effects and {name, *extra} & {*UNDER_FORCE, _DERIVATIVES[1]}
             if name in _TRIM and not (isinstance(code, Machine) or undecided):
                 # Loads LLVM, which interpreting never needs.
                 from mbkit.engines.compiled_calls import quantity_call

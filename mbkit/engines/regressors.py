@@ -18,11 +18,10 @@ QUANTITIES: Final = ("regressor", "momentum_regressor", "energy_regressor")
 _STANDARD: Final = PARAMETER_SETS[0]
 
 
-def with_losses(Y: Array, columns: RegressorColumns, v: Array, rate: Array) -> Array:
-    """Return these columns of the regressor of one state, with those of friction, and of rotors with this rate."""
-    losses, rotors = list(columns.friction), list(columns.rotors)
-    parts = [np.diag(x)[:, losses] for x in (v, np.sign(v))]
-    return np.hstack([Y[:, list(columns.bodies)], *parts, np.diag(rate)[:, rotors]])
+def with_joints(Y: Array, columns: RegressorColumns, v: Array, rate: Array) -> Array:
+    """Return these columns of the regressor of one state, with those of joints, of what adds to T with this rate."""
+    own = columns.of_rates(loss=v, jump=np.sign(v), T=rate)
+    return np.hstack([Y[:, list(columns.bodies)], *(np.diag(x)[:, which] for x, which in own)])
 
 
 class Regressors:

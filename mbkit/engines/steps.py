@@ -189,7 +189,7 @@ class Steps:
         # An overflow is reported as an error.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             try:
-                if self.model.needs.friction and not self.soft_friction:
+                if "jump" in self.model.effects and not self.soft_friction:
                     # By name: the phases of friction are those of runs, a floor above.
                     one: Any = import_module("mbkit.simulate.solvers.friction.single_step")
                     q1, v1 = one.step(self, chosen, **states, dt=h)

@@ -39,7 +39,7 @@ _SIZE: Final = len(STANDARD)
 def consistent(system: Array, unknowns: Unknowns, length: float, prior: str, weight: float) -> tuple[Array, Array]:
     """Return the unknowns, (p,), and the standard parameters of all bodies, (10 nb,), that are matter.
 
-    Bodies without mass stay without. Friction and armature are not negative.
+    Bodies without mass stay without. Numbers of joints are not negative.
 
     Parameters
     ----------

@@ -180,11 +180,11 @@ def _series(t: Array, frequency: float, coefficients: Array) -> tuple[Array, Arr
 class _Search:
     """The condition number as a function of free numbers, (nv, 2 L + 1): place in the range, shape of the series."""
 
-    def __init__(self, model: Model, period: float, harmonics: int, margin: float, friction: bool) -> None:
-        self._dyn, self._columns = LagrangianDynamics(model), regressor_columns(model, _BASE, friction, False)
+    def __init__(self, model: Model, period: float, harmonics: int, margin: float, losses: bool) -> None:
+        self._dyn, self._columns = LagrangianDynamics(model), regressor_columns(model, _BASE, losses, False)
         if not self._columns.bodies:
             raise InputError(f"model: expected one whose motion depends on inertial parameters, got {model.name}")
-        self._friction, self._frequency = friction, 2 * np.pi / period
+        self._frequency = 2 * np.pi / period
         self._shape = (model.nv, 2 * harmonics + 1)
         self._t = np.linspace(0.0, period, _PER_PERIOD * harmonics, endpoint=False)
         self._fine = np.linspace(0.0, period, 8 * _PER_PERIOD * harmonics, endpoint=False)
@@ -205,8 +205,8 @@ class _Search:
     def regressor(self, q: Array, v: Array, a: Array) -> Array:
         """Return the equations of all samples of some motions, (..., N nv, p); with friction of those that move."""
         at, rates, second = (x.reshape(-1, self._shape[0]) for x in (q, v, a))
-        Y = self._dyn.regressor(at, rates, second, _BASE, friction=self._friction)
-        if self._friction:
+        Y: Array = self._dyn._evaluate("regressor", self._columns, q=at, v=rates, a=second)
+        if self._columns.along:
             # As `identify` leaves them out.
             Y = Y * moving(v, REST).reshape(*Y.shape[:2], 1)
         return Y.reshape(*v.shape[:-2], -1, Y.shape[-1])

@@ -18,10 +18,13 @@ from mbkit._check import Array, finite_array
 from mbkit.engines.base import Dynamics
 from mbkit.errors import InputError
 from mbkit.model import Model
-from mbkit.model.base_parameters import PARAMETER_SETS, BaseParameters, regressor_columns
+from mbkit.model.base_parameters import PARAMETER_SETS, BaseParameters, RegressorColumns, regressor_columns
+from mbkit.model.elements.kinds import kind
 from mbkit.simulate.progress import Progress
 
 _BASE: Final = PARAMETER_SETS[1]
+#: Effects of what acts beside bodies and gravity.
+_KNOWN: Final = {"T", "V", "loss", "jump", "force"}
 #: Part of a joint's greatest speed below which it counts as at rest.
 REST: Final = 0.05
 #: Numbers of a regressor that are held at once.
@@ -32,7 +35,7 @@ _PROBES: Final = 4
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """The parameters of an identification: base parameters, then friction and armature.
+    """The parameters of an identification: base parameters, then numbers of joints.
 
     Attributes
     ----------
@@ -42,41 +45,24 @@ class Unknowns:
         Their values in the model.
     acting : (p,) array
         The same: what of them is in the model's inverse dynamics.
-    friction, armature : bool
+    columns : RegressorColumns
+        Those of the regressor.
     """
 
     base: BaseParameters
     names: tuple[str, ...]
     combinations: tuple[str, ...]
     nominal: Array
-    friction: bool
-    armature: bool
+    columns: RegressorColumns
 
     @classmethod
-    def of(cls, model: Model, friction: bool, armature: bool) -> Unknowns:
-        """Return the unknowns of a model."""
-        base = model.base_parameters()
-        columns = regressor_columns(model, _BASE, friction, armature)
+    def of(cls, model: Model, losses: bool, rotors: bool) -> Unknowns:
+        """Return the unknowns of a model, with numbers of joints that lose energy, and of rotors."""
+        base, columns = model.base_parameters(), regressor_columns(model, _BASE, losses, rotors)
         names = columns.names(model)
-        damping, dry, rotors = (of_velocities(model, field) for field in ("damping", "friction", "armature"))
-        loss = [damping, dry] if friction else []
-        rest = [rotors[list(columns.rotors)]] if armature else []
-        nominal = np.concatenate([base.values, *loss, *rest])
+        nominal = np.concatenate([base.values, *(model.per_velocity(f)[list(k)] for f, k in columns.along)])
         combinations = (*base.combinations, *names[base.count :])
-        return cls(base, names, combinations, nominal, friction, armature)
-
-
-def of_velocities(model: Model, field: str) -> Array:
-    """Return damping, friction or armature as each velocity feels it, (nv,), with the joints that mimic."""
-    layout, out = model.layout, np.zeros(model.nv)
-    for joint in model.joints:
-        if joint.mimic:
-            # Dry friction acts on the rate, the others on its square.
-            ratio = abs(joint.mimic.ratio)
-            out[layout.v[joint.mimic.joint]] += getattr(joint, field) * (ratio if field == "friction" else ratio**2)
-        else:
-            out[layout.v[joint.name]] += getattr(joint, field)
-    return out
+        return cls(base, names, combinations, nominal, columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,14 +92,14 @@ class Measurements:
         checked = _weights(weights, arrays["tau"])
         return cls(arrays["q"], arrays["v"], arrays["a"], arrays["tau"], checked)
 
-    def moving(self, dry: NDArray[np.bool_], rest: float) -> Measurements:
-        """Return the samples without the torques of joints with dry friction, (nv,), that are at rest.
+    def moving(self, jumps: NDArray[np.bool_], rest: float) -> Measurements:
+        """Return the samples without the torques of joints with a force that jumps, (nv,), that are at rest.
 
-        There friction holds with any force up to its bound, and noise decides the sign of v.
+        There it holds with any force up to its bound, and noise decides the sign of v.
         """
-        if not dry.any():
+        if not jumps.any():
             return self
-        kept = moving(self.v, rest) | ~dry
+        kept = moving(self.v, rest) | ~jumps
         weights = np.ones(self.v.shape) if self.weights is None else self.weights
         return self if kept.all() else replace(self, weights=np.asarray(weights * kept))
 
@@ -178,27 +164,23 @@ def equations(dyn: Dynamics, unknowns: Unknowns, data: Measurements, progress: P
 
 def _blocks(dyn: Dynamics, unknowns: Unknowns, data: Measurements) -> Iterator[tuple[slice, Array, Array]]:
     """Yield samples with their regressor and the torque that it has to explain."""
-    model, needs = dyn.model, dyn.model.needs
-    known = needs.springs or needs.damping or needs.friction or needs.armature or needs.forces
+    model = dyn.model
+    known = any(kind(name).effects & _KNOWN for name in model.acts if name != "gravity")
     size = max(64, _BLOCK // max(model.nv * len(unknowns.names), 1))
     for start in range(0, len(data), size):
         part = slice(start, min(start + size, len(data)))
-        state = data.q[part], data.v[part], data.a[part]
-        Y = _regressor(dyn, unknowns, *state)
+        q, v, a = data.q[part], data.v[part], data.a[part]
+        Y = dyn._evaluate("regressor", unknowns.columns, q=q, v=v, a=a)
         tau = data.tau[part]
         if known:
-            # Springs, and what else is not to be found, as the model has them.
-            tau = tau - (dyn.inverse_dynamics(*state) - Y @ unknowns.nominal)
+            # What is not to be found, as the model has it.
+            tau = tau - (dyn.inverse_dynamics(q, v, a) - Y @ unknowns.nominal)
         yield part, Y, tau
-
-
-def _regressor(dyn: Dynamics, unknowns: Unknowns, q: Array, v: Array, a: Array) -> Array:
-    return dyn.regressor(q, v, a, _BASE, friction=unknowns.friction, armature=unknowns.armature)
 
 
 def _used(dyn: Dynamics, unknowns: Unknowns) -> list[NDArray[np.intp]]:
     """Return the columns that each velocity's torque depends on: those of bodies that it carries."""
     model, rng = dyn.model, np.random.default_rng(0)
     q, v = model.random_state(rng, _PROBES)
-    Y = _regressor(dyn, unknowns, q, v, rng.standard_normal((_PROBES, model.nv)))
+    Y = dyn._evaluate("regressor", unknowns.columns, q=q, v=v, a=rng.standard_normal((_PROBES, model.nv)))
     return [np.flatnonzero(Y[:, j].any(axis=0)) for j in range(model.nv)]

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from operator import attrgetter
 from typing import Any, ClassVar, Final
 
 import numpy as np
 
 from mbkit.errors import InputError, ModelError
-from mbkit.identify.measurements import of_velocities
 from mbkit.model import Joint, Model
-from mbkit.model.base_parameters import STANDARD, body_of, length_of, standard_names
+from mbkit.model.base_parameters import OF_JOINTS, STANDARD, body_of, length_of, standard_names
 from mbkit.model.validation import check_substituted, suspects
 from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
 
@@ -187,10 +187,10 @@ class Identification(ResultTable):
         out = []
         for joint in model.joints:
             changes: dict[str, Any] = {}
-            for field in ("damping", "friction", "armature"):
-                names = [f"{n}.{field}" for n in _velocities(model, joint)]
+            for field in chain(*OF_JOINTS):
+                names = [f"{n}.{field}" for n in model.velocity_names[model.layout.v[joint.name]]]
                 if names and names[0] in values:
-                    before = of_velocities(model, field)[model.layout.v[joint.name]]
+                    before = model.per_velocity(field)[model.layout.v[joint.name]]
                     changes[field] = getattr(joint, field) + np.array([values[n] for n in names]) - before
             out.append(replace(joint, **changes) if changes else joint)
         return tuple(out)
@@ -230,7 +230,3 @@ class Identification(ResultTable):
         yield Table(_COLUMNS, self.parameters)
         yield Table(_RESIDUALS, self.residuals)
         yield Items(f"the data cannot tell {x.text}" for x in self.undetermined)
-
-
-def _velocities(model: Model, joint: Joint) -> tuple[str, ...]:
-    return model.velocity_names[model.layout.v[joint.name]]

@@ -173,8 +173,8 @@ def identify(
         (prior or ENTROPIC) if physical else "",
         standard_names(model),
         tuple(standard.tolist()),
-        unknowns.friction,
-        unknowns.armature,
+        bool(friction),
+        bool(armature),
         model,
         None if cutoff is None else real("cutoff", cutoff, positive=True),
     )

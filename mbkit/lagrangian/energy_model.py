@@ -21,7 +21,7 @@ from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.lagrangian.energies.symbols import plain
 from mbkit.lagrangian.printer import ExpressionPrinter
 from mbkit.model import Model
-from mbkit.model.description import Needs
+from mbkit.model.elements.kinds import Needs
 from mbkit.model.joint_types import PRISMATIC
 from mbkit.model.parts import Body, Frame, Joint
 

@@ -91,7 +91,7 @@ def load(
 
     No other files are opened, except those that an MJCF includes, and the meshes that give a body of an MJCF its
     inertia. The model's ``notes`` name all decisions. Tendons of an MJCF act as springs and dampers, and the rotors of
-    its actuators as armature; a tendon whose inertia changes with q is refused. Limits are data, off in every engine.
+    its actuators act too; a tendon whose inertia changes with q is refused. Limits are data, off in every engine.
 
     Parameters
     ----------

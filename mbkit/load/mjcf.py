@@ -44,6 +44,9 @@ _REFUSED: Final = {
     "composite": "write its bodies out; MuJoCo's save as XML does",
     "flexcomp": "deformable bodies are not rigid; remove it",
 }
+#: Numbers of a joint's velocities, and their attributes in MJCF, which MuJoCo's models have too.
+_SPRING: Final = {"stiffness": "stiffness", "damping": "damping", "rest": "springref"}
+JOINT_NUMBERS: Final = _SPRING | {"armature": "armature", "friction": "frictionloss"}
 # Sections that are read, have notes of their own, or do not act on the motion.
 _READ: Final = (
     *("compiler", "default", "option", "worldbody", "size", "visual", "statistic"),
@@ -252,7 +255,7 @@ class _Tree:
             )
         if any(higher["damping"]) and "damper" not in self.off:
             self.b.add_joint_force(f"damper of {joint.name}", joint.name, _damper(joint, *higher["damping"]))
-        friction = read.number(element, "frictionloss", item, 0.0)
+        friction = read.number(element, JOINT_NUMBERS["friction"], item, 0.0)
         if friction and not kind_of(kind).coordinate_velocities:
             self.b.note(
                 f"{LEFT_OUT}: dry friction {friction:g} of {joint.kind} joint {joint.name!r}, "

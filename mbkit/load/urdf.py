@@ -34,6 +34,10 @@ _UNALIGNED: Final = {
 }
 
 
+#: Numbers of a joint's velocities, and Pinocchio's names for them.
+OF_VELOCITIES: Final = {"armature": "armature", "damping": "damping", "friction": "upperDryFrictionLimit"}
+
+
 def joint_kind(joint: Any) -> tuple[str, Array | None]:
     """Return the kind and axis of one of Pinocchio's joints."""
     name = joint.shortname().removeprefix("JointModel")
@@ -53,7 +57,7 @@ def joint_kind(joint: Any) -> tuple[str, Array | None]:
 def joint_numbers(raw: Any, joint: Any) -> dict[str, Any]:
     """Return the constants and limits of one of Pinocchio's joints, as `ModelBuilder.add_joint` takes them."""
     q, v = slice(joint.idx_q, joint.idx_q + joint.nq), slice(joint.idx_v, joint.idx_v + joint.nv)
-    out = {"armature": raw.armature[v], "damping": raw.damping[v], "friction": raw.upperDryFrictionLimit[v]}
+    out = {name: getattr(raw, own)[v] for name, own in OF_VELOCITIES.items()}
     if joint.nv == 1:
         out |= {"velocity_limit": raw.upperVelocityLimit[v], "effort_limit": raw.upperEffortLimit[v]}
         if joint.nq == 1:

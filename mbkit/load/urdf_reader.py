@@ -36,9 +36,10 @@ BASE_JOINT: Final = "root_joint"
 _OPEN: Final = "1.7976931348623157e308"
 _MAX_LISTED: Final = 40
 _KINDS: Final = {k: k for k in ("fixed", "revolute", "continuous", "prismatic", "planar")} | {"floating": "free"}
-# Numbers of <dynamics> and the builder's names for them; URDF has the first two, published files the others too.
+#: Numbers of <dynamics>, which the builder has by the same names.
+DYNAMICS: Final = ("damping", "friction")
+# Others that published files have.
 _SPRING: Final = {"spring_stiffness": "stiffness", "spring_reference": "rest"}
-_DYNAMICS: Final = {"damping": "damping", "friction": "friction"} | _SPRING
 _MOMENTS: Final = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 # The elements of URDF's dynamics, with the elements in each and its attributes.
 _SCHEMA: Final[Mapping[str, tuple[frozenset[str], frozenset[str]]]] = {
@@ -55,7 +56,7 @@ _SCHEMA: Final[Mapping[str, tuple[frozenset[str], frozenset[str]]]] = {
         ("child", "", "link"),
         ("axis", "", "xyz"),
         ("limit", "", "lower upper effort velocity"),
-        ("dynamics", "", " ".join(_DYNAMICS)),
+        ("dynamics", "", " ".join((*DYNAMICS, *_SPRING))),
         ("mimic", "", "joint multiplier offset"),
     )
 }
@@ -355,16 +356,19 @@ def _dynamics(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[
     dynamics = read.only(joint, "dynamics", item)
     if dynamics is None:
         return {}, ""
-    numbers = {own: read.number(dynamics, name, item, 0.0) for name, own in _DYNAMICS.items()}
+    numbers = {
+        own: read.number(dynamics, name, item, 0.0)
+        for name, own in (*zip(DYNAMICS, DYNAMICS, strict=True), *_SPRING.items())
+    }
     for name in ("friction", "stiffness"):
         if numbers[name] < 0:
             read.fault(f"{item}: {name} {numbers[name]:g} is negative; expected 0 or more", dynamics)
     stiffness, rest = numbers["stiffness"], numbers["rest"]
     if not stiffness:
         # A rest alone says nothing.
-        numbers = {name: numbers[name] for name in ("damping", "friction")}
+        numbers = {name: numbers[name] for name in DYNAMICS}
     if kind in ("free", "planar") and any(numbers.values()):
-        what, type_ = "a spring" if stiffness else "damping or friction", joint.attributes["type"]
+        what, type_ = "a spring" if stiffness else " or ".join(DYNAMICS), joint.attributes["type"]
         read.fault(f"{item}: {what} on a {type_} joint, which URDF parsers drop; remove it", dynamics)
     if stiffness:
         unit = "which a fixed joint leaves idle" if kind == "fixed" else "read as N m/rad or N/m"
@@ -373,8 +377,7 @@ def _dynamics(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[
     if kind in ("", "fixed", "free", "planar"):
         return {}, ""
     # Parsers refuse the element without one of these.
-    given = {"damping", "friction"} & dynamics.attributes.keys()
-    return numbers, _copy(dynamics, "damping", "friction") if given else ""
+    return numbers, "" if dynamics.attributes.keys().isdisjoint(DYNAMICS) else _copy(dynamics, *DYNAMICS)
 
 
 def unbounded(limit: ArrayLike) -> Array:

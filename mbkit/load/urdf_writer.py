@@ -11,14 +11,17 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
+from mbkit.load.urdf_reader import DYNAMICS
 from mbkit.load.xml_reader import reserved
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.kinds import joint_types
 from mbkit.model.elements.paths import Path
 
 _TYPES: Final = {k: k for k in ("fixed", "revolute", "continuous", "prismatic", "planar")} | {"free": "floating"}
-_CARRIED: Final = "gravity mimic joint.damping joint.friction joint.limit joint.velocity_limit joint.effort_limit"
-URDF: Final = Path("urdf", "URDF cannot say of", joint_types(*_TYPES) | {*_CARRIED.split()})
+_CARRIED: Final = "gravity mimic joint.limit joint.velocity_limit joint.effort_limit"
+URDF: Final = Path(
+    "urdf", "URDF cannot say of", joint_types(*_TYPES) | {*_CARRIED.split(), *(f"joint.{x}" for x in DYNAMICS)}
+)
 # Stands for no limit: the largest number that every reader reads.
 _OPEN: Final = 1e308
 
@@ -78,7 +81,7 @@ def _joint(joint: Joint) -> str:
             limits = {"lower": joint.lower, "upper": joint.upper} | limits
         if bounded or np.isfinite(list(limits.values())).any():
             out.append(_element("limit", {k: np.clip(x, -_OPEN, _OPEN) for k, x in limits.items()}))
-        dynamics = {k: x for k, x in (("damping", joint.damping), ("friction", joint.friction)) if x.any()}
+        dynamics = {k: x for k in DYNAMICS if (x := getattr(joint, k)).any()}
         out += [_element("dynamics", dynamics)] if dynamics else []
     if joint.mimic is not None:
         m = joint.mimic

@@ -2,9 +2,9 @@
 
 from mbkit.model.base_parameters import BaseParameters
 from mbkit.model.builder import ModelBuilder
-from mbkit.model.description import Needs
 from mbkit.model.elements.forces import Bushing, FrameForce, GravityCompensation, JointForce
 from mbkit.model.elements.formula import Formula
+from mbkit.model.elements.kinds import Needs
 from mbkit.model.elements.motion_laws import FormulaMotion, SplineMotion
 from mbkit.model.joint_types import KINDS, JointKind, JointType, kind_of, register_joint_type
 from mbkit.model.model import Model

@@ -21,6 +21,7 @@ with the body's velocities ω and v in its axes. Two linear maps lead from them 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final
@@ -33,7 +34,7 @@ from mbkit.errors import InputError, NumericalError
 from mbkit.model import manifold
 from mbkit.model.description import Description
 from mbkit.model.elements.paths import Path
-from mbkit.model.parts import Body, Joint, Numbers, _Frozen
+from mbkit.model.parts import Body, Joint, Numbers, _Frozen, rules_of
 from mbkit.spatial import skew
 
 #: The ten standard parameters of a body, in the order of Khalil and Dombre, and the places of its inertia.
@@ -43,6 +44,8 @@ PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 PARAMETER_SETS: Final = ("standard", "base")
 #: Power of a length in the energy of each.
 POWERS: Final = np.array([0] * 6 + [1] * 3 + [2])
+#: Fields of joints in which the torque is linear too: those that lose energy, and those of rotors.
+OF_JOINTS: Final = (Joint.adding_to("loss") + Joint.adding_to("jump"), Joint.adding_to("T"))
 #: What is smaller than this beside the largest is taken as not there, where nobody says otherwise.
 TOLERANCE: Final = 1e-7
 #: Rounding of a coefficient, and of right angles in a file: π is often written with eleven digits.
@@ -174,21 +177,27 @@ def standard_names(model: Description) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class RegressorColumns:
-    """The columns of a regressor: indices of standard parameters, velocities with losses, and those with rotors."""
+    """The columns of a regressor: indices of standard parameters, then fields of joints with those of velocities."""
 
     bodies: tuple[int, ...]
-    friction: tuple[int, ...] = ()
-    rotors: tuple[int, ...] = ()
+    along: tuple[tuple[str, tuple[int, ...]], ...] = ()
 
     def names(self, model: Description) -> tuple[str, ...]:
         """Return the names of the columns."""
         standard, velocities = standard_names(model), model.velocity_names
-        losses = (f"{velocities[k]}.{kind}" for kind in ("damping", "friction") for k in self.friction)
-        return (*(standard[k] for k in self.bodies), *losses, *(f"{velocities[k]}.armature" for k in self.rotors))
+        return (
+            *(standard[k] for k in self.bodies),
+            *(f"{velocities[k]}.{field}" for field, which in self.along for k in which),
+        )
+
+    def of_rates(self, **by_effect: Any) -> Iterator[tuple[Any, list[int]]]:
+        """Yield for each field what the effect of its numbers is linear in, (nv,), and the velocities with columns."""
+        for field, which in self.along:
+            yield by_effect[rules_of(Joint)[field].does], list(which)
 
 
 @lru_cache(maxsize=64)
-def regressor_columns(model: Description, parameters: str, friction: bool, armature: bool) -> RegressorColumns:
+def regressor_columns(model: Description, parameters: str, losses: bool, rotors: bool) -> RegressorColumns:
     """Return the columns for a set of parameters; see `Model.regressor_columns`."""
     if parameters not in PARAMETER_SETS:
         raise InputError(f"parameters: expected 'standard' or 'base', got {shown(parameters)}")
@@ -196,8 +205,10 @@ def regressor_columns(model: Description, parameters: str, friction: bool, armat
     if parameters == PARAMETER_SETS[1]:
         index = {name: k for k, name in enumerate(standard_names(model))}
         bodies = tuple(index[name] for name in base_parameters(model, TOLERANCE).names)
-    rotors = (model.layout.v[j.name].start for j in model.independent_joints if j.type.nv == 1)
-    return RegressorColumns(bodies, tuple(range(model.nv)) if friction else (), tuple(rotors) if armature else ())
+    single = tuple(model.layout.v[j.name].start for j in model.independent_joints if j.type.nv == 1)
+    asked = (losses, tuple(range(model.nv))), (rotors, single)
+    pairs = zip(OF_JOINTS, asked, strict=True)
+    return RegressorColumns(bodies, tuple((f, which) for names, (on, which) in pairs if on for f in names))
 
 
 def standard_parameters(body: Body) -> Array:

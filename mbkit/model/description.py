@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import chain, count, pairwise
 from types import MappingProxyType
@@ -16,7 +16,7 @@ import numpy as np
 from mbkit._check import Array, by_key, shown
 from mbkit.errors import InputError, ModelError, UnknownNameError
 from mbkit.model.elements.forces import Bushing, Force, GravityCompensation
-from mbkit.model.elements.kinds import PART_KINDS, acts, has, kind
+from mbkit.model.elements.kinds import PART_KINDS, Needs, acts, has, kind
 from mbkit.model.elements.motion_laws import Motion, beyond, interval
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.joint_types import KINDS
@@ -64,38 +64,6 @@ def digest(*parts: Any) -> str:
 SERVOS: Final = "servos"
 #: How notes begin on what would act, and does not here.
 LEFT_OUT: Final = "left out of the motion"
-
-
-@dataclass(frozen=True)
-class Needs:
-    """One flag per feature; True where the description has it.
-
-    Limits are data, off in every engine. `forces` are those given by functions and what holds weights; their
-    parts do not count as springs and dampers.
-    """
-
-    gravity: bool
-    springs: bool
-    damping: bool
-    armature: bool
-    friction: bool
-    limits: bool
-    effort_limits: bool
-    mimic: bool
-    loops: bool
-    quaternions: bool
-    time: bool
-    forces: bool = False
-    no_slip: bool = False
-
-    def as_dict(self) -> dict[str, bool]:
-        """Return the flags by name."""
-        return asdict(self)
-
-    def __str__(self) -> str:
-        there, absent = ([k for k, x in self.as_dict().items() if x is on] for on in (True, False))
-        there = ["dry friction" if name == "friction" else name for name in there]
-        return f"has {', '.join(there) or 'nothing'}; without {', '.join(absent) or 'nothing'}"
 
 
 @dataclass(frozen=True)
@@ -340,6 +308,21 @@ class Description:
         """One name per entry of v."""
         return tuple(_named(j.name, s) for j in self.independent_joints for s in j.type.velocity_suffixes)
 
+    @cached_property
+    def velocity_joints(self) -> tuple[str, ...]:
+        """The joint of each entry of v."""
+        return tuple(j.name for j in self.independent_joints for _ in range(j.type.nv))
+
+    def per_velocity(self, name: str) -> Array:
+        """Return a number of all joints as each entry of v has it, (nv,).
+
+        That of a mimic joint counts by the square of its ratio, as a force grows with the ratio too; the size of a
+        force that jumps by the ratio alone.
+        """
+        full, G = _joined([getattr(j, name) for j in self.joints]), self.layout.G
+        ratios = np.abs(G) if name in Joint.adding_to("jump") else np.square(G)
+        return np.asarray(ratios.T @ full if self.layout.reduced else full)
+
     @property
     def mass(self) -> float:
         """Total mass, kg; `InputError` where it depends on a parameter without a value."""
@@ -349,7 +332,7 @@ class Description:
 
     @cached_property
     def rotors(self) -> frozenset[str]:
-        """Names of the bodies that stand for the armature of free joints, without weight and equal along all axes.
+        """Names of the bodies that stand for the rotors of free joints, without weight and equal along all axes.
 
         They have inertia alone, and count neither as mass nor in the centre of mass.
         """
@@ -386,10 +369,10 @@ class Description:
 
     @cached_property
     def loses_energy(self) -> bool:
-        """Whether dampers, dry friction, or forces without a potential do work that no energy accounts for."""
+        """Whether dampers, forces that jump, or those without a potential do work that no energy accounts for."""
         damped = has("forces", "damping")
         lost = self.driven_by_forces or any(isinstance(f, Bushing) and damped(self, f) for f in self.forces)
-        return self.needs.damping or self.needs.friction or lost
+        return self.needs.damping or "jump" in self.effects or lost
 
     @cached_property
     def constraints(self) -> tuple[Any, ...]:
@@ -411,6 +394,11 @@ class Description:
     def acts(self) -> Mapping[str, tuple[str, ...]]:
         """The kinds of parts that act, such as ``"joint.stiction"``, each with the names of its parts."""
         return acts(self)
+
+    @cached_property
+    def effects(self) -> frozenset[str]:
+        """All that the kinds that act do, such as ``"T"``, ``"jump"`` and ``"row"``."""
+        return frozenset[str]().union(*(kind(name).effects for name in self.acts))
 
     @cached_property
     def needs(self) -> Needs:

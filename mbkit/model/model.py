@@ -23,7 +23,7 @@ from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, Unsupported
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
 from mbkit.model.description import SERVOS, Description, expect_name
-from mbkit.model.elements.kinds import PART_KINDS
+from mbkit.model.elements.kinds import PART_KINDS, that_do
 from mbkit.model.parameters import Parameter
 from mbkit.model.validation import check_substituted, model_faults
 
@@ -263,14 +263,10 @@ class Model(Description):
 
         Parameters
         ----------
-        parameters : {"standard", "base"}
-            The ten standard parameters of each body, in the order of ``base_parameters().standard_names``, or the base
-            parameters, each named after the standard parameter that leads it.
-        friction : bool
-            Whether columns of viscous and of dry friction follow: ``"joint.damping"`` for every velocity, then
-            ``"joint.friction"``.
-        armature : bool
-            Whether columns of rotors follow: ``"joint.armature"`` for every joint with one velocity.
+        parameters, friction, armature
+            Those of `Dynamics.regressor`: standard parameters in the order of ``base_parameters().standard_names``, or
+            base parameters, each named after the standard one that leads it; then ``"joint.damping"`` and
+            ``"joint.friction"`` of each velocity, and ``"joint.armature"`` of each joint with one velocity.
 
         Returns
         -------
@@ -333,6 +329,11 @@ class Model(Description):
             for kind in gone:
                 model = kind.removed(model)
         return model
+
+    @property
+    def smooth(self) -> Model:
+        """The model without forces that jump, such as dry friction; itself where it has none."""
+        return self.without(*that_do("jump")) if "jump" in self.effects else self
 
     def lock(self, joints: Mapping[str, Any] | Sequence[str], q: ArrayLike | None = None) -> Model:
         """Return the model with some joints fixed: its terms are those of this one with these velocities zero.

@@ -51,6 +51,9 @@ class NumberRule:
     added: bool = False
     #: Why it cannot be a free parameter; empty where it can.
     fixed: str = ""
+    #: What it adds along a coordinate x or its rate v: ½ number v² to ``"T"`` or Rayleigh's ``"loss"``, ½ number x² to
+    #: ``"V"``, or a force of its size that may ``"jump"`` with the sign of v.
+    does: str = ""
     #: The equations have it; other numbers are data.
     acts: bool = True
     #: It is an orientation or an axis.
@@ -176,6 +179,16 @@ class _Frozen:
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         return type(self), self._values()
 
+    @classmethod
+    def adding_to(cls, effect: str) -> tuple[str, ...]:
+        """Return the fields whose numbers have an effect along a coordinate or its rate."""
+        return tuple(name for name, rule in rules_of(cls).items() if rule.does == effect)
+
+    @property
+    def rotors(self) -> Any:
+        """The inertia beside that of bodies: of a joint on each velocity, (nv,), of a coupling on its rate."""
+        return sum(getattr(self, name) for name in self.adding_to("T"))
+
 
 @dataclass(frozen=True, eq=False)
 class Body(_Frozen):
@@ -257,10 +270,10 @@ class Joint(_Frozen):
     upper: Annotated[Array, NumberRule("rad, m", OF_Q, nothing=inf, fixed=_IS_DATA, acts=False)]
     velocity_limit: Annotated[Array, NumberRule("rad/s, m/s", OF_V, least=0.0, nothing=inf, fixed=_IS_DATA, acts=False)]
     effort_limit: Annotated[Array, NumberRule("N m, N", OF_V, least=0.0, nothing=inf, fixed=_IS_DATA, acts=False)]
-    armature: Annotated[Array, NumberRule("kg m², kg", OF_V, least=0.0)]
-    damping: Annotated[Array, NumberRule("N m s/rad, N s/m", OF_V, least=0.0)]
-    friction: Annotated[Array, NumberRule("N m, N", OF_V, least=0.0, fixed=_DRY)]
-    stiffness: Annotated[Array, NumberRule("N m/rad, N/m", OF_V, least=0.0)]
+    armature: Annotated[Array, NumberRule("kg m², kg", OF_V, least=0.0, does="T")]
+    damping: Annotated[Array, NumberRule("N m s/rad, N s/m", OF_V, least=0.0, does="loss")]
+    friction: Annotated[Array, NumberRule("N m, N", OF_V, least=0.0, fixed=_DRY, does="jump")]
+    stiffness: Annotated[Array, NumberRule("N m/rad, N/m", OF_V, least=0.0, does="V")]
     rest: Annotated[Array, NumberRule("rad, m", OF_V, added=True)]
     mimic: Mimic | None = None
     stiction: Annotated[Array | None, NumberRule("N m, N", OF_V, least=0.0, fixed=_DRY, optional=True)] = None
@@ -299,6 +312,23 @@ class Joint(_Frozen):
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
         # Another process may not have registered the type.
         return (type(self), self._values()) if self.type.built_in else (_of_type, (self.type, self._values()))
+
+
+def rest_faults(item: str, joint: Joint) -> Iterator[str]:
+    """Yield one sentence per fault of what may hold a joint at rest."""
+    bound, curve = joint.stiction, joint.stribeck_velocity
+    given = [x for x in (joint.friction, bound, curve) if x is not None]
+    if not all(np.isfinite(x).all() for x in given):
+        yield f"{item}: dry friction: expected finite numbers; lock(...) holds a joint that nothing moves"
+    elif bound is not None and np.any(bound < joint.friction):
+        yield f"{item}: stiction {bound} is below the friction of motion, {joint.friction}; give at least that"
+    elif curve is not None and bound is None:
+        yield f"{item}: stribeck_velocity without stiction, from which the friction would fall; give stiction too"
+    if any(np.any(x) for x in given) and not joint.type.coordinate_velocities:
+        yield (
+            f"{item}: dry friction on a {joint.kind} joint, whose velocities are along moving axes: friction by axis "
+            "is no law of matter there; use joints of one axis, or a force that is a function of the velocity"
+        )
 
 
 def _of_type(joint_type: JointType, values: tuple[Any, ...]) -> Joint:
@@ -381,10 +411,10 @@ class JointCoupling(_Frozen):
     name: str
     joints: tuple[str, ...]
     factors: Annotated[Array, NumberRule(shape=("joints",))]
-    stiffness: Annotated[float, NumberRule("N m/rad, N/m", least=0.0)]
+    stiffness: Annotated[float, NumberRule("N m/rad, N/m", least=0.0, does="V")]
     rest_length: Annotated[float, NumberRule("rad, m")]
-    damping: Annotated[float, NumberRule("N m s/rad, N s/m", least=0.0)]
-    armature: Annotated[float, NumberRule("kg m², kg", least=0.0)]
+    damping: Annotated[float, NumberRule("N m s/rad, N s/m", least=0.0, does="loss")]
+    armature: Annotated[float, NumberRule("kg m², kg", least=0.0, does="T")]
 
     @property
     def length(self) -> str:

@@ -17,10 +17,21 @@ from mbkit.model.elements.forces import force_faults
 from mbkit.model.elements.motion_laws import motion_faults
 from mbkit.model.elements.references import KINDS_OF_PARTS, called
 from mbkit.model.loops import held_directions
-from mbkit.model.parts import RESTING, Body, Joint, JointCoupling, Loop, NoSlip, numbers
+from mbkit.model.parts import (
+    RESTING,
+    Body,
+    Joint,
+    JointCoupling,
+    Loop,
+    NoSlip,
+    numbers,
+    rest_faults,
+)
 from mbkit.model.rolling import LIES_FLAT, ROLLING_KINDS
 from mbkit.spatial import skew
 
+# What adds to T along a joint's velocity, by the name of the field.
+_TURNING: Final = " or ".join(Joint.adding_to("T"))
 # Names in a message.
 _MAX_NAMES: Final = 40
 # M of so many velocities has 200 MB.
@@ -122,37 +133,21 @@ def _negative(what: str, part: Any) -> Iterator[str]:
             yield f"{what} {part.name!r}: {name} {value if np.ndim(value) else format(value, 'g')} is negative"
 
 
-def _friction_faults(item: str, joint: Joint) -> Iterator[str]:
-    bound, curve = joint.stiction, joint.stribeck_velocity
-    given = [x for x in (joint.friction, bound, curve) if x is not None]
-    if not all(np.isfinite(x).all() for x in given):
-        yield f"{item}: dry friction: expected finite numbers; lock(...) holds a joint that nothing moves"
-    elif bound is not None and np.any(bound < joint.friction):
-        yield f"{item}: stiction {bound} is below the friction of motion, {joint.friction}; give at least that"
-    elif curve is not None and bound is None:
-        yield f"{item}: stribeck_velocity without stiction, from which the friction would fall; give stiction too"
-    if any(np.any(x) for x in given) and not joint.type.coordinate_velocities:
-        yield (
-            f"{item}: dry friction on a {joint.kind} joint, whose velocities are along moving axes: friction by axis "
-            "is no law of matter there; use joints of one axis, or a force that is a function of the velocity"
-        )
-
-
 def _joint_faults(joint: Joint) -> Iterator[str]:
     item, type_ = f"joint {joint.name!r}", joint.type
     if joint.child == "world":
         yield f"{item}: the world cannot be a child; swap parent and child"
     if np.any(joint.lower > joint.upper):
         yield f"{item}: lower limit {joint.lower} above upper limit {joint.upper}"
-    yield from _friction_faults(item, joint)
+    yield from rest_faults(item, joint)
     if type_.quaternion is not None and np.isfinite([x[type_.quaternion :] for x in (joint.lower, joint.upper)]).any():
         yield f"{item}: limits on the quaternion of a {joint.kind} joint bound no angle; leave them infinite"
     # The same about three axes is a sphere's, which has no gyroscopic term; neither has what rests.
-    sphere = type_.quaternion == 0 and not np.ptp(joint.armature) > 0
-    if not np.isin(joint.armature, (0.0, RESTING)).all() and type_.nv != 1 and not sphere:
+    sphere = type_.quaternion == 0 and not np.ptp(joint.rotors) > 0
+    if not np.isin(joint.rotors, (0.0, RESTING)).all() and type_.nv != 1 and not sphere:
         yield (
-            f"{item}: armature on a {joint.kind} joint; expected a joint of one velocity, or one number for the three "
-            "of a ball joint (engines leave out the gyroscopic term otherwise): add a rotor as a body"
+            f"{item}: {_TURNING} on a {joint.kind} joint; expected a joint of one velocity, or one number for the "
+            "three of a ball joint (engines leave out the gyroscopic term otherwise): add a rotor as a body"
         )
     if np.any(joint.stiffness) and not type_.coordinate_velocities:
         yield f"{item}: joint spring on a {joint.kind} joint, which has no angle to act on; use add_spring"
@@ -296,7 +291,7 @@ def suspects(model: Description, *, point_masses: bool) -> tuple[tuple[str, str]
             why = f"no mass moves with joint {name!r}" if alone else f"joints {name!r} and {others} move the same mass"
             if not alone and not others:
                 why = f"two velocities of joint {name!r} move the same mass"
-            reasons.setdefault(model.joint(name).child, f"{why}, so M is singular: give mass, inertia or armature")
+            reasons.setdefault(model.joint(name).child, f"{why}, so M is singular: give mass, inertia or {_TURNING}")
     return tuple(reasons.items())
 
 
@@ -512,10 +507,10 @@ def _sample(model: Description, q: Array | None = None) -> _Sample:
         M[moving, part] = M[part, moving].T
         composite[joint.name] = X.T @ inertia @ X
         momenta[joint.name] = moving, X.T @ F
-        diagonal[part] += joint.armature
+        diagonal[part] += joint.rotors
     np.fill_diagonal(M, diagonal)
     for coupling in model.couplings:
         row = model.layout.coupling_row(coupling)
-        M += coupling.armature * np.outer(row, row)
+        M += coupling.rotors * np.outer(row, row)
     M = np.asarray(model.layout.G.T @ M @ model.layout.G) if model.layout.reduced else M
     return _Sample(M, places, jacobians, {name: R for name, (R, _) in poses.items()}, n)

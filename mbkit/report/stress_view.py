@@ -8,7 +8,7 @@ import statistics
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_args
 
 from mbkit._check import by_key
 from mbkit.report.document import Bullet, Column, Document, Items, Section, Span, Table
@@ -17,6 +17,7 @@ from mbkit.report.formatting import choice, error_text, time_text
 from mbkit.simulate.plotting.style import engine_index
 from mbkit.studies.results import counted
 from mbkit.studies.stress import measurements as stress
+from mbkit.studies.stress.case import Family
 from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
 from mbkit.studies.stress.measurements import CaseResult, Line, Measurement, Outcome, Row, name_of, place
 from mbkit.studies.stress.result import StressResult
@@ -35,13 +36,7 @@ HOW: Final[dict[Outcome, str]] = {
     "unjudged": "not judged: the truth is not known well enough",
     "not run": "not run",
 }
-_FAMILIES: Final = {
-    "stiffness": "Stiffness",
-    "mass ratio": "Mass ratio",
-    "length": "Length",
-    "spin": "Spin",
-    "near-singular": "Near-singular",
-    "friction": "Dry friction",
+_FAMILIES: Final = {x: x.capitalize() for x in get_args(Family)} | {
     "large": "Large and small",
     "long": "Long runs",
     "step": "Step size",

@@ -158,8 +158,8 @@ def acting_of(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting 
 
 def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
     dyn, read = problem.dyn, problem.torque
-    if method.dry_friction and not dyn.model.needs.friction:
-        # Without friction its step is that of this method.
+    if method.dry_friction and "jump" not in dyn.model.effects:
+        # Without jumps its step is that of this method.
         method = METHODS[EULER_METHOD]
         problem = replace(problem, method=method.name)
     if dyn.soft_friction and method.dry_friction:
@@ -175,7 +175,7 @@ def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
         SMOOTH_RUNS.admit(dyn.model, f"{method.name}{soft}: not known of")
     elif not dyn.soft_friction:
         RUNS.admit(dyn.model)
-    if not dyn.model.needs.friction or dyn.soft_friction or method.dry_friction:
+    if "jump" not in dyn.model.effects or dyn.soft_friction or method.dry_friction:
         return _solver(dyn, method, read)(problem)
     from mbkit.simulate.solvers.friction.runs import run_in_phases
 

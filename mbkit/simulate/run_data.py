@@ -151,14 +151,14 @@ class RunData:
     def work(self, engine: str | Dynamics | None = None) -> Array:
         """Return ∫ (τ + τ_lost + Σ Jᵀ w)·v dt since the first state in J, shape (K,) or (N, K).
 
-        τ_lost are the forces of dampers and of dry friction, those given by functions without a potential, and those of
+        τ_lost are the forces of dampers, those that jump, those given by functions without a potential, and those of
         constraints that do work: drives of motions in time, blades with a speed, soft loops. Of a system
         written as energies it holds what changes T + V beside its forces, as where a frame is moved.
 
         The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇; UnsupportedError
-        where its rows change between two saved states. So is that of dry friction, ``f |Δq|`` from one stop or turn in
+        where its rows change between two saved states. So is that of jumps, ``f |Δq|`` from one stop or turn in
         `events` to the next. All else, also torque on quasi-velocities, is a quadrature of fourth order in the distance
-        of the saved states, of second order in an interval with a turn or stop of dry friction; a function that jumps
+        of the saved states, of second order in an interval with a turn or stop of theirs; a function that jumps
         makes it first order, and so do rows that jump beside a function.
         """
         dyn, force, t, q, v = self._by(engine), self._acted(), self.t, self.q, self.v
@@ -170,14 +170,14 @@ class RunData:
             else:
                 held = np.zeros(self._numbers) if force is None else force.between(t)
                 steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
-        if self.model.needs.friction and not dyn.soft_friction:
+        if "jump" in self.model.effects and not dyn.soft_friction:
             steps = steps - self._rubbed(dyn)
         out = np.zeros(q.shape[:-1])
         np.cumsum(steps, axis=-1, out=out[..., 1:])
         return out
 
     def _rubbed(self, dyn: Dynamics) -> Array:
-        """Return the energy that dry friction takes in each interval; states of events part them."""
+        """Return the energy that forces that jump take in each interval; states of events part them."""
         t, q, v = self.t, *(x.reshape(-1, *x.shape[-2:]) for x in (self.q, self.v))
         coordinates, plain = np.array(_plain(dyn.model), dtype=int).T
         out = np.zeros((len(q), max(len(t) - 1, 0)))
@@ -204,7 +204,7 @@ class RunData:
     def momentum(self, engine: str | Dynamics | None = None) -> Array:
         """Return the bodies' linear momentum, kg m/s, and angular one about the world's origin, kg m²/s.
 
-        The shape is (K, 6) or (N, K, 6), in world axes; armature belongs to no body and is left out.
+        The shape is (K, 6) or (N, K, 6), in world axes; rotors belong to no body and are left out.
         """
         dyn, q, v = self._by(engine), self.q, self.v
         if not self.model.has_bodies:
@@ -370,7 +370,7 @@ def _driven(dyn: Dynamics) -> bool:
 
 
 def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
-    """Return the power under τ of all forces but τ itself, exact dry friction and those in the energy; (N,)."""
+    """Return the power under τ of all forces but τ itself, exact ones that jump and those in the energy; (N,)."""
     model = dyn.model
     if not model.has_bodies:
         rate = dyn._evaluate("energy_rate", q=q, v=v, a=dyn.forward_dynamics(q, v, tau))
@@ -389,7 +389,7 @@ def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
 def _dampers(dyn: Dynamics, q: Array, v: Array) -> Array:
     """Return the passive force of springs and dampers alone."""
     own = dyn.passive(q, v) - dyn._lost_force(q, v)
-    return np.asarray(own - dyn._friction.law.force(v) if dyn.model.needs.friction else own)
+    return np.asarray(own - dyn._friction.law.force(v) if "jump" in dyn.model.effects else own)
 
 
 def _plain(model: Model) -> list[tuple[int, int]]:

@@ -22,7 +22,6 @@ from mbkit.load.urdf_writer import urdf_text
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.model.elements.references import KINDS_OF_PARTS
-from mbkit.model.joint_numbers import owners
 from mbkit.studies._targets import with_values
 from mbkit.studies.explain.result import Cause
 from mbkit.studies.explain.study import explain
@@ -65,8 +64,8 @@ class Converted:
 def convert(model: Model, to: str) -> Converted:
     """Write a description as MJCF or URDF, and read it back to see that it says the same.
 
-    The motion alone is written: bodies, joints, masses, inertias, springs, dampers, armature, limits, dry
-    friction, frames; no geometry. MJCF is the MuJoCo model that mbkit itself builds, with all digits, read
+    The motion alone is written: bodies, joints, masses, inertias, springs, dampers, rotors, limits, forces
+    that jump, frames; no geometry. MJCF is the MuJoCo model that mbkit itself builds, with all digits, read
     back with MuJoCo's own parser; URDF is read back with Pinocchio's.
 
     Parameters
@@ -142,7 +141,7 @@ def _to_mjcf(model: Model) -> Converted:
         own = dynamics(model, DERIVED, compile=False).constraint_residual(at.q)
         if not np.abs(back.constraint_residual(at.q) - own).max() < _TOLERANCE * max(1.0, np.abs(own).max()):
             raise MbkitError(f"convert: loops of {model.name} read back otherwise; please report this model")
-    difference = gaps(model_terms(model, at), values, at.v, owners(model))
+    difference = gaps(model_terms(model, at), values, at.v, model.velocity_joints)
     if not difference.comparable or difference.worst > _TOLERANCE:
         why = f"MuJoCo wants inertias with A + B >= C of {', '.join(lifted)}" if lifted else "please report this model"
         off = f"{difference.worst:.1e} at {difference.joint}"

@@ -21,6 +21,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, MbkitError, MbkitWarning
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.manifold import limits_box
 from mbkit.simulate import Trajectory, simulate
 
@@ -55,9 +56,9 @@ def require_motion(model: object, purpose: str) -> Model:
 def integrable(model: Model, *, native: bool = True) -> tuple[Model, list[str]]:
     """Return a model that references by series and, where `native`, engines' own integrators hold, and what differs."""
     notes = []
-    if model.needs.friction:
-        # No reference of series crosses its jumps, and no engine's own integrator holds it exactly.
-        model, notes = model.without("friction"), ["without dry friction"]
+    if "jump" in model.effects:
+        # No reference of series crosses jumps, and no engine's own integrator holds them exactly.
+        model, notes = model.smooth, [f"without {EFFECTS['jump']}"]
     if native and model.layout.reduced:
         model, notes = free_of_mimic(model), [*notes, "mimic joints free"]
     return model, notes

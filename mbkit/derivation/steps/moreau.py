@@ -21,8 +21,8 @@ from mbkit.derivation.steps.symbols import SymbolicSpace, choose
 from mbkit.model.changes.dry_friction import ROUNDING
 from mbkit.model.parts import RESTING
 
-#: A round reads these and writes the same names with a 1 behind. `side` and `still` are of the velocities with
-#: friction; `k` is the number of steps so far, `end` that to make; `best` is the least number of failures so far and
+#: A round reads these and writes the same names with a 1 behind. `side` and `still` are of the velocities whose
+#: forces jump; `k` is the number of steps so far, `end` that to make; `best` is the least number of failures so far and
 #: `left` how many attempts may fail to have fewer; `go` is 1 while there are steps to make.
 STATE: Final = ("q", "w", "side", "still", "k", "end", "best", "left", "go")
 #: Attempts that may not have fewer failures before sides are changed one by one.
@@ -34,8 +34,8 @@ MANY: Final = 1e9
 def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks: list[str]) -> list[Part]:
     """Return the parts of an attempt, of the equations of a model whose joints slide or rest as parameters say.
 
-    `which` are the velocities with friction, `sides` and `locks` the parameters of their sides and of their armatures
-    at rest. The parts read `STATE`, tau, dt, bound (the friction at rest, in the order
+    `which` are the velocities whose forces jump, `sides` and `locks` the parameters of their sides and of their rotors
+    at rest. The parts read `STATE`, tau, dt, bound (the largest forces at rest, in the order
     of `which`) and the other parameters.
     """
     model, space = equations.model, SymbolicSpace(equations.model)
@@ -56,14 +56,14 @@ def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks
     v, h, still, side = space.to_body_velocity(s["q"], s["w"]), s["dt"], s["still"], s["side"]
 
     def spread(x: Any) -> Any:
-        """Return numbers of the velocities with friction among all."""
+        """Return numbers of the velocities that may rest among all."""
         return ca.mtimes(pick.T, x)
 
     def parameters(side: Any, lock: Any) -> Any:
         return ca.vertcat(side, lock, *at_step)[order]
 
     def solve() -> ca.Function:
-        # What comes to rest is accelerated so that it has no velocity at the end: a force on a giant armature.
+        # What comes to rest is accelerated so that it has no velocity at the end: a force on a giant rotor.
         target = -ca.mtimes(pick, v) / h
         force = s["tau"] + ca.vertcat(spread(RESTING * still * target), ca.SX(s["tau"].numel() - nv, 1))
         forward = equations.function("forward_dynamics")

@@ -28,8 +28,9 @@ from mbkit.engines.imported import Imported, Parts, checked, written
 from mbkit.errors import UnsupportedError
 from mbkit.load.urdf_reader import BASE_JOINT, Snapper
 from mbkit.load.xml_reader import Element
-from mbkit.model import Model, ModelBuilder
+from mbkit.model import Joint, Model, ModelBuilder
 from mbkit.model.description import LEFT_OUT
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.joint_types import kind_of
 from mbkit.spatial import skew
 
@@ -137,9 +138,10 @@ def read_sdf(root: Element, text: str, floating_base: bool, gravity: Array) -> M
     held = f"the base {bases} floats in SDF, and is held here at its pose; floating_base=True lets it move"
     if len(loose) > 1:
         held = f"the bases {bases} float in SDF, and are held here at their poses; floating_base=True lets them move"
-    pairs = [(j, e.text.strip()) for j in root.walk() if j.tag == "joint" for e in j.walk() if e.tag == "friction"]
+    tags, read = Joint.adding_to("jump"), (j for j in root.walk() if j.tag == "joint")
+    pairs = [(j, e.text.strip()) for j in read for e in j.walk() if e.tag in tags]
     dry = ", ".join(f"{j.attributes.get('name')} ({x} N m or N)" for j, x in pairs if x.strip("0."))
-    ignored = f"{LEFT_OUT}: dry friction, which Drake does not read from SDF: {dry}" if dry else ""
+    ignored = f"{LEFT_OUT}: {EFFECTS['jump']}, which Drake does not read from SDF: {dry}" if dry else ""
     for note in (held if loose and not floating_base else "", ignored, *told, snap.note):
         if note:
             b.note(note)
@@ -299,7 +301,7 @@ def _add_body(parts: Parts, name: str, body: Any, X: Any) -> None:
     parts.body(name, mass, np.array(X.multiply(com)), R @ (about + mass * skew(com) @ skew(com)) @ R.T)
 
 
-def _numbers(joint: Any, kind: str, effort: float, armature: float) -> tuple[str, dict[str, Any]]:
+def _numbers(joint: Any, kind: str, effort: float, rotor: float) -> tuple[str, dict[str, Any]]:
     """Return a joint's kind, continuous where a revolute one has no limits, and its numbers."""
     nv = kind_of(kind).nv
     damping = np.array(joint.default_damping_vector()) if nv else np.zeros(0)
@@ -314,7 +316,8 @@ def _numbers(joint: Any, kind: str, effort: float, armature: float) -> tuple[str
         axis = getattr(joint, ways[kind])() if kind in ways else _screw_axis(joint)
         lower, upper = np.array(joint.position_lower_limits()), np.array(joint.position_upper_limits())
         numbers |= {"axes": np.array([axis]), "lower": lower, "upper": upper}
-        numbers |= {"velocity_limit": np.array(joint.velocity_upper_limits()), "armature": np.full(1, armature)}
+        numbers |= {"velocity_limit": np.array(joint.velocity_upper_limits())}
+        numbers |= dict.fromkeys(Joint.adding_to("T"), np.full(1, rotor))
         if kind == "helical":
             numbers["pitch"] = float(joint.screw_pitch()) / _TURN
         if kind == "revolute" and not np.isfinite([lower, upper]).any():

@@ -18,7 +18,7 @@ from pydrake.multibody import tree
 from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
 
 from mbkit._check import Array
-from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, SOLVED, STACKS
+from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, ROTORS_OF_SEVERAL, SOLVED, STACKS
 from mbkit.errors import UnsupportedError
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.kinds import joint_types
@@ -191,9 +191,9 @@ def _numbers_not_held(model: Model) -> Iterator[str]:
 DRAKE: Final = Path(
     "drake",
     "",
-    joint_types(*_STEPS) | OF_TREES - {"joint.armature.several"} | {"row", "speed", "t"},
+    joint_types(*_STEPS) | OF_TREES - {ROTORS_OF_SEVERAL} | {"row", "speed", "t"},
     dict.fromkeys(OF_COUPLINGS, "Drake has nothing on a sum of joint coordinates")
-    | {"joint.armature.several": "Drake has no rotor for it"},
+    | {ROTORS_OF_SEVERAL: "Drake has no rotor for it"},
     also=_numbers_not_held,
     instead=SOLVED,
 )
@@ -232,10 +232,9 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
     else:
         # Metres per radian here, per turn there.
         added = plant.AddJoint(tree.ScrewJoint(name, at, body, axis, _TURN * joint.pitch, damping))
-    if joint.armature[k]:
-        # Drake knows armature as the inertia of an actuator's rotor.
+    if rotor := float(joint.rotors[k]):
         actuator = plant.AddJointActuator(f"{name}.rotor", added)
-        actuator.set_default_rotor_inertia(float(joint.armature[k]))
+        actuator.set_default_rotor_inertia(rotor)
         actuator.set_default_gear_ratio(1.0)
     stiffness, rest = float(joint.stiffness[k]), float(joint.rest[k])
     if stiffness:

@@ -13,7 +13,7 @@ from mbkit.model import Model, PointSpring
 class JointPassive:
     """Springs and dampers at the joints, and joint couplings; entry i is full coordinate q_order[i].
 
-    `armature` is the couplings' part of M, None without one. `stiffness_matrix` and `damping_matrix` are the
+    `rotors` is the couplings' part of M, None without one. `stiffness_matrix` and `damping_matrix` are the
     derivatives of the force by q and by v, with the other sign.
     """
 
@@ -21,7 +21,7 @@ class JointPassive:
         layout = model.layout
         lengths, rates = np.eye(layout.sizes[2]), np.eye(layout.sizes[3])
         damping = np.zeros(layout.sizes[3])
-        # Each row is a length, linear in q, with its rate, stiffness, rest length, damping and armature.
+        # Each row is a length, linear in q, with its rate, stiffness, rest length, damping and rotor.
         rows: list[tuple[Any, ...]] = []
         for joint in model.joints:
             iq, iv = layout.full_q[joint.name], layout.full_v[joint.name]
@@ -37,17 +37,17 @@ class JointPassive:
             length = sum(
                 rate[layout.full_v[x].start] * lengths[layout.full_q[x].start] for x in dict.fromkeys(c.joints)
             )
-            rows.append((length, rate, c.stiffness, c.rest_length, c.damping, c.armature))
+            rows.append((length, rate, c.stiffness, c.rest_length, c.damping, c.rotors))
         self.damping = damping[v_order]
         self._against = -self.damping
         self._lengths, rates = (
             np.array([row[i] for row in rows]).reshape(len(rows), order.size)[:, order]
             for i, order in enumerate((q_order, v_order))
         )
-        self._stiffness, self._rest, dampers, armature = (np.array([row[i] for row in rows]) for i in range(2, 6))
+        self._stiffness, self._rest, dampers, inertias = (np.array([row[i] for row in rows]) for i in range(2, 6))
         self._pull = rates.T * self._stiffness
         self.stiffness_matrix = self._pull @ rates
-        self.armature = (rates.T * armature) @ rates if armature.any() else None
+        self.rotors = (rates.T * inertias) @ rates if inertias.any() else None
         self._coupled_damping = (rates.T * dampers) @ rates if dampers.any() else None
         self.damping_matrix = np.diag(self.damping) + (rates.T * dampers) @ rates
 

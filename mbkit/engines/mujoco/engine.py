@@ -111,7 +111,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         if not isinstance(soft_friction, (bool, np.bool_)):
             raise InputError(f"soft_friction: expected True or False, got {shown(soft_friction)}")
         # Without friction there is nothing to hold.
-        self.soft_friction = bool(soft_friction) and model.needs.friction
+        self.soft_friction = bool(soft_friction) and "jump" in model.effects
         self.path = FRICTION_LOSS if self.soft_friction else MUJOCO
         super().__init__(model)
         self.softness = Softness.of(solref, solimp)
@@ -159,9 +159,10 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
 
     @cached_property
     def _torn_couplings(self) -> tuple[str, ...]:
-        """Names of the couplings whose armature MuJoCo leaves out of M between branches, from an evaluation of M."""
+        """Names of the couplings whose rotor MuJoCo leaves out of M between branches, from an evaluation of M."""
         layout, q = self.model.layout, self.model.neutral()
-        rows = {c.name: c.armature**0.5 * layout.coupling_row(c) @ layout.G for c in self.model.couplings if c.armature}
+        own = {c: c.rotors for c in self.model.couplings if c.rotors}
+        rows = {c.name: x**0.5 * layout.coupling_row(c) @ layout.G for c, x in own.items()}
         if not rows:
             return ()
         with self._lock:
@@ -241,7 +242,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             raise InputError(f"constraint_law: expected one state, got shapes {q.shape}, {v.shape}, {tau.shape}")
         pushed: Array = tau + self._elements.force(self, q, v) if self.model.forces else tau
         with self._lock, heard_warnings():
-            if self.model.needs.friction and not self.soft_friction:
+            if "jump" in self.model.effects and not self.soft_friction:
                 _, pushed = self._exact_friction(q, v, pushed, self._forward_dynamics)
             with self._with_loops():
                 b = self._set(q, v)
@@ -332,7 +333,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
         mujoco.mj_kinematics(self._m, self._d)
         mujoco.mj_comPos(self._m, self._d)
         if self._m.ntendon:
-            # Their armature is part of M.
+            # Their rotor is part of M.
             mujoco.mj_tendon(self._m, self._d)
         mujoco.mj_makeM(self._m, self._d)
         return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
@@ -462,7 +463,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
             For what MuJoCo does not hold: mimic joints, forces by functions and exact dry friction, and forces on a
             free joint's translation, which MuJoCo holds in world axes.
         """
-        MUJOCO_RUNS.admit(self.model.without("friction") if self.soft_friction else self.model)
+        MUJOCO_RUNS.admit(self.model.smooth if self.soft_friction else self.model)
         q0, v0 = self.model.check_q(q0, "q0"), self.model.check_v(v0, "v0")
         size = batch_of(q0=q0, v0=v0)
         if size is not None:

@@ -20,12 +20,14 @@ from mbkit._check import Array, by_key
 from mbkit.engines.imported import Beside, Imported, Parts, checked
 from mbkit.engines.mujoco.constraints import matrix_of
 from mbkit.engines.mujoco.engine import MujocoDynamics
-from mbkit.engines.mujoco.model import full_mass_matrix, heard_warnings, mapped
+from mbkit.engines.mujoco.model import INERTIA, full_mass_matrix, heard_warnings, mapped
 from mbkit.errors import UnsupportedError
+from mbkit.load.mjcf import JOINT_NUMBERS
 from mbkit.load.mjcf_couplings import with_couplings
 from mbkit.load.mjcf_equalities import coupled
 from mbkit.load.urdf_reader import BASE_JOINT
-from mbkit.model import Coupler, GravityCompensation, JointCoupling, Loop, Model, PointSpring
+from mbkit.model import Coupler, GravityCompensation, Joint, JointCoupling, Loop, Model, PointSpring
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.joint_types import kind_of
 
 _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
@@ -36,7 +38,7 @@ _ASLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 _MAX_NAMES: Final = 6
 #: Takes something out of a compiled model.
 _Removal = Callable[[Any], None]
-_OF_TENDON: Final = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", "armature")
+_OF_TENDON: Final = ("stiffness", "stiffnesspoly", "damping", "dampingpoly", INERTIA)
 
 
 def read(text: str, format_: str, floating_base: bool = False, files: dict[str, bytes] | None = None) -> Imported:
@@ -119,7 +121,7 @@ class _Read(MujocoDynamics):
             return out | {k: np.array([method(*x) for x in zip(q, v, strict=True)]) for k, method in pairs.items()}
 
     def _mass_matrix(self, q: Array) -> Array:
-        # With the transmission: actuators have armature.
+        # With the transmission: actuators have rotors.
         self._set(q)
         mujoco.mj_fwdPosition(self._m, self._d)
         return self._columns(self._columns(full_mass_matrix(self._m, self._d)).T)
@@ -143,12 +145,12 @@ def _constraints(m: Any) -> list[str]:
 
 
 def _rubbing(m: Any) -> Iterator[str]:
-    """Name the joints whose dry friction no description holds: their velocities are along moving axes."""
+    """Name the joints with jumps that no description holds: their velocities are along moving axes."""
     for j in range(m.njnt):
         type_ = kind_of(kind := _KINDS[int(m.jnt_type[j])])
         first = int(m.jnt_dofadr[j])
         if m.dof_frictionloss[first : first + type_.nv].any() and not type_.coordinate_velocities:
-            yield f"dry friction of {kind} joint {_called(m.joint(j), j)} is left out"
+            yield f"{EFFECTS['jump']} of {kind} joint {_called(m.joint(j), j)} is left out"
 
 
 def _extras(m: Any) -> Iterator[tuple[Beside, _Removal]]:
@@ -159,7 +161,7 @@ def _extras(m: Any) -> Iterator[tuple[Beside, _Removal]]:
             yield Beside(f"tendon {i}", "tendon", text), _zeroed(i, *(f"tendon_{name}" for name in _OF_TENDON))
     # An actuator may have several controls, which nu counts.
     for i in range(len(m.actuator_trntype)):
-        numbers = _numbers(m, "actuator", i, ("gear", "armature", "damping", "dampingpoly", "gainprm", "biasprm"))
+        numbers = _numbers(m, "actuator", i, ("gear", INERTIA, "damping", "dampingpoly", "gainprm", "biasprm"))
         text = f"actuator {_called(m.actuator(i), i)}{_driven(m, i)} has {numbers or 'no numbers'}"
         zeros = dict.fromkeys(("actuator_armature", "actuator_damping", "actuator_dampingpoly"), 0.0)
         silent = _assigned(i, actuator_forcelimited=1, actuator_forcerange=0.0, **zeros)
@@ -321,16 +323,16 @@ class _Description:
     def _joint(self, name: str, kind: str, parent: str, child: str, R: Array, p: Array, j: int) -> None:
         m, nv = self.m, kind_of(kind).nv
         v = slice(int(m.jnt_dofadr[j]), int(m.jnt_dofadr[j]) + nv) if j >= 0 else slice(0, 0)
-        numbers: dict[str, Any] = {"armature": np.array(m.dof_armature[v])}
-        if kind_of(kind).coordinate_velocities:
-            numbers["friction"] = np.array(m.dof_frictionloss[v])
-        if kind == "free" and numbers["armature"].any():
+        effects = ["T", *["jump"] * kind_of(kind).coordinate_velocities, *["loss"] * (not self._off("DAMPER"))]
+        fields = [x for effect in effects for x in Joint.adding_to(effect)]
+        numbers: dict[str, Any] = {x: np.array(getattr(m, f"dof_{JOINT_NUMBERS[x]}")[v]) for x in fields}
+        turning = Joint.adding_to("T")
+        if kind == "free" and any(numbers[x].any() for x in turning):
+            words = " and ".join(turning)
             raise UnsupportedError(
-                f"joint {name!r} is free and has armature, which mbkit.load reads as a body without weight; MuJoCo's "
-                "model has no such body to compare. Set the armature to 0; mbkit check compares the engines with it"
+                f"joint {name!r} is free and has {words}, which mbkit.load reads as a body without weight; MuJoCo's "
+                f"model has no such body to compare. Set the {words} to 0; mbkit check compares the engines with it"
             )
-        if not self._off("DAMPER"):
-            numbers["damping"] = np.array(m.dof_damping[v])
         if nv == 1:
             axis, ref = np.array(m.jnt_axis[j]), float(m.qpos0[m.jnt_qposadr[j]])
             numbers["axes"] = axis[None, :]

@@ -15,9 +15,11 @@ from mbkit._check import Array
 from mbkit._escape import xml_attribute, xml_comment
 from mbkit.engines.mujoco.constraints import OF_JOINTS, OF_TENDON
 from mbkit.engines.mujoco.engine import MujocoDynamics
-from mbkit.engines.mujoco.model import MUJOCO, Placed, by_mbkit, heard_warnings, mapped, specified
+from mbkit.engines.mujoco.model import INERTIA, MUJOCO, OF_COUPLING, Placed, by_mbkit, heard_warnings, mapped, specified
 from mbkit.errors import MbkitError, UnsupportedError
+from mbkit.load.mjcf import JOINT_NUMBERS
 from mbkit.model import Joint, Model
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
 
 _TYPES: Final = {
@@ -26,7 +28,6 @@ _TYPES: Final = {
     int(mujoco.mjtJoint.mjJNT_BALL): "ball",
     int(mujoco.mjtJoint.mjJNT_FREE): "free",
 }
-_OF_COUPLING: Final = ("stiffness", "damping", "armature")
 # MuJoCo refuses principal moments below 1e-15 kg m².
 _LEAST: Final = 2e-15
 
@@ -40,8 +41,8 @@ def _numbers_not_held(model: Model) -> Iterator[str]:
         elif joint.kind == "free" and joint.parent == "world" and np.ptp(joint.damping) > 0:
             yield f"joint {joint.name!r} is damped differently in turning and in moving"
     for coupling in model.couplings:
-        if coupling.armature and model.branched(coupling):
-            yield f"coupling {coupling.name!r} has armature between branches, which MuJoCo leaves out of M"
+        if coupling.rotors and model.branched(coupling):
+            yield f"coupling {coupling.name!r} has {INERTIA} between branches, which MuJoCo leaves out of M"
     yield from (f"{force}, which is no spring and no weight of MuJoCo's" for force in by_mbkit(model))
     yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
 
@@ -55,7 +56,7 @@ MJCF: Final = Path(
         "mimic": "mimic joints are free joints with equality constraints, which MuJoCo keeps softly",
         "row": "loops are equality constraints, which MuJoCo keeps softly",
         "joint.limit": "MuJoCo acts on joint limits, softly, which mbkit's terms leave out",
-        "joint.friction": "MuJoCo's dry friction is soft; mbkit's holds exactly at rest",
+        "jump": f"MuJoCo's {EFFECTS['jump']} is soft; mbkit's holds exactly at rest",
         "joint.velocity_limit": "MJCF has no velocity limits",
     },
     also=_numbers_not_held,
@@ -142,9 +143,8 @@ def _joint(joint: Any, owner: Joint) -> str:
     kind = _TYPES[int(joint.type)]
     attributes: dict[str, Any] = {"name": joint.name, "type": kind}
     if kind in ("hinge", "slide"):
-        attributes |= {"pos": joint.pos, "axis": joint.axis, **_numbers(joint, "stiffness", "damping")}
+        attributes |= {"pos": joint.pos, "axis": joint.axis, **_numbers(joint, *JOINT_NUMBERS.values())}
         attributes["springref"] = joint.springref if attributes["stiffness"] else None
-        attributes |= _numbers(joint, "armature", "frictionloss")
         # 2 is MuJoCo's "as the range says".
         if int(joint.limited) == 1:
             attributes |= {"limited": "true", "range": joint.range}
@@ -153,7 +153,8 @@ def _joint(joint: Any, owner: Joint) -> str:
             attributes |= {"actuatorfrclimited": "true", "actuatorfrcrange": (-effort, effort)}
     else:
         attributes |= {"pos": joint.pos} if kind == "ball" else {}
-        attributes |= {"damping": owner.damping[-1] or None, "armature": owner.armature[-1] or None}
+        fields = Joint.adding_to("loss") + Joint.adding_to("T")
+        attributes |= {JOINT_NUMBERS[x]: getattr(owner, x)[-1] or None for x in fields}
         attributes |= _numbers(joint, "stiffness")
     attributes["actuatorgravcomp"] = "true" if joint.actgravcomp else None
     return _attributes(**attributes)
@@ -169,7 +170,7 @@ def _tendons(spec: Any, model: Model) -> Iterator[str]:
         yield "  <tendon>"
     for k, tendon in enumerate(spec.tendons):
         between_points = k < len(model.springs)
-        tag, names = ("spatial", ("stiffness", "damping")) if between_points else ("fixed", _OF_COUPLING)
+        tag, names = ("spatial", ("stiffness", "damping")) if between_points else ("fixed", OF_COUPLING)
         numbers = _numbers(tendon, *names)
         rest = tendon.springlength[0] if between_points or numbers["stiffness"] else None
         yield f"    <{tag}{_attributes(name=tendon.name, springlength=rest, **numbers)}>"

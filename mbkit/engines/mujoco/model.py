@@ -20,10 +20,12 @@ from mbkit._check import Array, by_key
 from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, SOLVED, STACKS
 from mbkit.engines.mujoco.constraints import EQUALITIES, OF_JOINTS, OF_TENDON, Softness, matrix_of, wxyz
 from mbkit.errors import MbkitError, UnsupportedError
+from mbkit.load.mjcf import JOINT_NUMBERS
 from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Bushing, GravityCompensation, Joint, Model
-from mbkit.model.elements.kinds import joint_types
+from mbkit.model.elements.kinds import EFFECTS, joint_types
 from mbkit.model.elements.paths import Path
+from mbkit.model.parts import JointCoupling, rules_of
 from mbkit.model.validation import static_bodies
 
 if TYPE_CHECKING:
@@ -71,6 +73,9 @@ _STACKABLE: Final = tuple(STACKS)
 # MuJoCo's compiler refuses principal moments below this (mjMINVAL).
 _SMALLEST: Final = 1e-15
 _OPEN: Final = 1e10
+#: Numbers of a coupling that a tendon has by the same name, its inertia among them.
+OF_COUPLING: Final = tuple(name for name, rule in rules_of(JointCoupling).items() if rule.does)
+(INERTIA,) = JointCoupling.adding_to("T")
 
 
 @dataclass
@@ -181,7 +186,7 @@ def specified(
 _OFF: Final = {
     "contacts": "CONTACT",
     "joint limits": "LIMIT",
-    "dry friction": "FRICTIONLOSS",
+    EFFECTS["jump"]: "FRICTIONLOSS",
     "equality constraints": "EQUALITY",
     "constraint solver": "CONSTRAINT",
     "actuators": "ACTUATION",
@@ -393,13 +398,20 @@ def _add_joint(new: Any, joint: Joint, R: Array, p: Array, placed: Placed, at_or
         names.append(joint.name + suffix)
         j = new.add_joint(name=names[-1], type=type_, axis=R @ axis, pos=p)
         if type_ in (_HINGE, _SLIDE):
-            j.stiffness[0], j.springref = joint.stiffness[k], joint.rest[k]
-            j.damping[0], j.frictionloss = joint.damping[k], joint.friction[k]
-            j.armature = joint.armature[k]
+            for field, name in JOINT_NUMBERS.items():
+                _set(j, name, getattr(joint, field)[k])
             low, high = float(joint.lower[k]), float(joint.upper[k])
             if np.isfinite([low, high]).any() and low < high:
                 # MuJoCo has no open end; this one is never reached.
                 j.limited, j.range = 1, [max(low, -_OPEN), min(high, _OPEN)]
+
+
+def _set(element: Any, name: str, number: float) -> None:
+    """Set a number of an element, the first where its attribute is a polynomial."""
+    if np.ndim(held := getattr(element, name)):
+        held[0] = number
+    else:
+        setattr(element, name, number)
 
 
 def _add_springs(spec: Any, description: Model, placed: Placed) -> None:
@@ -422,9 +434,9 @@ def _add_couplings(spec: Any, description: Model, placed: Placed) -> None:
         sign = -1.0 if coupling.rest_length == -1.0 else 1.0
         for joint, factor in zip(coupling.joints, coupling.factors, strict=True):
             tendon.wrap_joint(placed.joints[joint][0], sign * float(factor))
-        tendon.stiffness[0], tendon.damping[0] = coupling.stiffness, coupling.damping
         tendon.springlength = [sign * coupling.rest_length] * 2
-        tendon.armature = coupling.armature
+        for name in OF_COUPLING:
+            _set(tendon, name, getattr(coupling, name))
 
 
 def _add_loops(spec: Any, description: Model, placed: Placed, softness: Softness) -> None:
@@ -482,7 +494,8 @@ def _set_constants(model: Any, description: Model, placed: Placed) -> None:
     for joint in description.joints:
         if joint.kind in ("ball", "free"):
             adr = _addresses(model, placed.joints[joint.name])[1]
-            model.dof_damping[adr], model.dof_armature[adr] = joint.damping, joint.armature
+            for field in Joint.adding_to("loss") + Joint.adding_to("T"):
+                getattr(model, f"dof_{JOINT_NUMBERS[field]}")[adr] = getattr(joint, field)
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 

@@ -2,7 +2,7 @@
 
 `pinocchio.constraintDynamics` gives the accelerations where it can: every loop is a "point" or a "frame", nothing is
 moved in time, nothing rolls, as its constraints hold positions, no coupler holds joints, no joint mimics another, no
-coupling has an armature, and no row is redundant but those of a plane that does not move. It factors J M⁻¹ Jᵀ + μ and
+coupling has a rotor, and no row is redundant but those of a plane that does not move. It factors J M⁻¹ Jᵀ + μ and
 iterates (Carpentier, Budhiraja and Mansard 2021, Proximal and sparse resolution of constrained dynamic equations).
 Elsewhere the equation
 

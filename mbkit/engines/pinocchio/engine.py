@@ -31,7 +31,7 @@ from mbkit.engines.pinocchio.model import (
     build,
 )
 from mbkit.engines.pinocchio.regressors import PinRegressors
-from mbkit.engines.regressors import with_losses
+from mbkit.engines.regressors import with_joints
 from mbkit.model import Model
 from mbkit.model.base_parameters import RegressorColumns
 from mbkit.model.manifold import NEAR_UNIT
@@ -169,7 +169,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         self._Gt = np.ascontiguousarray(self._G.T)
         self._placements: dict[str, tuple[int, pin.SE3]] = {}
         if model.constrained:
-            rotors = self._joint_passive.armature is not None
+            rotors = self._joint_passive.rotors is not None
             self._held = PinConstraints(model, self._pin, None if self._direct else self._G, rotors)
         # A class that derives from this one may have methods of its own.
         if type(self) is PinocchioDynamics:
@@ -207,10 +207,10 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
                 if not (needs.springs or self.model.springs or self.model.couplings):
                     bare["inverse_dynamics"] = lambda q, v, a: rnea(q, v, a) + damping * v
                     bare["forward_dynamics"] = lambda q, v, tau: aba(q, v, tau - damping * v)
-            if self._joint_passive.armature is not None:
+            if self._joint_passive.rotors is not None:
                 own = {name: own[name] for name in ("gravity", "nle")}
             bare |= own
-        if self.model.forces or needs.friction:
+        if self.model.forces or "jump" in self.model.effects:
             # They are added the checked way.
             del bare["inverse_dynamics"], bare["forward_dynamics"]
         elif self.model.constrained:
@@ -267,11 +267,11 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
 
     def _full_mass_matrix(self, q: Array) -> Array:
         M: Array = pin.crba(self._m, self._d, q)
-        rotors = self._joint_passive.armature
+        rotors = self._joint_passive.rotors
         return M if rotors is None else M + rotors
 
     def _mass_matrix_inverse(self, q: Array) -> Array:
-        if self._reduced or self._joint_passive.armature is not None:
+        if self._reduced or self._joint_passive.rotors is not None:
             return super()._mass_matrix_inverse(q)
         return self._matrix(pin.computeMinverse(self._m, self._d, self._full_q(q)))
 
@@ -283,7 +283,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
 
     def _inverse_dynamics(self, q: Array, v: Array, a: Array, *acting: Any) -> Array:
         q, v = self._full_q(q), self._full_v(v)
-        a, rotors = self._full_v(a), self._joint_passive.armature
+        a, rotors = self._full_v(a), self._joint_passive.rotors
         out: Array = pin.rnea(self._m, self._d, q, v, a, *self._outside(q, *acting))
         out -= self._full_passive(q, v)
         if rotors is not None:
@@ -293,7 +293,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
     def _forward_dynamics(self, q: Array, v: Array, tau: Array, *acting: Any) -> Array:
         if self.model.constrained:
             return self._constrained_motion(q, v, tau + self._generalized_force(q, *acting) if acting else tau)
-        if self._reduced or self._joint_passive.armature is not None:
+        if self._reduced or self._joint_passive.rotors is not None:
             # ABA knows neither mimic joints nor rotors between joints.
             return self._solved_motion(q, v, tau, *acting)
         q, v = self._full_q(q), self._full_v(v)
@@ -320,12 +320,12 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         q, v, a = self._full_q(q), self._full_v(v), self._full_v(a)
         by_q, by_v, M = pin.computeRNEADerivatives(self._m, self._d, q, v, a)
         by_q, by_v = by_q + passive.stiffness_matrix, by_v + passive.damping_matrix
-        M = M if passive.armature is None else M + passive.armature
+        M = M if passive.rotors is None else M + passive.rotors
         return np.stack([self._matrix(x) for x in (by_q, by_v, M)])
 
     def _forward_dynamics_derivatives(self, q: Array, v: Array, tau: Array) -> Array:
         passive = self._joint_passive
-        if self._reduced or passive.armature is not None:
+        if self._reduced or passive.rotors is not None:
             return super()._forward_dynamics_derivatives(q, v, tau)
         q, v = self._full_q(q), self._full_v(v)
         force = self._full_v(tau) + passive.force(q, v)
@@ -337,7 +337,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         return self._matrix(pin.computeCoriolisMatrix(self._m, self._d, self._full_q(q), self._full_v(v)))
 
     def _kinetic_energy(self, q: Array, v: Array) -> Any:
-        q, v, rotors = self._full_q(q), self._full_v(v), self._joint_passive.armature
+        q, v, rotors = self._full_q(q), self._full_v(v), self._joint_passive.rotors
         own = pin.computeKineticEnergy(self._m, self._d, q, v)
         return own if rotors is None else own + 0.5 * float(v @ rotors @ v)
 
@@ -355,15 +355,15 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
 
     def _regressor(self, q: Array, v: Array, a: Array, columns: RegressorColumns) -> Array:
         Y = self._regressors.torques(self._full_q(q), self._full_v(v), self._full_v(a))
-        return with_losses(self._reduced_rows(Y), columns, v, a)
+        return with_joints(self._reduced_rows(Y), columns, v, a)
 
     def _momentum_regressor(self, q: Array, v: Array, columns: RegressorColumns) -> Array:
         Y = self._regressors.momentum(self._full_q(q), self._full_v(v))
-        return with_losses(self._reduced_rows(Y), columns, v, v)
+        return with_joints(self._reduced_rows(Y), columns, v, v)
 
     def _energy_regressor(self, q: Array, v: Array, columns: RegressorColumns) -> Array:
         Y = self._regressors.energies(self._full_q(q), self._full_v(v))[:, list(columns.bodies)]
-        rotors = 0.5 * v[list(columns.rotors)] ** 2
+        rotors = np.concatenate([np.zeros(0), *(0.5 * x[which] ** 2 for x, which in columns.of_rates(T=v))])
         return np.hstack([Y, np.vstack([rotors, 0.0 * rotors])])
 
     def _reduced_rows(self, Y: Array) -> Array:

@@ -17,6 +17,7 @@ import pinocchio as pin
 from mbkit._check import Array
 from mbkit.engines.base import OF_COUPLINGS, OF_TREES, SOLVED
 from mbkit.engines.elements.passive import pull
+from mbkit.load.urdf import OF_VELOCITIES
 from mbkit.model import Body, Joint, Model, PointSpring
 from mbkit.model.elements.kinds import joint_types
 from mbkit.model.elements.paths import Path
@@ -60,9 +61,10 @@ def build(description: Model) -> PinModel:
                 carrier = model.addJoint(carrier, motion, pin.SE3(R, p), joint.name + suffix)
                 R, p = np.eye(3), np.zeros(3)
             first = model.joints[carrier].idx_v + model.joints[carrier].nv - joint.type.nv
-            armature = np.array(model.armature)
-            armature[first : first + joint.type.nv] = joint.armature
-            model.armature = armature
+            for name in Joint.adding_to("T"):
+                numbers = np.array(getattr(model, OF_VELOCITIES[name]))
+                numbers[first : first + joint.type.nv] = getattr(joint, name)
+                setattr(model, OF_VELOCITIES[name], numbers)
         bodies[joint.child] = (carrier, R, p)
         body = description.body(joint.child)
         if carrier:

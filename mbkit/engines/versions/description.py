@@ -92,7 +92,8 @@ def travelling(steps: Steps | None, model: Model) -> tuple[dict[str, Any], dict[
                 "child": joint.child,
                 "rotation": joint.rotation.tolist(),
                 "translation": joint.translation.tolist(),
-                **{name: getattr(joint, name).tolist() for name in ("armature", "damping", "stiffness", "rest")},
+                **{name: getattr(joint, name).tolist() for name in ("damping", "stiffness", "rest")},
+                "rotors": joint.rotors.tolist(),
                 "steps": [{**step, "type": _plain_type(step["type"])} for step in steps[joint.kind](joint)],
             }
             for joint in model.tree
@@ -109,8 +110,8 @@ def _mjcf(model: Model) -> tuple[dict[str, Any], dict[str, Sequence[str]]]:
     from mbkit.engines.mujoco.mjcf_writer import mjcf_text
     from mbkit.engines.mujoco.model import specified
 
-    # `Dynamics` adds these to an engine's own terms, also what holds the weight of armature.
-    model = model.without("forces", "friction")
+    # `Dynamics` adds these to an engine's own terms, also what holds the weight of rotors.
+    model = model.smooth.without("forces")
     model = replace(model, forces=(), bindings=tuple(b for b in model.bindings if b.where != "forces"))
     text = mjcf_text(model, "for another version")
     return {"text": text}, {name: tuple(own) for name, own in specified(model)[1].joints.items()}

@@ -85,7 +85,7 @@ class VersionDynamics(MappedDynamics):
         self._springs = JointPassive(self.model, *orders)
         #: What the engine does not know of.
         self._beside = None if "passive" in gives else self._springs
-        rotors = None if self._beside is None else self._beside.armature
+        rotors = None if self._beside is None else self._beside.rotors
         self._rotors = None if rotors is None else layout.G.T @ rotors @ layout.G
         self._ends = {
             s: tuple(Frame(s.name, b, np.eye(3), p) for b, p in ((s.body_a, s.point_a), (s.body_b, s.point_b)))

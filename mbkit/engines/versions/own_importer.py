@@ -17,8 +17,10 @@ from mbkit.engines.versions.dynamics import VersionDynamics
 from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion
 from mbkit.engines.versions.process import RemoteError, new_key, process_of
 from mbkit.errors import UnsupportedError
-from mbkit.model import Coupler, Model
+from mbkit.model import Coupler, Joint, Model
 
+#: Fields of joints that have another name on the way.
+_FIELDS: Final = {"rotors": Joint.adding_to("T")[0]}
 #: The file in `remote` of engines that take MuJoCo's model.
 _MUJOCO: Final = "mujoco_importer"
 
@@ -140,7 +142,10 @@ def _model(name: str, said: Mapping[str, Any]) -> Model:
         parts.body(body, mass, np.array(com), np.array(inertia))
     for (joint, kind, parent, child, R, p), numbers in said["joints"]:
         # None stands for no limit.
-        values = {k: np.array([_SIGN.get(k, 1.0) * np.inf if y is None else y for y in x]) for k, x in numbers.items()}
+        values = {
+            _FIELDS.get(k, k): np.array([_SIGN.get(k, 1.0) * np.inf if y is None else y for y in x])
+            for k, x in numbers.items()
+        }
         if kind == "revolute" and np.isinf(values["lower"]).all() and np.isinf(values["upper"]).all():
             kind = "continuous"
         parts.joint(joint, kind, parent, child, np.array(R), np.array(p), **values)

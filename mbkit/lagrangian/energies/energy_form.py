@@ -191,7 +191,7 @@ class EnergyForm:
 
     @cached_property
     def jumps(self) -> tuple[str, ...]:
-        """Forces that jump where a velocity changes its sign, as dry friction does, by name."""
+        """Forces that jump where a velocity changes its sign, by name."""
         out = []
         for name, x in _parts(self).items():
             kind, at_zero = (sp.Abs, 0) if name == "dissipation" else (sp.sign, 1)
@@ -281,7 +281,7 @@ def acting_forces(form: EnergyForm) -> list[sp.Expr]:
     """Return the generalized forces beside V's: forces, inputs and dissipation, one a coordinate."""
     # Not from the equations of motion, whose Christoffel symbols are long.
     named = zip(form.coordinates, gradient(form.dissipation, form.velocities), form.forces, strict=True)
-    return [tidy(x + form.inputs.get(q, sp.Integer(0)) - friction) for q, friction, x in named]
+    return [tidy(x + form.inputs.get(q, sp.Integer(0)) - loss) for q, loss, x in named]
 
 
 def timed_parameters(form: EnergyForm) -> tuple[sp.Symbol, ...]:

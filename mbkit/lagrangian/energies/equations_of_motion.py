@@ -195,9 +195,9 @@ def equations_of_motion(system: EnergyForm, *, coriolis: bool = True) -> Equatio
         drift += (curl - curl.T) * v - sp.Matrix(gradient(k.T0, q))
     if t is not None:
         drift += sp.diff(k.M, t) * v + sp.diff(k.b, t)
-    friction = gradient(system.dissipation, system.velocities)
+    losses = gradient(system.dissipation, system.velocities)
     inputs = [system.inputs.get(x, sp.Integer(0)) for x in q]
-    forces = sp.Matrix(system.forces) + sp.Matrix(inputs) - sp.Matrix(friction)
+    forces = sp.Matrix(system.forces) + sp.Matrix(inputs) - sp.Matrix(losses)
     return EquationsOfMotion(
         coordinates=q,
         velocities=system.velocities,

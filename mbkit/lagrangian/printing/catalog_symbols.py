@@ -65,7 +65,7 @@ def in_symbols(model: Model) -> Model | None:
             if all(np.allclose(x, y, rtol=_SAME, atol=_SAME * float(np.abs(y).max(initial=0.0))) for x, y in pairs):
                 zeros = {name: 0.0 for name, x in values.items() if x == 0.0}
                 named = moved.with_parameters(**zeros) if zeros else moved
-                # What the catalog's system does not have, such as forces and friction, is the model's own.
+                # What the catalog's system does not have, such as forces, is the model's own.
                 return replace(model, bindings=tuple(b for b in named.bindings if b.where != "frames"))
             return None
     return None
@@ -132,7 +132,7 @@ def _content(model: Model) -> tuple[list[Any], list[Any]]:
     for where in ("bodies", "joints", "springs", "couplings", "loops"):
         for part in getattr(model, where):
             held, rules = {f.name: getattr(part, f.name) for f in fields(part)}, rules_of(type(part))
-            # Data and dry friction are those of the model.
+            # Data and what jumps are those of the model.
             numbers += [held[f] for f, rule in rules.items() if rule.direction or not rule.fixed]
             names += [(where, f, x) for f, x in held.items() if f not in rules]
     return names, numbers

@@ -79,7 +79,7 @@ def quasi_equations(system: EnergyForm, quasi: QuasiVelocities) -> QuasiEquation
         drift += transport.T * (k.M * v + k.b)
     if quasi.moves or system.time is not None:
         drift += quasi.transported(k.M) * v + quasi.transported(k.b)
-    friction = sp.Matrix(gradient(system.dissipation, w))
+    losses = sp.Matrix(gradient(system.dissipation, w))
     return QuasiEquationsOfMotion(
         coordinates=system.coordinates,
         velocities=w,
@@ -88,7 +88,7 @@ def quasi_equations(system: EnergyForm, quasi: QuasiVelocities) -> QuasiEquation
         coriolis_matrix=_coriolis_matrix(system, quasi),
         drift=tidy_matrix(drift),
         potential_gradient=tidy_matrix(_along(quasi, system.V)),
-        forces=tidy_matrix(sp.Matrix(system.forces) + quasi.input_forces - friction),
+        forces=tidy_matrix(sp.Matrix(system.forces) + quasi.input_forces - losses),
         **constraint_fields(system, quasi.D * v + quasi.drift),
         D=quasi.D,
         rates=quasi.rates,

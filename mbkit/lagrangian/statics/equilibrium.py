@@ -26,6 +26,7 @@ from mbkit.errors import InputError, NumericalError, UnknownNameError
 from mbkit.lagrangian.system import Lagrangian
 from mbkit.methods.small_motions import SmallMotion, small_motion
 from mbkit.model import Model
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.parts import read_only
 
@@ -60,7 +61,7 @@ EQUILIBRIUM: Final = Path(
     "equilibrium",
     "equilibrium: not known of",
     ALL,
-    notes={"jump": "dry friction, which holds a range of configurations, is left out"},
+    notes={"jump": f"{EFFECTS['jump']}, which holds a range of configurations, is left out"},
     also=_driven,
 )
 
@@ -177,7 +178,7 @@ def equilibrium(
     equilibrium, not all. Stability is that of M δq̈ + D δq̇ + K δq = 0 on what constraints leave free. Where K is
     symmetric and D feeds no energy in, K's sign decides (Lagrange and Dirichlet, Kelvin and Tait); else the
     eigenvalues do. Each has a bound of its error from the rounding of M, D and K, entry by entry, whatever their units;
-    what the bound does not decide is None. `Equilibrium.notes` tell what is left out, such as dry friction.
+    what the bound does not decide is None. `Equilibrium.notes` tell what is left out, such as forces that jump.
 
     Examples
     --------
@@ -319,7 +320,7 @@ class _Balance:
         """Return ∂(inverse dynamics)/∂v at rest."""
         if isinstance(self.dyn, LagrangianDynamics):
             return np.asarray(self.dyn.inverse_dynamics_derivatives(q, self._zero, self._zero).v)
-        # Of a quadratic differences are exact, and those of two speeds leave out the jump of dry friction.
+        # Of a quadratic differences are exact, and those of two speeds leave out what jumps.
         change = (
             np.array([self.dyn.inverse_dynamics(q, s * e, self._zero) for s in (2, -2, 1, -1)]) for e in self._unit
         )

@@ -10,7 +10,7 @@ falls from s to f at once.) A joint that mimics another has its own friction, wh
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.model.elements.forces import JointForce
-from mbkit.model.elements.formula import Formula, Operation
+from mbkit.model.elements.formula import written
 from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Parameter
 from mbkit.model.parts import RESTING, Joint
 
+#: The number that holds what rests.
+_ROTOR: Final = Joint.adding_to("T")[0]
 #: A force at rest is above its bound where it is so by more than this part, as rounding of its sums may be.
 ROUNDING: Final = 1e-13
 
@@ -104,14 +106,9 @@ class DryFrictionLaw:
         return np.asarray((v == 0) & (self.bound > 0), dtype=np.bool_)
 
 
-def names_of(model: Model) -> list[str]:
-    """Return the names of the velocities with friction, each that of its joint or a numbered one."""
-    return [j.name if j.type.nv == 1 else f"{j.name} {k}" for j in model.independent_joints for k in range(j.type.nv)]
-
-
 def held_at_rest(model: Model) -> str:
     """Return in words what f sign(v) leaves out at rest; empty without dry friction."""
-    bounds = zip(names_of(model), DryFrictionLaw(model).bound, strict=True)
+    bounds = zip(model.velocity_names, DryFrictionLaw(model).bound, strict=True)
     held = " and ".join(f"{bound:g} at {name!r}" for name, bound in bounds if bound)
     return f"dry friction is f sign(v): zero at rest, where it can hold up to {held} (N or N m)" if held else ""
 
@@ -119,13 +116,13 @@ def held_at_rest(model: Model) -> str:
 class Sliding:
     """The model whose joints slide one way or rest, as parameters say, and these parameters' values.
 
-    Friction is a force with a given sign there, smooth through rest; a joint that rests has an armature that nothing
+    Friction is a force with a given sign there, smooth through rest; a joint that rests has a rotor that nothing
     moves. So each phase between two changes is an ordinary smooth system, of one derivation.
     """
 
     def __init__(self, model: Model) -> None:
         self.law = DryFrictionLaw(model)
-        self.names = names_of(model)
+        self.names = model.velocity_names
         #: Independent velocities with friction.
         self.which = np.flatnonzero(self.law.bound > 0)
         self.sides = {int(i): f"friction side of {self.names[i]}" for i in self.which}
@@ -164,14 +161,14 @@ class Sliding:
             bindings += [
                 Binding("forces", name, "numbers", (k,), Parameter(self.sides[int(rows[k])], 0.0)) for k in own
             ]
-        bound = {(b.part, b.index): b for b in model.bindings if b.where == "joints" and b.field == "armature"}
+        bound = {(b.part, b.index): b for b in model.bindings if b.where == "joints" and b.field == _ROTOR}
         of = [(joint, k) for joint in model.independent_joints for k in range(joint.type.nv)]
         for i, lock in self.locks.items():
             joint, k = of[i]
             held = bound.pop((joint.name, (k,)), None)
-            own_number: Any = float(joint.armature[k]) if held is None else held.expression
-            bindings.append(Binding("joints", joint.name, "armature", (k,), Parameter(lock, 0.0) + own_number))
-        kept = [b for b in model.bindings if not (b.where == "joints" and b.field == "armature")]
+            own_number: Any = float(getattr(joint, _ROTOR)[k]) if held is None else held.expression
+            bindings.append(Binding("joints", joint.name, _ROTOR, (k,), Parameter(lock, 0.0) + own_number))
+        kept = [b for b in model.bindings if not (b.where == "joints" and b.field == _ROTOR)]
         with unchecked():
             return replace(
                 model,
@@ -187,22 +184,13 @@ def _force(name: str, joint: Joint, numbers: FrictionNumbers, signs: Sequence[fl
     sides = tuple("side" if n == 1 else f"side_{k}" for k in range(n))
     speeds = tuple("v" if n == 1 else f"v_{k}" for k in range(n))
     curved = bool((numbers.stribeck > 0).any())
-    arguments = (*sides, *(speeds if curved else ()))
-    operations: list[Operation] = [("input", (k,), 0.0) for k in range(len(arguments))]
 
-    def add(operation: str, *operands: int, value: float = 0.0) -> int:
-        operations.append((operation, operands, value))
-        return len(operations) - 1
-
-    def results() -> Iterator[int]:
+    def law(*given: Any) -> tuple[Any, ...]:
+        out = []
         for k, (f, s, w) in enumerate(zip(*(x.tolist() for x in numbers), strict=True)):
-            size = add("const", value=-signs[k] * f)
-            if w > 0:
-                square = add("sq", add("mul", n + k, add("const", value=1.0 / w)))
-                fall = add("exp", add("neg", square))
-                size = add("add", size, add("mul", add("const", value=-signs[k] * (s - f)), fall))
-            yield add("mul", k, size)
+            fall = (s - f) * (-((given[n + k] * (1.0 / w)) ** 2)).exp() if w > 0 else 0.0
+            out.append(given[k] * (-signs[k] * (f + fall)))
+        return tuple(out)
 
-    outputs = tuple(results())
-    formula = Formula(arguments, tuple(operations), outputs)
+    formula = written(law, *sides, *(speeds if curved else ()))
     return JointForce(name, joint.name, formula, None, sides, np.zeros(n))

@@ -137,7 +137,7 @@ def _entries(
             if i <= k or not symmetric:
                 end = names[i] + names[k] if field == "inertia" else names[i] if i == k else f"{names[i]}.{names[k]}"
                 yield end, ((i, k), (k, i)) if symmetric and i != k else ((i, k),)
-    elif field == "armature" and value.ndim and part.type.quaternion is not None:
+    elif rule.does == "T" and value.ndim and part.type.quaternion is not None:
         # A rotor has the same inertia about every axis there.
         yield "", tuple((i,) for i in range(len(value)))
     elif value.ndim:

@@ -143,7 +143,7 @@ class Variants:
 
 
 def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, seed: int = 0) -> Variants:
-    """Draw variants of a model: other masses, inertias, dampers, payloads, gravity; dry friction does not vary.
+    """Draw variants of a model: other masses, inertias, dampers, payloads, gravity; what takes no parameter stays.
 
     Parameters
     ----------

@@ -78,6 +78,10 @@ class _Recorded:
     def __neg__(self) -> _Recorded:
         return self._new("neg", self.place)
 
+    def exp(self) -> _Recorded:
+        """Return e to this power."""
+        return self._new("exp", self.place)
+
     def __pow__(self, n: int) -> _Recorded:
         if not (isinstance(n, int) and n > 0):
             raise InputError(f"power: expected a whole number above zero in a law that is written down, got {n!r}")

@@ -7,7 +7,7 @@ Joint types are kinds by themselves, such as ``"joint_type.revolute"``; so are t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from types import MappingProxyType
 from typing import Any, Final
@@ -26,10 +26,46 @@ from mbkit.model.rolling import NO_SLIP_ROWS
 #: A `mbkit.model.description.Description`, a floor above.
 _Model = Any
 _Test = Callable[[_Model, Any], bool]
-#: Effects of a kind: coordinates, kinetic and potential energy, dissipation of a rate, a force that jumps with a
-#: velocity's sign, another force, a row of positions or of velocities, a limit that is data, dependence on the time.
-EFFECTS: Final = ("q", "T", "V", "loss", "jump", "force", "row", "speed", "bound", "t")
+#: Effects of a kind, each with a word: coordinates, kinetic and potential energy, dissipation of a rate, a force that
+#: jumps with a velocity's sign, another force, a row of positions or of velocities, a limit that is data, the time.
+EFFECTS: Final[Mapping[str, str]] = MappingProxyType(
+    {"q": "coordinates", "T": "rotors", "V": "springs and weights", "loss": "damping", "jump": "dry friction"}
+    | {"force": "forces", "row": "constraints", "speed": "velocity constraints", "bound": "limits"}
+    | {"t": "terms that depend on the time"}
+)
 _OF_TYPES: Final = "joint_type."
+
+
+@dataclass(frozen=True)
+class Needs:
+    """One flag per feature; True where the description has it.
+
+    Limits are data, off in every engine. `forces` are those given by functions and what holds weights; their
+    parts do not count as springs and dampers.
+    """
+
+    gravity: bool
+    springs: bool
+    damping: bool
+    armature: bool
+    friction: bool
+    limits: bool
+    effort_limits: bool
+    mimic: bool
+    loops: bool
+    quaternions: bool
+    time: bool
+    forces: bool = False
+    no_slip: bool = False
+
+    def as_dict(self) -> dict[str, bool]:
+        """Return the flags by name."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        there, absent = ([k for k, x in self.as_dict().items() if x is on] for on in (True, False))
+        there = [EFFECTS["jump"] if name == "friction" else name for name in there]
+        return f"has {', '.join(there) or 'nothing'}; without {', '.join(absent) or 'nothing'}"
 
 
 @dataclass(frozen=True)
@@ -43,6 +79,11 @@ class Kind:
     numbers: frozenset[str]
     features: tuple[str, ...]
     at: _Test
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """All that it does, also by what another kind does."""
+        return frozenset(y for x in self.does for y in ((x,) if x in EFFECTS else PART_KINDS[x].effects))
 
     def parts(self, model: _Model) -> tuple[Any, ...]:
         """Return the parts of a model that are of this kind."""
@@ -108,7 +149,7 @@ def register_kind(
     if name in PART_KINDS or name.startswith(_OF_TYPES):
         raise InputError(f"kind {name!r}: expected a name that no other kind has")
     if section not in ("", *KINDS_OF_PARTS) or not {*does.split()} <= {*EFFECTS, *PART_KINDS}:
-        expected = f"a section of {KINDS_OF_PARTS} and effects of {EFFECTS}, or kinds"
+        expected = f"a section of {KINDS_OF_PARTS} and effects of {tuple(EFFECTS)}, or kinds"
         raise InputError(f"kind {name!r}: expected {expected}, got {section!r} and {does!r}")
     sets = frozenset(does.split()), frozenset(numbers.split()), tuple(features.split())
     PART_KINDS[name] = Kind(name, section, words, *sets, at or has(section, *numbers.split()))
@@ -139,6 +180,11 @@ def acts(model: _Model) -> Mapping[str, tuple[str, ...]]:
     """Return the kinds that act in a model by name, each with the names of its parts."""
     kinds = (*PART_KINDS.values(), *map(_of_joint_type, dict.fromkeys(j.kind for j in model.joints)))
     return MappingProxyType({k.name: names for k in kinds if (names := tuple(p.name for p in k.parts(model)))})
+
+
+def that_do(effect: str) -> tuple[str, ...]:
+    """Return the names of the kinds that have an effect, as `Model.without` takes them."""
+    return tuple(k.name for k in PART_KINDS.values() if k.features and effect in k.effects)
 
 
 def unregistered(model: _Model) -> Iterator[str]:
@@ -187,7 +233,7 @@ register_kind("", "energies", "{p.name} was written as energies and has no bodie
 _WRITTEN = (
     ("row", "loops", "constraints: constraints[0] is {p.form.constraints[0]!s:.80}"),
     ("speed", "no_slip", "velocity constraints: velocity_constraints[0] is {p.form.velocity_constraints[0]!s:.80}"),
-    ("t", "time", "terms that depend on the time"),
+    ("t", "time", EFFECTS["t"]),
 )
 for _does, _need, _what in _WRITTEN:
     register_kind("", f"written.{_does}", f"{{p.name}} has {_what}", _does, at=partial(_written_with, _need))

@@ -148,11 +148,9 @@ def softness(dyn: Dynamics, q: Array, v: Array) -> Iterator[str]:
 
 
 def _smooth(dyn: Dynamics) -> Dynamics:
-    """Return the dynamics between jumps of dry friction, which no step goes across."""
-    if not dyn.model.needs.friction:
-        return dyn
-    bare = dyn.model.without("friction")
-    return dyn._of_model(bare, bare.form_digest)
+    """Return the dynamics between jumps of forces, which no step goes across."""
+    bare = dyn.model.smooth
+    return dyn if bare is dyn.model else dyn._of_model(bare, bare.form_digest)
 
 
 class _Sample:

@@ -22,6 +22,7 @@ from mbkit.engines import Dynamics
 from mbkit.engines.registry import DERIVED, MUJOCO, PINOCCHIO
 from mbkit.methods.registry import DEFAULT_METHOD, EULER_METHOD, METHODS
 from mbkit.model import Model
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.simulate import Trajectory
 from mbkit.studies.compare.errors import EPS, ROUNDINGS, interleaved
 from mbkit.studies.compare.findings import STEP, stiff_joints
@@ -178,12 +179,13 @@ def _implicit_damping(model: Model, dyn: Dynamics, q0: Array, v0: Array) -> Roll
 # order of a few sums, amplified by the conditioning that both share.
 _UNCHANGED: Final = 1e-9
 
-#: Need, field of Needs, MuJoCo's bits, what was off.
+_JUMP: Final = EFFECTS["jump"]
+#: Need, field of Needs or effect, MuJoCo's bits, what was off.
 _NEEDS: Final = (
     ("geometry", "", (), "meshes and shapes never opened (measured with one small sphere on each body)"),
     ("contacts", "", ("CONTACT", "CONSTRAINT"), "collision detection and contact forces (with the same spheres)"),
     ("limits", "limits", ("LIMIT", "CONSTRAINT"), "joint limits kept as data; no limit rows, no constraint solver"),
-    ("dry friction", "friction", ("FRICTIONLOSS", "CONSTRAINT"), "MuJoCo's soft dry friction; no constraint solver"),
+    (_JUMP, "jump", ("FRICTIONLOSS", "CONSTRAINT"), f"MuJoCo's soft {_JUMP}; no constraint solver"),
     ("damping", "damping", ("DAMPER",), "dampers"),
     ("springs", "springs", ("SPRING",), "springs"),
     ("gravity", "gravity", ("GRAVITY",), "gravity"),
@@ -191,8 +193,6 @@ _NEEDS: Final = (
 )
 #: What is on where the description has it.
 _KEPT: Final = ("damping", "springs", "gravity", "loops")
-#: What acts instead of what is off.
-_WITHOUT: Final = {"dry friction": "without it mbkit's exact dry friction acts"}
 
 
 def omissions(model: Model, engines: Mapping[str, Dynamics], seed: int) -> tuple[Omission, ...]:
@@ -206,7 +206,7 @@ def omissions(model: Model, engines: Mapping[str, Dynamics], seed: int) -> tuple
 def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
     from mbkit.engines.mujoco.engine import Variant
 
-    needs = model.needs.as_dict()
+    needs = model.needs.as_dict() | {"jump": "jump" in model.effects}
     variants = {
         need: Variant(dyn, bits, spheres=not field)
         for need, field, bits, _ in _NEEDS
@@ -231,7 +231,8 @@ def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
         saved = times[need][0] - times["lean"][0]
         spread = math.hypot(times[need][1], times["lean"][1])
         # What is there and off would act: leaving it out is a choice, said aloud, and no engine's fault.
-        note = _WITHOUT.get(need, "it is off in every engine, so that the smooth terms compare") if present else ""
+        instead = f"without it mbkit's exact {_JUMP} acts" if need == _JUMP else ""
+        note = instead or "it is off in every engine, so that the smooth terms compare" if present else ""
         unchanged = changes[need] <= _UNCHANGED
         rows.append(Omission(need, present, what, saved, spread, math.nan, changes[need], unchanged, note))
     return rows

@@ -1,4 +1,4 @@
-"""What a description has that bears on runs: servos, dry friction, limits, joints too fast for ordinary steps."""
+"""What a description has that bears on runs: servos, forces that jump, limits, joints too fast for ordinary steps."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import numpy as np
 from mbkit._check import Array, by_key
 from mbkit.model import Model
 from mbkit.model.description import LEFT_OUT, SERVOS
-from mbkit.model.joint_numbers import dry_friction, owners, per_velocity
-from mbkit.studies.compare.result import ACTUATORS, FRICTION, LIMITS, STIFF, Finding
+from mbkit.model.elements.kinds import EFFECTS
+from mbkit.model.parts import Joint, rules_of
+from mbkit.studies.compare.result import ACTUATORS, LIMITS, STIFF, Finding
 from mbkit.studies.results import counted
 
 #: The step of the rollouts, s.
@@ -18,7 +19,7 @@ STEP: Final = 1e-3
 
 
 def findings(model: Model, forces: Array, M: Array, J: Array | None = None) -> tuple[Finding, ...]:
-    """Return what the file has and is left out, dry friction beside the other forces, limits, and stiff joints.
+    """Return what the file has and is left out, forces that jump beside the other forces, limits, and stiff joints.
 
     `forces` are the sums of the sizes of gravity, velocity and passive forces at some states, (N, nv), `M` and `J` the
     mass matrices and the Jacobians of the constraints there, (N, nv, nv) and (N, m, nv).
@@ -28,17 +29,27 @@ def findings(model: Model, forces: Array, M: Array, J: Array | None = None) -> t
         for x in model.notes
         if x.startswith((SERVOS, LEFT_OUT))
     ]
-    return tuple(x for x in (*noted, _friction(model, forces), _limits(model), *stiff_joints(model, M, J)) if x)
+    return tuple(x for x in (*noted, _largest_jump(model, forces), _limits(model), *stiff_joints(model, M, J)) if x)
 
 
-def _friction(model: Model, forces: Array) -> Finding | None:
-    if (friction := dry_friction(model, forces)) is None:
+def _largest_jump(model: Model, forces: Array) -> Finding | None:
+    (name,) = Joint.adding_to("jump")
+    size, other = model.per_velocity(name), np.median(forces, axis=0)
+    if not size.any():
         return None
+    with np.errstate(divide="ignore"):
+        ratios = np.where(size > 0, size / np.where(size > 0, other, 1.0), 0.0)
+    worst, names = int(np.argmax(ratios)), model.velocity_joints
+    joint, ratio = model.joint(names[worst]), float(ratios[worst])
+    turn, slide = rules_of(Joint)[name].unit.split(", ")
+    unit = f"{slide} or {turn}" if joint.type.nv > 1 else slide if joint.type.lengths else turn
+    beside = f"{ratio:.2g} times the other forces there" if np.isfinite(ratio) else "where no other acts"
+    joints = tuple(dict.fromkeys(name for name, x in zip(names, size, strict=True) if x))
     says = (
-        f"{friction} (gravity, velocities, springs and dampers, at the median state); "
-        f"{counted(len(friction.joints), 'joint')} in all"
+        f"{size[worst]:.3g} {unit} at {joint.name}, {beside} (gravity, velocities, springs and dampers, at the median "
+        f"state); {counted(len(joints), 'joint')} in all"
     )
-    return Finding(FRICTION, says, friction.joints, friction.ratio)
+    return Finding(EFFECTS["jump"], says, joints, ratio)
 
 
 def _limits(model: Model) -> Finding | None:
@@ -58,13 +69,13 @@ def stiff_joints(model: Model, M: Array, J: Array | None = None, step: float = S
     With all others free, a joint's velocity decays by its damper at the rate d (M⁻¹)ⱼⱼ, and swings by its spring at
     √(k (M⁻¹)ⱼⱼ). Constraints take the place of M⁻¹ by the mobility that they leave.
     """
-    damping, stiffness = per_velocity(model, "damping"), per_velocity(model, "stiffness")
+    damping, stiffness = model.per_velocity("damping"), model.per_velocity("stiffness")
     if not (damping.any() or stiffness.any()):
         return []
     mobility = np.max([np.diag(_mobility(*x)) for x in zip(M, [None] * len(M) if J is None else J, strict=True)], 0)
     out = []
     for what, rates in (("damping", damping * mobility), ("stiffness", np.sqrt(stiffness * mobility))):
-        for j, (joint, rate) in enumerate(zip(owners(model), rates, strict=True)):
+        for j, (joint, rate) in enumerate(zip(model.velocity_joints, rates, strict=True)):
             if rate * step > 1.0:
                 of = f"{what} over inertia is {rate:.2g} 1/s" if what == "damping" else f"it swings at {rate:.2g} rad/s"
                 value = (damping if what == "damping" else stiffness)[j]

@@ -12,6 +12,7 @@ from mbkit._check import by_key
 from mbkit._escape import one_line
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.constrained import off_by
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.simulate.plotting.style import (
     CROSS,
     PLAIN,
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 #: The reference of terms of an engine whose constraints are soft.
 OWN_LAW: Final = "own law"
 #: Kinds of findings.
-FRICTION: Final = "dry friction"
 ACTUATORS: Final = "actuators"
 LIMITS: Final = "limits"
 STIFF: Final = "stiff joint"
@@ -129,12 +129,13 @@ class RolloutRow:
 
 @dataclass(frozen=True)
 class Finding:
-    """What the description has that bears on runs: what no engine uses, dry friction, joints for other methods.
+    """What the description has that bears on runs: what no engine uses, forces that jump, joints for other methods.
 
-    `kind` is ``"actuators"``, ``"left out of the motion"``, ``"dry friction"``, ``"limits"`` or ``"stiff joint"``;
+    `kind` is ``"actuators"``, ``"left out of the motion"``, the word for jumps in
+    `mbkit.model.elements.kinds.EFFECTS`, ``"limits"`` or ``"stiff joint"``;
     `says` tells it in words, and `joints` has its joints. `mbkit check` adds ``"the file itself"``, with the links and
     joints that `mbkit.lint` names.
-    `size` of friction is its ratio to the other forces at that joint and the median state, the largest of all joints;
+    `size` of a jump is its ratio to the other forces at that joint and the median state, the largest of all joints;
     of a stiff joint its time constant, s; of the file the number of findings; of limits NaN.
     """
 
@@ -206,7 +207,7 @@ class Comparison(ResultTable):
     `facts` has nq, nv, mass, digest, needs and notes of the model. `reference` is what the terms of all `engines` were
     measured by: the oracle. Accelerations of an engine with soft constraints are measured by its own written law
     instead, and `softness` has the digits that it keeps of the exact ones, at the median state. `findings` are what the
-    description has that no engine uses, its dry friction and its stiff joints. `precision` is the error against run
+    description has that no engine uses, its jumps and its stiff joints. `precision` is the error against run
     time of a few methods on a short horizon. `setup` has the seconds to build each engine; the derivation works when
     first called.
     `seconds` is the time of the whole study.
@@ -298,17 +299,17 @@ class Comparison(ResultTable):
         out += [f"{', '.join(absent)} left out"] if absent else []
         out += [f"no {r.term}" for r in self.refusals if not r.engine]
         loops = self.facts["needs"]["loops"] if self.softness else False
-        what, them, exact = ("loops", "them", "rigid") if loops else (FRICTION, "it", "exact")
+        what, them, exact = ("loops", "them", "rigid") if loops else (EFFECTS["jump"], "it", "exact")
         out += [
             f"{name} holds {what} softly, and agrees with its own law of {them}; its accelerations are "
             f"{off_by(10.0**-x, f'the {exact} ones')} at the median state"
             for name, x in self.softness.items()
         ]
         rows = [r for r in self.rollouts if not r.informs]
-        rubbing = [x.size for x in self.findings if x.kind == FRICTION]
+        rubbing = [x.size for x in self.findings if x.kind == EFFECTS["jump"]]
         if rows and rubbing:
             size = f"{rubbing[0]:.2g} times the other forces"
-            out += [f"rollouts and error against run time are without dry friction ({size})"]
+            out += [f"rollouts and error against run time are without {EFFECTS['jump']} ({size})"]
         judged = [r for r in rows if r.judged]
         if rows and not judged:
             out.append(f"none of {len(rows)} rollouts judged" if len(rows) > 1 else "the rollout not judged")

@@ -20,7 +20,7 @@ from mbkit.engines.registry import STANDARD, find_engine
 from mbkit.errors import KnownDefectWarning, MbkitError, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw
-from mbkit.model.joint_numbers import owners
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import engine_names, with_values
@@ -83,7 +83,7 @@ class Judge:
                 self.forces = self.forces + np.abs(quantity(at.q, at.v))
         acting = np.abs(at.tau) + self.forces
         # Its size is told beside the other forces.
-        self.forces = self.forces - np.abs(DryFrictionLaw(model).force(at.v)) if model.needs.friction else self.forces
+        self.forces = self.forces - np.abs(DryFrictionLaw(model).force(at.v))
         gravity = float(np.linalg.norm(model.gravity))
         heavy = gravity * float(np.sqrt(model.mass)) if gravity else 0.0
         self.scales: Scales = Scales.of(oracle.mass_matrix(at.q), at.v, acting, heavy)
@@ -95,7 +95,7 @@ class Judge:
         if model.has_bodies and model.mass:
             self.terms += MECHANISM_TERMS if model.constrained else BODY_TERMS
             self.scales = BodyScales.around(self.scales, oracle, at)
-        self.joint_of = owners(model)
+        self.joint_of = model.velocity_joints
         #: Tolerances of engines that are not double, by their bits.
         self._lower = {
             dyn.bits: Precision(model, at, dyn.bits, self.scales, oracle)
@@ -379,15 +379,15 @@ def _build(
             try:
                 # A few dozen states are no reason to compile; run times are.
                 options = {} if compile else find_engine(name).brief
-                own = find_engine(name).load().own_friction if model.needs.friction else {}
+                own = find_engine(name).load().own_friction if "jump" in model.effects else {}
                 try:
                     engines[name] = dynamics(model, name, **options, **own)
                 except UnsupportedError as error:
                     if not own:
                         raise
-                    # Exact friction stands in.
+                    # The exact law stands in.
                     engines[name] = dynamics(model, name, **options)
-                    refusals.append(Refusal.of(name, error, f"dry friction as {name} holds it"))
+                    refusals.append(Refusal.of(name, error, f"{EFFECTS['jump']} as {name} holds it"))
             except MbkitError as error:
                 refusals.append(Refusal.of(name, error))
         setup[name] = time.perf_counter() - start

@@ -49,7 +49,7 @@ def states(model: Model, samples: int, seed: int) -> States:
     """Return `samples` random states; without constraints also neutral, at-limit and near-singular ones.
 
     Near singular: every angle 1e-4 from a multiple of a right angle, which is near gimbal lock and stretched arms. With
-    dry friction, also states in which every other velocity is at rest, or all are.
+    forces that jump, also states in which every other velocity is at rest, or all are.
     """
     rng = np.random.default_rng(seed)
     q, v = model.random_state(rng, samples)
@@ -59,7 +59,7 @@ def states(model: Model, samples: int, seed: int) -> States:
         parts.append(("neutral", np.tile(model.neutral(), (2, 1))))
         parts.append(("at limits", _at_limits(model, rng, few)))
         parts.append(("near singular", _near_singular(model, rng, few)))
-        if model.needs.friction:
+        if "jump" in model.effects:
             parts.append((_AT_REST, model.random_state(rng, few)[0]))
     q = np.concatenate([x for _, x in parts])
     v = np.concatenate([v, rng.standard_normal((len(q) - samples, model.nv))])

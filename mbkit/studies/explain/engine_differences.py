@@ -1,7 +1,7 @@
 """Why two engines differ on one description: a convention, a left-out quantity or a known defect.
 
 Only the answers of the engines are known. So each usual mistake is put into the questions to the first engine or its
-answers, one at a time, until it answers as the second does. Gravity, armature, damping and the ten inertial numbers of
+answers, one at a time, until it answers as the second does. Gravity, rotors, damping and the ten inertial numbers of
 a body enter the terms linearly; these are fitted, and what has another origin leaves a residual.
 """
 
@@ -20,15 +20,16 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import KnownDefectWarning, MbkitError, UnsupportedError
 from mbkit.load.shapes import NOTHING, MassProperties
-from mbkit.model import Model
-from mbkit.model.elements.kinds import PART_KINDS
-from mbkit.model.joint_numbers import owners
+from mbkit.model import JointCoupling, Model
+from mbkit.model.elements.kinds import PART_KINDS, that_do
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.hypotheses import body_mistakes, joint_mistakes, number_text
 from mbkit.studies.explain.merged_model import MergedModel, merge, with_mass_properties
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, gaps, model_terms
 
+#: What adds to T along a rate.
+_ROTOR: Final = JointCoupling.adding_to("T")[0]
 #: Pairs of joints tried in each other's place.
 _MAX_SWAPS: Final = 400
 #: Quantities beside the terms of every explanation, in which known defects show.
@@ -94,7 +95,7 @@ class _Engines:
         self.a, self.b, self.tolerance, self.name = a, b, out.tolerance, out.b
         self.model = b.model
         self.at = terms.states_of(self.model, out.samples, out.seed)
-        self.owners = owners(self.model)
+        self.owners = self.model.velocity_joints
         self.values = {dyn: evaluated(dyn, self.at) for dyn in (a, b)}
         for dyn, values in self.values.items():
             if "M" not in values:
@@ -290,7 +291,7 @@ class _Engines:
     # Quantities that enter the terms linearly.
 
     def _linear(self) -> Iterator[_Trial]:
-        """Yield quantities left out of the whole robot, and fits of gravity, armature and damping."""
+        """Yield quantities left out of the whole robot, and fits of gravity, rotors and damping."""
         own, wanted = self._terms(self.model), self.wanted
         kinds = [
             k for name, k in PART_KINDS.items() if name in self.model.acts and k.does <= {"T", "V", "loss", "force"}
@@ -308,8 +309,8 @@ class _Engines:
             yield _Trial("gravity", "", says, self._terms(replace(self.model, gravity=gravity)))
         yield from self._couplings(own)
         if "M" in own:
-            armature = np.mean(np.einsum("nii->ni", wanted["M"] - own["M"]), axis=0)
-            yield from self._fit("armature", armature, own | {"M": own["M"] + np.diag(armature)})
+            added = np.mean(np.einsum("nii->ni", wanted["M"] - own["M"]), axis=0)
+            yield from self._fit(_ROTOR, added, own | {"M": own["M"] + np.diag(added)})
         if "passive" in own and "passive" in wanted:
             v = self.at.v
             damping = np.sum((own["passive"] - wanted["passive"]) * v, axis=0) / np.sum(v**2, axis=0)
@@ -329,12 +330,12 @@ class _Engines:
         for c in couplings:
             left = replace(self.model, couplings=tuple(x for x in couplings if x is not c))
             yield _Trial("joint coupling", f"coupling {c.name!r}", "lacks it", self._terms(left))
-        rotors = ", ".join(repr(c.name) for c in couplings if c.armature)
-        if rotors and "M" in own:
+        turning = ", ".join(repr(c.name) for c in couplings if c.rotors)
+        if turning and "M" in own:
             chains = [self.model.chains[name] for name in self.owners]
             related = np.array([[a <= b or b <= a for a in chains] for b in chains])
-            says = "has no armature between branches"
-            yield _Trial("joint coupling", f"coupling {rotors}", says, own | {"M": own["M"] * related})
+            says = f"has no {_ROTOR} between branches"
+            yield _Trial("joint coupling", f"coupling {turning}", says, own | {"M": own["M"] * related})
 
     def _bodies(self) -> Iterator[_Trial]:
         whole = merge(self.model)
@@ -354,7 +355,7 @@ class _Engines:
     def _fitted_matter(self, whole: MergedModel, name: str, own: Values) -> tuple[float, Values] | None:
         """Return the added mass and the terms with the body's ten numbers fitted, if these explain M."""
         bodies = tuple(replace(b, **vars(NOTHING)) for b in whole.model.bodies)
-        empty = replace(whole.model, bodies=bodies).without("armature", "damping", "springs")
+        empty = replace(whole.model, bodies=bodies).without(*that_do("T"), "damping", "springs")
         columns = [self._terms(with_mass_properties(empty, name, mass_properties)) for mass_properties in _PROBES]
         common = set(own).intersection(*columns)
         if "M" not in common:
@@ -390,6 +391,6 @@ class _Engines:
                 one, other = (evaluated(type(x)(some), at) for x in (self.a, self.b))
             except MbkitError:
                 return False
-            return gaps(one, other, at.v, owners(some)).worst > self.tolerance
+            return gaps(one, other, at.v, some.velocity_joints).worst > self.tolerance
 
         return terms.minimal_differing_subtree(whole, differs)

@@ -399,7 +399,7 @@ def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> list[Mistake]:
     out += _mimic_difference(a.mimic, b.mimic, near)
     for name in NUMBERS:
         ours, theirs = (_acting(name, x) for x in (a, b))
-        # Without stiction, that is the friction, and no other difference.
+        # Without a number at rest, that is the one of motion, and no other difference.
         if not (near.numbers(ours, theirs) or getattr(a, name) is getattr(b, name) is None):
             kind = _NUMBER.get(name, name.replace("_", " "))
             changed = {n: getattr(b, n) for n in (name, *(["rest"] if name == "stiffness" else []))}

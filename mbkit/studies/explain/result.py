@@ -22,7 +22,7 @@ _MAX_LINES: Final = 3
 class Cause:
     """A difference between two sides.
 
-    Its `kind` names the usual mistake, such as ``"armature"`` or ``"inertia about the wrong point"``; `subject` is the
+    Its `kind` names the usual mistake, such as ``"gravity"`` or ``"inertia about the wrong point"``; `subject` is the
     body or joint, empty for the whole; `says` is a sentence about the second side; `a` and `b` are the numbers of the
     two sides, where they are numbers. `effects` has for each term the relative difference of this cause alone: the
     larger of two, where it is added to the first side, and where it is removed from the second. It is infinite where

@@ -14,7 +14,6 @@ from mbkit.errors import InputError
 from mbkit.model import GravityCompensation, Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
-from mbkit.model.joint_numbers import owners
 from mbkit.model.model import unchecked
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.engine_differences import engine_causes
@@ -55,7 +54,7 @@ def explain(
     """Explain why two descriptions, or two engines, differ.
 
     Every difference between the descriptions is named, in each number of each kind of part, also of forces by
-    functions: armature, friction, springs, gravity, a lost, fused or changed body, inertia about the wrong point or in
+    functions: rotors, jumps, springs, gravity, a lost, fused or changed body, inertia about the wrong point or in
     the wrong axes, a joint's place, axis, zero or pitch, quaternion and joint order, mimic joints, velocity frames, a
     known defect of an engine.
     Joints are matched by structure and name, and a mere choice of frames is no difference.
@@ -230,8 +229,8 @@ class _Descriptions:
         if a.velocity_names != b.velocity_names or not a.nv:
             return Gaps(comparable=False)
         at = states_of(b, self.samples, self.seed)
-        out = terms.gaps(model_terms(a, at), model_terms(b, at), at.v, owners(a))
-        return replace(out, terms=(*out.terms, *terms.friction_gap(a, b, owners(a))))
+        out = terms.gaps(model_terms(a, at), model_terms(b, at), at.v, a.velocity_joints)
+        return replace(out, terms=(*out.terms, *terms.jump_gap(a, b, a.velocity_joints)))
 
     def _gaps_by_name(self, one: MergedModel, other: MergedModel) -> Gaps | None:
         """Return the differences of terms with joints matched by name, where the names are the same."""

@@ -24,6 +24,7 @@ from mbkit.model import JointCoupling, Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw, FrictionNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.forces import coordinate_arguments
+from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.references import _OF_BODIES, _OF_JOINTS, names_in
 from mbkit.model.model import unchecked
 from mbkit.studies.compare.errors import Scales, force_errors, matrix_errors
@@ -133,10 +134,10 @@ def gaps(a: Values, b: Values, v: Array, joints: Sequence[str]) -> Gaps:
     return Gaps(tuple(out))
 
 
-def friction_gap(a: Model, b: Model, joints: Sequence[str]) -> Iterator[Gap]:
-    """Yield the difference of dry friction at rest and about the Stribeck velocities, which random states miss.
+def jump_gap(a: Model, b: Model, joints: Sequence[str]) -> Iterator[Gap]:
+    """Yield the difference of forces that jump at rest and about the Stribeck velocities, which random states miss.
 
-    Each velocity's is relative to its own friction.
+    Each velocity's is relative to its own.
     """
     numbers = [FrictionNumbers.of(x.joints) for x in (a, b)]
     if all((x.bound == x.sliding).all() for x in numbers):
@@ -145,7 +146,7 @@ def friction_gap(a: Model, b: Model, joints: Sequence[str]) -> Iterator[Gap]:
     ours, theirs = (np.vstack([law.bound, -law.force_at(speeds)]) for law in map(DryFrictionLaw, (a, b)))
     size = np.maximum(ours, theirs).max(axis=0)
     apart = np.abs(ours - theirs).max(axis=0) / np.where(size > 0, size, 1.0)
-    yield Gap("dry friction", float(apart.max()), joints[int(np.argmax(apart))])
+    yield Gap(EFFECTS["jump"], float(apart.max()), joints[int(np.argmax(apart))])
 
 
 def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:

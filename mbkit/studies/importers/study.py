@@ -42,7 +42,6 @@ from mbkit.load.urdf_reader import urdf_links
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.model.elements.forces import by_functions
-from mbkit.model.joint_numbers import owners
 from mbkit.model.model import unchecked
 from mbkit.model.validation import listing
 from mbkit.studies import results
@@ -200,12 +199,12 @@ def stages(
         ours = model_terms(one.model, at)
         source = reference if isinstance(reference, Imported) else None
         if source is None and whole.forces:
-            smooth = whole.without("friction")
+            smooth = whole.smooth
             source = Imported(whole, lambda q, v, _: model_terms(smooth, States(q, v)), ())
         if source is not None:
             ours = _own_terms_of(one.model, source, {j.name: j.name for j in one.model.joints}, at)
         theirs_ = _own_terms_of(one.model, imported, matching.to_b, at)
-        apart = gaps(ours, theirs_, at.v, owners(one.model))
+        apart = gaps(ours, theirs_, at.v, one.model.velocity_joints)
     by_term = {g.term: g for g in apart.terms}
     for name in TERMS:
         if g := by_term.get(name):
@@ -301,7 +300,7 @@ def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str]
 
 
 def _terms(imported: Imported, at: States, without: tuple[str, ...] = ()) -> Values:
-    """Return an importer's own terms with the dry friction that it read, which engines hold outside of their terms."""
+    """Return an importer's own terms with the forces that jump, which engines hold outside of their terms."""
     terms = imported.terms(at.q, at.v, without)
     return _with(terms, {"passive": DryFrictionLaw(imported.model).force(at.v)})
 
@@ -311,7 +310,7 @@ def own_terms(
 ) -> tuple[list[Cause], list[str], bool]:
     """Return what acts in an importer's model beside bodies and joints, what does not, and whether that is all."""
     at = states_of(imported.model, samples, seed)
-    joints = owners(imported.model)
+    joints = imported.model.velocity_joints
     whole, described = _terms(imported, at), model_terms(imported.model, at)
     bare = _terms(imported, at, tuple(x.key for x in imported.beside)) if imported.beside else whole
     causes, idle = [], []
@@ -380,10 +379,10 @@ def compare_parsers(
     ends: a crash or an endless loop there is reported like any other refusal.
 
     The readings are compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses, centres of
-    mass, inertias, armature, damping, friction, limits, the loops and couplers of an MJCF, and M, g, nle and passive by
+    mass, inertias, numbers of joints, limits, the loops and couplers of an MJCF, and M, g, nle and passive by
     joint name, by the engine itself on its own model, with all that it holds beside bodies and joints: flags, tendons,
-    actuators at zero control, fluid, gravity compensation. Here passive holds the dry friction that was read. Links
-    that an importer fuses are fused on the other side too. Why one differs is in its ``explanation``. Mimic joints,
+    actuators at zero control, fluid, gravity compensation. Here passive holds the forces that jump. Links that
+    an importer fuses are fused on the other side too. Why one differs is in its ``explanation``. Mimic joints,
     limits, loops and couplers are in no term: they decide nothing, and the verdict names those that differ. Where mbkit
     does not read the file, an MJCF is compared with MuJoCo's own reading, and any other file with nothing: the
     importers that read it are only listed.

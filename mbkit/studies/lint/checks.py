@@ -19,7 +19,6 @@ import numpy as np
 from mbkit._check import Array, by_key
 from mbkit.engines import Dynamics
 from mbkit.model import Body, Model
-from mbkit.model.joint_numbers import owners
 from mbkit.model.validation import body_fault, listing
 from mbkit.spatial import skew
 from mbkit.studies.compare.findings import stiff_joints
@@ -439,7 +438,7 @@ def effort(at: Judged) -> Iterator[LintFinding]:
         return
     rest = np.zeros((len(at.poses), at.model.nv))
     needed = np.abs(at.engine.inverse_dynamics(at.poses, rest, rest)).max(axis=0)
-    for joint, force, limit in zip(owners(at.model), needed, at.model.effort_limits, strict=True):
+    for joint, force, limit in zip(at.model.velocity_joints, needed, at.model.effort_limits, strict=True):
         if force > limit > 0:
             says = f"holding it against gravity takes {force:.3g}, and its effort is limited to {limit:.3g}"
             expected = f"an effort of {force:.3g} N or Nm"

@@ -412,7 +412,7 @@ def reference(
         Increasing times within the duration, s; 0 is added if it is not among them.
     torque : array_like or callable, optional
         (nv,), held all the time; (K - 1, nv), held over each interval of `save`, which then runs from 0 to `duration`;
-        or a function of (t, q, v), for which only two engines make a reference, as for dry friction.
+        or a function of (t, q, v), for which only two engines make a reference, as for forces that jump.
     seconds : float
         Limit of the search, without derivation and compilation. The best reference by then is returned.
     progress : bool or callable, optional
@@ -498,8 +498,8 @@ def _search(motion: Motion, deadline: Deadline, seconds: float) -> tuple[list[Kn
             return False
         return bool(_cut(motion, pairs[-1]).horizon == motion.save[-1])
 
-    # A series cannot follow the jumps of dry friction: runs go from one to the next, phase by phase.
-    if not (motion.torque.callable or motion.model.needs.friction):
+    # A series cannot follow jumps: runs go from one to the next, phase by phase.
+    if not (motion.torque.callable or "jump" in motion.model.effects):
         small = _quadruple_seconds(motion, _STEPS * motion.duration) < seconds / 6
         if small and holds(taylor_pair, 113, within=seconds / 2):
             return pairs, refused

@@ -74,8 +74,8 @@ def work_precision(
     Parameters
     ----------
     model : Model
-        Without its dry friction, of which a note tells. Its mimic joints are free where MuJoCo's own integrators are
-        among the methods: MuJoCo would make them soft.
+        Without its forces that jump, as a note says. Its mimic joints are free where MuJoCo's own integrators are among
+        the methods: MuJoCo would make them soft.
     engines : sequence of str
     methods : sequence of str, or mapping of str to sequence of str, optional
         Names of `mbkit.simulate.METHODS`, for all engines that have them or for each; by default every method on every

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from typing import Any
 
 #: Numbers of a joint with one velocity, as Newton calls them.
-_OF_ONE = {"armature": "armature", "damping": "damping", "stiffness": "stiffness", "rest": "rest_q"}
+NUMBERS = {"rotors": "armature", "damping": "damping", "stiffness": "stiffness", "rest": "rest_q"}
 
 
 def built(data: dict[str, Any]) -> Any:
@@ -30,7 +30,7 @@ def built(data: dict[str, Any]) -> Any:
                 child = builder.add_link()
             else:
                 child = bodies[joint["child"]] = _link(builder, joint["child"], data["bodies"][joint["child"]])
-            own = {name: joint[name][k] for name in _OF_ONE if step["type"] in ("revolute", "prismatic")}
+            own = {name: joint[name][k] for name in NUMBERS if step["type"] in ("revolute", "prismatic")}
             numbers[joint["name"]].append(_joint(builder, step, parent, child, at, own))
             parent, at = child, wp.transform()
     builder.add_articulation([*range(builder.joint_count)])
@@ -46,7 +46,7 @@ def _joint(builder: Any, step: dict[str, Any], parent: int, child: int, at: Any,
     kind = step["type"]
     if kind in ("revolute", "prismatic"):
         # Versions before 1.8 have no springs of joints.
-        own = {_OF_ONE[name]: value for name, value in own.items() if value and (name != "rest" or own["stiffness"])}
+        own = {NUMBERS[name]: value for name, value in own.items() if value and (name != "rest" or own["stiffness"])}
         own["axis"] = wp.vec3(step["axes"][0])
     if kind == "free":
         return builder.add_joint_free(child, parent=parent, parent_xform=at)

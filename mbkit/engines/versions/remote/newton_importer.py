@@ -14,6 +14,7 @@ from collections import Counter
 import newton
 import numpy as np
 from common import rotation
+from newton_builder import NUMBERS
 from on_newton import Engine
 
 TYPE_CHECKING = False
@@ -25,14 +26,15 @@ _KINDS = {"REVOLUTE": "revolute", "PRISMATIC": "prismatic", "BALL": "ball", "FRE
 _OF_BODY = re.compile(r"for body '([^']+)'")
 #: Newton's numbers of velocities, and the description's.
 _NUMBERS = {
-    **{name: "joint_" + name for name in ("armature", "damping", "friction", "stiffness")},
+    **{name: f"joint_{NUMBERS[name]}" for name in ("rotors", "damping", "stiffness")},
+    "friction": "joint_friction",
     "lower": "joint_limit_lower",
     "upper": "joint_limit_upper",
     "velocity_limit": "joint_velocity_limit",
     "effort_limit": "joint_effort_limit",
 }
 #: Those of joints of several velocities too.
-_OF_ALL = ("armature", "damping", "friction")
+_OF_ALL = ("rotors", "damping", "friction")
 _LIMITS = ("lower", "upper", "velocity_limit", "effort_limit")
 
 

@@ -41,9 +41,9 @@ def built(data: dict[str, Any]) -> Any:
             body = child if last else plant.AddRigidBody(f"{n}.{k}.between", _inertia(None))
             own.append(plant.AddJoint(_joint(step, f"{n}.{k}", frame, body.body_frame())))
             frame = body.body_frame()
-        if len(own) == 1 and len(joint["armature"]) == 1 and joint["armature"][0]:
+        if len(own) == 1 and len(joint["rotors"]) == 1 and joint["rotors"][0]:
             actuator = plant.AddJointActuator(f"{n}.rotor", own[0])
-            actuator.set_default_rotor_inertia(joint["armature"][0])
+            actuator.set_default_rotor_inertia(joint["rotors"][0])
             actuator.set_default_gear_ratio(1.0)
     plant.Finalize()
     return plant, joints, bodies

@@ -43,7 +43,7 @@ def built(data: dict[str, Any]) -> Any:
     model.gravity = pin.Motion(np.array(data["gravity"]), np.zeros(3))
     bodies = {"world": (0, np.eye(3), np.zeros(3))}
     numbers: dict[str, list[int]] = {}
-    armature: list[float] = []
+    rotors: list[float] = []
     moment = np.zeros(3)
     for joint in data["joints"]:
         carrier, R, p = bodies[joint["parent"]]
@@ -53,7 +53,7 @@ def built(data: dict[str, Any]) -> Any:
             carrier = model.addJoint(carrier, _joint_model(step), pin.SE3(R, p), f"{joint['name']}.{k}")
             numbers[joint["name"]].append(carrier)
             R, p = np.eye(3), np.zeros(3)
-        armature += joint["armature"]
+        rotors += joint["rotors"]
         body = data["bodies"][joint["child"]]
         bodies[joint["child"]] = (carrier, R, p)
         if carrier:
@@ -63,10 +63,10 @@ def built(data: dict[str, Any]) -> Any:
             model.appendBodyToJoint(carrier, inertia, pin.SE3(R, p))
         else:
             moment += body["mass"] * (p + R @ np.array(body["com"]))
-    if any(armature):
+    if any(rotors):
         if not hasattr(model, "armature"):
             raise NotImplementedError("this version has no armature")
-        model.armature = np.array(armature)
+        model.armature = np.array(rotors)
     return model, numbers, bodies, moment
 
 

@@ -33,7 +33,7 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
     """Step one state or a batch over the grid."""
     dyn = problem.dyn
     record, reasons, evaluations = GridRecord(problem), dict[int, str](), 0
-    compiled = dyn.derived and not problem.torque.callable and dyn.model.needs.friction
+    compiled = dyn.derived and not problem.torque.callable and "jump" in dyn.model.effects
     compiled = compiled and getattr(dyn, "compiles_steps", False)
     for i in range(len(problem.q)):
         member = problem.member(i)

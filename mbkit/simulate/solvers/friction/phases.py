@@ -81,7 +81,7 @@ class Friction:
     def holding(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> Array:
         """Return the forces of friction on what rests, and zero elsewhere; of the shape of v."""
         tau = applied(force, t, q, v)
-        # Without the friction of what rests, and without its armature.
+        # Without the friction of what rests, and without its rotor.
         free = self._dynamics(np.where(phase.still, 0.0, phase.sides), phase.still & False)
         dyn, loose = (at_time(x, t) for x in (phase.dyn, free._bare or free))
         a = np.where(phase.still, 0.0, dyn.forward_dynamics(q, v, tau))

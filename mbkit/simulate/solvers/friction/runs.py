@@ -17,7 +17,6 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.methods.registry import method_of
-from mbkit.model.changes.dry_friction import names_of
 from mbkit.simulate.events import Followed, Hit
 from mbkit.simulate.problem import RUNS, IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
@@ -110,7 +109,7 @@ class _Member:
         self.problem, self.member, self._solver = problem, problem.member(i), solver
         dyn = problem.dyn if self.member is None else problem.dyn._of_sample(i)
         self.friction = Friction(dyn)
-        self.names = names_of(dyn.model)
+        self.names = dyn.model.velocity_names
         self.q, self.v = problem.q[i].copy(), problem.v[i].copy()
         self.force = problem.torque.of_member(self.member)
         self.part = _Part([], [], [], [])
