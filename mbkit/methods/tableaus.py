@@ -391,7 +391,7 @@ class RosenbrockTableau:
         for weights, order in ((self.b, self.order), (self.b - self.error, self.lower)):
             _require_order(self.name, alpha, alpha + coupling, weights @ coupling, order)
 
-    stages = forwarded("b.size", "Number of stages.")
+    stages: int = forwarded("b.size", "Number of stages.")
 
     @property
     def digest(self) -> str:

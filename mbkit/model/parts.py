@@ -524,7 +524,7 @@ class OfJoint(_Frozen):
 
     section = "prescribed"
     joint: str
-    name = forwarded("joint", "The joint's, which has one motion.")
+    name: str = forwarded("joint", "The joint's, which has one motion.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -71,8 +71,8 @@ class EnergyEquations(ConstraintQuantities, Equations):
         """Return Σ_jk γ^k_ij v_j p_k, which quasi-velocities add to the rate of a momentum."""
         return sum((turn * p[k] for k, turn in enumerate(self._turns)), ca.SX(self.model.nv, 1))
 
-    kinetic_energy = forwarded("_T", "T(q, v).")
-    potential_energy = forwarded("_V", "V(q).")
+    kinetic_energy: ca.SX = forwarded("_T", "T(q, v).")
+    potential_energy: ca.SX = forwarded("_V", "V(q).")
 
     @cached_property
     def gravity(self) -> Any:

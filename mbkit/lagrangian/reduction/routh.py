@@ -84,7 +84,7 @@ class Routhian(Printable, Generic[FormT]):
     def __reduce__(self) -> tuple[Any, ...]:
         return routhian, (self.system, self.cyclic)
 
-    R = forwarded("lagrangian.L", "The Routhian L - Σ p q̇ of the ignored coordinates, a Lagrangian of the others.")
+    R: sp.Expr = forwarded("lagrangian.L", "The Routhian L - Σ p q̇ of the ignored coordinates, a Lagrangian of the others.")
 
     @property
     def effective_potential(self) -> sp.Expr:

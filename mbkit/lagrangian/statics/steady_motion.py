@@ -53,11 +53,11 @@ class SteadyMotion:
     q: Array
     v: Array
 
-    stable = forwarded(
+    stable: bool | None = forwarded(
         "equilibrium.stable",
         "Whether small motions of the other coordinates stay small; None where the linear equation does not decide.",
     )
-    frequencies = forwarded(
+    frequencies: Array = forwarded(
         "equilibrium.frequencies", "Angular frequencies of small motions that oscillate, rad/s, increasing."
     )
 

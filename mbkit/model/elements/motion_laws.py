@@ -48,7 +48,7 @@ class FormulaMotion(OfJoint):
     symbols: tuple[str, ...]
     numbers: Constants
 
-    constants = forwarded("formula.constants", "The numbers in the formula.")
+    constants: tuple[float, ...] = forwarded("formula.constants", "The numbers in the formula.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -258,7 +258,7 @@ class BisectResult(ResultTable):
     _listed = "onsets"
     _csv_columns = columns_of(Onset)
 
-    passed = forwarded("check.passed", "Whether the baseline passes, so that there is nothing to look for.")
+    passed: bool = forwarded("check.passed", "Whether the baseline passes, so that there is nothing to look for.")
 
     @property
     def verdict(self) -> str:
