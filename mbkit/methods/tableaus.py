@@ -13,7 +13,6 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit.errors import InputError
 from mbkit.methods.one_step import StageRates, Stages
@@ -391,7 +390,10 @@ class RosenbrockTableau:
         for weights, order in ((self.b, self.order), (self.b - self.error, self.lower)):
             _require_order(self.name, alpha, alpha + coupling, weights @ coupling, order)
 
-    stages: int = forwarded("b.size", "Number of stages.")
+    @property
+    def stages(self) -> int:
+        """Number of stages."""
+        return self.b.size
 
     @property
     def digest(self) -> str:

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
-from mbkit._attributes import forwarded
 from mbkit._check import Array, finite_array, shown
 from mbkit.errors import ModelError
 from mbkit.model.joint_types import JointType, kind_of, register_joint_type
@@ -524,7 +523,11 @@ class OfJoint(_Frozen):
 
     section = "prescribed"
     joint: str
-    name: str = forwarded("joint", "The joint's, which has one motion.")
+
+    @property
+    def name(self) -> str:
+        """The joint's, which has one motion."""
+        return self.joint
 
 
 @dataclass(frozen=True, eq=False)

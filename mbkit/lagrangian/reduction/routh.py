@@ -23,7 +23,6 @@ import sympy as sp
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from mbkit._attributes import forwarded
 from mbkit._check import Array, finite_array, require_finite, rows
 from mbkit._escape import terminal
 from mbkit.engines.base import at_times
@@ -84,7 +83,10 @@ class Routhian(Printable, Generic[FormT]):
     def __reduce__(self) -> tuple[Any, ...]:
         return routhian, (self.system, self.cyclic)
 
-    R: sp.Expr = forwarded("lagrangian.L", "The Routhian L - Σ p q̇ of the ignored coordinates, a Lagrangian of the others.")
+    @property
+    def R(self) -> sp.Expr:
+        """The Routhian L - Σ p q̇ of the ignored coordinates, a Lagrangian of the others."""
+        return self.lagrangian.L
 
     @property
     def effective_potential(self) -> sp.Expr:

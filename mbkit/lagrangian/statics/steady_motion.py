@@ -15,7 +15,6 @@ import numpy as np
 import sympy as sp
 from numpy.typing import ArrayLike
 
-from mbkit._attributes import forwarded
 from mbkit._check import Array, real, real_array, rows
 from mbkit._escape import html, terminal
 from mbkit.engines.base import Dynamics
@@ -53,13 +52,15 @@ class SteadyMotion:
     q: Array
     v: Array
 
-    stable: bool | None = forwarded(
-        "equilibrium.stable",
-        "Whether small motions of the other coordinates stay small; None where the linear equation does not decide.",
-    )
-    frequencies: Array = forwarded(
-        "equilibrium.frequencies", "Angular frequencies of small motions that oscillate, rad/s, increasing."
-    )
+    @property
+    def stable(self) -> bool | None:
+        """Whether small motions of the other coordinates stay small; None where the linear equation does not decide."""
+        return self.equilibrium.stable
+
+    @property
+    def frequencies(self) -> Array:
+        """Angular frequencies of small motions that oscillate, rad/s, increasing."""
+        return self.equilibrium.frequencies
 
     def __str__(self) -> str:
         lines = [str(self.equilibrium).replace(": equilibrium,", ": steady motion,", 1)]

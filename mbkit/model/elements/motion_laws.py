@@ -14,7 +14,6 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
-from mbkit._attributes import forwarded
 from mbkit._check import Array
 from mbkit.model.elements.formula import Arithmetic, Formula
 from mbkit.model.parts import Constants, NumberRule, OfJoint, Prescribed
@@ -48,7 +47,10 @@ class FormulaMotion(OfJoint):
     symbols: tuple[str, ...]
     numbers: Constants
 
-    constants: tuple[float, ...] = forwarded("formula.constants", "The numbers in the formula.")
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """The numbers in the formula."""
+        return self.formula.constants
 
 
 @dataclass(frozen=True, eq=False)

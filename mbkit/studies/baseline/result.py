@@ -9,7 +9,6 @@ from typing import Final, Literal
 
 import numpy as np
 
-from mbkit._attributes import forwarded
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of, counted
 from mbkit.studies.versions.result import ASIDE, AWAY, TOWARDS, digits_text
@@ -258,7 +257,10 @@ class BisectResult(ResultTable):
     _listed = "onsets"
     _csv_columns = columns_of(Onset)
 
-    passed: bool = forwarded("check.passed", "Whether the baseline passes, so that there is nothing to look for.")
+    @property
+    def passed(self) -> bool:
+        """Whether the baseline passes, so that there is nothing to look for."""
+        return self.check.passed
 
     @property
     def verdict(self) -> str:
