@@ -732,3 +732,15 @@ def test_terms_are_told_before_anything_is_integrated(tmp_path: Path) -> None:
     assert " timings, interleaved in one process, the longest runs timed least" in page
     brief = CliRunner().invoke(cli, ["check", "pendulum", "--samples", "2", "--no-rollouts", "--out", str(tmp_path)])
     assert "terms:" not in brief.stderr
+
+
+def test_a_momentum_s_moment_about_a_moving_center_of_mass_may_round() -> None:
+    """Slides turn nothing: m v x v is zero as far as the rotations of joints are orthogonal, and v is not small."""
+    b = mb.ModelBuilder("slides", gravity=(0, 0, 0))
+    axes = np.random.default_rng(3).normal(size=(4, 3))
+    for i, axis in enumerate(axes):
+        b.add_body(f"b{i}", mass=2.0, com=(0.1, 0.2, 0.3), inertia=(0.1, 0.1, 0.1))
+        parent = f"b{i - 1}" if i else "world"
+        b.add_joint(f"j{i}", "prismatic", parent=parent, child=f"b{i}", rpy=axis, axis=axis)
+    result = mb.compare(b.build(), terms_only=True)
+    assert result.passed, result.verdict

@@ -144,9 +144,16 @@ def _mechanism_load_errors(error: Array, reference: Array, scales: BodyScales) -
     return Errors(e.absolute, e.relative / scales.of_accelerations, e.per_velocity)
 
 
-def _forces(error: Array, reference: Array, force: Array, arm: Array) -> Errors:
+def _forces(error: Array, reference: Array, force: Array, arm: Array, moment: Array | float = 0.0) -> Errors:
     force = np.maximum(force, np.abs(reference[..., :3]).max(axis=(1, 2), initial=0.0))
-    return _halves(error, force, np.maximum(force * arm, np.abs(reference[..., 3:]).max(axis=(1, 2), initial=0.0)))
+    moment = np.maximum(force * arm + moment, np.abs(reference[..., 3:]).max(axis=(1, 2), initial=0.0))
+    return _halves(error, force, moment)
+
+
+def _momentum_bias_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
+    # The centre of mass moves along the momentum: m v × v is zero as far as rotations are orthogonal.
+    carried = scales.mass * scales.velocity[:, 0] ** 2
+    return _forces(error[:, None], reference[:, None], scales.curved, scales.reach, carried)
 
 
 def _locked_inertia_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:  # noqa: ARG001
@@ -225,9 +232,7 @@ BODY_TERMS: Final = (
     _term("J̇ v", "jacobian_dot_v", "q v", _acceleration_of_frame_errors, _frame),
     _term("centre of mass", "center_of_mass", "q", _center_errors),
     _term("A_G", "centroidal_momentum_matrix", "q", _momentum_matrix_errors),
-    _term(
-        "Ȧ_G v", "centroidal_momentum_bias", "q v", lambda e, x, s: _forces(e[:, None], x[:, None], s.curved, s.reach)
-    ),
+    _term("Ȧ_G v", "centroidal_momentum_bias", "q v", _momentum_bias_errors),
     _term("locked inertia", "locked_inertia", "q", _locked_inertia_errors),
     _term("M⁻¹", "mass_matrix_inverse", "q", _inverse_errors),
     _term("joint loads", JOINT_LOADS, "q v a", _load_errors),
