@@ -223,10 +223,8 @@ def _body_differences(
     if not a.mass and not a.inertia.any():
         return [Mistake("added body", "has matter in it", vars(b))]
     out = []
-    for name, what, same in (
-        ("mass", "mass", near.number(a.mass, b.mass)),
-        ("com", "centre of mass", near.point(a.com, b.com)),
-    ):
+    same_of = {"mass": ("mass", near.number(a.mass, b.mass)), "com": ("centre of mass", near.point(a.com, b.com))}
+    for name, (what, same) in same_of.items():
         if not same:
             ours, theirs = getattr(a, name), getattr(b, name)
             wanted = replace(a, **{name: theirs})
