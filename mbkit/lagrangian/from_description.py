@@ -45,7 +45,7 @@ def from_model(
     """Return a model as a `Lagrangian` to read and to run: T, V and Rayleigh's dissipation in its coordinates.
 
     The joints' formulas are evaluated on exact sums of cosines and sines. Numbers are the decimals of the description.
-    Springs are in V, dampers in the dissipation, rotors in T. A force that jumps is -f sign(v), which is zero at
+    Springs are in V, dampers in the dissipation, rotors in T. Dry friction is -f sign(v), which is zero at
     rest, where that of the engines holds any force up to its bound; limits are data, as in every engine. Forces of
     functions at joints are written out, their potentials in V.
 
@@ -90,7 +90,7 @@ def from_model(
     Warns
     -----
     MbkitWarning
-        Forces that jump: no term of the equations holds a joint at rest.
+        Dry friction: no term of the equations holds a joint at rest.
 
     Notes
     -----

@@ -57,8 +57,7 @@ def simulate(
         s. The run ends exactly there: where it is no multiple of `dt`, the last step is shorter.
     method : str
         With a step: ``"rk4"`` and ``"semi_implicit_euler"``, MuJoCo 4's formulas on any engine; ``"moreau"``, for many
-        joints with forces that jump; ``"gauss4"`` and
-        ``"gauss6"``, implicit, on any engine; ``"implicit_midpoint"``, symplectic, on the own derivation;
+        joints with dry friction; ``"gauss4"`` and ``"gauss6"``, implicit, on any engine; ``"implicit_midpoint"``, symplectic, on the own derivation;
         ``"mujoco_euler"``, ``"mujoco_rk4"``, ``"mujoco_implicit"``, ``"mujoco_implicitfast"`` and
         ``"mujoco_discrete"``, MuJoCo's own on its engine. With a tolerance: ``"rk853"``, fastest on the own
         derivation, and ``"dop853"``, ``"radau"``, ``"bdf"``, ``"lsoda"``, SciPy's, on any engine (the last three are
@@ -110,7 +109,7 @@ def simulate(
     -------
     Trajectory
         Of a run that diverged, the states up to then, with `stats.ended`, `stats.reached` and `stats.message`, and an
-        `MbkitWarning`. In a batch the others go on. Where forces of joints jump, `events` has where each of them
+        `MbkitWarning`. In a batch the others go on. With dry friction `events` has where each of them
         stops, lets go or turns, and a run in which that cannot be decided ends there.
 
     Raises

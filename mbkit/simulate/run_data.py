@@ -151,12 +151,12 @@ class RunData:
     def work(self, engine: str | Dynamics | None = None) -> Array:
         """Return ∫ (τ + τ_lost + Σ Jᵀ w)·v dt since the first state in J, shape (K,) or (N, K).
 
-        τ_lost are the forces of dampers, those that jump, those given by functions without a potential, and those of
+        τ_lost are the forces of dampers, dry friction, those given by functions without a potential, and those of
         constraints that do work: drives of motions in time, blades with a speed, soft loops. Of a system
         written as energies it holds what changes T + V beside its forces, as where a frame is moved.
 
         The work of a constant or held torque is τ·Δq, exact for the saved positions, where v = q̇; UnsupportedError
-        where its rows change between two saved states. So is that of jumps, ``f |Δq|`` from one stop or turn in
+        where its rows change between two saved states. So is that of dry friction, ``f |Δq|`` from one stop or turn in
         `events` to the next. All else, also torque on quasi-velocities, is a quadrature of fourth order in the distance
         of the saved states, of second order in an interval with a turn or stop of theirs; a function that jumps
         makes it first order, and so do rows that jump beside a function.

@@ -131,12 +131,11 @@ class RolloutRow:
 class Finding:
     """What the description has that bears on runs: what no engine uses, forces that jump, joints for other methods.
 
-    `kind` is ``"actuators"``, ``"left out of the motion"``, the word for jumps in
-    `mbkit.model.elements.kinds.EFFECTS`, ``"limits"`` or ``"stiff joint"``;
+    `kind` is ``"actuators"``, ``"left out of the motion"``, ``"dry friction"``, ``"limits"`` or ``"stiff joint"``;
     `says` tells it in words, and `joints` has its joints. `mbkit check` adds ``"the file itself"``, with the links and
     joints that `mbkit.lint` names.
-    `size` of a jump is its ratio to the other forces at that joint and the median state, the largest of all joints;
-    of a stiff joint its time constant, s; of the file the number of findings; of limits NaN.
+    `size` of dry friction is its ratio to the other forces at that joint and the median state, the largest of all
+    joints; of a stiff joint its time constant, s; of the file the number of findings; of limits NaN.
     """
 
     kind: str
@@ -207,7 +206,7 @@ class Comparison(ResultTable):
     `facts` has nq, nv, mass, digest, needs and notes of the model. `reference` is what the terms of all `engines` were
     measured by: the oracle. Accelerations of an engine with soft constraints are measured by its own written law
     instead, and `softness` has the digits that it keeps of the exact ones, at the median state. `findings` are what the
-    description has that no engine uses, its jumps and its stiff joints. `precision` is the error against run
+    description has that no engine uses, its dry friction and its stiff joints. `precision` is the error against run
     time of a few methods on a short horizon. `setup` has the seconds to build each engine; the derivation works when
     first called.
     `seconds` is the time of the whole study.

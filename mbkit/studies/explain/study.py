@@ -54,9 +54,9 @@ def explain(
     """Explain why two descriptions, or two engines, differ.
 
     Every difference between the descriptions is named, in each number of each kind of part, also of forces by
-    functions: rotors, jumps, springs, gravity, a lost, fused or changed body, inertia about the wrong point or in
-    the wrong axes, a joint's place, axis, zero or pitch, quaternion and joint order, mimic joints, velocity frames, a
-    known defect of an engine.
+    functions: rotor inertia, dry friction, springs, gravity, a lost, fused or changed body, inertia about the wrong
+    point or in the wrong axes, a joint's place, axis, zero or pitch, quaternion and joint order, mimic joints, velocity
+    frames, a known defect of an engine.
     Joints are matched by structure and name, and a mere choice of frames is no difference.
 
     The effect of each difference is measured: it is added alone to the first description, and removed alone from

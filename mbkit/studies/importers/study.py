@@ -381,7 +381,7 @@ def compare_parsers(
     The readings are compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses, centres of
     mass, inertias, numbers of joints, limits, the loops and couplers of an MJCF, and M, g, nle and passive by
     joint name, by the engine itself on its own model, with all that it holds beside bodies and joints: flags, tendons,
-    actuators at zero control, fluid, gravity compensation. Here passive holds the forces that jump. Links that
+    actuators at zero control, fluid, gravity compensation. Here passive holds the dry friction. Links that
     an importer fuses are fused on the other side too. Why one differs is in its ``explanation``. Mimic joints,
     limits, loops and couplers are in no term: they decide nothing, and the verdict names those that differ. Where mbkit
     does not read the file, an MJCF is compared with MuJoCo's own reading, and any other file with nothing: the

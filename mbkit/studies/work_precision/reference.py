@@ -412,7 +412,7 @@ def reference(
         Increasing times within the duration, s; 0 is added if it is not among them.
     torque : array_like or callable, optional
         (nv,), held all the time; (K - 1, nv), held over each interval of `save`, which then runs from 0 to `duration`;
-        or a function of (t, q, v), for which only two engines make a reference, as for forces that jump.
+        or a function of (t, q, v), for which only two engines make a reference, as for dry friction.
     seconds : float
         Limit of the search, without derivation and compilation. The best reference by then is returned.
     progress : bool or callable, optional
