@@ -57,12 +57,12 @@ def simulate(
         s. The run ends exactly there: where it is no multiple of `dt`, the last step is shorter.
     method : str
         With a step: ``"rk4"`` and ``"semi_implicit_euler"``, MuJoCo 4's formulas on any engine; ``"moreau"``, for many
-        joints with dry friction; ``"gauss4"`` and ``"gauss6"``, implicit, on any engine; ``"implicit_midpoint"``, symplectic, on the own derivation;
-        ``"mujoco_euler"``, ``"mujoco_rk4"``, ``"mujoco_implicit"``, ``"mujoco_implicitfast"`` and
-        ``"mujoco_discrete"``, MuJoCo's own on its engine. With a tolerance: ``"rk853"``, fastest on the own
-        derivation, and ``"dop853"``, ``"radau"``, ``"bdf"``, ``"lsoda"``, SciPy's, on any engine (the last three are
-        for stiff scenes); ``"taylor"``, heyoka's, and ``"cvodes"``, SUNDIALS', on the own derivation; ``"taylor"`` on
-        the oracle computes with 34 digits. `mbkit.simulate.METHODS` describes them.
+        joints with dry friction; ``"gauss4"`` and ``"gauss6"``, implicit, on any engine; ``"implicit_midpoint"``,
+        symplectic, on the own derivation; ``"mujoco_euler"``, ``"mujoco_rk4"``, ``"mujoco_implicit"``,
+        ``"mujoco_implicitfast"`` and ``"mujoco_discrete"``, MuJoCo's own on its engine. With a tolerance: ``"rk853"``,
+        fastest on the own derivation, and ``"dop853"``, ``"radau"``, ``"bdf"``, ``"lsoda"``, SciPy's, on any engine
+        (the last three are for stiff scenes); ``"taylor"``, heyoka's, and ``"cvodes"``, SUNDIALS', on the own
+        derivation; ``"taylor"`` on the oracle computes with 34 digits. `mbkit.simulate.METHODS` describes them.
     dt : float, optional
         Step of a method with a fixed step, s; 1e-3 by default. An adaptive method has none.
     rtol, atol : float, optional
