@@ -395,3 +395,18 @@ def test_soft_loops_are_doubted_in_each_run_of_one_engine():
         (doubt,) = (x for x in mb.simulate(dyn, q, tau, 0.01, "rk4", dt=1e-3).check().doubts if "soft" in x)
         assert f"{100 * off:.2g} %" in doubt
     assert not mb.simulate(mb.dynamics(model, "lagrangian"), q, tau, 0.01, "rk4", dt=1e-3).check().doubts
+
+
+def test_a_motion_as_small_as_its_tolerance_is_doubted():
+    """A block of 1e-3 m/s comes up a slope by 4.2e-8 m: `bdf` is a quarter of it off, within an atol of 1e-8."""
+    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
+    b.add_body("block", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), damping=0.0)
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    torque = [-12.0]
+    for speed, atol, doubted in ((1e-3, 1e-8, True), (1e-3, 1e-12, False), (1.0, 1e-8, False), (0.0, 1e-8, False)):
+        run = mb.simulate(dyn, [0.0], [speed], 1e-4, "bdf", rtol=1e-8, atol=atol, torque=torque)
+        error = abs(run.q[-1, 0] - (speed * 1e-4 - 6e-8))
+        assert error < 1e3 * atol
+        assert any("smaller atol" in x for x in run.check().doubts) == doubted
+    assert not mb.simulate(dyn, [0.0], [1e-3], 1e-4, "rk4", dt=1e-5, torque=torque).check().doubts

@@ -49,6 +49,8 @@ _SUM: Final = 1e-3
 _BRIEF: Final = 0.01
 #: Smallest eigenvalue of the mass matrix beside its largest, where a random configuration has a unit diagonal.
 _IDLE: Final = 1e-7
+#: Times `atol` that a run must move, so that a hundredth of its motion is known.
+_MOVED: Final = 100.0
 #: m or rad: the precision that a position must have.
 _POSITION: Final = 1e-6
 
@@ -105,6 +107,8 @@ def diagnostics(
         checks.append(condition(matrices[-1:] if quick else matrices))
     if not quick:
         checks.append(softness(dyn, at_q[0, 0], at_v[0, 0]))
+        if tolerances and not method.scaled_by_start:
+            checks.append(travel(q, v, tolerances))
     checks.append(coordinate_magnitude(at_q, None if method.scaled_by_start else tolerances))
     if tolerances and method.scaled_by_start:
         checks.append(scale_growth(at_q, at_v, tolerances))
@@ -326,6 +330,16 @@ def coordinate_magnitude(q: Array, tolerances: Tolerances | None) -> Iterator[st
         yield (
             f"rtol = {tolerances.rtol:g} of a coordinate of {largest:.2g} allows an error of "
             f"{tolerances.rtol * largest:.1g} in each step; count it from a nearer origin, or take a smaller rtol"
+        )
+
+
+def travel(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
+    """Find a motion as small as the error that a tolerance allows; what starts at rest may stay there."""
+    moved = float(np.abs(q - q[:, :1]).max(initial=0.0))
+    if v[:, 0].any() and moved < _MOVED * tolerances.atol:
+        yield (
+            f"coordinates move by at most {moved:.2g}, and atol = {tolerances.atol:g} allows an error of that size in "
+            "each step; take a smaller atol"
         )
 
 
