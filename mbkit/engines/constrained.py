@@ -34,7 +34,7 @@ QUANTITIES: Final = (
     "constraint_forces",
     "generalized_constraint_force",
 )
-ASKED: Final = frozenset({"row", "speed"}), "it has no loops and no other constraints"
+ASKED: Final = frozenset({"row", "speed"}), "it has no loops and no other constraints (add_loop, or constraints=[...])"
 ROWS: Final = Path("constraint rows", "", ALL, asks=ASKED)
 
 

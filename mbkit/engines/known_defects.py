@@ -12,14 +12,14 @@ from mbkit._warn import warn
 from mbkit.errors import KnownDefectWarning
 
 # Engine, the first and the last version in which it was reproduced, quantity; the wrong value; the right one. The
-# first is the oldest that was tried, or the one that brought what is wrong: Pinocchio's wheels have rotors since
+# first is the oldest that was tried, or the one that brought what is wrong: Pinocchio's wheels have an armature since
 # 3.3.1, MuJoCo's tendons since 3.3.1.
 CORIOLIS: Final = (
     "known defect of pinocchio 2.6.18 to 4.1.0, coriolis_matrix: computeCoriolisMatrix leaves C v + g different from "
     "nle for some joint types (pinocchio#2053); nle is right"
 )
 KINETIC_ENERGY: Final = (
-    "known defect of pinocchio 3.3.1 to 4.1.0, kinetic_energy: computeKineticEnergy leaves out the rotors of some "
+    "known defect of pinocchio 3.3.1 to 4.1.0, kinetic_energy: computeKineticEnergy leaves out the armature of some "
     "joint types; half vᵀ M v is right"
 )
 JACOBIAN_RATE: Final = (
@@ -33,7 +33,7 @@ TINY_MASS: Final = (
     "or take a larger unit of mass"
 )
 TENDON_ARMATURE: Final = (
-    "known defect of mujoco 3.3.1 to 4.0.0, mass_matrix: the inertia of a tendon over joints of different branches is "
+    "known defect of mujoco 3.3.1 to 4.0.0, mass_matrix: the armature of a tendon over joints of different branches is "
     "left out of M's entries between the branches, and with them out of accelerations and the kinetic energy; the "
     "lagrangian and pinocchio engines have all of a c cᵀ"
 )

@@ -376,7 +376,7 @@ class Description:
 
     @cached_property
     def constraints(self) -> tuple[Any, ...]:
-        """The parts that bind coordinates or velocities: loops, couplers, motions in time, contacts without slip."""
+        """Loops, couplers, motions in time and contacts without slip, the parts that bind coordinates or velocities."""
         return tuple(x for section in CONSTRAINT_FEATURES for x in getattr(self, section))
 
     @cached_property

@@ -185,7 +185,7 @@ class _Frozen:
 
     @property
     def rotors(self) -> Any:
-        """The inertia beside that of bodies: of a joint on each velocity, (nv,), of a coupling on its rate."""
+        """The inertia beside that of bodies, of a joint on each velocity, (nv,), of a coupling on its rate."""
         return sum(getattr(self, name) for name in self.adding_to("T"))
 
 
