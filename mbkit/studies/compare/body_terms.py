@@ -146,8 +146,8 @@ def _mechanism_load_errors(error: Array, reference: Array, scales: BodyScales) -
 
 def _forces(error: Array, reference: Array, force: Array, arm: Array, moment: Array | float = 0.0) -> Errors:
     force = np.maximum(force, np.abs(reference[..., :3]).max(axis=(1, 2), initial=0.0))
-    moment = np.maximum(force * arm + moment, np.abs(reference[..., 3:]).max(axis=(1, 2), initial=0.0))
-    return _halves(error, force, moment)
+    angular = np.maximum(force * arm + moment, np.abs(reference[..., 3:]).max(axis=(1, 2), initial=0.0))
+    return _halves(error, force, angular)
 
 
 def _momentum_bias_errors(error: Array, reference: Array, scales: BodyScales) -> Errors:
