@@ -124,7 +124,10 @@ def flowed(manifold: Manifold, q: Array, v: Array, well: float) -> tuple[Array, 
         return None
     if not manifold.apartness(q) > well:
         return None
-    x = manifold._terms(q, v)
-    v1 = v + least_change(x.M, x.J, -x.rate)
+    v1 = v
+    # Once more for what rounding leaves, as a velocity may be small beside the one that was drawn.
+    for _ in range(2):
+        x = manifold._terms(q, v1)
+        v1 = v1 + least_change(x.M, x.J, -x.rate)
     good = np.linalg.norm(v1) <= _SLOPE * np.linalg.norm(v) and not manifold.still_open(q, v1)
     return (q, v1) if good else None
