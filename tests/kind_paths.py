@@ -142,6 +142,8 @@ def _called(name: str, x: Example, low: str) -> bool:
         name.split(".")[-1].replace("_", "-"),
         name.split(".")[-1],
         "dry friction" if "tion" in name.partition(".")[2] else "",
+        # It is told by its body.
+        "of its weight" if "compensation" in name else "",
     )
     constraint = x.rows and "constraint" in low
     return constraint or any(w and w in low for w in more)
@@ -360,7 +362,7 @@ def _changed(x: Example, name: str) -> list[tuple[str, Model]]:
     return out
 
 
-@column("quantities", "its number as a parameter", "free numbers")
+@column("quantities", "its number as a parameter")
 def _number(x: Example, folder: Path) -> Told:
     """The model with the number typed is evaluated beside the one at another value."""
     k = PART_KINDS.get(x.name)

@@ -53,7 +53,8 @@ class Package(NamedTuple):
     limit : float
         Seconds that one evaluation may take, compiling included.
     defects : mapping
-        Its known defects by the begin of the quantity, "coriolis" or "kinetic_"; announced where a model shows them.
+        Its known defects by the begin of the quantity, ``"coriolis"`` or ``"kinetic_"``; announced where a model shows
+        them.
     importer : str
         Its file in `remote` that describes what its own importer reads; empty where there is none.
     """
