@@ -90,3 +90,14 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
+
+
+@pytest.fixture(scope="module")
+def own_environments(tmp_path_factory):
+    """Environments in a folder of the module's own, whose processes are started once and end with it."""
+    from mbkit._child_process import end_all
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MBKIT_ENVIRONMENTS", str(tmp_path_factory.mktemp("environments")))
+        yield
+        end_all()

@@ -27,7 +27,6 @@ import pytest
 import scipy.linalg
 
 import mbkit as mb
-from mbkit._child_process import end_all
 from mbkit.codegen.c_source import export_c
 from mbkit.errors import InputError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.lagrangian import from_model, program
@@ -43,6 +42,7 @@ from tests.plain_mechanics import TIP, Case, random_case
 from tests.test_engine_versions import present
 from validation.matrix import takes
 
+pytestmark = pytest.mark.usefixtures("own_environments")
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake", "oracle")
 #: Sums of a few hundred rounded terms, and second differences of the reference's rows.
 CLOSE = 1e-9
@@ -539,15 +539,6 @@ BELOW |= {
     "remote runs": "sent",
     "remote runs of joints": "sent",
 }
-
-
-@pytest.fixture(scope="module", autouse=True)
-def environments(tmp_path_factory):
-    """Processes of the present interpreter, each started once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MBKIT_ENVIRONMENTS", str(tmp_path_factory.mktemp("environments")))
-        yield
-        end_all()
 
 
 def test_every_kind_has_an_example_and_every_path_a_check() -> None:

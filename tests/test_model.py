@@ -819,3 +819,26 @@ def test_degrees_of_roll_pitch_and_yaw_are_hinted_at() -> None:
         for note in mb.load(text, floating_base=True).notes
     )
     assert hints(lambda: mb.explain(mb.load("ur5"), mb.load("ur5").without("gravity"))) == []
+
+
+def test_numbers_of_velocities_and_the_model_without_jumps() -> None:
+    """A follower with ratio -2 counts fourfold in armature and damping, and twofold in dry friction."""
+    b = mb.ModelBuilder("follower")
+    for i, mimic in enumerate((None, mb.Mimic("j0", ratio=-2.0), None)):
+        b.add_body(f"b{i}", mass=1.0, com=(0, 0, 0.3), inertia=(0.1, 0.1, 0.1))
+        numbers = {"armature": 1.0 + i, "damping": 0.5, "friction": 0.25} | ({"mimic": mimic} if mimic else {})
+        parent = f"b{i - 1}" if i else "world"
+        b.add_joint(f"j{i}", "revolute", parent=parent, child=f"b{i}", axis=(0, 1, 0), **numbers)
+    model = b.build()
+    assert model.velocity_joints == ("j0", "j2")
+    assert model.per_velocity("armature") == pytest.approx([1.0 + 4 * 2.0, 3.0])
+    assert model.per_velocity("damping") == pytest.approx([0.5 + 4 * 0.5, 0.5])
+    assert model.per_velocity("friction") == pytest.approx([0.25 + 2 * 0.25, 0.25])
+    assert {"T", "V", "loss", "jump", "q"} <= model.effects
+    assert model.smooth == model.without("friction")
+    smooth = model.smooth
+    assert "jump" not in smooth.effects
+    assert smooth.smooth is smooth
+    for name in ("parent", "stiction", "lower", "armatur"):
+        with pytest.raises(UnknownNameError, match=name):
+            model.per_velocity(name)

@@ -7,22 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from mbkit._child_process import end_all
 from tests import kind_mutations as mutations
 from tests.kind_paths import COLUMNS, ROWS, registered
 
 mutations.checks()
+pytestmark = pytest.mark.usefixtures("own_environments")
 GATES = sorted({*registered()} - {*mutations.ELSEWHERE})
 RECORDED = json.loads((Path(__file__).parent.parent / "validation" / "matrix.json").read_text(encoding="utf-8"))
 RIGHT = {(r["kind"], path) for r in RECORDED["rows"] for path, cell in r["cells"].items() if cell[0] == "right"}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def environments(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MBKIT_ENVIRONMENTS", str(tmp_path_factory.mktemp("environments")))
-        yield
-        end_all()
 
 
 def survivors(mutation: str, path: str, folder: Path, most: int | None = None) -> list[str]:

@@ -93,7 +93,7 @@ class Constrained:
     model: Model
     #: Whether the engine lets constraints give way: its states are those of its own equations, and none is projected.
     soft_constraints: bool = False
-    #: Options with which the engine holds what jumps by its own soft law, and whether it does.
+    #: Options with which the engine holds dry friction by its own soft law, and whether it does.
     own_friction: ClassVar[Mapping[str, Any]] = {}
     soft_friction: bool = False
     engine: ClassVar[str]
@@ -104,7 +104,7 @@ class Constrained:
     forward_dynamics: Callable[..., Array]
 
     def _friction_beside_passive(self, q: Array, v: Array, tau: Array) -> Array:  # noqa: ARG002  # of a soft law
-        """Return the forces that jump, in accelerations under τ, less those in `passive`; (N, nv)."""
+        """Return the forces of dry friction in accelerations under τ, less those in `passive`; (N, nv)."""
         return np.zeros_like(v)
 
     @property
@@ -344,7 +344,7 @@ class Constrained:
         return self._evaluate("generalized_constraint_force", q=q, v=v, tau=tau)
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:
-        # What jumps is in τ already.
+        # Dry friction is in τ already.
         J, forces = self.constraint_jacobian(q), self._without_friction("constraint_forces")(q, v, tau)
         return (np.swapaxes(J, -1, -2) @ forces[..., None])[..., 0]
 

@@ -32,6 +32,7 @@ from mbkit.model.parts import (
     NumberRule,
     PointSpring,
     read_only,
+    rules_of,
 )
 
 #: Attributes of a description that bind its coordinates or velocities to each other.
@@ -314,11 +315,13 @@ class Description:
         return tuple(j.name for j in self.independent_joints for _ in range(j.type.nv))
 
     def per_velocity(self, name: str) -> Array:
-        """Return a number of all joints as each entry of v has it, (nv,).
+        """Return armature, damping, stiffness or friction of all joints, as each entry of v has it, (nv,).
 
-        That of a mimic joint counts by the square of its ratio, as a force grows with the ratio too; the size of a
-        force that jumps by the ratio alone.
+        That of a mimic joint counts by the square of its ratio, as a force grows with the ratio too; dry friction by
+        the ratio alone. Other names raise `UnknownNameError`.
         """
+        if name not in (known := [k for k, rule in rules_of(Joint).items() if rule.does]):
+            raise UnknownNameError("number of a joint's velocity", name, known)
         full, G = _joined([getattr(j, name) for j in self.joints]), self.layout.G
         ratios = np.abs(G) if name in Joint.adding_to("jump") else np.square(G)
         return np.asarray(ratios.T @ full if self.layout.reduced else full)

@@ -49,6 +49,8 @@ _SUM: Final = 1e-3
 _BRIEF: Final = 0.01
 #: Smallest eigenvalue of the mass matrix beside its largest, where a random configuration has a unit diagonal.
 _IDLE: Final = 1e-7
+#: m/s or rad/s: what rounding leaves of the velocities of a state at rest, as its projection.
+_STILL: Final = 1e3 * _EPS
 #: Times `atol` that a run must move, so that a hundredth of its motion is known.
 _MOVED: Final = 100.0
 #: m or rad: the precision that a position must have.
@@ -336,7 +338,7 @@ def coordinate_magnitude(q: Array, tolerances: Tolerances | None) -> Iterator[st
 def travel(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
     """Find a motion as small as the error that a tolerance allows; what starts at rest may stay there."""
     moved = float(np.abs(q - q[:, :1]).max(initial=0.0))
-    if v[:, 0].any() and moved < _MOVED * tolerances.atol:
+    if np.abs(v[:, 0]).max(initial=0.0) > _STILL and moved < _MOVED * tolerances.atol:
         yield (
             f"coordinates move by at most {moved:.2g}, and atol = {tolerances.atol:g} allows an error of that size in "
             "each step; take a smaller atol"
