@@ -14,6 +14,7 @@ from click.testing import CliRunner
 import mbkit as mb
 from mbkit.cli import cli
 from mbkit.lagrangian import systems
+from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.printer import ExpressionPrinter, folded, written
 from mbkit.lagrangian.printing.catalog_symbols import with_plain_turns
 from mbkit.lagrangian.printing.summary import SystemSummary, python_code
@@ -246,6 +247,14 @@ def test_symbols_as_they_are_written():
         "p_φ",
         "m₁",
     ]
+
+
+def test_dots_stand_on_the_letter_of_a_part_s_coordinate():
+    names = ("x.x", "floating_base.theta1", "wrist.1")
+    rates = [velocity_of(sp.Symbol(n)) for n in names]
+    assert [written(r.name) for r in rates] == ["x.ẋ", "floating_base.θ̇₁", "wri̇st.1"]
+    board = ExpressionPrinter((), ())
+    assert [board.latex(r) for r in rates] == [r"x.\dot{x}", r"floating_{base}.\dot{\theta}_{1}", r"\dot{wrist}.1"]
 
 
 def test_expressions_on_one_line():

@@ -166,6 +166,24 @@ def test_friction_and_armature_are_found_and_written_back(physical: bool) -> Non
     assert [after.joint(f"j{k}").friction[0] for k in range(3)] == pytest.approx([0.5, 0.4, 0.3], rel=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_zero_but_for_rounding_or_noise_is_zero_in_the_model(seed: int) -> None:
+    true = arm().without("damping", "friction", "armature")
+    q, v, a = motion(true, seed=seed)
+    tau = torques(true, q, v, a)
+    for given in (tau, noise(tau, 0.01, seed)):
+        found = mb.identify(true, q, v, a, given, friction=True, rest=0.0)
+        told = {p.name: p for p in found.parameters}
+        for j in found.model.joints:
+            for field in ("damping", "friction"):
+                estimate = told[f"{j.name}.{field}"]
+                assert getattr(j, field) == (estimate.value if estimate.value > 0 else 0.0)
+                assert abs(estimate.value) < 4 * estimate.deviation
+    # A number that the data deny is refused.
+    with pytest.raises(ModelError, match="j1': damping"):
+        _ = mb.identify(true, q, v, a, noise(tau - 0.1 * v, 0.01), friction=True, rest=0.0).model
+
+
 def test_what_is_not_asked_for_is_taken_from_the_model() -> None:
     true = arm().without("friction")
     q, v, a = motion(true)

@@ -24,7 +24,7 @@ _CASES = re.compile(
     r"\\begin\{cases\} (.*?) & \\text\{for\}\\:(.*?)\\\\(.*?) & \\text\{otherwise\} \\end\{cases\}",
 )
 _NUMBER = r"\d+\.?\d*(?:e[-+]?\d+)?"
-_TOKEN = re.compile(rf"{_NUMBER}|[A-Za-z]\w*|[⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ]+|[<>=!]=|\S", re.ASCII)
+_TOKEN = re.compile(rf"{_NUMBER}|[A-Za-z]\w*(?:\.\w+)*|[⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ]+|[<>=!]=|\S", re.ASCII)
 _GREEK = (
     "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi omicron pi rho sigma tau upsilon phi chi "
     "psi omega"

@@ -40,7 +40,7 @@ class Fit:
     values : (p,) array
         Along directions that the data cannot tell they are as far as before.
     deviations : (p,) array
-        Standard deviations, infinite where the data cannot tell a parameter.
+        Standard deviations, no less than rounding; infinite where the data cannot tell a parameter.
     null : (k, p) array
         Directions that change no torque, each with a one that the others do not have.
     condition : float
@@ -80,7 +80,9 @@ def fit(given: Sequence[Equations], start: Array, units: Array, *, weighted: boo
         if np.abs(noise / before - 1).max(initial=0.0) < _SETTLED:
             break
     null = solution.null
-    deviations = np.where(null.any(axis=0), np.inf, solution.deviations(found))
+    # Rounding of a sum of equations moves the estimates together, unlike noise of each.
+    rounding = _EPS * max((x.count**0.5 * x.size for x in given), default=0.0)
+    deviations = np.where(null.any(axis=0), np.inf, solution.deviations(np.maximum(found, rounding)))
     return Fit(solution.values, deviations, null, solution.condition, found)
 
 

@@ -19,6 +19,8 @@ from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Titl
 _SIZE: Final = len(STANDARD)
 #: Velocities whose residuals are printed.
 _SHOWN: Final = 8
+#: Standard deviations below a bound within which an estimate is the bound.
+_UNSURE: Final = 3.0
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,7 @@ class Identification(ResultTable):
         """Return a description with the identified masses, centres of mass and inertias, friction and armature.
 
         `mbkit.convert` writes it as URDF or MJCF. A joint that others mimic gets the friction that is not theirs.
+        Friction and armature below zero by less than three standard deviations are zero.
 
         Raises
         ------
@@ -183,15 +186,18 @@ class Identification(ResultTable):
         raise ModelError(model.name, [*faults, hint])
 
     def _joints(self, model: Model) -> tuple[Joint, ...]:
-        values = {p.name: p.value for p in self.parameters}
+        found = {p.name: p for p in self.parameters}
         out = []
         for joint in model.joints:
             changes: dict[str, Any] = {}
             for field in chain(*OF_JOINTS):
                 names = [f"{n}.{field}" for n in model.velocity_names[model.layout.v[joint.name]]]
-                if names and names[0] in values:
-                    before = model.per_velocity(field)[model.layout.v[joint.name]]
-                    changes[field] = getattr(joint, field) + np.array([values[n] for n in names]) - before
+                if names and names[0] in found:
+                    beside = getattr(joint, field) - model.per_velocity(field)[model.layout.v[joint.name]]
+                    values = np.array([found[n].value for n in names]) + beside
+                    # Rounding and noise of what is zero have any sign.
+                    unsure = [_UNSURE * found[n].deviation if found[n].determined else 0.0 for n in names]
+                    changes[field] = np.where((values < 0) & (values >= np.negative(unsure)), 0.0, values)
             out.append(replace(joint, **changes) if changes else joint)
         return tuple(out)
 

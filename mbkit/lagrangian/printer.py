@@ -227,7 +227,10 @@ class _Latex(LatexPrinter):  # type: ignore[misc]
     """SymPy's printer, with ½ in front of a product, and with names that are not TeX escaped."""
 
     def _print_Symbol(self, expr: sp.Symbol, style: str = "plain") -> str:
-        numbered = _NUMBERED.fullmatch(expr.name)
+        part, name, number = apart(expr.name)
+        if part or number:
+            return f"{self._print_Symbol(sp.Symbol(part[:-1]))}{part[-1:]}{self._print_Symbol(sp.Symbol(name))}{number}"
+        numbered = _NUMBERED.fullmatch(name)
         if numbered and pretty_symbol(numbered[2]) != numbered[2]:
             stem, letter, digits = (self._print_Symbol(sp.Symbol(part), style) for part in numbered.groups())
             return f"{stem}_{{{letter}_{{{digits}}}}}"
@@ -269,14 +272,22 @@ def spread(x: sp.Expr) -> sp.Expr:
     return sp.Add(*(sp.Mul(number, *others, term) for term in sums[0].args))
 
 
+def apart(name: str) -> tuple[str, ...]:
+    """Return a name's part, its coordinate, and the number of that: ``"arm."``, ``"wrist"``, ``".1"``."""
+    return re.fullmatch(r"((?:.*\.(?!\d+$))?)(.*?)((?:\.\d+)?)", name, flags=re.S).groups()  # type: ignore[union-attr]
+
+
 def written(name: str) -> str:
-    """Return a symbol's name in Unicode: θ̇₁; a letter below the line stays behind its mark: m_p."""
-    name = one_line(name)
+    """Return a symbol's name in Unicode: θ̇₁; a letter below the line stays behind its mark: m_p.
+
+    A part's name before a point stays as it is, and a number behind one: arm.θ̇₁, ẋ.1.
+    """
+    part, name, number = apart(one_line(name))
     stem, mark, index = name.partition("_")
     split = mark and index[:1].isalpha() and stem
     # One letter with its dot where there is such a letter.
     text = f"{pretty_symbol(stem)}_{pretty_symbol(index)}" if split else str(pretty_symbol(name))
-    return unicodedata.normalize("NFC", text)
+    return unicodedata.normalize("NFC", f"{part}{text}{number}")
 
 
 def _below(x: sp.Expr) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from textwrap import indent
 from typing import Any, Final
 
@@ -19,8 +19,20 @@ from mbkit.model.elements.paths import Path
 
 _TYPES: Final = {k: k for k in ("fixed", "revolute", "continuous", "prismatic", "planar")} | {"free": "floating"}
 _CARRIED: Final = "gravity mimic joint.limit joint.velocity_limit joint.effort_limit"
+
+
+def _notes(model: Model) -> Iterator[str]:
+    if not np.array_equal(model.gravity, [0.0, 0.0, -9.81]):
+        yield f"URDF has no gravity: load it with gravity={tuple((model.gravity + 0.0).tolist())}"
+    if hidden := {f.name for f in model.frames} & {b.name for b in model.bodies}:
+        yield f"frames that have a body's name were left out: {', '.join(sorted(hidden))}"
+
+
 URDF: Final = Path(
-    "urdf", "URDF cannot say of", joint_types(*_TYPES) | {*_CARRIED.split(), *(f"joint.{x}" for x in DYNAMICS)}
+    "urdf",
+    "URDF cannot say of",
+    joint_types(*_TYPES) | {*_CARRIED.split(), *(f"joint.{x}" for x in DYNAMICS)},
+    beside=_notes,
 )
 # Stands for no limit: the largest number that every reader reads.
 _OPEN: Final = 1e308

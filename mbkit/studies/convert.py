@@ -18,7 +18,7 @@ from mbkit.engines import dynamics
 from mbkit.engines.registry import DERIVED
 from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError, UnsupportedError, writing
 from mbkit.load import load
-from mbkit.load.urdf_writer import urdf_text
+from mbkit.load.urdf_writer import URDF, urdf_text
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.model.elements.references import KINDS_OF_PARTS
@@ -120,17 +120,9 @@ def _head(model: Model, check: str) -> str:
 
 
 def _to_mjcf(model: Model) -> Converted:
-    from mbkit.engines.mujoco.mjcf_writer import MJCF, mjcf_text, read_back
+    from mbkit.engines.mujoco.mjcf_writer import LIFTED, MJCF, mjcf_text, read_back
 
-    notes = [*MJCF.admit(model)]
-    efforts = ((j.name, j.effort_limit[np.isfinite(j.effort_limit)]) for j in model.joints)
-    if lost := [name for name, x in efforts if len(x) and (model.joint(name).type.nv > 1 or not x.all())]:
-        notes.append(f"MJCF has no effort limits of zero or of several velocities at once: {', '.join(lost)}")
-    # Bodies whose moments MuJoCo would not take as they are.
-    moments = {b.name: np.linalg.eigvalsh(b.inertia) for b in model.bodies if b.mass}
-    lifted = [repr(name) for name, (low, middle, high) in moments.items() if low < 1e-15 or low + middle < high]
-    if lifted:
-        notes.append(f"principal moments of points and plates were lifted to what MuJoCo takes: {', '.join(lifted)}")
+    notes = MJCF.admit(model)
     text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
     at = states_of(model, _STATES, 0)
     back = read_back(model, text)
@@ -143,19 +135,14 @@ def _to_mjcf(model: Model) -> Converted:
             raise MbkitError(f"convert: loops of {model.name} read back otherwise; please report this model")
     difference = gaps(model_terms(model, at), values, at.v, model.velocity_joints)
     if not difference.comparable or difference.worst > _TOLERANCE:
-        why = f"MuJoCo wants inertias with A + B >= C of {', '.join(lifted)}" if lifted else "please report this model"
+        why = next((n for n in notes if n.startswith(LIFTED)), "please report this model")
         off = f"{difference.worst:.1e} at {difference.joint}"
         raise MbkitError(f"convert: what was written of {model.name} reads back otherwise: {off}; {why}")
-    return Converted(model.name, "mjcf", text, difference.terms, tuple(notes))
+    return Converted(model.name, "mjcf", text, difference.terms, notes)
 
 
 def _to_urdf(model: Model) -> Converted:
-    notes = []
-    if not np.array_equal(model.gravity, [0.0, 0.0, -9.81]):
-        notes.append(f"URDF has no gravity: load it with gravity={tuple((model.gravity + 0.0).tolist())}")
-    hidden = {f.name for f in model.frames} & {b.name for b in model.bodies}
-    if hidden:
-        notes.append(f"frames that have a body's name were left out: {', '.join(sorted(hidden))}")
+    notes = [*URDF.admit(model)]
     text = urdf_text(model, _head(model, "agreed with the description by Pinocchio's parser"))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "robot.urdf"

@@ -30,6 +30,7 @@ _TYPES: Final = {
 }
 # MuJoCo refuses principal moments below 1e-15 kg m².
 _LEAST: Final = 2e-15
+LIFTED: Final = "principal moments"
 
 
 def _numbers_not_held(model: Model) -> Iterator[str]:
@@ -47,6 +48,15 @@ def _numbers_not_held(model: Model) -> Iterator[str]:
     yield from (f"body {name!r}: {why}" for name, why in model.nonphysical)
 
 
+def _notes(model: Model) -> Iterator[str]:
+    efforts = ((j, j.effort_limit[np.isfinite(j.effort_limit)]) for j in model.joints)
+    if lost := [j.name for j, x in efforts if len(x) and (j.type.nv > 1 or not x.all())]:
+        yield f"MJCF has no effort limits of zero or of several velocities at once: {', '.join(lost)}"
+    moments = {b.name: np.linalg.eigvalsh(b.inertia) for b in model.bodies if b.mass}
+    if lifted := [repr(n) for n, (low, middle, high) in moments.items() if low < 1e-15 or low + middle < high]:
+        yield f"{LIFTED} of points and plates were lifted to what MuJoCo takes: {', '.join(lifted)}"
+
+
 MJCF: Final = Path(
     "mjcf",
     "MJCF cannot say of",
@@ -60,6 +70,7 @@ MJCF: Final = Path(
         "joint.velocity_limit": "MJCF has no velocity limits",
     },
     also=_numbers_not_held,
+    beside=_notes,
 )
 
 

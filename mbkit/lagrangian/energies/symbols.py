@@ -12,6 +12,7 @@ import sympy as sp
 from sympy.core.function import AppliedUndef, UndefinedFunction
 
 from mbkit.errors import InputError
+from mbkit.lagrangian.printer import apart
 
 
 def velocity_of(coordinate: sp.Symbol) -> sp.Symbol:
@@ -26,9 +27,10 @@ def acceleration_of(coordinate: sp.Symbol) -> sp.Symbol:
 
 def _dotted(symbol: sp.Symbol, dots: str) -> sp.Symbol:
     # SymPy's printers read the modifier from the name, before its digits and indices.
-    stem, rest = re.fullmatch(r"(.*?)(_.*|\d*)", symbol.name, flags=re.S).groups()  # type: ignore[union-attr]
+    part, name, number = apart(symbol.name)
+    stem, rest = re.fullmatch(r"(.*?)(_.*|\d*)", name, flags=re.S).groups()  # type: ignore[union-attr]
     # A positive coordinate has velocities of any sign.
-    return sp.Symbol(f"{stem}{dots}{rest}", **({"real": True} if symbol.is_real else {}))
+    return sp.Symbol(f"{part}{stem}{dots}{rest}{number}", **({"real": True} if symbol.is_real else {}))
 
 
 def free_name(name: str, used: Collection[str]) -> str:

@@ -36,6 +36,8 @@ class Path:
         Two kinds or effects that it does not carry together, and why.
     also : callable
         ``also(model)`` yields further faults, which depend on numbers.
+    beside : callable
+        ``beside(model)`` yields further notes, on what is of no kind.
     instead : str
         Remedies, beside `Model.without`.
     """
@@ -48,6 +50,7 @@ class Path:
     asks: tuple[frozenset[str], str] = (frozenset(), "")
     apart: tuple[tuple[str, str, str], ...] = ()
     also: Callable[[_Model], Iterable[str]] = lambda _: ()
+    beside: Callable[[_Model], Iterable[str]] = lambda _: ()
     instead: str = ""
 
     def __post_init__(self) -> None:
@@ -72,7 +75,8 @@ class Path:
             raise UnsupportedError(refusal)
         kinds = [kind(name) for name in model.acts] if self.notes else []
         notes = [text for key, text in self.notes.items() if any(_is(k, key) for k in kinds)]
-        return tuple(filter(None, dict.fromkeys(text if isinstance(text, str) else text(model) for text in notes)))
+        texts = (text if isinstance(text, str) else text(model) for text in notes)
+        return tuple(filter(None, dict.fromkeys([*texts, *self.beside(model)])))
 
     def refuses(self, model: _Model, words: str = "") -> str:
         """Return why the path does not carry a model, with every part; empty where it does."""
