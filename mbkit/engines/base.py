@@ -750,8 +750,8 @@ def no_dynamics(value: Any, name: str = "dyn") -> InputError:
 # Dynamics that depend on the time: the time is one of their model's parameters.
 
 
-def at_time(dyn: _Dynamics, t: float) -> _Dynamics:
-    """Return the dynamics at a time; the same ones where time does not enter."""
+def at_time(dyn: _Dynamics, t: float | Array) -> _Dynamics:
+    """Return the dynamics at a time, or at that of each sample; the same ones where time does not enter."""
     clock = dyn.model.time_parameter
     return dyn if clock is None else dyn.at(**{clock: t})  # type: ignore[return-value]  # of its own kind
 

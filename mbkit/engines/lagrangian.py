@@ -344,7 +344,8 @@ class LagrangianDynamics(Dynamics):
         out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
         for name in ("parameter_values", "_phases", "_matter"):
             out.__dict__.pop(name, None)
-        vars(out).update(model=model, _batched=batched, _wrenched={})
+        bare: Any = self._bare
+        vars(out).update(model=model, _batched=batched, _wrenched={}, _bare=bare and bare._with(model, batched))
         return out
 
     def __reduce__(self) -> tuple[Any, ...]:

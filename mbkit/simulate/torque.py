@@ -107,8 +107,8 @@ class StateFeedback:
         self._constant = self.torque + self.gain @ np.concatenate([self.q, self.v])
 
     def __call__(self, t: float, q: Array, v: Array) -> Array:  # noqa: ARG002  # the same at any time
-        """Return the torque at one state, (nv,)."""
-        return np.asarray(self._constant - self.gain @ np.concatenate([q, v]))
+        """Return the torque at one state, (nv,), or at those of a batch, (N, nv)."""
+        return np.asarray(self._constant - np.concatenate([q, v], axis=-1) @ self.gain.T)
 
     def __repr__(self) -> str:
         nv, nx = self.gain.shape
@@ -244,10 +244,10 @@ class Torque:
 
     @classmethod
     def of_force(cls, force: Array, model: Model) -> Torque:
-        """Return a constant force, (n,): τ, and behind it what wrenches there are."""
-        out = cls(None, model, None, None)
-        out._size, out._constant, out._of_all = len(force), force, force
-        out._with_functions = ForceFunctions(PiecewiseConstantTorque(force, None), ())
+        """Return a constant force, (n,) or of a batch (N, n): τ, and behind it what wrenches there are."""
+        out, constant = cls(None, model, None, None), force if force.ndim == 1 else force[:, None]
+        out._size, out._constant, out._of_all = force.shape[-1], constant, force
+        out._with_functions = ForceFunctions(PiecewiseConstantTorque(constant, None), ())
         return out
 
     @property
@@ -299,6 +299,23 @@ class Torque:
         out._of_all = out._constant
         out._with_functions = ForceFunctions(PiecewiseConstantTorque(out._constant, None), self._functions)
         return out
+
+    def of_steps(self, members: Indices, starts: Indices, count: int) -> Torque:
+        """Return the force on members of a batch over `count` steps, from a step of its own on for each of them."""
+        out = copy(self)
+        if self._rows is not None:
+            out._rows = self.at_steps(members, starts, count)
+        elif self._constant.ndim > 1:
+            out._constant = self._constant[members]
+        out._of_all = self._of_all[members]
+        return out
+
+    def at_steps(self, members: Indices, starts: Indices, count: int) -> Array:
+        """Return the rows of `of_steps`, (m, count, n); behind the last step they are those of the last one."""
+        if self._rows is None:
+            return np.broadcast_to(self._of_all[members][:, None], (len(members), count, self._size))
+        k = np.minimum(starts[:, None] + np.arange(count), self._rows.shape[-2] - 1)
+        return np.asarray(self._rows[k] if self._rows.ndim == 2 else self._rows[members[:, None], k])
 
     def over_states(self, member: int | None, start: int, count: int) -> Array | None:
         """Return the force that leads to each of some states of one trajectory, (count, n); None of functions."""

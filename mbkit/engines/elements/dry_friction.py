@@ -173,6 +173,8 @@ class DryFriction:
     def __init__(self, model: Model) -> None:
         self._model, self.law = model, DryFrictionLaw(model)
         self._constrained = model.constrained
+        #: A model, and that whose joints slide, for `phases`.
+        self._slid: tuple[Model, Model] | None = None
 
     def beside(self, quantity: str, method: Callable[..., Any], dyn: Any) -> Callable[..., Any]:
         """Return an engine's method for a quantity with friction; terms of one with elements hold it at speed."""
@@ -313,9 +315,15 @@ class DryFriction:
 
     def phases(self, dyn: Any, sides: Array, still: Mask) -> Any:
         """Return the dynamics of a batch in which each state has its own signs and rest, (N, nv); own derivation."""
-        own, sliding = self.phase(dyn, np.ones(sides.shape[1]), np.zeros(sides.shape[1], dtype=bool)), self.sliding
+        sliding, bare, model = self.sliding, dyn._bare or dyn, dyn.model
+        if self._slid is None or self._slid[0] is not model:
+            none = np.zeros(model.nv)
+            self._slid = model, sliding.at(none, none > 0, model)
+        own = bare._of_model(self._slid[1], sliding.form)
         values = {name: np.where(still, 0.0, sides)[:, i] for i, name in sliding.sides.items()}
-        return own.at(**values, **{name: RESTING * still[:, i] for i, name in sliding.locks.items()})
+        values |= {name: RESTING * still[:, i] for i, name in sliding.locks.items()}
+        own = own._with(own.model, {**own._batched, **values})
+        return own._under(*dyn._acting) if dyn._acting[0] else own
 
     @cached_property
     def sliding(self) -> Sliding:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,25 +12,35 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.model.changes.dry_friction import ROUNDING
+from mbkit.simulate.events import Hit
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """Smooth dynamics in which velocities have signs, (nv,), or rest."""
+    """Smooth dynamics in which velocities have signs, (nv,), or rest; of trajectories side by side (m, nv).
+
+    `rubbed` are the dynamics with friction of the same trajectories.
+    """
 
     dyn: Dynamics
     sides: Array
     still: NDArray[np.bool_]
+    rubbed: Dynamics
+
+    def take(self, which: Indices) -> Phase:
+        """Return the phases of these trajectories, by index, which may repeat."""
+        dyn, rubbed = self.dyn.of_samples(which), self.rubbed.of_samples(which)
+        return Phase(dyn, self.sides[which], self.still[which], rubbed)
 
 
 class Friction:
-    """Dry friction of one trajectory's dynamics."""
+    """Dry friction of one trajectory's dynamics, or of trajectories `side_by_side` on the own derivation."""
 
-    def __init__(self, dyn: Dynamics) -> None:
-        self._dyn, self._own = dyn, dyn._friction
-        self.law = self._own.law
+    def __init__(self, dyn: Dynamics, *, side_by_side: bool = False) -> None:
+        self._dyn, self._own, self._side_by_side = dyn, dyn._friction, side_by_side
+        self.law, self._names = self._own.law, dyn.model.velocity_names
         #: Velocities with friction.
         self.which = np.flatnonzero(self.law.bound > 0)
         layout = dyn.model.layout
@@ -39,26 +50,44 @@ class Friction:
         # Joints with friction have a coordinate for each velocity.
         self._places = np.array([i for part in places for i in part], dtype=np.intp)[self.which]
 
-    def phase(self, t: float, q: Array, v: Array, force: Force, leaving: Array | None = None) -> Phase:
-        """Return the phase that begins in a state, or those of a batch on the own derivation.
+    def phase(
+        self,
+        t: float | Array,
+        q: Array,
+        v: Array,
+        force: Force,
+        leaving: Array | None = None,
+        members: Indices | None = None,
+    ) -> Phase:
+        """Return the phase that begins in a state, or those of `members` side by side, (m, nv).
 
         `leaving` has the signs of velocities that are about to be.
         """
         tau = applied(force, t, q, v)
         resting, signs = self.law.at_rest(v), np.sign(v)
         held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
+        rubbed = self._dyn if members is None else self._dyn.of_samples(members)
         if resting.any():
-            sliding = at_time(self._dynamics(signs, still), t)
-            held, still = self._own.decided(
-                sliding, lambda f: sliding.forward_dynamics(q, v, f), q, tau, resting, leaving
+            rows: Any = np.flatnonzero(resting.any(axis=1)) if self._side_by_side else ...
+            own = rubbed.of_samples(rows) if self._side_by_side else rubbed
+            when: Any = t[rows] if isinstance(t, np.ndarray) else t
+            sliding = at_time(self._dynamics(own, signs[rows], still[rows]), when)
+            held[rows], still[rows] = self._own.decided(
+                sliding,
+                lambda f: sliding.forward_dynamics(q[rows], v[rows], f),
+                *(q[rows], tau[rows], resting[rows], None if leaving is None else leaving[rows]),
             )
-        sides = np.where(resting, -np.sign(held), signs)
-        return Phase(self._dynamics(sides, still), sides, still)
+        return self.given(np.where(resting, -np.sign(held), signs), still, rubbed)
 
-    def _dynamics(self, sides: Array, still: NDArray[np.bool_]) -> Dynamics:
-        make = self._own.phases if sides.ndim == 2 else self._own.phase
-        out: Dynamics = make(self._dyn, sides, still)
-        return out
+    def given(self, sides: Array, still: NDArray[np.bool_], rubbed: Dynamics) -> Phase:
+        """Return a phase that is known."""
+        return Phase(self._dynamics(rubbed, sides, still), sides, still, rubbed)
+
+    def _dynamics(self, rubbed: Dynamics, sides: Array, still: NDArray[np.bool_]) -> Dynamics:
+        if self._side_by_side:
+            return self._own.phases(rubbed, sides, still)  # type: ignore[no-any-return]  # of the same engine
+        one: Dynamics = self._own.phase(rubbed, *(x.reshape(-1, x.shape[-1])[0] for x in (sides, still)))
+        return one
 
     def held(self, phase: Phase, start: Array, q: Array, v: Array) -> tuple[Array, Array]:
         """Return states of a phase from `start` on in which what rests keeps its place and no velocity, to the bit."""
@@ -68,7 +97,7 @@ class Friction:
         rests[..., self._places] = phase.still[..., self.which]
         return np.where(rests, start, q), np.where(phase.still, 0.0, v)
 
-    def margins(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> Array:
+    def margins(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).
 
         Of one that slides it is the speed, of one that rests the part of its bound that is left.
@@ -78,43 +107,59 @@ class Friction:
             out = np.where(phase.still, 1 + ROUNDING - np.abs(self.holding(phase, t, q, v, force)) / self._bound, out)
         return out[..., self.which]
 
-    def holding(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> Array:
+    def holding(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return the forces of friction on what rests, and zero elsewhere; of the shape of v."""
         tau = applied(force, t, q, v)
         # Without the friction of what rests, and without its rotor.
-        free = self._dynamics(np.where(phase.still, 0.0, phase.sides), phase.still & False)
+        free = self._dynamics(phase.rubbed, np.where(phase.still, 0.0, phase.sides), phase.still & False)
         dyn, loose = (at_time(x, t) for x in (phase.dyn, free._bare or free))
         a = np.where(phase.still, 0.0, dyn.forward_dynamics(q, v, tau))
         pulled = loose.inverse_dynamics(q, v, a) - tau[..., : v.shape[-1]]
         if dyn._acting[0]:
-            pulled = pulled - self._of_wrenches(q, tau)
+            pulled = pulled - _of_wrenches(phase.rubbed, q, tau)
         return np.where(phase.still, pulled, 0.0)
 
     @property
     def _bound(self) -> Array:
         return np.where(self.law.bound > 0, self.law.bound, 1.0)
 
-    def _of_wrenches(self, q: Array, tau: Array) -> Array:
-        frames, axes = self._dyn._acting
-        wrenches = np.split(tau[..., self._dyn.model.nv :], len(frames), axis=-1)
-        bare = self._dyn._bare or self._dyn
-        return bare.generalized_force(q, dict(zip((f.name for f in frames), wrenches, strict=True)), axes)
+    def after(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> tuple[Array, Array]:
+        """Return the velocity at the end of a phase, zero of what stopped there, and the signs of what lets go.
 
-    def ended(self, margins: Array) -> Indices:
-        """Return which velocities end their phase, as indices: those with the least margins, to rounding."""
-        return self.which[margins <= max(float(margins.min()), 0.0) + 1e-15]
-
-    def after(self, phase: Phase, t: float, q: Array, v: Array, force: Force) -> tuple[Array, Array]:
-        """Return the velocity at the end of a phase, zero of what stopped there, and the signs of what lets go."""
-        ended = self.ended(self.margins(phase, t, q, v, force))
-        lets_go = ended[phase.still[ended]]
-        out, leaving = np.where(phase.still, 0.0, v), np.zeros(len(v))
-        out[ended] = 0.0
-        if lets_go.size:
-            leaving[lets_go] = -np.sign(self.holding(phase, t, q, v, force)[lets_go])
+        Those velocities end their phase that have the least margins, to rounding.
+        """
+        margins = self.margins(phase, t, q, v, force)
+        ended = np.zeros(v.shape, dtype=bool)
+        ended[..., self.which] = margins <= np.maximum(margins.min(axis=-1, keepdims=True), 0.0) + 1e-15
+        lets_go = ended & phase.still
+        out, leaving = np.where(phase.still | ended, 0.0, v), np.zeros(v.shape)
+        if lets_go.any():
+            leaving = np.where(lets_go, -np.sign(self.holding(phase, t, q, v, force)), 0.0)
         return out, leaving
 
+    def hits(
+        self,
+        before: tuple[Array, NDArray[np.bool_]],
+        after: tuple[Array, NDArray[np.bool_]],
+        state: tuple[float, Array, Array],
+        member: int | None,
+    ) -> list[Hit]:
+        """Return what stops, lets go or turns between sides and rest of a trajectory and the next ones, at t, q, v."""
+        (side, rested), (new, rests) = before, after
+        out = []
+        for i in np.flatnonzero((rested != rests) | ((side * new < 0) & ~(rested | rests))):
+            what = "stops" if rests[i] else "lets go" if rested[i] else "turns"
+            out.append(Hit(f"{self._names[i]} {what}", *state, member))
+        return out
 
-def applied(force: Force, t: float, q: Array, v: Array) -> Array:
+
+def _of_wrenches(dyn: Dynamics, q: Array, tau: Array) -> Array:
+    frames, axes = dyn._acting
+    wrenches = np.split(tau[..., dyn.model.nv :], len(frames), axis=-1)
+    bare = dyn._bare or dyn
+    return bare.generalized_force(q, dict(zip((f.name for f in frames), wrenches, strict=True)), axes)
+
+
+def applied(force: Force, t: float | Array, q: Array, v: Array) -> Array:
     """Return the force at one state, (n,), or at several of a trajectory, (N, n)."""
     return np.asarray(force(t, q, v) if callable(force) else force)

@@ -1,52 +1,41 @@
-"""Runs with dry friction by any method: phase after phase, each ended where something stops or lets go.
+"""Runs with dry friction by an adaptive method: phase after phase, each ended where something stops or lets go.
 
-A method with a fixed step takes the step in which a phase ends in parts, to the end of the phase and on from there; the
-parts are steps of the method, so that the order stays. An adaptive method has the end as an event.
+The end of a phase is an event. Methods with a fixed step are in `fixed`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from scipy.optimize import brentq
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, NumericalError
-from mbkit.methods.registry import method_of
 from mbkit.simulate.events import Followed, Hit
 from mbkit.simulate.problem import RUNS, IntegrationProblem
 from mbkit.simulate.result import Ended, SolverResult
+from mbkit.simulate.solvers.friction.fixed import MAX_EMPTY_PHASES, UNDECIDED, Solver, run_fixed_in_phases
 from mbkit.simulate.solvers.friction.phases import Friction, Phase
-from mbkit.simulate.time_grid import Grid
 
-#: problem -> result, of a smooth problem.
-Solver = Callable[[IntegrationProblem], SolverResult]
-#: Phases in a row that end where they begin, at most.
-_MOST: Final = 20
-#: Steps at once at the start, and the factor by which they grow while nothing changes.
-_WINDOW, _GROWTH = 32, 4
 _EPS: Final = float(np.finfo(float).eps)
-#: Of a step, from where on the end of a phase is looked for.
-_FROM: Final = 1e-6
 _END: Final = "end of a phase"
-_UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
 
 
 def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
     """Integrate a problem with dry friction; `solver` gives that of smooth dynamics."""
     dyn = problem.dyn
     RUNS.admit(dyn.model)
-    walk = _fixed if problem.equal_steps is not None else _adaptive
+    if problem.equal_steps is not None:
+        return run_fixed_in_phases(problem, solver)
     parts = []
     for i in range(len(problem.q)):
         run = _Member(problem, i, solver)
         parts.append(run.part)
         try:
-            walk(run)
+            _adaptive(run)
         except FunctionError as error:
             # Of a torque that is asked whether a phase ends.
             run.part.error = error
@@ -109,7 +98,6 @@ class _Member:
         self.problem, self.member, self._solver = problem, problem.member(i), solver
         dyn = problem.dyn if self.member is None else problem.dyn._of_sample(i)
         self.friction = Friction(dyn)
-        self.names = dyn.model.velocity_names
         self.q, self.v = problem.q[i].copy(), problem.v[i].copy()
         self.force = problem.torque.of_member(self.member)
         self.part = _Part([], [], [], [])
@@ -119,165 +107,32 @@ class _Member:
         """Return the phase from here."""
         return self.friction.phase(t, self.q, self.v, self.force(k), leaving)
 
-    def solve(self, phase: Phase, k: int, steps: int | None, **changes: object) -> SolverResult:
-        """Solve a part of the problem from here, with the force from row k on."""
-        torque = self.problem.torque.of_part(self.member, k, k + steps if steps else None)
+    def solve(self, phase: Phase, k: int, **changes: object) -> SolverResult:
+        """Solve the rest of the problem from here, with the force from row k on."""
+        torque = self.problem.torque.of_part(self.member, k, None)
         own = replace(self.problem, dyn=phase.dyn, q0=self.q, v0=self.v, torque=torque, **changes)  # type: ignore[arg-type]
         result = self._solver(phase.dyn)(own)
         q, v = self.friction.held(phase, self.q, result.q, result.v)
         return replace(result, q=q, v=v)
 
-    def next(
-        self, phase: Phase, k: int, t: float, q: Array, v: Array, *, moved: bool, pushed: bool = False
-    ) -> Phase | None:
+    def next(self, phase: Phase, k: int, t: float, q: Array, v: Array, *, moved: bool) -> Phase | None:
         """Go to the end of a phase, and return the next one; None where it cannot be decided.
 
-        `moved` tells that time has passed, `pushed` that it has at least begun to.
+        `moved` tells that time has passed.
         """
         q, v = self.friction.held(phase, self.q, q, v)
         v, leaving = self.friction.after(phase, t, q, v, self.force(k))
         self._stuck = 0 if moved else self._stuck + 1
-        if self._stuck > _MOST:
+        if self._stuck > MAX_EMPTY_PHASES:
             self.part.ended = "step_too_small"
-            self.part.message = f"{_UNDECIDED} at t = {t:.9g} s: their phases end where they begin"
+            self.part.message = f"{UNDECIDED} at t = {t:.9g} s: their phases end where they begin"
             return None
         self.q, self.v = q, v
         # What let go and came to rest at once did not let go.
-        out = self.begin(k, t, leaving if moved or pushed else None)
-        self._tell(phase, out, t)
+        out = self.begin(k, t, leaving if moved else None)
+        sides = (phase.sides, phase.still), (out.sides, out.still)
+        self.part.hits += self.friction.hits(*sides, (t, self.q.copy(), self.v.copy()), self.member)
         return out
-
-    def _tell(self, before: Phase, after: Phase, t: float) -> None:
-        turned = (before.sides * after.sides < 0) & ~(before.still | after.still)
-        for i in np.flatnonzero((before.still != after.still) | turned):
-            what = "stops" if after.still[i] else "lets go" if before.still[i] else "turns"
-            self.part.hits.append(Hit(f"{self.names[i]} {what}", t, self.q.copy(), self.v.copy(), self.member))
-
-
-def _fixed(run: _Member) -> None:
-    problem, grid, part = run.problem, run.problem.grid, run.part
-    wanted = set(problem.kept.tolist())
-    if 0 in wanted:
-        part.keep(np.array([grid.start]), run.q[None], run.v[None])
-    part.reached, k, window = grid.start, 0, _WINDOW
-    phase = run.begin(0, grid.start) if grid.steps else None
-    while k < grid.steps and phase is not None:
-        n = min(window, grid.steps - k)
-        result = run.solve(
-            phase, k, n, **_on_grid(Grid(grid.time(k), grid.time(k + n), grid.dt, n, grid.step(k + n - 1)))
-        )
-        good = _good(run, phase, k, result)
-        states = range(k + 1, k + 1 + good)
-        rows = np.array([i - k for i in states if i in wanted], dtype=int)
-        part.keep(np.array([grid.time(k + int(i)) for i in rows]), result.q[rows], result.v[rows])
-        part.count(result)
-        k += good
-        part.reached = grid.time(k)
-        run.q, run.v = result.q[good], result.v[good]
-        problem.report(run.member or 0)(part.reached)
-        if good == n:
-            window = min(window * _GROWTH, 1 << 16)
-            continue
-        if good == len(result.t) - 1:
-            # The solver stopped before any phase ended.
-            part.message = result.message
-            break
-        window = _WINDOW
-        phase = _across(run, phase, k)
-        if phase is not None:
-            k += 1
-            part.reached = grid.time(k)
-            if k in wanted:
-                part.keep(np.array([grid.time(k)]), run.q[None], run.v[None])
-
-
-def _on_grid(grid: Grid) -> dict[str, object]:
-    return {
-        "start": grid.start,
-        "duration": grid.end - grid.start,
-        "equal_steps": grid,
-        "kept": np.arange(grid.steps + 1, dtype=np.intp),
-    }
-
-
-def _good(run: _Member, phase: Phase, k: int, result: SolverResult) -> int:
-    """Return how many states behind the first are of the phase."""
-    friction, grid, n = run.friction, run.problem.grid, len(result.t) - 1
-    sliding = np.flatnonzero(((phase.sides * result.v[1:])[:, friction.which] < 0).any(axis=1))
-    n = int(sliding[0]) if sliding.size else n
-    if not (n and phase.still.any()):
-        return n
-    rows = run.problem.torque.over_states(run.member, k, n)
-    timed = phase.dyn.model.time_parameter is not None
-    if rows is None or (timed and not phase.dyn.takes_parameters):
-        forces = [run.force(k + i) for i in range(n)]
-        states = zip(forces, result.q[1 : n + 1], result.v[1 : n + 1], strict=True)
-        each = [friction.margins(phase, grid.time(k + 1 + i), q, v, f) for i, (f, q, v) in enumerate(states)]
-        margins = np.array(each).reshape(n, -1)
-    else:
-        times: Any = np.array([grid.time(k + 1 + i) for i in range(n)]) if timed else 0.0
-        margins = friction.margins(phase, times, result.q[1 : n + 1], result.v[1 : n + 1], rows)
-    over = np.flatnonzero((margins < 0).any(axis=1))
-    return int(over[0]) if over.size else n
-
-
-class _PartOfStep:
-    """The rest of a step in one phase, from the state of a trajectory at time t on."""
-
-    def __init__(self, run: _Member, phase: Phase, k: int, t: float) -> None:
-        self._run, self._phase, self._k, self._t, self._force = run, phase, k, t, run.force(k)
-        method = method_of(run.problem.method)
-        self._stepped = method.explicit and phase.dyn.model.time_parameter is None and not callable(self._force)
-
-    def state(self, s: float) -> tuple[Array, Array]:
-        """Return the state after s seconds, by one step of the method."""
-        run, phase = self._run, self._phase
-        if self._stepped:
-            q, v = phase.dyn.step(run.q, run.v, np.asarray(self._force), s, run.problem.method)
-            return run.friction.held(phase, run.q, q, v)
-        result = run.solve(phase, self._k, 1, **_on_grid(Grid(self._t, self._t + s, s, 1, s)))
-        run.part.evaluations += result.evaluations
-        return result.q[-1], result.v[-1]
-
-    def least(self, s: float) -> float:
-        """Return how far the velocities are from the end of the phase after s seconds, the nearest one."""
-        return float(self._run.friction.margins(self._phase, self._t + s, *self.state(s), self._force).min())
-
-    def end(self, length: float) -> float:
-        """Return after how many seconds the phase ends, before `length`; 0 where it ends at once."""
-        first, noise = _FROM * length, _EPS * (1 + float(np.abs(self._run.v).max()))
-        known = {first: noise}
-        if (soon := self.least(first)) <= -noise:
-            run = self._run
-            now = float(run.friction.margins(self._phase, self._t, run.q, run.v, self._force).min())
-            if not now > 0:
-                return 0.0
-            # What rests at its bound to the last bits, and is pulled more and more, lets go in the next instant.
-            known, first, length = {0.0: now, first: soon}, 0.0, first
-
-        def least(s: float) -> float:
-            return known.get(s) or self.least(s)
-
-        return float(brentq(least, first, length, xtol=4 * _EPS * length, rtol=4 * _EPS))
-
-
-def _across(run: _Member, phase: Phase, k: int) -> Phase | None:
-    """Take the step in which a phase ends; return the phase at its end."""
-    grid, current, done = run.problem.grid, phase, 0.0
-    start, h = grid.time(k), grid.step(k)
-    while True:
-        rest = _PartOfStep(run, current, k, start + done)
-        if not rest.least(h - done) < 0:
-            run.q, run.v = rest.state(h - done)
-            return current
-        s = rest.end(h - done)
-        q, v = rest.state(s) if s else (run.q, run.v)
-        done += s
-        run.part.steps += 1
-        following = run.next(current, k, start + done, q, v, moved=s >= _FROM * (h - done + s), pushed=s > 0)
-        if following is None:
-            return None
-        current = following
 
 
 def _adaptive(run: _Member) -> None:
@@ -301,7 +156,7 @@ def _adaptive(run: _Member) -> None:
 
         save = None if rows is None else np.append(rows[(rows > t) & (rows < problem.end)], problem.end)
         events = (*problem.events, Followed(end, _END, parts=2 if timed and own.still.any() else 1, noise=noise))
-        result = run.solve(own, k, None, start=t, duration=problem.end - t, save=save, events=events)
+        result = run.solve(own, k, start=t, duration=problem.end - t, save=save, events=events)
         part.count(result)
         part.hits += [replace(x, member=run.member) for x in result.events if x.name != _END]
         phase_ended = bool(result.events) and result.events[-1].name == _END and result.ended == "event"
@@ -337,11 +192,9 @@ def _merged(problem: IntegrationProblem, parts: list[_Part]) -> SolverResult:
     if problem.batch is None:
         (t, q, v), reached = states[0], np.asarray(parts[0].reached)
     else:
-        wanted = problem.save
-        if wanted is None:
-            wanted = np.array([problem.grid.time(int(i)) for i in problem.kept])
-        count = max((len(x[0]) for x in states), default=len(wanted))
-        t, reached = wanted[:count], np.full(n, problem.start)
+        assert problem.save is not None
+        count = max((len(x[0]) for x in states), default=len(problem.save))
+        t, reached = problem.save[:count], np.full(n, problem.start)
         reached[: len(parts)] = [part.reached for part in parts]
         q, v = np.full((n, count, nq), np.nan), np.full((n, count, nv), np.nan)
         for i, (own, *state) in enumerate(states):

@@ -1,0 +1,405 @@
+"""Runs with dry friction by a method with a fixed step: trajectories side by side, each in a phase of its own.
+
+All go blocks of steps by one solver, to whom the phase of each is a number. The margins of all states of a block are
+computed together. A trajectory whose phase ends in a block keeps its states up to there and takes the step in which it
+ends in parts, to the end of the phase and on from there; the parts are steps of the method, so that the order stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize.elementwise import find_root
+
+from mbkit._check import Array
+from mbkit.engines import Dynamics
+from mbkit.errors import FunctionError, NumericalError
+from mbkit.methods.registry import method_of
+from mbkit.simulate.events import Hit
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.progress import Progress
+from mbkit.simulate.result import Ended, SolverResult
+from mbkit.simulate.solvers.fixed_step import GridRecord
+from mbkit.simulate.solvers.friction.phases import Friction, Phase
+from mbkit.simulate.time_grid import Grid, Indices
+
+#: problem -> result, of a smooth problem.
+Solver = Callable[[IntegrationProblem], SolverResult]
+#: Phases in a row that end where they begin, at most.
+MAX_EMPTY_PHASES: Final = 20
+UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
+#: Steps of the first block, and the factor by which blocks grow while nothing changes.
+_BLOCK, _GROWTH = 32, 4
+#: States of a block, at most.
+_MOST_STATES: Final = 2**16
+_EPS: Final = float(np.finfo(float).eps)
+#: Fraction of a step before which the end of a phase is not searched.
+_FROM: Final = 1e-6
+
+
+def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solver]) -> SolverResult:
+    """Integrate a problem with dry friction on a grid; `solver` gives that of smooth dynamics.
+
+    Torque functions, and engines whose parameters are not numbers, take the members of a batch one by one.
+    """
+    torque, every = problem.torque, np.arange(len(problem.q))
+    if problem.batch is not None and problem.dyn.derived and (not torque.callable or torque.feedback is not None):
+        try:
+            return _together(problem, [_Members(problem, every, solver, side_by_side=True)])
+        except NumericalError:
+            # Of one state: the others have nothing to do with it.
+            pass
+    return _together(problem, [_Members(problem, every[i : i + 1], solver, side_by_side=False) for i in every])
+
+
+def _together(problem: IntegrationProblem, parts: list[_Members]) -> SolverResult:
+    record, early, error = GridRecord(problem), dict[int, tuple[Ended, str]](), None
+    for part in parts:
+        try:
+            part.to_end(record)
+        except FunctionError as failed:
+            error = failed
+        except NumericalError as failed:
+            if part.side_by_side:
+                raise
+            reached = problem.grid.time(int(part.k[0]))
+            part.early[int(part.members[0])] = "diverged", f"diverged after t = {reached:.6g} s: {failed}"
+        record.steps[part.members] = part.k
+        early |= part.early
+        error = error or part.error
+        if error is not None:
+            break
+    out = record.result(lambda _: "", sum(x.evaluations for x in parts), sum(x.jacobians for x in parts), error)
+    if early and error is None:
+        ended, message = early[min(early)]
+        if problem.batch is not None:
+            message += f"; {len(early)} of {len(problem.q)} trajectories ended early, see reached"
+        out = replace(out, ended=ended, message=message)
+    hits = sorted((x for part in parts for x in part.hits), key=lambda x: (x.member or 0, x.t))
+    doubts = dict.fromkeys(x for part in parts for x in part.doubts)
+    return replace(out, steps=sum(x.steps for x in parts), events=tuple(hits), doubts=tuple(doubts))
+
+
+class _Members:
+    """Trajectories of a problem, side by side or one alone."""
+
+    def __init__(
+        self, problem: IntegrationProblem, members: Indices, solver: Callable[[Dynamics], Solver], *, side_by_side: bool
+    ) -> None:
+        self.problem, self.members, self.side_by_side, self._solver = problem, members, side_by_side, solver
+        alone = None if side_by_side else problem.member(int(members[0]))
+        self._alone = alone
+        dyn = problem.dyn if alone is None else problem.dyn._of_sample(alone)
+        self.friction = Friction(dyn, side_by_side=side_by_side)
+        self._timed = dyn.model.time_parameter is not None
+        self._force = None if side_by_side else problem.torque.of_member(alone)
+        self.q, self.v = problem.q[members].copy(), problem.v[members].copy()
+        n = len(members)
+        #: Steps done by each.
+        self.k: Indices = np.zeros(n, dtype=np.intp)
+        self._empty = np.zeros(n, dtype=int)
+        self._going = np.full(n, True)
+        self._window = _BLOCK
+        #: How those ended that did so early, and why.
+        self.early: dict[int, tuple[Ended, str]] = {}
+        self.error: FunctionError | None = None
+        self.hits: list[Hit] = []
+        self.doubts: list[str] = []
+        self.steps = self.evaluations = self.jacobians = 0
+        self._phase: Phase
+
+    def to_end(self, record: GridRecord) -> None:
+        """Go over the grid."""
+        grid = self.problem.grid
+        self._record = record
+        if not grid.steps or not len(self.k):
+            return
+        rows = np.arange(len(self.k))
+        self._phase = self.begin(rows, self.times(np.full(len(rows), grid.start)))
+        parts = len(self.problem.q) // len(self.k)
+        while self.error is None and self._going.any():
+            self._block()
+            self._going &= self.k < grid.steps
+            self.problem.bar.update((self.members[0] / len(self.k) + self.k.mean() / grid.steps) / parts)
+
+    # What acts
+
+    def times(self, t: Array) -> Any:
+        """Return times as dynamics and forces take them: one of each trajectory, or that of one."""
+        return t if self.side_by_side else float(t[0])
+
+    def forces(self, rows: Indices) -> Any:
+        """Return the force in the step that follows."""
+        if self._force is not None:
+            force = self._force(int(self.k[0]))
+            return _of_each(force) if callable(force) else force[None]
+        torque = self.problem.torque
+        if torque.feedback is not None:
+            return torque.feedback
+        return torque.at_steps(self.members[rows], self.k[rows], 1)[:, 0]
+
+    def _of_states(
+        self, rows: Indices, phase: Phase, row: Indices, step: Indices, t: Array, q: Array, v: Array
+    ) -> Array:
+        """Return the margins of states in phases of rows, each behind one of the steps of a block."""
+        friction = self.friction
+        if self._force is None:
+            torque = self.problem.torque
+            own: Any = torque.feedback or torque.at_steps(self.members[rows[row]], self.k[rows[row]] + step, 1)[:, 0]
+            return friction.margins(phase.take(row), t, q, v, own)
+        first = int(self.k[0])
+        forces = self.problem.torque.over_states(self._alone, first, int(step[-1]) + 1)
+        if forces is not None and (not self._timed or phase.dyn.takes_parameters):
+            return friction.margins(phase, t, q, v, forces[step])
+        each = []
+        for i, (j, when) in enumerate(zip(step.tolist(), t.tolist(), strict=True)):
+            force: Any = _of_each(self._force(first + j)) if forces is None else forces[j, None]
+            each.append(friction.margins(phase, when, q[i : i + 1], v[i : i + 1], force))
+        return np.concatenate(each)
+
+    def begin(self, rows: Indices, t: Any, leaving: Array | None = None) -> Phase:
+        """Return the phases from here."""
+        members = self.members[rows] if self.side_by_side else None
+        return self.friction.phase(t, self.q[rows], self.v[rows], self.forces(rows), leaving, members)
+
+    def _keep(self, rows: Indices, k: Indices, q: Array, v: Array) -> None:
+        """Put states behind k steps into the record, if they are wanted."""
+        kept = self._record.kept
+        place = np.minimum(np.searchsorted(kept, k), len(kept) - 1)
+        found = kept[place] == k
+        where = self.members[rows][found], place[found]
+        self._record.q[where], self._record.v[where] = q[found], v[found]
+
+    # A block
+
+    def _next(self) -> tuple[Indices, Indices, int, float]:
+        """Return who goes on, the equal steps before each, and how many of what length: where time enters, the last."""
+        grid, rows = self.problem.grid, np.flatnonzero(self._going)
+        stop = grid.steps if grid.last == grid.dt else grid.steps - 1
+        left = stop - self.k[rows]
+        if not left.any():
+            return rows, left + 1, 1, grid.last
+        rows, left = rows[left > 0], left[left > 0]
+        n = min(self._window, int(left.max()), max(_MOST_STATES // len(rows), _BLOCK))
+        if self._timed:
+            # Up to where the next ones stand.
+            ahead = left.max() - left[left < left.max()]
+            n, rows, left = min([n, *ahead.tolist()]), rows[left == left.max()], left[left == left.max()]
+        return rows, left, n, grid.dt
+
+    def _block(self) -> None:
+        rows, left, n, h = self._next()
+        grid, k = self.problem.grid, self.k[rows]
+        phase = self._phase if len(rows) == len(self.k) else self._phase.take(rows)
+        start = grid.time(int(k.min()))
+        result = self._solved(rows, phase, n, Grid(start, start + n * h, h, n, h))
+        q, v = (x if self.side_by_side else x[None] for x in (result.q, result.v))
+        q, v = self.friction.held(replace(phase, still=phase.still[:, None]), q[:, :1], q, v)
+        made = np.rint((np.atleast_1d(result.reached) - start) / h).astype(np.intp)
+        limit = np.minimum(np.minimum(made, q.shape[1] - 1), np.minimum(left, n))
+        good = self._good(rows, phase, q, v, limit, start, h)
+        self._window = self._next_window(good, good < limit)
+        steps = np.arange(1, q.shape[1])
+        inside = steps <= good[:, None]
+        self._keep(np.repeat(rows, good), (k[:, None] + steps)[inside], q[:, 1:][inside], v[:, 1:][inside])
+        last = np.arange(len(rows)), good
+        self.q[rows], self.v[rows], self.k[rows] = q[last], v[last], k + good
+        self.error = result.error
+        if self.error is None:
+            self._lose(rows[(good == limit) & (limit < np.minimum(left, n))], result)
+            self._across(rows[good < limit])
+
+    def _next_window(self, good: Indices, changed: NDArray[np.bool_]) -> int:
+        """Return the steps of the next block: more where few phases end, as steps behind an end are in vain."""
+        most = _MOST_STATES
+        return int(np.clip(_GROWTH * good.mean() * (1 - changed.mean()) ** 3, _BLOCK, most))
+
+    def _solved(self, rows: Indices, phase: Phase, n: int, grid: Grid) -> SolverResult:
+        problem, k = self.problem, self.k[rows]
+        if self.side_by_side:
+            torque: Any = problem.torque.of_steps(self.members[rows], k, n)
+            q, v = self.q[rows], self.v[rows]
+        else:
+            torque = problem.torque.of_part(self._alone, int(k[0]), int(k[0]) + n)
+            q, v = self.q[0], self.v[0]
+        silent, every = Progress(None, ""), np.arange(n + 1, dtype=np.intp)
+        own = IntegrationProblem.on_grid(phase.dyn, problem.method, q, v, grid, every, torque, silent)
+        out = self._solver(phase.dyn)(own)
+        self.steps += out.steps
+        self.evaluations += out.evaluations
+        self.jacobians += out.jacobians
+        self.doubts += out.doubts
+        return out
+
+    def _good(self, rows: Indices, phase: Phase, q: Array, v: Array, limit: Indices, start: float, h: float) -> Indices:
+        """Return how many states behind the first are of the phase."""
+        which = self.friction.which
+        along: Array = phase.sides[:, None, which] * v[:, 1:, which]
+        back: Any = np.any(along < 0, axis=2)
+        good = np.where(back.any(axis=1), np.minimum(back.argmax(axis=1), limit), limit)
+        counts = np.where(phase.still.any(axis=1), good, 0)
+        if counts.any():
+            row = np.repeat(np.arange(len(good)), counts)
+            step = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+            states = row, step + 1
+            margins = self._of_states(rows, phase, row, step, start + (step + 1) * h, q[states], v[states])
+            over = (margins < 0).any(axis=1)
+            np.minimum.at(good, row[over], step[over])
+        return np.asarray(good)
+
+    def _lose(self, rows: Indices, result: SolverResult) -> None:
+        self._going[rows] = False
+        for i in rows.tolist():
+            member = int(self.members[i])
+            message = result.message
+            if self.side_by_side:
+                alone = _Members(self.problem, self.members[i : i + 1], self._solver, side_by_side=False)
+                alone.to_end(GridRecord(self.problem))
+                message = alone.early.get(member, ("", message))[1]
+            self.early[member] = "diverged", message
+
+    # The end of a phase
+
+    def _across(self, rows: Indices) -> None:
+        """Take the step in which phases end."""
+        if not len(rows):
+            return
+        grid, whole, phase = self.problem.grid, rows, self._phase.take(rows)
+        start, left = (np.array([f(k) for k in self.k[rows].tolist()]) for f in (grid.time, grid.step))
+        while len(rows):
+            part, every = _PartOfStep(self, rows, phase, start), np.arange(len(rows))
+            q, v = part.state(every, left)
+            over = part.least(every, left, (q, v)) < 0
+            self.q[rows[~over]], self.v[rows[~over]] = q[~over], v[~over]
+            self._phase.sides[rows[~over]], self._phase.still[rows[~over]] = phase.sides[~over], phase.still[~over]
+            rows, start, left, every = rows[over], start[over], left[over], every[over]
+            if not len(rows):
+                break
+            s = part.ends(every, left)
+            q, v = part.state(every, s)
+            self.steps += len(rows)
+            moved = s >= _FROM * left
+            start, left = start + s, left - s
+            phase, decided = self._following(rows, phase.take(every), start, (q, v), moved, s > 0)
+            if not decided.all():
+                rows, start, left = rows[decided], start[decided], left[decided]
+                phase = phase.take(np.flatnonzero(decided))
+        self._phase = self.friction.given(self._phase.sides, self._phase.still, self._phase.rubbed)
+        whole = whole[self._going[whole]]
+        self.k[whole] += 1
+        self._keep(whole, self.k[whole], self.q[whole], self.v[whole])
+
+    def _following(
+        self,
+        rows: Indices,
+        before: Phase,
+        t: Array,
+        state: tuple[Array, Array],
+        moved: NDArray[np.bool_],
+        pushed: NDArray[np.bool_],
+    ) -> tuple[Phase, NDArray[np.bool_]]:
+        """Go to the ends of phases; return the next ones, and which of them can be decided.
+
+        `moved` tells that time has passed, `pushed` that it has at least begun to.
+        """
+        when = self.times(t)
+        v, leaving = self.friction.after(before, when, *state, self.forces(rows))
+        self._empty[rows] = np.where(moved, 0, self._empty[rows] + 1)
+        decided = self._empty[rows] <= MAX_EMPTY_PHASES
+        self._going[rows] = decided
+        for i, time in zip(rows[~decided].tolist(), t[~decided].tolist(), strict=True):
+            why = f"{UNDECIDED} at t = {time:.9g} s: their phases end where they begin"
+            self.early[int(self.members[i])] = "step_too_small", why
+        self.q[rows], self.v[rows] = state[0], v
+        # What let go and came to rest at once did not let go.
+        after = self.begin(rows, when, leaving * (moved | pushed)[:, None])
+        for i in np.flatnonzero(decided).tolist():
+            own = before.sides[i], before.still[i]
+            at = float(t[i]), self.q[rows[i]].copy(), self.v[rows[i]].copy()
+            member = self.problem.member(int(self.members[rows[i]]))
+            self.hits += self.friction.hits(own, (after.sides[i], after.still[i]), at, member)
+        return after, decided
+
+
+def _of_each(force: Any) -> Callable[[float, Array, Array], Array]:
+    """Return the function of states of a trajectory, (N, ...), for that of one state."""
+    return lambda t, q, v: np.array([force(t, *state) for state in zip(q, v, strict=True)])
+
+
+class _PartOfStep:
+    """The rest of a step in one phase, from the states of trajectories at times t on."""
+
+    def __init__(self, run: _Members, rows: Indices, phase: Phase, t: Array) -> None:
+        self._run, self._rows, self.phase, self._t = run, rows, phase, t
+        self._force = run.forces(rows)
+        self._method = method_of(run.problem.method)
+        timed = phase.dyn.model.time_parameter is not None
+        self._stepped = self._method.explicit and not timed and not callable(self._force)
+        if run.side_by_side:
+            self._stepped = self._stepped and getattr(phase.dyn, "compiles_steps", False)
+
+    def _of(self, i: Indices) -> tuple[Phase, Indices, Array, Any]:
+        phase = self.phase if len(i) == len(self._rows) else self.phase.take(i)
+        return phase, self._rows[i], self._t[i], self._force if callable(self._force) else self._force[i]
+
+    def state(self, i: Indices, s: Array) -> tuple[Array, Array]:
+        """Return the states after s seconds, by one step of the method."""
+        run, moving = self._run, np.flatnonzero(s > 0)
+        q, v = run.q[self._rows[i]], run.v[self._rows[i]]
+        if not len(moving):
+            return q, v
+        phase, rows, t, force = self._of(i[moving])
+        q0, v0, s = q[moving], v[moving], s[moving]
+        if self._stepped:
+            h: Any = s[:, None] if run.side_by_side else float(s[0])
+            ends = phase.dyn._step(self._method, q0, v0, force, h)
+        else:
+            ends = q0.copy(), v0.copy()
+            for j, (start, length) in enumerate(zip(t.tolist(), s.tolist(), strict=True)):
+                grid = Grid(start, start + length, length, 1, length)
+                one = run._solved(rows[j : j + 1], phase.take(np.array([j])), 1, grid)
+                for now, states in zip(ends, (one.q, one.v), strict=True):
+                    now[j] = states.reshape(-1, states.shape[-1])[-1]
+        q[moving], v[moving] = run.friction.held(phase, q0, *ends)
+        return q, v
+
+    def least(self, i: Indices, s: Array, state: tuple[Array, Array] | None = None) -> Array:
+        """Return how far the velocities are from the end of the phase after s seconds, the nearest one; (m,)."""
+        phase, _, t, force = self._of(i)
+        q, v = self.state(i, s) if state is None else state
+        return np.asarray(self._run.friction.margins(phase, self._run.times(t + s), q, v, force).min(axis=1))
+
+    def ends(self, i: Indices, length: Array) -> Array:
+        """Return after how many seconds phases end, before `length`; 0 where they end at once."""
+        first = _FROM * length
+        noise = _EPS * (1 + np.abs(self._run.v[self._rows[i]]).max(axis=1))
+        soon, now = self.least(i, first), np.full(len(i), np.inf)
+        early = np.flatnonzero(soon <= -noise)
+        if len(early):
+            now[early] = self.least(i[early], 0 * length[early])
+        # What rests at its bound to the last bits, and is pulled more and more, lets go in the next instant.
+        low, high = np.where(soon <= -noise, 0.0, first), np.where(soon <= -noise, first, length)
+        at_low, at_high = np.where(soon <= -noise, now, noise), np.where(soon <= -noise, soon, -1.0)
+        out = np.zeros(len(i))
+        open_ = np.flatnonzero(at_low > 0)
+
+        def least(x: Array, j: Array) -> Array:
+            j = j.astype(np.intp)
+            known = np.where(x == 0, at_low[j], at_high[j])
+            inside = np.flatnonzero((x > 0) & (x < 1))
+            if len(inside):
+                k = j[inside]
+                known[inside] = self.least(i[k], low[k] + x[inside] * (high - low)[k])
+            return np.asarray(known)
+
+        if len(open_):
+            tolerances = {"xatol": 4 * _EPS, "xrtol": 4 * _EPS}
+            found = find_root(
+                least, (np.zeros(len(open_)), np.ones(len(open_))), args=(open_,), tolerances=tolerances
+            ).x
+            out[open_] = np.where(np.isfinite(found), low[open_] + found * (high - low)[open_], 0.0)
+        return out

@@ -1,0 +1,136 @@
+"""Runs with dry friction side by side: each trajectory is that of a run of its own, whatever the others do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mbkit as mb
+from mbkit.errors import MbkitWarning
+from mbkit.model import Model
+from tests.random_trees import off
+from tests.test_dry_friction import mostly_at_rest, rubbed
+
+#: A step, and a run of so many steps with a shorter one at its end.
+STEP, STEPS = 5e-3, 60
+DURATION = (STEPS - 0.4) * STEP
+SINGLE = ("revolute", "prismatic")
+
+
+def pushed_in_time(model: Model) -> Model:
+    """Return the model with a force of t that passes what friction holds now and then."""
+    b = mb.ModelBuilder.of(model)
+    for k, joint in enumerate(model.independent_joints):
+        b.add_joint_force(f"push {k}", joint.name, lambda t, q, v, k=k: 6.0 * (9.0 * t + k).sin())  # noqa: ARG005
+    return b.build()
+
+
+def together_and_alone(dyn: Any, q: Any, v: Any, method: str, each: dict[str, Any], **more: Any) -> tuple[Any, list]:
+    """Return a batch, and runs of its members; `each` has the arguments with a row for each of them."""
+    settings = {"dt": STEP, "doubt": False, **more}
+    batch = mb.simulate(dyn, q, v, DURATION, method, **each, **settings)
+    alone = []
+    for i in range(len(q)):
+        own = {name: x[i] if not isinstance(x, dict) else {f: w[i] for f, w in x.items()} for name, x in each.items()}
+        one = dyn if dyn.samples is None else dyn._of_sample(i)
+        alone.append(mb.simulate(one, q[i], v[i], DURATION, method, **own, **settings))
+    return batch, alone
+
+
+def require_same(batch: Any, alone: list, tolerance: float = 1e-9) -> None:
+    """Events are the same, in the same order; states and times to rounding, which changes of phase enlarge."""
+    for i, run in enumerate(alone):
+        mine = [e for e in batch.events if e.member == i]
+        assert [e.name for e in mine] == [e.name for e in run.events], i
+        assert [e.t for e in mine] == pytest.approx([e.t for e in run.events], abs=tolerance)
+        assert off(batch.q[i], run.q) < tolerance
+        assert off(batch.v[i], run.v) < tolerance
+        np.testing.assert_array_equal(batch.v[i] == 0, run.v == 0)
+    # Otherwise nothing was tested.
+    assert len(batch.events) > 2
+    assert len({e.t for e in batch.events}) > len(batch.events) // 2
+
+
+@pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_members_change_phases_at_their_own_times(method: str, seed: int) -> None:
+    """With a force for each step of each, kept now and then, and a last step that is shorter."""
+    model = rubbed(seed, 4, SINGLE)
+    q, v, tau = mostly_at_rest(model, 9, seed)
+    rows = tau[:, None] * np.random.default_rng(seed).uniform(0, 1.5, (9, STEPS, 1)).round()
+    dyn = mb.dynamics(model, "lagrangian")
+    require_same(*together_and_alone(dyn, q, v, method, {"torque": rows}, save=[0.0, 7 * STEP, 50 * STEP, DURATION]))
+
+
+@pytest.mark.parametrize("method", ["rk4", "gauss4"])
+def test_members_under_a_force_of_t(method: str) -> None:
+    model = pushed_in_time(rubbed(3, 3, SINGLE))
+    q, v, _ = mostly_at_rest(model, 7)
+    require_same(*together_and_alone(mb.dynamics(model, "lagrangian"), q, v, method, {}, t0=0.3))
+
+
+def test_members_under_wrenches_with_parameters_of_their_own() -> None:
+    b = mb.ModelBuilder.of(rubbed(4, 3, SINGLE))
+    b.set_body(b.build().bodies[1].name, mass=mb.Parameter("m", 1.0))
+    model = b.build()
+    q, v, _ = mostly_at_rest(model, 8)
+    dyn = mb.dynamics(model, "lagrangian").at(m=np.linspace(0.5, 4, 8))
+    wrench = np.random.default_rng(1).uniform(-50, 50, (8, 1, 6)) * np.ones((1, STEPS, 1))
+    require_same(*together_and_alone(dyn, q, v, "rk4", {"wrenches": {model.bodies[-1].name: wrench}}))
+
+
+def test_members_under_a_state_feedback_and_under_a_function() -> None:
+    model = rubbed(5, 3, SINGLE)
+    q, v, _ = mostly_at_rest(model, 5)
+    dyn = mb.dynamics(model, "lagrangian")
+    law = mb.simulate.StateFeedback(np.hstack([20 * np.eye(3), np.eye(3)]))
+    for torque in (law, lambda t, q, v: law(t, q, v)):
+        require_same(*together_and_alone(dyn, q, v, "rk4", {}, torque=torque))
+
+
+def test_no_number_depends_on_the_threads_or_on_the_neighbours() -> None:
+    model = rubbed(6, 4, SINGLE)
+    q, v, tau = mostly_at_rest(model, 200)
+    runs = []
+    for threads, which in ((1, slice(None)), (3, slice(None)), (1, slice(40, 57))):
+        dyn = mb.dynamics(model, "lagrangian", threads=threads)
+        each = tau[which, None] * np.ones((1, STEPS, 1))
+        runs.append(mb.simulate(dyn, q[which], v[which], DURATION, dt=STEP, torque=each, doubt=False))
+    np.testing.assert_array_equal(runs[0].q, runs[1].q)
+    assert [(e.name, e.t, e.member) for e in runs[0].events] == [(e.name, e.t, e.member) for e in runs[1].events]
+    assert off(runs[0].q[40:57], runs[2].q) < 1e-12
+    assert [e.name for e in runs[0].events if 40 <= e.member < 57] == [e.name for e in runs[2].events]
+
+
+def test_what_diverges_ends_alone() -> None:
+    """A member whose force grows beyond all numbers stops there; the others finish, with what they do alone."""
+    model = rubbed(7, 3, SINGLE)
+    q, v, tau = mostly_at_rest(model, 5)
+    rows = tau[:, None] * np.ones((1, STEPS, 1))
+    rows[2, 33:] = 1e105
+    with pytest.warns(MbkitWarning, match="1 of 5 trajectories"):
+        batch, alone = together_and_alone(mb.dynamics(model, "lagrangian"), q, v, "rk4", {"torque": rows})
+    assert batch.stats.ended == alone[2].stats.ended == "diverged"
+    assert batch.stats.reached[2] == alone[2].stats.reached < DURATION
+    assert [batch.stats.reached[i] for i in (0, 1, 3, 4)] == [DURATION] * 4
+    for i in (0, 1, 3, 4):
+        assert off(batch.q[i], alone[i].q) < 1e-9
+    good = len(alone[2].t)
+    assert off(batch.q[2, :good], alone[2].q) < 1e-9
+    assert np.isnan(batch.q[2, good:]).all()
+
+
+def test_steps_of_a_batch_are_those_of_its_states() -> None:
+    """In one call, with what ends its phase within the step, under wrenches and at a time of their own."""
+    model = pushed_in_time(rubbed(8, 3, SINGLE))
+    q, v, tau = mostly_at_rest(model, 40)
+    v *= 0.01
+    dyn = mb.dynamics(model, "lagrangian")
+    wrenches = {model.bodies[-1].name: np.random.default_rng(2).uniform(-5, 5, (40, 6))}
+    batch = dyn.step(q, v, tau, 1e-2, wrenches=wrenches, t=0.2)
+    for i in range(40):
+        own = {name: w[i] for name, w in wrenches.items()}
+        for together, alone in zip(batch, dyn.step(q[i], v[i], tau[i], 1e-2, wrenches=own, t=0.2), strict=True):
+            assert off(together[i], alone) < 1e-12
