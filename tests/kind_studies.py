@@ -63,7 +63,8 @@ from tests.kind_paths import (
     registered,
     without_part,
 )
-from tests.plain_mechanics import Case, Part, derivative, rotation
+from tests.path_checks import resting
+from tests.plain_mechanics import Case, derivative, rotation
 from tests.test_engine_versions import present
 from tests.written_math import assigned, lines_of_latex, lines_of_text, number, plain
 
@@ -551,16 +552,8 @@ def _sticking(x: Example, folder: Path) -> Told:
     """Joint x stays at rest while the others move: the force that holds it is below its limit, in NumPy."""
     if not x.model.needs.friction:
         raise NotAskedError("no dry friction")
-    c, k = x.plain, x.plain.n - (3 if x.name.endswith("several") else 1)
-    at = np.arange(k, c.n)
-    rows = np.eye(c.n)[at]
-    v = np.where(np.arange(c.n) < k, 0.05 * c.v, 0.0)
-    tau = 0.05 * x.tau
-    held = Part("held", (), speeds=lambda c, q: rows)
-    other = replace(x, plain=replace(c, v=v, parts=[held]), tau=tau)
-    a = other.accelerated()
-    needed = replace(other, plain=replace(other.plain, parts=[])).force(a) - tau
-    assert np.abs(needed[at]).max() < 0.2
+    other = resting(x)
+    tau = other.tau
     q1, v1 = other.state(other.flow([DURATION])[-1])
     worst = 0.0
     for method in ("rk4", "rk853", "auto", "gauss4", "dop853"):

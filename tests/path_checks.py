@@ -1,11 +1,12 @@
 """Checks of texts, quantities and runs on each kind's example: a refusal of the path's own, or the truth in NumPy."""
 
-# ruff: noqa: ARG001  # all checks are called alike
+# ruff: noqa: ARG001, ARG005  # all checks, and all parts, are called alike
 from __future__ import annotations
 
 import ctypes
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from itertools import combinations
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 
 import mbkit as mb
 from mbkit.codegen.c_source import C_CODE, export_c
@@ -23,6 +25,7 @@ from mbkit.model.elements.paths import PATHS
 from tests import kind_examples
 from tests.fake_cuda import fake_gpu
 from tests.kind_examples import EXAMPLES, TYPES, Example
+from tests.plain_mechanics import Part
 from validation.gpu import on_device
 
 Check = Callable[[mb.Model, Path], None]
@@ -51,6 +54,42 @@ def close(got: Any, wanted: Any, most: float = 1e-9) -> None:
     got, wanted = np.asarray(got), np.asarray(wanted)
     assert got.shape == wanted.shape
     assert np.abs(got - wanted).max(initial=0.0) < most * max(1.0, np.abs(wanted).max(initial=0.0))
+
+
+def resting(x: Example) -> Example:
+    """Return an example with dry friction whose joint x rests, held by a force below its limit, while others move."""
+    c, k = x.plain, x.plain.n - (3 if x.name.endswith("several") else 1)
+    at, level = np.arange(k, c.n), 0.3 if x.name == "joint.stiction" else 0.1
+    rows = np.eye(c.n)[at]
+    held = replace(
+        c, v=np.where(np.arange(c.n) < k, 0.05 * c.v, 0.0), parts=[Part("held", (), speeds=lambda c, q: rows)]
+    )
+    out, tau = replace(x, plain=held, tau=0.05 * x.tau), 0.05 * x.tau
+    needed = replace(out, plain=replace(held, parts=[])).force(out.accelerated()) - tau
+    tau[at] += needed[at] - level
+    return replace(out, tau=tau)
+
+
+def stopping(x: Example, end: float) -> tuple[Example, np.ndarray]:
+    """Return the same, whose joint x slides to a stop within some seconds, and x and its rate at their end."""
+    rest = resting(x)
+    c, k = rest.plain, len(rest.plain.parts[0].speeds(rest.plain, rest.plain.q))
+    at = c.n - k
+    (own,) = x.plain.parts
+
+    def sliding(c: Any, t: float, q: np.ndarray, u: np.ndarray) -> Any:
+        # Of one side, so that nothing jumps.
+        return own.force(
+            c, t, q, np.where(np.arange(c.n) == at, np.maximum(u, 1e-12), np.where(np.arange(c.n) > at, 0.0, u))
+        )
+
+    parts = [Part("sliding", (), force=sliding)]
+    parts += [Part("held", (), speeds=lambda c, q: np.eye(c.n)[at + 1 :])] if k > 1 else []
+    start = replace(rest, plain=replace(c, v=c.v + 0.04 * end * np.eye(c.n)[at], parts=parts))
+    t = scipy.optimize.brentq(lambda t: start.flow([t])[-1][c.n + at], 1e-3 * end, end, xtol=1e-14)
+    q, v = np.split(start.flow([t])[-1], 2)
+    stopped = replace(c, q=q, v=np.where(np.arange(c.n) < at, v, 0.0), t=c.t + t)
+    return start, replace(rest, plain=stopped).flow([end - t])[-1]
 
 
 # Texts
@@ -147,15 +186,19 @@ def by_actuators(model: mb.Model, folder: Path) -> None:
 
 
 def by_reduced_inertia(model: mb.Model, folder: Path) -> None:
-    """Half of it times squared rates is the energy of a motion that the rows allow."""
+    """Half of it times squared rates is the energy of a motion that the rows allow, and it changes along that."""
     x, dyn = case(model)
+    h = 1e-5
     degrees, energy = dyn.mobility(x.q).degrees_of_freedom, 0.5 * x.v @ x.mass_matrix(x.plain.q) @ x.v
     for names in combinations(range(model.nv), degrees):
+        of, rates = [model.velocity_names[k] for k in names], x.v[list(names)]
         try:
-            J = dyn.reduced_inertia(x.q, [model.velocity_names[k] for k in names]).inertia
+            J, slopes, _ = dyn.reduced_inertia(x.q, of)
         except NumericalError:
             continue
-        close(0.5 * x.v[list(names)] @ J @ x.v[list(names)], energy)
+        close(0.5 * rates @ J @ rates, energy)
+        ahead, back = (dyn.reduced_inertia(model.integrate(x.q, s * x.v), of).inertia for s in (h, -h))
+        close(slopes @ rates, (ahead - back) / (2 * h), 1e-6)
         return
     raise AssertionError("no coordinates determine the others")
 
@@ -192,7 +235,7 @@ def by_step_derivative(model: mb.Model, folder: Path) -> None:
     """At a state where all moves, and at one that dry friction stops within the step."""
     x, dyn = case(model)
     n, h, dt = model.nv, 1e-5, 0.01
-    for v in (x.v, 1e-3 * x.v):
+    for v in (x.v, 1e-3 * x.v, *([resting(x).v] if model.needs.friction else [])):
         A, B, _ = dyn.discretize(x.q, v, x.tau, dt)
 
         def after(z: np.ndarray, v: np.ndarray = v) -> tuple[np.ndarray, np.ndarray]:
@@ -267,13 +310,18 @@ def by_embedding(model: mb.Model, folder: Path) -> None:
 def by_running(method: str, most: float, **setting: Any) -> Check:
     def check(model: mb.Model, folder: Path) -> None:
         x, _ = case(model)
-        dyn = mb.dynamics(model, "lagrangian", compile=False)
         duration = _STEPS * setting.get("dt", _STEP)
+        one(x, duration, x.flow([duration])[-1])
+        if model.needs.friction:
+            one(resting(x), duration, resting(x).flow([duration])[-1])
+            one(stopping(x, duration)[0], duration, stopping(x, duration)[1])
+
+    def one(x: Example, duration: float, end: np.ndarray) -> None:
+        dyn, (q, v) = mb.dynamics(x.model, "lagrangian", compile=False), x.state(end)
         save = None if "dt" in setting else np.array([x.t, x.t + duration])
         run = mb.simulate(dyn, x.q, x.v, duration, method, torque=x.tau, t0=x.t, save=save, **setting)
-        q, v = x.motion(np.array([0.0, duration]))
-        close(model.difference(q[-1], run.q[-1]), np.zeros(model.nv), most)
-        close(run.v[-1], v[-1], most)
+        close(x.model.difference(q, run.q[-1]), np.zeros(x.model.nv), most)
+        close(run.v[-1], v, most)
 
     return check
 

@@ -41,6 +41,7 @@ CASES = {
     "solo12": (lambda: mb.load("solo12", floating_base=True), ("mass_matrix", "inverse_dynamics", "forward_dynamics")),
     "tree": (lambda: random_tree(1, 10), ("nle", "passive", "inverse_dynamics", "energy_rate")),
     "pair": (lambda: random_tree(3, 2, ("ball", "prismatic")), tuple(FUNCTIONS)),
+    "bars": (mb.catalog.four_bar, tuple(FUNCTIONS)),
 }
 
 
@@ -282,13 +283,7 @@ def test_bad_names_are_told():
             export_c(model, ["nle"], name=name)
 
 
-def test_what_no_tree_holds_is_refused():
-    b = mb.ModelBuilder("closed")
-    b.add_body("b", mass=1.0, inertia=np.eye(3))
-    b.add_joint("j", "revolute", parent="world", child="b", axis=(1, 0, 0))
-    b.prescribe("j", rate=1.0)
-    with pytest.raises(UnsupportedError, match=r"without\('prescribed'\)"):
-        export_c(b.build())
+def test_c_of_what_does_not_move_is_refused():
     b = mounted("statue", "stone", "foot", "fixed", mass=2.0)
     with pytest.raises(UnsupportedError, match="no joint of it moves"):
         export_c(b.build())

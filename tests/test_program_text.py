@@ -152,7 +152,7 @@ def test_what_a_program_cannot_hold_is_refused() -> None:
         program(mb.catalog.pendulum(), ["gravity"])
     with pytest.raises(UnknownNameError, match="inverse_dynamic"):
         program(mb.catalog.pendulum(), "inverse_dynamic")
-    with pytest.raises(UnsupportedError, match="leaves out what holds four_bar: loop 'pin'"):
+    with pytest.raises(UnsupportedError, match=r"leaves out what holds four_bar: loop 'pin'.*export_c holds them"):
         program(mb.catalog.four_bar(), "inverse_dynamics")
     with pytest.raises(UnsupportedError, match="results"):
         program(mb.catalog.pendulum(), "forward_dynamics_derivatives")

@@ -26,7 +26,7 @@ from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedE
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import held_at_rest
 from mbkit.model.elements import paths
-from mbkit.model.elements.kinds import EFFECTS
+from mbkit.model.elements.kinds import EFFECTS, kind
 
 #: Quantity -> (name in C of its one output, its meaning).
 _OUTPUTS: Final = {
@@ -37,7 +37,7 @@ _OUTPUTS: Final = {
     "coriolis_force": ("Cv", "C(q, v) v"),
     "passive": ("tau_passive", f"forces of springs, dampers, {EFFECTS['jump']} and functions"),
     "inverse_dynamics": ("tau", "forces M a + C(q, v) v + g(q) - tau_passive(q, v)"),
-    "forward_dynamics": ("a", "accelerations dv/dt = M^-1 (tau + tau_passive - C v - g)"),
+    "forward_dynamics": ("a", "accelerations dv/dt under forces tau, by the equation of motion"),
     "kinetic_energy": ("T", "kinetic energy, J"),
     "potential_energy": ("V", "potential energy of gravity and springs, J"),
     "energy_rate": ("dE_dt", "d(T + V)/dt at accelerations a, W"),
@@ -61,7 +61,7 @@ _DERIVATIVES: Final = {
     "by_q": "derivative by q along the configuration manifold: column k is that of q (+) t e_k",
     "by_v": "derivative by v",
     "by_a": "derivative by a, the mass matrix",
-    "by_tau": "derivative by tau, the inverse of the mass matrix",
+    "by_tau": "derivative by tau, without constraints the inverse of the mass matrix",
 }
 _INPUTS: Final = {
     "q": "coordinates",
@@ -72,12 +72,9 @@ _INPUTS: Final = {
     "parameters": "parameters",
 }
 
+_HOLD: Final = "constraints hold accelerations at states that satisfy them; all other terms are those without them"
 C_CODE: Final = paths.Path(
-    "c",
-    "a tree's program leaves out what holds",
-    paths.ALL - {"row", "speed"} | {"written.row", "written.speed"},
-    notes={"jump": held_at_rest},
-    instead="mbkit.lagrangian.from_model(model).model has them in its equations",
+    "c", "export_c: not known of", paths.ALL, notes={"jump": held_at_rest, "row": _HOLD, "speed": _HOLD}
 )
 #: Data of a description that no function holds.
 _LEFT_OUT: Final = ("limits", "effort_limits")
@@ -136,7 +133,9 @@ def _declaration(f: CFunction, macro: str, nv: int) -> str:
 
 def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_line: str, notes: Iterable[str]) -> str:
     macro = prefix.upper()
-    present = [need.replace("_", " ") for need, on in model.needs.as_dict().items() if on and need not in _LEFT_OUT]
+    needs = (need for need, on in model.needs.as_dict().items() if on and need not in _LEFT_OUT)
+    features = (x for k in map(kind, model.acts) if k.does != {"bound"} for x in k.features)
+    present = dict.fromkeys(x.replace("_", " ") for x in (*needs, *features))
     q_units, v_units = _units(model)
     parameters = followers = ""
     if model.parameters:
@@ -162,6 +161,7 @@ def _header(prefix: str, model: Model, functions: Sequence[CFunction], first_lin
         macro=macro,
         parameters=parameters,
         followers=followers,
+        held=" + J(q)^T lambda" if model.constrained else "",
         notes="".join(f"\n    {line}" for note in notes for line in wrap(c_comment(f"Note: {note}."), 84)),
     )
     sizes = {"NQ": model.nq, "NV": model.nv} | ({"NP": len(model.parameters)} if model.parameters else {})
@@ -352,7 +352,7 @@ def export_c(
     InputError
         No quantity, a quantity of frames without `frames`, or a `name` that is no identifier in C.
     UnsupportedError
-        The model has constraints, or no joint that moves.
+        The model has no joint that moves.
 
     Examples
     --------

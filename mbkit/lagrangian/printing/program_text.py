@@ -26,8 +26,15 @@ from mbkit.lagrangian.elements import SYMPY
 from mbkit.lagrangian.energies.symbols import free_name
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned, folded
 from mbkit.model import Model
+from mbkit.model.elements.paths import ALL
 
-PROGRAM: Final = replace(C_CODE, name="program")
+PROGRAM: Final = replace(
+    C_CODE,
+    name="program",
+    words="a tree's program leaves out what holds",
+    carries=ALL - {"row", "speed"} | {"written.row", "written.speed"},
+    instead="export_c holds them; mbkit.lagrangian.from_model(model).model has them in its equations",
+)
 #: Operations of a term from which on it gets a name of its own: a line of text has some 100 letters.
 _LONG: Final = 10
 _WIDTH: Final = 100
