@@ -288,6 +288,25 @@ def test_machine_code_lives_as_long_as_a_call_of_it(monkeypatch):
     assert [engine() for engine in engines] == [None] * 12
 
 
+def test_calls_move_from_round_to_round_and_go_on_where_they_ended():
+    x, y = ca.SX.sym("x"), ca.SX.sym("y", 2)
+    turn, add = built(ca.Function("turn", [x, y], [ca.sin(x) + y])), built(ca.Function("add", [y, x], [ca.sum1(y) - x]))
+    path, between, given = np.zeros((9, 1, 3)), np.zeros((2, 3)), np.arange(54.0).reshape(9, 2, 3)
+    path[0] = 0.1, 0.2, 0.3
+    step = path.strides[0]
+    sequence = KernelSequence(
+        [
+            Call(turn, [path[0].T, given[0].T], [between.T], [step, given.strides[0], 0]),
+            Call(add, [between.T, path[0].T], [path[1].T], [0, step, step]),
+        ]
+    )
+    for first, last in ((0, 5), (5, 6), (6, 6), (6, 16)):
+        sequence.run(first, last)
+    for k in range(8):
+        one = np.sum(np.sin(path[k]) + given[k], axis=0) - path[k, 0]
+        np.testing.assert_allclose(path[k + 1, 0], one, rtol=4 * EPS)
+
+
 def test_vectors_put_aside_lie_within_cache_lines():
     if platform.machine() not in ("x86_64", "AMD64") or jit.host().width < 4:
         pytest.skip("a wider vector than the stack's 16 bytes is needed")

@@ -18,16 +18,20 @@ from mbkit import catalog
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import Equations
 from mbkit.derivation.steps import fixed
+from mbkit.derivation.steps.collocation import Collocation
 from mbkit.derivation.steps.fixed import march, march_in_stages, step
 from mbkit.engines import compiled_calls, dynamics
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import MbkitWarning, UnknownNameError
+from mbkit.methods.registry import method_of
+from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import RK4, Trajectory, simulate
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers import compiled_fixed_step
+from mbkit.simulate.solvers.implicit_midpoint import midpoint_of
 from mbkit.simulate.time_grid import Grid
 from mbkit.simulate.torque import Torque
 from tests.random_trees import ALL, random_tree
@@ -270,6 +274,52 @@ def test_no_bit_depends_on_neighbours_or_threads(
     shuffled = simulate(floating, q[order], v[order], 0.02)
     assert np.array_equal(shuffled.q, simulate(floating, q, v, 0.02).q[order])
     assert np.array_equal(simulate(floating, q[-1], v[-1], 0.02).v, simulate(floating, q, v, 0.02).v[-1])
+
+
+@pytest.mark.parametrize("n", [1, 11, 300])
+def test_a_block_stops_anywhere_for_another_torque(n: int, floating: LagrangianDynamics) -> None:
+    (q, v), steps, space = start(floating, n), 75, Space(floating.model)
+    stops = [0, 1, 4, 5, 17, 33, 40, 74, steps]
+    tau = np.random.default_rng(1).normal(size=(n, len(stops) - 1, floating.model.nv))
+    table = np.repeat(tau, np.diff(stops), axis=1)
+    run = simulate(floating, q, v, steps * 1e-3, dt=1e-3, torque=table)
+    chunk = compiled_fixed_step.Chunk(floating.step_plan("rk4"), space, n, steps, torques=False, all_kept=False)
+    chunk.begin(q, space.to_integrator_velocity(q, v), np.empty(0))
+    chunk.set_times(Grid.of(0.0, 1.0, 1e-3), 0, steps)
+    done = 0
+    for i, stop in enumerate(stops[1:]):
+        chunk.hold(tau[:, i].T[None])
+        for k in (*range(done + chunk.block, stop, chunk.block), stop):
+            chunk.run_to(k - done)
+            if k - done == chunk.block:
+                chunk.again()
+                done = k
+        assert np.array_equal(chunk.now("q"), run.q[:, stop].T)
+        assert np.array_equal(space.to_body_velocity(run.q[:, stop], chunk.now("w").T), run.v[:, stop])
+
+
+@pytest.mark.parametrize("method", ["gauss4", "implicit_midpoint"])
+def test_a_block_of_implicit_steps_stops_anywhere(method: str, planar: LagrangianDynamics) -> None:
+    (q, v), steps = start(planar, 3), 40
+    tau = np.linspace(-1, 1, 3 * steps).reshape(3, steps, 1) + np.zeros(2)
+    run = simulate(planar, q, v, steps * 1e-3, method, dt=1e-3, torque=tau)
+    formula = method_of(method).formula
+    parts = Collocation(planar.equations, formula) if isinstance(formula, ImplicitTableau) else midpoint_of(planar)
+    momenta = np.einsum("nkij,nkj->nki", [planar.mass_matrix(x) for x in run.q], run.v)
+    carried = {"q": run.q, "w": run.v, "pi": momenta}
+    chunk = compiled_fixed_step.ImplicitChunk(planar, parts, 3, steps, torques=False)
+    chunk.begin(q, carried[chunk.carried[1]][:, 0], np.zeros((3, parts.unknowns)), np.empty(0))
+    chunk.set_times(Grid.of(0.0, 1.0, 1e-3), 0, steps)
+    j = 0
+    for k in range(steps):
+        if j == chunk.block:
+            chunk.again()
+            j = 0
+        chunk.hold(tau[:, k].T[None])
+        j += 1
+        chunk.run_to(j)
+        for name in chunk.carried:
+            np.testing.assert_allclose(chunk.now(name), carried[name][:, k + 1].T, rtol=1e-12, atol=1e-13)
 
 
 # What the method promises

@@ -407,6 +407,17 @@ def test_each_state_of_a_batch_has_its_time(model: Any, compiled: bool) -> None:
         np.testing.assert_allclose(got[0][:, 0], 0.5 * np.sin(3 * (times + H)), atol=1e-15)
 
 
+def test_a_run_has_the_times_of_a_loop_whatever_is_kept() -> None:
+    dyn, t0, h = own(_shaken(), compiled=True), 0.3, 1e-3
+    q, v = np.zeros(1), np.ones(1)
+    runs = [simulate(dyn, q, v, 0.06, dt=h, t0=t0, save=save) for save in (None, 7, [t0 + 0.06])]
+    for k in range(60):
+        q, v = dyn.step(q, v, [0.0], h, t=t0 + k * h)
+    for run in runs:
+        assert np.array_equal(run.q[-1], q)
+        assert np.array_equal(run.v[-1], v)
+
+
 def test_with_a_wrench_and_parameters_of_each_state_too() -> None:
     b = mounted("shaken", "block", "x", "prismatic", gravity=(0, 0, 0), mass=mb.Parameter("m"), axis=(1, 0, 0))
     b.add_joint_force("shake", "x", lambda t, q, v: 3.0 * ca.cos(50 * t))  # noqa: ARG005

@@ -162,7 +162,7 @@ def kernel(model, quantity, states, elimination):
     code = mb.dynamics(model, "lagrangian", threads=1, elimination=elimination).code(quantity)
     out = np.empty((BATCH, int(np.prod(code.shapes[0]))))
     times = len(states[0]) // BATCH
-    sequence = KernelSequence([Call(code, [x[:BATCH] for x in states], [out])], times)
+    sequence = KernelSequence([Call(code, [x[:BATCH] for x in states], [out])])
     return lambda: sequence.run(0, times), out
 
 

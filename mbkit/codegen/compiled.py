@@ -199,25 +199,57 @@ _HELD: Final[WeakValueDictionary[str, Compiled]] = WeakValueDictionary()
 
 # Compiled functions called one after another without going back to Python in between.
 
-# The list holds, for each call, the addresses of loop, table and work space, and the number of states. The signature is
-# that of a compiled function's own loop, so that it is loaded like one.
+# The list holds the number of its calls, and for each the addresses of loop, table and work space, how many states and
+# moves it has, and the address of these: where in the table an array's address stands, that address in round 0, and the
+# bytes to the next round. The signature is that of a compiled function's own loop, so that it is loaded like one.
+_ENTRY: Final = "{ptr, ptr, ptr, i64, i64, ptr}"
 _CODE: Final = f"""
 define void @{RUN}(ptr %list, ptr %unused, i64 %first, i64 %last) nounwind {{
 entry:
+  %calls = load i64, ptr %list
+  %entries = getelementptr i64, ptr %list, i64 1
+  %round0 = sdiv i64 %first, %calls
+  %at0 = srem i64 %first, %calls
   %any = icmp slt i64 %first, %last
   br i1 %any, label %one, label %done
 one:
-  %i = phi i64 [ %first, %entry ], [ %next, %one ]
-  %call = getelementptr {{ptr, ptr, ptr, i64}}, ptr %list, i64 %i
-  %entries = load {{ptr, ptr, ptr, i64}}, ptr %call
-  %run = extractvalue {{ptr, ptr, ptr, i64}} %entries, 0
-  %table = extractvalue {{ptr, ptr, ptr, i64}} %entries, 1
-  %work = extractvalue {{ptr, ptr, ptr, i64}} %entries, 2
-  %states = extractvalue {{ptr, ptr, ptr, i64}} %entries, 3
+  %i = phi i64 [ %first, %entry ], [ %next, %made ]
+  %at = phi i64 [ %at0, %entry ], [ %following, %made ]
+  %round = phi i64 [ %round0, %entry ], [ %after, %made ]
+  %call = getelementptr {_ENTRY}, ptr %entries, i64 %at
+  %fields = load {_ENTRY}, ptr %call
+  %run = extractvalue {_ENTRY} %fields, 0
+  %table = extractvalue {_ENTRY} %fields, 1
+  %work = extractvalue {_ENTRY} %fields, 2
+  %states = extractvalue {_ENTRY} %fields, 3
+  %moves = extractvalue {_ENTRY} %fields, 4
+  %moved = extractvalue {_ENTRY} %fields, 5
+  br label %check
+check:
+  %j = phi i64 [ 0, %one ], [ %more, %move ]
+  %left = icmp slt i64 %j, %moves
+  br i1 %left, label %move, label %made
+move:
+  %where = getelementptr {{ptr, i64, i64}}, ptr %moved, i64 %j
+  %what = load {{ptr, i64, i64}}, ptr %where
+  %place = extractvalue {{ptr, i64, i64}} %what, 0
+  %start = extractvalue {{ptr, i64, i64}} %what, 1
+  %bytes = extractvalue {{ptr, i64, i64}} %what, 2
+  %way = mul i64 %round, %bytes
+  %address = add i64 %start, %way
+  store i64 %address, ptr %place
+  %more = add i64 %j, 1
+  br label %check
+made:
   call void %run(ptr %table, ptr %work, i64 0, i64 %states)
   %next = add i64 %i, 1
-  %more = icmp slt i64 %next, %last
-  br i1 %more, label %one, label %done
+  %beside = add i64 %at, 1
+  %ends = icmp eq i64 %beside, %calls
+  %following = select i1 %ends, i64 0, i64 %beside
+  %turned = add i64 %round, 1
+  %after = select i1 %ends, i64 %turned, i64 %round
+  %going = icmp slt i64 %next, %last
+  br i1 %going, label %one, label %done
 done:
   ret void
 }}
@@ -225,32 +257,40 @@ done:
 
 
 class Call(NamedTuple):
-    """A function and the (N, n) arrays that it reads and writes, as in `Compiled.run`."""
+    """A function and the (N, n) arrays that it reads and writes in a first round, as in `Compiled.run`.
+
+    From round to round each of them moves by so many bytes of `moves`, none by default.
+    """
 
     code: Compiled
     inputs: Sequence[Array]
     outputs: Sequence[Array]
+    moves: Sequence[int] = ()
 
 
 class KernelSequence:
-    """Calls on fixed arrays, kept alive, in order, repeated `times`; one thread may run it at a time."""
+    """Calls on fixed arrays, kept alive, in order, round after round; one thread may run it at a time."""
 
-    def __init__(self, calls: Sequence[Call], times: int = 1) -> None:
-        self._calls, self._runner = tuple(calls), _runner()
+    def __init__(self, calls: Sequence[Call]) -> None:
+        self._calls, self._run = tuple(calls), _runner().run
         self._work = aligned(max((call.code.work_size for call in calls), default=0))
         # The sum in which a compiled function marks numbers that are not finite.
         self._work[:] = 0.0
-        self._tables = [call.code.table(call.inputs, call.outputs) for call in calls]
-        loops = (ctypes.cast(call.code.loaded.run, ctypes.c_void_p).value for call in calls)
-        entries = [
-            (loop, table.ctypes.data, self._work.ctypes.data, len(call.inputs[0]))
-            for loop, table, call in zip(loops, self._tables, calls, strict=True)
-        ]
-        self._list = np.array(entries * times, dtype=np.int64)
+        entries, self._tables = [len(calls)], list[Array]()
+        for call in calls:
+            table = call.code.table(call.inputs, call.outputs)
+            address, places = table.ctypes.data, range(3, len(table), 4)
+            moves = [(address + 8 * i, table[i], by) for i, by in zip(places, call.moves, strict=False) if by]
+            self._tables += table, np.array(moves, dtype=np.int64)
+            loop = ctypes.cast(call.code.loaded.run, ctypes.c_void_p).value or 0
+            entries += loop, address, self._work.ctypes.data, len(call.inputs[0])
+            entries += len(moves), self._tables[-1].ctypes.data
+        self._list = np.array(entries, dtype=np.int64)
+        self._address = self._list.ctypes.data
 
     def run(self, first: int, last: int) -> None:
-        """Make the calls from `first` to before `last`; other Python threads run meanwhile."""
-        self._runner.run(self._list.ctypes.data, None, first, last)
+        """Make the calls from `first` to before `last`, counted over the rounds; other Python threads run meanwhile."""
+        self._run(self._address, None, first, last)
 
 
 @cache

@@ -187,7 +187,7 @@ class Tableau:
         """Time and weights of each stage, sliced once."""
         return [(float(c), self.A[i, :i]) for i, c in enumerate(self.c)]
 
-    @property
+    @cached_property
     def digest(self) -> str:
         """Eight digits that tell the coefficients, for the name of compiled code."""
         return _digest(self.A, self.b)

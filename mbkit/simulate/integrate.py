@@ -115,7 +115,7 @@ def integrate(
             indices = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
             read = Torque(torque, model, batch, grid.steps, wrenches)
             problem = IntegrationProblem.on_grid(own, method, q, v, grid, indices, read, bar)
-            applied = read.applied(grid.times)
+            applied = read.applied(grid.times if read.held else None)
         outcome = _outcome(problem, chosen)
     seconds = time.perf_counter() - started
     outcome = along_constraints(dyn, outcome)

@@ -49,12 +49,17 @@ class Grid:
         """Time of the k-th state, s; start + k dt, so that rounding does not pile up."""
         return self.end if k == self.steps else self.start + k * self.dt
 
+    def times_of(self, k: Indices) -> Array:
+        """Return the times of some states, s."""
+        out = k * np.float64(self.dt)
+        out += self.start
+        out[k == self.steps] = self.end
+        return out
+
     @property
     def times(self) -> Array:
         """All of them, (steps + 1,), s."""
-        out = self.start + np.arange(self.steps + 1, dtype=np.float64) * np.float64(self.dt)
-        out[-1] = self.end
-        return out
+        return self.times_of(np.arange(self.steps + 1))
 
     def step(self, k: int) -> float:
         """Length of the k-th step, s."""
@@ -78,7 +83,7 @@ class Grid:
         times = save_times(save, self.start, self.end)
         index = np.minimum(np.rint((times - self.start) / self.dt), self.steps).astype(np.intp)
         index = np.where(times == self.end, self.steps, index)
-        on_grid = np.array([self.time(int(k)) for k in index])
+        on_grid = self.times_of(index)
         off = np.abs(on_grid - times) > 1e-6 * self.dt + 4 * np.finfo(float).eps * abs(self.start)
         if off.any():
             raise InputError(

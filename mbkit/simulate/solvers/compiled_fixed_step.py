@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from itertools import pairwise
 from math import isqrt
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.codegen.compiled import Call, KernelSequence, aligned, cores
+from mbkit.codegen.compiled import Call, Compiled, KernelSequence, aligned, cores
 from mbkit.codegen.interpreter import Machine
+from mbkit.codegen.jit import host
 from mbkit.derivation.steps.collocation import Collocation
 from mbkit.derivation.steps.fixed import LAW, Part
 from mbkit.derivation.steps.midpoint import MOST
@@ -32,13 +33,13 @@ from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.fixed_step import GridRecord, divergence_reason, run_fixed, to_body_velocity
 from mbkit.simulate.solvers.vector_field import BOUND, are_bounded
-from mbkit.simulate.time_grid import Indices
-
-#: Largest number of steps between two checks.
-BLOCK: Final = 16
+from mbkit.simulate.time_grid import Grid, Indices
 
 # Half of what a core has in its second cache.
 _CACHE: Final = 2**19
+#: Steps of a block, at least and at most: as many as have room in the cache, so that Python has little to do for each.
+_SHORTEST: Final = 16
+_LONGEST: Final = 2048
 _LANES: Final = 8
 #: Multiplications of an implicit step's system beyond which compiling it takes longer than tens of thousands of steps
 #: in Python.
@@ -51,62 +52,99 @@ _STATE: Final = {"q1": "q", "w1": "w", "squares1": "squares"}
 class BlockLoop:
     """Room for the states of a block of steps side by side, one trajectory in each column.
 
-    Columns beyond the `count` states repeat the last one. `sizes` has for each name the number of places, one for each
-    step that has its own, and of rows. `block` is the number of steps of the next block, at most; `good` are the good
-    steps of the last one, (n,), or None where nobody looked; `carried` names q and what goes with it.
+    Columns beyond the `count` states repeat the last one. `sizes` has for each name the number of places, one, two that
+    take turns or one for each step, and of rows. `block` is the number of steps of the next block, at most; `carried`
+    names q and what goes with it; `clock` is the place of the time among the parameters, if it enters.
+
+    A run may stop at any step of a block, read `now`, set other torques by `hold`, and go on.
     """
 
     block: int
-    good: Indices | None = None
     carried: tuple[str, str] = ("q", "w")
+    #: The time that the parameters hold in a step, in steps behind its start.
+    evaluated: float = 0.0
 
-    def __init__(self, sizes: Mapping[str, tuple[int, int]], count: int) -> None:
-        width = padded(count)
+    def __init__(self, sizes: Mapping[str, tuple[int, int]], count: int, clock: int | None) -> None:
+        width, lanes = padded(count), host().width
         self._room = {}
         for name, (places, rows) in sizes.items():
             self._room[name] = aligned(places * rows * width).reshape(places, rows, width)
             self._room[name][:] = 0.0
-        self._count = self._taken = 0
+        self._count, self._taken, self._clock = count, 0, clock
+        # Whole vectors of the processor.
+        self._columns = -(-count // lanes) * lanes
 
-    def _array(self, name: str, place: int) -> Array:
+    def _call(self, code: Compiled, part: Part, step: int, period: int, places: Mapping[str, tuple[str, int]]) -> Call:
+        """Return a part's call in a step of the first `period`; `places` has names that stand in another room."""
+        arrays, moves = list[Array](), list[int]()
+        for name in (*part.reads, *part.writes):
+            own, place = places.get(name, (name, step))
+            room = self._room[own]
+            arrays.append(room[place % len(room)].T[: self._columns])
+            moves.append(period * room.strides[0] if len(room) > 2 else 0)
+        reads = len(part.reads)
+        return Call(code, arrays[:reads], arrays[reads:], moves)
+
+    def _fill(self, name: str, first: int, columns: Array) -> None:
+        """Put columns, (steps or 1, rows, n or 1), where they fit from this place on."""
         room = self._room[name]
-        return np.asarray(room[place % len(room)].T)
-
-    def _fill(self, name: str, place: int, columns: Array) -> None:
-        room = self._room[name][place]
-        room[:, : self._count] = columns
-        room[:, self._count :] = room[:, self._count - 1 : self._count]
+        room = room[first if len(room) > 1 else 0 :][: len(columns)]
+        columns = columns[: len(room)]
+        if columns.shape[-1] == 1:
+            room[:] = columns
+        else:
+            room[..., : self._count] = columns
+            room[..., self._count :] = columns[..., -1:]
 
     def _begin(self, parameters: Array, **states: Array) -> None:
         """Put in states, (n, rows), and the values of parameters, (p,) or (n, p)."""
-        self._count = len(states["q"])
+        self._count, self._taken = len(states["q"]), 0
         for name, x in states.items():
-            self._fill(name, 0, x.T)
-        for place in range(len(self._room.get("parameters", ())) if parameters.size else 0):
-            self._fill("parameters", place, np.atleast_2d(parameters).T)
+            self._fill(name, 0, x.T[None])
+        if parameters.size and "parameters" in self._room:
+            every = np.atleast_2d(parameters).T
+            self._fill("parameters", 0, np.broadcast_to(every, (len(self._room["parameters"]), *every.shape)))
 
-    def _hold(self, steps: int, dt: float, torques: Array) -> None:
-        self._room["dt"][:] = dt
-        for j in range(min(steps, len(self._room["tau"]))):
-            self._fill("tau", j, torques[j])
+    def hold(self, torques: Array) -> None:
+        """Set the torques of the steps from the present one on, (steps or 1, nv, n or 1)."""
+        self._fill("tau", self._taken, torques)
 
-    def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
-        """Take at most `block` steps of length dt from where the last ones ended; torques (steps or 1, nv, n or 1)."""
+    def set_times(self, grid: Grid, first: int, steps: int) -> None:
+        """Set length and times of the next steps, which are of equal length and the run's from `first` on."""
+        self._room["dt"][:] = dt = grid.step(first)
+        if self._clock is not None:
+            times = grid.times_of(np.arange(first, first + steps)) + self.evaluated * dt
+            self._room["parameters"][self._taken :][:steps, self._clock] = times[:, None]
+
+    def run_to(self, step: int) -> None:
+        """Take the steps from where the last ones ended to this one of the block."""
         raise NotImplementedError
 
     def again(self) -> None:
         """Make the last state the first one of the next block."""
         raise NotImplementedError
 
+    @property
+    def good(self) -> Indices | None:
+        """Good steps of the block so far, (n,); None where nobody looks."""
+        return None
+
     def to_body_velocity(self, q: Array, w: Array) -> Array:  # noqa: ARG002
         """Return the saved w, (n, steps, nv)."""
         return w
 
+    def now(self, name: str) -> Array:
+        """Return q, w, ... of the present states, (rows, n), which stay as they are until the next step."""
+        room = self._room[name]
+        return np.asarray(room[self._taken % len(room), :, : self._count])
+
     def states(self, name: str, which: Sequence[int] | Indices) -> Array:
         """Return q, w, ... after these many steps of the block, (n, steps, rows)."""
         room = self._room[name]
-        places = np.asarray(which) if self._taken < len(room) else np.asarray(which) % len(room)
-        return np.asarray(room[:, :, : self._count][places].transpose(2, 0, 1))
+        places: Any = np.asarray(which) % len(room)
+        if places[-1] - places[0] == len(places) - 1:
+            places = slice(places[0], places[-1] + 1)
+        return np.asarray(room[places, :, : self._count].transpose(2, 0, 1))
 
 
 def padded(count: int) -> int:
@@ -136,7 +174,9 @@ def run_blocks(
             n = min(loop.block, stop - k)
             if torque.held or not torques.size:
                 torques = torque.columns(which, k, k + n)
-            loop.advance(n, grid.time(k), grid.step(k), torques)
+            loop.set_times(grid, k, n)
+            loop.hold(torques)
+            loop.run_to(n)
             rows, good, last = record.rows(k + 1, k + n), loop.good, dict[int, list[Array]]()
             if rows.start < rows.stop:
                 q, w = (loop.states(name, kept[rows] - k) for name in loop.carried)
@@ -204,55 +244,53 @@ def _widest(plan: Plan) -> int:
 class Chunk(BlockLoop):
     """At most `most` states that take explicit steps.
 
-    `torques`: each step of a block has its own; `all_kept`: each state of a block can be read, not only the last;
-    `watched`: it is looked for steps that are not good; `clock`: place of the time among the parameters.
+    `torques`: each step of a block has its own; `all_kept`: each state of a block can be read, not only the last, which
+    is so of few states anyway; `watched`: it is looked for steps that are not good; `steps`: those of the run.
     """
-
-    block = BLOCK
 
     def __init__(
         self,
         plan: Plan,
         space: Space,
         most: int,
+        steps: int,
         *,
         torques: bool,
         all_kept: bool,
         watched: bool = False,
         clock: int | None = None,
     ) -> None:
-        places = {**dict.fromkeys(_STATE.values(), BLOCK + 1 if all_kept else 2), "tau": BLOCK if torques else 1}
-        places["parameters"] = 1 if clock is None else BLOCK
-        self._clock = clock
-        own = {name: (places.get(name, 1), rows) for name, rows in plan.sizes.items() if name not in _STATE}
-        super().__init__(own, most)
+        own = [*_STATE.values(), *(["tau"] if torques else []), *([] if clock is None else ["parameters"])]
+        fits = _CACHE // (8 * padded(most) * sum(plan.sizes[name] for name in own))
+        self.block = max(min(fits, _LONGEST, steps), _SHORTEST)
+        self.all_kept = all_kept or fits >= _SHORTEST
+        places = dict.fromkeys(own, self.block)
+        places |= dict.fromkeys(_STATE.values(), self.block + 1 if self.all_kept else 2)
+        rooms = {name: (places.get(name, 1), rows) for name, rows in plan.sizes.items() if name not in _STATE}
+        super().__init__(rooms, most, clock)
         self._calls, self._space, self._watched = len(plan.parts), space, watched
-        period = BLOCK if all_kept or torques or clock is not None else 2
-        steps = [call for j in range(period) for call in self._step(plan, j)]
-        self._sequence = KernelSequence(steps, BLOCK // period)
-
-    def _step(self, plan: Plan, j: int) -> list[Call]:
-        def array(name: str) -> Array:
-            return self._array(_STATE.get(name, name), j + (name in _STATE))
-
-        return [
-            Call(code, [array(n) for n in part.reads], [array(n) for n in part.writes])
-            for part, code in zip(plan.parts, plan.codes, strict=True)
-        ]
+        # Of states that take turns a round has both.
+        period = 1 if self.all_kept else 2
+        calls = list[Call]()
+        for j in range(period):
+            after = {name: (state, j + 1) for name, state in _STATE.items()}
+            calls += [self._call(*pair, j, period, after) for pair in zip(plan.codes, plan.parts, strict=True)]
+        self._sequence = KernelSequence(calls)
 
     def begin(self, q: Array, w: Array, parameters: Array, **more: Array) -> None:
         """Put in states, (n, nq) and (n, nv) of `Space`, the values of parameters, (p,) or (n, p), and what is more."""
         self._begin(parameters, q=q, w=w, squares=np.zeros((len(q), 1)), **more)
 
-    def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
-        self._hold(steps, dt, torques)
-        if self._clock is not None:
-            self._room["parameters"][:steps, self._clock] = (start + np.arange(steps) * dt)[:, None]
-        self._sequence.run(0, steps * self._calls)
-        self._taken = steps
-        if self._watched:
-            q, w = (self.states(name, np.arange(1, steps + 1)) for name in self.carried)
-            self.good = np.logical_and.accumulate(are_bounded(q, w), axis=1).sum(axis=1)
+    def run_to(self, step: int) -> None:
+        self._sequence.run(self._taken * self._calls, step * self._calls)
+        self._taken = step
+
+    @property
+    def good(self) -> Indices | None:
+        if not self._watched:
+            return None
+        q, w = (self.states(name, np.arange(1, self._taken + 1)) for name in self.carried)
+        return np.asarray(np.logical_and.accumulate(are_bounded(q, w), axis=1).sum(axis=1))
 
     def to_body_velocity(self, q: Array, w: Array) -> Array:
         return to_body_velocity(self._space, q, w)
@@ -261,6 +299,7 @@ class Chunk(BlockLoop):
         for name in _STATE.values():
             room = self._room[name]
             room[0] = room[self._taken % len(room)]
+        self._taken = 0
 
 
 def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> SolverResult:
@@ -278,7 +317,8 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
     dense = 2 * len(record.kept) > grid.steps
 
     def new_chunk(plan: Plan, most: int, *, all_kept: bool, watched: bool = False) -> Chunk:
-        return Chunk(plan, space, most, torques=problem.torque.held, all_kept=all_kept, watched=watched, clock=clock)
+        torques = problem.torque.held
+        return Chunk(plan, space, most, grid.steps, torques=torques, all_kept=all_kept, watched=watched, clock=clock)
 
     def blocks(chunk: Chunk, members: Indices, ends: Indices) -> Iterator[tuple[int, dict[int, list[Array]]]]:
         more = {} if law is None else {LAW: law.numbers[None]}
@@ -301,7 +341,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
             chunk = new_chunk(plan, -(-n // len(parts)), all_kept=dense)
 
             def run(part: slice) -> Iterator[int]:
-                for end, _ in blocks(chunk, members[part], record.kept[:0] if dense else record.kept):
+                for end, _ in blocks(chunk, members[part], record.kept[:0] if chunk.all_kept else record.kept):
                     yield end
                 squares[part] = chunk.states("squares", [0])[:, 0, 0]
 
@@ -377,8 +417,8 @@ def _split(n: int, widest: int, workers: int) -> list[slice]:
 WIDEST: Final = 72
 # Blocks without a miss after which one iteration less is tried.
 _PATIENCE: Final = 32
-# Steps of a block, whose states fill half of a core's second cache.
-_SHORTEST, _LONGEST = 16, 256
+# Steps of a block at most: one that is not solved is repeated.
+_LONGEST_IMPLICIT: Final = 256
 
 
 class ImplicitParts(Protocol):
@@ -407,7 +447,7 @@ class ImplicitChunk(BlockLoop):
     """
 
     def __init__(self, dyn: LagrangianDynamics, parts: ImplicitParts, count: int, steps: int, *, torques: bool) -> None:
-        self._parts, self.carried = parts, parts.carried
+        self._parts, self.carried, self.evaluated = parts, parts.carried, parts.clock
         every = (*parts.iteration, parts.end)
         self._codes = {part.name: dyn.code(part.name, make=part.make) for part in every}
         rows = dict[str, int]()
@@ -416,22 +456,21 @@ class ImplicitChunk(BlockLoop):
             rows |= dict(zip(part.reads, code.inputs, strict=True))
             rows |= dict(zip(part.writes, (r * c for r, c in code.shapes), strict=True))
         x, q, other = parts.past[0], *parts.carried
-        most = min(_CACHE // (8 * padded(count) * (rows[q] + rows[other] + 2 * rows[x] + 1)), _LONGEST, isqrt(steps))
-        n, back = max(most, _SHORTEST), len(parts.past) - 1
+        fits = _CACHE // (8 * padded(count) * (rows[q] + rows[other] + 2 * rows[x] + 1))
+        n, back = max(min(fits, _LONGEST_IMPLICIT, isqrt(steps)), _SHORTEST), len(parts.past) - 1
         # Until there are unknowns to guess the next one from, more iterations are needed.
         self._longest, self.block = n, back + 1
         # The time is one of the parameters, and another in each step.
         clock = dyn.model.time_parameter
-        self._clock = None if clock is None else list(dyn.model.parameters).index(clock)
         # The unknown of each step behind those of the last ones before the block.
-        places = {q: n + 1, other: n + 1, "misses": n + 1, x: n + back, "guess": 2, "trial": 2}
+        places = {q: n + 1, other: n + 1, "misses": n + 1, x: n + back, "guess": n + 1, "trial": 2}
         places |= {"tau": n if torques else 1, "parameters": 1 if clock is None else n}
         rows |= {"trial": rows[x], "tau": dyn.equations.force.numel()}
         ends = {*parts.past[1:], *parts.end.writes, f"{x}1"} - {"guess"}
-        self._own = tuple(name for name in rows if name not in places and name not in ends)
-        super().__init__({name: (places.get(name, 1), rows[name]) for name in rows if name not in ends}, count)
-        self._count, self._back = count, back
-        self._sequences: dict[tuple[int, int], KernelSequence] = {}
+        at = None if clock is None else list(dyn.model.parameters).index(clock)
+        super().__init__({name: (places.get(name, 1), rows[name]) for name in rows if name not in ends}, count, at)
+        self._back = back
+        self._sequences: dict[int, KernelSequence] = {}
         self._iterations, self._smooth = 2, 0
         self.iterations = 0
         self._alive = np.full(count, True)
@@ -440,47 +479,33 @@ class ImplicitChunk(BlockLoop):
         """Put in (n, nq) configurations, what goes with them, unknowns, and values of parameters, (p,) or (n, p)."""
         self._begin(parameters, **{self.carried[0]: q, self.carried[1]: other}, guess=guess)
         for place in range(self._back):
-            self._fill(self._parts.past[0], place, guess.T)
+            self._fill(self._parts.past[0], place, guess.T[None])
 
     def _sequence(self, iterations: int) -> KernelSequence:
-        key = iterations, self.block
-        if key not in self._sequences:
-            calls = [call for j in range(self.block) for call in self._step(j, iterations)]
-            self._sequences[key] = KernelSequence(calls)
-        return self._sequences[key]
+        if iterations not in self._sequences:
+            x, back = self._parts.past[0], self._back
+            tries = [("guess", 0), *(("trial", i) for i in range(iterations - 1)), (x, back)]
+            calls = [
+                self._call(self._codes[part.name], part, 0, 1, {x: before, f"{x}1": after})
+                for before, after in pairwise(tries)
+                for part in self._parts.iteration
+            ]
+            places = {name: (x, back - i) for i, name in enumerate(self._parts.past)} | {"guess": ("guess", 1)}
+            places |= {f"{name}1": (name, 1) for name in (*self.carried, "misses")}
+            end = self._parts.end
+            self._sequences[iterations] = KernelSequence([*calls, self._call(self._codes[end.name], end, 0, 1, places)])
+        return self._sequences[iterations]
 
-    def _step(self, j: int, iterations: int) -> list[Call]:
-        at, x, end = self._array, self._parts.past[0], self._parts.end
-        arrays = {name: at(name, 0) for name in self._own}
-        varied = (*self.carried, "misses", "tau", *(["parameters"] if "parameters" in self._room else []))
-        arrays |= {name: at(name, j) for name in varied}
-        # The block's first guess stays unchanged, so that the block can be repeated.
-        tries = [at("guess", min(j, 1)), *(at("trial", i) for i in range(iterations - 1)), at(x, j + self._back)]
-        calls = []
-        for before, after in pairwise(tries):
-            arrays |= {x: before, f"{x}1": after}
-            calls += [self._call(part, arrays) for part in self._parts.iteration]
-        arrays |= {name: at(x, j + self._back - i) for i, name in enumerate(self._parts.past)}
-        arrays |= {f"{name}1": at(name, j + 1) for name in (*self.carried, "misses")} | {"guess": at("guess", 1)}
-        return [*calls, self._call(end, arrays)]
-
-    def _call(self, part: Part, arrays: dict[str, Array]) -> Call:
-        return Call(self._codes[part.name], [arrays[n] for n in part.reads], [arrays[n] for n in part.writes])
-
-    def advance(self, steps: int, start: float, dt: float, torques: Array) -> None:
-        """Take some steps, and count in `good` how many of them are solved."""
-        self._hold(steps, dt, torques)
-        if self._clock is not None:
-            times = start + (np.arange(steps) + self._parts.clock) * dt
-            self._room["parameters"][:steps, self._clock] = times[:, None]
-        self._room["misses"][0] = 0.0
+    def run_to(self, step: int) -> None:
+        first, steps = self._taken, step - self._taken
         if self._smooth >= _PATIENCE and self._iterations > 1:
             self._iterations, self._smooth = self._iterations - 1, 0
         iterations, calls = self._iterations, len(self._parts.iteration)
         while True:
-            self._sequence(iterations).run(0, steps * (iterations * calls + 1))
+            every = iterations * calls + 1
+            self._sequence(iterations).run(first * every, step * every)
             self.iterations += iterations * steps * int(self._alive.sum())
-            missed = self._room["misses"][steps, 0, : self._count] > 0
+            missed = self._room["misses"][step, 0, : self._count] > 0
             if not (missed & self._alive).any():
                 self._smooth += 1
                 break
@@ -488,23 +513,27 @@ class ImplicitChunk(BlockLoop):
             if iterations == MOST:
                 break
             iterations = min(iterations + max(iterations // 2, 1), MOST)
-        self._iterations, self._taken = iterations, steps
-        self.good = np.full(self._count, steps)
+        self._iterations, self._taken = iterations, step
         if missed.any():
-            self.good = np.count_nonzero(self._room["misses"][1 : steps + 1, 0, : self._count] == 0, axis=0)
             # What is lost asks for no more iterations.
             self._alive &= ~missed
             if self._iterations == MOST:
                 self._iterations = 2
 
+    @property
+    def good(self) -> Indices:
+        solved = self._room["misses"][1 : self._taken + 1, 0, : self._count] == 0
+        return np.asarray(solved.sum(axis=0))
+
     def again(self) -> None:
         n, past = self._taken, self._room[self._parts.past[0]]
         if self.block != self._longest:
             self.block, self._iterations = self._longest, 2
-        for name in self.carried:
+        for name in (*self.carried, "guess"):
             self._room[name][0] = self._room[name][n]
-        self._room["guess"][0] = self._room["guess"][1]
+        self._room["misses"][0] = 0.0
         past[: self._back] = past[n : n + self._back].copy()
+        self._taken = 0
 
 
 def run_implicit(

@@ -78,9 +78,9 @@ class GridRecord:
         # Read-only, so that nobody needs a copy.
         q.setflags(write=False)
         v.setflags(write=False)
-        reached = np.array([grid.time(int(k)) for k in steps])
+        reached = grid.times_of(steps)
         return SolverResult(
-            t=np.array([grid.time(int(k)) for k in kept[:rows]]),
+            t=grid.times_of(kept[:rows]),
             q=q[0] if single else q,
             v=v[0] if single else v,
             steps=int(steps.sum()),

@@ -81,7 +81,7 @@ def _poses(problem: IntegrationProblem, record: GridRecord) -> tuple[str, ...]:
     """Return the singular poses on the way, in a sentence; none where steps are left out of what is kept."""
     if len(record.kept) <= problem.grid.steps:
         return ()
-    times = np.array([problem.grid.time(int(k)) for k in record.kept])
+    times = problem.grid.times_of(record.kept)
     poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
     for i, last in enumerate(record.steps.tolist()):
         poses.saw_run(i, times[1 : last + 1], record.q[i, 1 : last + 1])
@@ -221,7 +221,7 @@ def _to_velocities(
 ) -> None:
     """Turn the kept momenta into velocities."""
     kept, (n, rows, nv) = record.kept, record.v.shape
-    times = np.array([problem.grid.time(int(k)) for k in kept])
+    times = problem.grid.times_of(kept)
     size = max(_SLICE // max(n * (nv or 1), 1), 1)
     for start in range(0, rows, size):
         q, v = (x[:, start : start + size] for x in (record.q, record.v))
