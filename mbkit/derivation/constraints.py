@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import casadi as ca
@@ -544,10 +544,7 @@ class ConstrainedMotion(ConstraintQuantities):
         a, multipliers = self.constraint_factors.motion(force)
         rows = self.constraint_rows
         lost, every = list(rows.choice.redundant), rows.all
-        # A row whose slope is rounding of the others' follows from them.
-        sizes = self.constraint_factors.rows.squares
-        doubt = ca.if_else(reduce(ca.fmin, sizes) > DEPENDENT**2 * reduce(ca.fmax, sizes), 0.0, np.nan)
-        doubt += off_branch(every.jacobian[lost, :], every.gamma[lost, :], a, force, self.mass_matrix)
+        doubt = off_branch(every.jacobian[lost, :], every.gamma[lost, :], a, force, self.mass_matrix)
         return a + doubt, multipliers + doubt
 
     @property

@@ -8,7 +8,7 @@ couplings couple branches; the entries that they fill in are added to the patter
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import reduce
 from typing import Any, Final
 
 import casadi as ca
@@ -21,6 +21,8 @@ from mbkit.model import Model
 #: Mass of a coordinate that has none, in terms of the mean one.
 _MASSLESS: Final = 1e-20
 _TINY: Final = 1e-300
+#: Columns from which on a reflection onto a row of theirs saves more than its root costs.
+_WORTH_A_ROOT: Final = 6
 
 
 def elimination_order(model: Model) -> tuple[int, ...]:
@@ -99,20 +101,15 @@ class Elimination:
     def solve(self, f: ca.SX, pulls: Sequence[Any] | None = None) -> ca.SX:
         """Return M⁻¹ f, (n,) or (n, k); less L⁻¹ D⁻¹ of pulls."""
         x = self._lowered(f)
-        return self._raised([a - b for a, b in zip(x, pulls, strict=True)] if pulls else x, self.inverse)
+        return self._raised([a - b for a, b in zip(x, pulls, strict=True)] if pulls else x)
 
-    def half(self, f: ca.SX) -> ca.SX:
-        """Return D^-½ L^-ᵀ f, (n,) or (n, k), whose squares are those of f in the metric of M⁻¹."""
-        x = (a * root for a, root in zip(self._lowered(f), self._roots, strict=True))
-        return ca.vertcat(ca.SX(0, f.shape[1]), *x)
+    def lowered(self, f: ca.SX) -> ca.SX:
+        """Return L^-ᵀ f, (n,) or (n, k), whose squares in the metric of D⁻¹ are those of f in that of M⁻¹."""
+        return ca.vertcat(ca.SX(0, f.shape[1]), *self._lowered(f))
 
-    def whole(self, y: ca.SX) -> ca.SX:
-        """Return L⁻¹ D^-½ y: M⁻¹ f of y = `half`(f)."""
-        return self._raised([scalar(y[k, :]) for k in range(len(self._order))], self._roots)
-
-    @cached_property
-    def _roots(self) -> list[Any]:
-        return [ca.sqrt(x) for x in self.inverse]
+    def raised(self, y: ca.SX) -> ca.SX:
+        """Return L⁻¹ D⁻¹ y: M⁻¹ f of y = `lowered`(f)."""
+        return self._raised([scalar(y[k, :]) for k in range(len(self._order))])
 
     def _lowered(self, f: ca.SX) -> list[Any]:
         """Return L^-ᵀ f by its rows."""
@@ -122,11 +119,11 @@ class Elimination:
                 x[i] = x[i] - factor * x[k]
         return x
 
-    def _raised(self, x: list[Any], scales: list[Any]) -> ca.SX:
-        """Return L⁻¹ of rows times their scales."""
+    def _raised(self, x: list[Any]) -> ca.SX:
+        """Return L⁻¹ D⁻¹ of rows."""
         for k in self._order:
             moved = sum((factor * x[i] for i, factor in self.factors[k].items()), 0.0)
-            x[k] = x[k] * scales[k] - moved
+            x[k] = x[k] * self.inverse[k] - moved
         return ca.vertcat(*x) if x else ca.SX(0, 1)
 
 
@@ -229,28 +226,28 @@ class ConstraintTerms:
 class ConstraintFactors:
     """Factors of M = LᵀDL and of J's rows in the metric of M, which give v̇ and λ.
 
-    B = D^-½ L^-ᵀ Jᵀ = Q R with Q orthogonal: v̇ is the free acceleration with its part along Q replaced (Golub and Van
-    Loan 2013, Matrix Computations, ch. 5.3 and 6.2). So errors grow with the condition κ of B; J M⁻¹ Jᵀ = RᵀR
-    would have its square. Where M itself would lose digits or has no inverse, as with links without mass in a loop,
-    `careful` ones are those of W = M + Jᵀ diag(s) J, and a solution is refined once.
+    B = L^-ᵀ Jᵀ = Q R with Q orthogonal in the metric of D⁻¹: v̇ is the free acceleration with its part along Q replaced
+    (Golub and Van Loan 2013, Matrix Computations, ch. 5.3 and 6.2). So errors grow with the condition κ of D^-½ B;
+    that of J M⁻¹ Jᵀ is its square. Where M itself would lose digits or has no inverse, as with links without mass in a
+    loop, `careful` ones are those of W = M + Jᵀ diag(s) J, and a solution is refined once.
     """
 
     def __init__(self, c: ConstraintTerms, M: Any, order: tuple[int, ...], *, careful: bool) -> None:
         self._c, self._M, self.careful = c, M, careful
         self._stiffening: Any = c.stiffening(M) if careful else None
         self._W = Factors(c.weight(M) if careful else M, order)
-        self.rows = OrthogonalColumns(self._W.half(c.jacobian.T))
+        self.rows = OrthogonalColumns(self._W.lowered(c.jacobian.T), self._W.inverse)
 
     def change(self, residual: Any, rows: int | None = None) -> Any:
         """Return the least x in the metric of M with J x = residual, of all rows or of the first ones."""
-        return self._W.whole(self.rows.least(residual, rows))
+        return self._W.raised(self.rows.least(residual, rows))
 
     def solved(self, force: Any, rate: Any) -> tuple[Any, Any]:
         """Return x and λ of M x - Jᵀ λ = force, J x = rate, of one right-hand side or several, (n, k) and (m, k)."""
         J = self._c.jacobian
         given = force + ca.mtimes(J.T, ca.mtimes(ca.diag(self._stiffening), rate)) if self.careful else force
-        x, multipliers = self.rows.held(self._W.half(given), rate)
-        return self._W.whole(x), multipliers
+        x, multipliers = self.rows.held(self._W.lowered(given), rate)
+        return self._W.raised(x), multipliers
 
     def motion(self, force: Any, rate: Any | None = None) -> tuple[Any, Any]:
         """Return x and λ of M x - Jᵀ λ = force, J x = rate; by default v̇ with J v̇ = -γ.
@@ -270,70 +267,76 @@ class ConstraintFactors:
 
 
 class OrthogonalColumns:
-    """B = Q R of a matrix (n, m) whose columns are independent, by Householder's reflections of sparse columns.
+    """B = Q R of a matrix (n, m) whose columns are independent, with Q orthogonal in a diagonal metric, by default 1.
 
-    A reflection moves the rows that its column has and no other (Golub and Van Loan 2013, Matrix Computations, ch. 5.1
-    and 11.1). One of these rows then holds R's, the one that the fewest later columns have: so a leg of a platform
-    fills in nothing in the others.
+    Modified Gram-Schmidt: each column is taken out of the later ones. That is a reflection of the column onto a row of
+    zeros below B, and as stable (Björck and Paige 1992, SIAM J. Matrix Anal. Appl. 13); with its square as the metric
+    of this row no root is taken. A column that many others follow is reflected onto a row of its own, which then is
+    R's and no later column's: the one that the fewest of them have. So a leg of a platform fills in nothing in the
+    others (Golub and Van Loan 2013, Matrix Computations, ch. 5.1 and 11.1).
     """
 
-    def __init__(self, B: Any) -> None:
+    def __init__(self, B: Any, metric: Sequence[Any] | None = None) -> None:
         self._B, (self._n, self._m) = B, B.shape
+        metric = [1.0] * self._n if metric is None else metric
         columns: list[dict[int, Any]] = [{} for _ in range(self._m)]
         for i, j in zip(*B.sparsity().get_triplet(), strict=True):
             columns[j][i] = scalar(B[i, j])
         #: Squares of the columns, and of their parts beside the columns before them.
-        self.squares = [_dot(x, x) for x in columns]
+        self.squares: list[Any] = []
         self.remainders: list[Any] = []
-        #: Which columns share a row with one before.
-        self._joined: list[int] = []
-        #: Of each column the row of R_jj; and of its reflection 1 - w u uᵀ w and u.
+        #: Of each column the row of R_jj, its metric and the inverse, 1/R_jj, and the other entries of R.
         self._pivots: list[int] = []
-        self._reflections: list[tuple[Any, dict[int, Any]]] = []
-        #: 1/R_jj, no number where a column follows from those before it.
+        self._metric: list[Any] = []
+        self._scales: list[Any] = []
         self._inverse: list[Any] = []
-        for j, column in enumerate(columns):
-            later = columns[j + 1 :]
-            u = {i: x for i, x in column.items() if i not in self._pivots}
-            pivot = min(u, key=lambda i: sum(i in x for x in later), default=-1)
+        self._R: list[dict[int, Any]] = []
+        #: Of the reflections 1 + u w pᵀ.
+        self._reflections: list[tuple[dict[int, Any], Any, dict[int, Any]]] = []
+        for j, u in enumerate(columns):
+            own = {i: u.pop(p) for i, p in enumerate(self._pivots) if p in u}
+            dual = {i: metric[i] * x for i, x in u.items()}
+            left = _dot(u, dual)
+            self._R.append(own)
+            self.remainders.append(left)
+            self.squares.append(left + sum(self._metric[i] * x**2 for i, x in own.items()))
+            later = [x for x in columns[j + 1 :] if not u.keys().isdisjoint(x)]
+            if len(later) < _WORTH_A_ROOT:
+                # One without entries follows from those before; the evaluation reports it.
+                pivot, inverse, weight = self._n + j, -1.0, scalar(-1.0 / ca.SX(left))
+                u[pivot], dual[pivot], scale = 1.0, left, -weight
+            else:
+                pivot = min(u, key=lambda i: sum(i in x for x in later))
+                scale = reciprocal(metric[pivot])
+                # Away from the column, so that nothing cancels.
+                size = (1.0 - 2.0 * (u[pivot] < 0)) * ca.sqrt(left * scale)
+                weight = -1.0 / (left + dual[pivot] * size)
+                u[pivot] = u[pivot] + size
+                dual[pivot] = metric[pivot] * u[pivot]
+                inverse = weight * dual[pivot]
             self._pivots.append(pivot)
-            if len(u) < len(column):
-                self._joined.append(j)
-            if pivot < 0:
-                # It follows from them everywhere, or is zero; the evaluation reports it.
-                self._reflections.append((0.0, {}))
-                self._inverse.append(np.inf)
-                self.remainders.append(0.0)
-                continue
-            self.remainders.append(_dot(u, u))
-            x = u[pivot]
-            # Away from the column, so that nothing cancels.
-            size = (1.0 - 2.0 * (x < 0)) * ca.sqrt(self.remainders[j])
-            u[pivot] = longer = x + size
-            # One quotient for both.
-            weight = reciprocal(size * longer)
-            self._reflections.append((weight, u))
-            self._inverse.append(-weight * longer)
+            self._metric.append(metric[pivot] if pivot < self._n else left)
+            self._scales.append(scale)
+            self._inverse.append(inverse)
+            self._reflections.append((u, weight, dual))
             for other in later:
                 self._reflect(j, other)
-        self._R = [
-            {i: column[p] for i, p in enumerate(self._pivots[:j]) if p in column} for j, column in enumerate(columns)
-        ]
 
     @property
     def independent(self) -> Any:
-        """Whether each column has a part beside the columns before it, relative to its size."""
-        out: Any = ca.SX(1.0)
-        for j in self._joined:
-            out = ca.logic_and(out, self.remainders[j] > DEPENDENT**2 * self.squares[j])
+        """Whether each column has a part beside the columns before it, relative to its size, and beside the largest."""
+        out: Any = reduce(ca.fmin, self.squares) > DEPENDENT**2 * sum(self.squares)
+        for left, square, before in zip(self.remainders, self.squares, self._R, strict=True):
+            if before:
+                out = ca.logic_and(out, left > DEPENDENT**2 * square)
         return out
 
     def _reflect(self, j: int, y: dict[int, Any]) -> None:
-        weight, u = self._reflections[j]
+        u, weight, dual = self._reflections[j]
         if not u.keys().isdisjoint(y):
-            factor = weight * _dot(u, y)
+            factor = weight * _dot(dual, y)
             for i, x in u.items():
-                y[i] = y.get(i, 0.0) - factor * x
+                y[i] = y.get(i, 0.0) + factor * x
 
     def least(self, rate: Any, rows: int | None = None) -> Any:
         """Return the least y with Bᵀ y = rate, of all columns or of the first ones."""
@@ -341,9 +344,14 @@ class OrthogonalColumns:
         return self._back(dict(zip(self._pivots, z, strict=False)), len(z), rate.shape[1])
 
     def held(self, free: Any, rate: Any) -> tuple[Any, Any]:
-        """Return the y nearest to `free` with Bᵀ y = rate, and λ with y = free + B λ; columns (n, k) and (m, k)."""
+        """Return the y nearest to `free` with Bᵀ y = rate, and λ with y = free + B λ; columns (n, k) and (m, k).
+
+        In a metric G it is Bᵀ G y.
+        """
         z, y = self._coordinates(rate, self._m), self._turned(free)
         weights = self.weights([a - y.get(p, 0.0) for a, p in zip(z, self._pivots, strict=True)])
+        # Columns that fill the space leave nothing of it but rounding.
+        y = y if self._m < self._n else {}
         return self._back(y | dict(zip(self._pivots, z, strict=True)), self._m, rate.shape[1]), weights
 
     def balanced(self, f: Any, which: list[int]) -> tuple[Any, Any, list[Any]]:
@@ -354,7 +362,8 @@ class OrthogonalColumns:
         """
         y = self._turned(f)
         mu, rows = ca.vertcat(ca.SX(0, 1), *(y.get(p, ca.SX(1, 1)) for p in self._pivots)), self._B[which, :]
-        own = OrthogonalColumns(ca.vertcat(ca.SX(0, len(which)), *self._coordinates(rows.T, self._m)))
+        shares = ca.vertcat(ca.SX(0, len(which)), *self._coordinates(rows.T, self._m))
+        own = OrthogonalColumns(shares, self._metric)
         mu, _ = own.held(mu, f[which])
         parts = [scalar(mu[i]) for i in range(self._m)]
         left = f - self._back(dict(zip(self._pivots, parts, strict=True)), self._m, 1)
@@ -379,12 +388,12 @@ class OrthogonalColumns:
         return out
 
     def _coordinates(self, rate: Any, rows: int) -> list[Any]:
-        """Return R^-ᵀ rate."""
+        """Return R^-ᵀ rate over the metric."""
         out: list[Any] = []
         for j in range(rows):
             known = sum((r * out[i] for i, r in self._R[j].items()), 0.0)
             out.append((scalar(rate[j, :]) - known) * self._inverse[j])
-        return out
+        return [x * scale for x, scale in zip(out, self._scales, strict=False)]
 
     def _back(self, y: dict[int, Any], rows: int, k: int) -> Any:
         """Return Q y, (n, k)."""
@@ -394,4 +403,6 @@ class OrthogonalColumns:
 
 
 def _dot(a: dict[int, Any], b: dict[int, Any]) -> Any:
-    return sum((x * b[i] for i, x in a.items() if i in b), 0.0)
+    # In two sums: in one, each product waits for those before it.
+    terms = [x * b[i] for i, x in a.items() if i in b]
+    return sum(terms[::2]) + sum(terms[1::2])

@@ -267,8 +267,8 @@ class Manifold:
         J, _, gamma, M, _ = self.call("embedded", q, v)
         return np.asarray(a + least_change(M, J, -gamma[:, 0] - J @ a, held))
 
-    def _free(self, held: Collection[int]) -> Array:
-        return np.setdiff1d(np.arange(self.dyn.model.nv), [*held]).astype(int)
+    def _free(self, held: Collection[int]) -> list[int]:
+        return [k for k in range(self.dyn.model.nv) if k not in held]
 
     def require_followed(self, q: Array, v: Array, held: Collection[int], names: str) -> None:
         """Refuse held coordinates that break the constraints at a state, or leave the others undetermined there."""

@@ -175,7 +175,7 @@ def least_change(W: Array, J: Array, change: Array, held: Collection[int] = (), 
 
     The entries `held` are zero.
     """
-    free, out = np.setdiff1d(np.arange(len(W)), [*held]).astype(int), np.zeros(len(W))
+    free, out = [k for k in range(len(W)) if k not in held], np.zeros(len(W))
     out[free] = under_rows(W[np.ix_(free, free)], J[:, free], np.zeros(len(free)), change, rounding)[0]
     return out
 
