@@ -13,6 +13,10 @@ Pinocchio's aba.
 Compile time is no part of the runs: `first_run_s` is a first run of rk853 with an empty
 cache, deriving and compiling included. The budget: UR5, 10 s, at least 5 times faster
 than the fastest way that MuJoCo, or SciPy on Pinocchio, has.
+
+`fixed` has the processor's time of one step of RK4 in a run of one state, µs: of short and long
+runs, with the last state kept or all, of the machine code alone, and of a loop that reads the state
+and sets a torque before each step.
 """
 
 from __future__ import annotations
@@ -27,6 +31,9 @@ import pinocchio as pin
 from scipy.integrate import solve_ivp
 
 import mbkit as mb
+from mbkit.model.integration_space import Space
+from mbkit.simulate.solvers.compiled_fixed_step import Chunk
+from mbkit.simulate.time_grid import Grid
 from mbkit.studies.study_runs import start_state
 from validation.stamp import results, stamp
 
@@ -38,6 +45,14 @@ SCENES = (
     ("double_pendulum, 5 s", mb.catalog.double_pendulum, 5.0),
     ("panda, mimic free, 0.5 s", lambda: mb.load("panda", mimic="free").without("damping"), 0.5),
     ("anymal_b, floating, 2 s", lambda: mb.load("anymal_b", floating_base=True).without("damping"), 2.0),
+)
+#: Steps of DT s of RK4 in one run.
+STEPS, DT = (1_000, 100_000), 1e-4
+FIXED = (
+    ("double_pendulum", mb.catalog.double_pendulum),
+    ("four_bar", mb.catalog.four_bar),
+    ("ur5", lambda: mb.load("ur5").without("damping")),
+    ("panda, mimic free", lambda: mb.load("panda", mimic="free").without("damping")),
 )
 #: (engine, method) -> order of the fixed-step ones, None of those with a tolerance.
 WAYS = {
@@ -223,6 +238,41 @@ def measure(scene):
     }
 
 
+def fixed(label, model):
+    """Return the processor's time of a step of RK4 in runs of one state, µs."""
+    dyn, (q, v), space = mb.dynamics(model, "lagrangian", threads=1, compile=True), start(model), Space(model)
+    chunk = Chunk(dyn.step_plan("rk4"), space, 1, STEPS[0], torques=False, all_kept=False)
+    chunk.begin(q[None], space.to_integrator_velocity(q, v)[None], dyn.parameter_values)
+    chunk.set_times(Grid.of(0.0, 1.0, DT), 0, chunk.block)
+    zero = np.zeros((1, model.nv, 1))
+
+    def alone():
+        chunk.run_to(chunk.block)
+        chunk.again()
+
+    def stopped():
+        for k in range(chunk.block):
+            chunk.now("q"), chunk.now("w")
+            chunk.hold(zero)
+            chunk.run_to(k + 1)
+        chunk.again()
+
+    calls = {"machine code": (chunk.block, alone), "stopped at each": (chunk.block, stopped)}
+    for count in STEPS:
+        for kept, save in (("last", [count * DT]), ("all", None)):
+            calls[f"{count} steps, {kept} kept"] = (
+                count,
+                lambda n=count, s=save: mb.simulate(dyn, q, v, n * DT, "rk4", dt=DT, save=s),
+            )
+    best = dict.fromkeys(calls, np.inf)
+    for _ in range(ROUNDS):
+        for name, (count, call) in calls.items():
+            # The first of some finds cold caches.
+            best[name] = min(best[name], *(seconds(call)[1] / count * 1e6 for _ in range(5)))
+    print(f"{label}: " + ", ".join(f"{name} {us:.3f} µs" for name, us in best.items()))
+    return {"model": label, "step_us": best}
+
+
 def show(row):
     print(f"{row['scene']}: reference holds to {row['reference_holds_to']:.1e}, first run {row['first_run_s']:.2f} s")
     for name, r in sorted(row["ways"].items(), key=lambda item: item[1].get("ms", np.inf)):
@@ -240,6 +290,7 @@ def show(row):
 
 #: See `validation.smoke`.
 SMOKE = {"SCENES": (("double_pendulum, 50 ms", mb.catalog.double_pendulum, 0.05),), "ROUNDS": 1, "PATIENCE": 0.02}
+SMOKE |= {"STEPS": (20, 40), "FIXED": FIXED[:1]}
 
 
 def main():
@@ -248,7 +299,7 @@ def main():
     for label, make, duration in SCENES:
         rows.append(measure(Scene(label, make(), duration)))
         show(rows[-1])
-    about = {"rounds": ROUNDS, **stamp(__file__)}
+    about = {"fixed": [fixed(label, make()) for label, make in FIXED], "rounds": ROUNDS, **stamp(__file__)}
     with results("trajectory.json").open("w", encoding="utf-8") as f:
         json.dump({"rows": rows, **about}, f, indent=1)
 
