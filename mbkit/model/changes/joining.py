@@ -47,8 +47,9 @@ def mounted(model: Model, pose: ArrayLike) -> Model:
             f"mount: {model.name} floats on joint {floating[0]!r}; a mount is for a fixed base, and q places a free one"
         )
     bindings = list(model.bindings)
+    places = {"world": ("world", R, p)}
     parts: dict[str, Any] = {
-        kind: tuple(hung_on(x, "world", R, p, bindings) for x in getattr(model, kind)) for kind in KINDS_OF_PARTS
+        kind: tuple(hung_on(x, places, bindings) for x in getattr(model, kind)) for kind in KINDS_OF_PARTS
     }
     rpy = [round(float(x) + 0.0, 4) for x in np.degrees(spatial.rpy_from_matrix(R))]
     note = f"mounted at {np.round(p, 6).tolist()} m, roll, pitch, yaw {rpy} degrees"

@@ -382,7 +382,7 @@ class EditingBuilder:
         """Take the parts of another builder, with its ground at R, p on a body; `nominal` is p without parameters."""
         bindings = other._bindings
         for kind, parts in other._parts.items():
-            self._parts[kind] += [hung_on(x, body, R, p, bindings) for x in parts]
+            self._parts[kind] += [hung_on(x, {"world": (body, R, p)}, bindings) for x in parts]
         # There is one gravity.
         self._bindings += [b for b in bindings if b.where != "gravity"]
         self._odd |= other._odd

@@ -1,4 +1,4 @@
-"""References of parts to bodies and joints: other names for these, and another place for what hangs on the ground."""
+"""References of parts to bodies and joints: other names for these, and another place for what hangs on them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _CALLED: Final = {"bodies": "body", "no_slip": "no slip"}
 _OF_BODIES: Final = ("parent", "child", "body", "body_a", "body_b", "frame")
 _OF_JOINTS: Final = ("joint", "leader", "joints", "without")
 #: Bodies that a part hangs on, with the end of its fields' names.
-_SIDES: Final = {"parent": "", "body_a": "_a", "body_b": "_b"}
+_SIDES: Final = {"parent": "", "body": "", "body_a": "_a", "body_b": "_b"}
 
 
 def called(section: str) -> str:
@@ -120,16 +120,13 @@ def moved_by(R: Array, p: Any, x: Any) -> Any:
     return out
 
 
-def hung_on(part: Any, body: str, R: Array, p: Any, bindings: list[Binding]) -> Any:
-    """Return a part with what hung on the ground hung on a body, where the ground has the pose R, p."""
+def hung_on(part: Any, places: Mapping[str, tuple[str, Array, Any]], bindings: list[Binding]) -> Any:
+    """Return a part with what hangs on some bodies hung on others; these see the old one's frame at R, p."""
+    names, new = rules_of(type(part)).keys(), dict[str, Any]()
     for side, end in _SIDES.items():
-        if getattr(part, side, None) != "world":
-            continue
-        part = replace(part, **{side: body})
-        names = rules_of(type(part)).keys()
-        for name in {f"rotation{end}", f"axis{end}"} & names:
-            part = replace(part, **{name: R @ getattr(part, name)})
-        for name in {f"translation{end}", f"point{end}"} & names:
-            point = moved_by(R, p, entries(part, name, bindings))
-            part = with_fields(part, {name: point}, bindings)
-    return part
+        if place := places.get(getattr(part, side, "")):
+            new[side], R, p = place
+            new |= {n: R @ getattr(part, n) for n in {f"rotation{end}", f"axis{end}"} & names}
+            points = {f"translation{end}", f"point{end}"} & names
+            new |= {n: moved_by(R, p, entries(part, n, bindings)) for n in points}
+    return with_fields(part, new, bindings) if new else part

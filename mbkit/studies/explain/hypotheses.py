@@ -6,10 +6,10 @@ them can be added to the first description or removed from the second without th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from itertools import permutations, product
+from itertools import islice, permutations, product
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,14 +18,13 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import Body, Joint, Mimic, Model
-from mbkit.model.changes.dry_friction import FrictionNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
-from mbkit.model.elements.formula import NUMPY, Formula
+from mbkit.model.elements.formula import NUMPY
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
 from mbkit.model.elements.references import called
-from mbkit.model.parts import Coupler, Loop, NumberRule, rules_of
-from mbkit.studies.explain.loop_differences import angle_of, axis_times_sine, loop_differences, same_loop
-from mbkit.studies.explain.merged_model import OTHERS, LinkInBody, MergedModel, Tolerances, composite
+from mbkit.model.parts import Coupler, Loop, rules_of
+from mbkit.studies.explain.loop_differences import loop_differences, turn_of
+from mbkit.studies.explain.merged_model import OTHERS, LinkInBody, MergedModel, Tolerances, acting, composite
 
 _WATER: Final = 1000.0  # kg/m³
 _DEGREE: Final = np.pi / 180
@@ -39,6 +38,7 @@ _WORDS: Final = {
     "prescribed": ("prescribed motion", "motion of"),
     "no_slip": ("contact without slip", "no slip"),
 }
+_OF_BODY: Final = {"mass": "mass", "com": "centre of mass"}
 _NUMBER: Final = {"stiffness": "spring", "stribeck_velocity": "Stribeck velocity"}
 #: Numbers of a joint that are told together, and those that are compared one by one.
 BOUNDS: Final = tuple(name for name, rule in rules_of(Joint).items() if not rule.acts)
@@ -215,24 +215,22 @@ def _body_differences(
     a = composite(links)
     mistakes = body_mistakes(links, R_PJ, base=base)
     for mistake in mistakes:
-        if near.mass_properties(replace(a, **mistake.fields), b):
+        if near.same(replace(a, **mistake.fields), b):
             return [mistake._replace(fields=vars(b))]
-    if a.mass and b.mass and b.mass != a.mass and near.mass_properties(a.scaled(b.mass / a.mass), b):
+    if a.mass and b.mass and b.mass != a.mass and near.same(a.scaled(b.mass / a.mass), b):
         says = f"has {number_text(b.mass / a.mass)} times the mass, and the inertia with it"
         return [Mistake("mass", says, vars(b))]
     if not a.mass and not a.inertia.any():
         return [Mistake("added body", "has matter in it", vars(b))]
     out = []
-    same_of = {"mass": ("mass", near.number(a.mass, b.mass)), "com": ("centre of mass", near.point(a.com, b.com))}
-    for name, (what, same) in same_of.items():
-        if not same:
-            ours, theirs = getattr(a, name), getattr(b, name)
-            wanted = replace(a, **{name: theirs})
-            says = f"has the {what} {number_text(ours)} -> {number_text(theirs)} {rules_of(Body)[name].unit}"
-            fitting = (x for x in mistakes if near.mass_properties(replace(a, **x.fields), wanted))
-            out.append(next(fitting, Mistake(what, says, {}))._replace(fields={name: theirs}))
-    if not near.inertia(a.inertia, b.inertia, a.mass):
-        out.append(Mistake(*_inertia_difference(a, b, mistakes, near), {"inertia": b.inertia}))
+    for name in near.differing(a, b):
+        wanted = replace(a, **{name: getattr(b, name)})
+        kind, says = _inertia_difference(a, b, mistakes, near) if name == "inertia" else (_OF_BODY[name], "")
+        if not says:
+            change = f"{number_text(getattr(a, name))} -> {number_text(getattr(b, name))} {rules_of(Body)[name].unit}"
+            usual = (x[:2] for x in mistakes if near.same(replace(a, **x.fields), wanted))
+            kind, says = next(usual, (kind, f"has the {kind} {change}"))
+        out.append(Mistake(kind, says, {name: getattr(b, name)}))
     return out
 
 
@@ -275,7 +273,7 @@ def _has_reordered_axes(a: Array, b: Array, mass: float, near: Tolerances) -> bo
         Q = axes[:, order] * signs
         for R in _reordered(Q) if np.linalg.det(Q) > 0 else ():
             turned = R @ np.diag(moments[list(order)]) @ R.T
-            if angle_of(R.T @ Q) > near.relative and near.inertia(turned, b, mass):
+            if np.linalg.norm(turn_of(R.T @ Q)) > near.relative and near.inertia(turned, b, mass):
                 return True
     return False
 
@@ -289,7 +287,7 @@ def link_differences(
         return None
     out = []
     for x in ours:
-        if not near.mass_properties(x.matter, there[x.name]):
+        if not near.same(x.matter, there[x.name]):
             alone = replace(x, R=np.eye(3), p=np.zeros(3))
             out += [(x.name, mistake) for mistake in _body_differences([alone], np.eye(3), there[x.name], near)]
     return out
@@ -360,73 +358,56 @@ def joint_mistakes(joint: Joint) -> list[Mistake]:
     return _effective(joint, rows)
 
 
-def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> list[Mistake]:
-    """Return the mistakes that turn joint `a` into joint `b`, named as exactly as possible."""
-    out: list[Mistake] = []
+def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> Iterator[Mistake]:
+    """Yield the mistakes that turn joint `a` into joint `b`, named as exactly as possible."""
     if a.parent != b.parent:
-        out.append(Mistake("parent", f"hangs it on {b.parent!r} and not on {a.parent!r}", {"parent": b.parent}))
+        yield Mistake("parent", f"hangs it on {b.parent!r} and not on {a.parent!r}", {"parent": b.parent})
     if a.type.motion != b.type.motion:
         # The numbers of one joint type mean nothing to the other.
         whole = {f.name: getattr(b, f.name) for f in fields(b) if f.name not in ("name", "child", "parent")}
-        return [*out, Mistake("joint kind", f"has it as a {b.kind} joint, not a {a.kind} one", whole)]
-    mistakes = joint_mistakes(a)
+        yield Mistake("joint kind", f"has it as a {b.kind} joint, not a {a.kind} one", whole)
+        return
+    apart = near.differing(a, b)
+    mistakes = joint_mistakes(a) if apart else []
 
-    def same(name: str, x: Any, y: Any) -> bool:
-        if name == "translation":
-            return near.point(x, y)
-        return near.number(x, y) if name == "pitch" else near.vector(x, y)
+    def named(*names: str) -> Iterator[Mistake]:
+        """Yield the first usual mistake in just these fields."""
+        usual = (x for x in mistakes if x.fields.keys() == {*names})
+        hits = (x for x in usual if not near.differing(replace(a, **x.fields), b, *names))
+        yield from (x._replace(fields=_fields(b, names)) for x in islice(hits, 1))
 
-    def differing(*names: str) -> dict[str, Any]:
-        return {n: getattr(b, n) for n in names if not same(n, getattr(a, n), getattr(b, n))}
-
-    def known(wanted: dict[str, Any]) -> list[Mistake]:
-        """Return the first usual mistake in just these fields."""
-        for x in mistakes:
-            if x.fields.keys() == wanted.keys() and all(same(n, x.fields[n], y) for n, y in wanted.items()):
-                return [x._replace(fields=wanted)]
-        return []
-
-    placement = differing("rotation", "translation")
+    placement = [n for n in ("rotation", "translation") if n in apart]
     if placement:
-        each = ((known({n: x}) or [_moved(n, a, b, near)])[0] for n, x in placement.items())
-        out += known(placement) or each
+        yield from [*named(*placement)] or [next(named(n), _moved(n, a, b, near)) for n in placement]
     for name, kind, says in (("axes", "axis", "{}, not {}"), ("pitch", "pitch", "{} m/rad for {}")):
-        if wanted := differing(name):
+        if name in apart:
             numbers = says.format(number_text(getattr(b, name)), number_text(getattr(a, name)))
-            out += known(wanted) or [Mistake(kind, f"has the {kind} {numbers}", wanted)]
-    out += _mimic_difference(a.mimic, b.mimic, near)
-    for name in NUMBERS:
-        ours, theirs = (_acting(name, x) for x in (a, b))
-        # Without a number at rest, that is the one of motion, and no other difference.
-        if not (near.numbers(ours, theirs) or getattr(a, name) is getattr(b, name) is None):
-            kind = _NUMBER.get(name, name.replace("_", " "))
-            changed = {n: getattr(b, n) for n in (name, *(["rest"] if name == "stiffness" else []))}
-            out.append(Mistake(kind, _other_number(kind, ours, theirs), changed))
-    if a.stiffness.any() and near.numbers(a.stiffness, b.stiffness) and not near.vector(a.rest, b.rest):
+            yield next(named(name), Mistake(kind, f"has the {kind} {numbers}", _fields(b, [name])))
+    if "mimic" in apart:
+        yield Mistake("mimic", _follows_otherwise(a.mimic, b.mimic), {"mimic": b.mimic})
+    for name in (n for n in NUMBERS if n in apart):
+        kind = _NUMBER.get(name, name.replace("_", " "))
+        more = ["rest"] if name == "stiffness" else []
+        yield Mistake(kind, _other_number(kind, acting(name, a), acting(name, b)), _fields(b, [name, *more]))
+    if a.stiffness.any() and "rest" in apart and "stiffness" not in apart:
         says = f"has the spring at rest at {number_text(b.rest)}, not {number_text(a.rest)}"
-        out.append(Mistake("spring", says, {"rest": b.rest}))
-    limits = {n: getattr(b, n) for n in BOUNDS if not near.numbers(getattr(a, n), getattr(b, n))}
-    if limits:
-        out.append(Mistake("limits", _other_limits(a, limits), limits))
-    return out
+        yield Mistake("spring", says, {"rest": b.rest})
+    if limits := _fields(b, [n for n in BOUNDS if n in apart]):
+        yield Mistake("limits", _other_limits(a, limits), limits)
 
 
-def _acting(name: str, joint: Joint) -> Array:
-    """Return a number per velocity; of what a joint lacks that by which it then moves."""
-    law = FrictionNumbers.of([joint])
-    given: Array = {"stiction": law.bound, "stribeck_velocity": law.stribeck}.get(name, getattr(joint, name))
-    return given
+def _fields(part: Any, names: Iterable[str]) -> dict[str, Any]:
+    return {n: getattr(part, n) for n in names}
 
 
 def _moved(name: str, a: Joint, b: Joint, near: Tolerances) -> Mistake:
     """Return the difference in rotation or translation, as another zero position where it is along the axis."""
-    value = {name: getattr(b, name)}
+    value = _fields(b, [name])
     if name == "rotation":
-        R = a.rotation.T @ b.rotation
-        angle = angle_of(R)
-        zero = a.type.axial and a.type.rotates and np.allclose(R @ a.axes[0], a.axes[0], atol=1e-9)
-        if zero:
-            angle = float(np.copysign(angle, axis_times_sine(R) @ a.axes[0]))
+        turn = turn_of(a.rotation.T @ b.rotation)
+        angle = float(np.linalg.norm(turn))
+        zero = a.type.axial and a.type.rotates and np.allclose(np.cross(turn, a.axes[0]), 0.0, atol=1e-9)
+        angle = float(turn @ a.axes[0]) if zero else angle
         amount = f"{number_text(angle)} rad ({number_text(angle / _DEGREE)}°)"
         if zero:
             return Mistake("zero position", f"counts from {amount} further on", value)
@@ -438,16 +419,11 @@ def _moved(name: str, a: Joint, b: Joint, near: Tolerances) -> Mistake:
     return Mistake("joint origin", says, value)
 
 
-def _mimic_difference(a: Mimic | None, b: Mimic | None, near: Tolerances) -> list[Mistake]:
-    if a is None and b is None:
-        return []
-    if a is None or b is None:
-        says = f"lets it follow {b.joint!r}, which is free" if b else f"leaves it free, which follows {a.joint!r}"  # type: ignore[union-attr]
-        return [Mistake("mimic", says, {"mimic": b})]
-    if abs(a.offset - b.offset) <= near.relative and not differing(replace(a, offset=b.offset), b, near):
-        return []
+def _follows_otherwise(a: Mimic | None, b: Mimic | None) -> str:
+    if not (a and b):
+        return f"lets it follow {b.joint!r}, which is free" if b else f"leaves it free, which follows {a.joint!r}"  # type: ignore[union-attr]
     one, other = (f"{number_text(m.ratio)} {m.joint} + {number_text(m.offset)}" for m in (b, a))
-    return [Mistake("mimic", f"lets it follow {one}, not {other}", {"mimic": b})]
+    return f"lets it follow {one}, not {other}"
 
 
 def _other_number(name: str, a: Array, b: Array) -> str:
@@ -495,7 +471,7 @@ def _hypothesis(x: Mistake, subject: str, put: Callable[..., MergedModel], a: ob
 def _matter_differences(one: MergedModel, joint: Joint, other: MergedModel, near: Tolerances) -> list[Hypothesis]:
     body = joint.child
     a, b = one.mass_properties(body), other.mass_properties(body)
-    if near.mass_properties(a, b):
+    if near.same(a, b):
         return []
     links = link_differences(one.links[body], other.links[body], near)
     if not links:
@@ -526,7 +502,9 @@ def _global_differences(a: Model, b: Model, near: Tolerances) -> list[Hypothesis
     for section in OTHERS:
         ours, theirs = ({x.name: x for x in getattr(m, section)} for m in (a, b))
         if section == "loops":
-            same = {x: y for x in ours if x not in theirs for y in theirs if same_loop(ours[x], theirs[y], near)}
+            same = {
+                x: y for x in ours if x not in theirs for y in theirs if not loop_differences(ours[x], theirs[y], near)
+            }
             others = ", ".join(f"{x!r} is {y!r}" for x, y in same.items())
             out += [Hypothesis("renamed", "", f"calls loops otherwise: {others}")] if same else []
             ours, theirs = _without(ours, same), _without(theirs, same.values())
@@ -567,7 +545,7 @@ def _other_numbers(a: Any, b: Any, near: Tolerances) -> str:
         return "" if _same_motion(a, b, near) else "moves it otherwise"
     if type(a) is not type(b):
         return f"has another kind of it: {b} for {a}"
-    others = differing(a, b, near)
+    others = near.differing(a, b)
     if isinstance(a, Coupler) and others:
         return f"has {_follows(b)} for {_follows(a)}"
     return f"has {', '.join(_change(n, getattr(a, n), getattr(b, n)) for n in others)}" if others else ""
@@ -597,35 +575,3 @@ def _same_motion(a: Motion, b: Motion, near: Tolerances) -> bool:
     t = np.maximum(first, -50.0) + (np.minimum(last, 50.0) - np.maximum(first, -50.0)) * np.linspace(0, 1, 257) ** 1.37
     x, y = (np.broadcast_to(position(part, t, NUMPY), t.shape) for part in (a, b))
     return near.vector(x, y, max(1.0, float(np.abs(x).max())))
-
-
-def differing(a: Any, b: Any, near: Tolerances) -> list[str]:
-    """Return the fields in which two parts of one kind differ; of a force's formulas, by their values."""
-    names = [f.name for f in fields(a)]
-    if "formula" in names:
-        names = [n for n in names if n not in ("symbols", "numbers")]
-    rules = rules_of(type(a))
-    return [n for n in names if not _same(rules.get(n), _value(a, getattr(a, n)), _value(b, getattr(b, n)), near)]
-
-
-def _value(part: Any, field: Any) -> Any:
-    """Return a field, or the values of a formula at random arguments of many sizes, which each name has for itself."""
-    if not isinstance(field, Formula):
-        return field
-    rngs = {name: np.random.default_rng([*name.encode()]) for name in field.arguments}
-    at = {name: rng.standard_normal(64) * 10 ** rng.uniform(-2, 2, 64) for name, rng in rngs.items()}
-    with np.errstate(all="ignore"):
-        values = field(at | dict(zip(part.symbols, part.numbers, strict=True)), NUMPY)
-    known = np.nan_to_num([np.broadcast_to(x, 64) for x in values], posinf=0.0, neginf=0.0)
-    return known if known.any() else field
-
-
-def _same(rule: NumberRule | None, a: Any, b: Any, near: Tolerances) -> bool:
-    if isinstance(a, float):
-        return near.number(a, b)
-    if not isinstance(a, np.ndarray) or a.shape != np.shape(b):
-        return bool(np.array_equal(a, b))
-    if rule is None:
-        # Values of a formula.
-        return bool(np.allclose(a, b, near.relative, near.relative))
-    return near.vector(a, b, near.length if rule.place else float(np.abs([a, b]).max(initial=0.0)))

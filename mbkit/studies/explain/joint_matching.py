@@ -7,7 +7,7 @@ Siblings are assigned at the least total cost, and a match by names alone is use
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -17,13 +17,14 @@ from mbkit._check import Array, by_key
 from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.forces import coordinate_arguments
-from mbkit.model.elements.references import _OF_BODIES, names_in, with_names
+from mbkit.model.elements.references import _OF_BODIES, hung_on, names_in, with_names
 from mbkit.model.joint_types import FIXED, PRISMATIC
 from mbkit.studies.explain.hypotheses import Hypothesis
-from mbkit.studies.explain.merged_model import OTHERS, FrameChange, MergedModel, Tolerances, merge, reattached
+from mbkit.studies.explain.merged_model import OTHERS, MergedModel, Tolerances, at_itself, merge, reattached
 from mbkit.studies.explain.terms import fitting, restricted
 
 _NAME, _FRAME, _NUMBER, _KIND, _ALONE = 0.1, 0.25, 1.0, 3.0, 2.0
+_FRAMES: Final = ("rotation", "translation")
 #: Cost of an assignment that is not possible.
 _NEVER: Final = 1e12
 
@@ -143,19 +144,11 @@ class _Assignment:
     def _own(self, a: Joint, b: Joint) -> float:
         x, y, near = self.a.bodies[a.child], self.b.bodies[b.child], self.near
         far = np.array([[np.linalg.norm(a.translation)], [np.linalg.norm(b.translation)]])
-        same_motion = a.type.motion == b.type.motion
-        differing = (
-            (a.name != b.name, _NAME),
-            (a.kind != b.kind, _FRAME if same_motion else _KIND),
-            (not near.point(*far), _NUMBER),
-            (not near.number(x.mass, y.mass), _NUMBER),
-            (not near.inertia(self.a.moments[x.name], self.b.moments[y.name], x.mass), _NUMBER),
-            (not near.vector(a.axes, b.axes), _FRAME),
-            (not near.vector(a.rotation, b.rotation), _FRAME),
-            (not near.point(a.translation, b.translation), _FRAME),
-            (not near.point(x.com, y.com), _FRAME),
-        )
-        return sum(cost for differs, cost in differing if differs)
+        other_kind = _FRAME if a.type.motion == b.type.motion else _KIND
+        frames = len(near.differing(a, b, "axes", "rotation", "translation")) + (not near.point(x.com, y.com))
+        numbers = (not near.point(*far)) + (not near.number(x.mass, y.mass))
+        numbers += not near.inertia(self.a.moments[x.name], self.b.moments[y.name], x.mass)
+        return _NAME * (a.name != b.name) + other_kind * (a.kind != b.kind) + _FRAME * frames + _NUMBER * numbers
 
 
 # The second description with names, order and frames of the first.
@@ -199,13 +192,13 @@ def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedMode
     joints = {j.name: j for j in a.joints}
     matter = {x.name: x for x in a.bodies}
     own = {x.name: x for x in b.model.bodies}
-    changes = {"world": FrameChange("world")}
+    places = {"world": at_itself("world")}
     out: dict[str, tuple[Joint, Body]] = {}
     moved = []
     for joint in b.model.tree:
-        there = changes[joint.parent].joint(joint)
+        there = hung_on(joint, places, [])
         body = own[joint.child]
-        changes[joint.child] = FrameChange(joint.child)
+        places[joint.child] = at_itself(joint.child)
         out[joint.name] = there, body
         like = joints.get(joint.name)
         if like is None or not joint.type.axial or like.type.motion != joint.type.motion:
@@ -218,27 +211,28 @@ def align_frames(b: MergedModel, a: Model, near: Tolerances) -> tuple[MergedMode
             shift = joint.axes[0] * (joint.axes[0] @ shift)
         if not shift.any() and np.array_equal(turn, np.eye(3)):
             continue
-        change = FrameChange(joint.child, turn.T, shift)
+        change = joint.child, turn.T, -turn.T @ shift
         other = _moved(there, body, turn, shift)
         after = _differing(*other, like, matter[like.child], near)
         gain = _differing(there, body, like, matter[like.child], near) - after
         for child in b.model.joints:
             if child.parent == joint.child and child.name in joints:
-                fixed = joints[child.name]
-                gain += _misplaced(child, fixed, near) - _misplaced(change.joint(child), fixed, near)
+                places_there = (child, hung_on(child, {joint.child: change}, []))
+                own_faults, faults = (len(near.differing(x, joints[child.name], *_FRAMES)) for x in places_there)
+                gain += own_faults - faults
         if gain > 0 and (gain > 1 or not after):
             out[joint.name] = other
-            changes[joint.child] = change
+            places[joint.child] = change
             moved.append(joint.name)
     model = replace(
-        reattached(b.model, changes),
+        reattached(b.model, places),
         joints=tuple(out[j.name][0] for j in b.model.joints),
         bodies=tuple(out[j.name][1] for j in b.model.joints),
     )
-    links = {
-        name: tuple(replace(x, R=changes[name].A @ x.R, p=changes[name].point(x.p)) for x in some)
-        for name, some in b.links.items()
-    }
+    links = {}
+    for name, some in b.links.items():
+        _, R, p = places[name]
+        links[name] = tuple(replace(x, R=R @ x.R, p=p + R @ x.p) for x in some)
     return MergedModel(model, links), tuple(moved)
 
 
@@ -253,16 +247,7 @@ def _moved(joint: Joint, body: Body, R: Array, p: Array) -> tuple[Joint, Body]:
 
 
 def _differing(joint: Joint, body: Body, like: Joint, matter: Body, near: Tolerances) -> int:
-    return (
-        _misplaced(joint, like, near)
-        + (not near.vector(joint.axes, like.axes))
-        + (not near.point(body.com, matter.com))
-        + (not near.inertia(body.inertia, matter.inertia, matter.mass))
-    )
-
-
-def _misplaced(joint: Joint, like: Joint, near: Tolerances) -> int:
-    return (not near.vector(joint.rotation, like.rotation)) + (not near.point(joint.translation, like.translation))
+    return len(near.differing(joint, like, *_FRAMES, "axes")) + len(near.differing(body, matter, "com", "inertia"))
 
 
 # Joints that only one of the descriptions has.
@@ -309,47 +294,31 @@ def reconcile_joint_sets(
 def _with_slides_in_order(a: Model, b: Model) -> Model:
     """Return `b` with slides that follow each other in the order of `a`: translations commute."""
     order = {j.name: k for k, j in enumerate(a.tree)}
-    joints = {j.name: j for j in b.joints}
-    for run in _runs_of_slides(b):
-        wanted = sorted(run, key=lambda name: order.get(name, -1))
-        if wanted == run or not set(run) <= set(order):
-            continue
-        own = [b.joint(name) for name in run]
-        for name, place in zip(wanted, own, strict=True):
+
+    def exchanged(pair: tuple[Joint, Joint]) -> bool:
+        below, joint = (order.get(x.name) for x in pair)
+        return below is not None and joint is not None and joint < below
+
+    while pair := next(filter(exchanged, _consecutive_slides(b)), None):
+        joints = {j.name: j for j in b.joints}
+        for joint, place in (pair, pair[::-1]):
             # Where a joint is on its parent belongs to the place.
-            where: dict[str, Any] = {"parent": place.parent, "child": place.child, "translation": place.translation}
-            joints[name] = replace(b.joint(name), rotation=place.rotation, **where)
-    return replace(b, joints=tuple(joints[j.name] for j in b.joints))
+            there = {n: getattr(place, n) for n in ("parent", "child", *_FRAMES)}
+            joints[joint.name] = replace(joint, **there)
+        b = replace(b, joints=tuple(joints[j.name] for j in b.joints))
+    return b
 
 
-def _runs_of_slides(model: Model) -> list[list[str]]:
-    """Return the slides that follow each other, without matter, turns or anything else between them."""
+def _consecutive_slides(model: Model) -> Iterator[tuple[Joint, Joint]]:
+    """Yield pairs of slides of which one carries the other, without matter, turns or anything else between them."""
     on = by_key((joint.parent, joint) for joint in model.joints)
     used = {name for kind in OTHERS for part in getattr(model, kind) for name in names_in(part, _OF_BODIES)}
-    runs: list[list[str]] = []
-    for joint in model.tree:
-        before = runs[-1] if runs else []
-        last = model.joint(before[-1]) if before else None
-        body = model.body(joint.parent) if joint.parent != "world" else None
-        plain = joint.kind == PRISMATIC.name and joint.mimic is None
-        follows = (
-            last is not None
-            and body is not None
-            and last.child == joint.parent
-            and len(on[joint.parent]) == 1
-            and not body.mass
-            and not body.inertia.any()
-            and joint.parent not in used
-            and np.array_equal(joint.rotation, np.eye(3))
-        )
-        if plain and follows:
-            before.append(joint.name)
-        elif plain:
-            runs.append([joint.name])
-        elif before:
-            # Ends the run.
-            runs.append([])
-    return [run for run in runs if len(run) > 1]
+    slides = {j.child: j for j in model.joints if j.kind == PRISMATIC.name and j.mimic is None}
+    for below, joint in ((slides[x.parent], x) for x in slides.values() if x.parent in slides):
+        between = model.body(joint.parent)
+        matter = between.mass or between.inertia.any() or between.name in used
+        if not matter and len(on[between.name]) == 1 and np.array_equal(joint.rotation, np.eye(3)):
+            yield below, joint
 
 
 def _held(model: Model, name: str) -> Model:
@@ -370,9 +339,8 @@ def _count_differences(a: Model, b: Model, near: Tolerances) -> float:
     count = 2.0 * (len(matching.only_a) + len(matching.only_b)) + (not near.number(one.ground.mass, there.ground.mass))
     for joint in one.model.joints:
         if joint.name in own:
-            x, y = one.model.body(joint.child), there.model.body(joint.child)
-            same = near.number(x.mass, y.mass), near.point(x.com, y.com), near.inertia(x.inertia, y.inertia, x.mass)
-            count += 3 - sum(same) + _misplaced(joint, own[joint.name], near)
+            count += len(near.differing(one.model.body(joint.child), there.model.body(joint.child)))
+            count += len(near.differing(joint, own[joint.name], *_FRAMES))
     return count
 
 

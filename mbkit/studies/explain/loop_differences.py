@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from mbkit import spatial
 from mbkit._check import Array
 from mbkit.model.loops import CROSSED, HINGED, SLIDING, WELDED
 from mbkit.model.parts import Loop
@@ -27,11 +28,6 @@ def exchanged(loop: Loop) -> Loop:
 _OF_END: Final = ("body", "rotation", "translation")
 
 
-def same_loop(a: Loop, b: Loop, near: Tolerances) -> bool:
-    """Return whether two loops hold the same, whatever they are called."""
-    return not loop_differences(a, b, near)
-
-
 def loop_differences(a: Loop, b: Loop, near: Tolerances) -> list[str]:
     """Return what `b` has otherwise than `a`, in sentences that begin with a verb; empty where they hold the same."""
     return min((list(_differences(a, x, near)) for x in (b, exchanged(b))), key=len)
@@ -40,17 +36,12 @@ def loop_differences(a: Loop, b: Loop, near: Tolerances) -> list[str]:
 def moved(a: Loop, b: Loop) -> tuple[float, float]:
     """Return by how much the ends of `b` are moved and turned against those of `a`, of one kind, in m and rad."""
     far = max(float(np.linalg.norm(x)) for x in _shifts(a, b).values())
-    return far, angle_of(_turn(a, b)) if a.kind in WELDED else 0.0
+    return far, _turn(a, b) if a.kind in WELDED else 0.0
 
 
-def angle_of(R: Array) -> float:
-    """Return the angle of a rotation, rad."""
-    return float(np.arctan2(np.linalg.norm(axis_times_sine(R)), np.trace(R) - 1))
-
-
-def axis_times_sine(R: Array) -> Array:
-    """Return twice the axis of a rotation times the sine of its angle, (3,)."""
-    return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+def turn_of(R: Array) -> Array:
+    """Return a rotation's axis times its angle in rad, (3,)."""
+    return spatial.log_quaternion(spatial.quaternion_from_matrix(R))
 
 
 def _differences(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
@@ -87,13 +78,13 @@ def _shifts(a: Loop, b: Loop) -> dict[str, Array]:
     return out
 
 
-def _turn(a: Loop, b: Loop) -> Array:
-    return np.asarray((a.rotation_a @ a.rotation_b.T).T @ b.rotation_a @ b.rotation_b.T)
+def _turn(a: Loop, b: Loop) -> float:
+    return float(np.linalg.norm(turn_of((a.rotation_a @ a.rotation_b.T).T @ b.rotation_a @ b.rotation_b.T)))
 
 
 def _turned(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
-    if a.kind in WELDED and not near.vector(_turn(a, b), np.eye(3)):
-        yield f"turns its ends by {_degrees(angle_of(_turn(a, b)))} against each other"
+    if a.kind in WELDED and _turn(a, b) > near.relative:
+        yield f"turns its ends by {_degrees(_turn(a, b))} against each other"
     if a.kind not in (*HINGED, *SLIDING, CROSSED):
         return
     own, other = ([getattr(x, f"rotation_{side}")[:, 2] for side in "ab"] for x in (a, b))

@@ -7,16 +7,19 @@ and each body knows its links.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
 
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties, together
-from mbkit.model import Body, Frame, Joint, Model
+from mbkit.model import Body, Frame, Joint, Mimic, Model
+from mbkit.model.changes.dry_friction import FrictionNumbers
 from mbkit.model.elements.forces import FrameForce, by_functions
-from mbkit.model.elements.references import KINDS_OF_PARTS, with_names
+from mbkit.model.elements.formula import NUMPY, Formula
+from mbkit.model.elements.references import KINDS_OF_PARTS, hung_on, with_names
+from mbkit.model.parts import OF_Q, OF_V, NumberRule, rules_of
 from mbkit.studies._targets import with_values
 
 #: Kinds of parts that are compared by their fields alone.
@@ -25,7 +28,7 @@ OTHERS: Final = tuple(kind for kind in KINDS_OF_PARTS if kind not in ("bodies", 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Comparison of parts of descriptions to a relative tolerance."""
+    """Comparison of parts of descriptions to a relative tolerance, field by field."""
 
     relative: float
     #: Size of the robot, m: the scale for coordinates that should be zero.
@@ -42,10 +45,6 @@ class Tolerances:
         size = max(abs(a), abs(b))
         return a == b or (size < np.inf and abs(a - b) <= self.relative * size)
 
-    def numbers(self, a: Array, b: Array) -> bool:
-        """Return whether all numbers of two vectors are equal."""
-        return a.shape == b.shape and all(map(self.number, a.tolist(), b.tolist()))
-
     def vector(self, a: Array, b: Array, scale: float = 1.0) -> bool:
         """Return whether two vectors or matrices are equal, as a whole."""
         return a.shape == b.shape and bool(np.abs(a - b).max(initial=0.0) <= self.relative * scale)
@@ -60,10 +59,60 @@ class Tolerances:
         floor = 1e-3 * mass * self.length**2 * self.relative
         return bool(np.abs(a - b).max() <= self.relative * np.abs(a).max() + floor)
 
-    def mass_properties(self, a: MassProperties, b: MassProperties) -> bool:
-        """Return whether mass, centre of mass and inertia are equal."""
-        com = self.point(a.com, b.com) or not (a.mass or b.mass)
-        return self.number(a.mass, b.mass) and com and self.inertia(a.inertia, b.inertia, a.mass)
+    def same(self, a: Any, b: Any) -> bool:
+        """Return whether two parts of one kind, or the matter of two bodies, are equal but for their names."""
+        return not self.differing(a, b)
+
+    def differing(self, a: Any, b: Any, *names: str) -> list[str]:
+        """Return the fields in which two parts of one kind differ, of all but the name or of these, each by its rule.
+
+        A force's formulas differ by their values, and a joint's friction by the force that acts.
+        """
+        rules = rules_of(Body if isinstance(a, MassProperties) else type(a))
+        of = names or [f.name for f in fields(a) if f.name != "name"]
+        if "formula" in of:
+            of = [n for n in of if n not in ("symbols", "numbers")]
+        return [n for n in of if not self._same(n, rules.get(n), a, b)]
+
+    def _same(self, name: str, rule: NumberRule | None, a: Any, b: Any) -> bool:
+        if getattr(a, name) is getattr(b, name) is None:
+            return True
+        x, y = (acting(name, part) for part in (a, b))
+        if isinstance(x, Mimic) and isinstance(y, Mimic):
+            return self.same(x, y)
+        if rule is None and isinstance(x, np.ndarray) and x.shape == np.shape(y):
+            return bool(np.allclose(x, y, self.relative, self.relative))
+        if rule is None or np.shape(x) != np.shape(y):
+            return bool(np.array_equal(x, y))
+        if name == "inertia":
+            return self.inertia(x, y, a.mass)
+        if rule.place:
+            return self.point(x, y) or (name == "com" and not (a.mass or b.mass))
+        if rule.direction or rule.added:
+            return self.vector(np.asarray(x), np.asarray(y))
+        if isinstance(x, float) or rule.shape in (OF_Q, OF_V):
+            return all(map(self.number, np.atleast_1d(x).tolist(), np.atleast_1d(y).tolist()))
+        return self.vector(x, y, float(np.abs([x, y]).max(initial=0.0)))
+
+
+def acting(name: str, part: Any) -> Any:
+    """Return a field as it acts: of dry friction what a joint then moves by, of a formula its values."""
+    given = getattr(part, name)
+    if isinstance(part, Joint) and name in _AT_REST:
+        return getattr(FrictionNumbers.of([part]), _AT_REST[name])
+    if not isinstance(given, Formula):
+        return given
+    # Random arguments of many sizes, which each name has for itself.
+    rngs = {name: np.random.default_rng([*name.encode()]) for name in given.arguments}
+    at = {name: rng.standard_normal(64) * 10 ** rng.uniform(-2, 2, 64) for name, rng in rngs.items()}
+    with np.errstate(all="ignore"):
+        values = given(at | dict(zip(part.symbols, part.numbers, strict=True)), NUMPY)
+    known = np.nan_to_num([np.broadcast_to(x, 64) for x in values], posinf=0.0, neginf=0.0)
+    return known if known.any() else given
+
+
+#: Optional numbers of a joint, and what acts without them.
+_AT_REST: Final = {"stiction": "bound", "stribeck_velocity": "stribeck"}
 
 
 @dataclass(frozen=True)
@@ -124,23 +173,13 @@ class MergedModel:
         return MergedModel(with_mass_properties(self.model, body, composite(links)), {**self.links, body: links})
 
 
-@dataclass(frozen=True)
-class FrameChange:
-    """Coordinates in another frame: x becomes A (x - o) + t on `body`."""
+#: A body's frame on another body: that one's name, and R and p there.
+Place = tuple[str, Array, Array]
 
-    body: str
-    A: Array = field(default_factory=lambda: np.eye(3))
-    o: Array = field(default_factory=lambda: np.zeros(3))
-    t: Array = field(default_factory=lambda: np.zeros(3))
 
-    def point(self, x: Array) -> Array:
-        """Return a point in the other frame."""
-        return np.asarray(self.A @ (x - self.o) + self.t)
-
-    def joint(self, joint: Joint) -> Joint:
-        """Return a joint on this body as it stands in the other frame."""
-        rotation, translation = self.A @ joint.rotation, self.point(joint.translation)
-        return replace(joint, parent=self.body, rotation=rotation, translation=translation)
+def at_itself(body: str) -> Place:
+    """Return the place of a body that stands where it does."""
+    return body, np.eye(3), np.zeros(3)
 
 
 def merge(model: Model) -> MergedModel:
@@ -150,19 +189,18 @@ def merge(model: Model) -> MergedModel:
     """
     model = _with_own_frames(with_values(model, "explain"))
     bodies = {b.name: b for b in model.bodies}
-    at = {"world": FrameChange("world")}
+    at = {"world": at_itself("world")}
     links: dict[str, list[LinkInBody]] = {"world": []}
     moving: dict[str, Joint] = {}
     for joint in model.tree:
-        placed, own = at[joint.parent].joint(joint), bodies[joint.child]
+        placed, own = hung_on(joint, at, []), bodies[joint.child]
+        at[joint.child] = placed.parent, placed.rotation, placed.translation
         if joint.type.nv:
             moving[joint.name] = placed
-            at[joint.child] = FrameChange(joint.child)
+            at[joint.child] = at_itself(joint.child)
             links[joint.child] = []
-        else:
-            at[joint.child] = FrameChange(placed.parent, placed.rotation, t=placed.translation)
-        here = at[joint.child]
-        links[here.body].append(LinkInBody(own.name, here.A, here.t, MassProperties(own.mass, own.com, own.inertia)))
+        body, R, p = at[joint.child]
+        links[body].append(LinkInBody(own.name, R, p, MassProperties(own.mass, own.com, own.inertia)))
     joints = tuple(moving[j.name] for j in model.joints if j.name in moving)
     matter = tuple(_body(j.child, composite(links[j.child])) for j in joints)
     merged = replace(reattached(model, at), bodies=matter, joints=joints)
@@ -184,22 +222,9 @@ def _with_own_frames(model: Model) -> Model:
     return replace(model, forces=tuple(forces), frames=tuple({x.name: x for x in own.values()}.values()))
 
 
-def attached(part: Any, changes: Mapping[str, FrameChange]) -> Any:
-    """Return a part with its places on bodies in other frames."""
-    names = {f.name for f in fields(part)}
-    for end in {"", "_a", "_b"} & {n.removeprefix("body") for n in names if n.startswith("body")}:
-        change = changes[getattr(part, f"body{end}")]
-        places = {n: getattr(part, n) for n in names & {f"{x}{end}" for x in ("translation", "point")}}
-        axes = {n: getattr(part, n) for n in names & {f"{x}{end}" for x in ("rotation", "axis")}}
-        new = {n: change.point(x) for n, x in places.items()} | {n: change.A @ x for n, x in axes.items()}
-        part = replace(part, **new, **{f"body{end}": change.body})
-    return part
-
-
-def reattached(model: Model, changes: Mapping[str, FrameChange]) -> Model:
+def reattached(model: Model, places: Mapping[str, Place]) -> Model:
     """Return the description with the places of parts beside bodies and joints in other frames."""
-    parts: dict[str, Any] = {kind: tuple(attached(x, changes) for x in getattr(model, kind)) for kind in OTHERS}
-    return replace(model, **parts)
+    return replace(model, **{kind: tuple(hung_on(x, places, []) for x in getattr(model, kind)) for kind in OTHERS})
 
 
 def with_common_frames(*sides: MergedModel) -> Iterator[MergedModel]:

@@ -21,7 +21,6 @@ from mbkit.studies.explain.hypotheses import (
     CONSTRAINTS,
     Hypothesis,
     differences,
-    differing,
     link_differences,
     links_in_common_axes,
     number_text,
@@ -206,7 +205,7 @@ class _Descriptions:
         for body in dict.fromkeys([*ours, *theirs]):
             held = [side.get(body) or GravityCompensation(body, 0.0) for side in (ours, theirs)]
             one, other = held
-            if not (changed := differing(one, other, near)):
+            if not (changed := near.differing(one, other)):
                 continue
             model = a if body in ours else b
             known = {j.name for j in model.joints}
@@ -288,7 +287,7 @@ class _Descriptions:
     def _ground_causes(self, one: MergedModel, other: MergedModel, near: Tolerances) -> Iterator[Cause]:
         """Yield the difference in the matter that stands still."""
         a, b = one.ground, other.ground
-        if near.mass_properties(a, b):
+        if near.same(a, b):
             return
         if not b.mass and a.mass:
             says = f"has no mass in what stands still, where {self.names[0]} has {number_text(a.mass)} kg"
@@ -315,7 +314,7 @@ def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) ->
 def _named_frames(a: Model, b: Model, near: Tolerances) -> Iterator[str]:
     """Yield the frames of one name and body that stand elsewhere on it; descriptions are compared without frames."""
     there = {(f.name, f.body): f for f in b.frames}
-    moved = [f.name for f in a.frames if differing(f, there.get((f.name, f.body), f), near)]
+    moved = [f.name for f in a.frames if not near.same(f, there.get((f.name, f.body), f))]
     if moved:
         yield f"named frames that stand elsewhere, which changes no term: {', '.join(moved)}"
 

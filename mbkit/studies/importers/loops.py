@@ -15,8 +15,9 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.load.xml_reader import Element
 from mbkit.model import Coupler, Loop, Mimic, Model
+from mbkit.model.elements.references import hung_on
 from mbkit.studies.explain.loop_differences import exchanged, moved
-from mbkit.studies.explain.merged_model import FrameChange, Tolerances, attached
+from mbkit.studies.explain.merged_model import Tolerances
 
 #: What switches equalities off, by element.
 _SWITCHES: Final = {**dict.fromkeys(("equality", "connect", "weld"), ("active",)), "flag": ("equality", "constraint")}
@@ -38,12 +39,12 @@ def between_joints(model: Model, parts: Sequence[Any], names: Mapping[str, str] 
     The ends' poses are those in the world, which is the joint "", where all coordinates are zero; `names` has other
     names for joints. What no joint moves against each other is no loop.
     """
-    at = {"world": FrameChange("")}
+    at = {"world": ("", np.eye(3), np.zeros(3))}
     for joint in model.tree:
-        placed = at[joint.parent].joint(joint)
+        placed = hung_on(joint, at, [])
         carrier = (names or {}).get(joint.name, joint.name) if joint.type.nv else placed.parent
-        at[joint.child] = FrameChange(carrier, placed.rotation, t=placed.translation)
-    moved = [attached(x, at) if isinstance(x, Loop) else x for x in parts]
+        at[joint.child] = carrier, placed.rotation, placed.translation
+    moved = [hung_on(x, at, []) if isinstance(x, Loop) else x for x in parts]
     loops = [x for x in moved if isinstance(x, Loop) and x.body_a != x.body_b]
     ordered = [exchanged(x) if x.body_a > x.body_b else x for x in loops]
     return [*ordered, *(x for x in moved if isinstance(x, Coupler))]

@@ -8,6 +8,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from importlib import metadata
@@ -18,36 +19,28 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array, count, real
-from mbkit._child_process import WorkerDiedError, WorkerStartError, WorkerTimeoutError
+from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.imported import IMPORTERS, Imported, Importer, check_installed, reader
 from mbkit.engines.registry import MUJOCO
 from mbkit.engines.versions import own_importer
 from mbkit.engines.versions.engine_version import EngineVersion, names_version
 from mbkit.engines.versions.engine_version import engine as engine_of
-from mbkit.errors import (
-    EngineProcessError,
-    InputError,
-    MbkitError,
-    MbkitWarning,
-    NumericalError,
-    OutputError,
-    UnknownNameError,
-    UnsupportedError,
-)
+from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_reader import urdf_links
-from mbkit.model import Model
+from mbkit.model import Body, Joint, Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.model.elements.forces import by_functions
 from mbkit.model.model import unchecked
+from mbkit.model.parts import rules_of
 from mbkit.model.validation import listing
 from mbkit.studies import results
 from mbkit.studies.explain.hypotheses import BOUNDS, OF_ALL, number_text
 from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_sets, rename_joints
-from mbkit.studies.explain.loop_differences import angle_of
+from mbkit.studies.explain.loop_differences import turn_of
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
@@ -57,8 +50,12 @@ from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserCompari
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import Worker, describe
 
-#: Fields of joints, and the stage in which they are compared.
-_NUMBERS: Final = dict(zip(OF_ALL, OF_ALL, strict=True)) | dict.fromkeys(BOUNDS, "limits")
+#: Stages of fields that are compared each by itself.
+_STAGES: Final = (
+    {"parent": "parents", "axes": "axes", "mass": "masses", "com": "centres of mass", "inertia": "inertias"}
+    | dict(zip(OF_ALL, OF_ALL, strict=True))
+    | dict.fromkeys(BOUNDS, "limits")
+)
 
 #: The least tolerance of an importer that holds single precision. Of robots that Newton reads rightly, M of tiago_pro
 #: is off by most: 9e-6, 150 times its unit roundoff.
@@ -87,72 +84,52 @@ class ImporterError(Exception):
     """An importer refuses a text, ended its process over it, or took too long; never leaves `mbkit.studies`."""
 
 
-class Reading:
-    """A file that an engine's importer reads, in at most `seconds` of processor time; so is each call of its terms."""
-
-    def __init__(self, engine: str, file: Stripped, floating_base: bool, seconds: float) -> None:
-        self._engine, self._seconds = engine, seconds
-        importer = IMPORTERS[engine]
-        self._worker = _workers.setdefault(importer, Worker())
-        self._begin(_read, importer.module, file.text, file.format, floating_base, file.meshes)
-
-    def result(self) -> Imported:
-        """Return the reading that was begun; raises `ImporterError`."""
-        model, *rest = self._finish()
-        return Imported(model, self._terms, *rest)
-
-    def end(self) -> None:
-        """End the importer's process."""
-        self._worker.end()
-
-    def _terms(self, q: Array, v: Array, without: tuple[str, ...] = ()) -> Values:
-        self._begin(_terms_of_held, q, v, without)
-        terms: Values = self._finish()
-        return terms
-
-    def _begin(self, function: Callable[..., Any], *args: Any) -> None:
-        try:
-            self._worker.begin(function, *args)
-        except (WorkerDiedError, WorkerStartError, WorkerTimeoutError) as error:
-            raise ImporterError(self._failure(error)) from None
-
-    def _finish(self) -> Any:
-        try:
-            return self._worker.finish(self._seconds)
-        except Exception as error:  # importers raise errors of all kinds
-            raise ImporterError(self._failure(error)) from None
-
-    def _failure(self, error: Exception) -> str:
-        if isinstance(error, WorkerTimeoutError):
-            return f"its importer was {error}, without an answer"
-        if isinstance(error, WorkerDiedError):
-            if not error.signal:
-                return f"its importer: {error}"
-            return f"its importer ended the process with {error.signal}" + (f" ({error.last})" if error.last else "")
-        return describe(error).removeprefix(f"{self._engine}: ")
-
-
-class RemoteReading:
-    """The same of an importer in an environment of its own, which has the time of its engine."""
-
-    def __init__(self, version: EngineVersion, file: Stripped, floating_base: bool) -> None:
-        self._version, self._file = version, (file.text, file.format, floating_base, file.meshes)
-
-    def result(self) -> Imported:
-        """Return the reading; raises `ImporterError`."""
-        read: Imported = _telling(self._version, own_importer.read, self._version, *self._file)
-        return replace(read, terms=partial(_telling, self._version, read.terms))
-
-    def end(self) -> None:
-        """Do nothing: nothing was begun."""
-
-
-def _telling(version: EngineVersion, function: Callable[..., Any], *args: Any) -> Any:
-    """Return what a function of an engine's process gives; raises `ImporterError`."""
+@contextmanager
+def _refusals(engine: str) -> Iterator[None]:
+    """Raise what an importer raises, which is errors of all kinds, as `ImporterError`."""
     try:
-        return function(*args)
-    except (UnsupportedError, UnknownNameError, NumericalError, EngineProcessError, OutputError) as error:
-        raise ImporterError(str(error).removeprefix(f"{version}: ")) from None
+        yield
+    except WorkerTimeoutError as error:
+        raise ImporterError(f"its importer was {error}, without an answer") from None
+    except WorkerDiedError as error:
+        how = f"ended the process with {error.signal}" + (f" ({error.last})" if error.last else "")
+        raise ImporterError(f"its importer {how}" if error.signal else f"its importer: {error}") from None
+    except Exception as error:
+        raise ImporterError(describe(error).removeprefix(f"{engine}: ")) from None
+
+
+def _begun(engine: str, file: tuple[Any, ...], seconds: float) -> Callable[[], Imported]:
+    """Have an engine's importer read a file, and return the function that waits for the reading.
+
+    It takes at most `seconds` of processor time, and so does each call of its terms.
+    """
+    importer = IMPORTERS[engine]
+    worker = _workers.setdefault(importer, Worker())
+    with _refusals(engine):
+        worker.begin(_read, importer.module, *file)
+
+    def terms(q: Array, v: Array, without: tuple[str, ...] = ()) -> Values:
+        with _refusals(engine):
+            return worker.call(_terms_of_held, q, v, without, cpu_seconds=seconds)
+
+    def result() -> Imported:
+        with _refusals(engine):
+            model, *rest = worker.finish(seconds)
+        return Imported(model, terms, *rest)
+
+    return result
+
+
+def _read_elsewhere(version: EngineVersion, file: tuple[Any, ...]) -> Imported:
+    """Return the reading of an importer in an environment of its own, which has the time of its engine."""
+    with _refusals(str(version)):
+        read = own_importer.read(version, *file)
+
+    def terms(*args: Any) -> Values:
+        with _refusals(str(version)):
+            return read.terms(*args)
+
+    return replace(read, terms=terms)
 
 
 def _read(module: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes]) -> tuple[Any, ...]:
@@ -244,45 +221,38 @@ def _missing(name: str, missing: list[str], what: str) -> Stage:
 
 def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict[str, list[tuple[float, str, str]]]:
     """Return for each stage what differs: by how much, where, and in words."""
-    names = ("kinds", "parents", "places", "axes", "total mass", "masses", "centres of mass", "inertias")
-    out: dict[str, list[tuple[float, str, str]]] = {name: [] for name in (*names, *_NUMBERS.values())}
-    for a, b in zip(one.model.joints, other.model.joints, strict=False):
-        if a.name != b.name:
-            continue
-        if a.type.motion != b.type.motion:
-            out["kinds"].append((1.0, a.name, f"{b.kind} for {a.kind}"))
-        if a.parent != b.parent:
-            out["parents"].append((1.0, a.name, f"on {b.parent} for {a.parent}"))
-        if not (near.vector(a.rotation, b.rotation) and near.point(a.translation, b.translation)):
-            far = float(np.linalg.norm(a.translation - b.translation))
-            turn = angle_of(a.rotation.T @ b.rotation)
-            out["places"].append((max(far, turn), a.name, f"{far:.3g} m and {turn:.3g} rad off"))
-        if a.axes.shape == b.axes.shape and not near.vector(a.axes, b.axes):
-            size = float(np.abs(a.axes - b.axes).max())
-            out["axes"].append((size, a.name, f"{number_text(b.axes)} for {number_text(a.axes)}"))
-        for field, stage in _NUMBERS.items():
-            old, new = getattr(a, field), getattr(b, field)
-            if old.shape == new.shape and not near.numbers(old, new):
-                size = float(np.max(np.where(np.isfinite(old) & np.isfinite(new), np.abs(new - old), np.inf)))
-                label = f"{field.replace('_', ' ')} " if stage == "limits" else ""
-                read, written = ("none" if np.isinf(x).all() else number_text(x) for x in (new, old))
-                out[stage].append((size, a.name, f"{label}{read} for {written}"))
+    out: dict[str, list[tuple[float, str, str]]] = {
+        name: [] for name in ("kinds", "parents", "places", "axes", "total mass")
+    }
+    out |= {name: [] for name in _STAGES.values() if name not in out}
     ours, theirs = (sum(b.mass for b in x.model.bodies) + x.ground.mass for x in (one, other))
     if not near.number(ours, theirs):
         base = " (the base's)" if near.number(ours - theirs, one.ground.mass - other.ground.mass) else ""
         says = f"{number_text(theirs)} kg for {number_text(ours)} kg{base}"
         out["total mass"].append((abs(theirs / ours - 1), "all", says))
-    bodies = {b.name: b for b in other.model.bodies}
-    for x, y in ((x, bodies[x.name]) for x in one.model.bodies if x.name in bodies):
-        if not near.number(x.mass, y.mass):
-            says = f"{number_text(y.mass)} kg for {number_text(x.mass)} kg"
-            out["masses"].append((abs(y.mass - x.mass) / max(x.mass, y.mass), x.name, says))
-        if not near.point(x.com, y.com):
-            says = f"{number_text(y.com)} for {number_text(x.com)} m"
-            out["centres of mass"].append((float(np.linalg.norm(x.com - y.com)), x.name, says))
-        if not near.inertia(x.inertia, y.inertia, x.mass):
-            size = float(np.abs(y.inertia - x.inertia).max() / max(np.abs(x.inertia).max(), np.abs(y.inertia).max()))
-            out["inertias"].append((size, x.name, f"{number_text(y.inertia)} for {number_text(x.inertia)} kg m²"))
+    there = {(x.section, x.name): x for x in (*other.model.joints, *other.model.bodies)}
+    for a in (*one.model.joints, *one.model.bodies):
+        if not (b := there.get((a.section, a.name))):
+            continue
+        apart = near.differing(a, b)
+        if isinstance(a, Joint) and a.type.motion != b.type.motion:
+            out["kinds"].append((1.0, a.name, f"{b.kind} for {a.kind}"))
+        if {"rotation", "translation"} & {*apart}:
+            far = float(np.linalg.norm(a.translation - b.translation))
+            turn = float(np.linalg.norm(turn_of(a.rotation.T @ b.rotation)))
+            out["places"].append((max(far, turn), a.name, f"{far:.3g} m and {turn:.3g} rad off"))
+        for field in (x for x in apart if x in _STAGES):
+            old, new, stage = getattr(a, field), getattr(b, field), _STAGES[field]
+            if isinstance(old, str):
+                out[stage].append((1.0, a.name, f"on {new} for {old}"))
+            elif np.shape(old) == np.shape(new):
+                moved = np.where(np.isfinite(old) & np.isfinite(new), np.subtract(new, old), np.inf)
+                size = float(np.linalg.norm(moved) if field == "com" else np.abs(moved).max())
+                size /= np.abs([old, new]).max() if field in ("mass", "inertia") else 1.0
+                label = f"{field.replace('_', ' ')} " if stage == "limits" else ""
+                unit = f" {rules_of(Body)[field].unit}" if isinstance(a, Body) else ""
+                read, written = ("none" if np.isinf(x).all() else number_text(x) for x in (new, old))
+                out[stage].append((size, a.name, f"{label}{read} for {written}{unit}"))
     return out
 
 
@@ -459,28 +429,29 @@ def _readings(
     seconds: float,
 ) -> tuple[dict[str, Imported], dict[str, str]]:
     """Return each importer's reading of a file, and why the others refuse it; all read at the same time."""
-    begun: dict[str, Reading | RemoteReading] = {}
+    file = (stripped.text, stripped.format, floating_base, stripped.meshes)
+    begun: dict[str, Callable[[], Imported]] = {}
     read: dict[str, Imported] = {}
     refused: dict[str, str] = {}
     try:
         for engine in engines:
-            if engine in elsewhere:
-                begun[engine] = RemoteReading(elsewhere[engine], stripped, floating_base)
-                continue
             try:
-                check_installed(engine)
-                begun[engine] = Reading(engine, stripped, floating_base, seconds)
+                if engine in elsewhere:
+                    begun[engine] = partial(_read_elsewhere, elsewhere[engine], file)
+                else:
+                    check_installed(engine)
+                    begun[engine] = _begun(engine, file, seconds)
             except (UnsupportedError, ImporterError) as error:
                 refused[engine] = str(error)
-        for engine, reading in begun.items():
+        for engine, result in begun.items():
             try:
-                read[engine] = reading.result()
+                read[engine] = result()
             except ImporterError as error:
                 refused[engine] = str(error)
     except BaseException:
         # Nobody waits any more for those that still read.
-        for reading in begun.values():
-            reading.end()
+        for engine in begun.keys() - elsewhere.keys():
+            _workers[IMPORTERS[engine]].end()
         raise
     return read, refused
 
