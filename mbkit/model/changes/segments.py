@@ -10,7 +10,7 @@ from mbkit._check import count
 from mbkit.errors import UnsupportedError
 from mbkit.model.builder import ModelBuilder
 from mbkit.model.elements.beams import BeamEnd
-from mbkit.model.elements.forces import RATE
+from mbkit.model.elements.forces import arguments_of
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.elements.references import KINDS_OF_PARTS, entries, names_in
 from mbkit.model.joint_types import FIXED, REVOLUTE, UNIVERSAL
@@ -77,8 +77,7 @@ def _numbers(model: Model, joint: Joint, points: list[Joint]) -> tuple[list[Any]
 def _require_free(model: Model, joint: Joint, points: list[Joint]) -> None:
     """Refuse what acts on the modes, or on points of the beam."""
     lost = {p.name for p in points}
-    own = {*model.coordinate_names[model.layout.q[joint.name]]}
-    own |= {name + RATE for name in own}
+    own = {*arguments_of(model, joint.name)}
     for kind in KINDS_OF_PARTS[2:]:
         for part in getattr(model, kind):
             of_modes = {getattr(part, "joint", None), getattr(part, "leader", None), *getattr(part, "joints", ())}

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, shown
 from mbkit.errors import InputError, did_you_mean
 from mbkit.model.elements.beams import OnBeam
-from mbkit.model.elements.forces import RATE
+from mbkit.model.elements.forces import arguments_of
 from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.elements.references import (
     _OF_BODIES,
@@ -313,7 +313,8 @@ class EditingBuilder:
             joints |= {j.name for j in more}
         frames = {f.name for f in self._parts["frames"] if f.body in bodies}
         self._locked = [x for x in self._locked if x[0] not in joints]
-        gone = self._arguments_of(joints)
+        holding = self._holding()
+        gone = {x for j in joints for x in arguments_of(holding, j)}
         lost = []
         for kind, parts in self._parts.items():
             for part in [*parts]:
@@ -369,7 +370,11 @@ class EditingBuilder:
     def add_prefix(self, prefix: str) -> None:
         """Put a prefix before the names of all bodies, joints, frames and other parts; parameters keep theirs."""
         prefix = self._read.name("prefix", prefix)
-        self._parts, self._bindings = renamed(self._holding(), prefix)
+
+        def new(name: str) -> str:
+            return name if name == "world" else prefix + name
+
+        self._parts, self._bindings = renamed(self._holding(), new, new, new)
         self._odd = {prefix + body for body in self._odd}
         self._sources = [x.renamed(prefix) for x in self._sources]
         self._locked = [(prefix + joint, *rest) for joint, *rest in self._locked]
@@ -390,12 +395,6 @@ class EditingBuilder:
         self._notes += other._notes
         self._sources += [x.hung_on(body, R, nominal) for x in other._sources]
         self._read.faults += other._read.faults
-
-    def _arguments_of(self, joints: set[str]) -> set[str]:
-        """Return the names of coordinates and velocities of joints in formulas."""
-        model = self._holding()
-        names = {n for j in joints for n in model.coordinate_names[model.layout.q[j]]}
-        return names | {n + RATE for j in joints for n in model.velocity_names[model.layout.v[j]]}
 
     def _holding(self) -> Any:
         """Return the parts as an unchecked description."""

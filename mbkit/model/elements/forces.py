@@ -340,6 +340,12 @@ def coordinate_arguments(model: _Model) -> Mapping[str, tuple[bool, int]]:
     return q | {name + RATE: (True, i) for i, name in enumerate(model.velocity_names)}
 
 
+def arguments_of(model: _Model, joint: str) -> tuple[str, ...]:
+    """Return those of a joint that moves freely."""
+    q, v = model.layout.q[joint], model.layout.v[joint]
+    return (*model.coordinate_names[q], *(name + RATE for name in model.velocity_names[v]))
+
+
 def by_functions(model: _Model) -> tuple[Force, ...]:
     """Return the forces given by functions: all but what holds weights."""
     return tuple(f for f in model.forces if not isinstance(f, GravityCompensation))

@@ -10,7 +10,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import UnknownNameError
-from mbkit.model.elements.forces import Force, coordinate_arguments
+from mbkit.model.elements.forces import Force, arguments_of
 from mbkit.model.elements.formula import Formula
 from mbkit.model.parameters import Binding, Expression, split
 from mbkit.model.parts import rules_of
@@ -45,15 +45,13 @@ def names_in(part: Any, of: Iterable[str] = (*_OF_BODIES, *_OF_JOINTS)) -> set[s
     return own | ({mimic.joint} if mimic else set())
 
 
-def renamed(model: _Model, prefix: str) -> tuple[dict[str, list[Any]], list[Binding]]:
-    """Return the parts and bindings of a model with a prefix before the names of all parts; parameters keep theirs."""
-
-    def new(name: str) -> str:
-        return name if name == "world" else prefix + name
-
-    arguments = {x: new(x) for x in coordinate_arguments(model)}
+def renamed(model: _Model, bodies: _New, joints: _New, others: _New) -> tuple[dict[str, list[Any]], list[Binding]]:
+    """Return the parts and bindings of a model with other names of its parts; parameters keep theirs."""
+    moving = [j.name for j in model.independent_joints]
+    arguments = {x: joints(j) + x.removeprefix(j) for j in moving for x in arguments_of(model, j)}
+    own = {"bodies": bodies, "joints": joints}
     made = [
-        (kind, p, with_names(model, p, new, new, arguments, new))
+        (kind, p, with_names(model, p, bodies, joints, arguments, own.get(kind, others)))
         for kind in KINDS_OF_PARTS
         for p in getattr(model, kind)
     ]

@@ -8,7 +8,7 @@ a body enter the terms linearly; these are fitted, and what has another origin l
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, combinations, islice
 from typing import Final, NamedTuple
@@ -23,10 +23,10 @@ from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import JointCoupling, Model
 from mbkit.model.elements.kinds import PART_KINDS, that_do
 from mbkit.studies.explain import terms
-from mbkit.studies.explain.hypotheses import body_mistakes, joint_mistakes, number_text
-from mbkit.studies.explain.merged_model import MergedModel, merge, with_mass_properties
+from mbkit.studies.explain.hypotheses import body_mistakes, joint_mistakes
+from mbkit.studies.explain.merged_model import MergedModel, merge, number_text, with_mass_properties
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, gaps, model_terms
+from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, gaps, larger, model_terms
 
 #: What adds to T along a rate.
 _ROTOR: Final = JointCoupling.adding_to("T")[0]
@@ -51,15 +51,15 @@ def engine_causes(a: Model | Dynamics, b: Model | Dynamics, out: Explanation) ->
     before, after = study.before, study.after
     # A term that only some engines have differs for no other cause than a known defect.
     named = {term for c in defects for term in c.effects}
-    left = _larger(after.terms, [g for g in study.more if g.term not in named])
+    left = larger(after.terms, [g for g in study.more if g.term not in named])
     explained = max((g.relative for g in left), default=np.inf) <= out.tolerance
     return replace(
         out,
         agree=out.agree and max(before.worst, *(g.relative for g in study.more), 0.0) <= out.tolerance,
-        gaps=_larger(out.gaps, (*before.terms, *study.more)),
+        gaps=larger(out.gaps, (*before.terms, *study.more)),
         causes=(*out.causes, *defects, *causes),
         explained=out.explained and explained,
-        left=_larger(out.left, left),
+        left=larger(out.left, left),
         subtree=out.subtree or (study.subtree() if not after.worst <= out.tolerance else ()),
     )
 
@@ -68,15 +68,6 @@ def _engine_on(x: Model | Dynamics, model: Model) -> Dynamics:
     if not isinstance(x, Dynamics):
         return dynamics(model)
     return x if x.model is model or x.model == model else type(x)(model)
-
-
-def _larger(one: Iterable[Gap], other: Iterable[Gap]) -> tuple[Gap, ...]:
-    """Return every term once, with the larger of two gaps."""
-    out: dict[str, Gap] = {}
-    for gap in (*one, *other):
-        if gap.term not in out or gap.relative > out[gap.term].relative:
-            out[gap.term] = gap
-    return tuple(out.values())
 
 
 class _Trial(NamedTuple):

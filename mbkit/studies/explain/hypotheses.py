@@ -24,7 +24,15 @@ from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, posi
 from mbkit.model.elements.references import called
 from mbkit.model.parts import Coupler, Loop, rules_of
 from mbkit.studies.explain.loop_differences import loop_differences, turn_of
-from mbkit.studies.explain.merged_model import OTHERS, LinkInBody, MergedModel, Tolerances, acting, composite
+from mbkit.studies.explain.merged_model import (
+    OTHERS,
+    LinkInBody,
+    MergedModel,
+    Tolerances,
+    acting,
+    composite,
+    number_text,
+)
 
 _WATER: Final = 1000.0  # kg/m³
 _DEGREE: Final = np.pi / 180
@@ -84,19 +92,6 @@ class Hypothesis:
         """Return the hypothesis with fewer fields."""
         ours, theirs = ({k: x for k, x in (s or {}).items() if k not in names} for s in (self.ours, self.theirs))
         return replace(self, ours=ours, theirs=theirs)
-
-
-def number_text(value: Any) -> str:
-    """Return a number, vector or matrix of a description as text."""
-    if not isinstance(value, np.ndarray) or value.size == 1:
-        x = float(value.ravel()[0]) if isinstance(value, np.ndarray) else value
-        # Below this it is rounding.
-        return f"{0.0 if abs(x) < 1e-15 else x:.6g}"
-    if value.shape != (3, 3):
-        return f"({', '.join(map(number_text, value.ravel().tolist()))})"
-    if np.array_equal(value, value.T):
-        return f"[{', '.join(map(number_text, value[np.triu_indices(3)]))}]"
-    return f"[{'; '.join(map(number_text, value))}]"
 
 
 def _reordered(R: Array) -> list[Array]:

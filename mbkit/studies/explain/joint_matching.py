@@ -7,17 +7,15 @@ Siblings are assigned at the least total cost, and a match by names alone is use
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from mbkit._check import Array, by_key
-from mbkit.load.xml_reader import unused
 from mbkit.model import Body, Joint, Model
-from mbkit.model.elements.forces import coordinate_arguments
-from mbkit.model.elements.references import _OF_BODIES, hung_on, names_in, with_names
+from mbkit.model.elements.references import _OF_BODIES, hung_on, names_in, renamed
 from mbkit.model.joint_types import FIXED, PRISMATIC
 from mbkit.studies.explain.hypotheses import Hypothesis
 from mbkit.studies.explain.merged_model import OTHERS, MergedModel, Tolerances, at_itself, merge, reattached
@@ -158,27 +156,19 @@ def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
     """Return `b` with the names and the order of `a` where joints match."""
     own = {j.name: j for j in b.model.joints}
     theirs = {j.name: j.child for j in a.joints}
-    joints = {m.b: m.a for m in matching.pairs}
-    bodies = {"world": "world"} | {own[m.b].child: theirs[m.a] for m in matching.pairs}
-    used = set(theirs), {x.name for x in a.bodies} | {"world"}
     # Joints that were held still or removed are in the matching, but not in the description.
-    for joint in (own[n] for n in matching.only_b if n in own):
-        for names, name, others in ((joints, joint.name, used[0]), (bodies, joint.child, used[1])):
-            names[name] = unused(name, others)
-            others.add(names[name])
+    alone = [own[n] for n in matching.only_b if n in own]
+    joints = {j.name: f"{j.name} of the second" for j in alone} | {m.b: m.a for m in matching.pairs}
+    bodies = {j.child: f"{j.child} of the second" for j in alone} | {
+        own[m.b].child: theirs[m.a] for m in matching.pairs
+    }
+    bodies["world"] = "world"
     order = {m.a: k for k, m in enumerate(matching.pairs)}
-    matter = {bodies[x.name]: x for x in b.model.bodies}
-
-    def renamed(part: Any, arguments: Mapping[str, str], own: Callable[[str], str] = str) -> Any:
-        return with_names(b.model, part, lambda x: bodies.get(x, x), lambda x: joints.get(x, x), arguments, own)
-
-    named = [renamed(j, {}, joints.__getitem__) for j in b.model.joints]
-    model = replace(b.model, joints=tuple(named))
-    coordinates = dict(zip(coordinate_arguments(b.model), coordinate_arguments(model), strict=True))
-    parts: dict[str, Any] = {kind: tuple(renamed(x, coordinates) for x in getattr(b.model, kind)) for kind in OTHERS}
-    named.sort(key=lambda j: order.get(j.name, len(order)))
-    parts["bodies"] = tuple(replace(matter[j.child], name=j.child) for j in named)
-    model = replace(model, joints=tuple(named), **parts)
+    parts, _ = renamed(b.model, lambda name: bodies.get(name, name), lambda name: joints.get(name, name), str)
+    parts["joints"].sort(key=lambda joint: order.get(joint.name, len(order)))
+    matter = {x.name: x for x in parts["bodies"]}
+    parts["bodies"] = [matter[joint.child] for joint in parts["joints"]]
+    model = replace(b.model, **{kind: tuple(some) for kind, some in parts.items()})
     return MergedModel(model, {bodies[name]: some for name, some in b.links.items()})
 
 

@@ -16,7 +16,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.model.loops import CROSSED, HINGED, SLIDING, WELDED
 from mbkit.model.parts import Loop
-from mbkit.studies.explain.merged_model import Tolerances
+from mbkit.studies.explain.merged_model import Tolerances, number_text
 
 
 def exchanged(loop: Loop) -> Loop:
@@ -53,7 +53,8 @@ def _differences(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
         if body != own:
             yield f"ends it on {body!r} for {own!r}"
         elif not near.point(shifts[side], np.zeros(3)):
-            away = f"{np.linalg.norm(shifts[side]):.6g} m away, at {_text(b, side)} for {_text(a, side)}"
+            there, own_place = (number_text(getattr(x, f"translation_{side}")) for x in (b, a))
+            away = f"{np.linalg.norm(shifts[side]):.6g} m away, at {there} for {own_place}"
             yield f"has its point on {body!r} {away}"
     if not near.number(a.length, b.length):
         yield f"has a length of {b.length:.6g} m for {a.length:.6g} m"
@@ -96,11 +97,6 @@ def _turned(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
         if not near.vector(x, sign * y):
             angle = np.arccos(np.clip(abs(x @ y), 0.0, 1.0))
             yield f"has its axis on {getattr(a, f'body_{side}')!r} turned by {_degrees(angle)}"
-
-
-def _text(loop: Loop, side: str) -> str:
-    point: Array = getattr(loop, f"translation_{side}")
-    return f"({', '.join(f'{x:.6g}' for x in point)})"
 
 
 def _degrees(angle: float) -> str:

@@ -253,3 +253,16 @@ def _body(name: str, mass_properties: MassProperties) -> Body:
     return Body(
         name, mass_properties.mass, mass_properties.com, 0.5 * (mass_properties.inertia + mass_properties.inertia.T)
     )
+
+
+def number_text(value: Any) -> str:
+    """Return a number, vector or matrix of a description as text."""
+    if not isinstance(value, np.ndarray) or value.size == 1:
+        x = float(value.ravel()[0]) if isinstance(value, np.ndarray) else value
+        # Below this it is rounding.
+        return f"{0.0 if abs(x) < 1e-15 else x:.6g}"
+    if value.shape != (3, 3):
+        return f"({', '.join(map(number_text, value.ravel().tolist()))})"
+    if np.array_equal(value, value.T):
+        return f"[{', '.join(map(number_text, value[np.triu_indices(3)]))}]"
+    return f"[{'; '.join(map(number_text, value))}]"

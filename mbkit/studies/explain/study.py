@@ -23,10 +23,9 @@ from mbkit.studies.explain.hypotheses import (
     differences,
     link_differences,
     links_in_common_axes,
-    number_text,
 )
 from mbkit.studies.explain.joint_matching import Match, Matching, align_frames, reconcile_joint_sets, rename_joints
-from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge, with_common_frames
+from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge, number_text, with_common_frames
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import WHOLE, Gap, Gaps, model_terms, states_of
 from mbkit.studies.results import to_plain
@@ -201,7 +200,7 @@ class _Descriptions:
         `explain` merges bodies, and such a force acts on each of them.
         """
         ours, theirs = ({f.body: f for f in x.forces if isinstance(f, GravityCompensation)} for x in (a, b))
-        near, causes, found = Tolerances.of(a, self.tolerance), [], {g.term: g for g in out.gaps}
+        near, causes, found = Tolerances.of(a, self.tolerance), [], out.gaps
         for body in dict.fromkeys([*ours, *theirs]):
             held = [side.get(body) or GravityCompensation(body, 0.0) for side in (ours, theirs)]
             one, other = held
@@ -210,15 +209,14 @@ class _Descriptions:
             model = a if body in ours else b
             known = {j.name for j in model.joints}
             held = [replace(x, without=tuple(j for j in x.without if j in known)) for x in held]
-            effects = self._gaps(*(replace(model, forces=(x,)) for x in held))
+            gaps = self._gaps(*(replace(model, forces=(x,)) for x in held))
             says = f"holds {number_text(other.fraction)} of its weight for {number_text(one.fraction)}"
             says = says if "fraction" in changed else "holds its weight at other joints"
             h = Hypothesis("gravity compensation", f"body {body!r}", says, a=one.fraction, b=other.fraction)
-            causes.append(self._cause(h, effects.effects))
-            if out.comparable:
-                found |= {g.term: max(g, found.get(g.term, g), key=lambda x: x.relative) for g in effects.terms}
+            causes.append(self._cause(h, gaps.effects))
+            found = terms.larger(found, gaps.terms) if out.comparable else found
         acts = any(c.acts for c in causes)
-        return replace(out, agree=out.agree and not acts, causes=(*out.causes, *causes), gaps=tuple(found.values()))
+        return replace(out, agree=out.agree and not acts, causes=(*out.causes, *causes), gaps=found)
 
     def _is_massless(self, model: Model) -> bool:
         M = model_terms(model, states_of(model, self.samples, self.seed)).get("M")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -83,13 +83,25 @@ class Gaps:
         return {g.term: g.relative for g in self.terms} if self.comparable else {"M": np.inf}
 
 
+def larger(one: Iterable[Gap], other: Iterable[Gap]) -> tuple[Gap, ...]:
+    """Return every term once, with the larger of two gaps."""
+    out: dict[str, Gap] = {}
+    for gap in (*one, *other):
+        out[gap.term] = max(out.get(gap.term, gap), gap, key=lambda x: x.relative)
+    return tuple(out.values())
+
+
 def states_of(model: Model, samples: int, seed: int) -> States:
     """Return random states of a model."""
-    # An importer may give limits with lower > upper.
-    fits = all(np.all(j.lower <= j.upper) for j in model.joints)
     # Terms are those of the tree.
-    tree = model.without(*CONSTRAINT_FEATURES, *([] if fits else ["limits"]))
+    tree = _with_limits_that_can_be(model).without(*CONSTRAINT_FEATURES)
     return States(*tree.random_state(np.random.default_rng(seed), samples))
+
+
+def _with_limits_that_can_be(model: Model) -> Model:
+    """Return a description without its limits where an importer gave some with lower > upper."""
+    fits = all(np.all(j.lower <= j.upper) for j in model.joints)
+    return model if fits else model.without("limits")
 
 
 def model_terms(model: Model, at: States) -> Values:
@@ -156,7 +168,7 @@ def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
     hold: M Δv̇ relative to the forces at play. Infinite where a state of one is none of the other, NaN where neither has
     a state in which it could move.
     """
-    sides = [_moving(x) for x in (a, b)]
+    sides = [LagrangianDynamics(_with_limits_that_can_be(x), compile=False) for x in (a, b)]
     worst, rng = np.nan, np.random.default_rng(seed)
     for own, other in (sides, sides[::-1]):
         try:
@@ -182,11 +194,6 @@ def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
         if not (own.model.constrained or other.model.constrained):
             break
     return worst
-
-
-def _moving(model: Model) -> Dynamics:
-    fits = all(np.all(j.lower <= j.upper) for j in model.joints)
-    return LagrangianDynamics(model if fits else model.without("limits"), compile=False)
 
 
 def _consistent(dyn: Dynamics, q: Array, v: Array) -> bool:
@@ -246,14 +253,12 @@ def part(model: Model, joints: Collection[str]) -> Model:
 
     A joint whose parent is left out is fixed in the world as it is on its parent.
     """
-    out = restricted(model, joints)
+    out = restricted(model, joints).without(*CONSTRAINT_FEATURES)
     bodies = {b.name for b in out.bodies}
-    free: dict[str, Any] = dict.fromkeys(CONSTRAINT_FEATURES, ())
     return replace(
         out,
         joints=tuple(j if j.parent in bodies else replace(j, parent="world") for j in out.joints),
         couplings=tuple(c for c in model.couplings if set(c.joints) <= set(joints)),
-        **free,
     )
 
 

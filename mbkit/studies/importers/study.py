@@ -7,8 +7,8 @@ import os
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from importlib import metadata
@@ -38,10 +38,10 @@ from mbkit.model.model import unchecked
 from mbkit.model.parts import rules_of
 from mbkit.model.validation import listing
 from mbkit.studies import results
-from mbkit.studies.explain.hypotheses import BOUNDS, OF_ALL, number_text
+from mbkit.studies.explain.hypotheses import BOUNDS, OF_ALL
 from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_sets, rename_joints
 from mbkit.studies.explain.loop_differences import turn_of
-from mbkit.studies.explain.merged_model import MergedModel, Tolerances
+from mbkit.studies.explain.merged_model import MergedModel, Tolerances, number_text
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
@@ -84,11 +84,10 @@ class ImporterError(Exception):
     """An importer refuses a text, ended its process over it, or took too long; never leaves `mbkit.studies`."""
 
 
-@contextmanager
-def _refusals(engine: str) -> Iterator[None]:
-    """Raise what an importer raises, which is errors of all kinds, as `ImporterError`."""
+def _asked(engine: str, function: Callable[..., Any], *args: Any) -> Any:
+    """Return what an importer gives; raises `ImporterError` for what it raises, which is errors of all kinds."""
     try:
-        yield
+        return function(*args)
     except WorkerTimeoutError as error:
         raise ImporterError(f"its importer was {error}, without an answer") from None
     except WorkerDiedError as error:
@@ -98,38 +97,23 @@ def _refusals(engine: str) -> Iterator[None]:
         raise ImporterError(describe(error).removeprefix(f"{engine}: ")) from None
 
 
-def _begun(engine: str, file: tuple[Any, ...], seconds: float) -> Callable[[], Imported]:
-    """Have an engine's importer read a file, and return the function that waits for the reading.
+def _reading(engine: str, file: tuple[Any, ...], seconds: float) -> Imported:
+    """Return the reading of a file; it takes at most `seconds` of processor time, and so does each call of its terms.
 
-    It takes at most `seconds` of processor time, and so does each call of its terms.
+    Raises `UnsupportedError` where the importer is not installed, and `ImporterError`.
     """
+    check_installed(engine)
     importer = IMPORTERS[engine]
     worker = _workers.setdefault(importer, Worker())
-    with _refusals(engine):
-        worker.begin(_read, importer.module, *file)
-
-    def terms(q: Array, v: Array, without: tuple[str, ...] = ()) -> Values:
-        with _refusals(engine):
-            return worker.call(_terms_of_held, q, v, without, cpu_seconds=seconds)
-
-    def result() -> Imported:
-        with _refusals(engine):
-            model, *rest = worker.finish(seconds)
-        return Imported(model, terms, *rest)
-
-    return result
+    ask = partial(_asked, engine, partial(worker.call, cpu_seconds=seconds))
+    model, *rest = ask(_read, importer.module, *file)
+    return Imported(model, partial(ask, _terms_of_held), *rest)
 
 
-def _read_elsewhere(version: EngineVersion, file: tuple[Any, ...]) -> Imported:
-    """Return the reading of an importer in an environment of its own, which has the time of its engine."""
-    with _refusals(str(version)):
-        read = own_importer.read(version, *file)
-
-    def terms(*args: Any) -> Values:
-        with _refusals(str(version)):
-            return read.terms(*args)
-
-    return replace(read, terms=terms)
+def _reading_elsewhere(version: EngineVersion, file: tuple[Any, ...]) -> Imported:
+    """Return that of an importer in an environment of its own, which has the time of its engine."""
+    read: Imported = _asked(str(version), own_importer.read, version, *file)
+    return replace(read, terms=partial(_asked, str(version), read.terms))
 
 
 def _read(module: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes]) -> tuple[Any, ...]:
@@ -169,19 +153,25 @@ def stages(
             out.append(_missing("mimic", mimics, f"held {held}" if (held := imported.holds_mimics) else "left free"))
         out.append(_worst(name, some))
     back = {m.b: m.a for m in matching.pairs}
-    out += _constraint_stages(loops, described, imported, back, near)
+    constraints = between_joints(imported.model, imported.constraints, back)
+    for name, faults, compare in (
+        ("loops", loops.faults or imported.hidden, partial(loop_differences, near=near)),
+        ("couplers", loops.faults, partial(coupler_differences, file=described, names=back, tolerance=tolerance)),
+    ):
+        some = [] if faults else compare(written=loops, read=constraints)
+        every = "; ".join(f"{where}: {says}" for _, where, says in some)
+        out.append(Stage(name, None, math.nan, "", faults) if faults else replace(_worst(name, some), says=every))
     apart = Gaps(comparable=False)
     if not structural:
         at = states_of(one.model, samples, seed)
-        ours = model_terms(one.model, at)
-        source = reference if isinstance(reference, Imported) else None
-        if source is None and whole.forces:
-            smooth = whole.smooth
-            source = Imported(whole, lambda q, v, _: model_terms(smooth, States(q, v)), ())
-        if source is not None:
-            ours = _own_terms_of(one.model, source, {j.name: j.name for j in one.model.joints}, at)
-        theirs_ = _own_terms_of(one.model, imported, matching.to_b, at)
-        apart = gaps(ours, theirs_, at.v, one.model.velocity_joints)
+        smooth = whole.smooth
+        own = Imported(whole, lambda q, v, _: model_terms(smooth, States(q, v)), ())
+        sides = (
+            (reference if isinstance(reference, Imported) else own, {x: x for x in back.values()}),
+            (imported, matching.to_b),
+        )
+        ours, read = (_own_terms_of(one.model, *side, at) for side in sides)
+        apart = gaps(ours, read, at.v, one.model.velocity_joints)
     by_term = {g.term: g for g in apart.terms}
     for name in TERMS:
         if g := by_term.get(name):
@@ -196,22 +186,6 @@ def _worst(name: str, some: list[tuple[float, str, str]]) -> Stage:
     size, where, says = max(some, key=itemgetter(0), default=(0.0, "", ""))
     more = f" (and {len(some) - 1} more)" if len(some) > 1 else ""
     return Stage(name, not some, size, where, f"{where}: {says}{more}" if some else "")
-
-
-def _constraint_stages(
-    written: Written, file: Model, imported: Imported, names: Mapping[str, str], near: Tolerances
-) -> Iterator[Stage]:
-    """Compare an importer's loops and couplers with the file's; `names` has the file's joint for each of its own."""
-    read = between_joints(imported.model, imported.constraints, names)
-    for name, faults, differences in (
-        ("loops", written.faults or imported.hidden, partial(loop_differences, written, read, near)),
-        ("couplers", written.faults, partial(coupler_differences, written, file, read, names, near.relative)),
-    ):
-        yield Stage(name, None, math.nan, "", faults) if faults else _every(name, differences())
-
-
-def _every(name: str, some: list[tuple[float, str, str]]) -> Stage:
-    return replace(_worst(name, some), says="; ".join(f"{where}: {says}" for _, where, says in some))
 
 
 def _missing(name: str, missing: list[str], what: str) -> Stage:
@@ -430,29 +404,23 @@ def _readings(
 ) -> tuple[dict[str, Imported], dict[str, str]]:
     """Return each importer's reading of a file, and why the others refuse it; all read at the same time."""
     file = (stripped.text, stripped.format, floating_base, stripped.meshes)
-    begun: dict[str, Callable[[], Imported]] = {}
     read: dict[str, Imported] = {}
     refused: dict[str, str] = {}
-    try:
-        for engine in engines:
-            try:
-                if engine in elsewhere:
-                    begun[engine] = partial(_read_elsewhere, elsewhere[engine], file)
-                else:
-                    check_installed(engine)
-                    begun[engine] = _begun(engine, file, seconds)
-            except (UnsupportedError, ImporterError) as error:
-                refused[engine] = str(error)
-        for engine, result in begun.items():
-            try:
-                read[engine] = result()
-            except ImporterError as error:
-                refused[engine] = str(error)
-    except BaseException:
-        # Nobody waits any more for those that still read.
-        for engine in begun.keys() - elsewhere.keys():
-            _workers[IMPORTERS[engine]].end()
-        raise
+    with ThreadPoolExecutor(len(engines)) as pool:
+        begun = {x: pool.submit(_reading, x, file, seconds) for x in engines if x not in elsewhere}
+        try:
+            for engine in engines:
+                try:
+                    there = begun.get(engine)
+                    read[engine] = there.result() if there else _reading_elsewhere(elsewhere[engine], file)
+                except (UnsupportedError, ImporterError) as error:
+                    refused[engine] = str(error)
+        except BaseException:
+            # Nobody waits any more for those that still read.
+            for engine in begun:
+                if worker := _workers.pop(IMPORTERS[engine], None):
+                    worker.close()
+            raise
     return read, refused
 
 
@@ -483,23 +451,13 @@ def _compared(
     notes = (*explanation.notes, *imported.notes, *idle)
     if unmatched:
         notes = (*notes, f"compared by what they do to passive forces alone: {listing([*map(str, unmatched)], 6)}")
-    explanation = _with_mimics_held(with_own_terms(explanation, compared, causes, held), imported)
+    explanation = with_own_terms(explanation, compared, causes, held)
+    if way := imported.holds_mimics:
+        # Their constraints are outside of all terms.
+        free, tied = "leaves it free, which", f"holds it {way}, outside its terms; it"
+        causes = [replace(c, says=c.says.replace(free, tied)) for c in explanation.causes]
+        explanation = replace(explanation, causes=tuple(causes))
     return Parsed(engine, _version(engine), "", compared, explanation, notes)
-
-
-def _with_mimics_held(explanation: Explanation, imported: Imported) -> Explanation:
-    """Return an explanation that knows that the importer holds mimic joints by constraints, outside of all terms."""
-    if not imported.holds_mimics:
-        return explanation
-    causes = (
-        replace(
-            c, says=c.says.replace("leaves it free, which", f"holds it {imported.holds_mimics}, outside its terms; it")
-        )
-        if c.kind == "mimic"
-        else c
-        for c in explanation.causes
-    )
-    return replace(explanation, causes=tuple(causes))
 
 
 def written(source: str | os.PathLike[str]) -> Model:
