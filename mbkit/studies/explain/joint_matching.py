@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -168,7 +168,8 @@ def rename_joints(b: MergedModel, a: Model, matching: Matching) -> MergedModel:
     parts["joints"].sort(key=lambda joint: order.get(joint.name, len(order)))
     matter = {x.name: x for x in parts["bodies"]}
     parts["bodies"] = [matter[joint.child] for joint in parts["joints"]]
-    model = replace(b.model, **{kind: tuple(some) for kind, some in parts.items()})
+    fields: dict[str, Any] = {kind: tuple(some) for kind, some in parts.items()}
+    model = replace(b.model, **fields)
     return MergedModel(model, {bodies[name]: some for name, some in b.links.items()})
 
 

@@ -224,7 +224,8 @@ def _with_own_frames(model: Model) -> Model:
 
 def reattached(model: Model, places: Mapping[str, Place]) -> Model:
     """Return the description with the places of parts beside bodies and joints in other frames."""
-    return replace(model, **{kind: tuple(hung_on(x, places, []) for x in getattr(model, kind)) for kind in OTHERS})
+    parts: dict[str, Any] = {kind: tuple(hung_on(x, places, []) for x in getattr(model, kind)) for kind in OTHERS}
+    return replace(model, **parts)
 
 
 def with_common_frames(*sides: MergedModel) -> Iterator[MergedModel]:

@@ -204,8 +204,9 @@ def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict
         base = " (the base's)" if near.number(ours - theirs, one.ground.mass - other.ground.mass) else ""
         says = f"{number_text(theirs)} kg for {number_text(ours)} kg{base}"
         out["total mass"].append((abs(theirs / ours - 1), "all", says))
-    there = {(x.section, x.name): x for x in (*other.model.joints, *other.model.bodies)}
-    for a in (*one.model.joints, *one.model.bodies):
+    sides: list[list[Any]] = [[*x.model.joints, *x.model.bodies] for x in (one, other)]
+    there = {(x.section, x.name): x for x in sides[1]}
+    for a in sides[0]:
         if not (b := there.get((a.section, a.name))):
             continue
         apart = near.differing(a, b)
