@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import pickle
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -273,6 +274,14 @@ def test_what_is_no_law_is_refused_with_the_reason(law: Any, given: Any, words: 
         pendulum(law, **given)
     for word in words:
         assert word in str(caught.value)
+
+
+def test_models_at_other_times_share_what_does_not_depend_on_the_time() -> None:
+    """Else each evaluation of a run would look through all parts anew."""
+    model = replace(double())
+    one, other = (model.with_nominal({model.time_parameter: t}) for t in (0.5, 0.6))
+    assert one.effects is other.effects
+    assert one.time == 0.5
 
 
 def test_tables_without_a_common_time_are_refused() -> None:

@@ -41,6 +41,8 @@ TERMS = tuple(t for t in ALL_TERMS if t.name in ("M", "nle", "inverse dynamics",
 ENGINES = ("lagrangian", "pinocchio", "mujoco")
 FLOATING = ("talos", "anymal_b", "solo12")
 TREES, LARGEST, SAMPLES = 200, 30, 64
+#: Processes, one for each core.
+JOBS = None
 #: All of them.
 ROBOTS = None
 BARS = {"robots": 10.0, "floating robots": 10.0, "random trees": 50.0}
@@ -160,13 +162,13 @@ def as_json(stamped, found):
 
 
 #: See `validation.smoke`.
-SMOKE = {"FLOATING": (), "TREES": 1, "SAMPLES": 2, "ROBOTS": FEW}
+SMOKE = {"FLOATING": (), "TREES": 1, "SAMPLES": 2, "ROBOTS": FEW, "JOBS": 1}
 
 
 def main():
     console = Console(width=160 if not sys.stdout.isatty() else None)
     wanted = systems()
-    jobs = int(sys.argv[1]) if len(sys.argv) > 1 else None
+    jobs = int(sys.argv[1]) if len(sys.argv) > 1 else JOBS
     answers = run({name: partial(measured, make, samples=SAMPLES) for name, (_, make) in wanted.items()}, jobs=jobs)
     found = {}
     for name, result in track(answers, "comparing", len(wanted), console=Console(stderr=True)):

@@ -370,7 +370,7 @@ def table(data):
 
 #: See `validation.smoke`.
 SMOKE = {
-    "ROBOTS": {"z1": "mb.load('z1')"},
+    "ROBOTS": {"two links": "mb.catalog.double_pendulum()"},
     "SIZES": (2,),
     "SAMPLES": 64,
     "ROUNDS": 1,

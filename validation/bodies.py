@@ -22,6 +22,8 @@ from validation.stamp import results, stamp
 
 ENGINES = (*accuracy.ENGINES, "drake")
 SAMPLES = 8
+#: Processes, one for each core.
+JOBS = None
 #: In eps.
 BAR, BAR_OF_ENGINES = 50.0, 1e-12 / accuracy.EPS
 
@@ -46,7 +48,7 @@ def missed(found):
 
 
 #: See `validation.smoke`.
-SMOKE = {"accuracy.FLOATING": (), "accuracy.TREES": 1, "accuracy.ROBOTS": accuracy.FEW, "SAMPLES": 1}
+SMOKE = {"accuracy.FLOATING": (), "accuracy.TREES": 1, "accuracy.ROBOTS": accuracy.FEW, "SAMPLES": 1, "JOBS": 1}
 
 
 def main():
@@ -54,7 +56,7 @@ def main():
     os.environ["MBKIT_COMPILE"] = "0"
     console = Console(width=160 if not sys.stdout.isatty() else None)
     wanted = accuracy.systems()
-    jobs = int(sys.argv[1]) if len(sys.argv) > 1 else None
+    jobs = int(sys.argv[1]) if len(sys.argv) > 1 else JOBS
     calls = {name: partial(measured, make, SAMPLES) for name, (_, make) in wanted.items()}
     found = {}
     for name, result in track(run(calls, jobs=jobs), "comparing", len(wanted), console=Console(stderr=True)):

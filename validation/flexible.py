@@ -21,6 +21,8 @@ x, s, t, L, RHO, EI = sp.symbols("x s t L rho EI")
 SEGMENTS = (5, 10, 20)
 #: Modes of the turning beam and of the spin-up, and the parts of the full speed at which elements run.
 MODES, COUNTS, PARTS = (2, 4, 6, 8), (1, 2, 3, 4, 5), (1.0, 0.1)
+#: Modes of the spin-up beside Kane's equations.
+TURNED = 3
 #: Systems whose frequencies are measured; all of them.
 CASES = None
 ENGINES = ("pinocchio", "mujoco", "drake")
@@ -42,22 +44,22 @@ def strings_and_beams() -> dict[str, float]:
     tip = {m: 0.8, J: 0.3}
     shear = {kGA: 40.0, RI: 0.02}
     cases = {
-        "string with a mass": (
+        "string with a mass": lambda: (
             Continuum(moving, P * w.diff(x) ** 2 / 2, w, (0, L), fixed={0: [w]}, T_ends=body),
             {RHO: 1.3, P: 2.1, L: 1.7, m: 0.8},
             beams.string(2.1, 1.3, 1.7, 0.8, 3),
         ),
-        "Euler-Bernoulli beam": (
+        "Euler-Bernoulli beam": lambda: (
             Continuum(moving, bent, w, (0, L), fixed=clamped),
             numbers,
             beams.cantilever(2.1, 1.3, 1.7, 0, 0, 3),
         ),
-        "Euler-Bernoulli beam with a body": (
+        "Euler-Bernoulli beam with a body": lambda: (
             Continuum(moving, bent, w, (0, L), fixed=clamped, T_ends={L: body[L] + J * w.diff(x, t) ** 2 / 2}),
             numbers | tip,
             beams.cantilever(2.1, 1.3, 1.7, 0.8, 0.3, 3),
         ),
-        "Timoshenko beam with a body": (
+        "Timoshenko beam with a body": lambda: (
             Continuum(
                 moving + RI * psi.diff(t) ** 2 / 2,
                 EI * psi.diff(x) ** 2 / 2 + kGA * (w.diff(x) - psi) ** 2 / 2,
@@ -69,16 +71,15 @@ def strings_and_beams() -> dict[str, float]:
             numbers | tip | shear,
             beams.timoshenko(2.1, 40.0, 1.3, 0.02, 1.7, 0.8, 0.3, 3, 0.3),
         ),
-        "rotating beam": (
+        "rotating beam": lambda: (
             Continuum(moving, bent + RHO * Om**2 * (L**2 - x**2) / 4 * w.diff(x) ** 2, w, (0, L), fixed=clamped),
             numbers | {Om: 3.0},
             beams.rotating(2.1, 1.3, 1.7, 3.0, 3, 0.5),
         ),
     }
     out = {}
-    for name, (system, values, exact) in cases.items():
-        if CASES is not None and name not in CASES:
-            continue
+    for name in CASES or cases:
+        system, values, exact = cases[name]()
         modes = system.normal_modes(3, values)
         # Once as they are found, and once more as coordinates of a Lagrangian.
         a = system.discretized(modes)
@@ -104,11 +105,11 @@ def spin_up() -> dict[str, object]:
     """Return the deflection of the tip beside Kane's equations, and that of the naive form."""
     times, out = np.linspace(0, beams.RISE, 151), {}
     for name, stiffening in (("stiffened", True), ("naive", False)):
-        lag, a = paper(3, stiffening=stiffening)
+        lag, a = paper(TURNED, stiffening=stiffening)
         run = mb.simulate(
-            lag.dynamics(), *np.zeros((2, 3)), beams.RISE, "rk853", save=times, rtol=1e-12, atol=1e-14, doubt=False
+            lag.dynamics(), *np.zeros((2, TURNED)), beams.RISE, "rk853", save=times, rtol=1e-12, atol=1e-14, doubt=False
         )
-        tip, exact = run.q @ a.at(1.0), beams.spin_up(3, times, stiffening=stiffening)
+        tip, exact = run.q @ a.at(1.0), beams.spin_up(TURNED, times, stiffening=stiffening)
         at = int(np.abs(tip).argmax())
         out[name] = {
             "largest_m": float(tip[at]),
@@ -127,11 +128,11 @@ def of_element(part: float) -> dict[str, float]:
 
     Its kinetic energy is that of points, with terms of third and fourth order in deflections that the equations lack.
     """
-    b = mb.ModelBuilder.of(rotor(3))
+    b = mb.ModelBuilder.of(rotor(TURNED))
     b.prescribe("turn", part * beams.angle(t, sp)[0])
     dyn, times = mb.dynamics(b.build(), "lagrangian"), np.linspace(0, beams.RISE, 151)
-    run = mb.simulate(dyn, *np.zeros((2, 4)), beams.RISE, "rk853", save=times, rtol=1e-10, atol=1e-13)
-    tip, exact = tip_of(dyn, run.q), beams.spin_up(3, times, speed=part * beams.SPEED)
+    run = mb.simulate(dyn, *np.zeros((2, TURNED + 1)), beams.RISE, "rk853", save=times, rtol=1e-10, atol=1e-13)
+    tip, exact = tip_of(dyn, run.q), beams.spin_up(TURNED, times, speed=part * beams.SPEED)
     return {"largest_m": float(tip.min()), "difference": float(np.abs(tip - exact).max() / np.abs(exact).max())}
 
 
@@ -219,10 +220,11 @@ SMOKE = {
     "MODES": (1, 2),
     "COUNTS": (1,),
     "PARTS": (0.1,),
+    "TURNED": 1,
     "CASES": ("string with a mass",),
     "PULSE": 0.02,
     "TIMES": np.linspace(0, 0.02, 3),
-    "beams.RISE": 0.2,
+    "beams.RISE": 0.02,
 }
 
 

@@ -241,11 +241,11 @@ def made_of(part: str, seed: int) -> str:
     return mjcf_outcome(seed, Path.cwd()) if part == "random MJCFs" else tree_outcome(seed)
 
 
-def counted(part: str, count: int, seconds: float) -> tuple[Counter[str], dict[str, list[int]]]:
+def counted(worker: Worker, part: str, count: int, seconds: float) -> tuple[Counter[str], dict[str, list[int]]]:
     """Return how often each outcome came, and the seeds of the failures; no seed is begun after `seconds`."""
     found: Counter[str] = Counter()
     failures: dict[str, list[int]] = {}
-    worker, begun = Worker(), time.perf_counter()
+    begun = time.perf_counter()
     for seed in range(count):
         if time.perf_counter() - begun > seconds:
             break
@@ -261,7 +261,6 @@ def counted(part: str, count: int, seconds: float) -> tuple[Counter[str], dict[s
         if not is_good(part, made):
             failures.setdefault(made, []).append(seed)
             print(f"{part}, seed {seed}: {made}", flush=True)
-    worker.end()
     return found, failures
 
 
@@ -280,10 +279,10 @@ def main() -> int:
     trees = int(sys.argv[2]) if len(sys.argv) > 2 else TREES
     seconds = float(sys.argv[3]) * 20 if len(sys.argv) > 3 else float("inf")
     os.environ.setdefault("MBKIT_COMPILE", "0")
-    table = {}
+    table, worker = {}, Worker()
     for part, n in (("mutants", count), ("random MJCFs", count), ("random trees", trees)):
         begun = time.perf_counter()
-        found, failures = counted(part, n, seconds)
+        found, failures = counted(worker, part, n, seconds)
         table[part] = {
             "count": found.total(),
             "failures": sum(map(len, failures.values())),
@@ -292,6 +291,7 @@ def main() -> int:
         }
         print(f"{part}: {found.total()} in {time.perf_counter() - begun:.0f} s")
         print(json.dumps(table[part]["outcomes"], indent=1), flush=True)
+    worker.end()
     told = {**stamp(__file__), **table}
     results("fuzz.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
     return int(any(x["failures"] for x in table.values()))

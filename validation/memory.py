@@ -180,7 +180,7 @@ def measure(name, count):
 
 
 #: See `validation.smoke`.
-SMOKE = {"MODELS": 20, "CHOSEN": ("graph",)}
+SMOKE = {"MODELS": 4, "CHOSEN": ("graph",)}
 
 
 def main():

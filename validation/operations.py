@@ -243,7 +243,7 @@ def systems(most):
 
 #: See `validation.smoke`.
 SMOKE = {
-    "ROBOTS": {"z1": "mb.load('z1')"},
+    "ROBOTS": {"two links": "mb.catalog.double_pendulum()"},
     "SIZES": (2,),
     "BATCH": 8,
     "SAMPLES": 64,

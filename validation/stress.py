@@ -17,13 +17,13 @@ import mbkit as mb
 from mbkit.studies.stress import Breaking, CaseResult, StressResult
 from validation.stamp import results, stamp
 
-#: All of them, with every method.
-CASES = METHODS = None
+#: All of them, at all values, with every method.
+CASES = METHODS = VALUES = None
 OURS = ("lagrangian", "pinocchio")
 
 
 #: See `validation.smoke`.
-SMOKE = {"CASES": ("joint_spring",), "METHODS": ("rk4",)}
+SMOKE = {"CASES": ("joint_spring",), "METHODS": ("rk4",), "VALUES": (1e2, 1e4)}
 
 
 def main() -> None:
@@ -34,7 +34,7 @@ def main() -> None:
     if asked.data is not None:
         result = StressResult.from_json(asked.data.read_text(encoding="utf-8"))
     else:
-        result = mb.stress(CASES, methods=METHODS, quick=asked.quick)
+        result = mb.stress(CASES, methods=METHODS, values=VALUES, quick=asked.quick)
     rows = list(result.breaking())
     told: dict[str, Any] = {
         **({} if asked.data else {name: stamp(__file__)[name] for name in ("date", "code")}),

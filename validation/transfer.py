@@ -243,11 +243,11 @@ WHOLE: dict[str, Callable[[], Any]] = {"files": files, "steps": steps}
 
 #: See `validation.smoke`.
 SMOKE = {
-    "ROBOTS": {"z1": (False, "z1_description/z1")},
+    "ROBOTS": {"two links": (False, "double_pendulum_description/double_pendulum")},
     "TIMES": (0.02, 0.04),
     "RUNS": (TWIN, ("mujoco", "mujoco_rk4"), ("drake", "drake_sap")),
     "STEPS": (("mujoco", "mujoco_rk4", 1e-2),),
-    "FALLS": "z1",
+    "FALLS": "two links",
 }
 
 

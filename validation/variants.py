@@ -357,13 +357,16 @@ def seconds(call, *arguments):
 RATED = {"ur5": lambda: mb.load("ur5"), "anymal, free base": lambda: mb.load("anymal", floating_base=True)}
 
 
+#: Spreads of the numbers that differ between variants.
+SPREADS = {
+    "masses and a payload's mass": {"*.mass": 0.1},
+    "all inertial numbers": {"*.inertial": 0.1},
+    "masses and dampers": {"*.mass": 0.1, "*.damping": 0.3},
+}
+
+
 def rates():
     rows = []
-    spreads = {
-        "masses and a payload's mass": {"*.mass": 0.1},
-        "all inertial numbers": {"*.inertial": 0.1},
-        "masses and dampers": {"*.mass": 0.1, "*.damping": 0.3},
-    }
     for label, make in RATED.items():
         model = make()
         b = mb.ModelBuilder.of(model)
@@ -374,7 +377,7 @@ def rates():
         plain = mb.dynamics(model, "lagrangian", threads=1)
         q, v = model.random_state(0, SIZE)
         v = 0.1 * v
-        for spread_label, spread in spreads.items():
+        for spread_label, spread in SPREADS.items():
             many = mb.variants(model, spread, size=SIZE, seed=1)
             varied = many.dynamics(threads=1)
             row = {"model": label, "spread": spread_label, "numbers": len(many.values)}
@@ -390,7 +393,15 @@ def rates():
 
 
 #: See `validation.smoke`.
-SMOKE = {"ROBOTS": TWO[:1], "FREE": (), "RATED": {"z1": lambda: mb.load("z1")}, "SIZE": 3, "ROUNDS": 1, "STEPS": 2}
+SMOKE = {
+    "ROBOTS": TWO[:1],
+    "FREE": (),
+    "RATED": {"two links": mb.catalog.double_pendulum},
+    "SPREADS": {"masses and dampers": SPREADS["masses and dampers"]},
+    "SIZE": 3,
+    "ROUNDS": 1,
+    "STEPS": 2,
+}
 
 
 def main():

@@ -482,7 +482,9 @@ class Model(Description):
         time = numbers.pop(self.time_parameter or "", self.time)
         self.require_times("time", time)
         if not numbers:
-            # A run asks so at every step: nothing but the time differs, and what follows from the rest is kept.
+            # A run asks so at every step: nothing but the time differs, and what follows from the rest is kept. Each
+            # evaluation asks for the effects, which the copies of a model that has none yet would find again.
+            _ = self.effects
             if self.constrained:
                 # Before the copy, so that all times share one derivation and one choice of rows.
                 _states_of(self)
