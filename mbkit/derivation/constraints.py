@@ -68,15 +68,8 @@ _ASIDE: Final = 0.2
 
 
 def _ends(kin: Kinematics, loop: Loop) -> LoopEnds:
-    values = kin.values.of(loop)
-    both = kin.model.carrier(loop)
-    sides = (
-        (loop.body_a, values.translation_a, values.rotation_a),
-        (loop.body_b, values.translation_b, values.rotation_b),
-    )
-    p, q = (kin.carried_to(body, both, list(point), 1.0) for body, point, _ in sides)
-    a, b = ([kin.carried_to(body, both, [row[k] for row in R], 0.0) for k in range(3)] for body, _, R in sides)
-    return LoopEnds([x - y for x, y in zip(p, q, strict=True)], a, b, values.length)
+    (p, a), (q, b) = kin.ends(loop)
+    return LoopEnds([x - y for x, y in zip(p, q, strict=True)], a, b, kin.values.of(loop).length)
 
 
 class _Row(NamedTuple):

@@ -155,6 +155,16 @@ class Kinematics:
             x, body = self.to_parent(joint, x, weight), joint.parent
         return x
 
+    def ends(self, part: Any) -> list[tuple[Vector, list[Vector]]]:
+        """Return places and axes of the frames of a loop or bushing, in the axes of the body that carries both ends."""
+        values, both, out = self.values.of(part), self.model.carrier(part), list[tuple[Vector, list[Vector]]]()
+        for side in "ab":
+            body, R = getattr(part, f"body_{side}"), getattr(values, f"rotation_{side}")
+            place = self.carried_to(body, both, list(getattr(values, f"translation_{side}")), 1.0)
+            axes = [self.carried_to(body, both, [row[k] for row in R], 0.0) for k in range(3)]
+            out.append((place, axes))
+        return out
+
     def velocity_at(self, body: str, to: str, at: Vector) -> Vector:
         """Return the velocity of the point of a body at a place, seen from the body `to` that carries it, in its axes.
 

@@ -23,7 +23,8 @@ from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, 
 from mbkit.engines.closed_loops.actuation import ACTUATOR_FORCES
 from mbkit.engines.closed_loops.loop_loads import LOOP_LOADS
 from mbkit.engines.closed_loops.reduced_inertia import REDUCED_INERTIA, IndependentMotion
-from mbkit.engines.elements.dry_friction import UNDER_FORCE, DryFriction
+from mbkit.engines.elements.added_force import UNDER_FORCE
+from mbkit.engines.elements.dry_friction import DryFriction
 from mbkit.engines.frames_and_momenta import (
     ALIGNED,
     JOINT,
@@ -92,15 +93,7 @@ ROTORS_OF_SEVERAL: Final = "joint.armature.several"
 _OF_JOINTS: Final = "joint.armature joint.spring joint.damping"
 _OF_FORCES: Final = "joint frame bushing compensation compensation.partial of_time"
 #: Kinds that stand beside the terms of any adapter, at least in part: what holds a rotor's weight is a force.
-BESIDE: Final = frozenset(
-    [
-        "body.rotor",
-        "joint.friction",
-        "joint.friction.several",
-        "joint.stiction",
-        *(f"force.{x}" for x in _OF_FORCES.split()),
-    ]
-)
+BESIDE: Final = frozenset(["body.rotor", *that_do("jump"), *(f"force.{x}" for x in _OF_FORCES.split())])
 #: And what every adapter here carries of trees by itself.
 OF_TREES: Final = BESIDE.union(
     _OF_JOINTS.split(),

@@ -19,7 +19,7 @@ from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_o
 from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity
 from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import DERIVATION, Dynamics, scalar
-from mbkit.engines.elements.dry_friction import UNDER_FORCE
+from mbkit.engines.elements.added_force import UNDER_FORCE
 from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.engines.loads import Wrenches
@@ -27,6 +27,7 @@ from mbkit.engines.steps import momentum_step_slopes
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Joint, Model
+from mbkit.model.elements.kinds import that_do
 from mbkit.model.elements.paths import ALL, Path
 
 if TYPE_CHECKING:
@@ -59,13 +60,9 @@ _NOT_ON_GPU: Final = {
 }
 _ON_GPU: Final = ALL - {"jump", "force"} | {"force.joint", "force.frame", "force.compensation.partial"}
 GPU: Final = Path(
-    "gpu",
-    "device: not known of",
-    _ON_GPU | {"joint.friction", "joint.friction.several"},
-    _NOT_ON_GPU,
-    instead="use the CPU",
+    "gpu", "device: not known of", _ON_GPU.union(that_do("jump")) - {*_NOT_ON_GPU}, _NOT_ON_GPU, instead="use the CPU"
 )
-#: The host decides dry friction at rest.
+#: The host decides the forces at rest of what jumps.
 GPU_ARRAYS: Final = Path("gpu under force", "", _ON_GPU, instead="copy them with numpy first")
 #: Quantities of three derivatives.
 _DERIVATIVES: Final = ("inverse_dynamics_derivatives", "forward_dynamics_derivatives")

@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, rows
+from mbkit.engines.elements.passive import pull
 from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, Parts, axes_named, momentum_rates
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Joint, Model, PointSpring
+from mbkit.model.elements.kinds import that_do
 from mbkit.model.elements.paths import Path
 from mbkit.model.parts import Loop
 
@@ -30,15 +32,14 @@ QUANTITIES: Final = ("mass_matrix_inverse", "generalized_force", "joint_wrenches
 FOLLOWING: Final = {"newton_euler_residual": "joint_wrenches"}
 #: What needs the force on each body.
 OF_SINGLE_BODIES: Final = frozenset({"joint_wrenches", "undetermined_loads", "loads_under_force", "loads_of_motion"})
-_CARRIED: Final = (
-    "q loss jump row bound t gravity joint.spring joint.spring.several point.spring coupling.spring "
-    "joint.armature joint.armature.several coupling.armature"
-)
+_CARRIED: Final = ("q", "loss", "jump", "row", "bound", "t", "gravity", "point.spring")
+#: Whose energies are of coordinates alone, and act along the directions of joints.
+_OF_COORDINATES: Final = ("joints", "couplings")
 _BY_FUNCTIONS: Final = "forces by functions are known by what they do to the motion, not to single bodies"
 LOADS: Final = Path(
     "loads",
     "",
-    frozenset(_CARRIED.split()),
+    frozenset([*_CARRIED, *that_do("T", *_OF_COORDINATES), *that_do("V", *_OF_COORDINATES)]),
     why={
         "speed": "its forces act on bodies beside those of loops; constraint_forces(q, v, tau) has them",
         **dict.fromkeys(("force", "force.compensation", "body.rotor"), _BY_FUNCTIONS),
@@ -376,14 +377,10 @@ class _Balance:
             # Of the frame of the body's name, which may be another one than its own.
             speeds.append(V[:, :3] + np.cross(V[:, 3:], ends[-1] - self._dyn.pose(self._q, body)[:, :3, 3]))
         gap, rate = ends[1] - ends[0], speeds[1] - speeds[0]
-        pull = spring.stiffness * gap
-        if spring.needs_direction:
-            length = np.linalg.norm(gap, axis=1, keepdims=True)
-            along = np.sum(gap * rate, axis=1, keepdims=True) / length
-            pull = (spring.stiffness * (length - spring.rest_length) + spring.damping * along) * gap / length
+        on_first = pull(spring, gap, rate)
         for sign, body, point in ((1, spring.body_a, spring.point_a), (-1, spring.body_b, spring.point_b)):
             if body in self._index:
-                force = sign * _times(self._rotation(body).swapaxes(1, 2), pull)
+                force = sign * _times(self._rotation(body).swapaxes(1, 2), on_first)
                 self._add(body, force, np.cross(point, force))
 
     def residual(self) -> Array:

@@ -315,10 +315,10 @@ class Description:
         return tuple(j.name for j in self.independent_joints for _ in range(j.type.nv))
 
     def per_velocity(self, name: str) -> Array:
-        """Return armature, damping, stiffness or friction of all joints, as each entry of v has it, (nv,).
+        """Return a number along velocities, such as ``"damping"``, of all joints, as each entry of v has it, (nv,).
 
-        That of a mimic joint counts by the square of its ratio, as a force grows with the ratio too; dry friction by
-        the ratio alone. Other names raise `UnknownNameError`.
+        That of a mimic joint counts by the square of its ratio, as a force grows with the ratio too; the size of a
+        force that jumps by the ratio alone. Other names raise `UnknownNameError`, which lists these.
         """
         if name not in (known := [k for k, rule in rules_of(Joint).items() if rule.does]):
             raise UnknownNameError("number of a joint's velocity", name, known)

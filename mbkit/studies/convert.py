@@ -64,9 +64,9 @@ class Converted:
 def convert(model: Model, to: str) -> Converted:
     """Write a description as MJCF or URDF, and read it back to see that it says the same.
 
-    The motion alone is written: bodies, joints, masses, inertias, springs, dampers, rotor inertia, limits, dry
-    friction, frames; no geometry. MJCF is the MuJoCo model that mbkit itself builds, with all digits, read
-    back with MuJoCo's own parser; URDF is read back with Pinocchio's.
+    The motion alone is written, each kind of part that the format has, and frames; no geometry. MJCF is the MuJoCo
+    model that mbkit itself builds, with all digits, read back with MuJoCo's own parser; URDF is read back with
+    Pinocchio's.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ import casadi as ca
 
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
-from mbkit.derivation.kinematics import Kinematics, Vector, compensation_energies
+from mbkit.derivation.kinematics import Kinematics, Vector, column, compensation_energies
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.model.elements.forces import TIME, Bushing, Force, FrameForce, JointElement, coordinate_arguments
 from mbkit.model.elements.formula import Formula
@@ -57,23 +57,10 @@ def _of_frame(kin: Kinematics, force: FrameForce) -> _Port:
 
 def _of_bushing(kin: Kinematics, bushing: Bushing) -> _Port:
     values = kin.values.of(bushing)
-    both = kin.model.carrier(bushing)
-
-    def carried(body: str, x: Vector, weight: float) -> Vector:
-        while body != both:
-            joint = kin.carrier(body)
-            x, body = kin.to_parent(joint, x, weight), joint.parent
-        return x
-
-    p_a, p_b = carried(bushing.body_a, values.translation_a, 1.0), carried(bushing.body_b, values.translation_b, 1.0)
-    a, b = (
-        [carried(body, [row[k] for row in R], 0.0) for k in range(3)]
-        for body, R in ((bushing.body_a, values.rotation_a), (bushing.body_b, values.rotation_b))
-    )
+    (p_a, a), (p_b, b) = kin.ends(bushing)
     gap = [y - x for x, y in zip(p_a, p_b, strict=True)]
-    x = [*(dot3(axis, gap) for axis in a), *rotation_vector([[dot3(row, column) for column in b] for row in a])]
-    column = ca.jtimes(ca.vertcat(*(ca.SX(e) for e in x)), kin.q, kin.qdot)
-    rates = [scalar(column[i]) for i in range(6)]
+    x = [*(dot3(axis, gap) for axis in a), *rotation_vector([[dot3(row, e) for e in b] for row in a])]
+    rates = [scalar(e) for e in ca.vertsplit(ca.jtimes(column(x), kin.q, kin.qdot))]
     return _Port(
         dict(zip(bushing.own(kin.model), (*x, *rates), strict=True)), rates, (x, values.stiffness, values.damping)
     )
@@ -171,6 +158,5 @@ class ElementForces:
             if force.formula is not None:
                 given = self._evaluated(force, port, force.formula)
                 acting = [x + y for x, y in zip(acting, given, strict=True)]
-            rates, acts = (ca.vertcat(ca.SX(0, 1), *(ca.SX(x) for x in column)) for column in (port.rates, acting))
-            total += ca.jtimes(rates, kin.v, acts, True)
+            total += ca.jtimes(column(port.rates), kin.v, column(acting), True)
         return total

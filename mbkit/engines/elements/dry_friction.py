@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit._warn import warn
+from mbkit.engines.elements.added_force import LOADS, UNDER_FORCE, AddedForce
 from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import ROUNDING, DryFrictionLaw, Sliding
@@ -29,13 +30,6 @@ from mbkit.model.parts import RESTING
 
 #: What is at rest of velocities.
 Mask = NDArray[np.bool_]
-#: Quantities whose argument is a force, the third one.
-UNDER_FORCE: Final = (
-    *("forward_dynamics", "forward_dynamics_with_wrenches"),
-    *("constraint_forces", "generalized_constraint_force"),
-)
-#: Loads of mechanisms, by the place of the force among their arguments.
-_LOADS: Final = {"loads_under_force": 2, "loads_of_motion": 3}
 #: Exchanges that may leave as many conditions failing, before they go one by one.
 _PATIENCE: Final = 3
 #: Phases that dynamics keep, at most.
@@ -167,7 +161,7 @@ def friction_forces(
     return forces, holds
 
 
-class DryFriction:
+class DryFriction(AddedForce):
     """Dry friction of a model, for the quantities of an engine."""
 
     def __init__(self, model: Model) -> None:
@@ -176,61 +170,54 @@ class DryFriction:
         #: A model, and that whose joints slide, for `phases`.
         self._slid: tuple[Model, Model] | None = None
 
+    def force(self, dyn: Any, q: Array, v: Array) -> Array:  # noqa: ARG002  # of the velocities alone
+        return self.law.force(v)
+
+    def slopes(self, dyn: Any, q: Array, v: Array) -> tuple[Array, Array]:  # noqa: ARG002  # as above
+        by_v = self.law.slope(v)
+        return np.zeros_like(by_v), by_v
+
     def beside(self, quantity: str, method: Callable[..., Any], dyn: Any) -> Callable[..., Any]:
         """Return an engine's method for a quantity with friction; terms of one with elements hold it at speed."""
-        law, added = self.law, not dyn.has_elements
+        law, moving = self.law, method if dyn.has_elements else super().beside(quantity, method, dyn)
         if quantity in UNDER_FORCE:
 
             def pushed(q: Array, v: Array, tau: Array, *rest: Any) -> Any:
-                force = tau + _padded(law.force(v), tau) if added else tau
                 resting = law.at_rest(v)
                 if not resting.any():
-                    return method(q, v, force, *rest)
+                    return moving(q, v, tau, *rest)
                 if dyn.bits > _DOUBLE:
                     return self._in_phase(quantity, dyn, q, v, tau, rest, resting)
-                held, still = self._each(dyn, quantity, method, q, v, force, rest, resting)
-                out = method(q, v, force + _padded(held, tau), *rest)
+                held, still = self._each(dyn, quantity, moving, q, v, tau, rest, resting)
+                out = moving(q, v, tau + _padded(held, tau), *rest)
                 # What friction holds does not move, not even by a rounding.
                 return np.where(still, 0.0, out) if quantity.startswith(_FORWARD) else out
 
             return pushed
         if quantity == "forward_dynamics_derivatives":
 
-            def of_forward(q: Array, v: Array, tau: Array) -> Array:
+            def of_forward(q: Array, v: Array, tau: Array) -> Any:
                 if law.at_rest(v).any():
                     warn(
                         f"{self._model.name}: dry friction at rest has no derivative, and is left out of these; take "
                         "model.without('friction') to do so knowingly, or velocities that are not zero",
                         MbkitWarning,
                     )
-                if not added:
-                    return np.asarray(method(q, v, tau))
-                own = method(q, v, tau + law.force(v))
-                return np.asarray(own + _by_velocity(own[..., 2, :, :] @ law.slope(v)))
+                return moving(q, v, tau)
 
             return of_forward
-        if quantity in _LOADS:
-            place = _LOADS[quantity]
+        if quantity in LOADS:
 
-            def loaded(*states: Any) -> Any:
-                if law.at_rest(states[1]).any():
+            def loaded(q: Array, v: Array, *rest: Any) -> Any:
+                if law.at_rest(v).any():
                     raise UnsupportedError(
                         f"loads of joints and loops: {self._model.name} has joints with dry friction at rest, whose "
                         "share of the loads is not known; give velocities, or take model.without('friction')"
                     )
-                force = law.force(states[1]) if added else 0.0
-                return method(*states[:place], states[place] + force, *states[place + 1 :])
+                return moving(q, v, *rest)
 
             return loaded
-        if not added:
-            return method
-        if quantity == "passive":
-            return lambda q, v: method(q, v) + law.force(v)
-        if quantity in ("inverse_dynamics", "inverse_dynamics_with_wrenches"):
-            return lambda q, v, *rest: method(q, v, *rest) - law.force(v)
-        if quantity == "inverse_dynamics_derivatives":
-            return lambda q, v, a: method(q, v, a) - _by_velocity(law.slope(v))
-        return method
+        return moving
 
     def _each(
         self,
@@ -248,9 +235,11 @@ class DryFriction:
         rows: Any = ... if single else np.flatnonzero(resting.any(axis=1))
         own = dyn if single else dyn.of_samples(rows)
         forward = quantity.startswith(_FORWARD)
-        accelerate = (
-            own._without_friction(quantity if forward else _FORWARD) if own is not dyn or not forward else method
-        )
+        accelerate = method
+        if own is not dyn or not forward:
+            name = quantity if forward else _FORWARD
+            accelerate = own._without_friction(name)
+            accelerate = accelerate if own.has_elements else super().beside(name, accelerate, own)
         more = [x[rows] if isinstance(x, np.ndarray) else x for x in rest] if forward else []
         held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
         held[rows], still[rows] = self.decided(
@@ -351,11 +340,6 @@ class DryFriction:
             return value * phase._arithmetic.array(1.0 - still) if moves else value
 
         return np.concatenate([one(i) for i in range(len(v))])
-
-
-def _by_velocity(slope: Array) -> Array:
-    """Return derivatives by q, v and a of which that by v is not zero, (..., 3, nv, nv)."""
-    return np.stack([np.zeros_like(slope), slope, np.zeros_like(slope)], axis=-3)
 
 
 def _padded(force: Array, tau: Array) -> Array:

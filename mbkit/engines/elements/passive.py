@@ -66,16 +66,16 @@ class JointPassive:
 
 
 def pull(spring: PointSpring, gap: Array, rate: Array) -> Array:
-    """Return the force on a spring's first end, from the vector to its second end and that vector's rate.
+    """Return the force on a spring's first end, from the vector to its second end and that vector's rate, (..., 3).
 
     NaN where the force needs a direction and there is none, which the caller finds.
     """
-    length = np.linalg.norm(gap)
+    length = np.linalg.norm(gap, axis=-1, keepdims=True)
     # k (l - l0) / l written so that l0 = 0 needs no direction at l = 0.
     out = spring.stiffness * gap
     with np.errstate(invalid="ignore", divide="ignore"):
         if spring.stiffness and spring.rest_length:
             out = out - spring.stiffness * spring.rest_length * (gap / length)
         if spring.damping:
-            out = out + spring.damping * (gap / length) * (gap @ rate) / length
+            out = out + spring.damping * (gap / length) * np.sum(gap * rate, axis=-1, keepdims=True) / length
     return np.asarray(out)

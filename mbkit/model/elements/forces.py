@@ -73,13 +73,13 @@ class Force(_Frozen):
         """Whether it depends on the time itself."""
         return TIME in self.arguments
 
-    def positions(self, model: _Model) -> tuple[str, ...]:
+    def positions(self, model: _Model) -> tuple[str, ...]:  # noqa: ARG002  # of a joint they depend on it
         """Return the names of the positions that the element brings."""
-        raise NotImplementedError
+        return ()
 
-    def velocities(self, model: _Model) -> tuple[str, ...]:
+    def velocities(self, model: _Model) -> tuple[str, ...]:  # noqa: ARG002  # as above
         """Return the names of the velocities that it brings: what its force acts on."""
-        raise NotImplementedError
+        return ()
 
     def own(self, model: _Model) -> tuple[str, ...]:
         """Return both."""
@@ -297,14 +297,6 @@ class GravityCompensation(Force):
     def named(body: str) -> str:
         """Return the name of a body's."""
         return f"gravity compensation of {body}"
-
-    def positions(self, model: _Model) -> tuple[str, ...]:  # noqa: ARG002  # it brings none
-        """Return nothing."""
-        return ()
-
-    def velocities(self, model: _Model) -> tuple[str, ...]:  # noqa: ARG002  # as above
-        """Return nothing."""
-        return ()
 
     def misplaced(self, model: _Model) -> Iterator[str]:
         """Yield that there is no such body."""

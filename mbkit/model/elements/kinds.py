@@ -182,9 +182,10 @@ def acts(model: _Model) -> Mapping[str, tuple[str, ...]]:
     return MappingProxyType({k.name: names for k in kinds if (names := tuple(p.name for p in k.parts(model)))})
 
 
-def that_do(effect: str) -> tuple[str, ...]:
-    """Return the names of the kinds that have an effect, as `Model.without` takes them."""
-    return tuple(k.name for k in PART_KINDS.values() if k.features and effect in k.effects)
+def that_do(effect: str, *sections: str) -> tuple[str, ...]:
+    """Return the names of the kinds that have an effect, of some sections or of all, as `Model.without` takes them."""
+    kinds = (k for k in PART_KINDS.values() if k.features and (k.section in sections or not sections))
+    return tuple(k.name for k in kinds if effect in k.effects)
 
 
 def unregistered(model: _Model) -> Iterator[str]:
