@@ -410,7 +410,16 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         rotation: ArrayLike | None = None,
         rpy: ArrayLike | None = None,
     ) -> None:
-        """Name a frame that is fixed to a body, for poses and Jacobians."""
+        """Name a frame that is fixed to a body, for poses and Jacobians.
+
+        Parameters
+        ----------
+        name, body : str
+        translation : (3,) array_like
+            Origin in body axes, m.
+        rotation, rpy : (3, 3) or (3,) array_like, optional
+            Orientation: a matrix, or URDF's roll, pitch, yaw in rad. At most one.
+        """
         R = self._read.orientation(f"frame {shown(name)}", rotation, rpy)
         self._add(Frame, "frame", name, {"body": body, "translation": translation}, {"rotation": R})
 

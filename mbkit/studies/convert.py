@@ -22,6 +22,7 @@ from mbkit.load.urdf_writer import URDF, urdf_text
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.model.elements.references import KINDS_OF_PARTS
+from mbkit.model.validation import listing
 from mbkit.studies._targets import with_values
 from mbkit.studies.explain.result import Cause
 from mbkit.studies.explain.study import explain
@@ -107,7 +108,7 @@ def _check_names(model: Model, to: str) -> None:
     parts = (p for section in KINDS_OF_PARTS for p in getattr(model, section))
     bad = [name for name in dict.fromkeys([model.name, *(p.name for p in parts)]) if not xml_holds(name)]
     if bad:
-        names = ", ".join(map(repr, bad[:10])) + (f" and {len(bad) - 10} more" if len(bad) > 10 else "")
+        names = listing([*map(repr, bad)], 10)
         raise UnsupportedError(f"convert: {to} is XML, which cannot hold the characters of {names}; rename these parts")
 
 

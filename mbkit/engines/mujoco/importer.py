@@ -29,6 +29,7 @@ from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.model import Coupler, GravityCompensation, Joint, JointCoupling, Loop, Model, PointSpring
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.joint_types import kind_of
+from mbkit.model.validation import listing
 
 _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
 #: What changes no smooth term, and may take long or leave a part of the tree out.
@@ -139,8 +140,7 @@ def _constraints(m: Any) -> list[str]:
     kinds, out = by_key((kind, _called(m.eq(i), i)) for i, kind in enumerate(types)), []
     for kind, names in kinds.items():
         what = "mimic joints are soft equality constraints" if kind == "joint" else f"{kind} constraints are soft"
-        more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-        out.append(f"{what} ({', '.join(names[:_MAX_NAMES])}{more}), in none of the terms")
+        out.append(f"{what} ({listing(names, _MAX_NAMES)}), in none of the terms")
     return out
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -369,45 +369,33 @@ def _residual(model: Model, loop: Loop) -> list[float]:
 # States of both
 
 
-class _Before(NamedTuple):
-    """A joint with coordinates before locking: its locked ones, or None, and how many q and v it has."""
-
-    name: str
-    locked: tuple[float, ...] | None
-    nq: int
-    nv: int
-
-
-def _before(model: Model) -> list[_Before]:
-    """Return the joints of the model that was locked, in their order."""
+def _before(model: Model) -> tuple[Array, Any, Any]:
+    """Return the locked coordinates, and where the numbers of joints that still move are in q and v of before."""
     if not model.locked:
         raise InputError(f"{model.name} has no locked joints; lock makes a model that has")
-    every = {name: _Before(name, x, len(x), nv) for name, x, nv in model.locked}
-    every |= {j.name: _Before(j.name, None, j.type.nq, j.type.nv) for j in model.independent_joints}
-    return [every[j.name] for j in model.joints if j.name in every]
+    sizes = {j.name: (j.type.nq, j.type.nv) for j in model.independent_joints}
+    locked = {name: x for name, x, _ in model.locked}
+    sizes |= {name: (len(x), nv) for name, x, nv in model.locked}
+    names = [j.name for j in model.joints if j.name in sizes]
+    moves = [name not in locked for name in names]
+    of_q, of_v = (np.repeat(moves, [sizes[name][k] for name in names]) for k in (0, 1))
+    return np.array([x for name in names for x in locked.get(name, ())]), of_q, of_v
 
 
 def full_state(model: Model, q: ArrayLike, v: ArrayLike | None) -> tuple[Array, Array]:
     """Return q and v of the model that was locked, as `Model.full_state` says."""
-    joints = _before(model)
+    locked, of_q, of_v = _before(model)
     q, v = model.check_q(q), model.check_v(np.zeros(model.nv) if v is None else v)
     batch_of(q=q, v=v)
     lead = np.broadcast_shapes(q.shape[:-1], v.shape[:-1])
-    whole_q, whole_v = (np.zeros((*lead, n)) for n in (sum(x.nq for x in joints), sum(x.nv for x in joints)))
-    at_q = at_v = 0
-    for name, locked, nq, nv in joints:
-        whole_q[..., at_q : at_q + nq] = q[..., model.layout.q[name]] if locked is None else locked
-        if locked is None:
-            whole_v[..., at_v : at_v + nv] = v[..., model.layout.v[name]]
-        at_q, at_v = at_q + nq, at_v + nv
+    whole_q, whole_v = (np.zeros((*lead, len(x))) for x in (of_q, of_v))
+    whole_q[..., of_q], whole_q[..., ~of_q], whole_v[..., of_v] = q, locked, v
     return whole_q, whole_v
 
 
 def reduced_state(model: Model, q: ArrayLike, v: ArrayLike | None) -> tuple[Array, Array]:
     """Return q and v of the locked model, as `Model.reduced_state` says."""
-    joints = _before(model)
-    of_q = np.repeat([x.locked is None for x in joints], [x.nq for x in joints])
-    of_v = np.repeat([x.locked is None for x in joints], [x.nv for x in joints])
+    _, of_q, of_v = _before(model)
     q = rows("q", q, len(of_q), f"{model.name} before lock", "nq")
     v = rows("v", np.zeros(len(of_v)) if v is None else v, len(of_v), f"{model.name} before lock", "nv")
     batch_of(q=q, v=v)

@@ -115,18 +115,9 @@ class EditingBuilder:
         com: _Vector | None = None,
         inertia: ArrayLike | Sequence[Any] | None = None,
     ) -> None:
-        """Set numbers of a body.
+        """Set numbers of a body; the arguments are those of `add_body`. With `com` the inertia about it stays.
 
-        Parameters
-        ----------
-        name : str
-            A body; a link that a URDF's loader merged with another one is a frame, and its body holds its inertia.
-        mass : float, optional
-            kg.
-        com : (3,) array_like, optional
-            Centre of mass in body axes, m. The inertia stays what it is about the centre of mass.
-        inertia : (3, 3) or (3,) array_like, optional
-            About the centre of mass, in body axes (or its diagonal), kg m².
+        A link that a URDF's loader merged with another one is a frame, and its body holds its inertia.
         """
         self._set("bodies", name, {"mass": mass, "com": com, "inertia": inertia})
 
@@ -261,19 +252,12 @@ class EditingBuilder:
 
         Parameters
         ----------
-        name : str
+        name, mass, com, inertia
+            Those of `add_body`, in the payload's axes.
         at : str
             A frame or a body.
-        mass : float
-            kg.
-        com : (3,) array_like
-            Centre of mass in the payload's axes, m.
-        inertia : (3, 3) or (3,) array_like, optional
-            About the centre of mass, in the payload's axes (or its diagonal), kg m²; without it a point mass.
-        translation : (3,) array_like
-            Origin of the payload's axes in the frame, m.
-        rotation, rpy : (3, 3) or (3,) array_like, optional
-            Orientation of the payload's axes in the frame; at most one.
+        translation, rotation, rpy
+            Those of `add_frame` on it: where the payload's axes stand.
         """
         item = f"payload {shown(name)}"
         frame = self._frame(item, at)

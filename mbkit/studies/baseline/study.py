@@ -35,6 +35,7 @@ from mbkit.errors import (
 )
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.model import Model
+from mbkit.model.validation import listing
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import checked_target, engine_names, with_values
@@ -223,8 +224,8 @@ def check(
     recorded = read(where)
     if recorded.model != model.name and not {*model.coordinate_names} & {*recorded.coordinates}:
         raise BaselineError(
-            f"{where}: the baseline of another robot: {recorded.model!r} with {_shown(recorded.coordinates)}; "
-            f"this is {model.name!r} with {_shown(model.coordinate_names)}"
+            f"{where}: the baseline of another robot: {recorded.model!r} with {listing(recorded.coordinates, 4)}; "
+            f"this is {model.name!r} with {listing(model.coordinate_names, 4)}"
         )
     tell = progress or silent
     moved = _version_changes(recorded.versions, _versions_of(recorded.engines))
@@ -343,10 +344,6 @@ def _checked_model(model: object) -> Model:
     checked = require_motion(model, "record")
     checked.require_values("a baseline")
     return checked
-
-
-def _shown(names: Sequence[str]) -> str:
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 def _states(model: Model, samples: int, seed: int) -> States:
