@@ -95,7 +95,7 @@ class Plan:
     """An explicit method's step for one model in machine code: its parts in order, and the rows of what they use.
 
     `code` compiles a part. `thorough`: of a step that the quick projection onto constraints loses;
-    `fed`: under a state feedback.
+    `fed`: under a state feedback; `behind`: parts that follow it.
     """
 
     def __init__(
@@ -106,8 +106,10 @@ class Plan:
         *,
         thorough: bool = False,
         fed: bool = False,
+        behind: Sequence[Part] = (),
     ) -> None:
-        self.parts = parts_of(equations, method, lambda x: code(x).operations, thorough=thorough, fed=fed)
+        step = parts_of(equations, method, lambda x: code(x).operations, thorough=thorough, fed=fed)
+        self.parts = (*step, *behind)
         self.codes = tuple(code(part) for part in self.parts)
         self.sizes: dict[str, int] = {}
         for part, own in zip(self.parts, self.codes, strict=True):
@@ -150,12 +152,18 @@ class CompiledStep:
         self, q: Array, v: Array, tau: Array, dt: float, *behind: Array, threads: int | None
     ) -> tuple[Array, Array, bool]:
         """Return q and v after the step from one state or a batch, and whether all numbers on the way are finite."""
-        one = (*q.shape[:-1], 1)
-        arrays = {"q": q, "v": v, "tau": tau, "dt": np.full(one, dt), "squares": np.zeros(one)}
+        arrays, finite = self.everything(q, v, tau, np.full((*q.shape[:-1], 1), dt), *behind, threads=threads)
+        return arrays["q1"], arrays["v1"], finite
+
+    def everything(
+        self, q: Array, v: Array, tau: Array, dt: Array, *behind: Array, threads: int | None
+    ) -> tuple[dict[str, Array], bool]:
+        """Return what the parts of a step read and write, by name, and whether all of it is finite; dt (..., 1)."""
+        arrays = {"q": q, "v": v, "tau": tau, "dt": dt, "squares": np.zeros(dt.shape)}
         arrays |= zip(self._extra, behind, strict=True)
         finite = True
         for code, reads, writes in self._steps:
             results, good = code.call_checked(*(arrays[name] for name in reads), threads=threads)
             arrays |= zip(writes, (x[..., 0] for x in results), strict=True)
             finite &= good
-        return arrays["q1"], arrays["v1"], finite
+        return arrays, finite

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, wraps
 from inspect import signature
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -322,7 +322,13 @@ class LagrangianDynamics(Dynamics):
                 f"samples: expected a list of indices, got {which!r}; numpy.flatnonzero makes one of a mask"
             )
         index = index.astype(int)
-        return self._with(self.model, {name: x[index] for name, x in self._batched.items()})
+        if "parameter_values" not in vars(self):
+            return self._with(self.model, {name: x[index] for name, x in self._batched.items()})
+        values = self.parameter_values[index]
+        columns = dict(zip(self.model.parameters, values.T, strict=True))
+        out = self._with(self.model, {name: columns[name] for name in self._batched})
+        vars(out)["parameter_values"] = values
+        return out
 
     def _of_sample(self, i: int) -> LagrangianDynamics:
         own = {name: float(x[i]) for name, x in self._batched.items()}
@@ -492,19 +498,29 @@ class LagrangianDynamics(Dynamics):
             return False
         return not isinstance(self.code("forward_dynamics"), Machine)
 
-    def step_plan(self, method: str, *, thorough: bool = False, fed: bool = False) -> Plan:
+    def step_plan(self, method: str, *, thorough: bool = False, fed: bool = False, behind: Sequence[Part] = ()) -> Plan:
         """Return the compiled parts of an explicit method's step; `compiles_steps` says whether there are some.
 
         `thorough`: with the projection for steps that the usual one loses to their constraints; `fed`: under a state
-        feedback.
+        feedback; `behind`: with these parts at its end.
         """
         from mbkit.engines.compiled_calls import Plan
 
         plans: dict[Any, Plan] = self.equations.kept.setdefault("rollout", {})
-        key = METHODS[method].code_name, thorough, fed
+        key = METHODS[method].code_name, thorough, fed, *(part.name for part in behind)
         if key not in plans:
-            plans[key] = Plan(self.equations, method, self._part, thorough=thorough, fed=fed)
+            plans[key] = Plan(self.equations, method, self._part, thorough=thorough, fed=fed, behind=behind)
         return plans[key]
+
+    def step_with(self, method: str, part: Part) -> CompiledStep:
+        """Return an explicit method's step with a part at its end."""
+        from mbkit.engines.compiled_calls import CompiledStep
+
+        steps: dict[Any, CompiledStep] = self.equations.kept.setdefault("steps", {})
+        key = METHODS[method].code_name, part.name
+        if key not in steps:
+            steps[key] = CompiledStep(self.model, self.equations, self.step_plan(method, behind=[part]), self._part)
+        return steps[key]
 
     def device_steps(self, method: str, *, thorough: bool = False, fed: bool = False) -> CudaSteps:
         """Return the same steps on the GPU of these dynamics."""

@@ -17,6 +17,7 @@ import casadi as ca
 
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import Part, function_of
+from mbkit.derivation.steps.rest import holding
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
 from mbkit.model.changes.dry_friction import ROUNDING
 from mbkit.model.parts import RESTING
@@ -69,8 +70,7 @@ def moreau_parts(equations: Equations, which: list[int], sides: list[str], locks
         forward = equations.function("forward_dynamics")
         a = forward(s["q"], v, force, parameters(side * (1 - still), RESTING * still))
         a = (1 - spread(still)) * a + spread(still * target)
-        inverse = equations.function("inverse_dynamics")
-        needed = inverse(s["q"], v, a, parameters(side * (1 - still), ca.SX(n, 1))) - s["tau"][:nv]
+        needed = holding(equations, s["q"], v, a, s["tau"], parameters(side * (1 - still), ca.SX(n, 1)))
         given = {name: s[name] for name in first[: -len(extra) or None]} | extra
         return function_of("moreau_solve", given, {"a": a, "needed": ca.mtimes(pick, needed)})
 

@@ -46,7 +46,7 @@ _LANES: Final = 8
 _WORTH_COMPILING: Final = 10_000
 _MOST_STATES: Final = 1032
 # What a step writes -> what the next one reads.
-_STATE: Final = {"q1": "q", "w1": "w", "squares1": "squares"}
+_STATE: Final = {"q1": "q", "w1": "w", "squares1": "squares", "margin1": "margin"}
 
 
 class BlockLoop:
@@ -260,20 +260,22 @@ class Chunk(BlockLoop):
         watched: bool = False,
         clock: int | None = None,
     ) -> None:
-        own = [*_STATE.values(), *(["tau"] if torques else []), *([] if clock is None else ["parameters"])]
-        fits = _CACHE // (8 * padded(most) * sum(plan.sizes[name] for name in own))
+        #: What is written -> what the next step reads, or the host.
+        state = {name: before for name, before in _STATE.items() if name in plan.sizes}
+        sizes = {state.get(name, name): rows for name, rows in plan.sizes.items()}
+        own = [*state.values(), *(["tau"] if torques else []), *([] if clock is None else ["parameters"])]
+        fits = _CACHE // (8 * padded(most) * sum(sizes[name] for name in own))
         self.block = max(min(fits, _LONGEST, steps), _SHORTEST)
         self.all_kept = all_kept or fits >= _SHORTEST
         places = dict.fromkeys(own, self.block)
-        places |= dict.fromkeys(_STATE.values(), self.block + 1 if self.all_kept else 2)
-        rooms = {name: (places.get(name, 1), rows) for name, rows in plan.sizes.items() if name not in _STATE}
-        super().__init__(rooms, most, clock)
+        places |= dict.fromkeys(state.values(), self.block + 1 if self.all_kept else 2)
+        super().__init__({name: (places.get(name, 1), rows) for name, rows in sizes.items()}, most, clock)
         self._calls, self._space, self._watched = len(plan.parts), space, watched
         # Of states that take turns a round has both.
         period = 1 if self.all_kept else 2
         calls = list[Call]()
         for j in range(period):
-            after = {name: (state, j + 1) for name, state in _STATE.items()}
+            after = {name: (before, j + 1) for name, before in state.items()}
             calls += [self._call(*pair, j, period, after) for pair in zip(plan.codes, plan.parts, strict=True)]
         self._sequence = KernelSequence(calls)
 
@@ -296,14 +298,22 @@ class Chunk(BlockLoop):
         return to_body_velocity(self._space, q, w)
 
     def again(self) -> None:
-        for name in _STATE.values():
+        for name in self._room.keys() & {*_STATE.values()}:
             room = self._room[name]
             room[0] = room[self._taken % len(room)]
         self._taken = 0
 
 
-def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> SolverResult:
-    """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core."""
+def run_rollout(
+    problem: IntegrationProblem,
+    workers: int | None = None,
+    behind: Sequence[Part] = (),
+    margins: Array | None = None,
+) -> SolverResult:
+    """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core.
+
+    `behind` are parts that follow each step; `margins`, (N, steps), takes what they write of that name.
+    """
     dyn, method, grid, record = problem.dyn, problem.method, problem.grid, GridRecord(problem)
     assert isinstance(dyn, LagrangianDynamics)
     if isinstance(formula := method_of(method).formula, ImplicitTableau):
@@ -333,7 +343,7 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
 
             squares = step_on_device(problem, record, w0, members, thorough=thorough)
             return members[~(squares < BOUND**2)]
-        plan = dyn.step_plan(method, thorough=thorough, fed=law is not None)
+        plan = dyn.step_plan(method, thorough=thorough, fed=law is not None, behind=behind)
         parts = _split(n, _widest(plan), workers)
 
         def new_worker() -> Callable[[slice], Iterator[int]]:
@@ -341,7 +351,12 @@ def run_rollout(problem: IntegrationProblem, workers: int | None = None) -> Solv
             chunk = new_chunk(plan, -(-n // len(parts)), all_kept=dense)
 
             def run(part: slice) -> Iterator[int]:
+                before = 0
                 for end, _ in blocks(chunk, members[part], record.kept[:0] if chunk.all_kept else record.kept):
+                    if margins is not None:
+                        own = chunk.states("margin", np.arange(1, end - before + 1))
+                        margins[members[part], before:end] = own[..., 0]
+                    before = end
                     yield end
                 squares[part] = chunk.states("squares", [0])[:, 0, 0]
 

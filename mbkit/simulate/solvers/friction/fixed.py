@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -196,16 +197,24 @@ class _Members:
         grid, k = self.problem.grid, self.k[rows]
         phase = self._phase if len(rows) == len(self.k) else self._phase.take(rows)
         start = grid.time(int(k.min()))
-        result = self._solved(rows, phase, n, Grid(start, start + n * h, h, n, h))
+        margins = np.empty((len(rows), n)) if phase.still.any() and self._compiled(phase.dyn) else None
+        result = self._solved(rows, phase, n, Grid(start, start + n * h, h, n, h), margins)
         q, v = (x if self.side_by_side else x[None] for x in (result.q, result.v))
         q, v = self.friction.held(replace(phase, still=phase.still[:, None]), q[:, :1], q, v)
         made = np.rint((np.atleast_1d(result.reached) - start) / h).astype(np.intp)
         limit = np.minimum(np.minimum(made, q.shape[1] - 1), np.minimum(left, n))
-        good = self._good(rows, phase, q, v, limit, start, h)
+        good = self._good(rows, phase, q, v, limit, start, h) if margins is None else _first(margins < 0, limit)
         self._window = self._next_window(good, good < limit)
         steps = np.arange(1, q.shape[1])
         inside = steps <= good[:, None]
-        self._keep(np.repeat(rows, good), (k[:, None] + steps)[inside], q[:, 1:][inside], v[:, 1:][inside])
+        record, first = self._record, int(k[0])
+        if (k == first).all() and (good == n).all():
+            # Most blocks: nothing changes.
+            saved = record.rows(first + 1, first + n)
+            for whole, x in ((record.q, q), (record.v, v)):
+                whole[self.members[rows], saved] = x[:, record.kept[saved] - first]
+        else:
+            self._keep(np.repeat(rows, good), (k[:, None] + steps)[inside], q[:, 1:][inside], v[:, 1:][inside])
         last = np.arange(len(rows)), good
         self.q[rows], self.v[rows], self.k[rows] = q[last], v[last], k + good
         self.error = result.error
@@ -218,7 +227,18 @@ class _Members:
         most = _MOST_STATES
         return int(np.clip(_GROWTH * good.mean() * (1 - changed.mean()) ** 3, _BLOCK, most))
 
-    def _solved(self, rows: Indices, phase: Phase, n: int, grid: Grid) -> SolverResult:
+    def _compiled(self, dyn: Dynamics) -> bool:
+        """Return whether the margins of states are machine code with the steps."""
+        known = dyn.derived and method_of(self.problem.method).explicit and not self.problem.torque.callable
+        return known and getattr(dyn, "compiles_steps", False) and getattr(dyn, "device", None) is None
+
+    @cached_property
+    def margin_part(self) -> Any:
+        """The least margin, as a part behind a step."""
+        return self.friction.margin_part(self._phase.dyn)
+
+    def _solved(self, rows: Indices, phase: Phase, n: int, grid: Grid, margins: Array | None = None) -> SolverResult:
+        """Return the run of a block, whose margins are put into an array where one is given, (m, n)."""
         problem, k = self.problem, self.k[rows]
         if self.side_by_side:
             torque: Any = problem.torque.of_steps(self.members[rows], k, n)
@@ -228,7 +248,12 @@ class _Members:
             q, v = self.q[0], self.v[0]
         silent, every = Progress(None, ""), np.arange(n + 1, dtype=np.intp)
         own = IntegrationProblem.on_grid(phase.dyn, problem.method, q, v, grid, every, torque, silent)
-        out = self._solver(phase.dyn)(own)
+        if margins is None:
+            out = self._solver(phase.dyn)(own)
+        else:
+            from mbkit.simulate.solvers.compiled_fixed_step import run_rollout
+
+            out = run_rollout(own, behind=[self.margin_part], margins=margins)
         self.steps += out.steps
         self.evaluations += out.evaluations
         self.jacobians += out.jacobians
@@ -239,8 +264,7 @@ class _Members:
         """Return how many states behind the first are of the phase."""
         which = self.friction.which
         along: Array = phase.sides[:, None, which] * v[:, 1:, which]
-        back: Any = np.any(along < 0, axis=2)
-        good = np.where(back.any(axis=1), np.minimum(back.argmax(axis=1), limit), limit)
+        good = _first(np.any(along < 0, axis=2), limit)
         counts = np.where(phase.still.any(axis=1), good, 0)
         if counts.any():
             row = np.repeat(np.arange(len(good)), counts)
@@ -272,15 +296,15 @@ class _Members:
         start, left = (np.array([f(k) for k in self.k[rows].tolist()]) for f in (grid.time, grid.step))
         while len(rows):
             part, every = _PartOfStep(self, rows, phase, start), np.arange(len(rows))
-            q, v = part.state(every, left)
-            over = part.least(every, left, (q, v)) < 0
+            q, v, margins = part.ahead(every, left)
+            over = margins < 0
             self.q[rows[~over]], self.v[rows[~over]] = q[~over], v[~over]
             self._phase.sides[rows[~over]], self._phase.still[rows[~over]] = phase.sides[~over], phase.still[~over]
             rows, start, left, every = rows[over], start[over], left[over], every[over]
             if not len(rows):
                 break
-            s = part.ends(every, left)
-            q, v = part.state(every, s)
+            s = part.ends(every, left, margins[over])
+            q, v, _ = part.ahead(every, s)
             self.steps += len(rows)
             moved = s >= _FROM * left
             start, left = start + s, left - s
@@ -317,12 +341,17 @@ class _Members:
         self.q[rows], self.v[rows] = state[0], v
         # What let go and came to rest at once did not let go.
         after = self.begin(rows, when, leaving * (moved | pushed)[:, None])
-        for i in np.flatnonzero(decided).tolist():
-            own = before.sides[i], before.still[i]
-            at = float(t[i]), self.q[rows[i]].copy(), self.v[rows[i]].copy()
-            member = self.problem.member(int(self.members[rows[i]]))
-            self.hits += self.friction.hits(own, (after.sides[i], after.still[i]), at, member)
+        for i, name in self.friction.changes(before, after):
+            if decided[i]:
+                row = rows[i]
+                at = float(t[i]), self.q[row].copy(), self.v[row].copy()
+                self.hits.append(Hit(name, *at, self.problem.member(int(self.members[row]))))
         return after, decided
+
+
+def _first(over: Any, limit: Indices) -> Indices:
+    """Return before which place each row is over first, (m,), or its limit if that comes before."""
+    return np.asarray(np.where(over.any(axis=1), np.minimum(over.argmax(axis=1), limit), limit))
 
 
 def _of_each(force: Any) -> Callable[[float, Array, Array], Array]:
@@ -337,53 +366,53 @@ class _PartOfStep:
         self._run, self._rows, self.phase, self._t = run, rows, phase, t
         self._force = run.forces(rows)
         self._method = method_of(run.problem.method)
-        timed = phase.dyn.model.time_parameter is not None
-        self._stepped = self._method.explicit and not timed and not callable(self._force)
-        if run.side_by_side:
-            self._stepped = self._stepped and getattr(phase.dyn, "compiles_steps", False)
+        #: What a step reads of its parameters, where it is machine code with the margins of its end.
+        self._values: Array | None = None
+        dyn: Any = phase.dyn
+        timed = dyn.model.time_parameter
+        if run._compiled(dyn):
+            self._code, self._threads = dyn.step_with(run.problem.method, run.margin_part), dyn.threads
+            self._values = np.atleast_2d(dyn.parameter_values)
+            if timed is not None:
+                place = list(dyn.model.parameters).index(timed)
+                self._values = np.where(np.arange(self._values.shape[1]) == place, t[:, None], self._values)
+        self._stepped = self._method.explicit and timed is None and not callable(self._force)
+        self._stepped = self._stepped and not run.side_by_side
 
-    def _of(self, i: Indices) -> tuple[Phase, Indices, Array, Any]:
-        phase = self.phase if len(i) == len(self._rows) else self.phase.take(i)
-        return phase, self._rows[i], self._t[i], self._force if callable(self._force) else self._force[i]
-
-    def state(self, i: Indices, s: Array) -> tuple[Array, Array]:
-        """Return the states after s seconds, by one step of the method."""
-        run, moving = self._run, np.flatnonzero(s > 0)
+    def ahead(self, i: Indices, s: Array) -> tuple[Array, Array, Array]:
+        """Return the states after s seconds, by one step of the method, and the least of their margins, (m,)."""
+        run, phase = self._run, self.phase if len(i) == len(self._rows) else self.phase.take(i)
+        force = self._force if callable(self._force) else self._force[i]
         q, v = run.q[self._rows[i]], run.v[self._rows[i]]
-        if not len(moving):
-            return q, v
-        phase, rows, t, force = self._of(i[moving])
-        q0, v0, s = q[moving], v[moving], s[moving]
-        if self._stepped:
-            h: Any = s[:, None] if run.side_by_side else float(s[0])
-            ends = phase.dyn._step(self._method, q0, v0, force, h)
+        if self._values is not None:
+            given = q, v, force, s[:, None], self._values[i]
+            arrays, _ = self._code.everything(*given, threads=self._threads)
+            return *run.friction.held(phase, q, arrays["q1"], arrays["v1"]), arrays["margin1"][:, 0]
+        if self._stepped and s[0] > 0:
+            ends = phase.dyn._step(self._method, q, v, force, float(s[0]))
         else:
-            ends = q0.copy(), v0.copy()
-            for j, (start, length) in enumerate(zip(t.tolist(), s.tolist(), strict=True)):
+            ends = q.copy(), v.copy()
+            for j in np.flatnonzero(s > 0):
+                start, length = float(self._t[i[j]]), float(s[j])
                 grid = Grid(start, start + length, length, 1, length)
-                one = run._solved(rows[j : j + 1], phase.take(np.array([j])), 1, grid)
+                one = run._solved(self._rows[i[j : j + 1]], phase.take(np.array([j])), 1, grid)
                 for now, states in zip(ends, (one.q, one.v), strict=True):
                     now[j] = states.reshape(-1, states.shape[-1])[-1]
-        q[moving], v[moving] = run.friction.held(phase, q0, *ends)
-        return q, v
+        q, v = run.friction.held(phase, q, *ends)
+        return q, v, run.friction.margins(phase, run.times(self._t[i] + s), q, v, force).min(axis=1)
 
-    def least(self, i: Indices, s: Array, state: tuple[Array, Array] | None = None) -> Array:
-        """Return how far the velocities are from the end of the phase after s seconds, the nearest one; (m,)."""
-        phase, _, t, force = self._of(i)
-        q, v = self.state(i, s) if state is None else state
-        return np.asarray(self._run.friction.margins(phase, self._run.times(t + s), q, v, force).min(axis=1))
-
-    def ends(self, i: Indices, length: Array) -> Array:
-        """Return after how many seconds phases end, before `length`; 0 where they end at once."""
+    def ends(self, i: Indices, length: Array, over: Array) -> Array:
+        """Return after how many seconds phases end, before `length`, where margins are `over`; 0 if they do at once."""
         first = _FROM * length
         noise = _EPS * (1 + np.abs(self._run.v[self._rows[i]]).max(axis=1))
-        soon, now = self.least(i, first), np.full(len(i), np.inf)
+        soon, now = self.ahead(i, first)[2], np.full(len(i), np.inf)
         early = np.flatnonzero(soon <= -noise)
         if len(early):
-            now[early] = self.least(i[early], 0 * length[early])
+            now[early] = self.ahead(i[early], 0 * length[early])[2]
         # What rests at its bound to the last bits, and is pulled more and more, lets go in the next instant.
-        low, high = np.where(soon <= -noise, 0.0, first), np.where(soon <= -noise, first, length)
-        at_low, at_high = np.where(soon <= -noise, now, noise), np.where(soon <= -noise, soon, -1.0)
+        at_once = soon <= -noise
+        low, high = np.where(at_once, 0.0, first), np.where(at_once, first, length)
+        at_low, at_high = (np.where(at_once, *x) / noise for x in ((now, np.maximum(soon, 2 * noise)), (soon, over)))
         out = np.zeros(len(i))
         open_ = np.flatnonzero(at_low > 0)
 
@@ -393,13 +422,12 @@ class _PartOfStep:
             inside = np.flatnonzero((x > 0) & (x < 1))
             if len(inside):
                 k = j[inside]
-                known[inside] = self.least(i[k], low[k] + x[inside] * (high - low)[k])
+                known[inside] = self.ahead(i[k], low[k] + x[inside] * (high - low)[k])[2] / noise[k]
             return np.asarray(known)
 
         if len(open_):
-            tolerances = {"xatol": 4 * _EPS, "xrtol": 4 * _EPS}
-            found = find_root(
-                least, (np.zeros(len(open_)), np.ones(len(open_))), args=(open_,), tolerances=tolerances
-            ).x
+            ends = np.zeros(len(open_)), np.ones(len(open_))
+            tolerances = {"xatol": 4 * _EPS, "xrtol": 4 * _EPS, "fatol": 1.0}
+            found = find_root(least, ends, args=(open_,), tolerances=tolerances).x
             out[open_] = np.where(np.isfinite(found), low[open_] + found * (high - low)[open_], 0.0)
         return out

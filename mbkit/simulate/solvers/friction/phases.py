@@ -12,7 +12,6 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.model.changes.dry_friction import ROUNDING
-from mbkit.simulate.events import Hit
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
@@ -107,6 +106,14 @@ class Friction:
             out = np.where(phase.still, 1 + ROUNDING - np.abs(self.holding(phase, t, q, v, force)) / self._bound, out)
         return out[..., self.which]
 
+    def margin_part(self, dyn: Any) -> Any:
+        """Return the least margin as a part behind the steps of a phase's dynamics on the own derivation."""
+        from mbkit.derivation.steps.rest import phase_margin
+
+        sliding, which = self._own.sliding, self.which.tolist()
+        sides, locks = ([of[i] for i in which] for of in (sliding.sides, sliding.locks))
+        return phase_margin(dyn.equations, which, sides, locks, self.law.bound[which])
+
     def holding(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return the forces of friction on what rests, and zero elsewhere; of the shape of v."""
         tau = applied(force, t, q, v)
@@ -137,19 +144,14 @@ class Friction:
             leaving = np.where(lets_go, -np.sign(self.holding(phase, t, q, v, force)), 0.0)
         return out, leaving
 
-    def hits(
-        self,
-        before: tuple[Array, NDArray[np.bool_]],
-        after: tuple[Array, NDArray[np.bool_]],
-        state: tuple[float, Array, Array],
-        member: int | None,
-    ) -> list[Hit]:
-        """Return what stops, lets go or turns between sides and rest of a trajectory and the next ones, at t, q, v."""
-        (side, rested), (new, rests) = before, after
+    def changes(self, before: Phase, after: Phase) -> list[tuple[int, str]]:
+        """Return which trajectory's velocity stops, lets go or turns from one phase to the next, in words."""
+        rested, rests = np.atleast_2d(before.still, after.still)
+        turned = np.atleast_2d(before.sides * after.sides < 0) & ~(rested | rests)
         out = []
-        for i in np.flatnonzero((rested != rests) | ((side * new < 0) & ~(rested | rests))):
-            what = "stops" if rests[i] else "lets go" if rested[i] else "turns"
-            out.append(Hit(f"{self._names[i]} {what}", *state, member))
+        for row, i in zip(*(x.tolist() for x in np.nonzero((rested != rests) | turned)), strict=True):
+            what = "stops" if rests[row, i] else "lets go" if rested[row, i] else "turns"
+            out.append((row, f"{self._names[i]} {what}"))
         return out
 
 

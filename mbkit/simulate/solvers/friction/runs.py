@@ -130,8 +130,8 @@ class _Member:
         self.q, self.v = q, v
         # What let go and came to rest at once did not let go.
         out = self.begin(k, t, leaving if moved else None)
-        sides = (phase.sides, phase.still), (out.sides, out.still)
-        self.part.hits += self.friction.hits(*sides, (t, self.q.copy(), self.v.copy()), self.member)
+        for _, name in self.friction.changes(phase, out):
+            self.part.hits.append(Hit(name, t, self.q.copy(), self.v.copy(), self.member))
         return out
 
 
