@@ -891,7 +891,4 @@ def _lint(x: Example, folder: Path) -> Told:
 #: Rows and columns of the matrix.
 ROWS = (*EXAMPLES, *TYPES)
 #: What no column runs, and why.
-NOT_YET = (
-    "stress, whose models are its own", "Newton, MuJoCo Warp and MJX, which are judged in environments of their own",
-    "the pytest plugin, whose fixtures are `mbkit.testing`'s asserts and the baseline",
-)  # fmt: skip
+NOT_YET = ("Newton, MuJoCo Warp and MJX, which are judged in environments of their own",)

@@ -11,13 +11,18 @@ import subprocess
 import tempfile
 from dataclasses import fields, replace
 from functools import cache
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from textwrap import dedent
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
 import mujoco
 import numpy as np
+import pinocchio as pin
+import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
@@ -26,10 +31,12 @@ from mbkit.cli import cli
 from mbkit.codegen.c_source import export_c
 from mbkit.engines.imported import reader
 from mbkit.engines.oracle import OracleDynamics
+from mbkit.engines.versions.engine_version import PACKAGES
 from mbkit.lagrangian import from_model
 from mbkit.lagrangian.printing.summary import SystemSummary
 from mbkit.model import Model
 from mbkit.model.elements.kinds import PART_KINDS
+from mbkit.pytest_plugin import MbkitBaseline
 from mbkit.report import compare_view
 from mbkit.report.page import render
 from mbkit.studies._targets import with_values
@@ -37,6 +44,9 @@ from mbkit.studies.compare.study import Judge
 from mbkit.studies.compare.terms import TERMS, states
 from mbkit.studies.importers.loops import Written, between_joints
 from mbkit.studies.importers.study import stages
+from mbkit.studies.stress.case import Case as StressCase
+from mbkit.studies.stress.case import Problem
+from mbkit.studies.stress.measure import Limits, measure, prepare
 from mbkit.testing import assert_same_dynamics
 from tests import kind_examples
 from tests.kind_examples import EXAMPLES, Arm, Example, size_of
@@ -77,7 +87,9 @@ __all__ = ["COLUMNS", "NOT_YET", "ROWS", "cell", "registered"]
 def _elsewhere(engine: str) -> Any:
     """Return an engine whose environment is the present interpreter."""
     os.environ.setdefault("MBKIT_ENVIRONMENTS", tempfile.mkdtemp())
-    return present(engine, {"pinocchio": "4.1.0", "mujoco": "4.0.0"}[engine])
+    if find_spec(PACKAGES[engine].module.partition(".")[0]) is None:
+        raise NotAskedError(f"{engine} is not installed")
+    return present(engine, version(PACKAGES[engine].distribution))
 
 
 def _sent(x: Example, which: str) -> mb.Dynamics:
@@ -97,6 +109,7 @@ def _remote(x: Example, folder: Path, which: str) -> Told:
 
 
 column("other environments", "sent as data (Pinocchio)", "sent", which="pinocchio")(_remote)
+column("other environments", "sent as data (Drake)", "sent to drake", which="drake")(_remote)
 # A helical joint that could be sent is refused by the MJCF.
 column("other environments", "sent as MJCF (MuJoCo)", which="mujoco")(_remote)
 
@@ -173,6 +186,45 @@ def _in_mujoco(x: Example, folder: Path) -> Told:
         lam = (J @ d.qacc) / (J @ np.linalg.solve(M, J.T))
         d.qacc -= np.linalg.solve(M, J.T) @ lam[0]
     return max(off(d.qacc, a), rows, off(m.dof_frictionloss, loss), bounds, left), notes
+
+
+@column("files", "URDF in Pinocchio alone", "urdf")
+def _in_pinocchio(x: Example, folder: Path) -> Told:
+    """Pinocchio's own importer and algorithms, in its joints, and its numbers of losses and limits.
+
+    Its inverse dynamics know no losses; its planar joints move along the body's axes, and turns without limits are
+    cosine and sine.
+    """
+    path, notes = _written(x.model, folder, "urdf")
+    m = pin.buildModelFromUrdf(str(path), mimic=True)
+    m.gravity.linear = x.model.gravity
+    n, a = x.model.nv, 0.3 * x.v + 0.1
+    T, turned, q = np.zeros((m.nv, n)), np.zeros(m.nv), pin.neutral(m)
+    for j in x.model.independent_joints:
+        if not j.type.nv:
+            continue
+        own, at, there = m.joints[m.getJointId(j.name)], x.model.layout.v[j.name], x.q[x.model.layout.q[j.name]]
+        to = slice(own.idx_v, own.idx_v + own.nv)
+        angle, cut = there[-1], own.nq > own.nv and j.kind != "free"
+        q[own.idx_q : own.idx_q + own.nq] = [*there[:-1], np.cos(angle), np.sin(angle)] if cut else there
+        T[to, at] = np.eye(own.nv)
+        if j.kind == "planar":
+            T[to, at][:2, :2] = rotation(np.eye(3)[2], angle)[:2, :2].T
+            rate, along = x.v[at][2], T[to, at][:2, :2] @ x.v[at][:2]
+            turned[to][:2] = rate * np.array([along[1], -along[0]])
+    force = T.T @ pin.rnea(m, m.createData(), q, T @ x.v, T @ a + turned)
+    worst = off(force, x.force(a, bodies=True))
+    M = np.triu(pin.crba(m, m.createData(), q))
+    worst = max(worst, off(T.T @ (M + np.triu(M, 1).T) @ T, x.mass_matrix(x.plain.q)))
+    for j in (j for j in x.model.independent_joints if j.type.nv == 1):
+        own = m.joints[m.getJointId(j.name)]
+        k = own.idx_v
+        loss = [*m.damping[[k]], *m.upperDryFrictionLimit[[k]], *m.upperVelocityLimit[[k]], *m.upperEffortLimit[[k]]]
+        given = [*j.damping, *j.friction, *j.velocity_limit, *j.effort_limit]
+        bounds = [m.lowerPositionLimit[own.idx_q], m.upperPositionLimit[own.idx_q]] if own.nq == 1 else []
+        given += [*j.lower, *j.upper][: len(bounds)]
+        worst = max(worst, off(*(np.clip(z, -1e9, 1e9) for z in (np.array([*loss, *bounds]), np.array(given)))))
+    return worst, notes
 
 
 @column("files", "engines' own importers")
@@ -512,13 +564,50 @@ def _check(x: Example, folder: Path) -> Told:
     return np.inf if all(r.passed for r in rows) else 0.0
 
 
-@column("studies", "work_precision", close=1e-9)
-def _work_precision(x: Example, folder: Path) -> Told:
-    """Errors against the exact motion from the time zero on, which the study begins at."""
+@column("studies", "pytest plugin")
+def _plugin(x: Example, folder: Path) -> Told:
+    """Its fixture records the model, and fails a test of one without the part."""
+    node = SimpleNamespace(name="test", nodeid="test", user_properties=[])
+    config = SimpleNamespace(getoption=lambda _: True, rootpath=folder)
+    fixture = MbkitBaseline(SimpleNamespace(path=folder / "test_x.py", node=node, config=config))  # type: ignore[arg-type]
+    fixture(x.model, "x", engines=["lagrangian"], samples=1)
+    config.getoption = lambda _: False
+    if (less := without_part(x)) is None:
+        fixture(x.model, "x")
+        return 0.0
+    try:
+        MbkitBaseline(fixture._request)(less, "x")
+    except pytest.fail.Exception as error:
+        return _told(x, str(error))
+    return np.inf
+
+
+def _from_zero(x: Example) -> Example:
+    """Return the example at the time zero, which studies begin at, where it depends on the time."""
     c = x.plain
     y = x.flow(np.array([-x.t]))[-1] if x.model.time_parameter else np.concatenate([c.q, c.v])
     q, u = np.split(y, 2)
-    start = replace(x, plain=replace(c, q=q, v=u, t=0.0 if x.model.time_parameter else x.t))
+    return replace(x, plain=replace(c, q=q, v=u, t=0.0 if x.model.time_parameter else x.t))
+
+
+@column("studies", "stress")
+def _stress(x: Example, folder: Path) -> Told:
+    """A case of the user's own, whose number is nothing; its exact motion is NumPy's."""
+    start = _from_zero(replace(x, tau=0 * x.tau))
+    truth = lambda times: start.motion(np.maximum(times, 1e-12))[0]  # noqa: E731
+    problem = Problem(x.model, start.q, start.v, duration=DURATION, exact=truth, dt=STEP)
+    case = StressCase(x.name, "", "step", "nothing", "", (1.0,), (1.0,), lambda _: problem)
+    known = prepare(case, 1.0, 1e-6, 60.0)
+    if known.truth is None:
+        raise AssertionError(known.how)
+    out = measure(case, 1.0, "lagrangian", "rk4", Limits(60.0, STEP, 1e-8), known.truth)
+    return out.error if out.end == "finished" else np.inf
+
+
+@column("studies", "work_precision", close=1e-9)
+def _work_precision(x: Example, folder: Path) -> Told:
+    """Errors against the exact motion from the time zero on, which the study begins at."""
+    start = _from_zero(x)
     if np.abs(start.accelerated()).max() + np.abs(start.v).max() < 1e-9:
         raise NotAskedError("nothing moves")
     times = np.linspace(0.0, DURATION, 11)

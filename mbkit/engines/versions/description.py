@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, SOLVED, STACKS
+from mbkit.engines.base import BESIDE, OF_ANY_ENGINE, OF_COUPLINGS, OF_TREES, ROTORS_OF_SEVERAL, SOLVED, STACKS
 from mbkit.model import Joint, Model
 from mbkit.model.elements.kinds import joint_types
 from mbkit.model.elements.paths import Path
@@ -60,6 +60,7 @@ _OF_ALL: Final[dict[str, Callable[[Joint], list[dict[str, Any]]]]] = {
 ONE_BY_ONE: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _one)
 STACKED: Final = _OF_ALL | dict.fromkeys(("universal", "spherical_zyx"), _stacked)
 SENT: Final = Path("sent", "", joint_types(*ONE_BY_ONE) | OF_TREES | OF_COUPLINGS, instead=SOLVED)
+SENT_TO_DRAKE: Final = replace(SENT, name="sent to drake", carries=SENT.carries - {ROTORS_OF_SEVERAL})
 NEWTON: Final = replace(SENT, name="newton", carries=SENT.carries - joint_types("helical"))
 _RUN: Final = SENT.carries - BESIDE - {"mimic"}
 _WHY: Final = {"mimic": "it would have to be reduced; load with mimic='free'"}

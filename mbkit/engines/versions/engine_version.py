@@ -14,7 +14,7 @@ from mbkit._check import WORLD, real
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.known_defects import OF_PINOCCHIO
 from mbkit.engines.versions import environment
-from mbkit.engines.versions.description import NEWTON, ONE_BY_ONE, SENT, STACKED, Convention, Steps
+from mbkit.engines.versions.description import NEWTON, ONE_BY_ONE, SENT, SENT_TO_DRAKE, STACKED, Convention, Steps
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model.elements import paths
 from mbkit.model.elements.kinds import joint_types
@@ -110,6 +110,7 @@ PACKAGES: Final[dict[str, Package]] = {
         *("drake", "pydrake.multibody.plant", 440, 20),
         Convention((6, 3, 4, 5, 0, 1, 2), (3, 4, 5, 0, 1, 2), (), {"free": (0, 3), "ball": (0,)}, 3),
         STACKED,
+        SENT_TO_DRAKE,
     ),
     "newton": Package(
         *("newton", "newton", 680, 22),
