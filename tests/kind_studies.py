@@ -547,7 +547,7 @@ def _diff(x: Example, folder: Path) -> Told:
 def _check(x: Example, folder: Path) -> Told:
     """Two engines agree with 34 digits; one that lacks the part does not, and the page has each refusal."""
     untimed = patch("mbkit.studies.compare.study.interleaved", lambda calls: dict.fromkeys(calls, (1.0, 0.0)))
-    undrawn = patch("mbkit.report.figures.svg", lambda *_, **__: "")
+    undrawn = patch.multiple("mbkit.report.figures", svg=lambda *_, **__: "", term_costs=lambda *_: None)
     with untimed, undrawn:
         result = mb.compare(x.model, ("lagrangian", "pinocchio"), 1, terms_only=True)
         if bad := [r.reason for r in result.rows if not r.passed and "known defect" not in r.reason]:

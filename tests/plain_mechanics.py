@@ -173,6 +173,18 @@ class Case:
             M = M + self.mass[k] * J.T @ J + W.T @ R @ self.I[k] @ R.T @ W
         return M + sum(part.inertia(self, q) for part in self.parts)
 
+    def of_velocities(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return C v: the bodies' forces at q̈ = 0, whose accelerations are complex steps along v."""
+        M = derivative(lambda x: np.zeros((self.n, self.n)) + sum(part.inertia(self, x) for part in self.parts), q)
+        out, ahead = np.einsum("ijk,j,k->i", M, v, v) - np.einsum("jki,j,k->i", M, v, v) / 2, q + 1j * _STEP * v
+        for k, (R, _) in enumerate(self.poses(q)):
+            if not self.mass[k]:
+                continue
+            J, W, I = self.moving(k, self.com[k], q), self.turning(k, q), R @ self.I[k] @ R.T
+            a, turned = (np.imag(x @ v) / _STEP for x in (self.moving(k, self.com[k], ahead), self.turning(k, ahead)))
+            out = out + self.mass[k] * J.T @ a + W.T @ (I @ turned + np.cross(W @ v, I @ W @ v))
+        return out
+
     def potential(self, q: np.ndarray) -> Any:
         weight = sum(-m * self.weight @ self.point(f"b{k}", self.com[k], q) for k, m in enumerate(self.mass))
         return weight + sum(part.energy(self, q) for part in self.parts)
@@ -191,8 +203,7 @@ class Case:
         self, t: float, q: np.ndarray, v: np.ndarray, tau: np.ndarray, hold: tuple[int, ...] = ()
     ) -> np.ndarray:
         """Return v̇ by the multipliers of all rows; velocities in `hold` stay zero."""
-        dM = derivative(self.mass_matrix, q)
-        h = np.einsum("ijk,j,k->i", dM, v, v) - np.einsum("jki,j,k->i", dM, v, v) / 2
+        h = self.of_velocities(q, v)
         f = tau + self.loads(t, q, v) - h - derivative(self.potential, q)
         J, bias = np.zeros((0, self.n)), np.zeros(0)
         if any(part.rows for part in self.parts):
