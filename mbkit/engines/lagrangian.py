@@ -581,17 +581,26 @@ class LagrangianDynamics(Dynamics):
                 return out
         return super().step(q, v, tau, dt, method, wrenches, axes, t)
 
+    def single_step(self, method: str) -> Callable[..., tuple[Array, Array] | None]:
+        """Return the machine code of a step as a function of q, v, tau, dt and 0.0; None where it refuses them."""
+        return self._compiled_step(METHODS[method]).single
+
+    def _compiled_step(self, method: Method, *, thorough: bool = False) -> CompiledStep:
+        steps = self._thorough_steps if thorough else self._steps
+        held = steps.get(method.name)
+        if held is None or held[0] is not method:
+            from mbkit.engines.compiled_calls import CompiledStep
+
+            plan = self.step_plan(method.name, thorough=thorough)
+            held = steps[method.name] = method, CompiledStep(self.model, self.equations, plan, self._part)
+        return held[1]
+
     def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
         if not self.compiles_steps:
             return super()._step(method, q, v, tau, dt)
-        for steps in (self._steps, self._thorough_steps) if self.model.constrained else (self._steps,):
-            held = steps.get(method.name)
-            if held is None or held[0] is not method:
-                from mbkit.engines.compiled_calls import CompiledStep
-
-                plan = self.step_plan(method.name, thorough=steps is self._thorough_steps)
-                held = steps[method.name] = method, CompiledStep(self.model, self.equations, plan, self._part)
-            q1, v1, finite = held[1].run(q, v, tau, dt, *self._trailing(q), threads=self.threads)
+        for thorough in (False, True) if self.model.constrained else (False,):
+            step = self._compiled_step(method, thorough=thorough)
+            q1, v1, finite = step.run(q, v, tau, dt, *self._trailing(q), threads=self.threads)
             if finite:
                 break
         # Lost to its constraints all the same: in Python the projection goes on until it is done.

@@ -19,7 +19,7 @@ from mbkit.simulate.events import Event, Hit, at_energy, at_limits, at_section
 from mbkit.simulate.result import Stats
 from mbkit.simulate.run import simulate
 from mbkit.simulate.sensitivity import Sensitivities, sensitivities
-from mbkit.simulate.torque import StateFeedback
+from mbkit.simulate.torque import Policy, StateFeedback
 from mbkit.simulate.trajectory import RunCheck, Trajectory
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "Hit",
     "ImplicitTableau",
     "Method",
+    "Policy",
     "RunCheck",
     "Sensitivities",
     "StateFeedback",

@@ -27,6 +27,7 @@ from mbkit.simulate.constraint_projection import from_consistent
 from mbkit.simulate.events import Event, Hit, as_events
 from mbkit.simulate.integrate import integrate, times_of
 from mbkit.simulate.progress import Progress
+from mbkit.simulate.request import RunRequest
 from mbkit.simulate.result import Ended, Stats
 from mbkit.simulate.run_data import RunData
 from mbkit.simulate.singular_poses import SingularPoses
@@ -49,33 +50,37 @@ def _on_charts(method: Method) -> bool:
     return not method.engines and not method.jacobian
 
 
-def integrate_on_charts(
-    system: Embedded, q0: ArrayLike, v0: ArrayLike, duration: float, *options: Any
-) -> tuple[RunData, FunctionError | None]:
-    """Integrate one state; arguments are those of `mbkit.simulate` without `doubt`, on all coordinates."""
-    run = _Run(system, duration, *options)
-    return run.data(q0, v0), run.error
+def integrate_on_charts(system: Embedded, request: RunRequest) -> tuple[RunData, FunctionError | None]:
+    """Integrate one state on all coordinates; without checks of the run."""
+    if request.wrenches:
+        raise UnsupportedError(
+            "wrenches: a system written as energies has no frames; give the generalized force, torque="
+        )
+    if request.hold is not None:
+        raise UnsupportedError("hold: not on independent coordinates; take the dynamics of the whole system")
+    run = _Run(system, request)
+    return run.data(request.q0, request.v0), run.error
 
 
 class _Run:
     """A run so far, on all coordinates."""
 
-    def __init__(self, system: Embedded, duration: float, method: str, dt: float | None, *options: Any) -> None:
-        rtol, atol, torque, self._save, progress, events, t0 = options
+    def __init__(self, system: Embedded, request: RunRequest) -> None:
+        method, self._save = request.method, request.save
         self.system, self.model, self._method = system, system.model, method_of(method)
-        self._start, duration, dt = times_of(system.dynamics, self._method, t0, duration, dt)
+        self._start, duration, dt = times_of(system.dynamics, self._method, request.t0, request.duration, request.dt)
         self._end, self._duration, self._dt = self._start + duration, duration, dt
-        self.events = as_events(events)
-        self._bar = Progress(progress, f"{self.model.name}: {method} on independent coordinates")
+        self.events = as_events(request.events)
+        self._bar = Progress(request.progress, f"{self.model.name}: {method} on independent coordinates")
         if not _on_charts(self._method):
             usable = ", ".join(m.name for m in METHODS.values() if _on_charts(m))
             raise UnsupportedError(
                 f"{method}: not on independent coordinates, which Newton's iteration leads to; "
                 f"use {usable}, or the form with multipliers, lag.dynamics()"
             )
-        self._torque = Torque(torque, self.model, None, None)
+        self._torque = Torque(request.torque, self.model, None, None)
         self.force: Any = self._torque.of_member(None)(0)
-        self._tolerances = {"rtol": rtol, "atol": atol}
+        self._tolerances: dict[str, Any] = {"rtol": request.rtol, "atol": request.atol}
         self.poses = SingularPoses(system.dynamics)
         #: The run goes through singular poses: the choice is open, and nothing is moved in time.
         self.passes = system.independent is None and self.model.time_parameter is None
@@ -128,9 +133,8 @@ class _Run:
         with warnings.catch_warnings():
             # The whole run warns of its end.
             warnings.simplefilter("ignore", MbkitWarning)
-            part, self.error = integrate(
-                way.dyn, *start, span, self._method.name, torque=way.torque(), t0=0.0, **options
-            )
+            request = RunRequest(*start, span, self._method.name, torque=way.torque(), t0=0.0, **options)
+            part, self.error = integrate(way.dyn, request)
         self._counts += [part.stats.steps, part.stats.evaluations, part.stats.rejected]
         return part
 

@@ -9,26 +9,26 @@ from importlib import import_module
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, real
 from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.constrained import unwatched
-from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
+from mbkit.engines.frames_and_momenta import axes_named
 from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedError
 from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD, METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
 from mbkit.simulate.diagnostics.checks import diagnostics, massless_joints
-from mbkit.simulate.events import Event, as_events
+from mbkit.simulate.events import as_events
 from mbkit.simulate.problem import RUNS, IntegrationProblem
-from mbkit.simulate.progress import Progress, ProgressFunction
+from mbkit.simulate.progress import Progress
+from mbkit.simulate.request import RunRequest
 from mbkit.simulate.result import SolverResult, Stats
 from mbkit.simulate.run_data import Acting, RunData, RunSettings
-from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, save_times
+from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, save_times
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
 _OTHERS: Final = f"use {DEFAULT_METHOD!r} or {ADAPTIVE_METHOD!r}"
@@ -42,48 +42,34 @@ _LEAST_EXTENDED: Final = 1e-32
 _IN_PYTHON: Final = 40
 #: Evaluations in machine code that take the time of one, in a batch.
 _SIDE_BY_SIDE: Final = 8
+#: Part of a step by which the period of a controller may differ from a multiple of it.
+_MULTIPLE: Final = 1e-6
 
 
-def integrate(
-    dyn: Dynamics,
-    q0: ArrayLike,
-    v0: ArrayLike,
-    duration: float,
-    method: str = DEFAULT_METHOD,
-    dt: float | None = None,
-    rtol: float | None = None,
-    atol: float | None = None,
-    torque: ArrayLike | TorqueFunction | None = None,
-    save: ArrayLike | int | None = None,
-    progress: bool | ProgressFunction | None = None,
-    events: Event | Sequence[Event] | None = None,
-    doubt: bool = False,
-    t0: float | None = None,
-    wrenches: RunWrenches | None = None,
-    wrench_axes: str = ALIGNED,
-) -> tuple[RunData, FunctionError | None]:
+def integrate(dyn: Dynamics, request: RunRequest) -> tuple[RunData, FunctionError | None]:
     """Return a run's data, and the error of the torque or event function that ended it.
 
-    Arguments and other errors are those of `mbkit.simulate`.
+    Errors are those of `mbkit.simulate`.
     """
-    chosen = method_of(method)
-    model = dyn.model
-    q, v = model.check_q(q0, "q0"), model.check_v(v0, "v0")
+    chosen, model = method_of(request.method), dyn.model
+    q, v = model.check_q(request.q0, "q0"), model.check_v(request.v0, "v0")
     if model.velocity_map is not None:
         model.velocity_map.check_start(q, v)
     batch = _batch(dyn, batch_of(q0=q, v0=v))
     if batch is not None:
         q, v = np.broadcast_to(q, (batch, model.nq)), np.broadcast_to(v, (batch, model.nv))
-    start, duration, dt = times_of(dyn, chosen, t0, duration, dt)
+    start, duration, dt = times_of(dyn, chosen, request.t0, request.duration, request.dt)
     _require_engine(dyn, chosen)
     q, v = from_consistent(dyn, q, v, start)
-    wanted = as_events(events)
+    wanted = as_events(request.events)
     if wanted and not chosen.events:
         _refuse("events", chosen, [m.name for m in METHODS.values() if m.events])
-    acting = acting_of(dyn, wrenches, wrench_axes)
+    acting = _acting(dyn, request.wrenches, request.wrench_axes)
     if acting and not chosen.wrenches:
         _refuse("wrenches on frames", chosen, [m.name for m in METHODS.values() if m.wrenches])
-    given = [torque, *(wrenches or {}).values()]
+    hold = _period(request, dt if chosen.kind != "adaptive" else None)
+    at_stages = None if hold else request.torque
+    given = [at_stages, *(request.wrenches or {}).values()]
     if any(map(callable, given)) and not chosen.callables:
         _refuse("torque functions", chosen, [m.name for m in METHODS.values() if m.callables])
     _warn_beyond_limits(model, q)
@@ -95,33 +81,41 @@ def integrate(
             MbkitWarning,
         )
     own = dyn._under(*acting) if acting else dyn
-    bar = Progress(progress, f"{model.name}: {method} on {dyn.engine}")
+    bar = Progress(request.progress, f"{model.name}: {request.method} on {dyn.engine}")
     started = time.perf_counter()
     setting: float | Tolerances
     with bar, unwatched(dyn, own):
         if chosen.kind == "adaptive":
-            setting = _tolerances(dyn, chosen, rtol, atol)
-            if isinstance(save, (int, np.integer)):
-                raise InputError(f"save: expected a grid of times for an adaptive method, got the count {save}")
-            times = None if save is None else save_times(save, start, start + duration)
+            setting = _tolerances(dyn, chosen, request.rtol, request.atol)
+            if isinstance(request.save, (int, np.integer)):
+                raise InputError(f"save: expected a grid of times for an adaptive method, got the count {request.save}")
+            times = None if request.save is None else save_times(request.save, start, start + duration)
             whole = times is not None and times[0] == start and times[-1] == start + duration
-            read = Torque(torque, model, batch, len(times) - 1 if whole and times is not None else None, wrenches)
-            problem = IntegrationProblem(own, method, q, v, start, duration, setting, read, times, wanted, bar)
-            applied = read.applied(times)
+            rows = len(times) - 1 if whole and times is not None else None
+            read, jumps = Torque(at_stages, model, batch, rows, request.wrenches), times
+            if hold:
+                jumps, begins, table = _intervals(times, start, duration, hold[0], rows=read.held)
+                read, times = read.sampled(hold[1], begins, table), jumps if times is None else times
+            problem = IntegrationProblem(own, request.method, q, v, start, duration, setting, read, times, wanted, bar)
+            problem = replace(problem, jumps=jumps)
         else:
             setting = dt
-            _refuse_tolerances(chosen, rtol, atol)
+            _refuse_tolerances(chosen, request.rtol, request.atol)
             grid = Grid.of(start, duration, dt)
-            indices = grid.kept(save, (model.nq + model.nv) * (1 if batch is None else batch))
-            read = Torque(torque, model, batch, grid.steps, wrenches)
-            problem = IntegrationProblem.on_grid(own, method, q, v, grid, indices, read, bar)
-            applied = read.applied(grid.times if read.held else None)
+            indices = grid.kept(request.save, (model.nq + model.nv) * (1 if batch is None else batch))
+            read = Torque(at_stages, model, batch, grid.steps, request.wrenches)
+            if hold:
+                steps = max(grid.steps, 1)
+                read = read.sampled(hold[1], [*range(0, steps, round(hold[0] / dt)), steps])
+            problem = IntegrationProblem.on_grid(own, request.method, q, v, grid, indices, read, bar)
+            jumps = grid.times if read.held else None
+        applied = read.applied(jumps)
         outcome = _outcome(problem, chosen)
     seconds = time.perf_counter() - started
     outcome = along_constraints(dyn, outcome)
     settings = RunSettings(start, q.copy(), v.copy(), setting, outcome.doubts)
     doubts = outcome.doubts
-    if doubt and outcome.ended in ("finished", "event"):
+    if request.doubt and outcome.ended in ("finished", "event"):
         states = settings.with_start(outcome.t, outcome.q, outcome.v)
         compiled = chosen.kind == "native" or (_compiles(own) and not read.callable)
         work = max(outcome.steps, outcome.evaluations)
@@ -145,7 +139,39 @@ def integrate(
     return data, outcome.error
 
 
-def acting_of(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | None:
+def _period(request: RunRequest, dt: float | None) -> tuple[float, TorqueFunction] | None:
+    """Return the period of a controller that samples, s, and its function, checked; a fixed step divides the period."""
+    if request.hold is None:
+        return None
+    if not callable(request.torque):
+        raise InputError("hold: expected a torque function, which is sampled; an array is held as it is")
+    hold = real("hold", request.hold, positive=True)
+    if dt is not None and abs(hold / dt - round(hold / dt)) > _MULTIPLE:
+        raise InputError(f"hold: expected a multiple of the step, {dt:g} s, got {hold:g} s")
+    return hold, request.torque
+
+
+def _intervals(
+    times: Array | None, start: float, duration: float, hold: float, *, rows: bool
+) -> tuple[Array, list[int], Indices | None]:
+    """Return the ends of the intervals with one force each, where samples begin among them, and rows of a table.
+
+    A table of wrenches, where there are `rows` of one, has a row between two `times`.
+    """
+    count = max(1, int(np.ceil(duration / hold - _MULTIPLE)))
+    ends: Array = np.append(start + hold * np.arange(count, dtype=float), start + duration)
+    if times is not None and len(times):
+        # A saved time that is a sample's to rounding is the same time.
+        near = times[np.abs(times[:, None] - ends).argmin(axis=0)]
+        ends = np.where(np.abs(near - ends) <= _MULTIPLE * hold, near, ends)
+    if not rows or times is None:
+        return ends, [*range(count + 1)], None
+    every = np.union1d(times, ends)
+    table = np.clip(np.searchsorted(times, every[:-1], side="right") - 1, 0, len(times) - 2)
+    return every, np.searchsorted(every, ends).tolist(), table
+
+
+def _acting(dyn: Dynamics, wrenches: RunWrenches | None, axes: str) -> Acting | None:
     """Return the frames on which wrenches act, and the axes of these; None where there are none."""
     axes = axes_named(axes)
     if wrenches is not None and not isinstance(wrenches, Mapping):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -13,6 +15,7 @@ from mbkit.engines import Dynamics
 from mbkit.errors import InputError
 from mbkit.methods.registry import Tolerances
 from mbkit.model.elements.paths import ALL, Path
+from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import Event
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.time_grid import Grid, Indices, check_room, check_save
@@ -42,6 +45,8 @@ class IntegrationProblem:
     save: Array | None
     events: tuple[Event, ...]
     bar: Progress
+    # Ends of the intervals with one force each, where an adaptive run has several; by default the times to keep.
+    jumps: Array | None = None
     # Of a fixed step: the steps, and the indices of the states to keep.
     equal_steps: Grid | None = None
     kept: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
@@ -59,7 +64,8 @@ class IntegrationProblem:
     ) -> IntegrationProblem:
         """Return the problem of a method with a fixed step."""
         none = Tolerances(0.0, 0.0)
-        return cls(dyn, method, q0, v0, grid.start, grid.end - grid.start, none, torque, None, (), bar, grid, kept)
+        length = grid.end - grid.start
+        return cls(dyn, method, q0, v0, grid.start, length, none, torque, None, (), bar, None, grid, kept)
 
     @property
     def grid(self) -> Grid:
@@ -92,11 +98,23 @@ class IntegrationProblem:
         """States at the start, (N, nq + nv)."""
         return np.concatenate([self.q, self.v], axis=1)
 
-    @property
+    @cached_property
     def stops(self) -> list[float]:
-        """Times at which an adaptive run must stop on its way: where a held torque jumps, and the end."""
-        held = self.save.tolist() if self.save is not None and self.torque.held else []
-        return sorted({*held, self.end} - {self.start})
+        """Times at which an adaptive run must stop on its way: where a held force changes, and the end."""
+        jumps = self.save if self.jumps is None else self.jumps
+        held = [] if jumps is None or not self.torque.held else jumps.tolist()
+        return [*sorted({t for t in held if self.start < t < self.end}), self.end] if self.duration else []
+
+    def interval(self, t: float) -> int:
+        """Return which of the intervals between stops begins at a time, or holds it."""
+        return min(bisect_right(self.stops, t), max(len(self.stops) - 1, 0))
+
+    def sample(self, i: int, k: int, t: float, y: Array) -> None:
+        """Ask a torque that samples for its value from interval k on, where the i-th trajectory is in a state y."""
+        if self.torque.samples is not None:
+            model, one = self.dyn.model, self.batch is None
+            q, v = unit_quaternions(model, y[: model.nq])[0], y[model.nq :]
+            self.torque.sample(k, t, q if one else q[None], v if one else v[None], None if one else np.array([i]))
 
     def member(self, i: int) -> int | None:
         """Return the place of the i-th state in the batch, None where there is none."""
@@ -109,7 +127,8 @@ class IntegrationProblem:
                 f"save: {self.method} does not tell its own steps; give the times to keep, "
                 f"such as [{self.start:g}, {self.end:g}]"
             )
-        return self.save, np.array([self.start, *sorted({*self.save.tolist(), self.end} - {self.start})])
+        stops = self.stops if self.torque.samples is not None else [self.end]
+        return self.save, np.array([self.start, *sorted({*self.save.tolist(), *stops} - {self.start})])
 
     def report(self, i: int) -> Callable[[float], None]:
         """Return a function that reports the time that the i-th state has reached."""

@@ -11,12 +11,12 @@ from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import no_dynamics
 from mbkit.engines.frames_and_momenta import ALIGNED
-from mbkit.errors import DoubtfulRunWarning, FunctionError, MbkitWarning, UnsupportedError
+from mbkit.errors import DoubtfulRunWarning, FunctionError, MbkitWarning
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.simulate.events import Event
 from mbkit.simulate.integrate import integrate
 from mbkit.simulate.progress import ProgressFunction
-from mbkit.simulate.sampled_control import integrate_held
+from mbkit.simulate.request import RunRequest
 from mbkit.simulate.torque import RunWrenches, TorqueFunction
 from mbkit.simulate.trajectory import Trajectory
 
@@ -71,7 +71,8 @@ def simulate(
         Generalized force τ: (nv,) all the time; (steps, nv) or (N, steps, nv), held over each step (for an adaptive
         method, each interval of `save`, which then runs from `t0` to the end); or a function of (t, q, v) that
         returns (nv,), called for one state at a time, at each stage; a controller that samples takes `hold`. A
-        `StateFeedback` is such a function too, which fixed steps on the own derivation evaluate in machine code.
+        `StateFeedback` is such a function too, which fixed steps on the own derivation evaluate in machine code, and
+        `mbkit.simulate.Policy` one of all states of a batch.
     save : int or (K,) array_like, optional
         Which states to keep: every n-th and the last, or those at these times (for a fixed step, multiples of it after
         `t0`); by default all. An adaptive method takes times alone; a batch needs them, and so does ``"cvodes"``.
@@ -103,7 +104,7 @@ def simulate(
     hold : float, optional
         Period of a controller that samples, s: `torque` is called at the start and every `hold` seconds, with the state
         there, and its answer is held until the next call. A fixed step must divide it. On every method, MuJoCo's own
-        too. Without `save`, an adaptive method keeps the states at the samples. Without events.
+        too. Without `save`, an adaptive method keeps the states at the samples.
 
     Returns
     -------
@@ -143,24 +144,18 @@ def simulate(
     >>> bool(abs(run.energy() - run.energy()[0]).max() < 1e-12)
     True
     """
-    loads = (wrenches, wrench_axes)
-    arguments = (q0, v0, duration, method, dt, rtol, atol, torque, save, progress, events)
+    request = RunRequest(
+        *(q0, v0, duration, method, dt, rtol, atol, torque, save),
+        *(progress, events, doubt, t0, wrenches, wrench_axes, hold),
+    )
     error: FunctionError | None
-    if isinstance(dyn, Dynamics) and hold is not None:
-        data, error = integrate_held(dyn, *arguments, doubt, t0, *loads, hold=hold)
-    elif isinstance(dyn, Dynamics):
-        data, error = integrate(dyn, *arguments, doubt, t0, *loads)
+    if isinstance(dyn, Dynamics):
+        data, error = integrate(dyn, request)
     elif hasattr(dyn, "chart"):
-        if wrenches:
-            raise UnsupportedError(
-                "wrenches: a system written as energies has no frames; give the generalized force, torque="
-            )
-        if hold is not None:
-            raise UnsupportedError("hold: not on independent coordinates; take the dynamics of the whole system")
         # Only where SymPy and CasADi are loaded already.
         from mbkit.simulate.independent_coordinates import integrate_on_charts
 
-        data, error = integrate_on_charts(dyn, *arguments, t0)
+        data, error = integrate_on_charts(dyn, request)
     else:
         raise no_dynamics(dyn)
     run = Trajectory(**vars(data))

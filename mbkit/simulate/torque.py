@@ -6,10 +6,12 @@ its generalized force Σ Jᵀ w follows the configuration within a step (`mbkit.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from mbkit.errors import InputError, TorqueError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate.time_grid import Indices
 
+_DOUBLE = np.dtype(np.float64)
 #: torque(t, q, v) -> (nv,), of one state; of a wrench (6,)
 TorqueFunction = Callable[[float, Array, Array], ArrayLike]
 #: Wrenches by the names of the frames on which they act.
@@ -120,6 +123,45 @@ class StateFeedback:
         return np.column_stack([self._constant, self.gain]).ravel()
 
 
+class Policy:
+    """A torque function of many states: one call computes the torques of all trajectories of a batch.
+
+    With a fixed step it is called once for each stage, or with ``hold`` once for each sample. An adaptive method has
+    steps of its own for each trajectory, and asks for few of them or one.
+
+    Parameters
+    ----------
+    function : callable
+        function(t, q, v, members) -> (m, nv), of the time in s, states (m, nq) and (m, nv), and the indices (m,) of
+        the trajectories that these are the states of: a trajectory that ended is not asked for. A run of one state
+        has the index 0.
+
+    Raises
+    ------
+    InputError
+        No callable.
+
+    Examples
+    --------
+    >>> import numpy as np, mbkit as mb
+    >>> targets = np.array([[0.5], [1.0]])
+    >>> servo = mb.simulate.Policy(lambda t, q, v, members: 20 * (targets[members] - q) - 4 * v)
+    >>> dyn = mb.dynamics(mb.catalog.pendulum())
+    >>> run = mb.simulate(dyn, np.zeros((2, 1)), [0.0], 0.1, dt=1e-3, torque=servo, hold=0.01)
+    >>> print(run.tau[:, 0, 0])
+    [10. 20.]
+    """
+
+    def __init__(self, function: Callable[[float, Array, Array, Indices], ArrayLike]) -> None:
+        if not callable(function):
+            raise InputError(f"function: expected a callable of (t, q, v, members), got {type(function).__name__}")
+        self.function = function
+
+    def __call__(self, t: float, q: Array, v: Array) -> Array:
+        """Return the torque at one state, (nv,)."""
+        return np.asarray(np.asarray(self.function(t, q[None], v[None], np.zeros(1, dtype=np.intp)))[0])
+
+
 @dataclass(frozen=True, eq=False)
 class SampledTorque:
     """Values at the saved states of a force with functions in it, (K, n) or (N, K, n)."""
@@ -137,21 +179,53 @@ class TorqueCallback:
 
     def one(self, t: float, q: Array, v: Array, member: int | None = None) -> Array:
         """Return the force on one state; a `TorqueError` where the function raises or returns something else."""
-        when = f"at t = {t:.9g} s" + ("" if member is None else f" for trajectory {member}")
+        if isinstance(self.function, Policy):
+            return np.asarray(self.many(t, q[None], v[None], np.array([member or 0]))[0])
         try:
             # Copies: the function may write into them.
-            value: Any = self.function(t, q.copy(), v.copy())
+            value = self.function(t, q.copy(), v.copy())
         except Exception as error:
-            raise TorqueError(f"{self.name}: the callable raised {type(error).__name__} {when}: {error}") from error
+            raise self.failure(error, t, member) from error
+        return self.checked(value, t, member)
+
+    def many(self, t: float, q: Array, v: Array, members: Indices) -> Array:
+        """Return the forces on states of these members of a batch, (m, size)."""
+        if not isinstance(self.function, Policy):
+            each = zip(q, v, members.tolist(), strict=True)
+            return np.array([self.one(t, *state).copy() for state in each]).reshape(-1, self.size)
         try:
-            return finite_array(self.name, value, (self.size,))
+            value = self.function.function(t, q.copy(), v.copy(), members)
+        except Exception as error:
+            raise self.failure(error, t) from error
+        return self.checked(value, t, count=len(q))
+
+    def failure(self, error: Exception, t: float, member: int | None = None) -> TorqueError:
+        """Return the error of a function that raised one."""
+        what = f"{type(error).__name__} {_when(t, member)}: {error}"
+        failed = TorqueError(f"{self.name}: the callable raised {what}")
+        failed.__cause__ = error
+        return failed
+
+    def checked(self, value: Any, t: float, member: int | None = None, count: int | None = None) -> Array:
+        """Return the answer of a function for one state or so many; the caller copies it before it asks again."""
+        shape = (self.size,) if count is None else (count, self.size)
+        plain = type(value) is np.ndarray and value.dtype == _DOUBLE and value.shape == shape
+        # The checks below take as long as a step.
+        if plain and isfinite(np.vdot(value, value)):
+            return np.asarray(value)
+        try:
+            return finite_array(self.name, value, shape)
         except InputError as error:
-            raise TorqueError(f"{error}; it is what the callable returned {when}") from None
+            raise TorqueError(f"{error}; it is what the callable returned {_when(t, member)}") from None
         except Exception as error:
             raise TorqueError(
                 f"{self.name}: expected an array of numbers, got {type(value).__name__}; "
-                f"it is what the callable returned {when}"
+                f"it is what the callable returned {_when(t, member)}"
             ) from error
+
+
+def _when(t: float, member: int | None) -> str:
+    return f"at t = {t:.9g} s" + ("" if member is None else f" for trajectory {member}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,12 +266,42 @@ Applied = PiecewiseConstantTorque | ForceFunctions | SampledTorque
 Force = Array | Callable[..., Array]
 
 
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """When a controller is asked, and whom it has answered: sample s acts from step begins[s] to begins[s + 1]."""
+
+    controller: TorqueCallback
+    begins: list[int]
+    #: Samples so far of each trajectory, (N,).
+    asked: Indices
+    #: Each step has a row of its own in the table of forces, not each sample.
+    fine: bool
+
+    def at(self, k: int) -> int:
+        """Return which sample acts in step k."""
+        return bisect_right(self.begins, k) - 1
+
+    def row(self, k: int) -> int:
+        """Return the row of the table that acts in step k."""
+        return k if self.fine else self.at(k)
+
+    def rows(self, s: int) -> slice:
+        """Return the rows that sample s fills."""
+        return slice(self.begins[s], self.begins[s + 1]) if self.fine else slice(s, s + 1)
+
+
 class Torque:
     """The arguments `torque` and `wrenches` of a run, checked, and read step by step.
 
     As an array, τ is (nv,), (steps, nv) or (batch, steps, nv), and a wrench (6,), (batch, 6), (steps, 6) or
-    (batch, steps, 6); without `steps` nothing may change in time.
+    (batch, steps, 6); without `steps` nothing may change in time. A sampled torque is such a table, of which a
+    controller fills in each row when the run gets there (`sample`).
     """
+
+    #: Of a sampled torque; and of a part of a run, which trajectory it is and with which step it begins.
+    samples: Samples | None = None
+    _member: int | None = None
+    _first = 0
 
     def __init__(
         self,
@@ -209,7 +313,7 @@ class Torque:
     ) -> None:
         parts: list[tuple[slice, Array]] = []
         functions: list[tuple[slice, TorqueCallback]] = []
-        self._size = model.nv
+        self._size = self._nv = model.nv
         #: Of a torque that is nothing else.
         self.feedback = torque if isinstance(torque, StateFeedback) and not wrenches else None
         if isinstance(torque, StateFeedback) and torque.gain.shape != (model.nv, model.nq + model.nv):
@@ -250,10 +354,87 @@ class Torque:
         out._with_functions = ForceFunctions(PiecewiseConstantTorque(constant, None), ())
         return out
 
+    def sampled(self, controller: TorqueFunction, begins: list[int], table: Indices | None = None) -> Torque:
+        """Return this force with the torque that a controller gives for the steps from each of `begins` to the next.
+
+        Where the force has rows, `table` has the row of each step; by default one after the other.
+        """
+        out, lead = copy(self), self._of_all.shape[:-1]
+        count, rows = len(begins) - 1, self._rows
+        if rows is None:
+            rows = np.broadcast_to(self._of_all[..., None, :], (*lead, count, self._size)).copy()
+        else:
+            rows = rows if table is None else rows[..., table, :]
+            rows = np.broadcast_to(rows, (*lead, *rows.shape[-2:])).copy()
+        # Of what was never sampled nothing is known.
+        rows[..., : self._nv] = np.nan
+        asked = np.zeros(lead or 1, dtype=np.intp)
+        out._rows, fine = rows, self._rows is not None
+        out.samples = Samples(TorqueCallback(controller, self._nv), begins, asked, fine)
+        return out
+
+    def sample(self, k: int, t: float, q: Array, v: Array, members: Indices | None = None) -> None:
+        """Ask a sampled torque for its value from step k on: of a state, or of the states of these members.
+
+        A trajectory that was asked there already is not asked again, so that whoever begins with a step may ask.
+        """
+        samples = self.samples
+        if samples is None:
+            return
+        s = samples.at(self._first + k)
+        assert self._rows is not None
+        if members is None:
+            if samples.asked[0] <= s:
+                self._rows[samples.rows(s), : self._nv] = samples.controller.one(t, q, v, self._member)
+                samples.asked[0] = s + 1
+            return
+        new = samples.asked[members] <= s
+        if new.any():
+            who = members[new]
+            answers = samples.controller.many(t, q[new], v[new], who)
+            self._rows[who, samples.rows(s), : self._nv] = answers[:, None]
+            samples.asked[who] = s + 1
+
+    def as_table(self, count: int) -> Torque:
+        """Return the force of the next steps, which a sampled torque has answered already."""
+        if self.samples is None:
+            return self
+        out = copy(self)
+        out._rows, out.samples, out._first = self.over(0, count), None, 0
+        return out
+
+    @property
+    def sampled_rows(self) -> Array:
+        """The forces of one trajectory in each sample, (samples, n)."""
+        assert self._rows is not None
+        return self._rows
+
+    def next_sample(self, k: int, steps: int) -> int:
+        """Return the first step behind k at which a sampled torque is asked, or how many `steps` there are."""
+        begins = [] if self.samples is None else self.samples.begins
+        i = bisect_right(begins, self._first + k)
+        return begins[i] - self._first if i < len(begins) else steps
+
+    def changes(self, steps: int) -> list[int]:
+        """Return the steps, of so many, at which a sampled torque is asked."""
+        if self.samples is None:
+            return []
+        if not self._first:
+            return self.samples.begins[:-1]
+        return [k - self._first for k in self.samples.begins if 0 <= k - self._first < steps]
+
+    def _row(self, k: int) -> int:
+        return self._first + k if self.samples is None else self.samples.row(self._first + k)
+
     @property
     def held(self) -> bool:
         """Whether the force jumps between steps."""
         return self._rows is not None
+
+    @property
+    def in_each_step(self) -> bool:
+        """Whether each step may have another force, and not each sample alone."""
+        return self._rows is not None and (self.samples is None or self.samples.fine)
 
     @property
     def callable(self) -> bool:
@@ -262,7 +443,7 @@ class Torque:
 
     def during(self, k: int, members: Indices | None) -> Force:
         """Return the force during step k on a single state, or on these members of a batch."""
-        row, one = self._of_all if self._rows is None else self._rows[..., k, :], self._with_functions.one
+        row, one = self._of_all if self._rows is None else self._rows[..., self._row(k), :], self._with_functions.one
         if members is None:
             return partial(one, row) if self._functions else row
         rows = row[members] if row.ndim == 2 else np.broadcast_to(row, (len(members), self._size))
@@ -270,8 +451,10 @@ class Torque:
             return rows
 
         def many(t: float, q: Array, v: Array, part: Any = slice(None)) -> Array:
-            each = zip(rows[part], q, v, members[part].tolist(), strict=True)
-            return np.array([one(held, t, *state) for held, *state in each]).reshape(-1, self._size)
+            out = np.array(rows[part])
+            for place, function in self._functions:
+                out[:, place] = function.many(t, q, v, members[part])
+            return out
 
         return many
 
@@ -282,20 +465,22 @@ class Torque:
         arrays = self._of_all if self._rows is None else self._rows
 
         def during(k: int) -> Force:
-            row = arrays if self._rows is None else arrays[..., k, :]
+            row = arrays if self._rows is None else arrays[..., self._row(k), :]
             row = row[i] if row.ndim == 2 else row
             return partial(self._with_functions.one, row, member=i) if self._functions else row
 
         return during
 
-    def of_part(self, member: int | None, start: int, stop: int | None) -> Torque:
-        """Return the force of one trajectory from step `start` on, up to `stop`, as that of a run of one state."""
+    def of_part(self, member: int | None, start: int) -> Torque:
+        """Return the force of one trajectory from step `start` on, as that of a run of one state."""
         out = copy(self)
-        if self._rows is not None:
-            rows = self._rows if self._rows.ndim == 2 else self._rows[0 if member is None else member]
-            out._rows = rows[start:stop]
-        else:
-            out._constant = self._constant if member is None else self._of_all[member]
+        out._first = self._first + start
+        if member is not None:
+            out._member, out._constant = member, self._of_all[member]
+            if self._rows is not None and self._rows.ndim == 3:
+                out._rows = self._rows[member]
+            if self.samples is not None:
+                out.samples = replace(self.samples, asked=self.samples.asked[member : member + 1])
         out._of_all = out._constant
         out._with_functions = ForceFunctions(PiecewiseConstantTorque(out._constant, None), self._functions)
         return out
@@ -304,7 +489,7 @@ class Torque:
         """Return the force on members of a batch over `count` steps, from a step of its own on for each of them."""
         out = copy(self)
         if self._rows is not None:
-            out._rows = self.at_steps(members, starts, count)
+            out._rows, out.samples, out._first = self.at_steps(members, starts, count), None, 0
         elif self._constant.ndim > 1:
             out._constant = self._constant[members]
         out._of_all = self._of_all[members]
@@ -314,15 +499,15 @@ class Torque:
         """Return the rows of `of_steps`, (m, count, n); behind the last step they are those of the last one."""
         if self._rows is None:
             return np.broadcast_to(self._of_all[members][:, None], (len(members), count, self._size))
-        k = np.minimum(starts[:, None] + np.arange(count), self._rows.shape[-2] - 1)
+        k = np.minimum(self._places(starts[:, None] + np.arange(count)), self._rows.shape[-2] - 1)
         return np.asarray(self._rows[k] if self._rows.ndim == 2 else self._rows[members[:, None], k])
 
     def over_states(self, member: int | None, start: int, count: int) -> Array | None:
         """Return the force that leads to each of some states of one trajectory, (count, n); None of functions."""
         if self._functions:
             return None
-        own = self.of_part(member, start, start + count)
-        return np.broadcast_to(own._constant if own._rows is None else own._rows, (count, self._size))
+        rows = self.of_part(member, start).over(0, count)
+        return np.zeros((count, self._size)) if rows is None else rows
 
     def columns(self, members: Indices | slice, start: int, stop: int) -> Array:
         """Return an array's rows of steps start to stop for members of a batch: (steps, n, members or 1)."""
@@ -330,22 +515,40 @@ class Torque:
             constant = self._constant
             columns: Array = constant[:, None] if constant.ndim == 1 else constant[members, 0].T
             return np.broadcast_to(columns, (stop - start, *columns.shape))
+        if stop - start == 1:
+            row = self._rows[..., self._row(start), :]
+            return row[None, :, None] if row.ndim == 1 else np.ascontiguousarray(row[members].T[None])
+        rows = self._of_steps(start, stop)
         if self._rows.ndim == 2:
-            return self._rows[start:stop, :, None]
-        return np.ascontiguousarray(self._rows[members, start:stop].transpose(1, 2, 0))
+            return self._rows[rows, :, None]
+        return np.ascontiguousarray(self._rows[members][:, rows].transpose(1, 2, 0))
 
     def over(self, start: int, stop: int) -> Array | None:
         """Return the rows of steps start to stop, (steps, nv) or (N, steps, nv); None where all are zero."""
         if self._rows is not None:
-            return self._rows[..., start:stop, :]
+            return self._rows[..., self._of_steps(start, stop), :]
         return np.asarray(np.tile(self._constant, (stop - start, 1))) if self._constant.any() else None
+
+    def _of_steps(self, start: int, stop: int) -> slice | Indices:
+        """Return the rows of the table that act in these steps."""
+        if self.samples is None or self.samples.fine:
+            return slice(self._first + start, self._first + stop)
+        return self._places(np.arange(start, stop))
+
+    def _places(self, k: Indices) -> Indices:
+        """Return the rows of the table that act in steps, of the shape of k."""
+        k = self._first + k
+        if self.samples is None or self.samples.fine:
+            return k
+        return np.searchsorted(self.samples.begins, k, side="right") - 1
 
     def applied(self, bounds: Array | None) -> PiecewiseConstantTorque | ForceFunctions | None:
         """Return the force of a finished run, whose rows were held between `bounds`, s; None where it was zero."""
         held = PiecewiseConstantTorque(self._constant, None)
         if self._rows is not None:
             assert bounds is not None  # rows are read only where there are intervals
-            held = PiecewiseConstantTorque(self._rows, bounds[:-1])
+            which = slice(-1) if self.samples is None or self.samples.fine else self.samples.begins[:-1]
+            held = PiecewiseConstantTorque(self._rows, bounds[which])
         if self._functions:
             return ForceFunctions(held, self._functions)
         return held if held.rows.any() or self.held else None

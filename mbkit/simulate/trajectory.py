@@ -26,6 +26,7 @@ from mbkit.model import Model
 from mbkit.simulate.diagnostics.checks import CHECKED_TIMES, diagnostics
 from mbkit.simulate.events import Hit
 from mbkit.simulate.integrate import integrate
+from mbkit.simulate.request import RunRequest
 from mbkit.simulate.result import Stats
 from mbkit.simulate.run_data import RunData, RunSettings, dynamics_of_trajectory
 from mbkit.simulate.torque import PiecewiseConstantTorque, SampledTorque
@@ -373,10 +374,11 @@ def _step_doubling(
         return
     both = both[np.unique(np.linspace(0, len(both) - 1, CHECKED_TIMES).astype(int))]
     times = states[0][both]
-    one = (dyn, q[0], v[0]) if dyn.samples is None else (dyn.of_samples([0]), q[:1], v[:1])
+    own, q0, v0 = (dyn, q[0], v[0]) if dyn.samples is None else (dyn.of_samples([0]), q[:1], v[:1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MbkitWarning)
-        coarse, _ = integrate(*one, float(times[-1] - settings.t0), method.name, 2 * h, save=times, t0=settings.t0)
+        length = float(times[-1] - settings.t0)
+        coarse, _ = integrate(own, RunRequest(q0, v0, length, method.name, 2 * h, save=times, t0=settings.t0))
     if not coarse.stats.finished or np.abs(coarse.v).max() > _UNSTABLE * np.abs(v).max():
         return
     off = float(np.abs(model.difference(q[both], coarse.q.reshape(len(both), -1))).max()) / motion

@@ -143,6 +143,8 @@ class CompiledAttempts:
 
     def hold(self, k: int, stop: float) -> None:
         arena, self._k, self._stop = self._outer, k, stop
+        if self._torque.samples is not None:
+            self._sample(k)
         arena["tau"][:] = np.column_stack([self._force(k, i) for i in self._which])
         if not self._begun:
             arena.state[self._row["h"]] = self._first(stop)
@@ -154,6 +156,16 @@ class CompiledAttempts:
             attempts.hold(k, stop)
         # A lane that has no way to go stays where it is.
         arena.state[self._row["end"]] = np.where(self._active, stop, arena.state[self._row["t"]])
+
+    def _sample(self, k: int) -> None:
+        """Ask a torque that samples for its value from interval k on, in the states of all places that go on."""
+        places = [i for i in range(self._places) if not self._dropped[i] and i not in self._near]
+        if places:
+            state = self._outer.state[:, places]
+            t, q, w = float(state[self._row["t"], 0]), state[self._at["q"]].T.copy(), state[self._at["w"]].T
+            v = self._space.to_body_velocity(q, w.copy())
+            members = None if self._batch is None else np.array(self._which)[places]
+            self._torque.sample(k, t, q[0] if members is None else q, v[0] if members is None else v, members)
 
     def _first(self, stop: float) -> Array:
         arena = self._outer

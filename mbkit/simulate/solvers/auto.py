@@ -202,7 +202,7 @@ class SwitchingController:
 
     @property
     def _interval(self) -> int:
-        return int(np.searchsorted(self._context.stops, self._at[0], side="right"))
+        return self._context.problem.interval(self._at[0])
 
     def leaves(self, attempts: StepAttempts, place: int, steps: AcceptedSteps) -> bool:
         """Add accepted steps; return whether another method goes on from their end."""

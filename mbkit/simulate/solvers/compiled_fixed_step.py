@@ -9,11 +9,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from itertools import pairwise
 from math import isqrt
 from typing import Any, Final, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbkit._check import Array
 from mbkit.codegen.compiled import Call, Compiled, KernelSequence, aligned, cores
@@ -25,6 +27,7 @@ from mbkit.derivation.steps.midpoint import MOST
 from mbkit.engines.base import at_time
 from mbkit.engines.compiled_calls import Plan
 from mbkit.engines.lagrangian import LagrangianDynamics
+from mbkit.errors import FunctionError, NumericalError, TorqueError
 from mbkit.methods.registry import method_of
 from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
@@ -37,6 +40,8 @@ from mbkit.simulate.time_grid import Grid, Indices
 
 # Half of what a core has in its second cache.
 _CACHE: Final = 2**19
+#: Samples between two reports of how far a run is.
+_REPORTED: Final = 64
 #: Steps of a block, at least and at most: as many as have room in the cache, so that Python has little to do for each.
 _SHORTEST: Final = 16
 _LONGEST: Final = 2048
@@ -60,6 +65,8 @@ class BlockLoop:
     """
 
     block: int
+    #: Each step of a block has a torque of its own.
+    each_step: bool
     carried: tuple[str, str] = ("q", "w")
     #: The time that the parameters hold in a step, in steps behind its start.
     evaluated: float = 0.0
@@ -129,6 +136,11 @@ class BlockLoop:
         """Good steps of the block so far, (n,); None where nobody looks."""
         return None
 
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """Which of the present states are good, (n,)."""
+        raise NotImplementedError
+
     def to_body_velocity(self, q: Array, w: Array) -> Array:  # noqa: ARG002
         """Return the saved w, (n, steps, nv)."""
         return w
@@ -155,15 +167,75 @@ def padded(count: int) -> int:
     return -(-count // _LANES) * _LANES | _LANES
 
 
+class SampleMeeting:
+    """Asks a torque that samples, once at each sample for all parts of a batch, which wait there for one another.
+
+    velocity(t, q, w, members) is mbkit's velocity of states (n, nq) and (n, nv).
+    """
+
+    def __init__(
+        self, problem: IntegrationProblem, parts: int, velocity: Callable[[float, Array, Array, Indices], Array]
+    ) -> None:
+        self._problem, self._velocity, self._k = problem, velocity, 0
+        self._loops: list[tuple[BlockLoop, Indices]] = []
+        self._meeting = threading.Barrier(parts, self._ask) if parts > 1 else None
+        #: Of a torque function that failed.
+        self.error: FunctionError | None = None
+        self.steps = problem.torque.changes(problem.grid.steps)
+
+    def join(self, loop: BlockLoop, members: Indices) -> None:
+        """Add a part."""
+        self._loops.append((loop, members))
+
+    def __call__(self, k: int) -> bool:
+        """Ask at a step, when all parts are there; return whether to go on."""
+        self._k = k
+        if self._meeting is None:
+            self._ask()
+        else:
+            self._meeting.wait()
+        return self.error is None
+
+    def leave(self) -> None:
+        """Let nobody wait for a part that goes no further."""
+        if self._meeting is not None:
+            self._meeting.abort()
+
+    def _ask(self) -> None:
+        problem, k, t = self._problem, self._k, self._problem.grid.time(self._k)
+        members: Indices = np.concatenate([who[loop.alive] for loop, who in self._loops])
+        if not len(members):
+            return
+        order, states = np.argsort(members), list[Array]()
+        for name in self._loops[0][0].carried:
+            states.append(np.concatenate([loop.now(name).T[loop.alive] for loop, _ in self._loops])[order])
+        q, w = states
+        v = self._velocity(t, q, w, members[order])
+        try:
+            if problem.batch is None:
+                problem.torque.sample(k, t, q[0], v[0])
+            else:
+                problem.torque.sample(k, t, q, v, members[order])
+        except FunctionError as error:
+            self.error = error
+
+
 def run_blocks(
-    problem: IntegrationProblem, record: GridRecord, loop: BlockLoop, members: Indices, ends: Iterable[int] = ()
+    problem: IntegrationProblem,
+    record: GridRecord,
+    loop: BlockLoop,
+    members: Indices,
+    ends: Iterable[int] = (),
+    meeting: SampleMeeting | None = None,
 ) -> Iterator[tuple[int, dict[int, list[Array]]]]:
     """Take members of the batch, which are in the loop, through the run in blocks that stop at `ends` too.
 
     Yields the number of steps after each block, and the last good state of the trajectories that were lost in it.
+    Within a block it stops at samples, where all parts of a batch meet.
     """
     grid, torque, kept = problem.grid, problem.torque, record.kept
     k, torques, alive = 0, np.empty(0), np.full(len(members), True)
+    samples, going = ([] if meeting is None else [*reversed(meeting.steps)]), True
     # Most parts of a batch are contiguous, which is read and written faster.
     whole = slice(int(members[0]), int(members[-1]) + 1)
     which: slice | Indices = whole if whole.stop - whole.start == len(members) else members
@@ -171,12 +243,21 @@ def run_blocks(
     stops = {*ends, grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps}
     for stop in sorted(stops):
         while k < stop:
-            n = min(loop.block, stop - k)
-            if torque.held or not torques.size:
-                torques = torque.columns(which, k, k + n)
+            n, at = min(loop.block, stop - k), k
             loop.set_times(grid, k, n)
-            loop.hold(torques)
-            loop.run_to(n)
+            while at < k + n:
+                if meeting is not None and samples and samples[-1] == at:
+                    samples.pop()
+                    going = meeting(at)
+                    if not going:
+                        break
+                end = min(k + n, samples[-1]) if samples else k + n
+                if torque.held or not torques.size:
+                    torques = torque.columns(which, at, end if loop.each_step else at + 1)
+                loop.hold(torques)
+                loop.run_to(end - k)
+                at = end
+            n = at - k
             rows, good, last = record.rows(k + 1, k + n), loop.good, dict[int, list[Array]]()
             if rows.start < rows.stop:
                 q, w = (loop.states(name, kept[rows] - k) for name in loop.carried)
@@ -189,10 +270,27 @@ def run_blocks(
                     last[int(members[m])] = [loop.states(name, [good[m]])[m, 0] for name in loop.carried]
                 alive &= good == n
             yield k + n, last
-            if last and not alive.any():
+            if not going or (last and meeting is None and not alive.any()):
                 return
             loop.again()
             k += n
+
+
+@contextmanager
+def _meeting(meeting: SampleMeeting | None, loop: BlockLoop, members: Indices) -> Iterator[None]:
+    """Let a part take part in the samples; when it is closed before its end, the others end too."""
+    if meeting is None:
+        yield
+        return
+    meeting.join(loop, members)
+    try:
+        yield
+    except threading.BrokenBarrierError:
+        # Another part was stopped.
+        return
+    except BaseException:
+        meeting.leave()
+        raise
 
 
 def run_parts(
@@ -266,6 +364,7 @@ class Chunk(BlockLoop):
         own = [*state.values(), *(["tau"] if torques else []), *([] if clock is None else ["parameters"])]
         fits = _CACHE // (8 * padded(most) * sum(sizes[name] for name in own))
         self.block = max(min(fits, _LONGEST, steps), _SHORTEST)
+        self.each_step = torques
         self.all_kept = all_kept or fits >= _SHORTEST
         places = dict.fromkeys(own, self.block)
         places |= dict.fromkeys(state.values(), self.block + 1 if self.all_kept else 2)
@@ -286,6 +385,10 @@ class Chunk(BlockLoop):
     def run_to(self, step: int) -> None:
         self._sequence.run(self._taken * self._calls, step * self._calls)
         self._taken = step
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        return np.asarray(self.now("squares")[0] < BOUND**2)
 
     @property
     def good(self) -> Indices | None:
@@ -318,6 +421,8 @@ def run_rollout(
     assert isinstance(dyn, LagrangianDynamics)
     if isinstance(formula := method_of(method).formula, ImplicitTableau):
         return _run_collocation(problem, formula)
+    if problem.batch is None and problem.torque.samples is not None and not problem.torque.in_each_step:
+        return _run_step_by_step(problem)
     space = Space(dyn.model)
     w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn.parameter_values
     clock = None if dyn.model.time_parameter is None else list(dyn.model.parameters).index(dyn.model.time_parameter)
@@ -327,49 +432,61 @@ def run_rollout(
     dense = 2 * len(record.kept) > grid.steps
 
     def new_chunk(plan: Plan, most: int, *, all_kept: bool, watched: bool = False) -> Chunk:
-        torques = problem.torque.held
+        torques = problem.torque.in_each_step
         return Chunk(plan, space, most, grid.steps, torques=torques, all_kept=all_kept, watched=watched, clock=clock)
 
-    def blocks(chunk: Chunk, members: Indices, ends: Indices) -> Iterator[tuple[int, dict[int, list[Array]]]]:
+    def blocks(
+        chunk: Chunk, members: Indices, ends: Indices, meeting: SampleMeeting | None = None
+    ) -> Iterator[tuple[int, dict[int, list[Array]]]]:
         more = {} if law is None else {LAW: law.numbers[None]}
         chunk.begin(problem.q[members], w0[members], values[members] if values.ndim == 2 else values, **more)
-        return run_blocks(problem, record, chunk, members, ends.tolist())
+        return run_blocks(problem, record, chunk, members, ends.tolist(), meeting)
 
     def suspects_of(members: Indices, *, thorough: bool) -> Indices:
         """Take members of the batch to the end; return those that were not bounded, or lost to their constraints."""
         n, squares = len(members), np.zeros(len(members))
-        if dyn.device is not None and problem.batch is not None and clock is None:
+        if dyn.device is not None and problem.batch is not None and clock is None and problem.torque.samples is None:
             from mbkit.simulate.solvers.compiled_device_steps import step_on_device
 
             squares = step_on_device(problem, record, w0, members, thorough=thorough)
             return members[~(squares < BOUND**2)]
         plan = dyn.step_plan(method, thorough=thorough, fed=law is not None, behind=behind)
         parts = _split(n, _widest(plan), workers)
+        meeting = None
+        if problem.torque.samples is not None:
+            meeting = SampleMeeting(problem, len(parts), lambda t, q, w, i: to_body_velocity(space, q, w))  # noqa: ARG005
 
         def new_worker() -> Callable[[slice], Iterator[int]]:
             # The parts differ by one state at most.
             chunk = new_chunk(plan, -(-n // len(parts)), all_kept=dense)
 
             def run(part: slice) -> Iterator[int]:
-                before = 0
-                for end, _ in blocks(chunk, members[part], record.kept[:0] if chunk.all_kept else record.kept):
-                    if margins is not None:
-                        own = chunk.states("margin", np.arange(1, end - before + 1))
-                        margins[members[part], before:end] = own[..., 0]
-                    before = end
-                    yield end
-                squares[part] = chunk.states("squares", [0])[:, 0, 0]
+                ends, before = record.kept[:0] if chunk.all_kept else record.kept, 0
+                with _meeting(meeting, chunk, members[part]):
+                    for end, _ in blocks(chunk, members[part], ends, meeting):
+                        if margins is not None:
+                            own = chunk.states("margin", np.arange(1, end - before + 1))
+                            margins[members[part], before:end] = own[..., 0]
+                        before = end
+                        yield end
+                squares[part] = chunk.now("squares")[0]
 
             return run
 
-        run_parts(parts, new_worker, workers, grid.steps, problem.bar)
+        # Parts that wait for one another have a thread each.
+        run_parts(parts, new_worker, workers if meeting is None else len(parts), grid.steps, problem.bar)
+        if meeting is not None and meeting.error is not None:
+            failures.append(meeting.error)
         # A NaN is not below anything.
         return members[~(squares < BOUND**2)]
 
-    lost = dict[int, list[Array]]()
+    lost, failures = dict[int, list[Array]](), list[FunctionError]()
     suspects = suspects_of(np.arange(len(problem.q)), thorough=False)
+    if failures:
+        return record.result(lambda _: "", method_of(method).stages * int(record.steps.sum()), error=failures[0])
     if len(suspects) and dyn.model.constrained:
-        suspects = suspects_of(suspects, thorough=True)
+        if problem.torque.samples is None:
+            suspects = suspects_of(suspects, thorough=True)
         if len(suspects):
             # Near a singular pose stages are projected too, and the pose is named. The others of a batch are done.
             return run_fixed(problem, record, suspects)
@@ -390,6 +507,62 @@ def run_rollout(
     return record.result(why, method_of(method).stages * (int(record.steps.sum()) + len(lost)))
 
 
+def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
+    """Step one state under a torque that samples: blocks that stop at each sample take longer than their steps.
+
+    The loop is flat, and its checks are those of the machine code where they can be: Python's share is a microsecond.
+    """
+    dyn, grid, record, torque, method = problem.dyn, problem.grid, GridRecord(problem), problem.torque, problem.method
+    samples, forces = torque.samples, torque.sampled_rows
+    assert isinstance(dyn, LagrangianDynamics)
+    assert samples is not None
+    controller, begins = samples.controller, [*torque.changes(grid.steps), grid.steps]
+    ask, nv, timed = controller.function, dyn.model.nv, dyn.model.time_parameter is not None
+    # A step whose force is the answer alone.
+    step: Any = dyn.single_step(method) if forces.shape[1] == nv and not dyn.model.parameters else None
+    q, v, start, dt, steps, force = problem.q0, problem.v0, grid.start, grid.dt, grid.steps, forces[0]
+    row = int(record.kept[0] == 0)
+    kept = iter(record.kept[row:].tolist())
+    all_q, all_v, following, error = record.q[0], record.v[0], next(kept, -1), None
+    k = s = sample = 0
+    new, shorter = False, steps - 1 if grid.last != dt else steps
+    try:
+        for k in range(steps):
+            if k == sample:
+                # Copies: the function may write into them.
+                force = ask(start + k * dt, q.copy(), v.copy())
+                if step is None:
+                    forces[s, :nv] = controller.checked(force, start + k * dt)
+                    force = forces[s]
+                if not s % _REPORTED:
+                    problem.bar.update(k / steps)
+                s, new = s + 1, True
+                sample = begins[s]
+            state = None if step is None else step(q, v, force, dt, 0.0)
+            if state is None or k == shorter:
+                if step is not None:
+                    force = controller.checked(force, start + k * dt)
+                state = dyn.step(q, v, force, grid.step(k), method, t=grid.time(k) if timed else None)
+            if new:
+                forces[s - 1], new = force, False
+            q, v = state
+            if k + 1 == following:
+                all_q[row], all_v[row] = q, v
+                row, following = row + 1, next(kept, -1)
+        k = steps
+    except NumericalError:
+        # The reason is found in Python, with the same answers.
+        samples.asked[0] = s
+        return run_fixed(problem)
+    except TorqueError as failed:
+        error = failed
+    except Exception as failed:
+        error = controller.failure(failed, start + k * dt)
+    samples.asked[0] = s
+    record.steps[0] = k
+    return record.result(lambda _: "", method_of(method).stages * k, error=error)
+
+
 def _run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> SolverResult:
     """Take implicit steps; trajectories with one that is not solved, or is near a singular pose, run in Python."""
     dyn = problem.dyn
@@ -403,15 +576,19 @@ def _run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> S
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         tau = np.broadcast_to(first, (len(q0), first.shape[-1]))
         guess = dyn.code(parts.start.name, make=parts.start.make)(q0, v0, w0, tau, *more)[0][..., 0]
-        record, iterations, lost = run_implicit(problem, parts, w0, guess)
+
+        def velocity(t: float, q: Array, w: Array, members: Indices) -> Array:  # noqa: ARG001
+            return to_body_velocity(space, q, w)
+
+        record, iterations, lost, error = run_implicit(problem, parts, w0, guess, velocity)
         if not space.flat:
             # The start is there already, as it was given.
             q, w = (x[:, record.kept > 0] for x in (record.q, record.v))
             flat = space.to_body_velocity(*(x.reshape(-1, x.shape[-1]) for x in (q, w)))
             record.v[:, record.kept > 0] = flat.reshape(w.shape)
-    if lost:
+    if lost and error is None:
         return run_fixed(problem, record, np.array(sorted(lost)))
-    return record.result(lambda _: "", tableau.stages * iterations, iterations)
+    return record.result(lambda _: "", tableau.stages * iterations, iterations, error)
 
 
 def _split(n: int, widest: int, workers: int) -> list[slice]:
@@ -462,7 +639,7 @@ class ImplicitChunk(BlockLoop):
     """
 
     def __init__(self, dyn: LagrangianDynamics, parts: ImplicitParts, count: int, steps: int, *, torques: bool) -> None:
-        self._parts, self.carried, self.evaluated = parts, parts.carried, parts.clock
+        self._parts, self.carried, self.evaluated, self.each_step = parts, parts.carried, parts.clock, torques
         every = (*parts.iteration, parts.end)
         self._codes = {part.name: dyn.code(part.name, make=part.make) for part in every}
         rows = dict[str, int]()
@@ -536,6 +713,10 @@ class ImplicitChunk(BlockLoop):
                 self._iterations = 2
 
     @property
+    def alive(self) -> NDArray[np.bool_]:
+        return self._alive
+
+    @property
     def good(self) -> Indices:
         solved = self._room["misses"][1 : self._taken + 1, 0, : self._count] == 0
         return np.asarray(solved.sum(axis=0))
@@ -552,12 +733,17 @@ class ImplicitChunk(BlockLoop):
 
 
 def run_implicit(
-    problem: IntegrationProblem, parts: ImplicitParts, other: Array, guess: Array
-) -> tuple[GridRecord, int, dict[int, list[Array]]]:
+    problem: IntegrationProblem,
+    parts: ImplicitParts,
+    other: Array,
+    guess: Array,
+    velocity: Callable[[float, Array, Array, Indices], Array],
+) -> tuple[GridRecord, int, dict[int, list[Array]], FunctionError | None]:
     """Run every trajectory, some side by side, and such chunks at once on several cores.
 
-    `other` is what goes with q, (n, nv), and `guess` the first unknown. Returns also Newton's iterations, and the last
-    state of each trajectory that was lost, by its index. The record holds `other` in the place of v.
+    `other` is what goes with q, (n, nv), and `guess` the first unknown; velocity(t, q, other, members) is mbkit's.
+    Returns also Newton's iterations, the last state of each trajectory that was lost, by its index, and the error of a
+    torque function that ended the run. The record holds `other` in the place of v.
     """
     dyn, record, grid = problem.dyn, GridRecord(problem), problem.grid
     assert isinstance(dyn, LagrangianDynamics)
@@ -567,14 +753,18 @@ def run_implicit(
     # Threads append to it, and write their own members.
     iterations, lost = list[int](), dict[int, list[Array]]()
 
+    meeting = None if problem.torque.samples is None else SampleMeeting(problem, count, velocity)
+
     def run(part: slice) -> Iterator[int]:
         members = np.arange(n)[part]
-        chunk = ImplicitChunk(dyn, parts, len(members), grid.steps, torques=problem.torque.held)
+        chunk = ImplicitChunk(dyn, parts, len(members), grid.steps, torques=problem.torque.in_each_step)
         chunk.begin(problem.q[part], other[part], guess[part], values[part] if values.ndim == 2 else values)
-        for end, last in run_blocks(problem, record, chunk, members):
-            lost.update(last)
-            yield end
+        with _meeting(meeting, chunk, members):
+            for end, last in run_blocks(problem, record, chunk, members, (), meeting):
+                lost.update(last)
+                yield end
         iterations.append(chunk.iterations)
 
-    run_parts([slice(a, b) for a, b in pairwise(ends)], lambda: run, dyn.threads or cores(), grid.steps, problem.bar)
-    return record, sum(iterations), lost
+    workers = (dyn.threads or cores()) if meeting is None else count
+    run_parts([slice(a, b) for a, b in pairwise(ends)], lambda: run, workers, grid.steps, problem.bar)
+    return record, sum(iterations), lost, None if meeting is None else meeting.error

@@ -42,8 +42,10 @@ def run_cvodes(problem: IntegrationProblem) -> SolverResult:
         member = problem.member(i)
         force = torque.of_member(member)
         # A jump within a call is one that CVODES does not know of: its error test fails.
-        for k in range(len(times) - 1 if torque.held else 1):
-            piece = times[k : k + 2] if torque.held else times
+        for first in range(len(times) - 1 if torque.held else 1):
+            piece = times[first : first + 2] if torque.held else times
+            k = problem.interval(float(piece[0]))
+            problem.sample(i, k, float(piece[0]), y)
             known = np.concatenate([np.asarray(force(k)), solve.parameters(member)])
             at, intervals, failing = 0, 1, 0
             while at < len(piece) - 1:

@@ -111,6 +111,10 @@ class Stepper:
         """Return the saved w."""
         return w
 
+    def velocity(self, t: float, q: Array, w: Array) -> Array:  # noqa: ARG002
+        """Return mbkit's velocity of a state."""
+        return self.to_body_velocity(q, w)
+
     def reason(self, q: Array, w: Array) -> str:  # noqa: ARG002
         """Return why a step from such a state failed."""
         return DIVERGED
@@ -210,6 +214,8 @@ class SteppedRun:
         """Take step k; return whether any trajectory goes on."""
         grid, torque, step, record = self._problem.grid, self._problem.torque, self._step, self.record
         t, h, why = grid.time(k), grid.step(k), ""
+        if torque.samples is not None:
+            torque.sample(k, t, self._q, step.velocity(t, self._q, self._w), self._members)
         try:
             q, w = step(t, h, self._q, self._w, torque.during(k, self._members))
             good = are_bounded(q, w)

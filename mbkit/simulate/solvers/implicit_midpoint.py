@@ -56,7 +56,10 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
             # It loads LLVM, which interpreting never needs.
             from mbkit.simulate.solvers.compiled_fixed_step import run_implicit
 
-            record, iterations, lost = run_implicit(problem, midpoint, pi0, w0)
+            def velocity(t: float, q: Array, pi: Array, members: Indices) -> Array:
+                return _velocities(dyn, midpoint, members, t, q, pi)
+
+            record, iterations, lost, error = run_implicit(problem, midpoint, pi0, w0, velocity)
 
             def why(i: int) -> str:
                 return _reason(*lost[i])
@@ -150,6 +153,10 @@ class MidpointStepper(Stepper):
         self._members = members
         self._last, self._guess = [w[good] for w in self._last], self._guess[good]
 
+    def velocity(self, t: float, q: Array, w: Array) -> Array:
+        both = np.atleast_2d(q), np.atleast_2d(w)
+        return _velocities(self._dyn, self._midpoint, self._members, t, *both).reshape(w.shape)
+
     def reason(self, q: Array, w: Array) -> str:
         return _reason(q, w)
 
@@ -229,9 +236,14 @@ def _to_velocities(
         who, at = np.nonzero((at_k > 0) & (at_k <= record.steps[:, None]))
         if not len(who):
             continue
-        args = who, times[start + at], q[who, at], v[who, at]
-        if _written_out(dyn):
-            v[who, at] = called(dyn, midpoint.velocity, *args)[0]
-        else:
-            M, p = called(dyn, midpoint.velocity_system, *args)
-            v[who, at] = np.linalg.solve(M, p[..., None])[..., 0]
+        v[who, at] = _velocities(dyn, midpoint, who, times[start + at], q[who, at], v[who, at])
+
+
+def _velocities(
+    dyn: LagrangianDynamics, midpoint: Midpoint, members: Indices, t: Array | float, q: Array, pi: Array
+) -> Array:
+    """Return the velocities of states (n, nq) and (n, nv) in positions and momenta."""
+    if _written_out(dyn):
+        return called(dyn, midpoint.velocity, members, t, q, pi)[0]
+    M, p = called(dyn, midpoint.velocity_system, members, t, q, pi)
+    return np.asarray(np.linalg.solve(M, p[..., None])[..., 0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.versions.dynamics import VersionDynamics
+from mbkit.errors import FunctionError
 from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
@@ -25,20 +26,41 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
     """Run the engine's integrator; nothing is kept after a trajectory's last bounded state."""
     method, grid, torque = method_of(problem.method), problem.grid, problem.torque
     dyn, q0, v0 = problem.dyn, problem.q0, problem.v0
-    rollout = _in_its_process(problem, dyn) if isinstance(dyn, VersionDynamics) else _in_mujoco(problem, dyn)
+    rollout = _in_its_process(dyn) if isinstance(dyn, VersionDynamics) else _in_mujoco(dyn)
     check_room((grid.steps + 1) * len(problem.q), q0.shape[-1] + v0.shape[-1])
+    parts, error, now = [(q0[..., None, :], v0[..., None, :])], None, (q0, v0)
     # MuJoCo's step is fixed for a rollout, so a shortened last step is a rollout of its own.
     whole = grid.steps if grid.last == grid.dt else grid.steps - 1
-    first: dict[str, Any] = {"q0": q0, "v0": v0, "dt": grid.dt, "tau": torque.over(0, whole), "steps": whole}
-    q, v = rollout(integrator=method.scheme, **first)
-    if whole < grid.steps:
+    for k, end in pairwise(sorted({0, *torque.changes(grid.steps), whole, grid.steps})):
         # A state that diverged stays void; it only must not stop the others.
-        good = np.isfinite(q[..., -1, :]).all(-1, keepdims=True) & np.isfinite(v[..., -1, :]).all(-1, keepdims=True)
-        q1, v1 = np.where(good, q[..., -1, :], q0), np.where(good, v[..., -1, :], v0)
-        tail = torque.over(whole, grid.steps)
-        q1, v1 = rollout(integrator=method.scheme, q0=q1, v0=v1, dt=grid.last, tau=tail, steps=1)
-        q, v = np.concatenate([q, q1[..., 1:, :]], -2), np.concatenate([v, v1[..., 1:, :]], -2)
-    q, v = (np.asarray(x)[None] if problem.batch is None else np.asarray(x) for x in (q, v))
+        good = are_bounded(*now)
+        if not good.any():
+            break
+        q, v = (np.where(good[..., None], x, first) for x, first in zip(now, (q0, v0), strict=True))
+        try:
+            if problem.batch is None:
+                torque.sample(k, grid.time(k), q, v)
+            else:
+                torque.sample(k, grid.time(k), q[good], v[good], np.flatnonzero(good))
+        except FunctionError as failed:
+            error = failed
+            break
+        tau = torque.over(k, end)
+        if tau is not None and torque.samples is not None:
+            # Nobody is asked for the torque of what diverged.
+            tau = np.nan_to_num(tau)
+
+        def report(done: float, k: int = k, end: int = end) -> None:
+            problem.bar.update((k + done * (end - k)) / grid.steps)
+
+        q, v = rollout(method.scheme, q0=q, v0=v, dt=grid.step(k), tau=tau, steps=end - k, progress=report)
+        q, v = (np.where(good[..., None, None], np.asarray(x), np.nan) for x in (q, v))
+        parts.append((q[..., 1:, :], v[..., 1:, :]))
+        now = q[..., -1, :], v[..., -1, :]
+    q, v = (np.concatenate(x, axis=-2) for x in zip(*parts, strict=True))
+    missing = grid.steps + 1 - q.shape[-2]
+    q, v = (np.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, missing), (0, 0)], constant_values=np.nan) for x in (q, v))
+    q, v = (x[None] if problem.batch is None else x for x in (q, v))
     good = are_bounded(q, v)
     good[:, 0] = True  # the start is the caller's
     record = GridRecord(problem)
@@ -46,25 +68,25 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
     record.steps[:] = np.logical_and.accumulate(good, axis=1).sum(1) - 1
     record.q, record.v = q[:, record.kept], v[:, record.kept]
     problem.bar.update(1.0)
-    return record.result(lambda _: "", int(record.steps.sum()) * method.stages)
+    return record.result(lambda _: "", int(record.steps.sum()) * method.stages, error=error)
 
 
 _Rollout = Callable[..., tuple[Array, Array]]
 
 
-def _in_mujoco(problem: IntegrationProblem, dyn: Dynamics) -> _Rollout:
+def _in_mujoco(dyn: Dynamics) -> _Rollout:
     # MuJoCo is an extra.
     from mbkit.engines.mujoco.engine import MujocoDynamics
 
     assert isinstance(dyn, MujocoDynamics)
-    return partial(dyn.rollout, progress=problem.bar.update)
+    return dyn.rollout
 
 
-def _in_its_process(problem: IntegrationProblem, dyn: VersionDynamics) -> _Rollout:
+def _in_its_process(dyn: VersionDynamics) -> _Rollout:
     """Return the rollouts of an engine in an environment of its own."""
 
     def rollout(integrator: str, **more: Any) -> tuple[Array, Array]:
-        return dyn.own_run(method=integrator, progress=problem.bar.update, **more)
+        return dyn.own_run(method=integrator, **more)
 
     return rollout
 
@@ -86,13 +108,15 @@ def run_drake(problem: IntegrationProblem) -> SolverResult:
     assert isinstance(dyn, DrakeDynamics)
     scheme, (_, times), runs = method_of(problem.method).scheme, problem.saved_times(), list[DrakeRun]()
 
-    def walk(i: int, _y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, None]]:
+    def walk(i: int, y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, None]]:
         force = problem.torque.of_member(problem.member(i))
         run = DrakeRun(
             dyn, scheme, problem.tolerances.rtol, problem.start, problem.q[i], problem.v[i], problem.report(i)
         )
         runs.append(run)
-        for k, t in enumerate(times[1:].tolist()):
+        for begin, t in pairwise(times.tolist()):
+            k = problem.interval(begin)
+            problem.sample(i, k, begin, y)
             run.push(np.asarray(force(k)))
             try:
                 y = np.concatenate(run.over(t))

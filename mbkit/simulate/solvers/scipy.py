@@ -56,7 +56,7 @@ class _Solve:
             self.jacobian = RateJacobian(problem.dyn)
         self._stops = problem.stops
         if problem.save is not None and not self._method.multistep:
-            self._stops = sorted({*problem.save.tolist(), problem.end} - {problem.start})
+            self._stops = sorted({*problem.save.tolist(), *problem.stops, problem.end} - {problem.start})
 
     def steps(self, i: int, y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, Any]]:
         """Yield the end of each step, and a function of time for states within it."""
@@ -67,9 +67,12 @@ class _Solve:
                 self.jacobian.only(member)
         force_of, t = problem.torque.of_member(member), problem.start
         solver: Any = None
-        for k, stop in enumerate(self._stops):
-            force = force_of(k)
-            if solver is None or problem.torque.held:
+        interval = -1
+        for stop in self._stops:
+            before, interval = interval, problem.interval(t)
+            problem.sample(i, interval, t, y)
+            force = force_of(interval)
+            if solver is None or interval != before:
                 # A held force jumps here, and with it all that the solver remembers. A multistep method starts again
                 # with order 1, for which its last step is too long.
                 first = None if solver is None or self._method.multistep else min(solver.h_abs, stop - t)
@@ -78,10 +81,10 @@ class _Solve:
                 raise diverged(self.rates.why)
             solver.t_bound, solver.status = stop, "running"
             while solver.status == "running":
-                before = t, y
+                start = t, y
                 solver = self._step(record, solver, force, stop)
                 t, y = float(solver.t), solver.y.copy()
-                yield t, y, self._within(solver, before, force)
+                yield t, y, self._within(solver, start, force)
 
     def _solver(self, t: float, y: Array, force: Force, stop: float, first: float | None) -> Any:
         from scipy import integrate

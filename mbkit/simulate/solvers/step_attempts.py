@@ -115,6 +115,7 @@ class RungeKuttaAttempts:
 
     def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
         (member,) = which
+        self._member = member
         if self._batch is not None:
             self._field.only(np.array([member]))
         self._of_interval = self._torque.of_member(None if self._batch is None else member)
@@ -138,6 +139,12 @@ class RungeKuttaAttempts:
         return self._error < 1 and not self._field.near_singular
 
     def hold(self, k: int, stop: float) -> None:
+        if self._torque.samples is not None and not self._dropped:
+            v = self._space.to_body_velocity(self._q, self._w)
+            if self._batch is None:
+                self._torque.sample(k, self._t, self._q, v)
+            else:
+                self._torque.sample(k, self._t, self._q[None], v[None], np.array([self._member]))
         self._force, self._stop, self._fresh = self._of_interval(k), stop, True
         if not self._h and not self._dropped:
             self._h = self._first()

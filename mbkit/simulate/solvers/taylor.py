@@ -56,15 +56,20 @@ def run_taylor(problem: IntegrationProblem) -> SolverResult:
             settled = Rates(own).settled if dyn.model.constrained and kind.bits == 53 else None
             behind = kind.array(*own.constant_values) if dyn.bits > 53 else own.parameter_values.reshape(-1)
             across = _Across(problem, i) if settled else None
-            steps, force = TaylorSteps(system, integrator, kind, behind, settled, across), torque.of_member(member)
+            steps, held = TaylorSteps(system, integrator, kind, behind, settled, across), torque.of_member(member)
+
+            def force(k: int) -> Any:
+                problem.sample(i, k, steps.t, rounded(steps.y))
+                return held(k)
+
             try:
                 for t in steps(problem.start, y, stops, force):
                     yield t, rounded(steps.y), lambda t: rounded(steps.at(t))
             except StoppedError as error:
                 if error.ended != "diverged" or steps.crossed:
                     raise
-                interval = min(int(np.searchsorted(stops, steps.t, side="right")), len(stops) - 1)
-                raise diverged(_reason(own, steps.t, rounded(steps.y), force(interval))) from None
+                last = held(problem.interval(steps.t))
+                raise diverged(_reason(own, steps.t, rounded(steps.y), last)) from None
 
         records = run_each(problem, walk)
     return assemble_result(problem, records, evaluations=sum(record.steps for record in records))

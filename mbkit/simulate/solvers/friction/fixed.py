@@ -120,6 +120,7 @@ class _Members:
         if not grid.steps or not len(self.k):
             return
         rows = np.arange(len(self.k))
+        self._sample(rows)
         self._phase = self.begin(rows, self.times(np.full(len(rows), grid.start)))
         parts = len(self.problem.q) // len(self.k)
         while self.error is None and self._going.any():
@@ -128,6 +129,18 @@ class _Members:
             self.problem.bar.update((self.members[0] / len(self.k) + self.k.mean() / grid.steps) / parts)
 
     # What acts
+
+    def _sample(self, rows: Indices) -> None:
+        """Ask a torque that samples for its value, in the states of those who are hindmost."""
+        torque = self.problem.torque
+        if torque.samples is None:
+            return
+        k = int(self.k[rows].min())
+        rows, t = rows[self.k[rows] == k], self.problem.grid.time(k)
+        if self.side_by_side:
+            torque.sample(k, t, self.q[rows], self.v[rows], self.members[rows])
+        else:
+            self.problem.sample(int(self.members[0]), k, t, np.concatenate([self.q[0], self.v[0]]))
 
     def times(self, t: Array) -> Any:
         """Return times as dynamics and forces take them: one of each trajectory, or that of one."""
@@ -181,6 +194,8 @@ class _Members:
         """Return who goes on, the equal steps before each, and how many of what length: where time enters, the last."""
         grid, rows = self.problem.grid, np.flatnonzero(self._going)
         stop = grid.steps if grid.last == grid.dt else grid.steps - 1
+        # No torque is sampled in a state behind the end of a phase, and all go on from a sample together.
+        stop = min(stop, self.problem.torque.next_sample(int(self.k[rows].min()), stop))
         left = stop - self.k[rows]
         if not left.any():
             return rows, left + 1, 1, grid.last
@@ -194,6 +209,7 @@ class _Members:
 
     def _block(self) -> None:
         rows, left, n, h = self._next()
+        self._sample(rows)
         grid, k = self.problem.grid, self.k[rows]
         phase = self._phase if len(rows) == len(self.k) else self._phase.take(rows)
         start = grid.time(int(k.min()))
@@ -244,7 +260,7 @@ class _Members:
             torque: Any = problem.torque.of_steps(self.members[rows], k, n)
             q, v = self.q[rows], self.v[rows]
         else:
-            torque = problem.torque.of_part(self._alone, int(k[0]), int(k[0]) + n)
+            torque = problem.torque.of_part(self._alone, int(k[0])).as_table(n)
             q, v = self.q[0], self.v[0]
         silent, every = Progress(None, ""), np.arange(n + 1, dtype=np.intp)
         own = IntegrationProblem.on_grid(phase.dyn, problem.method, q, v, grid, every, torque, silent)

@@ -72,6 +72,7 @@ class _InPython:
         q, v = self._problem.q[i], self._problem.v[i]
         for k in range(grid.steps):
             try:
+                self._problem.sample(i, k, grid.time(k), np.concatenate([q, v]))
                 q, v = self._step(grid.time(k), grid.step(k), q, v, self._force(k))
             except NumericalError as error:
                 return k, k, str(error)
@@ -162,6 +163,8 @@ class _Compiled:
         k, attempts, why = 0, 0, ""
         while k < grid.steps and not why:
             # As many steps at once as have one length and one force.
+            q, w = (self._now[self._at[name], 0] for name in ("q", "w"))
+            self._problem.sample(self._i, k, grid.time(k), np.concatenate([q, self._space.to_body_velocity(q, w)]))
             last = k + 1 if held or k == grid.steps - 1 else grid.steps - (grid.step(grid.steps - 1) != grid.dt)
             self["tau"][:] = np.asarray(self._force(k))[:, None]
             self["dt"][:] = grid.step(k)

@@ -104,12 +104,13 @@ class _Member:
         self._stuck = 0
 
     def begin(self, k: int, t: float, leaving: Array | None = None) -> Phase:
-        """Return the phase from here."""
+        """Return the phase from here, with a torque that samples asked for its value."""
+        self.problem.sample(self.member or 0, k, t, np.concatenate([self.q, self.v]))
         return self.friction.phase(t, self.q, self.v, self.force(k), leaving)
 
     def solve(self, phase: Phase, k: int, **changes: object) -> SolverResult:
         """Solve the rest of the problem from here, with the force from row k on."""
-        torque = self.problem.torque.of_part(self.member, k, None)
+        torque = self.problem.torque.of_part(self.member, k)
         own = replace(self.problem, dyn=phase.dyn, q0=self.q, v0=self.v, torque=torque, **changes)  # type: ignore[arg-type]
         result = self._solver(phase.dyn)(own)
         q, v = self.friction.held(phase, self.q, result.q, result.v)
