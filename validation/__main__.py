@@ -66,6 +66,7 @@ PARTS = {
     "auto": Part(15, ("auto.json",), "method auto beside the best method of each hard problem"),
     "bench_terms": Part(15, ("terms.json",), "one sample of inverse and forward dynamics"),
     "operations": Part(10, ("operations.json",), "operations of each form, and the vector units' limit"),
+    "sampled": Part(1, ("sampled.json",), "controllers that sample: runs beside loops of steps, and batches"),
     "bench_single_calls": Part(1, ("single_calls.json",), "a single call, beside the bare call of the engine"),
     "friction": Part(6, ("friction.json",), "dry friction: references, orders across phases, a smoothed law"),
     "four_bar": Part(1, ("four_bar.json",), "a loop in four engines: error, gap and time of a step"),

@@ -417,12 +417,13 @@ def run_rollout(
 
     `behind` are parts that follow each step; `margins`, (N, steps), takes what they write of that name.
     """
-    dyn, method, grid, record = problem.dyn, problem.method, problem.grid, GridRecord(problem)
+    dyn, method, grid = problem.dyn, problem.method, problem.grid
     assert isinstance(dyn, LagrangianDynamics)
     if isinstance(formula := method_of(method).formula, ImplicitTableau):
         return _run_collocation(problem, formula)
     if problem.batch is None and problem.torque.samples is not None and not problem.torque.in_each_step:
         return _run_step_by_step(problem)
+    record = GridRecord(problem)
     space = Space(dyn.model)
     w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn.parameter_values
     clock = None if dyn.model.time_parameter is None else list(dyn.model.parameters).index(dyn.model.time_parameter)
