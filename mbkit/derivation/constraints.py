@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from typing import Any, Final, NamedTuple
 
 import casadi as ca
@@ -32,12 +33,13 @@ from mbkit._reproducible import DEPENDENT, independent_rows
 from mbkit.derivation.body_motion import BodyMotion
 from mbkit.derivation.elements.arithmetic import casadi_arithmetic
 from mbkit.derivation.kinematics import Kinematics, Vector, add, column, constant_transposed_times, follower
+from mbkit.derivation.link_mechanics import LinkMechanics, Motion
 from mbkit.derivation.mass_matrix_solve import ConstraintFactors, ConstraintTerms, Factors, OrthogonalColumns
 from mbkit.errors import InputError
 from mbkit.model import Model, NoSlip
 from mbkit.model.elements.motion_laws import MOTION_LAWS
 from mbkit.model.elements.references import called
-from mbkit.model.joint_types import cross3
+from mbkit.model.joint_types import cross3, dot3
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.manifold import closest_configuration, integrate, random_state
 from mbkit.model.parts import Coupler, Loop
@@ -126,10 +128,48 @@ def _every_row(kin: Kinematics, time: Any) -> Iterator[_Row]:
                 yield _Row(part.name, f"motion of {part.name!r}", at - path)
 
 
-def _terms(kin: Kinematics, time: Any, rows: list[_Row]) -> ConstraintTerms:
+def loop_drifts(kin: Kinematics, mechanics: LinkMechanics) -> dict[str, Any]:
+    """Return γ by the names of rows of loops whose ends the world carries: f̈ at v̇ = 0, from the motion of the links.
+
+    The ends' accelerations are those of the links, which inverse dynamics takes too, and the second derivatives of a
+    frame's axes are (ω̇ × + ω × ω ×) of them.
+    """
+    out: dict[str, Any] = {}
+    for loop in kin.model.loops:
+        if kin.model.carrier(loop) != "world":
+            continue
+        ends, values = _ends(kin, loop), kin.values.of(loop)
+        places, turns, bends = [], [], []
+        for body, point, rotation, axes in (
+            (loop.body_a, values.translation_a, values.rotation_a, ends.a),
+            (loop.body_b, values.translation_b, values.rotation_b, ends.b),
+        ):
+            linear, spin, turning = mechanics.drift_at(body, list(point), rotation)
+            motion = Motion.of(spin)
+            columns = [linear, *(add(cross3(turning, e), motion.centripetal(e)) for e in np.eye(3).tolist())]
+            place, *bent = ([dot3(row, x) for row in zip(*axes, strict=True)] for x in columns)
+            places.append(place)
+            bends += bent
+            turns += [[dot3(row, cross3(spin, e)) for row in zip(*axes, strict=True)] for e in np.eye(3).tolist()]
+        gap = [x - y for x, y in zip(*places, strict=True)]
+        speed = ca.vertsplit(ca.jtimes(column(ends.gap), kin.q, kin.qdot))
+        names, rows = LOOP_ROWS[loop.kind]
+        x, dx, ddx = (ca.SX.sym(name, 21) for name in ("x", "dx", "ddx"))
+        g, *frames = (ca.vertsplit(x[3 * k : 3 * k + 3]) for k in range(7))
+        f = column(rows(LoopEnds(g, frames[:3], frames[3:], ends.length)))
+        f = ca.jtimes(ca.jtimes(f, x, dx), ca.vertcat(x, dx), ca.vertcat(dx, ddx))
+        actual = (*ends.gap, *chain(*ends.a, *ends.b)), (*speed, *chain(*turns)), (*gap, *chain(*bends))
+        f = ca.substitute(f, ca.vertcat(x, dx, ddx), column(chain(*actual)))
+        out |= {f"{called(loop.section)} {loop.name!r} {name}": f[i] for i, name in enumerate(names)}
+    return out
+
+
+def _terms(
+    kin: Kinematics, time: Any, rows: list[_Row], known: Callable[[], dict[str, Any]] | None = None
+) -> ConstraintTerms:
     turned = kin.qdot if kin.model.quaternions else None
     value, speeds = (column(row.value for row in rows if row.moves is moves) for moves in (False, True))
-    return ConstraintTerms(value, kin.q, kin.v, time, tuple(row.name for row in rows), turned, speeds)
+    return ConstraintTerms(value, kin.q, kin.v, time, tuple(row.name for row in rows), turned, speeds, known)
 
 
 def _ways(kin: Kinematics) -> Any:
@@ -155,7 +195,7 @@ class Constraints:
         The Jacobian of all rows, those that say nothing among them.
     """
 
-    def __init__(self, kin: Kinematics, time: Any) -> None:
+    def __init__(self, kin: Kinematics, time: Any, known: Callable[[], dict[str, Any]] | None = None) -> None:
         self._kin = kin
         rows = _rows(kin, time)
         choice = self.choice = choose_rows(kin.model)
@@ -166,8 +206,9 @@ class Constraints:
         self.ways = _ways(kin)
         self.every = _terms(kin, time, rows).jacobian
         #: All rows that say something, and those of the equation.
-        self.all = _terms(kin, time, kept)
-        self.terms = self.all if not choice.redundant else _terms(kin, time, [kept[i] for i in self.independent])
+        self.all = self.terms = _terms(kin, time, kept, known)
+        if choice.redundant:
+            self.terms = _terms(kin, time, [kept[i] for i in self.independent], known)
 
     def spread(self, multipliers: Any) -> Any:
         """Return the multipliers of all rows with the least norm whose force is that of the independent ones."""

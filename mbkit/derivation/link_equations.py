@@ -11,14 +11,14 @@ form is taken where it has fewer operations and both agree to rounding at hard p
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Final
 
 import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.derivation.constraints import ConstrainedMotion
+from mbkit.derivation.constraints import ConstrainedMotion, Constraints, loop_drifts
 from mbkit.derivation.equations import NOTHING, Acting, ConstrainedEquations, Elimination, Equations
 from mbkit.derivation.gauss_elimination import GaussElimination
 from mbkit.derivation.kinematics import column
@@ -318,6 +318,11 @@ class LinkEquations(Equations):
 
 class ConstrainedLinkEquations(ConstrainedMotion, LinkEquations):
     """The same with constraints."""
+
+    @cached_property
+    def constraint_rows(self) -> Constraints:
+        """All rows, and which of them are independent, with γ of loops from the motion of the links."""
+        return Constraints(self.kin, self.time, cache(lambda: loop_drifts(self.kin, self.sound)))
 
 
 def _size(x: Any) -> int:

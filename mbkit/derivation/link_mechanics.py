@@ -24,11 +24,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import casadi as ca
 
-from mbkit.derivation.kinematics import Vector, add
+from mbkit.derivation.kinematics import Vector, add, constant_times, constant_transposed_times
 from mbkit.derivation.links import Inertia, Link, Links
 from mbkit.derivation.model_values import is_zero, scalar
 from mbkit.derivation.rotations import SYMMETRIC, Rotation, exact_congruence, to_child, to_parent
@@ -68,6 +68,9 @@ class Motion:
         ]
 
 
+_STILL: Final = Motion.of([0.0] * 3)
+
+
 class LinkMechanics:
     """Motions, drifts and forces of a tree's links.
 
@@ -95,9 +98,8 @@ class LinkMechanics:
         self.motions: list[Motion] = []
         self.drifts: list[Vector] = []
         self.shifts: list[Vector] = []
-        still = Motion.of([0.0] * 3)
         for link in self.links:
-            above = self.motions[link.parent] if link.parent >= 0 else still
+            above = self.motions[link.parent] if link.parent >= 0 else _STILL
             rate, inner = (link.rate, link.drift) if moving else ([0.0] * 6, [0.0] * 6)
             spin, linear, angular = to_child(link.fixed, above.spin), rate[:3], rate[3:]
             carried = to_child(link.turn, spin)
@@ -131,19 +133,33 @@ class LinkMechanics:
         x = [*to_child(link.turn, add(a, cross3(turning, link.slide))), *to_child(link.turn, turning)]
         return add(x, self.drifts[index]) if drifts else x
 
-    def forces(self, a: Sequence[Any] | None = None) -> list[Any]:
-        """Return the forces of the joints, one scalar for each velocity, that a motion with accelerations `a` takes."""
+    def _accelerations(self, a: Sequence[Any] | None = None) -> list[Vector]:
+        """Return A of each link, at v̇ = 0 by default."""
         A: list[Vector] = []
-        out: list[Any] = [0.0] * self.kin.model.nv
         for index, link in enumerate(self.links):
             x = self.carried(index, A[link.parent] if link.parent >= 0 else self.ground)
-            for (k, column), rotor in zip(link.columns, link.rotors, strict=True):
-                if a is not None:
+            if a is not None:
+                for k, column in link.columns:
                     x = add(x, [c * a[k] for c in column])
-                    out[k] = out[k] + rotor * a[k]
             A.append(x)
+        return A
+
+    def drift_at(self, body: str, point: Vector, rotation: list[Vector]) -> tuple[Vector, Vector, Vector]:
+        """Return the acceleration of a body's point at v̇ = 0, ω and ω̇, in axes with this rotation in the body."""
+        index, R, p = self.tree.place(body)
+        x, motion = (self._accelerations()[index], self.motions[index]) if index >= 0 else (self.ground, _STILL)
+        r = add(constant_times(R, point), p)
+        linear = add(add(x[:3], cross3(x[3:], r)), motion.centripetal(r))
+        parts = (constant_transposed_times(R, y) for y in (linear, motion.spin, x[3:]))
+        linear, spin, turning = (constant_transposed_times(rotation, y) for y in parts)
+        return linear, spin, turning
+
+    def forces(self, a: Sequence[Any] | None = None) -> list[Any]:
+        """Return the forces of the joints, one scalar for each velocity, that a motion with accelerations `a` takes."""
+        out: list[Any] = [0.0] * self.kin.model.nv
         wrenches = [
-            add(rigid_times(link.inertia, x), bias) for link, x, bias in zip(self.links, A, self._biases, strict=True)
+            add(rigid_times(link.inertia, x), bias)
+            for link, x, bias in zip(self.links, self._accelerations(a), self._biases, strict=True)
         ]
         for index in reversed(range(len(self.links))):
             link, x = self.links[index], wrenches[index]
@@ -153,6 +169,9 @@ class LinkMechanics:
                 x = rotated6(link.fixed, with_moment(rotated6(link.turn, x), link.slide))
                 wrenches[link.parent] = add(wrenches[link.parent], with_moment(x, link.translation))
         if a is not None:
+            for link in self.links:
+                for (k, _), rotor in zip(link.columns, link.rotors, strict=True):
+                    out[k] = out[k] + rotor * a[k]
             for coupling in self.kin.model.couplings:
                 row, rotor = self.coupling(coupling)
                 rate = sum((c * a[k] for k, c in row.items()), 0.0)

@@ -202,6 +202,11 @@ class Links:
         for joint in self.kin.model.tree:
             self._places[joint.child] = self._carry(joint)
 
+    def place(self, body: str) -> tuple[int, list[Vector], Vector]:
+        """Return the link of a body, -1 for the world, and the body's rotation and translation in it."""
+        index, R, p = self._places[body]
+        return index, [[_rounded(x) for x in row] for row in R], [_rounded(x) for x in p]
+
     def _choose_frames(self) -> None:
         """Turn frames about their z axes, and slide them along, so that places of children have more zeros.
 

@@ -7,8 +7,8 @@ couplings couple branches; the entries that they fill in are added to the patter
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import reduce
+from collections.abc import Callable, Sequence
+from functools import cached_property, reduce
 from typing import Any, Final
 
 import casadi as ca
@@ -170,6 +170,7 @@ class ConstraintTerms:
 
     `names` has one text for each row, and `qdot` is D(q) v where velocities are not the coordinates' rates. `speeds`
     has A v - b of the rows that hold velocities alone, which stand behind those of f. `by_time` is c: ∂f/∂t, then -b.
+    `known` gives γ of rows by name, where there is a shorter form of it than the derivative of the rate.
     """
 
     def __init__(
@@ -181,9 +182,10 @@ class ConstraintTerms:
         names: tuple[str, ...],
         qdot: ca.SX | None = None,
         speeds: ca.SX | None = None,
+        known: Callable[[], dict[str, Any]] | None = None,
     ) -> None:
-        self.value, self.names = value, names
-        self._q, self._v, self._qdot = q, v, qdot
+        self.value, self.names, self._known = value, names, known
+        self._q, self._v, self._qdot, self._time = q, v, qdot, time
         by_q = ca.jacobian(value, q)
         J = by_q if qdot is None else ca.mtimes(by_q, ca.jacobian(qdot, v))
         speeds = ca.SX(0, 1) if speeds is None else speeds
@@ -191,9 +193,17 @@ class ConstraintTerms:
         by_time = ca.SX(value.shape[0], 1) if time is None else ca.jacobian(value, time)
         self.by_time = ca.vertcat(by_time, ca.substitute(speeds, v, ca.SX.zeros(*v.shape)))
         self.rate = ca.vertcat(ca.mtimes(J, v) + by_time, speeds)
-        self.gamma = ca.jtimes(self.rate, q, v if qdot is None else qdot)
-        if time is not None:
-            self.gamma = self.gamma + ca.jacobian(self.rate, time)
+
+    @cached_property
+    def gamma(self) -> Any:
+        """γ."""
+        out = ca.jtimes(self.rate, self._q, self._v if self._qdot is None else self._qdot)
+        if self._time is not None:
+            out = out + ca.jacobian(self.rate, self._time)
+        known = self._known() if self._known else {}
+        for i in (i for i, name in enumerate(self.names) if name in known):
+            out[i] = known[self.names[i]]
+        return out
 
     def rate_along(self, by: Any) -> Any:
         """Return the derivative of ḟ along a move of the configuration, (nv,), with v and the time held."""
