@@ -564,7 +564,7 @@ def test_a_scale_is_one_factor_beside_free_numbers():
     [
         ("lnk.mass", ["'lnk.mass'", "did you mean 'link.mass'"]),
         ("tip.mass", ["'tip' is a frame on body 'link'", "link.mass"]),
-        ("hinge.friction", ["friction cannot be free"]),
+        ("hinge.stribeck_velocity", ["stribeck_velocity cannot be free"]),
         ("*.armature", ["'*.armature'", "did you mean 'hinge.armature'"]),
         ("link.masss", ["link.mass"]),
         (7, ["paths", "7"]),

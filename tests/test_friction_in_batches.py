@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.errors import MbkitWarning
+from mbkit.errors import InputError, MbkitWarning, ModelError
 from mbkit.model import Model
 from tests.random_trees import off
 from tests.test_dry_friction import mostly_at_rest, rubbed
@@ -134,3 +134,66 @@ def test_steps_of_a_batch_are_those_of_its_states() -> None:
         own = {name: w[i] for name, w in wrenches.items()}
         for together, alone in zip(batch, dyn.step(q[i], v[i], tau[i], 1e-2, wrenches=own, t=0.2), strict=True):
             assert off(together[i], alone) < 1e-12
+
+
+# Friction as a parameter
+
+
+def with_free_friction(seed: int, n: int = 3) -> tuple[Model, dict[str, np.ndarray]]:
+    """Return a model whose friction and stiction are parameters, two with a common one; and values of eight samples."""
+    b = mb.ModelBuilder.of(rubbed(seed, n, SINGLE))
+    common, model, values = mb.Parameter("common", 1.0), b.build(), {}
+    rng = np.random.default_rng(seed)
+    for k, joint in enumerate(model.joints):
+        own = mb.Parameter(f"f{k}", float(joint.friction[0])) if k else common
+        curve = None if k % 2 else 0.4
+        b.set_joint(joint.name, friction=own, stiction=1.3 * own + 0.2 * common, stribeck_velocity=curve)
+        values[own.name] = rng.uniform(0.2, 3, 8)
+    return b.build(), values
+
+
+@pytest.mark.parametrize("method", ["rk4", "semi_implicit_euler", "gauss4", "moreau", "rk853"])
+def test_samples_with_friction_of_their_own_are_models_with_these_numbers(method: str) -> None:
+    model, values = with_free_friction(11)
+    q, v, tau = mostly_at_rest(model, 8)
+    settings = {"dt": STEP} if method != "rk853" else {"save": np.linspace(0, DURATION, 5), "rtol": 1e-11}
+    dyn = mb.dynamics(model, "lagrangian").at(**values)
+    rows = tau[:, None] * np.ones((1, STEPS if "dt" in settings else 4, 1))
+    batch = mb.simulate(dyn, q, v, DURATION, method, torque=rows, doubt=False, **settings)
+    for i in range(8):
+        numbers = {name: float(x[i]) for name, x in values.items()}
+        plain = mb.dynamics(model.with_parameters(**numbers), "lagrangian")
+        assert not plain.model.parameters
+        run = mb.simulate(plain, q[i], v[i], DURATION, method, torque=rows[i], doubt=False, **settings)
+        assert off(batch.q[i], run.q) < 1e-8
+        assert [e.name for e in batch.events if e.member == i] == [e.name for e in run.events]
+        states = batch.q[i, -1], batch.v[i, -1], tau[i]
+        assert off(dyn._of_sample(i).forward_dynamics(*states), plain.forward_dynamics(*states)) < 1e-9
+    assert method == "moreau" or batch.events
+    accelerations = dyn.forward_dynamics(q, v, tau)
+    stepped = dyn.step(q, v, tau, STEP)
+    for i in range(8):
+        plain = mb.dynamics(model.with_parameters(**{name: float(x[i]) for name, x in values.items()}), "pinocchio")
+        assert off(accelerations[i], plain.forward_dynamics(q[i], v[i], tau[i])) < 1e-9
+        assert off(stepped[0][i], plain.step(q[i], v[i], tau[i], STEP)[0]) < 1e-9
+
+
+def test_friction_is_freed_and_varied_like_other_numbers() -> None:
+    """And zero, below which stiction cannot fall, and a number that comes later."""
+    model = rubbed(12, 2, SINGLE)
+    joint = model.joints[0].name
+    free = model.with_free(f"{joint}.friction")
+    assert dict(free.parameters) == {f"{joint}.friction": float(model.joints[0].friction[0])}
+    assert free.with_parameters(**dict(free.parameters)) == model
+    with pytest.raises(ModelError, match=r"stiction .* is below the friction of motion"):
+        mb.dynamics(free).at(**{f"{joint}.friction": 99.0})
+    b = mb.ModelBuilder.of(model)
+    b.set_joint(joint, friction=mb.Parameter("f"), stiction=None)
+    later = mb.dynamics(b.build(), "lagrangian")
+    with pytest.raises(InputError, match="no value for parameter 'f'"):
+        later.forward_dynamics(*(x[0] for x in mostly_at_rest(model, 1)))
+    q, v, _ = mostly_at_rest(model, 3)
+    b.set_joint(joint, friction=0.0)
+    bare = mb.dynamics(b.build(), "lagrangian")
+    runs = [mb.simulate(x, q, v, 0.1, dt=STEP, doubt=False).q for x in (later.at(f=np.zeros(3)), bare)]
+    assert off(*runs) < 1e-12

@@ -159,8 +159,7 @@ def test_freed_numbers_of_curves_and_laws_move_joints_as_their_formulas_say() ->
     [
         ("link.rotation", "did you mean|no number"),
         ("j.axes", "axes cannot be free: orientations and axes are no parameters"),
-        ("j.friction", "friction cannot be free: dry friction is a number in every engine"),
-        ("j.stribeck_velocity", "stribeck_velocity cannot be free: dry friction"),
+        ("j.stribeck_velocity", "stribeck_velocity cannot be free: Stribeck's curve is a number in every engine"),
         ("*.effort_limit", "effort_limit cannot be free: it is data"),
         ("tip.translation", "translation cannot be free: set_frame takes a Parameter"),
         ("spot.speed", "fits no number"),

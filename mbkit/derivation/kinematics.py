@@ -11,12 +11,11 @@ from functools import cached_property
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from mbkit.derivation import model_values
 from mbkit.derivation.model_values import Constants, Values, is_zero, scalar
 from mbkit.model import GravityCompensation, Joint, JointCoupling, Model
-from mbkit.model.changes.dry_friction import FrictionNumbers
+from mbkit.model.changes.dry_friction import FrictionNumbers, friction_bindings
 from mbkit.model.joint_types import cross3, dot3
 from mbkit.model.parts import PointSpring
 
@@ -333,9 +332,12 @@ def damping_forces(kin: Kinematics) -> Any:
 
 def dry_friction(kin: Kinematics, exp: Callable[[Any], Any]) -> Iterator[tuple[Any, Any]]:
     """Yield the rate of each velocity with dry friction, and its f(|v|)."""
+    free = {(b.part, b.index[0]) for b in friction_bindings(kin.model)}
     for joint in kin.model.joints:
         values, given = kin.values.of(joint), FrictionNumbers.of([joint])
-        for k in np.flatnonzero(given.sliding + given.bound):
+        for k in range(joint.type.nv):
+            if not (given.sliding[k] + given.bound[k] or (joint.name, k) in free):
+                continue
             rate, size = kin.velocities(joint)[k], values.friction[k]
             if given.stribeck[k]:
                 size += (values.stiction[k] - size) * exp(-((rate / values.stribeck_velocity[k]) ** 2))

@@ -345,7 +345,7 @@ class LagrangianDynamics(Dynamics):
         out = object.__new__(type(self))
         # Both share derived and compiled functions, now and later.
         out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
-        for name in ("parameter_values", "_phases", "_matter"):
+        for name in ("parameter_values", "_phases", "_matter", "_law"):
             out.__dict__.pop(name, None)
         bare: Any = self._bare
         vars(out).update(model=model, _batched=batched, _wrenched={}, _bare=bare and bare._with(model, batched))

@@ -83,8 +83,9 @@ Number = float | Expression
 class Parameter(Expression):
     """A named number of a description, such as a mass that a study varies.
 
-    It may stand for a mass, a centre of mass, an inertia, a length, a spring's or damper's constant, a rotor, a mimic
-    joint's ratio and offset, a number of a motion in time, or gravity. Not for orientations, axes and limits.
+    It may stand for a mass, a centre of mass, an inertia, a length, a spring's or damper's constant, dry friction and
+    stiction, a rotor, a mimic joint's ratio and offset, a number of a motion in time, or gravity. Not for orientations,
+    axes and limits.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ def numbers(part: Any) -> Iterator[tuple[str, NumberRule, Any]]:
 
 _ORIENTED: Final = "orientations and axes are no parameters"
 _IS_DATA: Final = "it is data"
-_DRY: Final = "dry friction is a number in every engine, as set_joint sets it"
+_CURVE: Final = "Stribeck's curve is a number in every engine, as set_joint sets it"
 OF_Q: Final = ("type.suffixes",)
 OF_V: Final = ("type.velocity_suffixes",)
 Numbers = Annotated[Array, NumberRule(shape=None)]
@@ -271,14 +271,14 @@ class Joint(_Frozen):
     effort_limit: Annotated[Array, NumberRule("N m, N", OF_V, least=0.0, nothing=inf, fixed=_IS_DATA, acts=False)]
     armature: Annotated[Array, NumberRule("kg m², kg", OF_V, least=0.0, does="T")]
     damping: Annotated[Array, NumberRule("N m s/rad, N s/m", OF_V, least=0.0, does="loss")]
-    friction: Annotated[Array, NumberRule("N m, N", OF_V, least=0.0, fixed=_DRY, does="jump")]
+    friction: Annotated[Array, NumberRule("N m, N", OF_V, least=0.0, does="jump")]
     stiffness: Annotated[Array, NumberRule("N m/rad, N/m", OF_V, least=0.0, does="V")]
     rest: Annotated[Array, NumberRule("rad, m", OF_V, added=True)]
     mimic: Mimic | None = None
-    stiction: Annotated[Array | None, NumberRule("N m, N", OF_V, least=0.0, fixed=_DRY, optional=True)] = None
-    stribeck_velocity: Annotated[Array | None, NumberRule("rad/s, m/s", OF_V, least=0.0, fixed=_DRY, optional=True)] = (
-        None
-    )
+    stiction: Annotated[Array | None, NumberRule("N m, N", OF_V, least=0.0, optional=True)] = None
+    stribeck_velocity: Annotated[
+        Array | None, NumberRule("rad/s, m/s", OF_V, least=0.0, fixed=_CURVE, optional=True)
+    ] = None
 
     def __repr__(self) -> str:
         follows = f", follows {self.mimic.joint!r}" if self.mimic else ""
@@ -317,7 +317,8 @@ def rest_faults(item: str, joint: Joint) -> Iterator[str]:
     """Yield one sentence per fault of what may hold a joint at rest."""
     bound, curve = joint.stiction, joint.stribeck_velocity
     given = [x for x in (joint.friction, bound, curve) if x is not None]
-    if not all(np.isfinite(x).all() for x in given):
+    # A parameter without a value is no number yet.
+    if any(np.isinf(x).any() for x in given):
         yield f"{item}: dry friction: expected finite numbers; lock(...) holds a joint that nothing moves"
     elif bound is not None and np.any(bound < joint.friction):
         yield f"{item}: stiction {bound} is below the friction of motion, {joint.friction}; give at least that"

@@ -188,7 +188,8 @@ class RunData:
             speeds = np.concatenate([v[i], *(x.v[None] for x in hits)])[order]
             moved = np.zeros((max(len(times) - 1, 0), v.shape[-1]))
             moved[:, plain] = np.diff(np.concatenate([q[i], *(x.q[None] for x in hits)])[order][:, coordinates], axis=0)
-            taken = np.append(0.0, np.cumsum(dyn._friction.law.dissipated(np.diff(times[order]), moved, speeds)))
+            law = dyn._friction.law_of(dyn._of_sample(i))
+            taken = np.append(0.0, np.cumsum(law.dissipated(np.diff(times[order]), moved, speeds)))
             out[i] = np.diff(taken[np.argsort(order)[: len(t)]])
         return out.reshape(*self.q.shape[:-2], -1)
 
@@ -380,7 +381,7 @@ def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
         # At rest the passive force is that of springs; forces by functions are counted above.
         force = force + _dampers(dyn, q, v) - _dampers(dyn, q, np.zeros_like(v))
     if dyn.soft_friction:
-        force = force + dyn._friction.law.force(v) + dyn._friction_beside_passive(q, v, tau)
+        force = force + dyn._friction.law_of(dyn).force(v) + dyn._friction_beside_passive(q, v, tau)
     if _driven(dyn):
         force = force + dyn.generalized_constraint_force(q, v, tau)
     return np.asarray(np.sum(force * v, axis=-1))
@@ -389,7 +390,7 @@ def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
 def _dampers(dyn: Dynamics, q: Array, v: Array) -> Array:
     """Return the passive force of springs and dampers alone."""
     own = dyn.passive(q, v) - dyn._lost_force(q, v)
-    return np.asarray(own - dyn._friction.law.force(v) if "jump" in dyn.model.effects else own)
+    return np.asarray(own - dyn._friction.law_of(dyn).force(v) if "jump" in dyn.model.effects else own)
 
 
 def _plain(model: Model) -> list[tuple[int, int]]:

@@ -8,7 +8,6 @@ from typing import Any
 
 import casadi as ca
 
-from mbkit._check import Array
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.fixed import Part, function_of
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
@@ -22,13 +21,12 @@ def holding(equations: Equations, q: Any, v: Any, a: Any, force: Any, parameters
     return needed - equations.applied(q, force)
 
 
-def phase_margin(
-    equations: Equations, which: Sequence[int], sides: Sequence[str], locks: Sequence[str], bound: Array
-) -> Part:
+def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str], locks: Sequence[str]) -> Part:
     """Return the part behind a step that tells how far its end is from that of its phase, ``margin1``.
 
     It is the least of the velocities `which`: the speed of one that slides, and of one that rests the part of its bound
-    that is left; negative beyond. `sides` and `locks` are the parameters of their sides and of their rotors at rest.
+    that is left; negative beyond. `sides` and `locks` are the parameters of their sides and of rotors at rest. The
+    part reads the largest forces at rest, ``bound``.
     """
     model, space, names = equations.model, SymbolicSpace(equations.model), list(equations.model.parameters)
     place, time = {name: i for i, name in enumerate(names)}, model.time_parameter
@@ -38,7 +36,7 @@ def phase_margin(
         tau, given = ca.SX.sym("tau", equations.force.numel()), ca.SX.sym("parameters", len(names))
         values = [x + dt * (name == time) for name, x in zip(names, ca.vertsplit(given), strict=True)]
         still, side = (ca.vertcat(*(values[place[x]] for x in of)) for of in (locks, sides))
-        still = still / RESTING
+        still, bound = still / RESTING, ca.SX.sym("bound", len(which))
         pick = ca.DM(ca.Sparsity.triplet(len(which), model.nv, list(range(len(which))), list(which)), 1.0)
         moves = 1 - ca.mtimes(pick.T, still)
         v = moves * space.to_body_velocity(q, w)
@@ -46,7 +44,7 @@ def phase_margin(
         loose = [0.0 if name in {*locks} else x for name, x in zip(names, values, strict=True)]
         needed = ca.mtimes(pick, holding(equations, q, v, a, tau, ca.vertcat(*loose)))
         margins = choose(still, 1 + ROUNDING - ca.fabs(needed) / bound, side * ca.mtimes(pick, v))
-        arguments = {"q1": q, "w1": w, "tau": tau, "dt": dt, "parameters": given}
+        arguments = {"q1": q, "w1": w, "tau": tau, "dt": dt, "bound": bound, "parameters": given}
         return function_of("phase_margin", arguments, {"margin1": reduce(ca.fmin, ca.vertsplit(margins))})
 
-    return Part("phase_margin", ("q1", "w1", "tau", "dt", "parameters"), ("margin1",), make)
+    return Part("phase_margin", ("q1", "w1", "tau", "dt", "bound", "parameters"), ("margin1",), make)

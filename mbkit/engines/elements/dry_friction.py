@@ -25,7 +25,7 @@ from mbkit._warn import warn
 from mbkit.engines.elements.added_force import LOADS, UNDER_FORCE, AddedForce
 from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.changes.dry_friction import ROUNDING, DryFrictionLaw, Sliding
+from mbkit.model.changes.dry_friction import ROUNDING, DryFrictionLaw, Sliding, friction_bindings
 from mbkit.model.parts import RESTING
 
 #: What is at rest of velocities.
@@ -165,21 +165,33 @@ class DryFriction(AddedForce):
     """Dry friction of a model, for the quantities of an engine."""
 
     def __init__(self, model: Model) -> None:
-        self._model, self.law = model, DryFrictionLaw(model)
+        self._model, self.law, self._varies = model, DryFrictionLaw(model), bool(friction_bindings(model))
         self._constrained = model.constrained
         #: A model, and that whose joints slide, for `phases`.
         self._slid: tuple[Model, Model] | None = None
 
     def force(self, dyn: Any, q: Array, v: Array) -> Array:  # noqa: ARG002  # of the velocities alone
-        return self.law.force(v)
+        return self.law_of(dyn).force(v)
 
     def slopes(self, dyn: Any, q: Array, v: Array) -> tuple[Array, Array]:  # noqa: ARG002  # as above
-        by_v = self.law.slope(v)
+        by_v = self.law_of(dyn).slope(v)
         return np.zeros_like(by_v), by_v
+
+    def law_of(self, dyn: Any) -> DryFrictionLaw:
+        """Return the law at the values of parameters of some dynamics of this model, or of each of their samples."""
+        if not (self._varies and dyn.derived):
+            return self.law
+        held = vars(dyn)
+        if "_law" not in held:
+            held["_law"] = DryFrictionLaw(
+                self._model, dict(zip(dyn.model.parameters, dyn.parameter_values.T, strict=True))
+            )
+        out: DryFrictionLaw = held["_law"]
+        return out
 
     def beside(self, quantity: str, method: Callable[..., Any], dyn: Any) -> Callable[..., Any]:
         """Return an engine's method for a quantity with friction; terms of one with elements hold it at speed."""
-        law, moving = self.law, method if dyn.has_elements else super().beside(quantity, method, dyn)
+        law, moving = self.law_of(dyn), method if dyn.has_elements else super().beside(quantity, method, dyn)
         if quantity in UNDER_FORCE:
 
             def pushed(q: Array, v: Array, tau: Array, *rest: Any) -> Any:
@@ -255,13 +267,14 @@ class DryFriction(AddedForce):
         tau: Array,
         resting: Mask,
         leaving: Array | None = None,
+        law: DryFrictionLaw | None = None,
     ) -> tuple[Array, Mask]:
         """Return the forces of friction at rest, and which joints stay at rest; (nv,) or (N, nv).
 
         `accelerate` gives accelerations under a force without friction at rest; `leaving` has the signs of the
         velocities that joints at rest are about to have, where that is known, (nv,) or (N, nv).
         """
-        law, shape = self.law, resting.shape
+        law, shape = law or self.law_of(dyn), resting.shape
         b = np.asarray(accelerate(tau), dtype=np.float64)
         A = self._responses(dyn, accelerate, q, tau, b)
         n = shape[-1]
@@ -281,8 +294,9 @@ class DryFriction(AddedForce):
         if not self._constrained:
             return np.asarray(np.linalg.inv(np.asarray((dyn._bare or dyn).mass_matrix(q))))
         # Accelerations are linear in the force; a large one loses fewest digits of the difference.
-        out, size = np.zeros((*a.shape, a.shape[-1])), max(1.0, float(np.abs(tau).max()), float(self.law.bound.max()))
-        for j in np.flatnonzero(self.law.bound):
+        law = self.law_of(dyn)
+        out, size = np.zeros((*a.shape, a.shape[-1])), max(1.0, float(np.abs(tau).max()), float(law.bound.max()))
+        for j in law.which:
             unit = np.broadcast_to(size * np.eye(a.shape[-1])[j], a.shape)
             out[..., j] = (np.asarray(accelerate(tau + _padded(unit, tau)), dtype=np.float64) - a) / size
         # A joint that loops hold responds by rounding alone, of either sign; the least response keeps A definite.

@@ -10,7 +10,7 @@ falls from s to f at once.) A joint that mimics another has its own friction, wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
@@ -21,17 +21,22 @@ from mbkit._check import Array
 from mbkit.model.elements.forces import JointForce
 from mbkit.model.elements.formula import written
 from mbkit.model.model import Model, unchecked
-from mbkit.model.parameters import Binding, Parameter
+from mbkit.model.parameters import Binding, Expression, Parameter
 from mbkit.model.parts import RESTING, Joint
 
 #: The number that holds what rests.
 _ROTOR: Final = Joint.adding_to("T")[0]
+#: Numbers that may be parameters.
+_BOUND: Final = ("friction", "stiction")
 #: A force at rest is above its bound where it is so by more than this part, as rounding of its sums may be.
 ROUNDING: Final = 1e-13
 
 
 class FrictionNumbers(NamedTuple):
-    """Sliding friction, bound at rest and Stribeck velocity of each full velocity; (n,) each, and all zero without."""
+    """Sliding friction, bound at rest and Stribeck velocity of each full velocity; (n,) each, and all zero without.
+
+    Of samples with parameters of their own the first two are (N, n).
+    """
 
     sliding: Array
     bound: Array
@@ -39,12 +44,27 @@ class FrictionNumbers(NamedTuple):
 
     @classmethod
     def of(cls, joints: Sequence[Joint]) -> FrictionNumbers:
-        """Read them off joints."""
+        """Read them off joints, at nominal values of parameters."""
         none = np.zeros(0)
         sliding = np.concatenate([none, *(j.friction for j in joints)])
         bound = np.concatenate([none, *(j.friction if j.stiction is None else j.stiction for j in joints)])
         curve = (np.zeros(j.type.nv) if j.stribeck_velocity is None else j.stribeck_velocity for j in joints)
         return cls(sliding, bound, np.concatenate([none, *curve]))
+
+    @classmethod
+    def at_values(cls, model: Model, values: Mapping[str, Any]) -> FrictionNumbers:
+        """Return them at values of parameters, a number or (N,) each."""
+        numbers, joints = cls.of(model.joints), {j.name: j for j in model.joints}
+        size = np.broadcast_shapes(*(np.shape(x) for x in values.values()))
+        sliding, bound = (np.array(np.broadcast_to(x, (*size, len(x)))) for x in numbers[:2])
+        for binding in friction_bindings(model):
+            place = model.layout.full_v[binding.part].start + binding.index[0]
+            value = binding.expression.evaluate(lambda p: values[p.name], float)
+            if binding.field == "friction":
+                sliding[..., place] = value
+            if binding.field == "stiction" or joints[binding.part].stiction is None:
+                bound[..., place] = value
+        return cls(sliding, bound, numbers.stribeck)
 
     def at(self, v: Array) -> Array:
         """Return f(|v|) of full velocities, (n,) or (N, n)."""
@@ -53,16 +73,28 @@ class FrictionNumbers(NamedTuple):
         return self.sliding + np.where(self.stribeck > 0, (self.bound - self.sliding) * fall, 0.0)
 
 
+def friction_bindings(model: Model) -> list[Binding]:
+    """Return the numbers of dry friction that are expressions of parameters."""
+    return [b for b in model.bindings if b.where == "joints" and b.field in _BOUND]
+
+
 class DryFrictionLaw:
     """The law of a model's friction by its independent velocities."""
 
-    def __init__(self, model: Model) -> None:
-        self._numbers = FrictionNumbers.of(model.joints)
+    def __init__(self, model: Model, values: Mapping[str, Any] | None = None) -> None:
+        nominal = FrictionNumbers.of(model.joints)
+        self._numbers = nominal if values is None else FrictionNumbers.at_values(model, values)
         self._G = model.layout.G if model.layout.reduced else None
-        sizes = np.abs(self._G.T) if self._G is not None else np.eye(len(self._numbers.bound))
-        #: The largest force at rest, (nv,); zero where a joint has no friction.
-        self.bound: Array = sizes @ self._numbers.bound
-        moving = sizes @ self._numbers.at(np.zeros(len(self._numbers.bound)))
+        n = len(nominal.bound)
+        sizes = np.abs(self._G) if self._G is not None else np.eye(n)
+        #: The largest force at rest, (nv,); zero where a joint has no friction. Of samples, (N, nv), as what follows.
+        self.bound: Array = self._numbers.bound @ sizes
+        moving = self._numbers.at(np.zeros(n)) @ sizes
+        may = nominal.bound != 0
+        for binding in friction_bindings(model):
+            may[model.layout.full_v[binding.part].start + binding.index[0]] = True
+        #: Velocities with friction, whatever parameters are.
+        self.which = np.flatnonzero(may @ sizes)
         #: That of a joint that has just let go, (nv,); its sign tells the side, and so it is zero nowhere else.
         self.just_moving: Array = np.where(self.bound > 0, np.maximum(moving, np.finfo(float).tiny), 0.0)
 
@@ -124,7 +156,7 @@ class Sliding:
         self.law = DryFrictionLaw(model)
         self.names = model.velocity_names
         #: Independent velocities with friction.
-        self.which = np.flatnonzero(self.law.bound > 0)
+        self.which = self.law.which
         self.sides = {int(i): f"friction side of {self.names[i]}" for i in self.which}
         self.locks = {int(i): f"friction lock of {self.names[i]}" for i in self.which}
         self.model = self._of(model)
@@ -147,17 +179,21 @@ class Sliding:
     def _of(self, model: Model) -> Model:
         layout, numbers = model.layout, FrictionNumbers.of(model.joints)
         joints, forces, bindings = [], [], list[Binding]()
+        free = {(b.part, b.field, b.index[0]): b.expression for b in friction_bindings(model)}
         for joint in model.joints:
             part = layout.full_v[joint.name]
             joints.append(replace(joint, friction=np.zeros(joint.type.nv), stiction=None, stribeck_velocity=None))
             # What follows by a ratio of zero does not move.
-            if not numbers.bound[part].any() or not layout.G[part].any():
+            own_free = {(field, k): x for (name, field, k), x in free.items() if name == joint.name}
+            if not (own_free or numbers.bound[part].any()) or not layout.G[part].any():
                 continue
             name = f"friction of {joint.name}"
             rows = [np.flatnonzero(layout.G[i])[0] for i in range(part.start, part.stop)]
             signs = [float(np.sign(layout.G[part.start + k, i])) for k, i in enumerate(rows)]
             own = [k for k, i in enumerate(rows) if int(i) in self.sides]
-            forces.append(_force(name, joint, FrictionNumbers(*(x[part] for x in numbers)), signs))
+            force, expressions = _force(name, joint, FrictionNumbers(*(x[part] for x in numbers)), signs, own_free)
+            forces.append(force)
+            bindings += [Binding("forces", name, "numbers", (k,), x) for k, x in expressions.items()]
             bindings += [
                 Binding("forces", name, "numbers", (k,), Parameter(self.sides[int(rows[k])], 0.0)) for k in own
             ]
@@ -168,7 +204,7 @@ class Sliding:
             held = bound.pop((joint.name, (k,)), None)
             own_number: Any = float(getattr(joint, _ROTOR)[k]) if held is None else held.expression
             bindings.append(Binding("joints", joint.name, _ROTOR, (k,), Parameter(lock, 0.0) + own_number))
-        kept = [b for b in model.bindings if not (b.where == "joints" and b.field == _ROTOR)]
+        kept = [b for b in model.bindings if not (b.where == "joints" and b.field in (_ROTOR, *_BOUND))]
         with unchecked():
             return replace(
                 model,
@@ -178,19 +214,36 @@ class Sliding:
             )
 
 
-def _force(name: str, joint: Joint, numbers: FrictionNumbers, signs: Sequence[float]) -> JointForce:
-    """Return -side f(|v|) of each velocity, with the side as a parameter."""
+def _force(
+    name: str,
+    joint: Joint,
+    numbers: FrictionNumbers,
+    signs: Sequence[float],
+    free: Mapping[tuple[str, int], Expression],
+) -> tuple[JointForce, dict[int, Expression]]:
+    """Return -side f(|v|) of each velocity, with the side as a parameter.
+
+    `free` has what f and s of velocities are expressions of; these are returned by their places among the numbers.
+    """
     n = joint.type.nv
     sides = tuple("side" if n == 1 else f"side_{k}" for k in range(n))
     speeds = tuple("v" if n == 1 else f"v_{k}" for k in range(n))
     curved = bool((numbers.stribeck > 0).any())
+    # Without a curve, stiction does nothing to what slides.
+    used = [x for x in free if x[0] == "friction" or numbers.stribeck[x[1]] > 0]
+    more = tuple(f"{field}_{k}" for field, k in used)
 
     def law(*given: Any) -> tuple[Any, ...]:
-        out = []
+        at, out = {x: given[n + i] for i, x in enumerate(used)}, []
         for k, (f, s, w) in enumerate(zip(*(x.tolist() for x in numbers), strict=True)):
-            fall = (s - f) * (-((given[n + k] * (1.0 / w)) ** 2)).exp() if w > 0 else 0.0
+            f = at.get(("friction", k), f)
+            s = at.get(("stiction", k), s if joint.stiction is not None else f)
+            fall = (s - f) * (-((given[n + len(used) + k] * (1.0 / w)) ** 2)).exp() if w > 0 else 0.0
             out.append(given[k] * (-signs[k] * (f + fall)))
         return tuple(out)
 
-    formula = written(law, *sides, *(speeds if curved else ()))
-    return JointForce(name, joint.name, formula, None, sides, np.zeros(n))
+    formula = written(law, *sides, *more, *(speeds if curved else ()))
+    names = (*sides, *more)
+    return JointForce(name, joint.name, formula, None, names, np.zeros(len(names))), {
+        n + i: free[x] for i, x in enumerate(used)
+    }

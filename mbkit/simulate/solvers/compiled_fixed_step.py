@@ -106,8 +106,8 @@ class BlockLoop:
     def _begin(self, parameters: Array, **states: Array) -> None:
         """Put in states, (n, rows), and the values of parameters, (p,) or (n, p)."""
         self._count, self._taken = len(states["q"]), 0
-        for name, x in states.items():
-            self._fill(name, 0, x.T[None])
+        for name in self._room.keys() & states.keys():
+            self._fill(name, 0, states[name].T[None])
         if parameters.size and "parameters" in self._room:
             every = np.atleast_2d(parameters).T
             self._fill("parameters", 0, np.broadcast_to(every, (len(self._room["parameters"]), *every.shape)))
@@ -412,10 +412,12 @@ def run_rollout(
     workers: int | None = None,
     behind: Sequence[Part] = (),
     margins: Array | None = None,
+    **read: Array,
 ) -> SolverResult:
     """Step one state or a batch over the grid; no number depends on `workers`, by default one for each core.
 
-    `behind` are parts that follow each step; `margins`, (N, steps), takes what they write of that name.
+    `behind` are parts that follow each step, of which each trajectory has what they `read`, (N, rows), by name;
+    `margins`, (N, steps), takes what they write of that name.
     """
     dyn, method, grid = problem.dyn, problem.method, problem.grid
     assert isinstance(dyn, LagrangianDynamics)
@@ -439,7 +441,7 @@ def run_rollout(
     def blocks(
         chunk: Chunk, members: Indices, ends: Indices, meeting: SampleMeeting | None = None
     ) -> Iterator[tuple[int, dict[int, list[Array]]]]:
-        more = {} if law is None else {LAW: law.numbers[None]}
+        more = {name: x[members] for name, x in read.items()} | ({} if law is None else {LAW: law.numbers[None]})
         chunk.begin(problem.q[members], w0[members], values[members] if values.ndim == 2 else values, **more)
         return run_blocks(problem, record, chunk, members, ends.tolist(), meeting)
 

@@ -269,7 +269,8 @@ class _Members:
         else:
             from mbkit.simulate.solvers.compiled_fixed_step import run_rollout
 
-            out = run_rollout(own, behind=[self.margin_part], margins=margins)
+            bound = self.friction.bounds(phase)
+            out = run_rollout(own, behind=[self.margin_part], margins=margins, bound=bound)
         self.steps += out.steps
         self.evaluations += out.evaluations
         self.jacobians += out.jacobians
@@ -388,7 +389,7 @@ class _PartOfStep:
         timed = dyn.model.time_parameter
         if run._compiled(dyn):
             self._code, self._threads = dyn.step_with(run.problem.method, run.margin_part), dyn.threads
-            self._values = np.atleast_2d(dyn.parameter_values)
+            self._values, self._bound = np.atleast_2d(dyn.parameter_values), run.friction.bounds(phase)
             if timed is not None:
                 place = list(dyn.model.parameters).index(timed)
                 self._values = np.where(np.arange(self._values.shape[1]) == place, t[:, None], self._values)
@@ -401,7 +402,7 @@ class _PartOfStep:
         force = self._force if callable(self._force) else self._force[i]
         q, v = run.q[self._rows[i]], run.v[self._rows[i]]
         if self._values is not None:
-            given = q, v, force, s[:, None], self._values[i]
+            given = q, v, force, s[:, None], self._bound[i], self._values[i]
             arrays, _ = self._code.everything(*given, threads=self._threads)
             return *run.friction.held(phase, q, arrays["q1"], arrays["v1"]), arrays["margin1"][:, 0]
         if self._stepped and s[0] > 0:

@@ -60,7 +60,7 @@ class _InPython:
     ) -> None:
         self._problem, self._dyn, self._record, self._i = problem, dyn, record, i
         self._force = problem.torque.of_member(member)
-        self._law, self._space = dyn._friction.law, Space(dyn.model)
+        self._law, self._space = dyn._friction.law_of(dyn), Space(dyn.model)
         self._which = np.flatnonzero(self._law.bound > 0)
         none = np.zeros(dyn.model.nv)
         # Without friction: neither a side nor rest.
@@ -133,7 +133,7 @@ class _Compiled:
         self._room[:] = 0.0
         self._ways, self._lanes = np.zeros(5, dtype=np.int64), width()
         self._clock: int | None = None
-        self["bound"][:] = friction.law.bound[which, None]
+        self["bound"][:] = dyn._friction.law_of(dyn).bound[which, None]
         if "parameters" in self._code.rows:
             others = {name: x for name, x in names.items() if name not in {*sides, *locks}}
             self["parameters"][:] = np.array([*others.values()], dtype=float)[:, None]

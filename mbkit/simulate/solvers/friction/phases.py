@@ -39,9 +39,9 @@ class Friction:
 
     def __init__(self, dyn: Dynamics, *, side_by_side: bool = False) -> None:
         self._dyn, self._own, self._side_by_side = dyn, dyn._friction, side_by_side
-        self.law, self._names = self._own.law, dyn.model.velocity_names
+        self._names = dyn.model.velocity_names
         #: Velocities with friction.
-        self.which = np.flatnonzero(self.law.bound > 0)
+        self.which = self._own.law.which
         layout = dyn.model.layout
         places = (
             range(layout.q[j.name].start, layout.q[j.name].start + j.type.nv) for j in dyn.model.independent_joints
@@ -63,9 +63,9 @@ class Friction:
         `leaving` has the signs of velocities that are about to be.
         """
         tau = applied(force, t, q, v)
-        resting, signs = self.law.at_rest(v), np.sign(v)
-        held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
         rubbed = self._dyn if members is None else self._dyn.of_samples(members)
+        resting, signs = self._own.law_of(rubbed).at_rest(v), np.sign(v)
+        held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
         if resting.any():
             rows: Any = np.flatnonzero(resting.any(axis=1)) if self._side_by_side else ...
             own = rubbed.of_samples(rows) if self._side_by_side else rubbed
@@ -75,6 +75,7 @@ class Friction:
                 sliding,
                 lambda f: sliding.forward_dynamics(q[rows], v[rows], f),
                 *(q[rows], tau[rows], resting[rows], None if leaving is None else leaving[rows]),
+                law=self._own.law_of(own),
             )
         return self.given(np.where(resting, -np.sign(held), signs), still, rubbed)
 
@@ -101,10 +102,11 @@ class Friction:
 
         Of one that slides it is the speed, of one that rests the part of its bound that is left.
         """
-        out = phase.sides * v
-        if phase.still.any():
-            out = np.where(phase.still, 1 + ROUNDING - np.abs(self.holding(phase, t, q, v, force)) / self._bound, out)
-        return out[..., self.which]
+        out, still = (phase.sides * v)[..., self.which], phase.still[..., self.which]
+        if still.any():
+            used = np.abs(self.holding(phase, t, q, v, force)[..., self.which]) / self.bounds(phase)
+            out = np.where(still, 1 + ROUNDING - used, out)
+        return out
 
     def margin_part(self, dyn: Any) -> Any:
         """Return the least margin as a part behind the steps of a phase's dynamics on the own derivation."""
@@ -112,7 +114,7 @@ class Friction:
 
         sliding, which = self._own.sliding, self.which.tolist()
         sides, locks = ([of[i] for i in which] for of in (sliding.sides, sliding.locks))
-        return phase_margin(dyn.equations, which, sides, locks, self.law.bound[which])
+        return phase_margin(dyn.equations, which, sides, locks)
 
     def holding(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return the forces of friction on what rests, and zero elsewhere; of the shape of v."""
@@ -126,9 +128,10 @@ class Friction:
             pulled = pulled - _of_wrenches(phase.rubbed, q, tau)
         return np.where(phase.still, pulled, 0.0)
 
-    @property
-    def _bound(self) -> Array:
-        return np.where(self.law.bound > 0, self.law.bound, 1.0)
+    def bounds(self, phase: Phase) -> Array:
+        """Return the largest forces at rest of velocities with friction, 1 where there are none; (k,) or (m, k)."""
+        bound = self._own.law_of(phase.rubbed).bound[..., self.which]
+        return np.broadcast_to(np.where(bound > 0, bound, 1.0), (*phase.still.shape[:-1], len(self.which)))
 
     def after(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> tuple[Array, Array]:
         """Return the velocity at the end of a phase, zero of what stopped there, and the signs of what lets go.
