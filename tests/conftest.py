@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 import tempfile
 from collections import Counter
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -42,6 +45,22 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     """Leave out files without a test of a processor's arithmetic where these alone are asked for."""
     others = config.getoption("markexpr") == "processors" and collection_path.match("test_*.py")
     return True if others and collection_path.stem not in PROCESSORS else None
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Import a worker's share of the files of a whole run before all others.
+
+    In a new checkout pytest writes out every assert, which takes a third of a minute. A worker reads the bytecode of
+    the shares that the others have written by then.
+    """
+    worker = getattr(session.config, "workerinput", None)
+    whole = session.config.args == session.config.getini("testpaths")
+    if worker and whole and not sys.dont_write_bytecode:
+        files = sorted(Path(__file__).parent.glob("test_*.py"))
+        for file in files[int(worker["workerid"].removeprefix("gw")) :: worker["workercount"]]:
+            # What fails or skips here does so again, and is told, where it is collected.
+            with suppress(Exception, pytest.skip.Exception):
+                import_module(f"tests.{file.stem}")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

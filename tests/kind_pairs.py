@@ -11,7 +11,7 @@ import random
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -96,16 +96,18 @@ def binds(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Spot:
-    """A joint: its type, and the kinds that stand on it."""
+    """A joint: its type, and the kinds that stand on it; of the same ones what follows is found once."""
 
     type: str = "revolute"
     kinds: frozenset[str] = frozenset()
 
     @property
+    @cache  # noqa: B019  # some hundred are different
     def leads(self) -> bool:
         return self.type in ONE and not any(map(binds, self.kinds))
 
     @property
+    @cache  # noqa: B019  # some hundred are different
     def asks(self) -> int:
         """Other joints that its parts ask for."""
         counts = (2 if k == "coupler.several" else 1 for k in self.kinds if k in PARTS)
@@ -114,11 +116,13 @@ class Spot:
         )
 
     @property
+    @cache  # noqa: B019  # some hundred are different
     def free(self) -> int:
         held = sum(section(k) in BINDING for k in self.kinds if k in PARTS)
         return int(JOINT_TYPES[self.type].nv) - held
 
     @property
+    @cache  # noqa: B019  # some hundred are different
     def acts(self) -> frozenset[str]:
         """All kinds that act on the joint, finer ones and its type too."""
         kinds = self.kinds - (NUMBERS_OF.keys() if self.type == "fixed" else set())
@@ -139,6 +143,7 @@ class Plan:
     def size(self) -> int:
         return len({*self.others, *(f"joint_type.{s.type}" for s in self.spots)}.union(*(s.kinds for s in self.spots)))
 
+    @cached_property
     def whole(self) -> Plan:
         """Return the plan with the hinges that its parts ask for, and one that nothing holds."""
         leads = sum(s.leads for s in self.spots)
@@ -148,7 +153,7 @@ class Plan:
         lack += [sum("compensation" in k for k in self.others) - sum(s.type != "fixed" for s in self.spots)]
         return replace(self, spots=(*self.spots, *[Spot()] * max(0, *lack)))
 
-    @property
+    @cached_property
     def acts(self) -> frozenset[str]:
         if self.paper:
             return frozenset(WRITTEN)
@@ -159,7 +164,7 @@ class Plan:
         out |= {"joint_type.fixed"} if "body.rotor" in out else set()
         out |= OF_BEAMS if "joint_type.beam" in out else set()
         out |= {"gravity"} if out & {*WEIGHTS} else set()
-        return frozenset(out).union(*(s.acts for s in self.whole().spots))
+        return frozenset(out).union(*(s.acts for s in self.whole.spots))
 
 
 #: Equations on paper have terms in the place of parts.
@@ -176,7 +181,7 @@ def built(name: str, plan: Plan, seed: int) -> Example:
 
 
 def _built(name: str, plan: Plan, rng: np.random.Generator) -> Example | None:
-    plan = plan.whole()
+    plan = plan.whole
     a, bodies, sites = Arm(name, gravity="gravity" in replace(plan, paper=False).acts, rng=rng), ["world"], []
     for spot in sorted(plan.spots, key=lambda s: "mimic" in s.kinds):
         # A tree now and then.
@@ -357,7 +362,7 @@ class _Search:
         acts = plan.acts
         gates = self.admitted(acts)
         out = {}
-        for kinds, there in ((acts, False), *((s.acts, True) for s in plan.whole().spots)):
+        for kinds, there in ((acts, False), *((s.acts, True) for s in plan.whole.spots)):
             for a, b in combinations(sorted(kinds, key=self.order.__getitem__), 2):
                 if new := self.todo.get((a, b, there), 0) & gates:
                     out[a, b, there] = new
@@ -380,9 +385,13 @@ class _Search:
         out = [Spot(t, frozenset([base(x)])) for t in (SEVERAL if many else ONE)]
         return [s for s in out if fits(s)]
 
+    @cache  # noqa: B019  # one search lives as long as its process
+    def taken(self, gates: int) -> list[str]:
+        return [x for x in NAMES if self.takes[x] & gates]
+
     def more(self, plan: Plan, gates: int) -> Plan:
         """Return the plan with one more kind."""
-        x = self.rng.choice([x for x in NAMES if self.takes[x] & gates])
+        x = self.rng.choice(self.taken(gates))
         if x in OTHERS:
             if x in plan.others or (x in LIMBS and any(k in LIMBS for k in plan.others)):
                 return plan
@@ -422,7 +431,7 @@ class _Search:
                 plan = tries[gains.index(max(gains))]
                 for x, gates in self.covered(plan).items():
                     self.todo[x] &= ~gates
-                yield plan.whole()
+                yield plan.whole
 
 
 @cache

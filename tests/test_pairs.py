@@ -46,7 +46,7 @@ def test_each_pair_of_kinds_stands_together_or_is_told_apart() -> None:
     told = {frozenset(x) for two in found.apart.values() for x in two}
     assert together | told == pairs(frozenset({*NAMES, *WRITTEN}))
     assert not together & told
-    on_joints = set().union(*(pairs(s.acts) for x in found.plans for s in x.whole().spots))
+    on_joints = set().union(*(pairs(s.acts) for x in found.plans for s in x.whole.spots))
     told = {frozenset(x) for two in found.apart_on_joints.values() for x in two}
     assert on_joints | told == pairs(frozenset(JOINT_KINDS))
     assert not on_joints & told

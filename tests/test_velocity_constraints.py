@@ -296,21 +296,24 @@ ON_ONE_PAGE = {
 }
 
 
+@cache
+def eliminated(name: str) -> list[NonholonomicEquations]:
+    make, rates = ON_ONE_PAGE[name]
+    lag = make()
+    return [getattr(lag, way)(rates) for way in WAYS]
+
+
 @pytest.mark.thorough("ball on a table", "suslov in numbers", "car")
 @pytest.mark.parametrize("name", ON_ONE_PAGE)
 def test_the_three_eliminations_print_the_same_text(name) -> None:
-    make, rates = ON_ONE_PAGE[name]
-    lag = make()
-    made = [getattr(lag, way)(rates) for way in WAYS]
+    made = eliminated(name)
     for texts in ([str(e) for e in made], [e.latex() for e in made], [str(e.reactions) for e in made]):
         assert max(map(len, texts)) <= 1.5 * min(map(len, texts))
 
 
 def test_suslov_s_body_has_two_short_equations() -> None:
     """I ω̇ + ω x I ω = λ e3 with ω3 = 0 (Suslov 1946; Bloch 2003, ch. 8.6)."""
-    lag = suslov()
-    for way in WAYS:
-        e = getattr(lag, way)(BODY)
+    for e in eliminated("suslov"):
         (O1, O2), (Odot1, Odot2) = e.velocities, e.accelerations
         rows = [A * Odot1 + O2 * (D * O1 + E * O2), B * Odot2 - O1 * (D * O1 + E * O2)]
         assert [sp.expand(eq.lhs - eq.rhs - row) for eq, row in zip(e.equations(), rows, strict=True)] == [0, 0]
