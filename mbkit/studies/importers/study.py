@@ -97,32 +97,30 @@ def _asked(engine: str, function: Callable[..., Any], *args: Any) -> Any:
         raise ImporterError(describe(error).removeprefix(f"{engine}: ")) from None
 
 
-def _reading(engine: str, file: tuple[Any, ...], seconds: float) -> Imported:
-    """Return the reading of a file; it takes at most `seconds` of processor time, and so does each call of its terms.
+def _reading(engine: str, version: EngineVersion | None, file: tuple[Any, ...], seconds: float) -> Imported:
+    """Return an importer's reading of a file, or that of a version in an environment of its own, with its own time.
 
-    Raises `UnsupportedError` where the importer is not installed, and `ImporterError`.
+    It takes at most `seconds` of processor time, and so does each call of its terms. Raises `UnsupportedError` where
+    the importer is not installed, and `ImporterError`.
     """
-    check_installed(engine)
-    importer = IMPORTERS[engine]
-    worker = _workers.setdefault(importer, Worker())
-    ask = partial(_asked, engine, partial(worker.call, cpu_seconds=seconds))
-    model, *rest = ask(_read, importer.module, *file)
-    return Imported(model, partial(ask, _terms_of_held), *rest)
+    if version:
+        ask, begin = partial(_asked, engine), partial(own_importer.read, version)
+    else:
+        check_installed(engine)
+        importer = IMPORTERS[engine]
+        call = partial(_workers.setdefault(importer, Worker()).call, cpu_seconds=seconds)
+        ask, begin = partial(_asked, engine, call), partial(_read, importer.module)
+    read: Imported = ask(begin, *file)
+    return replace(read, terms=partial(ask, read.terms))
 
 
-def _reading_elsewhere(version: EngineVersion, file: tuple[Any, ...]) -> Imported:
-    """Return that of an importer in an environment of its own, which has the time of its engine."""
-    read: Imported = _asked(str(version), own_importer.read, version, *file)
-    return replace(read, terms=partial(_asked, str(version), read.terms))
-
-
-def _read(module: str, text: str, format_: str, floating_base: bool, files: dict[str, bytes]) -> tuple[Any, ...]:
-    """Return what an importer holds but its terms."""
+def _read(module: str, *file: Any) -> Imported:
+    """Return what an importer holds, with terms that are computed in the process that holds it."""
     global _held
     # The file before can be as large.
     _held = None
-    _held = reader(module)(text, format_, floating_base, files)
-    return _held.model, _held.notes, _held.beside, _held.constraints, _held.hidden, _held.holds_mimics
+    _held = reader(module)(*file)
+    return replace(_held, terms=_terms_of_held)
 
 
 def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
@@ -408,12 +406,12 @@ def _readings(
     read: dict[str, Imported] = {}
     refused: dict[str, str] = {}
     with ThreadPoolExecutor(len(engines)) as pool:
-        begun = {x: pool.submit(_reading, x, file, seconds) for x in engines if x not in elsewhere}
+        begun = {x: pool.submit(_reading, x, None, file, seconds) for x in engines if x not in elsewhere}
         try:
             for engine in engines:
                 try:
-                    there = begun.get(engine)
-                    read[engine] = there.result() if there else _reading_elsewhere(elsewhere[engine], file)
+                    other = elsewhere.get(engine)
+                    read[engine] = _reading(engine, other, file, seconds) if other else begun[engine].result()
                 except (UnsupportedError, ImporterError) as error:
                     refused[engine] = str(error)
         except BaseException:

@@ -25,14 +25,15 @@ from mbkit.errors import (
     NonPhysicalWarning,
 )
 from mbkit.load import xml_reader
-from mbkit.load.shapes import MassProperties, together
+from mbkit.load.shapes import NOTHING, MassProperties, together
 from mbkit.load.urdf_reader import read_links
-from mbkit.model import Body, Model
+from mbkit.model import Model
 from mbkit.model.elements import paths
 from mbkit.model.validation import listing
 from mbkit.show.scene import SHAPES
 from mbkit.show.visuals import Shape, read_visuals
 from mbkit.studies._targets import model_of, with_values
+from mbkit.studies.explain.merged_model import Tolerances
 from mbkit.studies.lint.checks import CHECKS, Judged
 from mbkit.studies.lint.geometry import Geometry, geometry_of
 from mbkit.studies.lint.result import SURENESS, LintResult
@@ -139,11 +140,12 @@ def _links(model: Model) -> Model:
     if model.source.lower().endswith(".urdf"):
         with suppress(MbkitError), warnings.catch_warnings(action="ignore", category=MbkitWarning):
             links = replace(read_links(Path(model.source)), source=model.source)
-            parts: dict[str, list[MassProperties]] = defaultdict(list)
+            near, parts = Tolerances.of(model, _SAME), defaultdict[str, list[MassProperties]](list)
             for link in links.bodies:
                 frame, own = model.frame(link.name), MassProperties(link.mass, link.com, link.inertia)
                 parts[frame.body] += [own.moved(frame.rotation, frame.translation)] if link.mass else []
-            if all(_is(body, parts[body.name]) for body in model.bodies):
+            wholes = {body: together(some) for body, some in parts.items() if some}
+            if all(near.same(wholes.get(body.name, NOTHING), body) for body in model.bodies):
                 return links
     return model
 
@@ -154,13 +156,6 @@ def _axes(links: Model) -> dict[str, float]:
     joints = xml_reader.read(Path(links.source)).all("joint") if links.source.lower().endswith(".urdf") else []
     axes = {e.attributes["name"]: e.first("axis") for e in joints if e.attributes["name"] in moving}
     return {k: float(np.linalg.norm([*map(float, e.attributes["xyz"].split())])) for k, e in axes.items() if e}
-
-
-def _is(body: Body, parts: list[MassProperties]) -> bool:
-    """Return whether a body is its links together."""
-    whole = together(parts) if parts else MassProperties(0.0, body.com, np.zeros((3, 3)))
-    pairs = (whole.mass, body.mass), (whole.com, body.com), (whole.inertia, body.inertia)
-    return all(np.allclose(a, b, rtol=_SAME, atol=_SAME * np.abs(b).max()) for a, b in pairs)
 
 
 def _geometry(links: Model, skipped: list[str]) -> dict[str, Geometry]:
