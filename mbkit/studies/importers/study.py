@@ -225,7 +225,8 @@ def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict
                 label = f"{field.replace('_', ' ')} " if stage == "limits" else ""
                 unit = f" {rules_of(Body)[field].unit}" if isinstance(a, Body) else ""
                 read, written = ("none" if np.isinf(x).all() else number_text(x) for x in (new, old))
-                out[stage].append((size, a.name, f"{label}{read} for {written}{unit}"))
+                says = f"{label}{read}{unit * (field == 'mass')} for {written}{unit}"
+                out[stage].append((size, a.name, says))
     return out
 
 
