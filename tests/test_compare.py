@@ -713,6 +713,7 @@ def test_mujoco_is_named_where_its_own_run_is_off(monkeypatch):
     assert "pinocchio" not in compare_view.headline(result).split(":")[0]
 
 
+@pytest.mark.usefixtures("brief")
 def test_terms_are_told_before_anything_is_integrated(tmp_path: Path) -> None:
     told: list[mb.studies.Comparison] = []
     whole = mb.compare(mb.catalog.pendulum(), samples=2, checkpoint=told.append)

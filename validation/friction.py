@@ -445,10 +445,10 @@ SMOKE = {
     "PENDULUM": PENDULUM | {"f": mp.mpf(2)},
     "ARM_TIME": mp.mpf("0.1"),
     "EXACT": ("rk853",),
-    "TIGHT": 1e-4,
-    "STEPS": {"moreau": [50, 100], "rk853": [1e-3, 1e-4]},
+    "TIGHT": 1e-3,
+    "STEPS": {"moreau": [20, 40], "rk853": [1e-2, 1e-3]},
     "COST": (("double_pendulum",), 5, 1),
-    "RTOLS": (1e-4,),
+    "RTOLS": (1e-3,),
     "LENGTHS": (1e-2,),
     "WIDTHS": (1e-1,),
 }
