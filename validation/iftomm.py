@@ -277,7 +277,7 @@ SMOKE = {
     "SQUEEZED": 1e-3,
     "WAYS": [("rk853", {"rtol": 1e-3})],
     "STIFF": ("rodas5",),
-    "squeezer.STEPS": 40,
+    "squeezer.STEPS": 10,
 }
 
 
