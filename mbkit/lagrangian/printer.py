@@ -278,10 +278,7 @@ def apart(name: str) -> tuple[str, ...]:
 
 
 def written(name: str) -> str:
-    """Return a symbol's name in Unicode: θ̇₁; a letter below the line stays behind its mark: m_p.
-
-    A part's name before a point stays as it is, and a number behind one: arm.θ̇₁, ẋ.1.
-    """
+    """Return a symbol's name in Unicode: θ̇₁, arm.θ̇₁, ẋ.1; a letter below the line stays behind its mark: m_p."""
     part, name, number = apart(one_line(name))
     stem, mark, index = name.partition("_")
     split = mark and index[:1].isalpha() and stem

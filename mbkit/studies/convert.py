@@ -24,7 +24,6 @@ from mbkit.model.builder import expect_model
 from mbkit.model.elements.references import KINDS_OF_PARTS
 from mbkit.model.validation import listing
 from mbkit.studies._targets import with_values
-from mbkit.studies.explain.result import Cause
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of
 
@@ -121,7 +120,7 @@ def _head(model: Model, check: str) -> str:
 
 
 def _to_mjcf(model: Model) -> Converted:
-    from mbkit.engines.mujoco.mjcf_writer import LIFTED, MJCF, mjcf_text, read_back
+    from mbkit.engines.mujoco.mjcf_writer import MJCF, mjcf_text, read_back
 
     notes = MJCF.admit(model)
     text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
@@ -136,7 +135,7 @@ def _to_mjcf(model: Model) -> Converted:
             raise MbkitError(f"convert: loops of {model.name} read back otherwise; please report this model")
     difference = gaps(model_terms(model, at), values, at.v, model.velocity_joints)
     if not difference.comparable or difference.worst > _TOLERANCE:
-        why = next((n for n in notes if n.startswith(LIFTED)), "please report this model")
+        why = next((n for n in notes if n.startswith("principal moments")), "please report this model")
         off = f"{difference.worst:.1e} at {difference.joint}"
         raise MbkitError(f"convert: what was written of {model.name} reads back otherwise: {off}; {why}")
     return Converted(model.name, "mjcf", text, difference.terms, notes)
@@ -151,9 +150,8 @@ def _to_urdf(model: Model) -> Converted:
         with warnings.catch_warnings(action="ignore", category=MbkitWarning):
             back = load(path, gravity=model.gravity, nonphysical="warn")
     explanation = explain(model, back, samples=_STATES, tolerance=_TOLERANCE, names=("description", "URDF"))
-    acting: tuple[Cause, ...] = explanation.acting
-    if acting or not (explanation.agree or explanation.massless):
-        reasons = "; ".join(str(c) for c in acting) or explanation.verdict
+    if explanation.acting or not (explanation.agree or explanation.massless):
+        reasons = "; ".join(map(str, explanation.acting)) or explanation.verdict
         raise MbkitError(
             f"convert: what was written of {model.name} reads back otherwise: {reasons}; please report this model"
         )

@@ -30,7 +30,6 @@ _TYPES: Final = {
 }
 # MuJoCo refuses principal moments below 1e-15 kg m².
 _LEAST: Final = 2e-15
-LIFTED: Final = "principal moments"
 
 
 def _numbers_not_held(model: Model) -> Iterator[str]:
@@ -54,7 +53,7 @@ def _notes(model: Model) -> Iterator[str]:
         yield f"MJCF has no effort limits of zero or of several velocities at once: {', '.join(lost)}"
     moments = {b.name: np.linalg.eigvalsh(b.inertia) for b in model.bodies if b.mass}
     if lifted := [repr(n) for n, (low, middle, high) in moments.items() if low < 1e-15 or low + middle < high]:
-        yield f"{LIFTED} of points and plates were lifted to what MuJoCo takes: {', '.join(lifted)}"
+        yield f"principal moments of points and plates were lifted to what MuJoCo takes: {', '.join(lifted)}"
 
 
 MJCF: Final = Path(
