@@ -77,14 +77,10 @@ class _Tree:
         self.bodies = {x.name: x for x in model.bodies}
         self.moments = {x.name: np.asarray(np.linalg.eigvalsh(x.inertia), dtype=np.float64) for x in model.bodies}
         self.carrier = {j.child: j.name for j in model.joints}
-        self.children: dict[str, list[Joint]] = {name: [] for name in ("world", *self.bodies)}
-        for joint in model.joints:
-            self.children[joint.parent].append(joint)
+        self.children = by_key((j.parent, j) for j in model.joints)
         #: Number of joints on a body and beyond, and the joint that carries it.
         self.sizes = {j.child: sum(j.name in chain for chain in model.chains.values()) for j in model.joints}
-        self.levels = [["world"]]
-        while self.levels[-1]:
-            self.levels.append([j.child for name in self.levels[-1] for j in self.children[name]])
+        self.levels = [["world"], *by_key((len(model.chains[j.name]), j.child) for j in model.tree).values()]
 
 
 class _Assignment:
@@ -99,7 +95,7 @@ class _Assignment:
         for ours, theirs in reversed(list(zip(self.a.levels, self.b.levels, strict=False))):
             for x in ours:
                 for y in theirs:
-                    below[x, y] = self._siblings(self.a.children[x], self.b.children[y], below)
+                    below[x, y] = self._siblings(self.a.children.get(x, []), self.b.children.get(y, []), below)
         out: dict[str, str] = {}
         waiting = below["world", "world"][1]
         while waiting:

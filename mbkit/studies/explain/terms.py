@@ -20,7 +20,7 @@ from mbkit.errors import (
     NumericalError,
     UnsupportedError,
 )
-from mbkit.model import JointCoupling, Model
+from mbkit.model import Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw, FrictionNumbers
 from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.forces import coordinate_arguments
@@ -237,15 +237,11 @@ def fitting(model: Model, **fields: Any) -> Model:
         return fits and lost.isdisjoint(getattr(part, "arguments", ()))
 
     parts: dict[str, Any] = {kind: tuple(filter(fits, getattr(model, kind))) for kind in OTHERS}
-    return replace(tree, **parts | {"couplings": tuple(trimmed_couplings(model, moving))})
-
-
-def trimmed_couplings(model: Model, joints: Collection[str]) -> Iterator[JointCoupling]:
-    """Yield the couplings of some joints, the others standing at zero."""
-    for c in model.couplings:
-        kept = [k for k, name in enumerate(c.joints) if name in joints]
-        if kept:
-            yield replace(c, joints=tuple(c.joints[k] for k in kept), factors=c.factors[kept])
+    kept = ((c, [k for k, name in enumerate(c.joints) if name in moving]) for c in model.couplings)
+    parts["couplings"] = tuple(
+        replace(c, joints=tuple(c.joints[k] for k in some), factors=c.factors[some]) for c, some in kept if some
+    )
+    return replace(tree, **parts)
 
 
 def part(model: Model, joints: Collection[str]) -> Model:
