@@ -372,7 +372,7 @@ def cost(names, steps, rounds):
 
     rows = []
     for name in names:
-        bare = mb.catalog.double_pendulum() if name == "double_pendulum" else mb.load(name).without("friction")
+        bare = without_friction(name)
         b, rng = mb.ModelBuilder.of(bare), np.random.default_rng(1)
         dyn = mb.dynamics(bare, "lagrangian")
         weight = np.abs(dyn.gravity(bare.random_state(rng, 50)[0])).max(axis=0)
@@ -394,6 +394,78 @@ def cost(names, steps, rounds):
         ratio = each["moreau"] / each["semi_implicit_euler"]
         rows.append({"model": name, "us_a_step": each, "ratio": ratio, "ended": ended})
         print(f"{name:20} {each} {ratio:.2f} {ended}")
+    return rows
+
+
+def without_friction(name):
+    import mbkit as mb
+
+    return mb.catalog.double_pendulum() if name == "double_pendulum" else mb.load(name).without("friction")
+
+
+#: Robot, trajectories of a batch, variants, steps of one trajectory and of a batch, and rounds.
+BATCH = ("ur5", 1000, 200, 20_000, 200, 5)
+
+
+def batches(name, many, variants, alone, steps, rounds):
+    """Return the time of a run by rk4 with friction on all joints over that without, of one trajectory and of many.
+
+    What rests is under twice the friction that its weight needs. What slides is fast, and of one trajectory so short
+    that nothing stops. Mixed is friction of 0.3 times the weight, with half of the joints at rest at the start.
+    """
+    import mbkit as mb
+
+    bare, rows, rng = without_friction(name), [], np.random.default_rng(1)
+    plain = mb.dynamics(bare, "lagrangian", threads=1)
+    weight = np.maximum(np.abs(plain.gravity(bare.random_state(rng, 50)[0])).max(axis=0), 0.1)
+
+    def rubbed(part, scale=1.0):
+        b = mb.ModelBuilder.of(bare)
+        for joint in bare.independent_joints:
+            f = part * float(weight[bare.layout.v[joint.name]][0])
+            b.set_joint(joint.name, friction=f * scale, stiction=1.2 * f * scale)
+        return mb.dynamics(b.build(), "lagrangian", threads=1)
+
+    def measure(what, dyn, q, v, steps, dt, model_of_one=None):
+        runs, seconds = {}, {"with": [], "without": []}
+        for _ in range(rounds + 1):
+            for which, of in (("with", dyn), ("without", plain)):
+                begun = time.process_time()
+                runs[which] = mb.simulate(of, q, v, steps * dt, "rk4", dt=dt, doubt=False)
+                seconds[which].append(time.process_time() - begun)
+        # The first run compiles.
+        each = {which: float(np.median(x[1:])) for which, x in seconds.items()}
+        run, row = runs["with"], {"what": what, "trajectories": len(q) if q.ndim == 2 else 1, "steps": steps}
+        row |= {"seconds": each, "ratio": each["with"] / each["without"], "events": len(run.events)}
+        if q.ndim == 2:
+            off = []
+            for i in range(0, len(q), max(len(q) // 20, 1)):
+                of = dyn if model_of_one is None else model_of_one(i)
+                one = mb.simulate(of, q[i], v[i], steps * dt, "rk4", dt=dt, doubt=False)
+                off.append(float(np.abs(one.q - run.q[i]).max()))
+                assert [e.name for e in one.events] == [e.name for e in run.events if e.member == i]
+            row["off_single_runs"] = max(off)
+        rows.append(row)
+        print(row)
+
+    rest, slide, mixed = rubbed(2.0), rubbed(0.01), rubbed(0.3)
+    q, v = bare.random_state(rng)
+    measure("one at rest", rest, q, 0 * v, alone, 1e-3)
+    # Faster than gravity turns it.
+    fast = 6.0 * np.sign(v) + v
+    measure("one sliding", slide, q, fast, alone, 1e-2 / alone)
+    Q, V = bare.random_state(rng, many)
+    half = V * (rng.random(V.shape) > 0.5)
+    measure("many at rest", rest, Q, 0 * V, steps, 1e-3)
+    measure("many sliding", slide, Q, 6.0 * np.sign(V) + V, steps, 1e-2 / steps)
+    measure("many mixed", mixed, Q, half, steps, 1e-4)
+    measure("many mixed, often changing", mixed, Q, half, steps, 1e-3)
+    scale = mb.Parameter("scale", 1.0)
+    size = rng.uniform(0.5, 2.0, variants)
+    dyn = rubbed(0.3, scale).at(scale=size)
+    measure(
+        "variants of friction", dyn, Q[:variants], half[:variants], steps, 1e-3, lambda i: rubbed(0.3, float(size[i]))
+    )
     return rows
 
 
@@ -448,6 +520,7 @@ SMOKE = {
     "TIGHT": 1e-3,
     "STEPS": {"moreau": [20, 40], "rk853": [1e-2, 1e-3]},
     "COST": (("double_pendulum",), 5, 1),
+    "BATCH": ("double_pendulum", 3, 2, 20, 5, 1),
     "RTOLS": (1e-3,),
     "LENGTHS": (1e-2,),
     "WIDTHS": (1e-1,),
@@ -465,6 +538,7 @@ def main():
     data["arm_known_to"] = max((float(abs(a[0] - b[0])) for a, b in known), default=0.0)
     print("arm known to", data["arm_known_to"])
     data["cost_of_moreau"] = cost(*COST)
+    data["batches"] = batches(*BATCH)
     data["smoothed"] = smoothed(problems["two-link arm"], ARM["f"])
     results("friction.json").write_text(json.dumps({**stamp(__file__), **data}, indent=1) + "\n", encoding="utf-8")
 

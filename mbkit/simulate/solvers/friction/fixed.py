@@ -20,6 +20,7 @@ from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.methods.registry import method_of
+from mbkit.model.integration_space import Space
 from mbkit.simulate.events import Hit
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
@@ -33,8 +34,10 @@ Solver = Callable[[IntegrationProblem], SolverResult]
 #: Phases in a row that end where they begin, at most.
 MAX_EMPTY_PHASES: Final = 20
 UNDECIDED: Final = "stopped, as which joints rest cannot be decided"
-#: Steps of the first block, and the factor by which blocks grow while nothing changes.
+#: Steps of a block, at least, and the factor by which blocks grow while nothing changes.
 _BLOCK, _GROWTH = 32, 4
+#: States that machine code takes in the time in which a block is set up.
+_SET_UP: Final = 2**10
 #: States of a block, at most.
 _MOST_STATES: Final = 2**16
 _EPS: Final = float(np.finfo(float).eps)
@@ -104,7 +107,6 @@ class _Members:
         self.k: Indices = np.zeros(n, dtype=np.intp)
         self._empty = np.zeros(n, dtype=int)
         self._going = np.full(n, True)
-        self._window = _BLOCK
         #: How those ended that did so early, and why.
         self.early: dict[int, tuple[Ended, str]] = {}
         self.error: FunctionError | None = None
@@ -122,7 +124,8 @@ class _Members:
         rows = np.arange(len(self.k))
         self._sample(rows)
         self._phase = self.begin(rows, self.times(np.full(len(rows), grid.start)))
-        parts = len(self.problem.q) // len(self.k)
+        self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._compiled(self._phase.dyn) else 0)
+        self._window, parts = self._shortest, len(self.problem.q) // len(self.k)
         while self.error is None and self._going.any():
             self._block()
             self._going &= self.k < grid.steps
@@ -213,26 +216,45 @@ class _Members:
         grid, k = self.problem.grid, self.k[rows]
         phase = self._phase if len(rows) == len(self.k) else self._phase.take(rows)
         start = grid.time(int(k.min()))
-        margins = np.empty((len(rows), n)) if phase.still.any() and self._compiled(phase.dyn) else None
+        compiled = phase.still.any() and self._compiled(phase.dyn)
+        margins = np.empty((len(rows), n)) if compiled and self.side_by_side else None
         result = self._solved(rows, phase, n, Grid(start, start + n * h, h, n, h), margins)
         q, v = (x if self.side_by_side else x[None] for x in (result.q, result.v))
-        q, v = self.friction.held(replace(phase, still=phase.still[:, None]), q[:, :1], q, v)
         made = np.rint((np.atleast_1d(result.reached) - start) / h).astype(np.intp)
         limit = np.minimum(np.minimum(made, q.shape[1] - 1), np.minimum(left, n))
+        if compiled and margins is None:
+            # One alone has the margins of its states side by side, behind the steps.
+            times: Any = start + np.arange(1, q.shape[1]) * h
+            margins = self._margins_of(phase, times, q[0, 1:], v[0, 1:])
         good = self._good(rows, phase, q, v, limit, start, h) if margins is None else _first(margins < 0, limit)
         self._window = self._next_window(good, good < limit)
-        steps = np.arange(1, q.shape[1])
-        inside = steps <= good[:, None]
         record, first = self._record, int(k[0])
         if (k == first).all() and (good == n).all():
             # Most blocks: nothing changes.
             saved = record.rows(first + 1, first + n)
-            for whole, x in ((record.q, q), (record.v, v)):
-                whole[self.members[rows], saved] = x[:, record.kept[saved] - first]
+            places, every = record.kept[saved] - first, len(rows) == len(record.q)
+            # Views, which are not written twice.
+            here: Any = slice(places[0], places[-1] + 1) if len(places) == n else places
+            still = phase.still[:, None]
+            for whole, x, fixed, holds in (
+                (record.q, q, q[:, :1], self.friction.places(still)),
+                (record.v, v, 0.0, still),
+            ):
+                part = whole[:, saved] if every else x[:, here].copy()
+                part[...] = x[:, here]
+                if holds.any():
+                    np.copyto(part, fixed, where=holds)
+                if not every:
+                    whole[self.members[rows], saved] = part
         else:
-            self._keep(np.repeat(rows, good), (k[:, None] + steps)[inside], q[:, 1:][inside], v[:, 1:][inside])
+            steps = np.arange(1, q.shape[1])
+            inside = steps <= good[:, None]
+            row = np.repeat(np.arange(len(rows)), good)
+            states = self.friction.held(phase.still[row], q[row, 0], q[:, 1:][inside], v[:, 1:][inside])
+            self._keep(rows[row], (k[:, None] + steps)[inside], *states)
         last = np.arange(len(rows)), good
-        self.q[rows], self.v[rows], self.k[rows] = q[last], v[last], k + good
+        self.q[rows], self.v[rows] = self.friction.held(phase.still, self.q[rows], q[last], v[last])
+        self.k[rows] = k + good
         self.error = result.error
         if self.error is None:
             self._lose(rows[(good == limit) & (limit < np.minimum(left, n))], result)
@@ -240,8 +262,7 @@ class _Members:
 
     def _next_window(self, good: Indices, changed: NDArray[np.bool_]) -> int:
         """Return the steps of the next block: more where few phases end, as steps behind an end are in vain."""
-        most = _MOST_STATES
-        return int(np.clip(_GROWTH * good.mean() * (1 - changed.mean()) ** 3, _BLOCK, most))
+        return int(np.clip(_GROWTH * good.mean() * (1 - changed.mean()) ** 3, self._shortest, _MOST_STATES))
 
     def _compiled(self, dyn: Dynamics) -> bool:
         """Return whether the margins of states are machine code with the steps."""
@@ -252,6 +273,18 @@ class _Members:
     def margin_part(self) -> Any:
         """The least margin, as a part behind a step."""
         return self.friction.margin_part(self._phase.dyn)
+
+    def _margins_of(self, phase: Phase, t: Array, q: Array, v: Array) -> Array:
+        """Return the least margins of the states of a block of one trajectory, (1, n)."""
+        dyn: Any = phase.dyn
+        part, force = self.margin_part, self.problem.torque.over_states(self._alone, int(self.k[0]), len(q))
+        assert force is not None  # no function is compiled
+        states = q, Space(dyn.model).to_integrator_velocity(q, v), force, np.zeros((1, 1))
+        given = (
+            np.broadcast_to(x, (len(q), np.shape(x)[1]))
+            for x in (*states, self.friction.bounds(phase), with_time(dyn, t))
+        )
+        return np.asarray(dyn.code(part.name, make=part.make)(*given, threads=dyn.threads)[0][:, 0, 0][None])
 
     def _solved(self, rows: Indices, phase: Phase, n: int, grid: Grid, margins: Array | None = None) -> SolverResult:
         """Return the run of a block, whose margins are put into an array where one is given, (m, n)."""
@@ -280,7 +313,7 @@ class _Members:
     def _good(self, rows: Indices, phase: Phase, q: Array, v: Array, limit: Indices, start: float, h: float) -> Indices:
         """Return how many states behind the first are of the phase."""
         which = self.friction.which
-        along: Array = phase.sides[:, None, which] * v[:, 1:, which]
+        along: Array = np.where(phase.still, 0.0, phase.sides)[:, None, which] * v[:, 1:, which]
         good = _first(np.any(along < 0, axis=2), limit)
         counts = np.where(phase.still.any(axis=1), good, 0)
         if counts.any():
@@ -376,6 +409,14 @@ def _of_each(force: Any) -> Callable[[float, Array, Array], Array]:
     return lambda t, q, v: np.array([force(t, *state) for state in zip(q, v, strict=True)])
 
 
+def with_time(dyn: Any, t: Array) -> Array:
+    """Return values of parameters, (1, p) or (m, p), at a time of each sample."""
+    values, clock = np.atleast_2d(dyn.parameter_values), dyn.model.time_parameter
+    if clock is None:
+        return values
+    return np.where(np.arange(values.shape[1]) == list(dyn.model.parameters).index(clock), t[:, None], values)
+
+
 class _PartOfStep:
     """The rest of a step in one phase, from the states of trajectories at times t on."""
 
@@ -389,10 +430,7 @@ class _PartOfStep:
         timed = dyn.model.time_parameter
         if run._compiled(dyn):
             self._code, self._threads = dyn.step_with(run.problem.method, run.margin_part), dyn.threads
-            self._values, self._bound = np.atleast_2d(dyn.parameter_values), run.friction.bounds(phase)
-            if timed is not None:
-                place = list(dyn.model.parameters).index(timed)
-                self._values = np.where(np.arange(self._values.shape[1]) == place, t[:, None], self._values)
+            self._values, self._bound = with_time(dyn, t), run.friction.bounds(phase)
         self._stepped = self._method.explicit and timed is None and not callable(self._force)
         self._stepped = self._stepped and not run.side_by_side
 
@@ -404,7 +442,7 @@ class _PartOfStep:
         if self._values is not None:
             given = q, v, force, s[:, None], self._bound[i], self._values[i]
             arrays, _ = self._code.everything(*given, threads=self._threads)
-            return *run.friction.held(phase, q, arrays["q1"], arrays["v1"]), arrays["margin1"][:, 0]
+            return *run.friction.held(phase.still, q, arrays["q1"], arrays["v1"]), arrays["margin1"][:, 0]
         if self._stepped and s[0] > 0:
             ends = phase.dyn._step(self._method, q, v, force, float(s[0]))
         else:
@@ -415,7 +453,7 @@ class _PartOfStep:
                 one = run._solved(self._rows[i[j : j + 1]], phase.take(np.array([j])), 1, grid)
                 for now, states in zip(ends, (one.q, one.v), strict=True):
                     now[j] = states.reshape(-1, states.shape[-1])[-1]
-        q, v = run.friction.held(phase, q, *ends)
+        q, v = run.friction.held(phase.still, q, *ends)
         return q, v, run.friction.margins(phase, run.times(self._t[i] + s), q, v, force).min(axis=1)
 
     def ends(self, i: Indices, length: Array, over: Array) -> Array:

@@ -89,13 +89,17 @@ class Friction:
         one: Dynamics = self._own.phase(rubbed, *(x.reshape(-1, x.shape[-1])[0] for x in (sides, still)))
         return one
 
-    def held(self, phase: Phase, start: Array, q: Array, v: Array) -> tuple[Array, Array]:
+    def held(self, still: NDArray[np.bool_], start: Array, q: Array, v: Array) -> tuple[Array, Array]:
         """Return states of a phase from `start` on in which what rests keeps its place and no velocity, to the bit."""
-        if not phase.still.any():
+        if not still.any():
             return q, v
-        rests = np.zeros((*phase.still.shape[:-1], q.shape[-1]), dtype=bool)
-        rests[..., self._places] = phase.still[..., self.which]
-        return np.where(rests, start, q), np.where(phase.still, 0.0, v)
+        return np.where(self.places(still), start, q), np.where(still, 0.0, v)
+
+    def places(self, still: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which coordinates keep their place, (..., nq)."""
+        rests = np.zeros((*still.shape[:-1], self._dyn.model.nq), dtype=bool)
+        rests[..., self._places] = still[..., self.which]
+        return rests
 
     def margins(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).

@@ -113,7 +113,7 @@ class _Member:
         torque = self.problem.torque.of_part(self.member, k)
         own = replace(self.problem, dyn=phase.dyn, q0=self.q, v0=self.v, torque=torque, **changes)  # type: ignore[arg-type]
         result = self._solver(phase.dyn)(own)
-        q, v = self.friction.held(phase, self.q, result.q, result.v)
+        q, v = self.friction.held(phase.still, self.q, result.q, result.v)
         return replace(result, q=q, v=v)
 
     def next(self, phase: Phase, k: int, t: float, q: Array, v: Array, *, moved: bool) -> Phase | None:
@@ -121,7 +121,7 @@ class _Member:
 
         `moved` tells that time has passed.
         """
-        q, v = self.friction.held(phase, self.q, q, v)
+        q, v = self.friction.held(phase.still, self.q, q, v)
         v, leaving = self.friction.after(phase, t, q, v, self.force(k))
         self._stuck = 0 if moved else self._stuck + 1
         if self._stuck > MAX_EMPTY_PHASES:

@@ -31,7 +31,7 @@ def step(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: floa
     start = 0.0 if clock is None else float(dyn.model.parameters[clock] or 0.0)
     friction = Friction(dyn, side_by_side=together)
     phase = friction.phase(start, q, v, tau)
-    q1, v1 = friction.held(phase, q, *phase.dyn.step(q, v, tau, dt, method.name, t=start))
+    q1, v1 = friction.held(phase.still, q, *phase.dyn.step(q, v, tau, dt, method.name, t=start))
     over = (friction.margins(phase, start + dt, q1, v1, tau) < 0).any(axis=-1)
     if over.any():
         which: Any = np.flatnonzero(over) if together else ...
