@@ -672,10 +672,12 @@ def test_delta_never_turns_and_has_the_arms_angles_of_its_place(values: dict[str
 
 
 @pytest.mark.parametrize(
-    ("name", "most"), [("four_bar", 240), ("planar_3rrr", 1250), ("bricard", 1800), ("double_cardan_shaft", 2520)]
+    ("name", "most", "roots"),
+    [("four_bar", 240, 0), ("planar_3rrr", 1110, 2), ("bricard", 1740, 1), ("double_cardan_shaft", 2380, 2)],
 )
-def test_accelerations_under_loops_take_few_operations_and_no_root(name: str, most: int) -> None:
-    # With roots, and γ as a derivative of the rates, they were 267, 1107, 1995 and 2959, and up to 1.6 times slower.
+def test_accelerations_under_loops_take_few_operations_and_roots(name: str, most: int, roots: int) -> None:
+    # With a root for each row, and γ as a derivative of the rates, they were up to 1.3 times as many, and 1.6 times as
+    # slow as those of the formed J M⁻¹ Jᵀ.
     derived = program(mb.dynamics(catalog.get(name)(), "lagrangian", **OWN).function("forward_dynamics"))
     assert derived.arithmetic <= most
-    assert all(operation.name != "sqrt" for operation in derived.operations)
+    assert sum(operation.name == "sqrt" for operation in derived.operations) <= roots

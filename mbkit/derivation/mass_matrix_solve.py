@@ -21,8 +21,8 @@ from mbkit.model import Model
 #: Mass of a coordinate that has none, in terms of the mean one.
 _MASSLESS: Final = 1e-20
 _TINY: Final = 1e-300
-#: Columns from which on a reflection onto a row of theirs saves more than its root costs.
-_WORTH_A_ROOT: Final = 6
+#: Later columns from which on a reflection onto a row of their own saves more than its root costs.
+_WORTH_A_ROOT: Final = 4
 
 
 def elimination_order(model: Model) -> tuple[int, ...]:
