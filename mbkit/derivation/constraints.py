@@ -131,8 +131,8 @@ def _every_row(kin: Kinematics, time: Any) -> Iterator[_Row]:
 def loop_drifts(kin: Kinematics, mechanics: LinkMechanics) -> dict[str, Any]:
     """Return γ by the names of rows of loops whose ends the world carries: f̈ at v̇ = 0, from the motion of the links.
 
-    The ends' accelerations are those of the links, which inverse dynamics takes too, and the second derivatives of a
-    frame's axes are (ω̇ × + ω × ω ×) of them.
+    The ends' accelerations are those of the links, whose products inverse dynamics has too, and the second derivatives
+    of a frame's axes are (ω̇ × + ω × ω ×) of them.
     """
     out: dict[str, Any] = {}
     for loop in kin.model.loops:

@@ -322,7 +322,9 @@ class ConstrainedLinkEquations(ConstrainedMotion, LinkEquations):
     @cached_property
     def constraint_rows(self) -> Constraints:
         """All rows, and which of them are independent, with γ of loops from the motion of the links."""
-        return Constraints(self.kin, self.time, cache(lambda: loop_drifts(self.kin, self.sound)))
+        # Without gravity, of which rounding would be left at rest.
+        links = cache(lambda: loop_drifts(self.kin, LinkMechanics(self.sound.tree, falling=False)))
+        return Constraints(self.kin, self.time, links)
 
 
 def _size(x: Any) -> int:
