@@ -6,7 +6,7 @@ Every message names the argument or the body, says what was expected and what ca
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final
@@ -214,6 +214,13 @@ def nearest(name: str, known: Iterable[str], count: int = 3) -> list[str]:
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return the end of a message that suggests the nearest known name; empty where none is near."""
     return "".join(f"; did you mean {near!r}?" for near in nearest(name, known, 1))
+
+
+def require_known(what: str, known: Collection[str], *names: object) -> None:
+    """Raise `UnknownNameError` for the first name that is none of the known ones."""
+    for name in names:
+        if name not in known:
+            raise UnknownNameError(what, str(name), known)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from mbkit.catalog.planar_loops import *  # noqa: F403
 from mbkit.catalog.rigid_bodies import *  # noqa: F403
 from mbkit.catalog.rolling import *  # noqa: F403
 from mbkit.catalog.spatial_loops import *  # noqa: F403
-from mbkit.errors import UnknownNameError
+from mbkit.errors import require_known
 from mbkit.model import Model
 
 __all__ = ["get", "systems"]
@@ -51,8 +51,7 @@ def get(name: str) -> Callable[..., Model]:
     UnknownNameError
         With near names.
     """
-    if name not in SYSTEMS:
-        raise UnknownNameError("system", str(name), SYSTEMS)
+    require_known("system", SYSTEMS, name)
     return SYSTEMS[name]
 
 

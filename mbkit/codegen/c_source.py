@@ -22,7 +22,7 @@ from mbkit._version import __version__
 from mbkit.codegen.program import program
 from mbkit.derivation import FUNCTIONS, equations_of
 from mbkit.derivation.body_motion import OF_FRAME, OF_WHOLE
-from mbkit.errors import InputError, OutputError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, OutputError, UnsupportedError, require_known
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import held_at_rest
 from mbkit.model.elements import paths
@@ -408,9 +408,7 @@ def _checked(quantities: Iterable[str]) -> list[str]:
     known = (*FUNCTIONS, *OF_FRAME, *OF_WHOLE)
     # Each once, in the caller's order.
     wanted = list(dict.fromkeys(map(str, quantities)))
-    for quantity in wanted:
-        if quantity not in known:
-            raise UnknownNameError("quantity", quantity, known)
+    require_known("quantity", known, *wanted)
     if not wanted:
         raise InputError(f"quantities: expected at least one of {', '.join(FUNCTIONS)}, got none")
     return wanted

@@ -24,7 +24,7 @@ from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.steps import momentum_step_slopes
-from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnsupportedError, require_known
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.elements.kinds import that_do
@@ -293,9 +293,7 @@ class LagrangianDynamics(Dynamics):
 
     def at(self, /, **values: ArrayLike) -> LagrangianDynamics:
         """Return the same dynamics at other values of parameters, as `Dynamics.at` does; nothing is derived again."""
-        for name in values:
-            if name not in self.model.parameters:
-                raise UnknownNameError("parameter", name, self.model.parameters)
+        require_known("parameter", self.model.parameters, *values)
         many = {name: _column(name, x) for name, x in values.items() if np.ndim(x)}
         if (times := many.get(self.model.time_parameter or "")) is not None and len(times):
             self.model.require_times("time", float(times.min()), float(times.max()))
@@ -646,8 +644,7 @@ def _checked_device(device: str, compile: bool | None) -> str:  # noqa: A002  # 
 
 
 def _elimination(model: Model, name: str) -> Elimination:
-    if name not in ELIMINATIONS:
-        raise UnknownNameError("elimination", name, ELIMINATIONS)
+    require_known("elimination", ELIMINATIONS, name)
     if name != "mass matrix" and model.energy_equations is not None:
         raise UnsupportedError(f"{model.name}: written as energies, it has the elimination 'mass matrix', not {name!r}")
     if name == "least constraint" and not has_squares(model):

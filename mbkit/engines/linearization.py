@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array, arrays_shown, real, shown
 from mbkit.engines.steps import Slopes, differentiable_method, step_derivatives
-from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnsupportedError, require_known
 from mbkit.methods.registry import DEFAULT_METHOD, Method
 from mbkit.methods.small_motions import graded
 from mbkit.model import Model
@@ -57,8 +57,7 @@ class DiscreteLinearization(NamedTuple):
     #: The step of the state itself, (2nv,) or (N, 2nv): it leads to ``model.integrate(q, f[:nv])`` and ``v + f[nv:]``.
     f: Array
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
+    __repr__ = arrays_shown
 
 
 class Linearization(NamedTuple):
@@ -78,8 +77,7 @@ class Linearization(NamedTuple):
     #: ẏ = f + A_fixed y + B δτ. It differs from A at moving free and ball joints, which have half of -ad_v and -ω̂ here.
     A_fixed: Array
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
+    __repr__ = arrays_shown
 
     @property
     def eigenvalues(self) -> Any:
@@ -135,8 +133,7 @@ class InverseDynamicsDerivatives(NamedTuple):
     #: ∂τ/∂a, the mass matrix.
     a: Array
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
+    __repr__ = arrays_shown
 
 
 class ForwardDynamicsDerivatives(NamedTuple):
@@ -149,8 +146,7 @@ class ForwardDynamicsDerivatives(NamedTuple):
     #: ∂v̇/∂τ, the inverse of the mass matrix.
     tau: Array
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
+    __repr__ = arrays_shown
 
 
 class InverseDynamicsSecondDerivatives(NamedTuple):
@@ -170,8 +166,7 @@ class InverseDynamicsSecondDerivatives(NamedTuple):
     #: ∂²τ_i/∂q_j ∂a_k, the derivatives of the mass matrix's column k.
     qa: Array
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
+    __repr__ = arrays_shown
 
 
 def of_second_order(out: Any) -> Any:
@@ -436,8 +431,7 @@ class LinearizationQuantities:
         >>> list(model.parameters), dyn.parameter_derivatives("mass_matrix", [0.3]).tolist()  # M = m l²
         (['m', 'l'], [[[0.25, 2.0]]])
         """
-        if quantity not in DIFFERENTIABLE:
-            raise UnknownNameError("quantity", str(quantity), DIFFERENTIABLE)
+        require_known("quantity", DIFFERENTIABLE, quantity)
         parameters = inspect.signature(getattr(self, quantity)).parameters.values()
         names = [x.name for x in parameters if x.default is x.empty]
         if len(arguments) != len(names):

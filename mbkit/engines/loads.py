@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, batch_of, rows
 from mbkit.engines.elements.passive import pull
 from mbkit.engines.frames_and_momenta import ALIGNED, CLASSICAL, LOCAL, Parts, axes_named, momentum_rates
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.errors import InputError, require_known
 from mbkit.model import Frame, Joint, Model, PointSpring
 from mbkit.model.elements.kinds import that_do
 from mbkit.model.elements.paths import Path
@@ -227,9 +227,7 @@ class Loads:
         key = tuple(names)
         if key not in held:
             known = {joint.name: joint for joint in self.model.joints}
-            for name in key:
-                if name not in known:
-                    raise UnknownNameError("joint", str(name), known)
+            require_known("joint", known, *key)
             held[key] = Parts(known[name] for name in key)
         return held[key]
 

@@ -60,8 +60,7 @@ class OperationalSpace:
     reciprocal_condition: Any
     damped: Any
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
+    __repr__ = arrays_shown
 
 
 def operational_space(

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from mbkit._attributes import forwarded
 from mbkit._check import Array, batch_of, real
 from mbkit._escape import html, one_line
-from mbkit.errors import UnknownNameError, UnsupportedError
+from mbkit.errors import UnsupportedError, require_known
 from mbkit.lagrangian.energies.casadi_equations import EnergyEquations, VelocityMap
 from mbkit.lagrangian.energies.energy_form import EnergyForm
 from mbkit.lagrangian.energies.symbols import plain
@@ -154,9 +154,7 @@ class EnergyModel(Model):
 
     def with_nominal(self, values: Mapping[str, Any]) -> EnergyModel:
         """Return the same system at other values of its parameters."""
-        for name in values:
-            if name not in self.parameters:
-                raise UnknownNameError("parameter", name, self.parameters)
+        require_known("parameter", self.parameters, *values)
         moved = {n: real(f"parameter {n!r}", x) for n, x in values.items()}
         out = object.__new__(type(self))
         # Nothing but the values differs: what was derived from the rest is kept.

@@ -25,7 +25,7 @@ from mbkit.engines.base import QUANTITIES, Dynamics
 from mbkit.engines.constrained import ASKED
 from mbkit.engines.constraint_manifold import Manifold, require_few
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import InputError, NumericalError, UnknownNameError
+from mbkit.errors import InputError, NumericalError, require_known
 from mbkit.lagrangian.energy_model import abstract_parts
 from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
@@ -238,9 +238,7 @@ class Embedded:
         # However chosen, the best block of a matrix is no worse than this (Gu and Eisenstat 1996).
         self.least = _WORN / float(np.sqrt(1 + rows * self.degrees))
         known = self.model.coordinate_names
-        for name in independent or ():
-            if name not in known:
-                raise UnknownNameError("coordinate", name, known)
+        require_known("coordinate", known, *(independent or ()))
         if independent is not None and len(set(independent)) != self.degrees:
             choice = ", ".join(independent) or "none"
             raise InputError(f"independent: expected {self.degrees} of {', '.join(known)}, got {choice}")

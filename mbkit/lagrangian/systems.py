@@ -12,7 +12,7 @@ from typing import Any, Final
 import sympy as sp
 
 from mbkit._check import real
-from mbkit.errors import UnknownNameError
+from mbkit.errors import require_known
 from mbkit.lagrangian.energies.symbols import velocity_of
 from mbkit.lagrangian.system import Lagrangian
 
@@ -504,6 +504,5 @@ def get(name: str) -> Callable[..., Lagrangian]:
     UnknownNameError
         With near names.
     """
-    if name not in _SYSTEMS:
-        raise UnknownNameError("system on paper", str(name), _SYSTEMS)
+    require_known("system on paper", _SYSTEMS, name)
     return _SYSTEMS[name]

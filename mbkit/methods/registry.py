@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, Literal, NamedTuple
 
-from mbkit.errors import InputError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, UnsupportedError, require_known
 from mbkit.methods.one_step import SemiImplicitEuler
 from mbkit.methods.stability import IMPLICIT_EULER, IMPLICIT_IN_VELOCITY, SYMPLECTIC_EULER, Stability, TableauStability
 from mbkit.methods.tableaus import (
@@ -333,8 +333,7 @@ def method_of(name: object) -> Method:
     """Return the method of this name."""
     if not isinstance(name, str):
         raise InputError(f"method: expected a name, got {name!r}; there are: {', '.join(METHODS)}")
-    if name not in METHODS:
-        raise UnknownNameError("method", name, METHODS)
+    require_known("method", METHODS, name)
     return METHODS[name]
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import TWO_TURNS, Array, batch_of, count, generator, hint_at_degrees, real, rows
 from mbkit._escape import html
 from mbkit._warn import warn
-from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, UnsupportedError
+from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, UnsupportedError, require_known
 from mbkit.model import manifold
 from mbkit.model.base_parameters import TOLERANCE, BaseParameters, base_parameters, regressor_columns
 from mbkit.model.description import SERVOS, Description, expect_name
@@ -495,9 +495,7 @@ class Model(Description):
         return check_substituted(self, replace(moved, time=time))
 
     def _parameter_values(self, values: Mapping[str, Any]) -> dict[str, float]:
-        for name in values:
-            if name not in self.parameters:
-                raise UnknownNameError("parameter", name, self.parameters)
+        require_known("parameter", self.parameters, *values)
         return {name: real(f"parameter {name!r}", value) for name, value in values.items()}
 
     # Reading

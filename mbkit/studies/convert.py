@@ -16,7 +16,7 @@ from mbkit._escape import xml_holds
 from mbkit._version import __version__
 from mbkit.engines import dynamics
 from mbkit.engines.registry import DERIVED
-from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError, UnsupportedError, writing
+from mbkit.errors import MbkitError, MbkitWarning, UnsupportedError, require_known, writing
 from mbkit.load import load
 from mbkit.load.urdf_writer import URDF, urdf_text
 from mbkit.model import Model
@@ -95,8 +95,7 @@ def convert(model: Model, to: str) -> Converted:
     True
     """
     expect_model(model)
-    if to not in FORMATS:
-        raise UnknownNameError("format", str(to), FORMATS)
+    require_known("format", FORMATS, to)
     _check_names(model, to)
     model = with_values(model, "convert")
     return _to_mjcf(model) if to == "mjcf" else _to_urdf(model)

@@ -46,8 +46,7 @@ class Impact:
     reactions: Array
     energy_change: Any
 
-    def __repr__(self) -> str:
-        return arrays_shown(self)
+    __repr__ = arrays_shown
 
 
 def impact(

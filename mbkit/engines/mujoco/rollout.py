@@ -15,7 +15,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit._warn import warn
 from mbkit.engines.mujoco.model import MujocoModel, heard_warnings
-from mbkit.errors import DoubtfulRunWarning, UnknownNameError, UnsupportedError
+from mbkit.errors import DoubtfulRunWarning, UnsupportedError, require_known
 from mbkit.model import Model
 
 # All but RK4 are of first order. "euler" takes damping as it is, because the description is built with MuJoCo's
@@ -49,8 +49,7 @@ def rollout(
 ) -> tuple[Array, Array]:
     """Integrate one state or a batch on all cores, with options of the compiled model; see `MujocoDynamics.rollout`."""
     m = compiled.model
-    if integrator not in INTEGRATORS:
-        raise UnknownNameError("integrator of MuJoCo", integrator, INTEGRATORS)
+    require_known("integrator of MuJoCo", INTEGRATORS, integrator)
     m.opt.integrator, m.opt.timestep = INTEGRATORS[integrator], dt
     single = q0.ndim == 1
     q0, v0 = np.atleast_2d(q0), np.atleast_2d(v0)

@@ -15,7 +15,7 @@ from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.known_defects import OF_PINOCCHIO
 from mbkit.engines.versions import environment
 from mbkit.engines.versions.description import NEWTON, ONE_BY_ONE, SENT, SENT_TO_DRAKE, STACKED, Convention, Steps
-from mbkit.errors import InputError, UnknownNameError
+from mbkit.errors import InputError, require_known
 from mbkit.model.elements import paths
 from mbkit.model.elements.kinds import joint_types
 
@@ -228,8 +228,7 @@ def engine(name: str, *, seconds: float | None = None) -> EngineVersion:
             f"name: {form}, got {name!r}; without a version it is the installed one, which needs no engine()"
         )
     head, _, version = (part.strip() for part in name.partition("=="))
-    if head not in PACKAGES:
-        raise UnknownNameError("engine with versions", head, PACKAGES)
+    require_known("engine with versions", PACKAGES, head)
     if not (_VERSION.fullmatch(version) and environment.parsed(version)):
         raise InputError(f"name: {form}, got {name!r}")
     limit = PACKAGES[head].limit if seconds is None else real("seconds", seconds, positive=True)

@@ -15,7 +15,7 @@ from sympy.core.function import AppliedUndef, UndefinedFunction
 
 from mbkit._check import Array, real
 from mbkit._warn import warn
-from mbkit.errors import InputError, MbkitWarning, UnknownNameError
+from mbkit.errors import InputError, MbkitWarning, require_known
 from mbkit.lagrangian.energies.kinetic_energy import KineticSplit, require_inertia, split, warn_of_negative
 from mbkit.lagrangian.energies.symbols import (
     PlainSymbols,
@@ -292,9 +292,7 @@ def timed_parameters(form: EnergyForm) -> tuple[sp.Symbol, ...]:
 def parameter_values(form: EnergyForm, values: Mapping[str, float], what: str) -> Array:
     """Return the numbers of the parameters in their order, with some replaced; refuse one without a value."""
     numbers = {s.name: x for s, x in form.parameters.items()}
-    for name in values:
-        if name not in numbers:
-            raise UnknownNameError("parameter", name, numbers)
+    require_known("parameter", numbers, *values)
     numbers |= {n: real(f"parameter {n!r}", x) for n, x in values.items()}
     require_values(numbers, what)
     return np.array(list(numbers.values()), dtype=np.float64)

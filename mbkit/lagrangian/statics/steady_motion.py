@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from mbkit._check import Array, real, real_array, rows
 from mbkit._escape import html, terminal
 from mbkit.engines.base import Dynamics
-from mbkit.errors import InputError, NumericalError, UnknownNameError
+from mbkit.errors import InputError, NumericalError, require_known
 from mbkit.lagrangian.energies.symbols import name_of
 from mbkit.lagrangian.reduction.routh import Routhian
 from mbkit.lagrangian.statics.equilibrium import Equilibrium, equilibrium
@@ -188,9 +188,7 @@ def _start(reduced: Routhian[Any], q0: ArrayLike | None) -> Array | None:
 def _complete(what: str, given: Mapping[Any, float], names: list[str]) -> None:
     if not isinstance(given, Mapping):
         raise InputError(f"{what}: expected a mapping of names to numbers, got {given!r}")
-    for name in given:
-        if name not in names:
-            raise UnknownNameError(what, str(name), names)
+    require_known(what, names, *given)
     missing = [name for name in names if name not in given]
     if missing:
         raise InputError(f"{what}: expected a number for each of {', '.join(names)}, got none for {', '.join(missing)}")

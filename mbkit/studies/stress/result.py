@@ -10,7 +10,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from mbkit._check import real
-from mbkit.errors import UnknownNameError
+from mbkit.errors import require_known
 from mbkit.studies.results import NO_LIMIT, Block, Column, ResultTable, Table, Title, columns, counted
 from mbkit.studies.stress.figure import figure
 from mbkit.studies.stress.measurements import CaseResult, Measurement, Outcome, Row
@@ -95,8 +95,7 @@ class StressResult(ResultTable):
     def case(self, name: str) -> CaseResult:
         """Return the case of this name; `UnknownNameError` where there is none."""
         known = {case.name: case for case in self.cases}
-        if name not in known:
-            raise UnknownNameError("case", name, known)
+        require_known("case", known, name)
         return known[name]
 
     def rows(self) -> Iterator[tuple[CaseResult, Row]]:

@@ -20,7 +20,7 @@ from mbkit.engines import engine as named_version
 from mbkit.engines.registry import MUJOCO
 from mbkit.engines.versions import environment
 from mbkit.engines.versions.engine_version import PACKAGES, order_of, versions_of
-from mbkit.errors import InputError, MbkitError, UnknownNameError
+from mbkit.errors import InputError, MbkitError, UnknownNameError, require_known
 from mbkit.model import Model
 from mbkit.studies._checkpoint import Progress, silent
 from mbkit.studies._targets import names_of
@@ -98,8 +98,7 @@ def versions(
     A version that does not install, whose process dies or that hangs is in ``missing`` or has rows with a reason.
     A change that a later one of the spread undid is found only where one of its versions is measured.
     """
-    if engine not in PACKAGES:
-        raise UnknownNameError("engine with versions", str(engine), PACKAGES)
+    require_known("engine with versions", PACKAGES, engine)
     count("most", most, least=2)
     count("samples", samples, least=1)
     if tolerance is None:

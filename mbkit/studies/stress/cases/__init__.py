@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, get_args
 
-from mbkit.errors import UnknownNameError
+from mbkit.errors import require_known
 from mbkit.studies.stress.case import Case, Family
 from mbkit.studies.stress.cases._common import TABLE
 
@@ -31,6 +31,5 @@ def names() -> tuple[str, ...]:
 
 def get(name: str) -> Case:
     """Return the case of this name; `UnknownNameError` with near names where there is none."""
-    if name not in CASES:
-        raise UnknownNameError("case", str(name), CASES)
+    require_known("case", CASES, name)
     return CASES[name]
