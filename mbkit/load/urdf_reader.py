@@ -25,7 +25,8 @@ from mbkit.errors import ModelError, Suggestions
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import z_to
 from mbkit.load.xml_reader import Element, Reader, element_text, misspelt, reserved, unused
-from mbkit.model import Body, Mimic, Model, ModelBuilder, kind_of
+from mbkit.model import Body, Joint, Mimic, Model, ModelBuilder, kind_of
+from mbkit.model.parts import rules_of
 from mbkit.model.validation import body_fault, listing, repeated_names
 
 # The parser in C++ recurses over the tree, and its tables grow as the square.
@@ -360,9 +361,9 @@ def _dynamics(joint: Element, kind: str, item: str, read: Reader) -> tuple[dict[
         own: read.number(dynamics, name, item, 0.0)
         for name, own in (*zip(DYNAMICS, DYNAMICS, strict=True), *_SPRING.items())
     }
-    for name in ("friction", "stiffness"):
-        if numbers[name] < 0:
-            read.fault(f"{item}: {name} {numbers[name]:g} is negative; expected 0 or more", dynamics)
+    for name, x in numbers.items():
+        if x < rules_of(Joint)[name].least:
+            read.fault(f"{item}: {name} {x:g} is negative; expected 0 or more", dynamics)
     stiffness, rest = numbers["stiffness"], numbers["rest"]
     if not stiffness:
         # A rest alone says nothing.

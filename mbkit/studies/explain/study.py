@@ -51,14 +51,13 @@ def explain(
 ) -> Explanation:
     """Explain why two descriptions, or two engines, differ.
 
-    Every difference between the descriptions is named, in each number of each kind of part, also of forces by
-    functions: rotor inertia, dry friction, springs, gravity, a lost, fused or changed body, inertia about the wrong
-    point or in the wrong axes, a joint's place, axis, zero or pitch, quaternion and joint order, mimic joints, velocity
-    frames, a known defect of an engine.
+    Every difference between the descriptions is named, in each number of each kind of part of `Model.acts`, also of
+    forces by functions: a lost, fused or changed body, inertia about the wrong point or in the wrong axes, a joint's
+    place, axis, zero or pitch, quaternion and joint order, velocity frames, a known defect of an engine.
     Joints are matched by structure and name, and a mere choice of frames is no difference.
 
     The effect of each difference is measured: it is added alone to the first description, and removed alone from
-    of the second. The remainder with all of them put into the first is measured too.
+    the second. The remainder with all of them put into the first is measured too.
 
     Parameters
     ----------
