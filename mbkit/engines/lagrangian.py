@@ -24,7 +24,7 @@ from mbkit.engines.frames_and_momenta import ALIGNED
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.engines.loads import Wrenches
 from mbkit.engines.steps import momentum_step_slopes
-from mbkit.errors import InputError, NumericalError, UnsupportedError, require_known
+from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError, require_known
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.elements.kinds import that_do
@@ -644,7 +644,8 @@ def _checked_device(device: str, compile: bool | None) -> str:  # noqa: A002  # 
 
 
 def _elimination(model: Model, name: str) -> Elimination:
-    require_known("elimination", ELIMINATIONS, name)
+    if name not in ELIMINATIONS:
+        raise UnknownNameError("elimination", name, ELIMINATIONS)
     if name != "mass matrix" and model.energy_equations is not None:
         raise UnsupportedError(f"{model.name}: written as energies, it has the elimination 'mass matrix', not {name!r}")
     if name == "least constraint" and not has_squares(model):

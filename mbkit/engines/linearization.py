@@ -57,7 +57,8 @@ class DiscreteLinearization(NamedTuple):
     #: The step of the state itself, (2nv,) or (N, 2nv): it leads to ``model.integrate(q, f[:nv])`` and ``v + f[nv:]``.
     f: Array
 
-    __repr__ = arrays_shown
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
 
 class Linearization(NamedTuple):
@@ -77,7 +78,8 @@ class Linearization(NamedTuple):
     #: ẏ = f + A_fixed y + B δτ. It differs from A at moving free and ball joints, which have half of -ad_v and -ω̂ here.
     A_fixed: Array
 
-    __repr__ = arrays_shown
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
     @property
     def eigenvalues(self) -> Any:
@@ -133,7 +135,8 @@ class InverseDynamicsDerivatives(NamedTuple):
     #: ∂τ/∂a, the mass matrix.
     a: Array
 
-    __repr__ = arrays_shown
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
 
 class ForwardDynamicsDerivatives(NamedTuple):
@@ -146,7 +149,8 @@ class ForwardDynamicsDerivatives(NamedTuple):
     #: ∂v̇/∂τ, the inverse of the mass matrix.
     tau: Array
 
-    __repr__ = arrays_shown
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
 
 class InverseDynamicsSecondDerivatives(NamedTuple):
@@ -166,7 +170,8 @@ class InverseDynamicsSecondDerivatives(NamedTuple):
     #: ∂²τ_i/∂q_j ∂a_k, the derivatives of the mass matrix's column k.
     qa: Array
 
-    __repr__ = arrays_shown
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
 
 def of_second_order(out: Any) -> Any:

@@ -60,7 +60,8 @@ class OperationalSpace:
     reciprocal_condition: Any
     damped: Any
 
-    __repr__ = arrays_shown
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
 
 def operational_space(

@@ -46,7 +46,8 @@ class Impact:
     reactions: Array
     energy_change: Any
 
-    __repr__ = arrays_shown
+    def __repr__(self) -> str:
+        return arrays_shown(self)
 
 
 def impact(
