@@ -197,3 +197,21 @@ def test_friction_is_freed_and_varied_like_other_numbers() -> None:
     bare = mb.dynamics(b.build(), "lagrangian")
     runs = [mb.simulate(x, q, v, 0.1, dt=STEP, doubt=False).q for x in (later.at(f=np.zeros(3)), bare)]
     assert off(*runs) < 1e-12
+
+
+@pytest.mark.parametrize("method", ["moreau", "rk4"])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_what_rests_lets_go_where_a_wrench_passes_its_bound(method: str, compiled: bool) -> None:
+    """2 kg under 2 N and then 3.5 N against a friction of 3 N: v = 0.25 m/s² (t - 0.1 s)."""
+    b = mb.ModelBuilder("block", gravity=(0, 0, 0))
+    b.add_body("m", mass=2.0)
+    b.add_joint("x", "prismatic", parent="world", child="m", axis=(1, 0, 0), friction=3.0)
+    dyn = mb.dynamics(b.build(), "lagrangian", compile=compiled)
+    wrench = np.zeros((2, 20, 6))
+    wrench[:, :10, 0], wrench[:, 10:, 0] = 2.0, [[3.5], [-2.9]]
+    for q, w in ((np.zeros((2, 1)), wrench), (np.zeros(1), wrench[0])):
+        run = mb.simulate(dyn, q, 0 * q, 0.2, method, dt=0.01, wrenches={"m": w}, doubt=False)
+        v = run.v.reshape(-1, 21)
+        assert v[0] == pytest.approx(0.25 * np.maximum(np.arange(21) * 0.01 - 0.1, 0), abs=1e-12)
+        assert not v[0, :11].any()
+        assert not v[1:].any()
