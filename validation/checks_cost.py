@@ -66,7 +66,7 @@ def row(name, dyn, q, v, method, setting, duration):
 
 #: See `validation.smoke`.
 SMOKE = {
-    "MODELS": {"z1": lambda: mb.load("z1")},
+    "MODELS": {"two links": mb.catalog.double_pendulum},
     "ROUNDS": 2,
     "BATCH": 2,
     "WAYS": (("rk4", {"dt": 1e-3}, (0.01,)), ("rk853", {"rtol": 1e-8}, (0.01,))),
