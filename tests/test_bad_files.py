@@ -162,7 +162,10 @@ URDFS = {
         with_joint(LIMIT + '<dynamics friction="-1"/>'),
         ["joint 'j': friction", "negative", "line 1"],
     ),
-    "negative_damping": (with_joint(LIMIT + '<dynamics damping="-1"/>'), ["joint 'j': damping", "negative"]),
+    "negative_damping": (
+        with_joint(LIMIT + '<dynamics damping="-1"/>'),
+        ["joint 'j': damping -1 is negative", "line 1"],
+    ),
     "zero_axis": (with_joint('<axis xyz="0 0 0"/>' + LIMIT), ["joint 'j': axis is zero"]),
     "short_axis": (with_joint('<axis xyz="0 1"/>' + LIMIT), ["joint 'j': axis xyz: expected 3 numbers, got '0 1'"]),
     "negative_spring": (
