@@ -476,7 +476,9 @@ def paths(name: str) -> tuple[str, ...]:
 def pair_cell(name: str, path: str, folder: Path) -> Cell:
     """Return what comes of a model on a path; a refusal has to name each part that the gate does not take."""
     out, model, gates = told(name, path, folder), kind_examples.example(name).model, registered()
-    refusing = [gates[g] for g in {*PATHS.get(path, ()), *COLUMNS[path].gates} if gates[g].refuses(model)]
+    # An engine's own gate speaks before that of one of its quantities.
+    asked = {*PATHS.get(path, ()), *COLUMNS[path].gates, *({path.partition(":")[0]} & {*gates})}
+    refusing = [gates[g] for g in asked if gates[g].refuses(model)]
     if refusing and out.outcome in ("right", "left out"):
         return Cell("silent", out.error, f"the gate {refusing[0].name!r} refuses it")
     unnamed = [_unnamed(g, model, out.text) for g in refusing]

@@ -256,7 +256,7 @@ def _slopes(name: str) -> list[tuple[np.ndarray, ...]]:
             return x.beside(along, bent, s)
 
         ways = (lambda s: path(s).plain.q), (lambda s: path(s).v), (lambda s: path(s).accelerated())
-        dx, dv, wanted = map(differences, ways)
+        dx, dv, wanted = (differences(f, 3e-4) for f in ways)
         out.append((x.rates(c.q) @ dx, dv, wanted))
     return out
 

@@ -172,3 +172,14 @@ def test_the_command_prints_and_writes_it(tmp_path) -> None:
     assert subprocess.run([sys.executable, "-c", module], check=False).returncode == 0
     assert run(cli, ["derive", "ur5", "--program", "gravities"]).exit_code == 2
     assert run(cli, ["derive", "ur5", "--program", "gravity", "--json"]).exit_code == 2
+
+
+def test_what_is_no_number_where_rows_depend_on_each_other_is_written() -> None:
+    """A bead on a circle: its equations have a branch without a number, which its state does not enter."""
+    x, y, u, w = sp.symbols("x y xdot ydot")
+    bead = mb.lagrangian.Lagrangian((u**2 + w**2) / 2, 9.81 * y, [x, y], [u, w], constraints=[x**2 + y**2 - 1])
+    text, scope = program(bead.model, "forward_dynamics"), {}
+    exec(text.python(), scope)
+    a = np.ravel(scope["forward_dynamics"]([0.6, 0.8], [0.8, -0.6], [0.0, 0.0]))
+    # The rod's force along (x, y) makes up for gravity's part and the turn.
+    assert a == pytest.approx(np.array([0.0, -9.81]) + (9.81 * 0.8 - 1.0) * np.array([0.6, 0.8]), rel=1e-12)

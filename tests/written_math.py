@@ -36,7 +36,7 @@ _AFTER = {*"+-)}|,]<>", *_COMPARED, "if", "else", ""}
 
 def plain(text: str) -> str:
     """Return a formula with names in ASCII, as of a symbol: ``q1``, ``jddot0``, ``tau2``, and without backslashes."""
-    text = unicodedata.normalize("NFD", text).translate(
+    text = unicodedata.normalize("NFD", text.replace(r"\text{NaN}", "nan")).translate(
         str.maketrans("₀₁₂₃₄₅₆₇₈₉", "0123456789") | {ord(k): x for k, x in _LETTERS.items()}
     )
     for mark, word in (("\u0307", "dot"), ("\u0308", "ddot")):
@@ -126,6 +126,8 @@ class _Reader:
             return _FRACTIONS[x]
         if x[0].isdigit():
             return float(x)
+        if x == "nan":
+            return np.nan
         if x == "@":
             return self.atom() / self.atom()
         if x == "√":

@@ -214,6 +214,8 @@ def _inputs(function: Any, model: Model) -> tuple[_Inputs, set[str]]:
 def _expression(o: Operation, known: list[sp.Expr], inputs: list[tuple[sp.Symbol, ...]]) -> sp.Expr:
     if o.name == "input":
         return inputs[o.arguments[0]][o.arguments[1]]
+    if o.name == "const" and math.isnan(o.value):
+        return sp.nan
     if o.name == "const":
         return sp.Integer(int(o.value)) if o.value == int(o.value) and abs(o.value) < 1e6 else sp.Float(o.value, 17)
     return sp.sympify(SYMPY.operations[o.name](*(known[j] for j in o.arguments)))
