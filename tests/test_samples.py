@@ -5,6 +5,9 @@ The truth is a run cut at the samples: one run for each interval, under a consta
 
 from __future__ import annotations
 
+import _thread
+import time
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from scipy.integrate import solve_ivp
 import mbkit as mb
 from mbkit.errors import InputError, TorqueError, UnsupportedError
 from mbkit.simulate import METHODS, Event, Policy, StateFeedback, simulate
+from mbkit.simulate.integrate import _intervals
 
 PERIOD, STEP, COUNT = 0.04, 0.01, 4
 
@@ -189,6 +193,76 @@ def test_a_trajectory_that_ended_is_asked_no_more(engine, method):
     assert run.stats.reached[1] < 0.1
 
 
+@pytest.mark.parametrize("engine", ["compiled", "pinocchio"])
+@pytest.mark.parametrize("batch", [False, True])
+def test_a_trajectory_that_ends_late_keeps_the_samples_before(engine, batch):
+    """The states up to there are those of a run under the same torques as an array."""
+
+    def push(t, _q, v):
+        return np.full(v.shape, 1e80 if t > 0.195 else np.sin(50.0 * t))
+
+    model, q, v = scene("tree")
+    policy = Policy(lambda t, q, v, members: np.where(members[:, None] == 1, push(t, q, v), 0.1))
+    given = (np.stack([q, q]), np.stack([v, v]), 0.4) if batch else (q, v, 0.4)
+    with pytest.warns(mb.errors.MbkitWarning, match=r"diverged after t = 0\.2 s.*grew beyond all bounds"):
+        run = simulate(dynamics_of(model, engine), *given, dt=STEP, torque=policy if batch else push, hold=PERIOD)
+    table = np.array([push(PERIOD * (k // 4), q, v) for k in range(20)])
+    until = simulate(mb.dynamics(model), q, v, 0.2, dt=STEP, torque=table)
+    np.testing.assert_allclose(run.q[1, :21] if batch else run.q, until.q, rtol=0, atol=1e-12)
+
+
+def test_an_interrupt_does_not_wait_for_the_samples_of_a_block():
+    """Ctrl-C while several threads meet at slow samples."""
+    begun: list[float] = []
+
+    def slow(_t, _q, v, _members):
+        begun.append(time.monotonic())
+        if len(begun) == 3:
+            _thread.interrupt_main()
+        time.sleep(0.05)
+        return -v
+
+    model, q, v = scene("tree")
+    dyn = mb.dynamics(model, "lagrangian", compile=True, threads=2)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(dyn, np.tile(q, (40, 1)), np.tile(v, (40, 1)), 5.0, dt=STEP, torque=Policy(slow), hold=STEP)
+    assert len(begun) < 20
+
+
+def test_saved_times_beside_the_ends_are_no_samples():
+    """Times that are the start or the end but for rounding; and many of them beside many samples."""
+    model, q, v = scene("tree")
+    dyn = mb.dynamics(model)
+    plain, beside = (
+        simulate(dyn, q, v, 0.1, "rk853", torque=law, hold=PERIOD, save=save)
+        for save in ([0.0, 0.05, 0.1], [1e-9, 0.05, 0.1 - 1e-9])
+    )
+    np.testing.assert_allclose(beside.q, plain.q, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(beside.tau[0], plain.tau[0])
+    ends, begins, _ = _intervals(np.linspace(0.0, 100.0, 100_001), 0.0, 100.0, 1e-3, rows=False)
+    np.testing.assert_allclose(ends, np.linspace(0.0, 100.0, 100_001), rtol=0, atol=1e-12)
+    assert begins[-1] == 100_000
+
+
+@pytest.mark.parametrize("engine", ["compiled", "pinocchio"])
+@pytest.mark.parametrize("setting", [{"dt": STEP}, {"method": "rk853", "save": [0.5]}])
+def test_a_run_of_no_time_has_the_torque_of_its_state(engine, setting):
+    model, q, v = scene("tree")
+    dyn = dynamics_of(model, engine)
+    run = simulate(dyn, q, v, 0.0, torque=law, hold=PERIOD, t0=0.5, **setting)
+    np.testing.assert_array_equal(run.tau, [law(0.5, q, v)])
+    pair = simulate(dyn, [q, q], [v, 2 * v], 0.0, torque=law, hold=PERIOD, t0=0.5, **setting)
+    np.testing.assert_array_equal(pair.tau[:, 0], [law(0.5, q, v), law(0.5, q, 2 * v)])
+
+
+@pytest.mark.parametrize("engine", ["compiled", "pinocchio"])
+def test_progress_ends_with_the_run(engine):
+    model, q, v = scene("tree")
+    told: list[float] = []
+    simulate(dynamics_of(model, engine), q, v, 1.0, dt=STEP, torque=law, hold=PERIOD, progress=told.append)
+    assert told[-1] == 1.0
+
+
 @pytest.mark.parametrize("engine", ["compiled", "lagrangian", "pinocchio", "mujoco"])
 @pytest.mark.parametrize("method", ["rk4", "rk853", "gauss4", "mujoco_rk4"])
 @pytest.mark.parametrize("batch", [False, True])
@@ -229,9 +303,13 @@ def test_bad_samples_are_refused():
         simulate(dyn, [q, q], [v, v], 0.1, dt=STEP, torque=Policy(lambda _t, _q, v, _i: v[0]), hold=PERIOD)
     with pytest.raises(TorqueError, match=r"torque: nan at index \(1,\)"):
         simulate(dyn, q, v, 0.1, dt=STEP, torque=lambda *_: [0.0, np.nan], hold=PERIOD)
-    for hold in (0.0, -1.0, np.nan, "a"):
+    for hold in (0.0, -1.0, np.nan, "a", 0.015, 1e-10, 1e308):
         with pytest.raises(InputError, match="hold: expected"):
             simulate(dyn, q, v, 0.1, dt=STEP, torque=law, hold=hold)
+    # Times that a double does not tell apart, and more samples than a machine holds.
+    for hold, t0, why in ((1e-9, 1e8, "at times that differ"), (1e-11, 0.0, "which would take"), (1e-300, 0.0, "")):
+        with pytest.raises(InputError, match=f"hold: .*{why}"):
+            simulate(dyn, q, v, 0.1, "rk853", torque=law, hold=hold, t0=t0)
 
 
 def test_a_feedback_is_sampled_or_acts_at_every_stage():

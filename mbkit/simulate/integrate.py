@@ -28,7 +28,7 @@ from mbkit.simulate.progress import Progress
 from mbkit.simulate.request import RunRequest
 from mbkit.simulate.result import SolverResult, Stats
 from mbkit.simulate.run_data import Acting, RunData, RunSettings
-from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, save_times
+from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, check_room, save_times
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
 
 _OTHERS: Final = f"use {DEFAULT_METHOD!r} or {ADAPTIVE_METHOD!r}"
@@ -67,7 +67,8 @@ def integrate(dyn: Dynamics, request: RunRequest) -> tuple[RunData, FunctionErro
     acting = _acting(dyn, request.wrenches, request.wrench_axes)
     if acting and not chosen.wrenches:
         _refuse("wrenches on frames", chosen, [m.name for m in METHODS.values() if m.wrenches])
-    hold = _period(request, dt if chosen.kind != "adaptive" else None)
+    span = start, start + duration, 0.0 if chosen.kind == "adaptive" else dt
+    hold = _period(request, *span, (1 if batch is None else batch) * model.nv)
     at_stages = None if hold else request.torque
     given = [at_stages, *(request.wrenches or {}).values()]
     if any(map(callable, given)) and not chosen.callables:
@@ -109,6 +110,9 @@ def integrate(dyn: Dynamics, request: RunRequest) -> tuple[RunData, FunctionErro
                 read = read.sampled(hold[1], [*range(0, steps, round(hold[0] / dt)), steps])
             problem = IntegrationProblem.on_grid(own, request.method, q, v, grid, indices, read, bar)
             jumps = grid.times if read.held else None
+        if hold and not duration:
+            # No step does.
+            read.sample(0, start, q, v, None if batch is None else np.arange(batch))
         applied = read.applied(jumps)
         outcome = _outcome(problem, chosen)
     seconds = time.perf_counter() - started
@@ -139,15 +143,24 @@ def integrate(dyn: Dynamics, request: RunRequest) -> tuple[RunData, FunctionErro
     return data, outcome.error
 
 
-def _period(request: RunRequest, dt: float | None) -> tuple[float, TorqueFunction] | None:
-    """Return the period of a controller that samples, s, and its function, checked; a fixed step divides the period."""
+def _period(
+    request: RunRequest, start: float, end: float, dt: float, numbers: int
+) -> tuple[float, TorqueFunction] | None:
+    """Return the period of a controller that samples, s, and its function, checked.
+
+    A fixed step divides the period; a sample has so many numbers.
+    """
     if request.hold is None:
         return None
     if not callable(request.torque):
         raise InputError("hold: expected a torque function, which is sampled; an array is held as it is")
-    hold = real("hold", request.hold, positive=True)
-    if dt is not None and abs(hold / dt - round(hold / dt)) > _MULTIPLE:
+    hold, eps = real("hold", request.hold, positive=True), float(np.finfo(float).eps)
+    steps = hold / dt if dt else 1.0
+    if not (1 - _MULTIPLE <= steps < np.inf and abs(steps - round(steps)) <= _MULTIPLE):
         raise InputError(f"hold: expected a multiple of the step, {dt:g} s, got {hold:g} s")
+    if not hold > 4 * eps * max(abs(start), abs(end)):
+        raise InputError(f"hold: expected samples at times that differ, got {hold:g} s beside t = {end:g} s")
+    check_room((end - start) / hold, numbers, f"hold: {hold:g} s makes", "sample less often")
     return hold, request.torque
 
 
@@ -162,8 +175,9 @@ def _intervals(
     ends: Array = np.append(start + hold * np.arange(count, dtype=float), start + duration)
     if times is not None and len(times):
         # A saved time that is a sample's to rounding is the same time.
-        near = times[np.abs(times[:, None] - ends).argmin(axis=0)]
-        ends = np.where(np.abs(near - ends) <= _MULTIPLE * hold, near, ends)
+        inner, allowed = ends[1:-1], _MULTIPLE * hold
+        near = times[np.minimum(np.searchsorted(times, inner - allowed), len(times) - 1)]
+        ends[1:-1] = np.where(np.abs(near - inner) <= allowed, near, inner)
     if not rows or times is None:
         return ends, [*range(count + 1)], None
     every = np.union1d(times, ends)

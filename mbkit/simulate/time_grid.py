@@ -119,12 +119,17 @@ def save_times(save: ArrayLike, start: float, end: float) -> Array:
     return np.minimum(times, end)
 
 
-def check_room(states: int, numbers: int) -> None:
+def check_room(
+    rows: float,
+    numbers: int,
+    what: str = "save:",
+    instead: str = "keep fewer with save=, an every-n-th count or a grid of times",
+) -> None:
     """Refuse to keep more numbers than a machine holds, before it is filled."""
-    if states * numbers > _ROOM:
+    if rows * numbers > _ROOM:
         raise InputError(
-            f"save: {states} states of {numbers} numbers would take {states * numbers * 8 / 2**30:.3g} GiB; "
-            "keep fewer with save=, an every-n-th count or a grid of times"
+            f"{what} {rows:.16g} rows of {numbers} numbers, which would take {rows * numbers * 8 / 2**30:.3g} GiB; "
+            f"{instead}"
         )
 
 

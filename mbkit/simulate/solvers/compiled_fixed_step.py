@@ -181,7 +181,6 @@ class SampleMeeting:
         self._meeting = threading.Barrier(parts, self._ask) if parts > 1 else None
         #: Of a torque function that failed.
         self.error: FunctionError | None = None
-        self.steps = problem.torque.changes(problem.grid.steps)
 
     def join(self, loop: BlockLoop, members: Indices) -> None:
         """Add a part."""
@@ -235,7 +234,7 @@ def run_blocks(
     """
     grid, torque, kept = problem.grid, problem.torque, record.kept
     k, torques, alive = 0, np.empty(0), np.full(len(members), True)
-    samples, going = ([] if meeting is None else [*reversed(meeting.steps)]), True
+    samples, going = [*reversed(torque.changes(grid.steps))], True
     # Most parts of a batch are contiguous, which is read and written faster.
     whole = slice(int(members[0]), int(members[-1]) + 1)
     which: slice | Indices = whole if whole.stop - whole.start == len(members) else members
@@ -246,9 +245,9 @@ def run_blocks(
             n, at = min(loop.block, stop - k), k
             loop.set_times(grid, k, n)
             while at < k + n:
-                if meeting is not None and samples and samples[-1] == at:
+                if samples and samples[-1] == at:
                     samples.pop()
-                    going = meeting(at)
+                    going = meeting is None or meeting(at)
                     if not going:
                         break
                 end = min(k + n, samples[-1]) if samples else k + n
@@ -299,8 +298,9 @@ def run_parts(
     workers: int,
     steps: int,
     bar: Progress,
+    meeting: SampleMeeting | None = None,
 ) -> None:
-    """Run parts of a batch in threads, at most `workers`.
+    """Run parts of a batch in threads, at most `workers`; parts that meet wait for one another, in a thread each.
 
     new_worker(), called in each thread, returns run(part), which yields the number of `steps` done.
     """
@@ -317,7 +317,7 @@ def run_parts(
                 if stop.is_set():
                     return
 
-    workers = min(workers, len(parts))
+    workers = min(workers, len(parts)) if meeting is None else len(parts)
     if workers < 2:
         if parts:
             work(lambda: bar.update(sum(done) / total))
@@ -332,6 +332,9 @@ def run_parts(
                 bar.update(sum(done) / total)
         finally:
             stop.set()
+            if meeting is not None:
+                # A block may take as long as all its samples.
+                meeting.leave()
 
 
 def _widest(plan: Plan) -> int:
@@ -476,8 +479,7 @@ def run_rollout(
 
             return run
 
-        # Parts that wait for one another have a thread each.
-        run_parts(parts, new_worker, workers if meeting is None else len(parts), grid.steps, problem.bar)
+        run_parts(parts, new_worker, workers, grid.steps, problem.bar, meeting)
         if meeting is not None and meeting.error is not None:
             failures.append(meeting.error)
         # A NaN is not below anything.
@@ -553,13 +555,17 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
                 all_q[row], all_v[row] = q, v
                 row, following = row + 1, next(kept, -1)
         k = steps
-    except NumericalError:
-        # The reason is found in Python, with the same answers.
-        samples.asked[0] = s
-        return run_fixed(problem)
+        problem.bar.update(1.0)
     except TorqueError as failed:
         error = failed
     except Exception as failed:
+        # A sample at which the answer is known is behind.
+        if isinstance(failed, NumericalError) and k != sample:
+            if new:
+                forces[s - 1] = force
+            # The reason is found in Python, with the same answers.
+            samples.asked[0] = s
+            return run_fixed(problem)
         error = controller.failure(failed, start + k * dt)
     samples.asked[0] = s
     record.steps[0] = k
@@ -768,6 +774,6 @@ def run_implicit(
                 yield end
         iterations.append(chunk.iterations)
 
-    workers = (dyn.threads or cores()) if meeting is None else count
-    run_parts([slice(a, b) for a, b in pairwise(ends)], lambda: run, workers, grid.steps, problem.bar)
+    workers = dyn.threads or cores()
+    run_parts([slice(a, b) for a, b in pairwise(ends)], lambda: run, workers, grid.steps, problem.bar, meeting)
     return record, sum(iterations), lost, None if meeting is None else meeting.error
