@@ -432,7 +432,6 @@ class _PartOfStep:
             self._code, self._threads = dyn.step_with(run.problem.method, run.margin_part), dyn.threads
             self._values, self._bound = with_time(dyn, t), run.friction.bounds(phase)
         self._stepped = self._method.explicit and timed is None and not callable(self._force)
-        self._stepped = self._stepped and not run.side_by_side
 
     def ahead(self, i: Indices, s: Array) -> tuple[Array, Array, Array]:
         """Return the states after s seconds, by one step of the method, and the least of their margins, (m,)."""
@@ -443,16 +442,17 @@ class _PartOfStep:
             given = q, v, force, s[:, None], self._bound[i], self._values[i]
             arrays, _ = self._code.everything(*given, threads=self._threads)
             return *run.friction.held(phase.still, q, arrays["q1"], arrays["v1"]), arrays["margin1"][:, 0]
-        if self._stepped and s[0] > 0:
-            ends = phase.dyn._step(self._method, q, v, force, float(s[0]))
-        else:
-            ends = q.copy(), v.copy()
-            for j in np.flatnonzero(s > 0):
-                start, length = float(self._t[i[j]]), float(s[j])
-                grid = Grid(start, start + length, length, 1, length)
-                one = run._solved(self._rows[i[j : j + 1]], phase.take(np.array([j])), 1, grid)
-                for now, states in zip(ends, (one.q, one.v), strict=True):
-                    now[j] = states.reshape(-1, states.shape[-1])[-1]
+        ends = q.copy(), v.copy()
+        for j in np.flatnonzero(s > 0):
+            own, one = phase.take(np.array([j])), slice(j, j + 1)
+            start, length = float(self._t[i[j]]), float(s[j])
+            if self._stepped:
+                states = own.dyn._step(self._method, q[one], v[one], force[one], length)
+            else:
+                out = run._solved(self._rows[i[one]], own, 1, Grid(start, start + length, length, 1, length))
+                states = out.q, out.v
+            for now, x in zip(ends, states, strict=True):
+                now[j] = x.reshape(-1, x.shape[-1])[-1]
         q, v = run.friction.held(phase.still, q, *ends)
         return q, v, run.friction.margins(phase, run.times(self._t[i] + s), q, v, force).min(axis=1)
 
