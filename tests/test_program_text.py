@@ -176,10 +176,12 @@ def test_the_command_prints_and_writes_it(tmp_path) -> None:
 
 def test_what_is_no_number_where_rows_depend_on_each_other_is_written() -> None:
     """A bead on a circle: its equations have a branch without a number, which its state does not enter."""
-    x, y, u, w = sp.symbols("x y xdot ydot")
-    bead = mb.lagrangian.Lagrangian((u**2 + w**2) / 2, 9.81 * y, [x, y], [u, w], constraints=[x**2 + y**2 - 1])
+    q, v = sp.symbols("x y z"), sp.symbols("xdot ydot zdot")
+    T, V = sum(x**2 for x in v) / 2, 9.81 * q[1]
+    bead = Lagrangian(T, V, q, v, constraints=[sum(x**2 for x in q) - 1, q[2]], name="bead")
     text, scope = program(bead.model, "forward_dynamics"), {}
     exec(text.python(), scope)
-    a = np.ravel(scope["forward_dynamics"]([0.6, 0.8], [0.8, -0.6], [0.0, 0.0]))
-    # The rod's force along (x, y) makes up for gravity's part and the turn.
-    assert a == pytest.approx(np.array([0.0, -9.81]) + (9.81 * 0.8 - 1.0) * np.array([0.6, 0.8]), rel=1e-12)
+    a = np.ravel(scope["forward_dynamics"]([0.6, 0.8, 0.0], [0.8, -0.6, 0.0], [0.0, 0.0, 0.0]))
+    # The circle's force along (x, y) makes up for gravity's part and the turn.
+    wanted = np.array([0.0, -9.81, 0.0]) + (9.81 * 0.8 - 1.0) * np.array([0.6, 0.8, 0.0])
+    assert a == pytest.approx(wanted, rel=1e-12, abs=1e-14)

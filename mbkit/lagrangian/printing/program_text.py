@@ -113,6 +113,7 @@ class ProgramText(Printable):
         head = f'"""{self.quantity} of {python_docstring(self.model)}, in SI units; needs NumPy only."""'
         body = "\n".join(lines).replace("numpy.", "np.")
         about = f"{self.operations} operations{'; ' * bool(self.note)}{python_docstring(self.note)}."
+        head += "\n\nimport functools" if "functools." in body else ""
         return f'{head}\n\nimport numpy as np\n\n\ndef {self.quantity}({arguments}):\n    """{about}"""\n{body}\n'
 
     def c(self) -> str:
