@@ -337,3 +337,61 @@ def test_a_policy_acts_at_stages_too():
     assert calls == [3] * 80
     one = simulate(mb.dynamics(model), q, v, 0.2, dt=STEP, torque=law)
     np.testing.assert_allclose(many.q, one.q, atol=1e-14)
+
+
+@pytest.mark.parametrize("hold", [None, PERIOD])
+def test_a_policy_may_write_into_what_it_is_given(hold):
+    """And answer with the same array each time."""
+    model, q, v = scene("tree")
+    buffer = np.zeros((2, 2))
+
+    def careless(t, q, v, members):
+        buffer[:] = law(t, q, v)
+        q[:], v[:], members[:] = 77.0, 99.0, 0
+        return buffer
+
+    states = np.stack([q, -q]), np.stack([v, v])
+    plain, written = (
+        simulate(mb.dynamics(model), *states, 0.2, dt=STEP, torque=torque, hold=hold)
+        for torque in (law, Policy(careless))
+    )
+    np.testing.assert_array_equal(written.q, plain.q)
+
+
+@pytest.mark.parametrize("engine", ["compiled", "lagrangian", "pinocchio"])
+@pytest.mark.parametrize("method", ["rk4", "moreau"])
+def test_dry_friction_of_many_is_that_of_runs_cut_at_the_samples(engine, method):
+    """Some start at rest; phases end at steps of their own, between samples and at them."""
+    model, (q, v) = scene("friction")[0], np.random.default_rng(3).normal(size=(2, 8, 2))
+    q[::2, 1] = v[::2] = 0.0
+    dyn = dynamics_of(model, engine)
+
+    def kicks(t, q, _v):
+        return np.array([2.5 * np.sign(np.sin(30.0 * t + q[0])), 0.6 * np.cos(45.0 * t)])
+
+    run = simulate(dyn, q, v, 0.4, method, dt=STEP, torque=kicks, hold=PERIOD, save=4)
+    for i in range(3):
+        state = q[i], v[i]
+        for k in range(10):
+            part = simulate(dyn, *state, PERIOD, method, dt=STEP, torque=kicks(k * PERIOD, *state), doubt=False)
+            state = part.q[-1], part.v[-1]
+            np.testing.assert_allclose(
+                np.concatenate([run.q[i, k + 1], run.v[i, k + 1]]), np.concatenate(state), atol=1e-12
+            )
+
+
+@pytest.mark.parametrize("engine", ["compiled", "pinocchio"])
+def test_a_sample_of_impulses_that_fails_keeps_what_was_computed(engine):
+    model, q, v = scene("friction")
+    with pytest.raises(TorqueError, match=r"ZeroDivisionError at t = 0\.2 s") as told:
+        simulate(
+            dynamics_of(model, engine),
+            q,
+            v,
+            0.4,
+            "moreau",
+            STEP,
+            hold=PERIOD,
+            torque=lambda t, *_: [1 / (t < 0.19), 0.0],
+        )
+    assert told.value.trajectory.t[-1] == pytest.approx(0.2)

@@ -194,7 +194,7 @@ class TorqueCallback:
             each = zip(q, v, members.tolist(), strict=True)
             return np.array([self.one(t, *state).copy() for state in each]).reshape(-1, self.size)
         try:
-            value = self.function.function(t, q.copy(), v.copy(), members)
+            value = self.function.function(t, q.copy(), v.copy(), members.copy())
         except Exception as error:
             raise self.failure(error, t) from error
         return self.checked(value, t, count=len(q))
@@ -496,10 +496,14 @@ class Torque:
         return out
 
     def at_steps(self, members: Indices, starts: Indices, count: int) -> Array:
-        """Return the rows of `of_steps`, (m, count, n); behind the last step they are those of the last one."""
+        """Return the rows of `of_steps`, (m, count, n); behind the last step, or answer, they are those of the last."""
         if self._rows is None:
             return np.broadcast_to(self._of_all[members][:, None], (len(members), count, self._size))
-        k = np.minimum(self._places(starts[:, None] + np.arange(count)), self._rows.shape[-2] - 1)
+        last: Any = self._rows.shape[-2] - 1
+        if self.samples is not None:
+            asked = self.samples.asked[members][:, None]
+            last = (np.array(self.samples.begins)[asked] if self.samples.fine else asked) - 1
+        k = np.minimum(self._places(starts[:, None] + np.arange(count)), last)
         return np.asarray(self._rows[k] if self._rows.ndim == 2 else self._rows[members[:, None], k])
 
     def over_states(self, member: int | None, start: int, count: int) -> Array | None:

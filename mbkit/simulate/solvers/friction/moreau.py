@@ -143,15 +143,15 @@ class _Compiled:
         self._at = {name: slice(rows[f"{name}1"][0] - zero, sum(rows[f"{name}1"]) - zero) for name in STATE}
         self._count = sum(rows[name][1] for name in STATE)
         self._now = self._room[zero : zero + self._count]
-        q, v, grid = problem.q[i], problem.v[i], problem.grid
-        phase = friction.phase(grid.start, q, v, self._force(0)) if grid.steps else None
-        start = {"q": q, "w": self._space.to_integrator_velocity(q, v), "best": MANY, "left": PATIENCE, "go": 1.0}
-        if phase is not None:
-            start |= {"side": phase.sides[which], "still": 1.0 * phase.still[which]}
-        for name, value in start.items():
-            self._now[self._at[name]] = np.reshape(value, (-1, 1))
+        q, w = problem.q[i], self._space.to_integrator_velocity(problem.q[i], problem.v[i])
+        self._put(q=q, w=w, best=MANY, left=PATIENCE, go=1.0)
+        self._friction, self._which = friction, which
         self._log = aligned(_ROUNDS * self._now.size).reshape(_ROUNDS, *self._now.shape)
         self._most = _PATIENCE * (len(which) + 1)
+
+    def _put(self, **values: Array | float) -> None:
+        for name, value in values.items():
+            self._now[self._at[name]] = np.reshape(value, (-1, 1))
 
     def __getitem__(self, name: str) -> Array:
         first, count = self._code.rows[name]
@@ -164,7 +164,15 @@ class _Compiled:
         while k < grid.steps and not why:
             # As many steps at once as have one length and one force.
             q, w = (self._now[self._at[name], 0] for name in ("q", "w"))
-            self._problem.sample(self._i, k, grid.time(k), np.concatenate([q, self._space.to_body_velocity(q, w)]))
+            v = self._space.to_body_velocity(q, w) if k else self._problem.v[self._i]
+            try:
+                self._problem.sample(self._i, k, grid.time(k), np.concatenate([q, v]))
+            except FunctionError as error:
+                self.error = error
+                return k, attempts, str(error)
+            if not k:
+                phase = self._friction.phase(grid.start, q, v, self._force(0))
+                self._put(side=phase.sides[self._which], still=phase.still[self._which].astype(float))
             last = k + 1 if held or k == grid.steps - 1 else grid.steps - (grid.step(grid.steps - 1) != grid.dt)
             self["tau"][:] = np.asarray(self._force(k))[:, None]
             self["dt"][:] = grid.step(k)
