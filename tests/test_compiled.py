@@ -28,7 +28,7 @@ from hypothesis import strategies as st
 import mbkit as mb
 from mbkit import _fork
 from mbkit.codegen import backend, disk_cache, jit, simd_kernel
-from mbkit.codegen.compiled import Call, Compiled, KernelSequence, compiled
+from mbkit.codegen.compiled import Call, Compiled, KernelSequence, _runner, compiled
 from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.program import Program, program
 from mbkit.codegen.python_call import python_call
@@ -707,3 +707,16 @@ def test_a_fork_gets_its_turn_between_threads_that_are_always_busy():
     for target in (work, work, work, forks):
         threading.Thread(target=target, daemon=True).start()
     assert done.wait(timeout=60)
+
+
+def test_a_sequence_keeps_the_code_that_it_runs():
+    """Threads that meet an empty cache each load code, and the cache keeps that of one."""
+    _runner.cache_clear()
+    code = weakref.ref(_runner())
+    sequence = KernelSequence([])
+    _runner.cache_clear()
+    gc.collect()
+    assert code() is not None
+    del sequence
+    gc.collect()
+    assert code() is None

@@ -272,7 +272,8 @@ class KernelSequence:
     """Calls on fixed arrays, kept alive, in order, round after round; one thread may run it at a time."""
 
     def __init__(self, calls: Sequence[Call]) -> None:
-        self._calls, self._run = tuple(calls), _runner().run
+        # Threads that are the first together load it each for itself, and the cache keeps one.
+        self._calls, self._runner = tuple(calls), _runner()
         self._work = aligned(max((call.code.work_size for call in calls), default=0))
         # The sum in which a compiled function marks numbers that are not finite.
         self._work[:] = 0.0
@@ -290,7 +291,7 @@ class KernelSequence:
 
     def run(self, first: int, last: int) -> None:
         """Make the calls from `first` to before `last`, counted over the rounds; other Python threads run meanwhile."""
-        self._run(self._address, None, first, last)
+        self._runner.run(self._address, None, first, last)
 
 
 @cache

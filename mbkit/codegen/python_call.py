@@ -133,16 +133,18 @@ def python_call(
     turns = [places[next(iter(inputs))] + start * width for start in quaternions]
     lists = [*given, *made, *turns, *calls]
     numbers = np.array([*_process(), *counts, *lists], dtype=np.int64).view(_Numbers)
-    numbers.kept = [code for code, _, _ in steps]
+    # Threads that are the first together have a definition each, and the cache keeps one.
+    definition = _definition()
+    numbers.kept = [*(code for code, _, _ in steps), definition]
     new = ctypes.pythonapi.PyCFunction_NewEx
     new.restype, new.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.py_object, ctypes.c_void_p]
-    call: Callable[..., Any] = new(ctypes.addressof(_definition()[0]), numbers, None)
+    call: Callable[..., Any] = new(ctypes.addressof(definition[0]), numbers, None)
     return call
 
 
 @cache
 def _definition() -> tuple[_Definition, Any]:
-    """Return what Python knows of the function, and its code; both live as long as the process."""
+    """Return what Python knows of the function, and its code."""
     loaded = jit.load(jit.shared_object(f"python call {_HEAD}", lambda: jit.object_code(_code(), optimize=True)))
     address = ctypes.cast(loaded.run, ctypes.c_void_p).value
     return _Definition(b"evaluate", address, _METH_FASTCALL, None), loaded
