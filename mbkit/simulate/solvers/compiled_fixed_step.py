@@ -178,7 +178,7 @@ class SampleMeeting:
     ) -> None:
         self._problem, self._velocity, self._k = problem, velocity, 0
         self._loops: list[tuple[BlockLoop, Indices]] = []
-        self._meeting = threading.Barrier(parts, self._ask) if parts > 1 else None
+        self._meeting, self._left = threading.Barrier(parts, self._ask) if parts > 1 else None, False
         #: Of a torque function that failed.
         self.error: FunctionError | None = None
 
@@ -191,12 +191,16 @@ class SampleMeeting:
         self._k = k
         if self._meeting is None:
             self._ask()
+        elif self._left:
+            # Who leaves would wait for a turn beside many parts that meet often.
+            raise threading.BrokenBarrierError
         else:
             self._meeting.wait()
         return self.error is None
 
     def leave(self) -> None:
         """Let nobody wait for a part that goes no further."""
+        self._left = True
         if self._meeting is not None:
             self._meeting.abort()
 
