@@ -209,14 +209,13 @@ LOOPS = (
 )
 
 
-def cranks(apart: float, count: int = 3) -> mb.Model:
+def cranks(apart: float, count: int = 3, friction: float = 0.0) -> mb.Model:
     """Return cranks under a plate; a third stands at THETA + apart where the others stand at THETA."""
     b = mb.ModelBuilder("cranks")
     for k in range(count):
         b.add_body(f"crank{k}", mass=CRANK, com=(0, 0, LENGTH / 2), inertia=(ABOUT_Y, ABOUT_Y, 0.001))
-        b.add_joint(
-            f"hinge{k}", "revolute", parent="world", child=f"crank{k}", axis=(0, 1, 0), translation=(0.5 * k, 0, 0)
-        )
+        place = {"parent": "world", "axis": (0, 1, 0), "translation": (0.5 * k, 0, 0)}
+        b.add_joint(f"hinge{k}", "revolute", child=f"crank{k}", friction=0.0 if k else friction, **place)
     b.add_body("plate", mass=PLATE, com=(0.5, 0, 0), inertia=(0.02, 0.1, 0.1))
     b.add_joint("pin", "revolute", parent="crank0", child="plate", axis=(0, 1, 0), translation=(0, 0, LENGTH))
     x = 1.0 + LENGTH * (np.sin(THETA + apart) - np.sin(THETA))
@@ -342,6 +341,24 @@ def test_a_pose_on_another_branch_is_refused_by_its_row(engine: str, options: di
         dyn.forward_dynamics(np.array([moving, other]), np.zeros((2, 4)), [1.0, 0, 0, 0])
     with pytest.raises(NumericalError, match=r"loop 'loop2' z.*contradicts"):
         dyn.forward_dynamics(other, np.zeros(4), np.eye(4)[0])
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "oracle"])
+def test_dry_friction_at_rest_knows_the_branch_of_redundant_rows(engine: str) -> None:
+    """Where the mechanism moves, friction holds or slides; where it cannot, the rows say so, and not an inertia."""
+    dyn, still = mb.dynamics(cranks(0.0, friction=0.2), engine), np.zeros(4)
+    moving = np.array([THETA, THETA, THETA, -THETA])
+    other = np.array([4.7123890, -1.5707963, -1.5707963, 1.5707963])
+    held = -swing(THETA) / (swing(THETA, 1.0) - swing(THETA))
+    slides = dyn.forward_dynamics(moving, still, still)
+    assert slides == pytest.approx(swing(THETA, -0.2) * np.array([1, 1, 1, -1]), rel=1e-9)
+    assert not dyn.forward_dynamics(moving, still, [held + 0.1, 0, 0, 0])[0]
+    for states in (other, np.array([moving, other])):
+        with pytest.raises(NumericalError, match=r"loop 'loop2' z.*contradicts"):
+            dyn.forward_dynamics(states, np.zeros(states.shape), np.zeros(states.shape))
+    if dyn.bits == 53:
+        with pytest.raises(NumericalError, match=r"loop 'loop2' z.*contradicts"):
+            mb.simulate(dyn, other, still, 0.1, "rk853")
 
 
 def test_the_digits_of_an_acceleration_under_redundant_rows_are_its_own() -> None:

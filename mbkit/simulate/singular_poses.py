@@ -217,16 +217,13 @@ class Approach:
             elif rate:
                 self.ahead = float(-least / rate)
 
-    def length(self, h: float, longer: float) -> float:
-        """Return the length of the next step of rk853 with which no stage comes close to a pose ahead.
-
-        It is up to h, or that many times longer across the pose.
-        """
-        d, most = self.ahead, longer * h
-        if not 0.02 * h < d < 1.45 * most:
+    def length(self, h: float) -> float:
+        """Return the length, up to h, of the next step of rk853 with which no stage comes close to a pose ahead."""
+        d = self.ahead
+        if not 0.02 * h < d < 1.45 * h:
             return h
         # A little longer is better than a short step before it.
-        return d / _BETWEEN if d <= 1.05 * _BETWEEN * most else min(h, d - 0.45 * most)
+        return d / _BETWEEN if d <= 1.05 * _BETWEEN * h else min(h, d - 0.45 * h)
 
     def crosses(self, h: float) -> bool:
         """Return whether a pose is as near as a step of length h, ahead or behind; then it is `near`."""
@@ -299,8 +296,7 @@ class SingularPoses:
         rows = " and ".join(names[k] for k in self._rows)
         return (
             f"passed a singular pose at t = {when} (s), where {rows} lose their independence; other motions may begin "
-            f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the "
-            "tolerance, and by more with implicit methods"
+            f"there, and the run followed the smooth one; a step there may be off by {LOOSEST:g} whatever the tolerance"
         )
 
 

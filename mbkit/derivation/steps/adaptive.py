@@ -120,7 +120,8 @@ class AttemptParts:
         """Return the consistent state beside a step's end, and the error that it counts as."""
         extra, space = self.equations.extra_arguments, self.space
         q, v, far = thorough_projection(self.equations)(q1, space.to_body_velocity(q1, w1), *extra.values())
-        singular = dependence(self.equations)(q1, *extra.values()) > _SINGULAR
+        # NaN counts too: there is no acceleration at the pose itself.
+        singular = ca.logic_not(dependence(self.equations)(q1, *extra.values()) <= _SINGULAR)
         error = choose(far, larger(SYMBOLS, error, _TOO_FAR), error)
         return q, space.to_integrator_velocity(q, v), choose(singular, inf, error)
 

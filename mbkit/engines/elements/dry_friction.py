@@ -276,8 +276,10 @@ class DryFriction(AddedForce):
         """
         law, shape = law or self.law_of(dyn), resting.shape
         b = np.asarray(accelerate(tau), dtype=np.float64)
-        A = self._responses(dyn, accelerate, q, tau, b)
-        n = shape[-1]
+        # Where there are no accelerations nothing is held, and the engine says why there are none.
+        none = ~np.isfinite(b).all(axis=-1, keepdims=True)
+        A = np.where(none[..., None], 0.0, self._responses(dyn, accelerate, q, tau, b))
+        resting, b, n = resting & ~none, np.where(none, 0.0, b), shape[-1]
         A, b, on = A.reshape(-1, n, n), b.reshape(-1, n), resting.reshape(-1, n)
         bound, less = (np.broadcast_to(x, on.shape) for x in (law.bound, law.just_moving))
         known = np.zeros(on.shape) if leaving is None else (-leaving * law.just_moving).reshape(on.shape)

@@ -19,6 +19,7 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model import Model
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
+from mbkit.simulate.solvers.step_attempts import AcrossPoses
 from mbkit.simulate.solvers.trajectory_record import StoppedError, TrajectoryRecord, assemble_result, diverged, run_each
 from mbkit.simulate.solvers.vector_field import is_bounded
 
@@ -36,19 +37,27 @@ _REMEMBERED: Final = 32
 def run_cvodes(problem: IntegrationProblem) -> SolverResult:
     """Integrate one state, or each of a batch by itself; CVODES interpolates, and starts again where a torque jumps."""
     _, times = problem.saved_times()
-    solve, torque = _Solve(problem), problem.torque
+    solve, torque, across = _Solve(problem), problem.torque, AcrossPoses.of(problem)
 
     def walk(i: int, y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, None]]:
         member = problem.member(i)
-        force = torque.of_member(member)
+        force, gap = torque.of_member(member), 0.0
+        if across is not None:
+            across.follow(i)
         # A jump within a call is one that CVODES does not know of: its error test fails.
         for first in range(len(times) - 1 if torque.held else 1):
-            piece = times[first : first + 2] if torque.held else times
+            piece = (times[first : first + 2] if torque.held else times).copy()
             k = problem.interval(float(piece[0]))
             problem.sample(i, k, float(piece[0]), y)
             known = np.concatenate([np.asarray(force(k)), solve.parameters(member)])
             at, intervals, failing = 0, 1, 0
             while at < len(piece) - 1:
+                if across is not None and across.crosses(float(piece[at]), y, gap):
+                    piece[at], y = across.cross(k, float(piece[at + 1]))
+                    record.steps += 1
+                    at += int(piece[at] == piece[at + 1])
+                    yield float(piece[at]), y, None
+                    continue
                 # Where intervals fail together, bisection finds those that can be reached.
                 n = failing // 2 or min(intervals, len(piece) - 1 - at)
                 try:
@@ -56,15 +65,32 @@ def run_cvodes(problem: IntegrationProblem) -> SolverResult:
                 except StoppedError as error:
                     failing, failure = n, error
                 else:
-                    for t, state in zip(piece[at + 1 : at + n + 1].tolist(), states, strict=True):
+                    if across is not None and steps > n:
+                        # States that are farther apart than steps do not tell of a pose between them.
+                        piece, at, intervals = _refined(piece[at:], -(-steps // n)), 0, steps
+                        continue
+                    for j, state in enumerate(states, 1):
+                        t = float(piece[at + j])
                         yield t, state, None
+                        gap = t - float(piece[at + j - 1])
+                        if across is not None and across.crosses(t, state, gap):
+                            n = j
+                            break
+                    states = states[:n]
                     y, at, failing = states[-1], at + n, max(failing - n, 0)
                     intervals = max(1, min(4 * n, n * _PIECE // max(steps, 1)))
                 if failing == 1:
                     raise failure
 
     records = run_each(problem, walk)
-    return assemble_result(problem, records, evaluations=solve.evaluations, jacobians=solve.jacobians)
+    evaluations = solve.evaluations + (0 if across is None else across.evaluations)
+    return assemble_result(problem, records, evaluations=evaluations, jacobians=solve.jacobians)
+
+
+def _refined(times: Array, parts: int) -> Array:
+    """Return times with each of their intervals in equal parts."""
+    places = np.arange(len(times))
+    return np.interp(np.arange(parts * places[-1] + 1) / parts, places, times)
 
 
 class _Solve:

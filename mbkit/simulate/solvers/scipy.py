@@ -17,6 +17,7 @@ from mbkit.errors import MbkitError
 from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
+from mbkit.simulate.solvers.step_attempts import AcrossPoses
 from mbkit.simulate.solvers.trajectory_record import (
     TrajectoryRecord,
     assemble_result,
@@ -40,7 +41,7 @@ def run_scipy(problem: IntegrationProblem) -> SolverResult:
         warnings.filterwarnings("ignore", message="lsoda: ", category=UserWarning)
         records = run_each(problem, solve.steps)
     jacobians = 0 if solve.jacobian is None else solve.jacobian.evaluations
-    return assemble_result(problem, records, evaluations=solve.rates.evaluations, jacobians=jacobians)
+    return assemble_result(problem, records, evaluations=solve.evaluations, jacobians=jacobians)
 
 
 class _Solve:
@@ -48,7 +49,7 @@ class _Solve:
 
     def __init__(self, problem: IntegrationProblem) -> None:
         self._problem, self._method = problem, method_of(problem.method)
-        self.rates = Rates(problem.dyn, explicit=not self._method.jacobian)
+        self.rates, self._across = Rates(problem.dyn), AcrossPoses.of(problem)
         self.jacobian: Any = None
         if self._method.jacobian:
             from mbkit.simulate.diagnostics.stiffness import RateJacobian
@@ -58,6 +59,10 @@ class _Solve:
         if problem.save is not None and not self._method.multistep:
             self._stops = sorted({*problem.save.tolist(), *problem.stops, problem.end} - {problem.start})
 
+    @property
+    def evaluations(self) -> int:
+        return self.rates.evaluations + (0 if self._across is None else self._across.evaluations)
+
     def steps(self, i: int, y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, Any]]:
         """Yield the end of each step, and a function of time for states within it."""
         problem, member = self._problem, self._problem.member(i)
@@ -66,21 +71,31 @@ class _Solve:
             if self.jacobian is not None:
                 self.jacobian.only(member)
         force_of, t = problem.torque.of_member(member), problem.start
+        across = self._across
+        if across is not None:
+            across.follow(i)
         solver: Any = None
-        interval = -1
+        interval, first = -1, None
         for stop in self._stops:
             before, interval = interval, problem.interval(t)
             problem.sample(i, interval, t, y)
             force = force_of(interval)
-            if solver is None or interval != before:
+            if solver is not None and interval != before:
                 # A held force jumps here, and with it all that the solver remembers. A multistep method starts again
                 # with order 1, for which its last step is too long.
-                first = None if solver is None or self._method.multistep else min(solver.h_abs, stop - t)
-                solver = self._solver(t, y, force, stop, first)
-            if solver is None:
-                raise diverged(self.rates.why)
-            solver.t_bound, solver.status = stop, "running"
-            while solver.status == "running":
+                first, solver = None if self._method.multistep else solver.h_abs, None
+            while t < stop:
+                if across is not None and across.crosses(t, y, _length(solver)):
+                    (t, y), first, solver = across.cross(interval, stop), None, None
+                    yield t, y, across.at
+                    continue
+                if solver is None:
+                    solver = self._solver(t, y, force, stop, first and min(first, stop - t))
+                    if solver is None:
+                        raise diverged(self.rates.why)
+                    # It has a length now.
+                    continue
+                solver.t_bound, solver.status = stop, "running"
                 start = t, y
                 solver = self._step(record, solver, force, stop)
                 t, y = float(solver.t), solver.y.copy()
@@ -156,6 +171,11 @@ class _Solve:
             return np.asarray(shorter.y)
 
         return state
+
+
+def _length(solver: Any) -> float:
+    """Return the length of the next step; of LSODA, which does not tell it, that of the last one."""
+    return 0.0 if solver is None else float(getattr(solver, "h_abs", solver.step_size or 0.0))
 
 
 def _resize(solver: Any, length: float) -> None:

@@ -87,8 +87,6 @@ class RungeKuttaAttempts:
     #: The power of a step's length with which its estimated error grows.
     grows = 8
     _factors = staticmethod(predictive_factors)
-    #: How much longer a step across a singular pose, which is always rk853's, may be than the last one.
-    _longer = 1.0
     #: What machine code makes the same steps of.
     formula: Callable[[], EmbeddedTableau | RosenbrockTableau] = staticmethod(dormand_prince_853)
 
@@ -100,8 +98,8 @@ class RungeKuttaAttempts:
         self._force: Force = np.zeros(space.nv)
         self._h = self._t = self._stop = 0.0
         self._why = ""
-        # What the tolerance is multiplied by, and the length across a singular pose.
-        self._slack, self._stretch = 1.0, self._longer
+        #: What the tolerance is multiplied by.
+        self._slack = 1.0
 
     @property
     def evaluations(self) -> int:
@@ -114,15 +112,21 @@ class RungeKuttaAttempts:
     approach: Approach = forwarded("_field.approach", "How near a singular pose the run is.")
 
     def start(self, which: Sequence[int], q: Array, w: Array, t: float = 0.0, h: float = 0.0) -> None:
-        (member,) = which
+        self.follow(*which)
+        self._begin(t, q[0], w[0], h)
+
+    def follow(self, member: int) -> None:
+        """Go on with this trajectory of a batch."""
         self._member = member
         if self._batch is not None:
             self._field.only(np.array([member]))
         self._of_interval = self._torque.of_member(None if self._batch is None else member)
-        self._q, self._w, self._t, self._h = q[0], w[0], t, h
+
+    def _begin(self, t: float, q: Array, w: Array, h: float = 0.0) -> None:
+        self._q, self._w, self._t, self._h = q, w, t, h
         self._most, self._last, self._error = MAX_GROWTH, FIRST_ROOT, 0.0
         self._dropped, self._fresh = False, True
-        self._field.look(t, self._q, self._w)
+        self._field.look(t, q, w)
 
     def go_on(self, most: float, last: float) -> None:
         """Take over what the next length may be at most, and the root of the last error, from steps made elsewhere."""
@@ -165,7 +169,7 @@ class RungeKuttaAttempts:
         if self._dropped or self._t >= self._stop or self.stuck(0) is not None:
             return []
         approach = self._field.approach
-        length = approach.length(self._h, self._stretch) if approach.crosses(self._stretch * self._h) else self._h
+        length = approach.length(self._h) if approach.crosses(self._h) else self._h
         t = end_of_attempt(SCALARS, self._t, length, self._stop)
         step = t - self._t
         before = [self._t], [self._q], [self._w]
@@ -187,7 +191,6 @@ class RungeKuttaAttempts:
             self._slack, self._h, self._most = 10 * self._slack, step if across else 0.8 * step, 1.0
             return
         self._slack = 1.0 if good else self._slack
-        self._stretch = self._longer if good else 1.0
         factors = self._factors(SCALARS, np.float64(self._error if self._error >= 0 else math.nan), self._last)
         # A step of no length, far from the time's zero, ends the run.
         h, self._most, self._last = next_step(
@@ -256,6 +259,65 @@ class RungeKuttaAttempts:
         return self._step(t, q, w, end - t)[:2]
 
 
+#: Tolerance of a step across a singular pose: what rounding lets a step of rk853 hold.
+_CROSSING: Final = 1e-13
+
+
+class AcrossPoses(RungeKuttaAttempts):
+    """Steps of rk853 in place of another method's near a singular pose, from and to y = (q, v).
+
+    A series, an implicit stage and a method's past all need accelerations at places where these have few digits.
+    """
+
+    def __init__(self, problem: IntegrationProblem) -> None:
+        super().__init__(problem, Space(problem.dyn.model), problem.tolerances)
+        self.tighten(0, problem.tolerances)
+        self._model = problem.dyn.model
+        self._last_step: AcceptedSteps | None = None
+
+    @classmethod
+    def of(cls, problem: IntegrationProblem) -> AcrossPoses | None:
+        """Return those of a run; None where nothing is projected."""
+        return cls(problem) if problem.dyn.projects else None
+
+    def tighten(self, place: int, tolerances: Tolerances) -> None:
+        super().tighten(place, Tolerances(*(max(x, _CROSSING) for x in tolerances)))
+
+    def crosses(self, t: float, y: Array, h: float) -> bool:
+        """Return whether a step of length h from a state would meet a pose; `cross` then starts there."""
+        q, v = unit_quaternions(self._model, y[: self._model.nq])[0], y[self._model.nq :]
+        w = self._space.to_integrator_velocity(q, v)
+        self._begin(t, q, w)
+        # A series of a tight tolerance has short steps beside a pose, as it meets the digits that v̇ loses there.
+        out = self.approach.crosses(h) or self.approach.worse
+        if out:
+            # A method of several steps leaves the constraints by its errors.
+            self._q, self._w = self._field.settled(t, q, w)
+            self.approach.near = True
+        return out
+
+    def cross(self, k: int, stop: float) -> tuple[float, Array]:
+        """Return the time and the state after a step under force k; `StoppedError` where there is none."""
+        self.hold(k, stop)
+        while True:
+            ((_, done),) = self.advance()
+            if len(done.t) > 1:
+                break
+            if (reason := self.stuck(0)) is not None:
+                raise reason
+        self._last_step = done
+        return float(done.t[-1]), self._vector(done.q[-1], done.w[-1])
+
+    def at(self, t: float) -> Array:
+        """Return the state at a time within the last step."""
+        assert self._last_step is not None
+        q, w = self.within(0, self._last_step.rows(np.array([0])), np.array([t]))
+        return self._vector(q[0], w[0])
+
+    def _vector(self, q: Array, w: Array) -> Array:
+        return np.concatenate([q, self._space.to_body_velocity(q, w)])
+
+
 #: Of a step: how far apart the rates are that tell the time's own part, by a parabola.
 _APART: Final = 1e-3
 
@@ -269,7 +331,6 @@ class RosenbrockAttempts(RungeKuttaAttempts):
     grows = 5
     formula = staticmethod(rodas5p)
     _factors = staticmethod(elementary_factors)
-    _longer = 8.0
 
     def __init__(self, problem: IntegrationProblem, space: Space, tolerances: Tolerances) -> None:
         super().__init__(problem, space, tolerances)
@@ -284,14 +345,17 @@ class RosenbrockAttempts(RungeKuttaAttempts):
             self._turning[start : start + 4] = 1.0
         # y, ẏ and ∂ẏ/∂y at the start; y and ẏ at the end of the last attempt; its t and y at both ends, and stages.
         self._start: tuple[Array, Array, Array] | None = None
-        # The last attempt was rk853's, across a singular pose.
-        self._across = False
+        # Its stages are not on the constraints, and its derivatives are those of accelerations that grow at a pose.
+        self._field.near, self._k = False, 0
+        self._across = AcrossPoses.of(problem)
+        self._crossing = self._crossed = False
         self._arrived: tuple[Array, Array] | None = None
         self._last_attempt: tuple[float, float, Array, Array, Array] | None = None
 
     @property
     def evaluations(self) -> int:
-        return self._field.evaluations + self._own_rates.evaluations
+        across = 0 if self._across is None else self._across.evaluations
+        return self._field.evaluations + self._own_rates.evaluations + across
 
     @property
     def jacobians(self) -> int:
@@ -302,13 +366,38 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         if self._batch is not None:
             self._own_rates.only(which[0])
             self._exact.only(which[0])
+        if self._across is not None:
+            self._across.follow(which[0])
+
+    @property
+    def passed(self) -> bool:
+        return self._error < 1 and not (self._across and self._across.approach.near)
+
+    def tighten(self, place: int, tolerances: Tolerances) -> None:
+        super().tighten(place, tolerances)
+        if self._across is not None:
+            self._across.tighten(place, tolerances)
+
+    def advance(self) -> list[tuple[int, AcceptedSteps]]:
+        across = self._across
+        if across is None or self._dropped or self._t >= self._stop:
+            return super().advance()
+        if not self._crossing and self._fresh and across.crosses(self._t, self._vector(self._q, self._w), self._h):
+            across.hold(self._k, self._stop)
+            self._crossing = True
+        self._crossed = self._crossing
+        if not self._crossing:
+            return super().advance()
+        out = across.advance()
+        if across.now[0] > self._t:
+            self._t, self._q, self._w, *_ = across.now
+            self._fresh, self._crossing, self._error = True, False, 0.0
+        return out
+
+    def stuck(self, place: int) -> StoppedError | None:
+        return super().stuck(place) if self._across is None or not self._crossing else self._across.stuck(place)
 
     def _attempt(self, step: float) -> tuple[Array, Array, float]:
-        self._across = self._field.approach.crosses(step)
-        if self._across:
-            # Its stages are not on the constraints, and its derivatives are those of accelerations that grow there.
-            self._start, self._fresh = None, True
-            return super()._attempt(step)
         own, (rtol, atol) = self._own, self._tolerances
         y, there, J = self._known()
         k = self._increments(self._t, y, step, there, J)
@@ -338,7 +427,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         return self._start
 
     def hold(self, k: int, stop: float) -> None:
-        self._arrived = None
+        self._arrived, self._k = None, k
         super().hold(k, stop)
 
     def _rate(self, t: float, y: Array) -> Array:
@@ -380,8 +469,8 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         return (4 * near - far - 3 * there) / (2 * apart)
 
     def _inner(self, t: float, q: Array, w: Array, end: float) -> tuple[Array, Array]:
-        if self._across:
-            return super()._inner(t, q, w, end)
+        if self._crossed and self._across is not None:
+            return self._across._inner(t, q, w, end)
         last = self._last_attempt
         if last is not None and last[0] == t and end <= last[1]:
             t0, t1, y0, y1, k = last

@@ -16,14 +16,12 @@ from mbkit.engines.base import at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import NumericalError
-from mbkit.methods.registry import ADAPTIVE_METHOD, Tolerances
-from mbkit.model.integration_space import Space
+from mbkit.methods.registry import ADAPTIVE_METHOD
 from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
+from mbkit.simulate.solvers.step_attempts import AcrossPoses
 from mbkit.simulate.solvers.trajectory_record import (
-    AcceptedSteps,
     StoppedError,
     TrajectoryRecord,
     assemble_result,
@@ -47,15 +45,17 @@ def run_taylor(problem: IntegrationProblem) -> SolverResult:
     assert isinstance(dyn, (LagrangianDynamics, OracleDynamics))
     kind, stops = precision(dyn.bits), problem.stops
     system, tolerance = taylor_system(dyn.equations), max(min(problem.tolerances) / magnitude(problem.y), kind.eps)
+    # With 34 digits the drift is far below what a double tells.
+    across = AcrossPoses.of(problem) if kind.bits == 53 else None
     with system.integrator(kind, tolerance) as integrator:
 
         def walk(i: int, y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, Any]]:  # noqa: ARG001
             member = problem.member(i)
             own: Any = dyn if member is None else dyn.of_samples([member])
-            # With 34 digits the drift is far below what a double tells.
-            settled = Rates(own).settled if dyn.model.constrained and kind.bits == 53 else None
+            settled = None if across is None else Rates(own).settled
             behind = kind.array(*own.constant_values) if dyn.bits > 53 else own.parameter_values.reshape(-1)
-            across = _Across(problem, i) if settled else None
+            if across is not None:
+                across.follow(i)
             steps, held = TaylorSteps(system, integrator, kind, behind, settled, across), torque.of_member(member)
 
             def force(k: int) -> Any:
@@ -93,57 +93,6 @@ def rounded(y: Any) -> Array:
         return np.asarray(y, dtype=np.float64)
 
 
-#: Tolerance of a step across a singular pose: what rounding lets a step of rk853 hold.
-_CROSSING: Final = 1e-13
-
-
-class _Across:
-    """Steps of rk853 in place of a series near a singular pose, where a series has the digits of J's least value."""
-
-    def __init__(self, problem: IntegrationProblem, i: int) -> None:
-        self._space, self._model, self._i = Space(problem.dyn.model), problem.dyn.model, i
-        tolerances = Tolerances(*(max(x, _CROSSING) for x in problem.tolerances))
-        self._attempts = RungeKuttaAttempts(problem, self._space, tolerances)
-        self._start: AcceptedSteps | None = None
-
-    def begin(self, t: float, y: Array) -> None:
-        """Go on from a state."""
-        q, v = self._split(y)
-        self._attempts.start([self._i], q[None], self._space.to_integrator_velocity(q, v)[None], t)
-
-    def crosses(self, h: float) -> bool:
-        """Return whether a series of length h from where the last state was would meet a pose."""
-        approach = self._attempts.approach
-        # A series of a tight tolerance has short steps beside a pose, as it meets the digits that v̇ loses there.
-        out = approach.crosses(h) or approach.worse
-        approach.near = approach.near or out
-        return out
-
-    def step(self, k: int, stop: float) -> tuple[float, Array]:
-        """Return the time and the state after a step; `StoppedError` where there is none."""
-        self._attempts.hold(k, stop)
-        while True:
-            ((_, done),) = self._attempts.advance()
-            if len(done.t) > 1:
-                break
-            if (reason := self._attempts.stuck(0)) is not None:
-                raise reason
-        self._start = done
-        return float(done.t[-1]), self._state(done.q[-1], done.w[-1])
-
-    def at(self, t: float) -> Array:
-        """Return the state at a time within the last step."""
-        assert self._start is not None
-        q, w = self._attempts.within(0, self._start.rows(np.array([0])), np.array([t]))
-        return self._state(q[0], w[0])
-
-    def _split(self, y: Array) -> tuple[Array, Array]:
-        return unit_quaternions(self._model, y[: self._model.nq])[0], y[self._model.nq :]
-
-    def _state(self, q: Array, w: Array) -> Array:
-        return np.concatenate([q, self._space.to_body_velocity(q, w)])
-
-
 class TaylorSteps:
     """Steps of one trajectory at a time, with a borrowed integrator; t0, y0 and t, y are the ends of the last one.
 
@@ -158,7 +107,7 @@ class TaylorSteps:
         kind: Precision,
         behind: Any,
         settled: Callable[[float, Array], Array] | None = None,
-        across: _Across | None = None,
+        across: AcrossPoses | None = None,
     ) -> None:
         import heyoka
 
@@ -223,11 +172,10 @@ class TaylorSteps:
     def _stepped_across(self, k: int, stop: float, h: float) -> bool:
         """Take a step across a singular pose if a series of length h would meet one; return whether there was one."""
         assert self._across is not None
-        self._across.begin(self.t, rounded(self.y))
-        self.crossed = self._across.crosses(float(h))
+        self.crossed = self._across.crosses(self.t, rounded(self.y), float(h))
         if self.crossed:
             self.t0, self.y0 = self.t, self.y
-            self.t, self.y = self._across.step(k, stop)
+            self.t, self.y = self._across.cross(k, stop)
         return self.crossed
 
     def _without_series(self) -> StoppedError:

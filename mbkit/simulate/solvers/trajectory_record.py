@@ -10,7 +10,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.errors import FunctionError
-from mbkit.methods.registry import ADAPTIVE_METHOD, Tolerances, method_of
+from mbkit.methods.registry import Tolerances
 from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import Hit, State, Watch
@@ -81,7 +81,6 @@ class TrajectoryRecord:
         self._watch = Watch(problem.events, member) if problem.events else None
         own = dyn if member is None or not dyn.model.constrained else dyn.of_samples([member])
         self.poses = SingularPoses(own) if dyn.projects else None
-        self._multistep = method_of(problem.method).multistep
         self.steps = self.rejected = 0
         self.reached = problem.start
         self.last: Array | None = None
@@ -122,27 +121,20 @@ class TrajectoryRecord:
         self.reached = until
         if steps:
             self.last = accepted.q[steps]
-        passed = self.poses is not None and steps > 0 and self._passed(self.poses, accepted, steps)
+        if self.poses is not None:
+            self.poses.saw_all(accepted.t[1 : steps + 1], accepted.q[1 : steps + 1])
         if hit is not None:
             self._stop_at(hit)
         elif lost:
             self.stop(diverged())
-        elif passed:
-            why = "stopped past a singular pose, which a method of several steps leaves on any branch"
-            self.stop(StoppedError("step_too_small", f"{why} (method={ADAPTIVE_METHOD!r} on its own),"))
-        return hit is None and not lost and not passed
-
-    def _passed(self, poses: SingularPoses, accepted: AcceptedSteps, steps: int) -> bool:
-        """Look for singular poses; return whether one was passed by a method whose steps are not projected."""
-        before = len(poses.times)
-        poses.saw_all(accepted.t[1 : steps + 1], accepted.q[1 : steps + 1])
-        return self._multistep and len(poses.times) > before
+        return hit is None and not lost
 
     def reach(self, t: float, y: Array) -> None:
         """Go on to a state (q, v), of a solver that does not tell its steps."""
-        self.reached = t
+        self.reached, nq = t, self._model.nq
+        if self.poses is not None:
+            self.poses.saw(t, y[:nq])
         if self._save is not None and t in self._save:
-            nq = self._model.nq
             self._add(np.array([t]), y[None, :nq], y[None, nq:])
 
     def _state(self, q: Array, w: Array) -> tuple[Array, Array]:

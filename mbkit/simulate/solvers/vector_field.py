@@ -48,15 +48,15 @@ def are_bounded(q: Array, w: Array) -> NDArray[np.bool_]:
 class Field:
     """ẇ of the integrators' state, from an engine's forward dynamics; `evaluations` are summed over a batch.
 
-    Without a space, w is mbkit's v. Under constraints an `explicit` method's stages near a singular pose are projected:
+    Without a space, w is mbkit's v. Under constraints an explicit method's stages near a singular pose are projected:
     a fixed step says by `near` whether it is, and an adaptive run looks ahead.
     """
 
     #: Whether this step is near a singular pose; None where the run looks ahead.
     near: bool | None = None
 
-    def __init__(self, dyn: Dynamics, space: Space | None, *, explicit: bool = True) -> None:
-        self._dyn, self._space, self._explicit = dyn, None if space is None or space.flat else space, explicit
+    def __init__(self, dyn: Dynamics, space: Space | None) -> None:
+        self._dyn, self._space = dyn, None if space is None or space.flat else space
         self._use(dyn)
         self.evaluations = 0
         #: Why a motion at a singular pose went no further.
@@ -78,7 +78,7 @@ class Field:
     def near_singular(self) -> bool:
         """Whether constraints may soon depend on each other."""
         near = self._approach.near if self.near is None else self.near
-        return self._constrained and self._explicit and near
+        return self._constrained and near
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         """Return the state that a step led to, on its constraints if there are some."""
@@ -90,7 +90,7 @@ class Field:
 
     def look(self, t: float, q: Array, w: Array) -> None:
         """Look how near a singular pose the run is, at the start or the end of a step."""
-        if self._constrained and self._explicit and self.near is None:
+        if self._constrained and self.near is None:
             self._approach.saw(self._own, t, q, w if self._space is None else self._space.to_body_velocity(q, w))
 
     approach: Approach = forwarded("_approach", "How near a singular pose the run is.")
@@ -104,7 +104,7 @@ class Field:
 
     def consistent(self, t: float, q: Array, w: Array, force: Force) -> Array:
         """Return ẇ at an explicit method's stage; near a singular pose at the state on the constraints beside it."""
-        if self._constrained and self.near_singular:
+        if self.near_singular:
             # One of a batch with parameters of its own is a batch of one.
             q, w = (x.reshape(y.shape) for x, y in zip(self._projected(beside, t, q, w), (q, w), strict=True))
         return self(t, q, w, force)
@@ -118,9 +118,7 @@ class Field:
                 raise DivergenceError(self.undetermined or DIVERGED)
             force = force(t, q, v)
         self.evaluations += 1 if q.ndim == 1 else len(q)
-        # An implicit method does not look ahead: its step may begin at a pose.
-        looks = self._constrained and (self.near_singular or not self._explicit)
-        a = self._at_poses(t, q, v, force) if looks else None
+        a = self._at_poses(t, q, v, force) if self.near_singular else None
         if a is None:
             a = self._evaluated(t, q, v, force)
         return a if self._space is None else np.asarray(self._space.acceleration(q, v, a))
@@ -164,8 +162,10 @@ class Rates:
     `why` is the engine's reason when it last failed.
     """
 
-    def __init__(self, dyn: Dynamics, *, explicit: bool = False) -> None:
-        self._model, self._field = dyn.model, Field(dyn, None, explicit=explicit)
+    def __init__(self, dyn: Dynamics) -> None:
+        self._model, self._field = dyn.model, Field(dyn, None)
+        # Steps near a singular pose are not made of these.
+        self._field.near = False
         layout = dyn.model.layout
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
         self.why = ""
@@ -190,7 +190,7 @@ class Rates:
         q, lengths = unit_quaternions(self._model, y[:nq])
         v = y[nq:]
         try:
-            a = self._field.consistent(t, q, v, force)
+            a = self._field(t, q, v, force)
         except DivergenceError as error:
             self.why = str(error)
             return np.full(len(y), np.nan)
