@@ -75,10 +75,11 @@ def _blade(a: Vector, b: Vector, tangents: list[Vector], radius: Any, length: Ca
 
 
 def _disc(a: Vector, n: Vector, tangents: list[Vector], radius: Any, length: Callable[[Any], Any]) -> Contact:  # noqa: ARG001
-    cosine = dot3(a, n)
-    lowest = [x - cosine * y for x, y in zip(n, a, strict=True)]
-    s = length(dot3(lowest, lowest))
-    forward = [x / s for x in cross3(a, n)]
+    side = cross3(a, n)
+    # n - (n·a) a, of which nothing cancels where the disc lies nearly flat.
+    lowest = cross3(side, a)
+    s = length(dot3(side, side))
+    forward = [x / s for x in side]
     return Contact([-radius * x / s for x in lowest], radius * s, [n], [forward, cross3(n, forward)])
 
 

@@ -75,7 +75,8 @@ class _Solve:
         if across is not None:
             across.follow(i)
         solver: Any = None
-        interval, first = -1, None
+        first: float | None = None
+        interval = -1
         for stop in self._stops:
             before, interval = interval, problem.interval(t)
             problem.sample(i, interval, t, y)

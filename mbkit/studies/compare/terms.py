@@ -151,12 +151,11 @@ FORWARD_DYNAMICS: Final = "forward_dynamics"
 JOINT_LOADS: Final = "joint_wrenches"
 #: Quantities that depend on how an engine holds constraints.
 OF_CONSTRAINED_MOTION: Final = (FORWARD_DYNAMICS, JOINT_LOADS, "generalized_constraint_force")
-BIAS: Final = "constraint_bias"
 #: Of models with constraints. Jᵀ λ is unique where λ is not.
 CONSTRAINT_TERMS: Final = (
     Term("f", "constraint_residual", ("q",), row_errors),
     Term("J", "constraint_jacobian", ("q",), row_errors),
-    Term("J̇ v rows", BIAS, ("q", "v"), row_errors),
+    Term("J̇ v rows", "constraint_bias", ("q", "v"), row_errors),
     Term("Jᵀ λ", "generalized_constraint_force", ("q", "v", "tau"), constraint_force_errors),
 )
 
