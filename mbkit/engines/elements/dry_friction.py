@@ -277,7 +277,7 @@ class DryFriction(AddedForce):
         law, shape = law or self.law_of(dyn), resting.shape
         b = np.asarray(accelerate(tau), dtype=np.float64)
         # Where there are no accelerations nothing is held, and the engine says why there are none.
-        none = ~np.isfinite(b).all(axis=-1, keepdims=True)
+        none = np.asarray(~np.isfinite(b).all(axis=-1, keepdims=True))
         A = np.where(none[..., None], 0.0, self._responses(dyn, accelerate, q, tau, b))
         resting, b, n = resting & ~none, np.where(none, 0.0, b), shape[-1]
         A, b, on = A.reshape(-1, n, n), b.reshape(-1, n), resting.reshape(-1, n)

@@ -172,16 +172,16 @@ class RungeKuttaAttempts:
         length = approach.length(self._h) if approach.crosses(self._h) else self._h
         t = end_of_attempt(SCALARS, self._t, length, self._stop)
         step = t - self._t
-        before = [self._t], [self._q], [self._w]
+        ends = [(self._t, self._q, self._w)]
         q, w, self._error = self._checked_attempt(step)
         good = self._error < 1 and step > 0
         self._settle(step, good)
         if good:
             q, w = self._field.settled(t, q, w)
             self._t, self._q, self._w, self._fresh = t, q, w, True
-            for row, x in zip(before, (t, q, w), strict=True):
-                row.append(x)
-        return [(0, AcceptedSteps(np.array(before[0]), np.array(before[1]), np.array(before[2])))]
+            ends.append((t, q, w))
+        times, places, rates = zip(*ends, strict=True)
+        return [(0, AcceptedSteps(np.array(times), np.array(places), np.array(rates)))]
 
     def _settle(self, step: float, good: bool) -> None:
         loose = self._slack * self._tolerances.rtol >= LOOSEST
