@@ -470,7 +470,6 @@ def test_writers_and_paper_refuse_them_by_name() -> None:
     for call in (
         lambda: mb.convert(model, "mjcf"),
         lambda: mb.convert(model, "urdf"),
-        lambda: mb.lagrangian.export_c(model, ["mass_matrix"]),
         lambda: model.base_parameters(),
     ):
         with pytest.raises(UnsupportedError, match=r"no.slip"):
