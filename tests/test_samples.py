@@ -6,7 +6,9 @@ The truth is a run cut at the samples: one run for each interval, under a consta
 from __future__ import annotations
 
 import _thread
+import signal
 import time
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -211,8 +213,12 @@ def test_a_trajectory_that_ends_late_keeps_the_samples_before(engine, batch):
     np.testing.assert_allclose(run.q[1, :21] if batch else run.q, until.q, rtol=0, atol=1e-12)
 
 
-def test_an_interrupt_does_not_wait_for_the_samples_of_a_block():
+def test_an_interrupt_does_not_wait_for_the_samples_of_a_block(request):
     """Ctrl-C while several threads meet at slow samples."""
+    # A shell lets background processes ignore it.
+    request.addfinalizer(
+        partial(signal.signal, signal.SIGINT, signal.signal(signal.SIGINT, signal.default_int_handler))
+    )
     begun: list[float] = []
 
     def slow(_t, _q, v, _members):

@@ -20,6 +20,7 @@ DECISIVE: Final = (
     "spatial.py",
     "_check.py",
     "_reproducible.py",
+    "errors.py",
 )
 _ROOT: Final = Path(__file__).parent.parent
 
