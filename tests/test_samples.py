@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import _thread
 import signal
+import threading
 import time
 from functools import partial
 
@@ -401,3 +402,22 @@ def test_a_sample_of_impulses_that_fails_keeps_what_was_computed(engine):
             torque=lambda t, *_: [1 / (t < 0.19), 0.0],
         )
     assert told.value.trajectory.t[-1] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("method", ["rk4", "gauss4"])
+def test_a_sampled_batch_takes_no_more_threads_than_it_may(method):
+    """And has the same states with one thread as with three."""
+    model, q, v = scene("tree")
+    q, v = np.linspace(0.5, 1.0, 300)[:, None] * q, np.tile(v, (300, 1))
+    runs = []
+    for threads in (1, 3):
+        seen = set()
+
+        def policy(t, q, v, _members, seen=seen):
+            seen.add(threading.get_ident())
+            return law(t, q, v)
+
+        dyn = mb.dynamics(model, "lagrangian", compile=True, threads=threads)
+        runs.append(simulate(dyn, q, v, 0.1, method, dt=STEP, torque=Policy(policy), hold=STEP))
+        assert len(seen) <= threads
+    np.testing.assert_array_equal(runs[0].q, runs[1].q)

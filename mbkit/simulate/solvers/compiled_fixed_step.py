@@ -167,7 +167,7 @@ def padded(count: int) -> int:
     return -(-count // _LANES) * _LANES | _LANES
 
 
-class SampleMeeting:
+class SampleBarrier:
     """Asks a torque that samples, once at each sample for all parts of a batch, which wait there for one another.
 
     velocity(t, q, w, members) is mbkit's velocity of states (n, nq) and (n, nv).
@@ -178,7 +178,7 @@ class SampleMeeting:
     ) -> None:
         self._problem, self._velocity, self._k = problem, velocity, 0
         self._loops: list[tuple[BlockLoop, Indices]] = []
-        self._meeting, self._left = threading.Barrier(parts, self._ask) if parts > 1 else None, False
+        self._barrier, self._left = threading.Barrier(parts, self._ask) if parts > 1 else None, False
         #: Of a torque function that failed.
         self.error: FunctionError | None = None
 
@@ -189,20 +189,20 @@ class SampleMeeting:
     def __call__(self, k: int) -> bool:
         """Ask at a step, when all parts are there; return whether to go on."""
         self._k = k
-        if self._meeting is None:
+        if self._barrier is None:
             self._ask()
         elif self._left:
             # Who leaves would wait for a turn beside many parts that meet often.
             raise threading.BrokenBarrierError
         else:
-            self._meeting.wait()
+            self._barrier.wait()
         return self.error is None
 
     def leave(self) -> None:
         """Let nobody wait for a part that goes no further."""
         self._left = True
-        if self._meeting is not None:
-            self._meeting.abort()
+        if self._barrier is not None:
+            self._barrier.abort()
 
     def _ask(self) -> None:
         problem, k, t = self._problem, self._k, self._problem.grid.time(self._k)
@@ -229,7 +229,7 @@ def run_blocks(
     loop: BlockLoop,
     members: Indices,
     ends: Iterable[int] = (),
-    meeting: SampleMeeting | None = None,
+    barrier: SampleBarrier | None = None,
 ) -> Iterator[tuple[int, dict[int, list[Array]]]]:
     """Take members of the batch, which are in the loop, through the run in blocks that stop at `ends` too.
 
@@ -251,7 +251,7 @@ def run_blocks(
             while at < k + n:
                 if samples and samples[-1] == at:
                     samples.pop()
-                    going = meeting is None or meeting(at)
+                    going = barrier is None or barrier(at)
                     if not going:
                         break
                 end = min(k + n, samples[-1]) if samples else k + n
@@ -273,26 +273,26 @@ def run_blocks(
                     last[int(members[m])] = [loop.states(name, [good[m]])[m, 0] for name in loop.carried]
                 alive &= good == n
             yield k + n, last
-            if not going or (last and meeting is None and not alive.any()):
+            if not going or (last and barrier is None and not alive.any()):
                 return
             loop.again()
             k += n
 
 
 @contextmanager
-def _meeting(meeting: SampleMeeting | None, loop: BlockLoop, members: Indices) -> Iterator[None]:
+def _joined(barrier: SampleBarrier | None, loop: BlockLoop, members: Indices) -> Iterator[None]:
     """Let a part take part in the samples; when it is closed before its end, the others end too."""
-    if meeting is None:
+    if barrier is None:
         yield
         return
-    meeting.join(loop, members)
+    barrier.join(loop, members)
     try:
         yield
     except threading.BrokenBarrierError:
         # Another part was stopped.
         return
     except BaseException:
-        meeting.leave()
+        barrier.leave()
         raise
 
 
@@ -302,7 +302,7 @@ def run_parts(
     workers: int,
     steps: int,
     bar: Progress,
-    meeting: SampleMeeting | None = None,
+    barrier: SampleBarrier | None = None,
 ) -> None:
     """Run parts of a batch in threads, at most `workers`; parts that meet wait for one another, in a thread each.
 
@@ -321,7 +321,7 @@ def run_parts(
                 if stop.is_set():
                     return
 
-    workers = min(workers, len(parts)) if meeting is None else len(parts)
+    workers = min(workers, len(parts)) if barrier is None else len(parts)
     if workers < 2:
         if parts:
             work(lambda: bar.update(sum(done) / total))
@@ -336,9 +336,9 @@ def run_parts(
                 bar.update(sum(done) / total)
         finally:
             stop.set()
-            if meeting is not None:
+            if barrier is not None:
                 # A block may take as long as all its samples.
-                meeting.leave()
+                barrier.leave()
 
 
 def _widest(plan: Plan) -> int:
@@ -446,11 +446,11 @@ def run_rollout(
         return Chunk(plan, space, most, grid.steps, torques=torques, all_kept=all_kept, watched=watched, clock=clock)
 
     def blocks(
-        chunk: Chunk, members: Indices, ends: Indices, meeting: SampleMeeting | None = None
+        chunk: Chunk, members: Indices, ends: Indices, barrier: SampleBarrier | None = None
     ) -> Iterator[tuple[int, dict[int, list[Array]]]]:
         more = {name: x[members] for name, x in read.items()} | ({} if law is None else {LAW: law.numbers[None]})
         chunk.begin(problem.q[members], w0[members], values[members] if values.ndim == 2 else values, **more)
-        return run_blocks(problem, record, chunk, members, ends.tolist(), meeting)
+        return run_blocks(problem, record, chunk, members, ends.tolist(), barrier)
 
     def suspects_of(members: Indices, *, thorough: bool) -> Indices:
         """Take members of the batch to the end; return those that were not bounded, or lost to their constraints."""
@@ -461,10 +461,11 @@ def run_rollout(
             squares = step_on_device(problem, record, w0, members, thorough=thorough)
             return members[~(squares < BOUND**2)]
         plan = dyn.step_plan(method, thorough=thorough, fed=law is not None, behind=behind)
-        parts = _split(n, _widest(plan), workers)
-        meeting = None
+        # Parts that wait for one another have a thread each.
+        parts = _split(n, _widest(plan) if problem.torque.samples is None else max(-(-n // workers), 1), workers)
+        barrier = None
         if problem.torque.samples is not None:
-            meeting = SampleMeeting(problem, len(parts), lambda t, q, w, i: to_body_velocity(space, q, w))  # noqa: ARG005
+            barrier = SampleBarrier(problem, len(parts), lambda t, q, w, i: to_body_velocity(space, q, w))  # noqa: ARG005
 
         def new_worker() -> Callable[[slice], Iterator[int]]:
             # The parts differ by one state at most.
@@ -472,8 +473,8 @@ def run_rollout(
 
             def run(part: slice) -> Iterator[int]:
                 ends, before = record.kept[:0] if chunk.all_kept else record.kept, 0
-                with _meeting(meeting, chunk, members[part]):
-                    for end, _ in blocks(chunk, members[part], ends, meeting):
+                with _joined(barrier, chunk, members[part]):
+                    for end, _ in blocks(chunk, members[part], ends, barrier):
                         if margins is not None:
                             own = chunk.states("margin", np.arange(1, end - before + 1))
                             margins[members[part], before:end] = own[..., 0]
@@ -483,9 +484,9 @@ def run_rollout(
 
             return run
 
-        run_parts(parts, new_worker, workers, grid.steps, problem.bar, meeting)
-        if meeting is not None and meeting.error is not None:
-            failures.append(meeting.error)
+        run_parts(parts, new_worker, workers, grid.steps, problem.bar, barrier)
+        if barrier is not None and barrier.error is not None:
+            failures.append(barrier.error)
         # A NaN is not below anything.
         return members[~(squares < BOUND**2)]
 
@@ -761,23 +762,25 @@ def run_implicit(
     dyn, record, grid = problem.dyn, GridRecord(problem), problem.grid
     assert isinstance(dyn, LagrangianDynamics)
     values, n = dyn.parameter_values, len(other)
-    count = -(-n // WIDEST)
+    count, workers = -(-n // WIDEST), dyn.threads or cores()
+    if problem.torque.samples is not None:
+        # Parts that wait for one another have a thread each.
+        count = min(count, workers)
     ends = [n * i // max(count, 1) for i in range(count + 1)]
     # Threads append to it, and write their own members.
     iterations, lost = list[int](), dict[int, list[Array]]()
 
-    meeting = None if problem.torque.samples is None else SampleMeeting(problem, count, velocity)
+    barrier = None if problem.torque.samples is None else SampleBarrier(problem, count, velocity)
 
     def run(part: slice) -> Iterator[int]:
         members = np.arange(n)[part]
         chunk = ImplicitChunk(dyn, parts, len(members), grid.steps, torques=problem.torque.in_each_step)
         chunk.begin(problem.q[part], other[part], guess[part], values[part] if values.ndim == 2 else values)
-        with _meeting(meeting, chunk, members):
-            for end, last in run_blocks(problem, record, chunk, members, (), meeting):
+        with _joined(barrier, chunk, members):
+            for end, last in run_blocks(problem, record, chunk, members, (), barrier):
                 lost.update(last)
                 yield end
         iterations.append(chunk.iterations)
 
-    workers = dyn.threads or cores()
-    run_parts([slice(a, b) for a, b in pairwise(ends)], lambda: run, workers, grid.steps, problem.bar, meeting)
-    return record, sum(iterations), lost, None if meeting is None else meeting.error
+    run_parts([slice(a, b) for a, b in pairwise(ends)], lambda: run, workers, grid.steps, problem.bar, barrier)
+    return record, sum(iterations), lost, None if barrier is None else barrier.error
