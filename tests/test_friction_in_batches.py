@@ -216,3 +216,15 @@ def test_what_rests_lets_go_where_a_wrench_passes_its_bound(method: str, compile
         assert v[0] == pytest.approx(0.25 * np.maximum(np.arange(21) * 0.01 - 0.1, 0), abs=1e-12)
         assert not v[0, :11].any()
         assert not v[1:].any()
+
+
+def test_variants_of_friction_slide_as_in_the_closed_form() -> None:
+    """x = v t - f t²/2m of blocks that do not stop, each with a friction of its own."""
+    b = mb.ModelBuilder("slid")
+    b.add_joint("x", "prismatic", parent="world", child="block", axis=(1, 0, 0), friction=1.0)
+    b.add_body("block", mass=1.0)
+    many = mb.variants(b.build(point_masses=True), {"x.friction": 0.2}, size=5, seed=1)
+    run = mb.simulate(many.dynamics("lagrangian"), np.zeros((5, 1)), np.full((5, 1), 3.0), 1.0, dt=0.01)
+    drawn = np.array(many.values["x.friction"])
+    assert np.ptp(drawn) > 0.1
+    np.testing.assert_allclose(run.q[:, -1, 0], 3.0 - drawn / 2, rtol=0, atol=1e-13)

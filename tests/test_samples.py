@@ -421,3 +421,16 @@ def test_a_sampled_batch_takes_no_more_threads_than_it_may(method):
         runs.append(simulate(dyn, q, v, 0.1, method, dt=STEP, torque=Policy(policy), hold=STEP))
         assert len(seen) <= threads
     np.testing.assert_array_equal(runs[0].q, runs[1].q)
+
+
+def test_a_sampled_run_passes_a_singular_pose_as_a_run_without_samples_does():
+    """A torque of zero at each step: the same bits, and the same words about the pose."""
+    dyn = mb.dynamics(mb.catalog.four_bars(n=1), "lagrangian", compile=True)
+    side = np.array([-1.0 if name.startswith("phi") else 1.0 for name in dyn.model.coordinate_names])
+    start = (1.0 * side, 3.0 * side, 1.0)
+    with pytest.warns(mb.errors.DoubtfulRunWarning, match="singular pose"):
+        plain = simulate(dyn, *start, dt=STEP, doubt=False)
+    with pytest.warns(mb.errors.DoubtfulRunWarning, match="singular pose"):
+        run = simulate(dyn, *start, dt=STEP, torque=lambda _t, _q, v: 0 * v, hold=STEP, doubt=False)
+    assert run.stats.doubts == plain.stats.doubts
+    np.testing.assert_array_equal(run.q, plain.q)

@@ -430,7 +430,9 @@ def run_rollout(
     assert isinstance(dyn, LagrangianDynamics)
     if isinstance(formula := method_of(method).formula, ImplicitTableau):
         return _run_collocation(problem, formula)
-    if problem.batch is None and problem.torque.samples is not None and not problem.torque.in_each_step:
+    free = not (dyn.model.constrained or problem.torque.in_each_step)
+    if problem.batch is None and problem.torque.samples is not None and free:
+        # Single steps do not look for singular poses.
         return _run_step_by_step(problem)
     record = GridRecord(problem)
     space = Space(dyn.model)
