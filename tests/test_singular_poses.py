@@ -130,6 +130,24 @@ def test_a_run_starts_in_a_singular_pose_with_a_velocity(method, setting, close,
     assert "loop 'pin1' x and loop 'pin2' x" in told
 
 
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_single_steps_go_through_a_pose_as_a_run_does(engine) -> None:
+    """From the pose; with the middle stages, or the end, in it; and in a batch beside one that rests there."""
+    dyn, dt, tau = row(1, engine), 1e-3, np.zeros(3)
+    starts = [parallel(dyn, FLAT + ahead * 80 * dt, -80.0) for ahead in (0.0, 0.5, 1.0)]
+    for q, v in starts:
+        run = mb.simulate(dyn, q, v, dt, dt=dt, doubt=False)
+        step = dyn.step(q, v, tau, dt)
+        assert np.array_equal(step, (run.q[-1], run.v[-1]))
+        exact = motion(1, [dt], q[0], -80.0)[0]
+        assert step[0] == pytest.approx(parallel(dyn, exact, 0.0)[0], abs=1e-9)
+    both = dyn.step(*(np.array(x) for x in zip(*starts, strict=True)), tau, dt)
+    for i, (q, v) in enumerate(starts):
+        assert [x[i] for x in both] == pytest.approx(np.array(dyn.step(q, v, tau, dt)), abs=1e-13)
+    with pytest.raises(NumericalError, match="singular pose"):
+        dyn.step(starts[0][0], 0 * tau, tau, dt)
+
+
 @pytest.mark.thorough(every=4)
 @pytest.mark.parametrize(("method", "setting", "close"), METHODS)
 def test_the_velocity_says_on_which_branch_a_run_goes_on(method, setting, close) -> None:

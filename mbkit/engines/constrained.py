@@ -444,18 +444,6 @@ class Constrained:
             return states.accelerated(self, q, v, a, hold)  # type: ignore[no-any-return]  # by name
         return np.array([states.accelerated(self, *one, hold) for one in zip(q, v, a, strict=True)]).reshape(a.shape)
 
-    def _pulled(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the consistent states near the ends of a step."""
-        return self._states_held.manifold_of(self).at(t).pulled(q, v)  # type: ignore[no-any-return]  # by name
-
-    def _onto_constraints(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return the states after one step of Newton's onto the constraints, of stages near a singular pose."""
-        return self._states_held.manifold_of(self).at(t).beside(q, v)  # type: ignore[no-any-return]  # by name
-
-    def _explicit_step(self, *arguments: Any) -> Any:
-        """Take an explicit step under constraints, with the arguments of `constraint_manifold.explicit_step`."""
-        return self._states_held.explicit_step(self, *arguments)
-
     def mobility(self, q: ArrayLike | None = None) -> Any:
         """Return the degrees of freedom and the redundant rows, at a configuration or where the loops are closed.
 

@@ -19,7 +19,7 @@ from mbkit.engines.constrained import unwatched
 from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.engines.loads import Wrenches
 from mbkit.errors import InputError, NumericalError, UnsupportedError
-from mbkit.methods.one_step import ArrayStages, SemiImplicitEuler
+from mbkit.methods.one_step import SemiImplicitEuler
 from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method, explicit_method, method_of
 from mbkit.methods.tableaus import ImplicitTableau, Tableau
 from mbkit.model import Model
@@ -46,14 +46,6 @@ _MOST: Final = 25
 _ROUNDING: Final = 1e-11
 
 
-class _NotFiniteError(Exception):
-    """A stage has a state or acceleration that is not finite; its argument is which samples are, as far as known."""
-
-
-def _finite_rows(q: Array, v: Array) -> Array:
-    return np.asarray(np.isfinite(q).all(axis=-1) & np.isfinite(v).all(axis=-1))
-
-
 class Steps:
     """The method of `Dynamics` that takes a step."""
 
@@ -63,7 +55,6 @@ class Steps:
     unstepped: bool
     _states_held: Any
     soft_friction: bool
-    projects: Any
     at: Callable[..., Any]
     forward_dynamics: Callable[..., Array]
     _stacked_wrenches: Callable[..., Any]
@@ -71,9 +62,6 @@ class Steps:
     _method: Callable[..., Any]
     _states: Callable[..., Any]
     _of_sample: Callable[[int], Any]
-    _onto_constraints: Callable[..., Any]
-    _explicit_step: Callable[..., Any]
-    _pulled: Callable[..., Any]
 
     def step(
         self,
@@ -188,17 +176,14 @@ class Steps:
             self._states_held.manifold_of(self).at(self.model.time).check(states["q"], states["v"])
         # An overflow is reported as an error.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            try:
-                if "jump" in self.model.effects and not self.soft_friction:
-                    # By name: the phases of friction are those of runs, a floor above.
-                    one: Any = import_module("mbkit.simulate.solvers.friction.single_step")
-                    q1, v1 = one.step(self, chosen, **states, dt=h)
-                else:
-                    with unwatched(self):
-                        q1, v1 = self._step(chosen, **states, dt=h)
-                good = _finite_rows(q1, v1)
-            except _NotFiniteError as error:
-                good = error.args[0]
+            if "jump" in self.model.effects and not self.soft_friction:
+                # By name: the phases of friction are those of runs, a floor above.
+                one: Any = import_module("mbkit.simulate.solvers.friction.single_step")
+                q1, v1 = one.step(self, chosen, **states, dt=h)
+            else:
+                with unwatched(self):
+                    q1, v1 = self._step(chosen, **states, dt=h)
+            good = np.isfinite(q1).all(axis=-1) & np.isfinite(v1).all(axis=-1)
         if not good.all():
             # A mass matrix that is singular at the start has a message of its own, and so have drives that part.
             clock = self.model.time_parameter
@@ -213,44 +198,10 @@ class Steps:
         return q1, v1
 
     def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
-        """Return the state after a step, stage by stage."""
-        space, formula = Space(self.model), method.formula
-        assert isinstance(formula, (Tableau, SemiImplicitEuler))
-        w = space.to_integrator_velocity(q, v)
-
-        clock = self.model.time_parameter
-        start = 0.0 if clock is None else float(self.model.parameters[clock] or 0.0)
-
-        def take(near: bool) -> tuple[Array, Array, Array] | None:
-            last = [q]
-
-            def rates(t: float, q: Array, u: Array | None, w: Array) -> tuple[Array, Array]:
-                last[0], v = q, space.to_body_velocity(q, w)
-                if near:
-                    q, v = self._onto_constraints(t, q, v)
-                    w = space.to_integrator_velocity(q, v)
-                if not (good := _finite_rows(q, v)).all():
-                    raise _NotFiniteError(good)
-                try:
-                    own = self if clock is None else self.at(**{clock: t})
-                    a = own.forward_dynamics(q, v, tau)
-                except NumericalError:
-                    # Its message would blame the model for a state that has grown beyond all bounds.
-                    raise _NotFiniteError(np.array(False)) from None
-                return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
-
-            try:
-                q1, w1, _ = formula.step(space, rates, ArrayStages(method.stages, v.shape), start, dt, q, w)
-            except _NotFiniteError:
-                if near or not self.projects:
-                    raise
-                return None
-            return q1, w1, last[0]
-
-        taken: Any = self._explicit_step(formula, start, dt, q, take) if self.projects else take(False)
-        q1, w1, *_ = taken
-        v1 = space.to_body_velocity(q1, w1)
-        return self._pulled(start + dt, q1, v1) if self.projects else (q1, v1)
+        """Return the state after a step, stage by stage; NaN where there is none."""
+        # By name: it is the step of runs, a floor above.
+        loop: Any = import_module("mbkit.simulate.solvers.fixed_step")
+        return loop.take_step(self, method.name, q, v, tau, dt)  # type: ignore[no-any-return]  # by name
 
 
 def _beside(tau: Array, wrenches: Array) -> Array:

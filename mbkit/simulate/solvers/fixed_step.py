@@ -158,6 +158,28 @@ class _FieldStepper(Stepper):
         return np.asarray(self.space.to_body_velocity(q, w))
 
 
+def take_step(dyn: Dynamics, method: str, q: Array, v: Array, force: Array, h: float) -> tuple[Array, Array]:
+    """Return the states after one step of `run_fixed` under a held force, of one or a batch; NaN where there is none.
+
+    It starts at the time that the dynamics hold.
+    """
+    space, clock = Space(dyn.model), dyn.model.time_parameter
+    field, t = Field(dyn, space), 0.0 if clock is None else float(dyn.model.parameters[clock] or 0.0)
+    try:
+        q1, w1 = make_step(method, field, space)(t, h, q, space.to_integrator_velocity(q, v), force)
+    except DivergenceError:
+        if q.ndim == 1 or len(q) < 2:
+            return np.full(q.shape, np.nan), np.full(v.shape, np.nan)
+        # One must not stop the others.
+        rows = (np.array([i]) for i in range(len(q)))
+        each = [take_step(dyn.of_samples(i), method, q[i], v[i], force[i], h) for i in rows]
+        return np.concatenate([x for x, _ in each]), np.concatenate([x for _, x in each])
+    if not are_bounded(q1, w1).all():
+        return q1, w1
+    q1, w1 = field.settled(t + h, q1, w1)
+    return q1, np.asarray(space.to_body_velocity(q1, w1))
+
+
 def run_fixed(
     problem: IntegrationProblem, record: GridRecord | None = None, members: Indices | None = None
 ) -> SolverResult:
