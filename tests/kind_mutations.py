@@ -45,11 +45,7 @@ WITHOUT_ENERGY = ("force.frame",)
 ELSEWHERE = ("newton", "remote runs of joints")
 #: Refusals that no check finds needed. Whether motions that a coupler leaves still tell the tree's base parameters
 #: depends on the axes that it binds; they do in these examples.
-#: A program's text of rows runs and is right; what it prints to read, with minima and cases, is not read back yet.
-NEEDLESS = {
-    "base parameters": ("coupler", "coupler.several"),
-    "program": tuple(k for k, x in PART_KINDS.items() if x.does & {"row", "speed"} and x.section),
-}
+NEEDLESS = {"base parameters": ("coupler", "coupler.several")}
 
 
 @dataclass(frozen=True)

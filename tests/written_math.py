@@ -13,7 +13,7 @@ _FRACTIONS = {"½": 1 / 2, "⅓": 1 / 3, "¼": 1 / 4, "⅙": 1 / 6, "⅛": 1 / 8
 _HIGH = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ", "0123456789-/")
 _FUNCTIONS: dict[str, Callable[..., float]] = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sign": np.sign, "acos": np.arccos,
-    "asin": np.arcsin, "atan": np.arctan, "atan2": np.arctan2, "sqrt": np.sqrt, "tanh": np.tanh,
+    "asin": np.arcsin, "atan": np.arctan, "atan2": np.arctan2, "sqrt": np.sqrt, "tanh": np.tanh, "min": min, "max": max,
 }  # fmt: skip
 #: Comparisons of a formula by cases, in text and in LaTeX.
 _COMPARED: dict[str, Callable[[float, float], bool]] = {
@@ -31,7 +31,10 @@ _GREEK = (
 )
 _LETTERS = dict(zip("αβγδεζηθικλμνξοπρστυφχψω", _GREEK.split(), strict=True))
 _ENDS = {"(": ")", "{": "}", "|": "|", "[": "]"}
-_AFTER = {*"+-)}|,]<>", *_COMPARED, "if", "else", ""}
+_JOINED: dict[str, Callable[[bool, bool], bool]] = {
+    "and": operator.and_, "wedge": operator.and_, "or": operator.or_, "vee": operator.or_,
+}  # fmt: skip
+_AFTER = {*"+-)}|,]<>", *_COMPARED, *_JOINED, "if", "else", ""}
 
 
 def plain(text: str) -> str:
@@ -95,12 +98,34 @@ class _Reader:
     def group(self, start: str) -> float:
         out = self.sum()
         if self.eat("if"):
-            left, how, right = self.sum(), self.eat(*_COMPARED), self.sum()
+            holds = self.holds()
             assert self.eat("else")
             other = self.sum()
-            out = out if _COMPARED[how](left, right) else other
+            out = out if holds else other
         assert self.eat(_ENDS[start]), self.tokens[self.at - 9 : self.at + 9]
         return abs(out) if start == "|" else out
+
+    def holds(self) -> bool:
+        out = self.one_holds()
+        while word := self.eat(*_JOINED):
+            out = _JOINED[word](out, self.one_holds())
+        return out
+
+    def one_holds(self) -> bool:
+        if self.eat("not", "neg"):
+            return not self.one_holds()
+        start = self.at
+        if self.eat("("):
+            # Around a condition, or around a sum that is compared.
+            try:
+                out = self.holds()
+                if self.eat(")") and self.next not in _COMPARED:
+                    return out
+            except KeyError:
+                pass
+            self.at = start
+        left, how, right = self.sum(), self.eat(*_COMPARED), self.sum()
+        return _COMPARED[how](left, right)
 
     def arguments(self) -> list[float]:
         wrapped = bool(self.eat("{"))

@@ -174,7 +174,8 @@ class ExpressionPrinter:
             cases = [f"{self.text(y)} if {_compared(c, self)}" if c != sp.true else self.text(y) for y, c in x.args]
             return f"({' else '.join(cases)})"
         if isinstance(x, Application) and len(x.args) > 1:
-            return f"{x.func.__name__}({', '.join(map(self.text, x.args))})"
+            name = x.func.__name__.lower() if isinstance(x, (sp.Min, sp.Max)) else x.func.__name__
+            return f"{name}({', '.join(map(self.text, x.args))})"
         if isinstance(x, sp.Function):
             space = " " if isinstance(x, (sp.sin, sp.cos, sp.tan)) else ""
             text = self._argument(x.args[0]) if space else f"({self.text(x.args[0])})"
@@ -321,6 +322,8 @@ def _compared(x: Any, board: ExpressionPrinter) -> str:
     if isinstance(x, (sp.And, sp.Or)):
         word = " and " if isinstance(x, sp.And) else " or "
         return word.join(f"({_compared(c, board)})" for c in sorted(x.args, key=str))
+    if isinstance(x, sp.Not):
+        return f"not ({_compared(x.args[0], board)})"
     return one_line(str(x))
 
 

@@ -26,15 +26,9 @@ from mbkit.lagrangian.elements import SYMPY
 from mbkit.lagrangian.energies.symbols import free_name
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned, folded
 from mbkit.model import Model
-from mbkit.model.elements.paths import ALL
+from mbkit.model.elements.kinds import that_do
 
-PROGRAM: Final = replace(
-    C_CODE,
-    name="program",
-    words="a tree's program leaves out what holds",
-    carries=ALL - {"row", "speed"} | {"written.row", "written.speed"},
-    instead="export_c holds them; mbkit.lagrangian.from_model(model).model has them in its equations",
-)
+PROGRAM: Final = replace(C_CODE, name="program", words="program: not known of")
 #: Operations of a term from which on it gets a name of its own: a line of text has some 100 letters.
 _LONG: Final = 10
 _WIDTH: Final = 100
@@ -61,7 +55,7 @@ class ProgramText(Printable):
     results : sympy.Matrix
         The quantity, in named terms.
     note : str
-        Friction at rest, which no term holds; empty without.
+        Friction at rest, which no term holds, and where constraints hold; empty without both.
     """
 
     model: str
@@ -140,7 +134,7 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
     Parameters
     ----------
     model : Model
-        Any robot or system without constraints; one of named parameters keeps their names.
+        Any robot or system; one of named parameters keeps their names.
     quantity : str
         A key of `mbkit.lagrangian.FUNCTIONS`, such as ``"inverse_dynamics"``, ``"forward_dynamics"`` or
         ``"mass_matrix"``.
@@ -150,7 +144,7 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
     UnknownNameError
         Another quantity.
     UnsupportedError
-        The model has constraints, or no joint that moves; a quantity of several results.
+        The model has no joint that moves; a quantity of several results.
 
     Examples
     --------
@@ -193,8 +187,10 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
         known.append(x)
     (shape,), (out,) = operations.shapes, operations.outputs
     results = sp.ImmutableMatrix(*shape, lambda i, j: known[int(out[i, j])])
-    note = "; ".join(notes) if any(o.name == "sign" for o in operations.operations) else ""
-    return ProgramText(model.name, quantity, operations.arithmetic, inputs, tuple(terms), results, note)
+    jumps = model.acts.keys() & {*that_do("jump")}
+    if jumps and all(o.name != "sign" for o in operations.operations):
+        notes = PROGRAM.admit(model.without(*jumps))
+    return ProgramText(model.name, quantity, operations.arithmetic, inputs, tuple(terms), results, "; ".join(notes))
 
 
 def _inputs(function: Any, model: Model) -> tuple[_Inputs, set[str]]:
