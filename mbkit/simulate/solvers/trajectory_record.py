@@ -81,7 +81,9 @@ class TrajectoryRecord:
         self._watch = Watch(problem.events, member) if problem.events else None
         own = dyn if member is None or not dyn.model.constrained else dyn.of_samples([member])
         self.poses = SingularPoses(own) if dyn.projects else None
-        self.steps = self.rejected = 0
+        self.steps = self.rejected = self.evaluations = self.jacobians = 0
+        self.chosen = ""
+        self.doubts: list[str] = []
         self.reached = problem.start
         self.last: Array | None = None
         self.ended: Ended = "finished"
@@ -94,7 +96,7 @@ class TrajectoryRecord:
     def begin(self, q: Array, v: Array) -> None:
         """Keep the start if it is wanted."""
         if self._save is None or (len(self._save) and self._save[0] == self.reached):
-            self._kept.append((np.array([self.reached]), q[None], v[None]))
+            self.keep(np.array([self.reached]), q[None], v[None])
         if self._watch is not None:
             self._watch.start(self.reached, q, v)
         if self.poses is not None:
@@ -129,13 +131,26 @@ class TrajectoryRecord:
             self.stop(diverged())
         return hit is None and not lost
 
+    def add(self, run: SolverResult, events: Sequence[Hit]) -> None:
+        """Add the cost of a part that was a run of its own, and its events; not its states."""
+        for name in ("steps", "rejected", "evaluations", "jacobians"):
+            setattr(self, name, getattr(self, name) + getattr(run, name))
+        self.reached, self.last, self.chosen = float(run.reached), run.last, run.chosen
+        self.doubts += [x for x in run.doubts if x not in self.doubts]
+        self.events += events
+
+    def keep(self, t: Array, q: Array, v: Array) -> None:
+        """Keep states, (n,), (n, nq) and (n, nv), in mbkit's velocities."""
+        if len(t):
+            self._kept.append((t, q, v))
+
     def reach(self, t: float, y: Array) -> None:
         """Go on to a state (q, v), of a solver that does not tell its steps."""
         self.reached, nq = t, self._model.nq
         if self.poses is not None:
             self.poses.saw(t, y[:nq])
         if self._save is not None and t in self._save:
-            self._add(np.array([t]), y[None, :nq], y[None, nq:])
+            self.keep(np.array([t]), *self._state(y[None, :nq], y[None, nq:]))
 
     def _state(self, q: Array, w: Array) -> tuple[Array, Array]:
         """Return q and mbkit's v."""
@@ -170,7 +185,7 @@ class TrajectoryRecord:
         """Keep the wanted states up to a time in the last step; return False, and keep none, if one is unbounded."""
         if self._save is None:
             ends = slice(1, steps + 1 - int(until != accepted.t[steps]))
-            self._add(accepted.t[ends], accepted.q[ends], accepted.w[ends])
+            self.keep(accepted.t[ends], *self._state(accepted.q[ends], accepted.w[ends]))
             return True
         first, last = self._save.searchsorted((accepted.t[0], until), side="right")
         if first == last:
@@ -183,12 +198,8 @@ class TrajectoryRecord:
             q[between], w[between] = inner = within(accepted.rows(after[between] - 1), times[between])
             if not are_bounded(*inner).all():
                 return False
-        self._add(times, q, w)
+        self.keep(times, *self._state(q, w))
         return True
-
-    def _add(self, t: Array, q: Array, w: Array) -> None:
-        if len(t):
-            self._kept.append((t, *self._state(q, w)))
 
     @property
     def states(self) -> tuple[Array, Array, Array]:
@@ -219,7 +230,7 @@ class TrajectoryRecord:
         # The state of one of a batch is with the event, off the common times.
         self.ended, self.message = "event", f"stopped by {hit.name} at t = {hit.t:.6g} s"
         if hit.member is None and not (self._kept and self._kept[-1][0][-1] == hit.t):
-            self._kept.append((np.array([hit.t]), hit.q[None], hit.v[None]))
+            self.keep(np.array([hit.t]), hit.q[None], hit.v[None])
 
     def fail(self, error: FunctionError) -> None:
         """End where a torque or event function failed."""
@@ -268,11 +279,11 @@ def _by_rows(at: Callable[[float], Array], nq: int) -> Within:
 
 
 def assemble_result(
-    problem: IntegrationProblem, records: Sequence[TrajectoryRecord], *, evaluations: int, jacobians: int = 0
+    problem: IntegrationProblem, records: Sequence[TrajectoryRecord], *, evaluations: int = 0, jacobians: int = 0
 ) -> SolverResult:
     """Return one trajectory, or a batch of them as far as they came; those that were not begun have no record.
 
-    `evaluations` and `jacobians` are of all together.
+    `evaluations` and `jacobians` are those of all together that no record has.
     """
     batch, model = problem.batch, problem.dyn.model
     states = [record.states for record in records]
@@ -283,7 +294,7 @@ def assemble_result(
         assert problem.save is not None
         # A batch of none has all its times.
         count = max((len(t) for t, _, _ in states), default=0 if batch else len(problem.save))
-        t, reached = problem.save[:count], np.zeros(batch)
+        t, reached = problem.save[:count], np.full(batch, problem.start)
         reached[: len(records)] = [record.reached for record in records]
         q, v = (np.full((batch, count, n), np.nan) for n in (model.nq, model.nv))
         for i, (own, *state) in enumerate(states):
@@ -295,16 +306,17 @@ def assemble_result(
         q=q,
         v=v,
         steps=sum(record.steps for record in records),
-        evaluations=evaluations,
+        evaluations=evaluations + sum(record.evaluations for record in records),
         ended=ended,
         reached=reached,
         message=message,
         rejected=sum(record.rejected for record in records),
-        jacobians=jacobians,
+        jacobians=jacobians + sum(record.jacobians for record in records),
         events=tuple(hit for record in records for hit in record.events),
         error=next((record.error for record in records if record.error), None),
         last=next((record.last for record in records if record.ended in ("diverged", "step_too_small")), None),
-        doubts=(poses,) if poses else (),
+        chosen=next((record.chosen for record in records if record.chosen), ""),
+        doubts=tuple(dict.fromkeys([*([poses] if poses else ()), *(x for record in records for x in record.doubts)])),
     )
 
 

@@ -6,7 +6,7 @@ The end of a phase is an event. Methods with a fixed step are in `fixed`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -16,9 +16,10 @@ from mbkit.engines import Dynamics
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.simulate.events import Followed, Hit
 from mbkit.simulate.problem import RUNS, IntegrationProblem
-from mbkit.simulate.result import Ended, SolverResult
+from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.friction.fixed import MAX_EMPTY_PHASES, UNDECIDED, Solver, run_fixed_in_phases
 from mbkit.simulate.solvers.friction.phases import Friction, Phase
+from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result, diverged
 
 _EPS: Final = float(np.finfo(float).eps)
 _END: Final = "end of a phase"
@@ -30,65 +31,20 @@ def run_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics], Solv
     RUNS.admit(dyn.model)
     if problem.equal_steps is not None:
         return run_fixed_in_phases(problem, solver)
-    parts = []
+    records = []
     for i in range(len(problem.q)):
         run = _Member(problem, i, solver)
-        parts.append(run.part)
+        records.append(run.record)
         try:
             _adaptive(run)
         except FunctionError as error:
             # Of a torque that is asked whether a phase ends.
-            run.part.error = error
-            break
+            run.record.fail(error)
         except NumericalError as error:
-            run.part.ended, run.part.message = "diverged", f"diverged after t = {run.part.reached:.6g} s: {error}"
-    return _merged(problem, parts)
-
-
-@dataclass(eq=False)
-class _Part:
-    """What a trajectory has so far."""
-
-    t: list[Array]
-    q: list[Array]
-    v: list[Array]
-    hits: list[Hit]
-    last: SolverResult | None = None
-    steps: int = 0
-    evaluations: int = 0
-    rejected: int = 0
-    jacobians: int = 0
-    #: How it ended, and why, where the solver of its last phase does not tell.
-    ended: Ended | None = None
-    message: str = ""
-    error: FunctionError | None = None
-    reached: float = 0.0
-
-    def count(self, result: SolverResult) -> None:
-        """Add the cost of a phase."""
-        self.last = result
-        self.steps += result.steps
-        self.evaluations += result.evaluations
-        self.rejected += result.rejected
-        self.jacobians += result.jacobians
-        self.reached = float(result.reached)
-
-    def keep(self, t: Array, q: Array, v: Array) -> None:
-        """Keep states."""
-        if len(t):
-            self.t.append(t)
-            self.q.append(q)
-            self.v.append(v)
-
-    def end(self) -> tuple[Ended, str]:
-        """Return how it ended, and why."""
-        if self.error is not None:
-            return "function_failed", str(self.error)
-        if self.ended is not None:
-            return self.ended, self.message
-        if self.last is None or not self.message:
-            return "finished", ""
-        return self.last.ended, self.message
+            run.record.stop(diverged(str(error)))
+        if run.record.error is not None:
+            break
+    return assemble_result(problem, records)
 
 
 class _Member:
@@ -100,7 +56,8 @@ class _Member:
         self.friction = Friction(dyn)
         self.q, self.v = problem.q[i].copy(), problem.v[i].copy()
         self.force = problem.torque.of_member(self.member)
-        self.part = _Part([], [], [], [])
+        # Parts look for the events, and for singular poses.
+        self.record = TrajectoryRecord(replace(problem, events=()), i)
         self._stuck = 0
 
     def begin(self, k: int, t: float, leaving: Array | None = None) -> Phase:
@@ -125,27 +82,26 @@ class _Member:
         v, leaving = self.friction.after(phase, t, q, v, self.force(k))
         self._stuck = 0 if moved else self._stuck + 1
         if self._stuck > MAX_EMPTY_PHASES:
-            self.part.ended = "step_too_small"
-            self.part.message = f"{UNDECIDED} at t = {t:.9g} s: their phases end where they begin"
+            self.record.ended = "step_too_small"
+            self.record.message = f"{UNDECIDED} at t = {t:.9g} s: their phases end where they begin"
             return None
         self.q, self.v = q, v
         # What let go and came to rest at once did not let go.
         out = self.begin(k, t, leaving if moved else None)
         for _, name in self.friction.changes(phase, out):
-            self.part.hits.append(Hit(name, t, self.q.copy(), self.v.copy(), self.member))
+            self.record.events.append(Hit(name, t, self.q.copy(), self.v.copy(), self.member))
         return out
 
 
 def _adaptive(run: _Member) -> None:
-    problem, part = run.problem, run.part
+    problem, record = run.problem, run.record
     t, k, rows = problem.start, 0, problem.save
     stops = np.array(problem.stops)
-    part.reached = t
     # Steps of what rests do not feel a force that changes with time.
     timed = callable(run.force(0)) or problem.dyn.model.time_parameter is not None
     noise = max(1e-9, problem.tolerances.rtol)
     if rows is None or (len(rows) and rows[0] == t):
-        part.keep(np.array([t]), run.q[None], run.v[None])
+        record.keep(np.array([t]), run.q[None], run.v[None])
     phase: Phase | None = run.begin(0, t) if problem.duration else None
     while phase is not None and t < problem.end:
         own, begun = phase, t
@@ -158,65 +114,24 @@ def _adaptive(run: _Member) -> None:
         save = None if rows is None else np.append(rows[(rows > t) & (rows < problem.end)], problem.end)
         events = (*problem.events, Followed(end, _END, parts=2 if timed and own.still.any() else 1, noise=noise))
         result = run.solve(own, k, start=t, duration=problem.end - t, save=save, events=events)
-        part.count(result)
-        part.hits += [replace(x, member=run.member) for x in result.events if x.name != _END]
         phase_ended = bool(result.events) and result.events[-1].name == _END and result.ended == "event"
-        _keep(part, result, rows, t, at_end=not phase_ended)
+        record.add(result, [replace(x, member=run.member) for x in result.events if x.name != _END])
+        _keep(record, result, rows, t, at_end=not phase_ended)
         if not phase_ended:
-            part.message = result.message
+            record.ended, record.message, record.error = result.ended, result.message, result.error
             break
         hit = result.events[-1]
         moved = hit.t - t > 1e-12 * max(abs(t), problem.duration)
         t, k = hit.t, int(np.searchsorted(stops, hit.t, side="right"))
         phase = run.next(own, min(k, len(stops) - 1), t, hit.q, hit.v, moved=moved)
         if rows is None and moved:
-            part.keep(np.array([t]), run.q[None], run.v[None])
+            record.keep(np.array([t]), run.q[None], run.v[None])
 
 
-def _keep(part: _Part, result: SolverResult, rows: Array | None, begun: float, *, at_end: bool) -> None:
+def _keep(record: TrajectoryRecord, result: SolverResult, rows: Array | None, begun: float, *, at_end: bool) -> None:
     which = result.t > begun
     if not at_end and len(result.t):
         which[-1] = rows is not None and bool(np.isin(result.t[-1], rows))
     elif rows is not None and result.ended == "finished":
         which &= np.isin(result.t, rows)
-    part.keep(result.t[which], result.q[which], result.v[which])
-
-
-def _merged(problem: IntegrationProblem, parts: list[_Part]) -> SolverResult:
-    """Return the trajectories as one result."""
-    nq, nv, n = problem.q.shape[1], problem.v.shape[1], len(problem.q)
-    none = np.empty(0), np.empty((0, nq)), np.empty((0, nv))
-    states = [[np.concatenate([x, *kept]) for x, kept in zip(none, (p.t, p.q, p.v), strict=True)] for p in parts]
-    ends = [part.end() for part in parts]
-    early = [i for i, end in enumerate(ends) if end[0] != "finished"]
-    ended, message = ends[early[0]] if early else ("finished", "")
-    if problem.batch is None:
-        (t, q, v), reached = states[0], np.asarray(parts[0].reached)
-    else:
-        assert problem.save is not None
-        count = max((len(x[0]) for x in states), default=len(problem.save))
-        t, reached = problem.save[:count], np.full(n, problem.start)
-        reached[: len(parts)] = [part.reached for part in parts]
-        q, v = np.full((n, count, nq), np.nan), np.full((n, count, nv), np.nan)
-        for i, (own, *state) in enumerate(states):
-            inside = min(len(own), count)
-            q[i, :inside], v[i, :inside] = (x[:inside] for x in state)
-        message += f"; {len(early)} of {n} trajectories ended early, see reached" if early else ""
-    lasts = [part.last for part in parts if part.last is not None]
-    return SolverResult(
-        t=t,
-        q=q,
-        v=v,
-        steps=sum(part.steps for part in parts),
-        evaluations=sum(part.evaluations for part in parts),
-        ended=ended,
-        reached=reached,
-        message=message,
-        rejected=sum(part.rejected for part in parts),
-        jacobians=sum(part.jacobians for part in parts),
-        events=tuple(sorted((hit for part in parts for hit in part.hits), key=lambda hit: (hit.member or 0, hit.t))),
-        error=next((p.error for p in parts if p.error), next((x.error for x in lasts if x.error), None)),
-        chosen=next((x.chosen for x in lasts if x.chosen), ""),
-        doubts=tuple(dict.fromkeys(one for x in lasts for one in x.doubts)),
-        last=next((x.last for x in lasts if x.last is not None), None),
-    )
+    record.keep(result.t[which], result.q[which], result.v[which])
