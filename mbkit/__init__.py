@@ -59,7 +59,6 @@ if TYPE_CHECKING:
     from mbkit.studies.importers import compare_parsers as compare_parsers
     from mbkit.studies.lint import lint as lint
     from mbkit.studies.stress.study import stress as stress
-    from mbkit.studies.versions import versions as versions
     from mbkit.studies.work_precision.study import work_precision as work_precision
 
 
@@ -83,7 +82,6 @@ _NAMES = {
     "studies.explain": "explain",
     "studies.importers": "compare_parsers",
     "studies.lint": "lint",
-    "studies.versions": "versions",
 }
 _HOME = {name: f"mbkit.{module}" for module, names in _NAMES.items() for name in names.split()}
 # `show` and `simulate` are called too; methods and events are in the second.

@@ -7,6 +7,7 @@ import inspect
 import json
 import os
 import re
+import subprocess
 import sys
 import warnings
 from dataclasses import replace
@@ -697,3 +698,27 @@ def test_a_renamed_link_moves_no_frame(tmp_path: Path) -> None:
     assert result.effect == "no term moves (pinocchio)"
     path.write_text(text.replace("0.3 0 0", "0.4 0 0").replace('"arm"', '"upper"'), encoding="utf-8")
     assert "tool most, by 0.1 m and 0 rad" in mb.baseline.check(mb.load(path), file).effect
+
+
+def test_git_finds_the_commit_at_which_a_check_began_to_fail(tmp_path):
+    """The command of the book; a commit whose file cannot be read is skipped."""
+    env = {k: x for k, x in os.environ.items() if not k.startswith("GIT_")}
+    env |= {"GIT_CONFIG_GLOBAL": os.devnull, "PYTHONPATH": str(Path(mb.__file__).parents[1])}
+
+    def git(*words: str) -> str:
+        command = ["git", "-c", "user.name=A", "-c", "user.email=a@example.org", *words]
+        return subprocess.run(command, cwd=tmp_path, env=env, check=True, capture_output=True, text=True).stdout
+
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM)
+    mb.baseline.record(mb.load(path), tmp_path / "arm.toml", ["lagrangian"], target="./arm.urdf")
+    heavier, broken = ARM.replace('mass value="0.4"', 'mass value="0.41"'), ARM.replace("</robot>", "")
+    git("init", "-q")
+    for k, text in enumerate((ARM, ARM + "<!-- 1 -->", broken, ARM, heavier, heavier + "<!-- 5 -->")):
+        path.write_text(text)
+        git("add", "-A")
+        git("commit", "-q", "-m", f"commit {k}")
+    git("bisect", "start", "HEAD", git("log", "-1", "--format=%h", "--", "arm.toml").strip(), "--", "arm.urdf")
+    check = f"{sys.executable} -m mbkit baseline check arm.toml; s=$?; [ $s -eq 2 ] && s=125; exit $s"
+    git("bisect", "run", "sh", "-c", check)
+    assert git("log", "-1", "--format=%s", "refs/bisect/bad").strip() == "commit 4"

@@ -37,6 +37,7 @@ from mbkit.errors import (
 )
 from mbkit.studies._targets import engine_names
 from tests.random_trees import IN_MUJOCO, SOUND, random_tree
+from validation import versions
 
 #: Those that are installed here.
 ENGINES = tuple(name for name, package in PACKAGES.items() if not package.tested)
@@ -494,3 +495,55 @@ def test_studies_take_the_engines_that_dynamics_takes():
         with pytest.raises(MbkitError, match=words):
             engine_names([bad])
     assert find_engine("mujoco==3.3.7").load() is VersionDynamics
+
+
+#: What a process runs in the place of `serve.py`: the same, with something altered before.
+SERVE = """
+import os, sys
+sys.path.insert(0, {folder!r})
+import on_mujoco as engine
+import serve
+E = engine.Engine
+{alter}
+serve.serve(int(sys.argv[2]), "mujoco", sys.argv[4])
+"""
+
+
+def altered(version: str, alter: str = "") -> str:
+    """Make a version of MuJoCo that is the installed one but for what is altered."""
+    place = environment.place("mujoco", version)
+    program = place / "serve.py"
+    script(environment.python_of(place), f'shift 2; exec "{sys.executable}" "{program}" "$@"')
+    program.write_text(SERVE.format(folder=str(Path(serve.__file__).parent), alter=alter), encoding="utf-8")
+    return version
+
+
+def test_versions_side_by_side_show_which_changed_a_number_and_where_to(tmp_path, monkeypatch):
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        '<robot name="arm"><link name="base"/><link name="upper"><inertial><origin xyz="0.1 0.2 0.3" '
+        'rpy="0.3 0.2 0.1"/><mass value="2"/><inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0" ixz="0" iyz="0"/>'
+        '</inertial></link><joint name="j" type="continuous"><parent link="base"/><child link="upper"/>'
+        '<axis xyz="0 1 0"/></joint></robot>'
+    )
+    unturned = 'old = engine.parsed\nengine.parsed = lambda text, form: old(text.replace("0.3 0.2 0.1", "0 0 0"), form)'
+    alterations = {
+        "1.0": "",
+        "1.1": "old = E.gravity; E.gravity = lambda self, q: 1.001 * old(self, q)",
+        "1.2": unturned,
+        "1.3": "E.nle = lambda *x: os.abort()",
+        "1.4": 'old = E.rollout; E.rollout = lambda self, q, v, method, **x: old(self, q, v, method="euler", **x)',
+        "1.5": "",
+    }
+    monkeypatch.setitem(versions.VERSIONS, "mujoco", tuple(altered(*x) for x in alterations.items()))
+    found = versions.study("mujoco", [str(path)])
+    assert found["measured"] == list(alterations)
+    moves = {(c["version"], t, c["direction"].split()[0]) for c in found["changes"] for t in c["terms"]}
+    assert {
+        *(("1.1", "g", "away"), ("1.2", "g", "towards"), ("1.2", "file M", "away"), ("1.3", "file M", "towards")),
+        *(("1.3", "nle", "refused"), ("1.4", "nle", "given"), ("1.4", "own RK4", "away")),
+    } <= moves
+    assert not [x for x in moves if x[1] == "M"]
+    assert any("SIGABRT" in x["reason"] for x in found["reasons"])
+    assert not found["wrong"]
+    assert found["robots"][str(path)]["digits"] > 13

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.engines.versions.importer import VersionImport
 from tests.test_engine_versions import environments, present
 from validation.arms import JOINTS, arms, joint, link, scales, tensor, urdf, written
+from validation.own_parser import OwnParser
 
 __all__ = ["environments"]
 
@@ -24,7 +24,7 @@ def terms(engine: str, name: str, elements: list[str], folder) -> dict[str, np.n
     order = [model.joint_names.index(x) for x in JOINTS]
     q, v = np.empty((2, 1, len(order)))
     q[0, order], v[0, order] = ANGLES, faster * RATES
-    read = VersionImport(present(engine, "0"), path.read_text(encoding="utf-8"), "urdf", model)
+    read = OwnParser(present(engine, "0"), path.read_text(encoding="utf-8"), "urdf", model)
     out = {}
     for term, factor in factors.items():
         value = read.term(term, q, v)[0] / factor

@@ -50,7 +50,7 @@ PARTS = {
         "smallest files through importers of trained engines; environments of 600 MB each",
     ),
     "versions": Part(
-        35, ("versions.json",), "versions of MuJoCo, Pinocchio and Drake; makes some 18 GB of environments"
+        45, ("versions.json",), "versions of MuJoCo, Pinocchio and Drake; makes some 18 GB of environments"
     ),
     "trained_engines": Part(
         60, ("trained_engines.json",), "Newton, MuJoCo Warp and MJX on every robot; makes 2 GB of environments"

@@ -18,7 +18,6 @@ ENGINES = ("newton", "mujoco-warp", "mjx", "mjx-single")
 TESTS = (
     "tests/test_trained_engines.py",
     "tests/test_engine_versions.py::test_a_real_old_version",
-    "tests/test_baseline_bisect.py::test_a_real_version_is_found",
 )
 OPTIONS = ("-n", "0", "-rs")
 #: See `validation.smoke`.

@@ -4,6 +4,11 @@ Run ``python -m validation.versions``; it writes ``validation/versions.json``. E
 cache folder, or below ``MBKIT_ENVIRONMENTS``: 18 GB, and twenty minutes where none is there yet. Those of Newton and
 MuJoCo Warp take 7 GB more, and are measured on a few robots: each version compiles its own kernels.
 
+It is a loop over `mb.compare`: each robot in all versions of an engine at once, terms alone. Beside these terms stand
+those of the version's own parser (rows ``file M``, ``file g`` and ``file nle``) and 0.1 s of MuJoCo's own Runge-Kutta
+method. A number has changed where its error moved by more than the tolerance between two versions that follow each
+other.
+
 All robots of example-robot-data are measured, random trees, and one arm that is written in eight ways. Seven say the
 same, the eighth in other units; a parser that reads one of them otherwise is wrong. That they do is checked with
 mbkit's own reader and the oracle before anything is measured.
@@ -13,28 +18,31 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import sys
 import tempfile
+import time
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
-from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import mbkit as mb
+from mbkit._check import by_key
 from mbkit.engines.versions import process
-from mbkit.engines.versions.engine_version import versions_of
-from mbkit.engines.versions.importer import VersionImport
 from mbkit.errors import MbkitError, MbkitWarning
+from mbkit.load.sanitized_text import strip
+from mbkit.studies.compare.terms import states
 from mbkit.studies.results import to_plain
-from mbkit.studies.versions.measure import FILE, RUN
-from mbkit.studies.versions.result import Change, VersionRow
+from mbkit.studies.study_runs import free_of_mimic, start_state
 from tests.random_trees import random_tree
 from validation.arms import joint, link, urdf, written
+from validation.own_parser import OwnParser
 from validation.robots import FEW as TWO
 from validation.robots import chosen
 from validation.stamp import results, stamp
@@ -60,8 +68,9 @@ VERSIONS: dict[str, tuple[str, ...]] = {
 #: Of engines in which robots are trained, the last six versions, on these.
 TRAINED = {"newton", "mujoco-warp"}
 FEW = ("ur5", "panda", "hyq", "anymal")
-#: All of them.
+#: All of them, and ways of the arm.
 ROBOTS = None
+WAYS = None
 BARE = {"springs": False, "damping": False}
 TREES = {
     "turning": lambda: random_tree(5, 6, ("revolute", "free", "ball", "planar"), armature=False, **BARE),
@@ -91,35 +100,150 @@ def robots() -> list[str]:
     return out
 
 
+class Row(NamedTuple):
+    """One term of one robot in one version: its error by the oracle, NaN without a value, and why there is none."""
+
+    robot: str
+    version: str
+    term: str
+    error: float
+    reason: str = ""
+
+
+class Change(NamedTuple):
+    """A number whose error moved between two measured versions."""
+
+    before: Row
+    after: Row
+    direction: str
+
+
+#: Random states of each robot, beside neutral, at-limit and near-singular ones.
+SAMPLES = 2
+#: An error moved where it did by more: of engines in double precision and in single.
+TOLERANCE = {False: 1e-9, True: 1e-4}
+#: The state after a short run by the engine's own Runge-Kutta method; that run's step, s, and steps.
+RUN, DT, STEPS = "own RK4", 2e-2, 5
+#: Before the name of a term of the version's own parser; such terms and their quantities.
+FILE, OF_FILE = "file ", {"M": "mass_matrix", "g": "gravity", "nle": "nle"}
+
+
 def study(engine: str, targets: list[Any]) -> dict[str, Any]:
     """Return what moved, one row a robot, what is wrong in the last version, and what has no number."""
-    result = mb.versions(targets, engine, VERSIONS[engine], most=100, samples=2)
-    data, last = result.to_dict(), result.measured[-1]
-    by_robot: dict[str, list[VersionRow]] = {}
-    for r in result.rows:
-        by_robot.setdefault(r.robot, []).append(r)
-    kept = {k: data[k] for k in ("engine", "measured", "missing", "settings", "seconds", "verdict")}
-    return kept | {
-        "changes": together(result.changes, versions_of(engine)),
-        "robots": {name: summary(rows, last) for name, rows in by_robot.items()},
-        "wrong": wrong(result.rows, last, RIGHT[engine in TRAINED]),
-        "times": times_of(result.rows),
-        "reasons": reasons(result.rows),
+    begun, measured, missing = time.perf_counter(), [], []
+    for version in VERSIONS[engine]:
+        try:
+            mb.engine(f"{engine}=={version}").interpreter()
+        except MbkitError as error:
+            missing.append((version, str(error)))
+        else:
+            measured.append(version)
+    found = [row for target in targets for row in rows_of(target, engine, measured)]
+    rows = sorted(found, key=lambda row: measured.index(row.version))
+    for version in measured:
+        process.end(mb.engine(f"{engine}=={version}"))
+    tolerance, last = TOLERANCE[engine in TRAINED], measured[-1]
+    changes = list(changes_of(rows, tolerance))
+    by_robot = by_key((row.robot, row) for row in rows)
+    counts = {name: sum(c.after.robot == name for c in changes) for name in by_robot}
+    return {
+        "engine": engine,
+        "measured": measured,
+        "missing": missing,
+        "settings": {"samples": SAMPLES, "tolerance": tolerance},
+        "seconds": time.perf_counter() - begun,
+        "verdict": f"{engine} {measured[0]} to {last}: {len(changes)} changes, {len(missing)} versions not measured",
+        "changes": together(changes, VERSIONS[engine]),
+        "robots": {name: summary(some, last) | {"changes": counts[name]} for name, some in by_robot.items()},
+        "wrong": wrong(rows, last, RIGHT[engine in TRAINED]),
+        "reasons": reasons(rows),
     }
+
+
+def rows_of(target: Any, engine: str, versions: list[str]) -> Iterator[Row]:
+    """Yield the rows of one robot."""
+    model = mb.load(target) if isinstance(target, str) else target
+    name = target if isinstance(target, str) else model.name
+    engines = {f"{engine}=={version}": version for version in versions}
+    # A comparison takes two engines at least, also where one version alone holds the robot.
+    found = mb.compare(model, [*engines, "lagrangian"], SAMPLES, terms_only=True)
+    for r in found.rows:
+        if r.engine in engines:
+            lost = not math.isfinite(r.relative)
+            yield Row(name, engines[r.engine], r.term, math.nan if lost else r.relative, r.reason if lost else "")
+    terms = tuple(dict.fromkeys(r.term for r in found.rows))
+    for refusal in found.refusals:
+        if refusal.engine in engines:
+            for term in (refusal.term,) if refusal.term else terms:
+                yield Row(name, engines[refusal.engine], term, math.nan, refusal.reason)
+    for full, version in engines.items():
+        yield from run_rows(name, model, full, version)
+    if os.path.isfile(model.source or "") and all(j.type.nv <= 1 for j in model.joints):
+        stripped = strip(Path(model.source))
+        if not stripped.meshes:
+            yield from file_rows(name, free_of_mimic(model), stripped, engines)
+
+
+def run_rows(name: str, model: mb.Model, engine: str, version: str) -> Iterator[Row]:
+    """Yield the error of a short run by the engine's own method, where it has one."""
+    try:
+        dyn: Any = mb.dynamics(model, engine)
+        if not dyn.runs:
+            return
+        q0, v0 = start_state(model, 0)
+        q, v = dyn.rollout(q0, v0, DT, STEPS)
+    except MbkitError as error:
+        yield Row(name, version, RUN, math.nan, str(error))
+        return
+    exact = mb.simulate(mb.dynamics(model, "lagrangian"), q0, v0, DT * STEPS, method="rk853", rtol=1e-13)
+    apart = np.concatenate([model.difference(exact.q[-1], q[-1]), v[-1] - exact.v[-1]])
+    size = max(1.0, float(np.linalg.norm(np.concatenate([exact.q[-1], exact.v[-1]]))))
+    yield Row(name, version, RUN, float(np.linalg.norm(apart)) / size)
+
+
+def file_rows(name: str, model: mb.Model, file: Any, engines: dict[str, str]) -> Iterator[Row]:
+    """Yield the errors of terms of what each version's own parser reads, relative to the largest entry."""
+    at, oracle = states(model, SAMPLES, 0), mb.dynamics(model, "oracle")
+    exact = {x: getattr(oracle, of)(at.q, *([at.v] if of == "nle" else [])) for x, of in OF_FILE.items()}
+    for engine, version in engines.items():
+        try:
+            read = OwnParser(mb.engine(engine), file.text, file.format, model)
+            for term, quantity in OF_FILE.items():
+                off = np.abs(read.term(quantity, at.q, at.v) - exact[term]).max()
+                yield Row(name, version, FILE + term, float(off / np.abs(exact[term]).max()))
+        except MbkitError as error:
+            yield from (Row(name, version, FILE + term, math.nan, str(error)) for term in OF_FILE)
+
+
+def digits_of(error: float) -> float:
+    """Return the digits that a relative error leaves right, NaN for NaN."""
+    return math.nan if math.isnan(error) else min(15.65, max(0.0, -math.log10(max(error, 1e-300))))
+
+
+def changes_of(rows: Iterable[Row], tolerance: float) -> Iterator[Change]:
+    """Yield where a number's error moved, or where it began or ceased to be there."""
+    for some in by_key(((row.robot, row.term), row) for row in rows).values():
+        for one, other in pairwise(some):
+            old, new = one.error, other.error
+            if math.isnan(old) != math.isnan(new):
+                yield Change(one, other, "refused since" if math.isnan(new) else "given since")
+            elif abs(new - old) > tolerance:
+                # From one build to the next a worst error changes by less than a factor of two.
+                towards, away = 2 * new < old, 2 * old < new
+                where = "towards the truth" if towards else "away from the truth" if away else ""
+                yield Change(one, other, where or "as far from the truth as before")
 
 
 def together(changes: Iterable[Change], known: tuple[str, ...]) -> list[dict[str, Any]]:
     """Return changes of the same terms of the same robots between two versions as one."""
-    groups: dict[tuple[str, str, str, str], list[Change]] = {}
-    for c in changes:
-        groups.setdefault((c.before, c.version, c.direction, c.term), []).append(c)
+    groups = by_key(((c.before.version, c.after.version, c.direction, c.after.term), c) for c in changes)
     out: dict[tuple[Any, ...], dict[str, Any]] = {}
     for (before, version, direction, term), some in groups.items():
-        robots = tuple(c.robot for c in some)
+        robots = tuple(c.after.robot for c in some)
         new = {
             "before": before,
             "version": version,
-            # Whether none of those that pip has lies between.
+            # Whether every version between them could be measured: there is none.
             "next_to_it": known.index(version) == known.index(before) + 1,
             "direction": direction,
             "robots": robots,
@@ -130,8 +254,8 @@ def together(changes: Iterable[Change], known: tuple[str, ...]) -> list[dict[str
         one = out.setdefault((before, version, direction, robots), new)
         one["terms"].append(term)
         for c in some:
-            one["digits_before"].append(c.digits_before)
-            one["digits"].append(c.digits)
+            one["digits_before"].append(digits_of(c.before.error))
+            one["digits"].append(digits_of(c.after.error))
     order = list(known).index
     for one in out.values():
         for name in ("digits_before", "digits"):
@@ -145,48 +269,32 @@ def ends(values: Iterable[float]) -> list[float] | None:
     return [min(some), max(some)] if some else None
 
 
-def summary(rows: list[VersionRow], last: str) -> dict[str, Any]:
-    """Return a robot's row: its fewest digits in the last version, and the largest move of a number."""
+def summary(rows: list[Row], last: str) -> dict[str, Any]:
+    """Return a robot's row: its fewest digits in the last version, and the largest move of an error."""
     now = [r for r in rows if r.version == last and r.term != RUN]
-    lists = ([r.digits for r in now if r.term.startswith(FILE) is of_file] for of_file in (False, True))
+    lists = ([digits_of(r.error) for r in now if r.term.startswith(FILE) is of_file] for of_file in (False, True))
     own, file = (ends(x) for x in lists)
-    moves = [r.moved for r in rows if not math.isnan(r.moved)]
-    return {
-        "digits": own and own[0],
-        "file_digits": file and file[0],
-        "moved": float(f"{max(moves, default=0.0):.1e}"),
-        "changes": sum(r.changed for r in rows),
-    }
+    by_term = by_key((r.term, r.error) for r in rows if not math.isnan(r.error))
+    moves = [abs(x - y) for errors in by_term.values() for x, y in pairwise(errors)] or [0.0]
+    return {"digits": own and own[0], "file_digits": file and file[0], "moved": float(f"{max(moves):.1e}")}
 
 
-def wrong(rows: Iterable[VersionRow], last: str, least: float) -> list[dict[str, Any]]:
+def wrong(rows: Iterable[Row], last: str, least: float) -> list[dict[str, Any]]:
     """Return terms that are wrong in the last version, and since which measured one they are."""
-    of: dict[tuple[str, str], list[VersionRow]] = {}
-    for r in rows:
-        of.setdefault((r.robot, r.term), []).append(r)
     out = []
-    for (robot, term), some in of.items():
-        if term == RUN or some[-1].version != last or not some[-1].digits < least:
+    for (robot, term), some in by_key(((row.robot, row.term), row) for row in rows).items():
+        if term == RUN or some[-1].version != last or not digits_of(some[-1].error) < least:
             continue
         since = last
         for r in reversed(some):
-            if not r.digits < least:
+            if not digits_of(r.error) < least:
                 break
             since = r.version
-        out.append({"robot": robot, "term": term, "digits": round(some[-1].digits, 1), "since": since})
+        out.append({"robot": robot, "term": term, "digits": round(digits_of(some[-1].error), 1), "since": since})
     return out
 
 
-def times_of(rows: Iterable[VersionRow]) -> dict[str, list[float]]:
-    """Return each version's time over the last one's, the median of robots, and of how many."""
-    of: dict[str, dict[str, float]] = {}
-    for r in rows:
-        if not math.isnan(r.time_ratio):
-            of.setdefault(r.version, {})[r.robot] = r.time_ratio
-    return {version: [round(median(x.values()), 2), len(x)] for version, x in of.items()}
-
-
-def reasons(rows: Iterable[VersionRow]) -> list[dict[str, Any]]:
+def reasons(rows: Iterable[Row]) -> list[dict[str, Any]]:
     """Return why terms have no number: each reason once, with its robots, terms and versions."""
     of: dict[str, dict[str, list[str]]] = {}
     for r in rows:
@@ -231,7 +339,7 @@ def smallest(engine: str) -> dict[str, Any]:
         right = float(mb.dynamics(model, "oracle").mass_matrix([0.0])[0, 0])
         values = {}
         for version in VERSIONS[engine]:
-            read = VersionImport(mb.engine(f"{engine}=={version}"), text, "urdf", model)
+            read = OwnParser(mb.engine(f"{engine}=={version}"), text, "urdf", model)
             values[version] = float(read.term("mass_matrix", np.zeros((1, 1)), np.zeros((1, 1)))[0, 0, 0])
         out[name] = {"urdf": text, "right": right, "M": values}
     for version in VERSIONS[engine]:
@@ -243,6 +351,7 @@ def smallest(engine: str) -> dict[str, Any]:
 SMOKE = {
     "VERSIONS": {"mujoco": ("4.0.0",)},
     "ROBOTS": TWO[:1],
+    "WAYS": 1,
     "TREES": {"rotors": TREES["rotors"]},
     "SMALLEST": {"weld_turned": SMALLEST["weld_turned"]},
 }
@@ -256,7 +365,7 @@ def main() -> None:
     warnings.simplefilter("ignore", MbkitWarning)
     with tempfile.TemporaryDirectory() as folder:
         trees = [replace(make(), name=name) for name, make in TREES.items()]
-        models = [*written(Path(folder)), *trees]
+        models = [*written(Path(folder))[:WAYS], *trees]
         for engine in names:
             trained = engine in TRAINED
             few = [*FEW, *trees] if trained else [*robots(), *models]

@@ -13,7 +13,7 @@ import sys
 import click
 
 from mbkit._version import __version__
-from mbkit.cli import baseline, bench, check, convert, derive, diff, lint, plot, simulate, stress, versions
+from mbkit.cli import baseline, bench, check, convert, derive, diff, lint, plot, simulate, stress
 from mbkit.cli._shared import CommandGroup
 
 
@@ -34,7 +34,7 @@ def cli() -> None:
 
 for _command in (
     *(check.check, lint.lint, diff.diff, baseline.baseline, derive.derive, derive.export, simulate.simulate, plot.plot),
-    *(bench.bench, stress.stress, versions.versions, convert.convert, convert.robots),
+    *(bench.bench, stress.stress, convert.convert, convert.robots),
 ):
     cli.add_command(_command)
 

@@ -15,7 +15,7 @@ from mbkit.errors import BaselineError, InputError, MbkitError
 
 if TYPE_CHECKING:
     from mbkit.model import Model
-    from mbkit.studies.baseline import Baseline, BaselineResult, BisectResult
+    from mbkit.studies.baseline import Baseline, BaselineResult
 
 _FILE = click.Path(path_type=Path)
 
@@ -163,49 +163,6 @@ def _confirmed(file: Path) -> bool:
     return there and click.confirm(f"Record {file} again with these versions?", default=False)
 
 
-@shared.command("mbkit baseline bisect panda.toml", "mbkit baseline bisect baselines --json")
-@click.argument("paths", metavar="FILE...", nargs=-1, required=True, type=_FILE)
-@click.option("--target", help="What `mbkit baseline check` has as --target; with one file.")
-@shared.load_options
-@shared.json_option
-def bisect(paths: tuple[Path, ...], target: str | None, options: dict[str, Any], as_json: bool) -> None:
-    """Find where what fails of each FILE began: a version of an engine, or a commit of the description.
-
-    A changed description is looked for in the commits of its file in git; a number that moved, in the versions of its
-    engine from the recorded to the installed one. Each version runs in an environment of its own, which is made with uv
-    or pip and kept in the user's cache folder, or in MBKIT_ENVIRONMENTS. Exit status: 0 the baseline passes, 1 where it
-    began was found, 2 misuse, a file that cannot be read, or where it began was not found.
-    """
-    files = _files(paths)
-    _check_target(files, target, options)
-    statuses, results = [], []
-    for file in files:
-        try:
-            result = _bisect_one(file, target, options, table=not as_json)
-        except MbkitError as error:
-            shared.say("error", shared.in_options(str(error)))
-            statuses.append(MISUSE)
-            continue
-        results.append(result)
-        statuses.append(AGREE if result.passed else DIFFER if result.onsets else MISUSE)
-    if as_json:
-        shared.tell("[" + ",\n".join(r.to_json() for r in results) + "]")
-    shared.leave(max(statuses))
-
-
-def _bisect_one(file: Path, target: str | None, options: dict[str, Any], *, table: bool) -> BisectResult:
-    from mbkit.report.explain_view import bisect_view
-    from mbkit.simulate.progress import Bar
-    from mbkit.studies import baseline as baselines
-
-    model, new_target, options = _loaded(baselines.read(file), file, target, options)
-    with Bar(f"bisect {file.name}") as bar:
-        result = baselines.bisect(model, file, target=new_target, options=options, progress=bar)
-    if table:
-        shared.show(bisect_view(result), as_json=False)
-    return result
-
-
 @shared.command("mbkit baseline diff old.toml new.toml")
 @click.argument("path_a", type=_FILE)
 @click.argument("path_b", type=_FILE)
@@ -224,7 +181,7 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     shared.leave(AGREE if result.passed else DIFFER)
 
 
-for _command in (record, check, bisect, diff):
+for _command in (record, check, diff):
     baseline.add_command(_command)
 
 

@@ -393,13 +393,6 @@ def with_includes(mujoco: Element, path: Path) -> Element:
     return replace(mujoco, children=_Includes(path).inside(mujoco, path.parent, 1))
 
 
-def included_files(mujoco: Element, path: Path) -> frozenset[Path]:
-    """Return the main file and those that it includes, links resolved, or raise `LoadError`."""
-    includes = _Includes(path)
-    includes.inside(mujoco, path.parent, 1)
-    return frozenset(includes.seen)
-
-
 class _Includes:
     """The files that a main file includes."""
 

@@ -11,7 +11,7 @@ from typing import Final
 
 from mbkit.report.document import Block, Bullet, Column, Document, Items, Paragraph, Section, Span, Style, Table
 from mbkit.report.formatting import error_text
-from mbkit.studies.baseline import BaselineResult, BisectResult
+from mbkit.studies.baseline import BaselineResult
 from mbkit.studies.explain.result import Cause, Explanation, grouped
 from mbkit.studies.importers.result import DECIDING, TERMS, Parsed, ParserComparison, Stage
 
@@ -184,11 +184,6 @@ _MARKS: Final[dict[str, tuple[str, Style]]] = {
     "processor": ("·", "muted"),
     "effect": ("→", "bold"),
 }
-_OUTCOMES: Final[dict[bool | None, tuple[str, Style]]] = {
-    False: ("✓", "good"),
-    True: ("✗", "bad"),
-    None: ("–", "allowed"),
-}
 
 
 def baseline_view(result: BaselineResult, again: str = "") -> Document:
@@ -207,21 +202,6 @@ def baseline_view(result: BaselineResult, again: str = "") -> Document:
         good=result.passed,
         opening=[Items(bullets)],
         sections=[],
-        result=result,
-    )
-
-
-def bisect_view(result: BisectResult) -> Document:
-    """Return the document of a search for where a failure began."""
-    bullets = [Bullet(what, line, *_MARKS.get(what, ("✗", "bad"))) for what, line in result.lines()]
-    name = f"{result.model} ({result.path})"
-    looked_at = [Bullet(x.name, x.outcome, *_OUTCOMES[x.failed]) for x in result.examined]
-    return Document(
-        name=name,
-        verdict=result.verdict,
-        good=result.passed,
-        opening=[Items(bullets)],
-        sections=[Section("Examined", [Items(looked_at)])] if looked_at else [],
         result=result,
     )
 

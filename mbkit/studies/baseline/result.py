@@ -1,8 +1,7 @@
-"""What `check`, `diff` and `bisect` return: a status, what led to it, and ways to read them."""
+"""What `check` and `diff` return: a status, what led to it, and ways to read them."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -10,8 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from mbkit.studies.baseline.description import Change
-from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of, counted
-from mbkit.studies.versions.result import ASIDE, AWAY, TOWARDS, digits_text
+from mbkit.studies.results import Block, Items, Refusal, ResultTable, Title, columns_of, counted
 
 Status = Literal["same", "versions", "numbers", "description", "skipped"]
 # A person acts on the first few; the rest is in the data.
@@ -172,117 +170,3 @@ class BaselineResult(ResultTable):
     def _blocks(self) -> Iterator[Block]:
         yield Title(self.model, f": {self.verdict}")
         yield Items(f"{what}: {text}" for what, text in self.lines(everything=True))
-
-
-@dataclass(frozen=True)
-class Onset:
-    """Where something that fails now began to: the first version of an engine, or the first commit, that has it.
-
-    `engine` is empty for a commit. `first_bad` and `last_good` are versions, or hashes; an empty `first_bad` means
-    changes that are not committed. `skipped` lies between the two and could not be examined. `date` (ISO 8601) and
-    `subject` are the commit's. `changes` are the parameters that differ from the recorded ones since, `moved` the
-    numbers that do, the worst first; `direction` is where the worst went, and `digits_before` and `digits` are those of
-    it that are right by the oracle, NaN without a number.
-    """
-
-    kind: Literal["version", "commit"]
-    engine: str
-    first_bad: str
-    last_good: str
-    skipped: tuple[str, ...] = ()
-    date: str = ""
-    subject: str = ""
-    changes: tuple[Change, ...] = ()
-    moved: tuple[ChangedNumber, ...] = ()
-    direction: str = ""
-    digits_before: float = math.nan
-    digits: float = math.nan
-
-    @property
-    def where(self) -> str:
-        """The version or commit in words."""
-        between = f", or in {', '.join(map(self._short, self.skipped))}" if self.skipped else ""
-        good = f"{self._short(self.last_good)} is as recorded"
-        if self.kind == "version":
-            return f"{self.engine} {self.first_bad}{between}; {good}"
-        if not self.first_bad:
-            return f"changes that are not committed{between}; {good}"
-        return f"commit {self._short(self.first_bad)} of {self.date[:10]}, {self.subject!r}{between}; {good}"
-
-    def _short(self, name: str) -> str:
-        return name if self.kind == "version" else name[:10]
-
-    @property
-    def what(self) -> tuple[str, ...]:
-        """The first few things that began there, in words."""
-        out = [c.text for c in self.changes[:_MOST_CHANGES]]
-        if self.moved:
-            digits = ""
-            if self.direction in (TOWARDS, AWAY, ASIDE):
-                digits = f": {digits_text(self.digits_before)} digits before, {digits_text(self.digits)} since"
-            out += [str(self.moved[0]), f"{self.direction}{digits}"]
-        if len(self.moved) > 1:
-            out.append(f"and {len(self.moved) - 1} more: {', '.join(r.term for r in self.moved[1:])}")
-        return tuple(out)
-
-
-@dataclass(frozen=True)
-class Examined:
-    """A version or a commit that was looked at.
-
-    `outcome` is "as recorded", what differs there, or why it could not be examined; `failed` is None for the last.
-    """
-
-    name: str
-    failed: bool | None
-    outcome: str
-
-
-@dataclass(frozen=True, repr=False)
-class BisectResult(ResultTable):
-    """Where what fails of a baseline began.
-
-    `check` is the check as it is now. `onsets` are versions of engines or commits of the description; `examined` are
-    those that were looked at, in order; `notes` say what could not be.
-    """
-
-    model: str
-    path: str
-    check: BaselineResult
-    onsets: tuple[Onset, ...] = ()
-    examined: tuple[Examined, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    _derived = ("passed", "verdict")
-    _listed = "onsets"
-    _csv_columns = columns_of(Onset)
-
-    @property
-    def passed(self) -> bool:
-        """Whether the baseline passes, so that there is nothing to look for."""
-        return self.check.passed
-
-    @property
-    def verdict(self) -> str:
-        """One sentence."""
-        if self.passed:
-            return f"it passes, so there is nothing to look for: {self.check.verdict}"
-        if not self.onsets:
-            return f"{self.check.verdict}; where that began was not found"
-        return f"{self.check.verdict}; that began in {' and in '.join(o.where for o in self.onsets)}"
-
-    def lines(self) -> Iterator[tuple[str, str]]:
-        """Iterate over the findings: (subject, message)."""
-        for onset in self.onsets:
-            subject = onset.engine or "description"
-            yield from ((f"{subject} {self._name(onset)}".strip(), text) for text in onset.what)
-        yield from (("note", note) for note in self.notes)
-
-    @staticmethod
-    def _name(onset: Onset) -> str:
-        return onset.first_bad if onset.kind == "version" else onset.first_bad[:10] or "(not committed)"
-
-    def _blocks(self) -> Iterator[Block]:
-        yield Title(self.model, f": {self.verdict}")
-        yield Items(f"{what}: {text}" for what, text in self.lines())
-        yield Table([Column("examined", lambda x: x.name), Column("outcome", lambda x: x.outcome)], self.examined)

@@ -14,7 +14,7 @@ from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 
 
-class VersionImport:
+class OwnParser:
     """What a version of an engine makes of a text, in the coordinates of a description of the same file.
 
     Parameters
