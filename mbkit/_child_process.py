@@ -2,7 +2,7 @@
 
 A child is a new program, because engines and threads do not survive a fork: this Python or another, with mbkit or
 without. The two sides exchange messages of bytes; what they mean is for subclasses of `Child`. The other side is
-`mbkit.engines.versions.remote.serve.attend`.
+`mbkit.engines.remote.served.serve.attend`.
 
 No package does it. Pebble 5.2 ends the calls of a script without a guard and leaves orphans when the parent is killed;
 loky 3.7 ends no call that hangs, and one crash takes all calls with it. Both want themselves on the other side.

@@ -31,7 +31,7 @@ from mbkit.cli import cli
 from mbkit.codegen.c_source import export_c
 from mbkit.engines.imported import reader
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.engines.versions.engine_version import PACKAGES
+from mbkit.engines.remote.packages import PACKAGES
 from mbkit.lagrangian import from_model
 from mbkit.lagrangian.printing.summary import SystemSummary
 from mbkit.model import Model

@@ -8,8 +8,8 @@ import pytest
 
 import mbkit as mb
 from mbkit._child_process import end_all
-from mbkit.engines.versions import own_importer
-from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion, Package, register_remote_engine
+from mbkit.engines.remote import importer
+from mbkit.engines.remote.packages import PACKAGES, EngineVersion, Package, register_remote_engine
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.studies.importers.result import TERMS
 from mbkit.studies.importers.study import _SINGLE
@@ -28,7 +28,7 @@ def test_an_importer_that_is_not_judged_is_refused_by_name(tmp_path: Path) -> No
         mb.compare_parsers(path, ["newtn"])
     with pytest.raises(InputError, match="mujoco-warp"):
         mb.compare_parsers(path, mb.engine("newton"))  # type: ignore[arg-type]
-    assert set(own_importer.importers()) == {"newton", "mujoco-warp", "mjx", "mjx-single"}
+    assert set(importer.importers()) == {"newton", "mujoco-warp", "mjx", "mjx-single"}
 
 
 def needs(name: str) -> None:
@@ -110,7 +110,7 @@ def one_of_ones_own(tmp_path, monkeypatch):
     def registered(name: str, text: str, importer: str) -> EngineVersion:
         (file := tmp_path / f"on_{name}.py").write_text(text, encoding="utf-8")
         where: dict[str, str] = {"file": str(file), "importer": importer}
-        package = Package(name, "numpy", 1, 1, PACKAGES["mjx"].convention, tested=("1",), **where)
+        package = Package(name, "numpy", PACKAGES["mjx"].convention, tested=("1",), **where)
         register_remote_engine(name, package)
         names.append(name)
         present(name, "1")

@@ -11,15 +11,15 @@ import mbkit as mb
 from mbkit._child_process import end_all
 from mbkit.engines.pinocchio.engine import PinocchioDynamics
 from mbkit.engines.registry import EngineInfo, register_engine
-from mbkit.engines.versions.description import STACKED, Convention
-from mbkit.engines.versions.engine_version import (
+from mbkit.engines.remote.description import STACKED, Convention
+from mbkit.engines.remote.packages import (
     PACKAGES,
     Package,
     names_version,
     register_remote_engine,
     remote_engines,
 )
-from mbkit.engines.versions.remote import serve
+from mbkit.engines.remote.served import serve
 from mbkit.errors import EngineProcessError, InputError, UnknownNameError, UnsupportedError
 from mbkit.studies._targets import engine_names
 from mbkit.studies.compare.errors import digits_of, epsilon
@@ -160,7 +160,7 @@ def one_of_ones_own(tmp_path):
     def register(stacked=True, before="pass", **more):
         file = tmp_path / "on_mine.py"
         file.write_text(ENGINE.format(stacked=stacked, before=before), encoding="utf-8")
-        own = Package("mine", "numpy", 1, 1, Convention(), STACKED, tested=("1.0",), file=str(file), **more)
+        own = Package("mine", "numpy", Convention(), STACKED, tested=("1.0",), file=str(file), **more)
         register_remote_engine("mine", own)
         present("mine", "1.0")
         return mb.dynamics(mb.catalog.double_pendulum(), "mine")
@@ -199,7 +199,7 @@ def test_an_engine_that_hangs_is_ended_after_its_time(one_of_ones_own):
 def test_what_is_no_engine_of_ones_own_is_refused(tmp_path):
     file = tmp_path / "on_mine.py"
     file.touch()
-    good = Package("mine", "mine", 1, 1, Convention(), tested=("1.0",), file=str(file))
+    good = Package("mine", "mine", Convention(), tested=("1.0",), file=str(file))
     for name, package, match in (
         ("newton", good, "not in use"),
         ("Mine engine", good, "not in use"),
@@ -450,7 +450,7 @@ def test_a_method_that_an_engine_lacks_is_refused_by_name(real):
 @pytest.mark.usefixtures("users_own")
 def test_the_engine_of_the_book_agrees():
     """Exudyn, as the page on extending has it."""
-    own = Package("exudyn", "exudyn", 136, 12, Convention(), STACKED, tested=("1.13.6",), file=str(EXUDYN))
+    own = Package("exudyn", "exudyn", Convention(), STACKED, tested=("1.13.6",), file=str(EXUDYN))
     register_remote_engine("exudyn", own)
     try:
         version = mb.engine("exudyn")

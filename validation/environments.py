@@ -11,8 +11,8 @@ import re
 import subprocess
 import sys
 
-from mbkit.engines.versions import environment
-from mbkit.engines.versions.engine_version import engine
+from mbkit.engines.remote import environment
+from mbkit.engines.remote.packages import engine
 
 ENGINES = ("newton", "mujoco-warp", "mjx", "mjx-single")
 TESTS = (

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from mbkit.engines.imported import IMPORTERS
-from mbkit.engines.versions import process
-from mbkit.engines.versions.engine_version import engine
+from mbkit.engines.remote import process
+from mbkit.engines.remote.packages import engine
 from mbkit.errors import MbkitWarning
 from mbkit.studies.importers import Parsed, compare_parsers
 from mbkit.studies.importers.result import TERMS

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import weakref
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines.versions.engine_version import EngineVersion
-from mbkit.engines.versions.process import RemoteError, new_key, process_of
+from mbkit.engines.remote.packages import EngineVersion
+from mbkit.engines.remote.process import RemoteError, new_key, process_of
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
+
+#: The file beside an engine that reads a text.
+SERVED = Path(__file__).with_name("served_parsers.py")
 
 
 class OwnParser:
@@ -35,7 +39,7 @@ class OwnParser:
     def __init__(self, version: EngineVersion, text: str, format_: str, model: Model) -> None:
         self.version, self._process, self._key = version, process_of(version), new_key()
         weakref.finalize(self, self._process.unneeded.append, self._key)
-        joints = self._call("parse", text=text, format=format_)[0]["joints"]
+        joints = self._call("import", module=str(SERVED), text=text, format_=format_)[0]["joints"]
         moving = [j for j in model.layout.joints if j.type.nv]
         if any(j.type.nv > 1 for j in moving):
             raise UnsupportedError(f"{version}: a file is compared where each joint has one coordinate")

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from mbkit.engines.versions import environment
+from mbkit.engines.remote import environment
 from tests.fake_cuda import fake_gpu
 
 #: Nothing is worth a compiler, and the figures have no window.

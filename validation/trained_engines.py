@@ -15,7 +15,7 @@ from typing import Any
 
 import mbkit as mb
 from mbkit.engines.registry import DERIVED
-from mbkit.engines.versions.engine_version import engine
+from mbkit.engines.remote.packages import engine
 from mbkit.studies.compare.result import Comparison
 from validation.robots import FEW, chosen
 from validation.stamp import results, stamp

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 import mbkit as mb
-from mbkit.engines.versions.engine_version import engine, remote_engines
+from mbkit.engines.remote.packages import engine, remote_engines
 from validation.stamp import results, stamp
 
 RECORD = Path(__file__).with_name("importers.json")

@@ -34,7 +34,7 @@ import numpy as np
 
 import mbkit as mb
 from mbkit._check import by_key
-from mbkit.engines.versions import process
+from mbkit.engines.remote import process
 from mbkit.errors import MbkitError, MbkitWarning
 from mbkit.load.sanitized_text import strip
 from mbkit.studies.compare.terms import states

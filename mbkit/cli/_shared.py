@@ -149,7 +149,7 @@ def in_options(message: str) -> str:
 def check_engines(names: tuple[str, ...], least: int) -> None:
     """Raise for names that are no engine's, before anything is read, loaded or computed."""
     from mbkit.engines.registry import REFERENCE, compared, find_engine
-    from mbkit.engines.versions.engine_version import names_version, remote_engines
+    from mbkit.engines.remote.packages import names_version, remote_engines
 
     comparable = compared()
     for name in names:

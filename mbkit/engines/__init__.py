@@ -6,7 +6,7 @@ from mbkit.engines.closed_loops.loop_loads import UndeterminedLoads
 from mbkit.engines.closed_loops.reduced_inertia import ReducedInertia
 from mbkit.engines.linearization import DiscreteLinearization, InverseDynamicsSecondDerivatives, Linearization
 from mbkit.engines.registry import ENGINES, EngineInfo, dynamics, register_engine
-from mbkit.engines.versions.engine_version import EngineVersion, engine
+from mbkit.engines.remote.packages import EngineVersion, engine
 
 __all__ = [
     "ENGINES",

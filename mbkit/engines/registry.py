@@ -15,8 +15,8 @@ from typing import Any, Final
 from mbkit.engines import closed_loops, loads
 from mbkit.engines.base import Dynamics
 from mbkit.engines.frames_and_momenta import Composed
-from mbkit.engines.versions.engine_version import EngineVersion, names_version, remote_engines
-from mbkit.engines.versions.engine_version import engine as named_version
+from mbkit.engines.remote.packages import EngineVersion, names_version, remote_engines
+from mbkit.engines.remote.packages import engine as named_version
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
@@ -240,7 +240,7 @@ def find_engine(name: str) -> EngineInfo:
     """Return an engine's `EngineInfo`, of another version too; `UnknownNameError` for an unknown name."""
     _load_unknown(name)
     if names_version(name):
-        own = "mbkit.engines.versions.dynamics", "VersionDynamics"
+        own = "mbkit.engines.remote.dynamics", "VersionDynamics"
         return EngineInfo(named_version(name).name, None, *own, shown=())
     if name not in ENGINES:
         raise UnknownNameError("engine", str(name), (*ENGINES, *remote_engines()))
@@ -294,7 +294,7 @@ def dynamics(model: Model, engine: str | EngineVersion = PINOCCHIO, **options: A
         engine = named_version(engine)
     if isinstance(engine, EngineVersion):
         # The import is for few.
-        from mbkit.engines.versions.dynamics import VersionDynamics
+        from mbkit.engines.remote.dynamics import VersionDynamics
 
         if options:
             raise InputError(f"{', '.join(options)}: {engine} has no options")

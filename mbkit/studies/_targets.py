@@ -16,8 +16,8 @@ from typing import Any, Final
 from mbkit import catalog
 from mbkit._check import real
 from mbkit.engines.registry import ENGINES, REFERENCE, compared, find_engine
-from mbkit.engines.versions.engine_version import EngineVersion, names_version, remote_engines
-from mbkit.engines.versions.engine_version import engine as named_version
+from mbkit.engines.remote.packages import EngineVersion, names_version, remote_engines
+from mbkit.engines.remote.packages import engine as named_version
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import load
 from mbkit.load.loader import find

@@ -22,7 +22,7 @@ from typing import Any, Final, TypeVar
 
 from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError
 from mbkit.engines.registry import registered_engines
-from mbkit.engines.versions.remote.serve import attend
+from mbkit.engines.remote.served.serve import attend
 from mbkit.errors import MbkitError
 from mbkit.methods.registry import METHODS, registered_methods
 

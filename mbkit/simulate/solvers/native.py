@@ -10,7 +10,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics
-from mbkit.engines.versions.dynamics import VersionDynamics
+from mbkit.engines.remote.dynamics import VersionDynamics
 from mbkit.errors import FunctionError
 from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem

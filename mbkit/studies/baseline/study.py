@@ -24,7 +24,7 @@ from mbkit._check import Array, count
 from mbkit.engines import Dynamics, dynamics
 from mbkit.engines.oracle import OracleDynamics
 from mbkit.engines.registry import ENGINES, REFERENCE, compared, find_engine
-from mbkit.engines.versions.dynamics import VersionDynamics
+from mbkit.engines.remote.dynamics import VersionDynamics
 from mbkit.errors import (
     BaselineError,
     KnownDefectWarning,

@@ -23,9 +23,9 @@ from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.imported import IMPORTERS, Imported, Importer, check_installed, reader
 from mbkit.engines.registry import MUJOCO
-from mbkit.engines.versions import own_importer
-from mbkit.engines.versions.engine_version import EngineVersion, names_version
-from mbkit.engines.versions.engine_version import engine as engine_of
+from mbkit.engines.remote import importer as remote_importer
+from mbkit.engines.remote.packages import EngineVersion, names_version
+from mbkit.engines.remote.packages import engine as engine_of
 from mbkit.errors import InputError, MbkitError, MbkitWarning, UnknownNameError, UnsupportedError
 from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
@@ -104,7 +104,7 @@ def _reading(engine: str, version: EngineVersion | None, file: tuple[Any, ...], 
     the importer is not installed, and `ImporterError`.
     """
     if version:
-        ask, begin = partial(_asked, engine), partial(own_importer.read, version)
+        ask, begin = partial(_asked, engine), partial(remote_importer.read, version)
     else:
         check_installed(engine)
         importer = IMPORTERS[engine]
@@ -538,7 +538,7 @@ def _notes(stripped: Stripped) -> list[str]:
 
 
 def _known() -> tuple[str, ...]:
-    return (*IMPORTERS, *own_importer.importers())
+    return (*IMPORTERS, *remote_importer.importers())
 
 
 def _remote(importers: Sequence[str | EngineVersion]) -> dict[str | EngineVersion, EngineVersion]:

@@ -14,8 +14,7 @@ from collections import Counter
 import newton
 import numpy as np
 from common import rotation
-from newton_builder import NUMBERS
-from on_newton import Engine
+from on_newton import NUMBERS, Engine
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

@@ -9,14 +9,14 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from common import best_time, center_of
-from on_mujoco import body_of, built, parsed, places, smooth
+from common import center_of
+from on_mujoco import body_of, built, places, smooth
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-__all__ = ["VERSION", "Engine", "built", "parsed"]
+__all__ = ["VERSION", "Engine", "built"]
 wp.config.quiet = True
 VERSION = mjw.__version__
 _METHODS = ("euler", "implicitfast", "rk4")
@@ -150,9 +150,3 @@ class Engine:
         opt.integrator = before[0]
         opt.timestep.assign(before[1])
         return [np.stack(x, axis=1) for x in zip(*out, strict=True)]
-
-    def seconds(self, q: Any, v: Any, repeats: int) -> Any:
-        """Return the shortest time of one forward dynamics of the stack, s, of rounds of so many calls."""
-        d = self._at(q, v)
-        mjw.forward(self._w, d)
-        return [np.full(len(q), best_time(lambda: mjw.forward(self._w, d), repeats))]

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from common import best_time
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody import tree
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 
 try:
@@ -68,23 +66,6 @@ def _joint(step: dict[str, Any], name: str, at: Any, body: Any) -> Any:
         # Metres per radian here, per turn there.
         return tree.ScrewJoint(name, at, body, axes[0], 2 * np.pi * step["pitch"], 0.0)
     return (tree.BallRpyJoint if kind == "ball" else tree.QuaternionFloatingJoint)(name, at, body)
-
-
-def parsed(text: str, format_: str) -> Any:
-    """Return what Drake's parser reads from a text, its base welded to the world where nothing holds it."""
-    plant = MultibodyPlant(0.0)
-    models = Parser(plant).AddModelsFromString(text, "urdf" if format_ == "urdf" else "xml")
-    if format_ == "urdf":
-        carried = {int(plant.get_joint(j).child_body().index()) for j in plant.GetJointIndices()}
-        for b in [b for model in models for b in plant.GetBodyIndices(model) if int(b) not in carried]:
-            plant.WeldFrames(plant.world_frame(), plant.get_body(b).body_frame())
-    plant.Finalize()
-    joints = {}
-    for j in plant.GetJointIndices():
-        joint = plant.get_joint(j)
-        if joint.num_velocities():
-            joints[joint.name()] = [joint]
-    return plant, joints, {}
 
 
 class Engine:
@@ -152,14 +133,3 @@ class Engine:
         """Return the mass, kg, and its centre of mass, m."""
         self._set(q)
         return [self._plant.CalcTotalMass(self._context), self._plant.CalcCenterOfMassPositionInWorld(self._context)]
-
-    def seconds(self, q: Any, v: Any, repeats: int) -> Any:
-        """Return the shortest time of one forward dynamics, s, of rounds of so many calls."""
-        self._applied.FixValue(self._context, np.zeros(self._plant.num_velocities()))
-
-        def call() -> None:
-            # A state that is set again empties Drake's cache.
-            self._set(q, v)
-            self._accelerations.Eval(self._context)
-
-        return best_time(call, repeats)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
-from common import best_time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -19,12 +18,7 @@ _OFF = (
 
 def built(data: dict[str, Any]) -> Any:
     """Return the model of an MJCF that mbkit wrote."""
-    return parsed(data["text"], "mjcf")
-
-
-def parsed(text: str, format_: str) -> Any:  # noqa: ARG001  # MuJoCo sees it in the text
-    """Return what MuJoCo's parser reads from a text."""
-    return mujoco.MjModel.from_xml_string(text)
+    return mujoco.MjModel.from_xml_string(data["text"])
 
 
 def smooth(m: Any, acting: bool = False) -> Any:
@@ -152,9 +146,3 @@ class Engine:
             out_v.append(np.array(d.qvel))
         m.opt.integrator, m.opt.timestep = before
         return [np.array(out_q), np.array(out_v)]
-
-    def seconds(self, q: Any, v: Any, repeats: int) -> Any:
-        """Return the shortest time of one forward dynamics, s, of rounds of so many calls."""
-        m, d = self._m, self._d
-        d.qpos[:], d.qvel[:] = q, v
-        return best_time(lambda: mujoco.mj_forward(m, d), repeats)

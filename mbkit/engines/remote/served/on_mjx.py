@@ -10,15 +10,15 @@ from importlib.metadata import version
 import jax
 import mujoco
 import numpy as np
-from common import best_time, center_of
+from common import center_of
 from mujoco import mjx
-from on_mujoco import body_of, built, parsed, places, smooth
+from on_mujoco import body_of, built, places, smooth
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-__all__ = ["VERSION", "Engine", "built", "parsed"]
+__all__ = ["VERSION", "Engine", "built"]
 VERSION = version("mujoco-mjx")
 #: The smallest stack that is compiled, beside one state alone; larger ones have twice as many, and so on.
 _LEAST = 16
@@ -138,9 +138,3 @@ class Engine:
             start = [x[:, -1] for x in parts[-1]]
             parts.append(self._over(("rollout", method), run, *start, part, shared=(dt,)))
         return [np.concatenate(x, axis=1)[:, : steps + 1] for x in zip(*parts, strict=True)]
-
-    def seconds(self, q: Any, v: Any, repeats: int) -> Any:
-        """Return the shortest time of one forward dynamics of the stack, s, of rounds of so many calls."""
-        tau = np.zeros_like(v)
-        self.forward_dynamics(q, v, tau)
-        return [np.full(len(q), best_time(lambda: self.forward_dynamics(q, v, tau), repeats))]

@@ -17,9 +17,9 @@ from mbkit.engines import known_defects
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.elements.passive import JointPassive, pull
 from mbkit.engines.frames_and_momenta import ALIGNED, seen_from
-from mbkit.engines.versions.description import REMOTE_RUNS, REMOTE_RUNS_OF_JOINTS, places, travelling
-from mbkit.engines.versions.engine_version import EngineVersion
-from mbkit.engines.versions.process import RemoteError, new_key, process_of
+from mbkit.engines.remote.description import REMOTE_RUNS, REMOTE_RUNS_OF_JOINTS, places, travelling
+from mbkit.engines.remote.packages import EngineVersion
+from mbkit.engines.remote.process import RemoteError, new_key, process_of
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Frame, Model
 
@@ -378,9 +378,3 @@ class VersionDynamics(MappedDynamics):
                 "body's; use rk4, which any engine has"
             )
         return out
-
-    def seconds(self, q: Array, v: Array, repeats: int = 200) -> float:
-        """Return the shortest time of one forward dynamics in the engine's process, s, without the way there."""
-        x, u, _ = self._native(self.model.check_q(q), self.model.check_v(v))
-        plain: dict[str, Any] = {"repeats": repeats}
-        return float(self._ask("seconds", x, u, **plain)[0])

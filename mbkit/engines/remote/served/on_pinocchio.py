@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
-
 import numpy as np
 import pinocchio as pin
-from common import best_time
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -68,21 +64,6 @@ def built(data: dict[str, Any]) -> Any:
             raise NotImplementedError("this version has no armature")
         model.armature = np.array(rotors)
     return model, numbers, bodies, moment
-
-
-def parsed(text: str, format_: str) -> Any:
-    """Return what Pinocchio's parser reads from a text."""
-    if format_ == "urdf":
-        model = pin.buildModelFromXML(text)
-    else:
-        if not hasattr(pin, "buildModelFromMJCF"):
-            raise NotImplementedError("this version reads no MJCF")
-        with tempfile.TemporaryDirectory() as folder:
-            path = os.path.join(folder, "model.xml")
-            with open(path, "w", encoding="utf-8") as file:
-                file.write(text)
-            model = pin.buildModelFromMJCF(path)
-    return model, {str(model.names[j]): [j] for j in range(1, model.njoints)}, {}, np.zeros(3)
 
 
 class Engine:
@@ -147,8 +128,3 @@ class Engine:
     def matter(self, q: Any) -> Any:
         """Return the mass of what moves, kg, and its centre of mass, m."""
         return [pin.computeTotalMass(self._m), np.array(pin.centerOfMass(self._m, self._d, q))]
-
-    def seconds(self, q: Any, v: Any, repeats: int) -> Any:
-        """Return the shortest time of one forward dynamics, s, of rounds of so many calls."""
-        m, d, tau = self._m, self._d, np.zeros(self._m.nv)
-        return best_time(lambda: pin.aba(m, d, q, v, tau), repeats)

@@ -13,9 +13,9 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines.imported import Imported, Parts, checked, written
-from mbkit.engines.versions.dynamics import VersionDynamics
-from mbkit.engines.versions.engine_version import PACKAGES, EngineVersion
-from mbkit.engines.versions.process import RemoteError, new_key, process_of
+from mbkit.engines.remote.dynamics import VersionDynamics
+from mbkit.engines.remote.packages import PACKAGES, EngineVersion
+from mbkit.engines.remote.process import RemoteError, new_key, process_of
 from mbkit.errors import UnsupportedError
 from mbkit.model import Coupler, Joint, Model
 

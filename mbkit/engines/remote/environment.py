@@ -63,13 +63,6 @@ def python_of(environment: Path) -> Path:
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
-def made(distribution: str) -> list[str]:
-    """Return the versions that have an environment, oldest first; not those of ``name-more`` where it is ``name``."""
-    names = (path.name for path in folder().glob(place(distribution, "*").name))
-    versions = [name.removeprefix(f"{distribution}-").rpartition("-")[0] for name in names]
-    return sorted((x for x in versions if parsed(x) and exists(distribution, x)), key=Version)
-
-
 def parsed(version: str) -> Version | None:
     """Return a version that can be compared with others; None of a text that is no version."""
     try:
@@ -121,16 +114,6 @@ def interpreter(distribution: str, version: str, module: str, report: Report = _
             "folder that can be written"
         ) from None
     return python_of(path)
-
-
-def remove(distribution: str, version: str) -> None:
-    """Remove a version's environment."""
-    path = place(distribution, version)
-    # A half removed one must not stand under its name.
-    gone = path.with_name(f".{path.name}.gone")
-    with contextlib.suppress(FileNotFoundError):
-        os.replace(path, gone)
-    shutil.rmtree(gone, ignore_errors=True)
 
 
 @contextlib.contextmanager

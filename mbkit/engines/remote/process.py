@@ -18,8 +18,8 @@ from typing import Any, Final
 from mbkit._check import Array
 from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError
 from mbkit._fork import fork_safe
-from mbkit.engines.versions.engine_version import EngineVersion
-from mbkit.engines.versions.remote import serve
+from mbkit.engines.remote.packages import EngineVersion
+from mbkit.engines.remote.served import serve
 from mbkit.errors import EngineProcessError
 
 #: Seconds until a library is loaded.
@@ -28,7 +28,7 @@ _SERVE: Final = Path(serve.__file__)
 
 
 class RemoteError(Exception):
-    """The engine refused a call; its message. Never leaves `mbkit.engines.versions`."""
+    """The engine refused a call; its message. Never leaves `mbkit.engines.remote`."""
 
 
 class EngineProcess(Child):

@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from typing import Any
-
-
-def best_time(call: Callable[[], Any], repeats: int) -> float:
-    """Return the shortest time of a call, s, of rounds of so many calls."""
-    best = float("inf")
-    for _ in range(5):
-        start = time.perf_counter()
-        for _ in range(repeats):
-            call()
-        best = min(best, (time.perf_counter() - start) / repeats)
-    return best
 
 
 def center_of(masses: Any, points: Any) -> list[Any]:

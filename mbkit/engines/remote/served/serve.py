@@ -97,18 +97,21 @@ def unpacked(message: bytes) -> tuple[dict[str, Any], list[Any]]:
     return head, arrays
 
 
+def _module(name: str) -> Any:
+    """Return a module by its name, or by the path of its file."""
+    place, file = os.path.split(name.removesuffix(".py"))
+    sys.path[:0] = [place] if place else []
+    return importlib.import_module(file)
+
+
 def _answer(adapter: Any, held: dict[int, Any], head: dict[str, Any], arrays: list[Any]) -> bytes:
     """Return what a call gives: of the adapter's class, or a quantity of a model that the process holds."""
     name, key = head["call"], head.get("model", 0)
     if name == "build":
         held[key] = adapter.Engine(adapter.built(head["with"]))
         return packed({"joints": held[key].joints()})
-    if name == "parse":
-        held[key] = adapter.Engine(adapter.parsed(head["with"]["text"], head["with"]["format"]))
-        return packed({"joints": held[key].joints()})
     if name == "import":
-        module = importlib.import_module(head["with"].pop("module"))
-        held[key], said = module.imported(adapter, **head["with"])
+        held[key], said = _module(head["with"].pop("module")).imported(adapter, **head["with"])
         return packed(said)
     if name == "forget":
         held.pop(key, None)
@@ -137,9 +140,7 @@ def serve(handle: int, file: str, folder: str) -> None:
     """Answer calls of an engine, by its name, whose file is beside this one, or by the path of a file."""
 
     def prepare(_: Connection) -> Callable[[bytes], bytes]:
-        place, name = os.path.split(file[:-3]) if file.endswith(".py") else ("", "on_" + file)
-        sys.path[:0] = [place] if place else []
-        adapter = importlib.import_module(name)
+        adapter = _module(file if file.endswith(".py") else "on_" + file)
         held: dict[int, Any] = {}
 
         def answer(message: bytes) -> bytes:

@@ -8,13 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from packaging.version import Version
-
 from mbkit._check import WORLD, real
 from mbkit.engines.frames_and_momenta import TREE
 from mbkit.engines.known_defects import OF_PINOCCHIO
-from mbkit.engines.versions import environment
-from mbkit.engines.versions.description import NEWTON, ONE_BY_ONE, SENT, SENT_TO_DRAKE, STACKED, Convention, Steps
+from mbkit.engines.remote import environment
+from mbkit.engines.remote.description import NEWTON, ONE_BY_ONE, SENT, SENT_TO_DRAKE, STACKED, Convention, Steps
 from mbkit.errors import InputError, require_known
 from mbkit.model.elements import paths
 from mbkit.model.elements.kinds import joint_types
@@ -30,8 +28,6 @@ class Package(NamedTuple):
     ----------
     distribution, module : str
         What pip installs, and what can be imported then.
-    megabytes, seconds : float
-        What an environment takes, as measured.
     convention : Convention
     steps : mapping, optional
         The engine's joints in the place of each joint type. None: it reads the MJCF that mbkit writes.
@@ -61,8 +57,6 @@ class Package(NamedTuple):
 
     distribution: str
     module: str
-    megabytes: float
-    seconds: float
     convention: Convention
     steps: Steps | None = None
     path: paths.Path = SENT
@@ -92,8 +86,6 @@ _WARP: Final = {"WARP_CACHE_PATH": "{environment}/kernels"}
 _MJX: Final = Package(
     "mujoco-mjx",
     "mujoco.mjx",
-    730,
-    25,
     _MUJOCO,
     inertias_about={"": TREE},
     tested=("3.17.0",),
@@ -104,16 +96,16 @@ _MJX: Final = Package(
 )
 #: Engines with a file of their own in `remote`.
 PACKAGES: Final[dict[str, Package]] = {
-    "mujoco": Package("mujoco", "mujoco", 120, 11, _MUJOCO),
-    "pinocchio": Package("pin", "pinocchio", 430, 25, Convention(), ONE_BY_ONE, defects=OF_PINOCCHIO),
+    "mujoco": Package("mujoco", "mujoco", _MUJOCO),
+    "pinocchio": Package("pin", "pinocchio", Convention(), ONE_BY_ONE, defects=OF_PINOCCHIO),
     "drake": Package(
-        *("drake", "pydrake.multibody.plant", 440, 20),
+        *("drake", "pydrake.multibody.plant"),
         Convention((6, 3, 4, 5, 0, 1, 2), (3, 4, 5, 0, 1, 2), (), {"free": (0, 3), "ball": (0,)}, 3),
         STACKED,
         SENT_TO_DRAKE,
     ),
     "newton": Package(
-        *("newton", "newton", 680, 22),
+        *("newton", "newton"),
         Convention(turned={"free": (0, 3), "ball": (0,)}),
         STACKED,
         NEWTON,
@@ -128,7 +120,7 @@ PACKAGES: Final[dict[str, Package]] = {
         importer="newton_importer",
     ),
     "mujoco-warp": Package(
-        *("mujoco-warp", "mujoco_warp", 590, 20, _MUJOCO),
+        *("mujoco-warp", "mujoco_warp", _MUJOCO),
         bits=24,
         inertias_about={"": TREE},
         tested=("4.0.0",),
@@ -265,20 +257,3 @@ def names_version(name: object) -> bool:
 def remote_engines() -> tuple[str, ...]:
     """Return the engines that always have an environment of their own."""
     return tuple(name for name, package in PACKAGES.items() if package.tested)
-
-
-def order_of(version: str, what: str = "version") -> Version:
-    """Return a version by which versions are in order; raise `InputError` for a text that is none."""
-    if order := environment.parsed(version):
-        return order
-    raise InputError(f"{what}: expected a version such as '3.3', got {version!r}")
-
-
-def versions_of(name: str) -> tuple[str, ...]:
-    """Return the versions of an engine that can be installed here, oldest first."""
-    return environment.available(PACKAGES[name].distribution)
-
-
-def made_of(name: str) -> tuple[str, ...]:
-    """Return the versions of an engine that have an environment, oldest first."""
-    return tuple(environment.made(PACKAGES[name].distribution))
