@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import sympy as sp
+from scipy.integrate import solve_ivp
 
 import mbkit as mb
 from mbkit.errors import (
@@ -14,6 +15,7 @@ from mbkit.errors import (
     InputError,
     MbkitWarning,
     NumericalError,
+    TorqueError,
     UnknownNameError,
     UnsupportedError,
 )
@@ -362,6 +364,44 @@ def test_embedded_takes_torques_and_events_on_all_coordinates(rod):
     assert np.abs(held.q - same.q).max() < 1e-10
 
 
+@pytest.mark.parametrize(
+    ("method", "setting", "close"), [("rk853", {"rtol": 1e-11}, 1e-9), ("gauss6", {"dt": 0.02}, 5e-7)]
+)
+def test_embedded_holds_samples_and_tables_from_chart_to_chart(rod, method, setting, close):
+    """SciPy solves for the angle from jump to jump of the force; the choice of the coordinate changes between them."""
+
+    def law(s, q, v):
+        if s > 0.45:
+            raise ValueError("no more")
+        return np.array([np.sin(9 * s) - 0.3 * v[0], 2 + 0.2 * q[0]])
+
+    state, forces, states = np.array([0.1, 8.0 / 1.5]), [], []
+    for k in range(5):
+        forces.append(law(0.1 * k, *on_circle(*state)))
+
+        def rates(_s, y, force=forces[k]):
+            along = force @ [np.cos(y[0]), np.sin(y[0])]
+            return y[1], along / (2.0 * 1.5) - 9.81 / 1.5 * np.sin(y[0])
+
+        state = solve_ivp(rates, (0.0, 0.1), state, method="DOP853", rtol=3e-14, atol=1e-14).y[:, -1]
+        states.append(on_circle(*state)[0])
+    start, save = on_circle(0.1, 8.0 / 1.5), 0.1 * np.arange(6)
+    run = mb.simulate(rod.embedded(), *start, 0.5, method, torque=law, hold=0.1, save=save, **setting)
+    assert np.abs(run.q[1:] - states).max() < close
+    assert np.abs(run.tau[:-1] - forces).max() < 10 * close
+    assert [hit.name for hit in run.events] == ["independent: x", "independent: y"]
+    assert run.check()
+    rows = np.repeat(forces, 1 if "rtol" in setting else 5, axis=0)
+    table = mb.simulate(rod.embedded(), *start, 0.5, method, torque=rows, save=save, **setting)
+    assert np.abs(table.q[1:] - states).max() < close
+    assert np.abs(table.power_balance()).max() < 1e3 * close
+    with pytest.raises(TorqueError, match=r"ValueError at t = 0\.5 s: no more") as failed:
+        mb.simulate(rod.embedded(), *start, 0.6, method, torque=law, hold=0.1, **setting)
+    assert failed.value.trajectory.stats.reached == pytest.approx(0.5)
+    with pytest.raises(TorqueError, match=r"^torque: the callable raised ValueError at t = 0\.4.* s: no more"):
+        mb.simulate(rod.embedded(), *start, 0.6, method, torque=law, **setting)
+
+
 def test_a_choice_that_stays_ends_at_its_singular_pose(rod):
     q, v = on_circle(0.1, 8.0 / 1.5)
     with pytest.warns(MbkitWarning, match="singular pose at t = 0.3071"):
@@ -484,6 +524,9 @@ def test_embedded_refuses_what_it_cannot_do(rod):
         rod.embedded([x, y])
     with pytest.raises(InputError, match="leave none"):
         pendulum(constraints=[x, y]).embedded()
+    event = Event(lambda _t, q, _v: q[0], "plumb")
+    with pytest.raises(UnsupportedError, match="events"):
+        mb.simulate(rod.embedded(), [0.0, -1.5], [0.0, 0.0], 0.1, "rk4", events=event)
     with pytest.raises(InputError, match="q0"):
         mb.simulate(rod.embedded(), np.zeros((2, 2)), np.zeros((2, 2)), 1.0, "rk853")
 

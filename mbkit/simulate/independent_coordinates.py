@@ -8,31 +8,26 @@ other and no chart serves: the run goes through it on all coordinates, with mult
 from __future__ import annotations
 
 import re
-import time
 import warnings
 from dataclasses import replace
 from typing import Any, Final, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from mbkit._check import Array, finite_array
 from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.errors import FunctionError, InputError, MbkitWarning, NumericalError, UnsupportedError
+from mbkit.errors import FunctionError, MbkitWarning, NumericalError, UnsupportedError
 from mbkit.lagrangian.independent_coordinates import SINGULAR, Chart, Embedded, EmbeddedDynamics
 from mbkit.methods.registry import METHODS, Method, method_of
-from mbkit.simulate.constraint_projection import from_consistent
-from mbkit.simulate.events import Event, Hit, as_events
-from mbkit.simulate.integrate import integrate, times_of
-from mbkit.simulate.progress import Progress
+from mbkit.simulate.events import Event, Hit
+from mbkit.simulate.integrate import integrate
+from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.request import RunRequest
-from mbkit.simulate.result import Ended, Stats
+from mbkit.simulate.result import SolverResult
 from mbkit.simulate.run_data import RunData
-from mbkit.simulate.singular_poses import SingularPoses
-from mbkit.simulate.time_grid import Grid, save_times
-from mbkit.simulate.torque import Torque
+from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_result
 
 _WORN: Final = "the dependent coordinates are badly chosen"
 _NEAR: Final = "near a singular pose"
@@ -51,81 +46,65 @@ def _on_charts(method: Method) -> bool:
 
 
 def integrate_on_charts(system: Embedded, request: RunRequest) -> tuple[RunData, FunctionError | None]:
-    """Integrate one state on all coordinates; without checks of the run."""
+    """Integrate one state on all coordinates, as `mbkit.simulate.integrate.integrate` does."""
+    model, method = system.model, method_of(request.method)
     if request.wrenches:
         raise UnsupportedError(
             "wrenches: a system written as energies has no frames; give the generalized force, torque="
         )
-    if request.hold is not None:
-        raise UnsupportedError("hold: not on independent coordinates; take the dynamics of the whole system")
-    run = _Run(system, request)
-    return run.data(request.q0, request.v0), run.error
+    if not _on_charts(method):
+        usable = ", ".join(m.name for m in METHODS.values() if _on_charts(m))
+        raise UnsupportedError(
+            f"{method.name}: not on independent coordinates, which Newton's iteration leads to; "
+            f"use {usable}, or the form with multipliers, lag.dynamics()"
+        )
+    finite_array("q0", request.q0, (model.nq,))
+    finite_array("v0", request.v0, (model.nv,))
+    return integrate(system.dynamics, request, lambda problem: _Run(system, problem).result())
 
 
 class _Run:
     """A run so far, on all coordinates."""
 
-    def __init__(self, system: Embedded, request: RunRequest) -> None:
-        method, self._save = request.method, request.save
-        self.system, self.model, self._method = system, system.model, method_of(method)
-        self._start, duration, dt = times_of(system.dynamics, self._method, request.t0, request.duration, request.dt)
-        self._end, self._duration, self._dt = self._start + duration, duration, dt
-        self.events = as_events(request.events)
-        self._bar = Progress(request.progress, f"{self.model.name}: {method} on independent coordinates")
-        if not _on_charts(self._method):
-            usable = ", ".join(m.name for m in METHODS.values() if _on_charts(m))
-            raise UnsupportedError(
-                f"{method}: not on independent coordinates, which Newton's iteration leads to; "
-                f"use {usable}, or the form with multipliers, lag.dynamics()"
-            )
-        self._torque = Torque(request.torque, self.model, None, None)
-        self.force: Any = self._torque.of_member(None)(0)
-        self._tolerances: dict[str, Any] = {"rtol": request.rtol, "atol": request.atol}
-        self.poses = SingularPoses(system.dynamics)
+    def __init__(self, system: Embedded, problem: IntegrationProblem) -> None:
+        self.system, self.model, self.problem = system, system.model, problem
+        # Parts look for the events.
+        self.record = TrajectoryRecord(replace(problem, events=()), 0)
+        self._force_of = problem.torque.of_member(None)
+        self.force: Any = None
         #: The run goes through singular poses: the choice is open, and nothing is moved in time.
         self.passes = system.independent is None and self.model.time_parameter is None
-        self._states: list[tuple[float, Array, Array]] = []
-        self.hits: list[Hit] = []
         self._near: list[tuple[float, float]] = []
-        self._counts = np.zeros(3, dtype=int)
-        self._ended: Ended = "finished"
-        self._message = ""
-        self.error: FunctionError | None = None
 
-    def data(self, q0: ArrayLike, v0: ArrayLike) -> RunData:
-        """Integrate from a state; return the run."""
-        started = time.perf_counter()
-        model, dyn = self.model, self.system.dynamics
-        q, v = finite_array("q0", q0, (model.nq,)), finite_array("v0", v0, (model.nv,))
-        q, v = from_consistent(dyn, q, v, self._start)
-        with self._bar:
-            if self._method.kind == "adaptive":
-                self._adaptive(q, v)
-            else:
-                self._stepped(q, v, Grid.of(self._start, self._duration, self._dt))
+    def result(self) -> SolverResult:
+        """Integrate; return the run."""
+        problem = self.problem
+        try:
+            (self._adaptive if problem.equal_steps is None else self._stepped)(problem.q0, problem.v0)
+        except FunctionError as error:
+            # Of a torque that samples.
+            self.record.fail(error)
         for t, value in self._near:
             warn(
-                f"{model.name}: {_NEAR} at t = {t:.6g} s: the smallest singular value there is {value:.3g} of the "
+                f"{self.model.name}: {_NEAR} at t = {t:.6g} s: the smallest singular value there is {value:.3g} of the "
                 "largest",
                 MbkitWarning,
             )
-        times, positions, velocities = zip(*self._states, strict=True) if self._states else ((), (), ())
-        end = self._end if self._ended == "finished" else times[-1] if times else self._start
-        doubts = (self.poses.describe(),) if self.poses.times else ()
-        steps, evaluations, rejected = self._counts.tolist()
-        seconds = time.perf_counter() - started
-        stats = Stats(steps, evaluations, seconds, self._ended, end, self._message, rejected, doubts=doubts)
-        states = (
-            np.array(times),
-            np.array(positions).reshape(-1, model.nq),
-            np.array(velocities).reshape(-1, model.nv),
-        )
-        hits = tuple(sorted(self.hits, key=lambda hit: hit.t))
-        return RunData(*states, model, self._method.name, dyn.engine, stats, dyn, hits, self._torque.applied(None))
+        self.record.events.sort(key=lambda hit: hit.t)
+        return assemble_result(problem, [self.record])
 
-    def _keep_end(self, t: float, q: Array, v: Array) -> None:
-        if not self._states or self._states[-1][0] != t:
-            self._states.append((t, q, v))
+    def _keep(self, t: float, q: Array, v: Array) -> None:
+        self.record.keep(np.array([t]), q[None], v[None])
+
+    def saw(self, t: float, q: Array) -> None:
+        """Look for singular poses at the end of a step."""
+        if self.record.poses is not None:
+            self.record.poses.saw(t, q)
+
+    def _hold(self, k: int, t: float, q: Array, v: Array) -> None:
+        """Take the force from interval or step k on."""
+        self.problem.sample(0, k, t, np.concatenate([q, v]))
+        self.force = self._force_of(k)
 
     def integrated(self, way: _Way, q: Array, v: Array, span: float, **options: Any) -> RunData:
         """Return the run of a part, from a state on all coordinates."""
@@ -133,54 +112,59 @@ class _Run:
         with warnings.catch_warnings():
             # The whole run warns of its end.
             warnings.simplefilter("ignore", MbkitWarning)
-            request = RunRequest(*start, span, self._method.name, torque=way.torque(), t0=0.0, **options)
-            part, self.error = integrate(way.dyn, request)
-        self._counts += [part.stats.steps, part.stats.evaluations, part.stats.rejected]
+            request = RunRequest(*start, span, self.problem.method, torque=way.torque(), t0=0.0, **options)
+            part, self.record.error = integrate(way.dyn, request)
+        self.record.add(part.stats, way.begin)
         return part
 
     # With a tolerance
 
     def _adaptive(self, q: Array, v: Array) -> None:
-        if isinstance(self._save, (int, np.integer)):
-            raise InputError(f"save: expected a grid of times for an adaptive method, got the count {self._save}")
-        system, start, t, across = self.system, self._start, self._start, False
-        left = None if self._save is None else save_times(self._save, start, self._end).tolist()
+        problem, system, record, chart = self.problem, self.system, self.record, None
+        (rtol, atol), start, t, across, changes = problem.tolerances, problem.start, problem.start, False, 0
+        left = None if problem.save is None else problem.save.tolist()
         if left is None or left[0] == t:
-            self._states.append((t, q, v))
-        for _ in range(_MOST):
+            self._keep(t, q, v)
+        while t < problem.end:
             left = left and [s for s in left if s > t]
-            chart = system.chart(q, t)
+            k = problem.interval(t)
+            stop = problem.stops[k]
+            self._hold(k, t, q, v)
+            new, chart = chart is None, chart or system.chart(q, t)
             near = system.nearness(chart, q, t)
             if near < SINGULAR:
                 across = across or self.passes
                 if not (self._near and self._near[-1][0] == t):
                     self._near.append((t, near))
-            way = _Way(self, None if across else chart, q, v, t)
-            rest = self._end - t
+            way = _Way(self, None if across else chart, q, v, t, new=new)
             # Steps end behind the pose, where their errors are not those of a state within a step.
-            span = min(rest, self._behind(chart, q, v, t)) if across else rest
+            span = min(stop - t, self._behind(chart, q, v, t)) if across else stop - t
             part = self.integrated(
                 *(way, q, v, span),
                 save=None if left is None else sorted({*(s - t for s in left if s - t < span), span}),
                 events=way.events(),
-                progress=lambda done, t=t, span=span: self._bar.update(
-                    (t + done * span - start) / (self._end - start or 1.0)
-                ),
-                **self._tolerances,
+                progress=lambda done, t=t, span=span: problem.bar.update((t + done * span - start) / problem.duration),
+                rtol=rtol,
+                atol=atol,
             )
             ended = self._take(part, way, chart, left)
-            if not ended and (span == rest or not part.stats.finished):
+            if not ended and part.stats.ended != "finished":
                 return
-            across = ended == _NEAR
             if ended:
                 last = part.events[-1]
                 q, v = way.state(last.t, last.q, last.v)
                 t += last.t
             else:
-                q, v = part.q[-1], part.v[-1]
-                t += span
-        self._ended = "step_too_small"
-        self._message = f"the independent coordinates changed {_MOST} times up to t = {t:.6g} s"
+                q, v = way.state(span, part.q[-1], part.v[-1])
+                t = stop if span == stop - t else t + span
+            record.reached = t
+            if ended or across:
+                chart, changes = None, changes + 1
+            across = ended == _NEAR
+            if changes == _MOST:
+                record.ended = "step_too_small"
+                record.message = f"the independent coordinates changed {_MOST} times up to t = {t:.6g} s"
+                return
 
     def _behind(self, chart: Chart, q: Array, v: Array, t: float) -> float:
         """Return the time, s, in which a motion goes from near a singular pose to well behind it."""
@@ -200,65 +184,66 @@ class _Run:
         for k, (s, u, w) in enumerate(zip(part.t.tolist(), part.q, part.v, strict=True)):
             if saved is None:
                 if k and not (worn and k == len(part.t) - 1):
-                    self._states.append((begin + s, *way.state(s, u, w)))
+                    self._keep(begin + s, *way.state(s, u, w))
             elif s in saved and s > 0:
-                self._states.append((saved[s], *way.state(s, u, w)))
+                self._keep(saved[s], *way.state(s, u, w))
         for hit in part.events:
             if hit.name == _WORN:
                 continue
             q, v = way.state(hit.t, hit.q, hit.v)
-            self.hits.append(replace(hit, t=begin + hit.t, q=q, v=v))
+            self.record.events.append(replace(hit, t=begin + hit.t, q=q, v=v))
             if hit.name == _NEAR:
                 self._near.append((begin + hit.t, self.system.nearness(chart, q, begin + hit.t)))
         if worn:
             return name
-        self._ended, self._message = stats.ended, stats.message
-        end = begin + cast("float", stats.reached)
+        record = self.record
+        record.ended, record.message = stats.ended, stats.message
         if name == _NEAR:
             self._undetermined()
-        elif self._ended == "event":
-            self._message = f"stopped by {self.hits[-1].name} at t = {end:.6g} s"
-            self._keep_end(end, self.hits[-1].q, self.hits[-1].v)
-        elif self._ended != "finished":
-            self._message = self._message.rpartition(" after t = ")[0] + f" after t = {end:.6g} s"
+        elif stats.ended == "event":
+            record.stop_at(record.events[-1])
+        elif stats.ended not in ("finished", "function_failed"):
+            record.message = record.message.rpartition(" after t = ")[0] + f" after t = {record.reached:.6g} s"
         return ""
 
     def _undetermined(self) -> None:
         """End at a singular pose of a choice that stays."""
-        hit = self.hits[-1]
-        self._ended = "step_too_small"
-        self._message = (
-            f"ended {_NEAR} at t = {hit.t:.6g} s, where {', '.join(self.system.independent or ())} no longer determine "
-            "the motion; lag.embedded() changes the choice"
+        record = self.record
+        record.stop_at(record.events[-1])
+        record.ended = "step_too_small"
+        record.message = (
+            f"ended {_NEAR} at t = {record.events[-1].t:.6g} s, where {', '.join(self.system.independent or ())} no "
+            "longer determine the motion; lag.embedded() changes the choice"
         )
-        self._keep_end(hit.t, hit.q, hit.v)
 
     # With a fixed step
 
-    def _stepped(self, q: Array, v: Array, grid: Grid) -> None:
-        system, stays = self.system, self.system.independent is not None
-        kept = set(grid.kept(self._save, 2 * len(q)).tolist())
+    def _stepped(self, q: Array, v: Array) -> None:
+        problem, system, grid, record = self.problem, self.system, self.problem.grid, self.record
+        kept, stays, torque = set(problem.kept.tolist()), system.independent is not None, problem.torque
         if 0 in kept:
-            self._states.append((grid.start, q, v))
+            self._keep(grid.start, q, v)
         k, chart, was_near = 0, None, False
         while k < grid.steps:
             t, first = grid.time(k), k
-            self._bar.update(k / grid.steps)
+            problem.bar.update(k / grid.steps)
+            self._hold(k, t, q, v)
+            end = k + 1 if torque.in_each_step else min(k + _BLOCK, torque.next_sample(k, grid.steps))
             way = _Way(self, chart or system.chart(q, t), q, v, t, new=chart is None)
             chart = cast("Chart", way.chart)
-            part = self.integrated(way, q, v, grid.span(k, min(k + _BLOCK, grid.steps)), dt=grid.dt)
+            part = self.integrated(way, q, v, grid.span(k, end), dt=grid.dt)
             cast("EmbeddedDynamics", way.dyn).remember(q)
             worn = False
             for s, u, w in zip(part.t[1:].tolist(), part.q[1:], part.v[1:], strict=True):
                 k += 1
-                t = grid.time(k)
+                record.reached = t = grid.time(k)
                 q, v = way.at(s).state(u, w)
                 if k in kept:
-                    self._states.append((t, q, v))
+                    self._keep(t, q, v)
                 near = system.nearness(chart, q, t)
                 if near < SINGULAR and not was_near:
                     self._near.append((t, near))
-                    self.hits.append(Hit(_NEAR, t, q, v))
+                    record.events.append(Hit(_NEAR, t, q, v))
                     if stays:
                         self._undetermined()
                         return
@@ -269,10 +254,10 @@ class _Run:
             if worn or (not part.stats.finished and k > first and not stays):
                 chart = None
             elif not part.stats.finished:
-                self._ended = part.stats.ended
+                record.ended = part.stats.ended
                 # Of the run, and not of its last block.
                 now = f"after t = {t:.6g} s (step {k + 1})"
-                self._message = re.sub(r"after t = \S+ s \(step \d+\)", now, part.stats.message)
+                record.message = re.sub(r"after t = \S+ s \(step \d+\)", now, part.stats.message)
                 return
 
 
@@ -287,7 +272,7 @@ class _Way:
         self.dyn: Dynamics = run.system.dynamics if chart is None else run.system.on(chart, q, begin)
         self._times, self._places = [0.0], [q]
         if chart is not None and new:
-            run.hits.append(Hit(f"independent: {run.system.names(chart)}", begin, q.copy(), v.copy()))
+            run.record.events.append(Hit(f"independent: {run.system.names(chart)}", begin, q.copy(), v.copy()))
 
     def at(self, t: float) -> EmbeddedDynamics:
         """Return the dynamics at a time of the part."""
@@ -309,7 +294,7 @@ class _Way:
         self._times.append(t)
         self._places.append(q)
         if t >= max(self._times):
-            self._run.poses.saw(self.begin + t, q)
+            self._run.saw(self.begin + t, q)
         return q
 
     def torque(self) -> Any:
@@ -330,7 +315,7 @@ class _Way:
 
     def events(self) -> list[Event]:
         """Return the run's events on the part's coordinates, and those of its chart."""
-        out = [self._shifted(event) for event in self._run.events]
+        out = [self._shifted(event) for event in self._run.problem.events]
         if self.chart is not None:
             out.append(self._watch(self.chart, _NEAR))
             if self._run.system.independent is None:

@@ -26,7 +26,7 @@ from mbkit.simulate.events import as_events
 from mbkit.simulate.problem import RUNS, IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.request import RunRequest
-from mbkit.simulate.result import SolverResult, Stats
+from mbkit.simulate.result import SolverResult
 from mbkit.simulate.run_data import Acting, RunData, RunSettings
 from mbkit.simulate.time_grid import DEFAULT_STEP, Grid, Indices, check_room, save_times
 from mbkit.simulate.torque import RunWrenches, Torque, TorqueFunction
@@ -46,10 +46,12 @@ _SIDE_BY_SIDE: Final = 8
 _MULTIPLE: Final = 1e-6
 
 
-def integrate(dyn: Dynamics, request: RunRequest) -> tuple[RunData, FunctionError | None]:
+def integrate(
+    dyn: Dynamics, request: RunRequest, solver: Callable[[IntegrationProblem], SolverResult] | None = None
+) -> tuple[RunData, FunctionError | None]:
     """Return a run's data, and the error of the torque or event function that ended it.
 
-    Errors are those of `mbkit.simulate`.
+    The solver is by default that of the method. Errors are those of `mbkit.simulate`.
     """
     chosen, model = method_of(request.method), dyn.model
     q, v = model.check_q(request.q0, "q0"), model.check_v(request.v0, "v0")
@@ -114,7 +116,7 @@ def integrate(dyn: Dynamics, request: RunRequest) -> tuple[RunData, FunctionErro
             # No step does.
             read.sample(0, start, q, v, None if batch is None else np.arange(batch))
         applied = read.applied(jumps)
-        outcome = _outcome(problem, chosen)
+        outcome = _outcome(problem, chosen) if solver is None else solver(problem)
     seconds = time.perf_counter() - started
     outcome = along_constraints(dyn, outcome)
     settings = RunSettings(start, q.copy(), v.copy(), setting, outcome.doubts)
@@ -126,18 +128,8 @@ def integrate(dyn: Dynamics, request: RunRequest) -> tuple[RunData, FunctionErro
         work = work // min(batch or 1, _SIDE_BY_SIDE) if compiled else work * _IN_PYTHON
         driven = applied is not None or model.driven_by_forces
         doubts += tuple(diagnostics(dyn, chosen, setting, states, driven=driven, steps=outcome.steps, work=work))
-    stats = Stats(
-        steps=outcome.steps,
-        evaluations=outcome.evaluations,
-        seconds=seconds,
-        ended=outcome.ended,
-        reached=float(outcome.reached) if outcome.reached.ndim == 0 else tuple(outcome.reached.tolist()),
-        message=outcome.message + ("" if outcome.last is None else massless_joints(dyn, outcome.last)),
-        rejected=outcome.rejected,
-        jacobians=outcome.jacobians,
-        chosen=outcome.chosen,
-        doubts=doubts,
-    )
+    message = outcome.message + ("" if outcome.last is None else massless_joints(dyn, outcome.last))
+    stats = outcome.stats(seconds=seconds, message=message, doubts=doubts)
     kept = outcome.t, outcome.q, outcome.v
     data = RunData(*kept, model, chosen.name, dyn.engine, stats, dyn, outcome.events, applied, settings, acting)
     return data, outcome.error

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields
+from typing import Any, Literal
 
 from mbkit._check import Array
 from mbkit.errors import FunctionError
@@ -41,11 +41,11 @@ class Stats:
         Signs that a finished run is wrong, each with its measured reason and a remedy.
     """
 
-    steps: int
-    evaluations: int
-    seconds: float
-    ended: Ended
-    reached: float | tuple[float, ...]
+    steps: int = 0
+    evaluations: int = 0
+    seconds: float = 0.0
+    ended: Ended = "finished"
+    reached: float | tuple[float, ...] = 0.0
     message: str = ""
     rejected: int = 0
     jacobians: int = 0
@@ -63,9 +63,9 @@ class Stats:
         return f"{self.steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {end}{chosen}"
 
 
-@dataclass(frozen=True)
-class SolverResult:
-    """Kept states and the figures of a run; `reached` has shape () or (N,).
+@dataclass(frozen=True, kw_only=True)
+class SolverResult(Stats):
+    """Kept states of a run, with its cost and end.
 
     `last` is the last good configuration of the first trajectory that could not go on, where the method reports it;
     `error` is that of a torque or event function.
@@ -74,15 +74,10 @@ class SolverResult:
     t: Array
     q: Array
     v: Array
-    steps: int
-    evaluations: int
-    ended: Ended
-    reached: Array
-    message: str
-    rejected: int = 0
-    jacobians: int = 0
     events: tuple[Hit, ...] = ()
     error: FunctionError | None = None
-    chosen: str = ""
-    doubts: tuple[str, ...] = ()
     last: Array | None = None
+
+    def stats(self, **more: Any) -> Stats:
+        """Return the cost and the end alone, with what else is known of them."""
+        return Stats(**{x.name: getattr(self, x.name) for x in fields(Stats)} | more)

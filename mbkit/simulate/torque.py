@@ -184,6 +184,9 @@ class TorqueCallback:
         try:
             # Copies: the function may write into them.
             value = self.function(t, q.copy(), v.copy())
+        except TorqueError:
+            # Of a function within this one.
+            raise
         except Exception as error:
             raise self.failure(error, t, member) from error
         return self.checked(value, t, member)

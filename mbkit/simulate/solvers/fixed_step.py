@@ -78,7 +78,7 @@ class GridRecord:
         # Read-only, so that nobody needs a copy.
         q.setflags(write=False)
         v.setflags(write=False)
-        reached = grid.times_of(steps)
+        reached = grid.times_of(steps).tolist()
         return SolverResult(
             t=grid.times_of(kept[:rows]),
             q=q[0] if single else q,
@@ -86,7 +86,7 @@ class GridRecord:
             steps=int(steps.sum()),
             evaluations=evaluations,
             ended="function_failed" if error is not None else "diverged" if message else "finished",
-            reached=np.asarray(reached[0] if single else reached),
+            reached=reached[0] if single else tuple(reached),
             message=message,
             jacobians=jacobians,
             error=error,

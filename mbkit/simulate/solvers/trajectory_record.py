@@ -15,7 +15,7 @@ from mbkit.model.integration_space import Space
 from mbkit.model.manifold import unit_quaternions
 from mbkit.simulate.events import Hit, State, Watch
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.result import Ended, SolverResult
+from mbkit.simulate.result import Ended, SolverResult, Stats
 from mbkit.simulate.singular_poses import SingularPoses, describe_poses
 from mbkit.simulate.solvers.vector_field import DIVERGED, are_bounded
 from mbkit.simulate.time_grid import Indices
@@ -126,18 +126,17 @@ class TrajectoryRecord:
         if self.poses is not None:
             self.poses.saw_all(accepted.t[1 : steps + 1], accepted.q[1 : steps + 1])
         if hit is not None:
-            self._stop_at(hit)
+            self.stop_at(hit)
         elif lost:
             self.stop(diverged())
         return hit is None and not lost
 
-    def add(self, run: SolverResult, events: Sequence[Hit]) -> None:
-        """Add the cost of a part that was a run of its own, and its events; not its states."""
+    def add(self, run: Stats, begin: float = 0.0) -> None:
+        """Add the cost of a part that was a run of its own and began at a time, s."""
         for name in ("steps", "rejected", "evaluations", "jacobians"):
             setattr(self, name, getattr(self, name) + getattr(run, name))
-        self.reached, self.last, self.chosen = float(run.reached), run.last, run.chosen
-        self.doubts += [x for x in run.doubts if x not in self.doubts]
-        self.events += events
+        assert isinstance(run.reached, float)
+        self.reached, self.chosen = begin + run.reached, run.chosen
 
     def keep(self, t: Array, q: Array, v: Array) -> None:
         """Keep states, (n,), (n, nq) and (n, nv), in mbkit's velocities."""
@@ -226,7 +225,8 @@ class TrajectoryRecord:
         """End early, after `reached`."""
         self.ended, self.message = reason.ended, f"{reason} after t = {self.reached:.6g} s"
 
-    def _stop_at(self, hit: Hit) -> None:
+    def stop_at(self, hit: Hit) -> None:
+        """End at an event, whose state is the last one."""
         # The state of one of a batch is with the event, off the common times.
         self.ended, self.message = "event", f"stopped by {hit.name} at t = {hit.t:.6g} s"
         if hit.member is None and not (self._kept and self._kept[-1][0][-1] == hit.t):
@@ -289,16 +289,15 @@ def assemble_result(
     states = [record.states for record in records]
     if batch is None:
         t, q, v = states[0]
-        reached = np.asarray(records[0].reached)
     else:
         assert problem.save is not None
         # A batch of none has all its times.
         count = max((len(t) for t, _, _ in states), default=0 if batch else len(problem.save))
-        t, reached = problem.save[:count], np.full(batch, problem.start)
-        reached[: len(records)] = [record.reached for record in records]
+        t = problem.save[:count]
         q, v = (np.full((batch, count, n), np.nan) for n in (model.nq, model.nv))
         for i, (own, *state) in enumerate(states):
             q[i, : len(own)], v[i, : len(own)] = state
+    reached = [float(record.reached) for record in records] + [problem.start] * (len(problem.q) - len(records))
     ended, message = _end(records, batch)
     poses = describe_poses({i: record.poses for i, record in enumerate(records) if record.poses}, batch)
     return SolverResult(
@@ -308,7 +307,7 @@ def assemble_result(
         steps=sum(record.steps for record in records),
         evaluations=evaluations + sum(record.evaluations for record in records),
         ended=ended,
-        reached=reached,
+        reached=reached[0] if batch is None else tuple(reached),
         message=message,
         rejected=sum(record.rejected for record in records),
         jacobians=jacobians + sum(record.jacobians for record in records),

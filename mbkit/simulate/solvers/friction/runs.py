@@ -115,7 +115,9 @@ def _adaptive(run: _Member) -> None:
         events = (*problem.events, Followed(end, _END, parts=2 if timed and own.still.any() else 1, noise=noise))
         result = run.solve(own, k, start=t, duration=problem.end - t, save=save, events=events)
         phase_ended = bool(result.events) and result.events[-1].name == _END and result.ended == "event"
-        record.add(result, [replace(x, member=run.member) for x in result.events if x.name != _END])
+        record.add(result)
+        record.last, record.doubts = result.last, [*record.doubts, *result.doubts]
+        record.events += [replace(x, member=run.member) for x in result.events if x.name != _END]
         _keep(record, result, rows, t, at_end=not phase_ended)
         if not phase_ended:
             record.ended, record.message, record.error = result.ended, result.message, result.error
