@@ -37,7 +37,6 @@ PATHS: dict[str, tuple[str, ...]] = {
     "C": ("c",),
     "rk4": ("runs",),
     "implicit_midpoint": ("runs", "symplectic runs"),
-    "cvodes": ("runs without phases",),
     "pinocchio: accelerations": ("pinocchio",),
     "lagrangian: accelerations": (),
     "oracle: accelerations": ("derivation",),

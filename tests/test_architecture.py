@@ -44,8 +44,6 @@ METHOD_NAMES = (
     "methods/",
     # Which methods studies run on an engine, and an engine's own names of its integrators.
     "engines/",
-    # The integrator's name in CasADi.
-    "simulate/solvers/cvodes.py",
     # The closed form of a method's error on a case, as for joint types.
     "studies/stress/cases/",
 )

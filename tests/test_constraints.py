@@ -146,7 +146,6 @@ def test_every_method_stays_on_the_constraints(rod, method):
         "moreau": 0.1,
         "implicit_midpoint": 1e-3,
         "bdf": 1e-5,
-        "cvodes": 1e-5,
         "lsoda": 1e-5,
     }.get(method, 1e-6)
 

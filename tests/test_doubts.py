@@ -319,7 +319,7 @@ def test_digits_that_are_not_lost_are_not_doubted():
 
 @pytest.mark.thorough
 def test_errors_that_add_up_over_many_steps_are_told():
-    """As of a box that tumbles for 300 flips, of which cvodes loses a hundredth at rtol = 1e-8."""
+    """As of a box that tumbles for 300 flips, of which a multistep method loses a hundredth at rtol = 1e-8."""
     told = doubts(hinge(1e6), "radau", [0.1], duration=1.0, rtol=1e-4, save=[0.0, 1.0])[1]
     assert any("errors of" in x and "add up" in x for x in told)
     assert not doubts(hinge(1e2), "radau", [0.1], duration=1.0, rtol=1e-8, save=[0.0, 1.0])[1]

@@ -556,6 +556,7 @@ BELOW |= {
     "embedded": "paper",
     "remote runs": "sent",
     "remote runs of joints": "sent",
+    "runs without phases": "mujoco runs",
 }
 
 

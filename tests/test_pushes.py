@@ -154,7 +154,6 @@ ERRORS = {
     "implicit_midpoint": 1e-3,
     "rk4": 1e-8,
     "gauss4": 1e-8,
-    "cvodes": 1e-5,
     "bdf": 1e-5,
 }
 

@@ -314,7 +314,6 @@ def test_native_batches_torques_and_implicit_methods() -> None:
         ("pinocchio", "mujoco_rk4", r"not on the pinocchio engine; use mbkit.dynamics\(model, 'mu"),
         ("mujoco", "implicit_midpoint", "not on the mujoco engine, which .*momenta nor ∂T/∂q.*; use mbkit.dyn"),
         ("mujoco", "taylor", "not on the mujoco engine, which .*no expressions.*; use mbkit.dyn"),
-        ("mujoco", "cvodes", "not on the mujoco engine, which .*no expressions.*; use mbkit.dyn"),
     ],
 )
 def test_a_method_that_only_some_engines_have_says_why(engine: str, method: str, words: str) -> None:

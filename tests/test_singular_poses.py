@@ -30,9 +30,8 @@ METHODS = [
     ("taylor", {"rtol": 1e-13}, 1e-11),
     ("bdf", {"rtol": 1e-9}, 1e-6),
     ("lsoda", {"rtol": 1e-9}, 1e-6),
-    ("cvodes", {"rtol": 1e-9}, 1e-6),
 ]
-_NEEDS_OWN = ("rodas5", "radau", "taylor", "bdf", "lsoda", "cvodes")
+_NEEDS_OWN = ("rodas5", "radau", "taylor", "bdf", "lsoda")
 #: One of each kind of method, fixed and adaptive, that runs on another engine.
 ELSEWHERE = [(*m, "pinocchio") for m in METHODS if m[0] in ("rk4", "rk853", "dop853")]
 #: Every method on the own engine, and those.
@@ -382,10 +381,10 @@ def test_a_series_of_any_tolerance_passes_the_poses_of_parallel_four_bars(n, rto
 
 
 @pytest.mark.thorough(every=3)
-@pytest.mark.parametrize("method", ["cvodes", "bdf", "lsoda"])
+@pytest.mark.parametrize("method", ["bdf", "lsoda"])
 @pytest.mark.parametrize("start", [(0.153, -2.79), (-0.895, -4.99)])
 def test_a_method_of_several_steps_passes_a_pose_between_saved_times(method, start) -> None:
-    """Its own steps land on any branch there: cvodes was off by 3 rad without a word."""
+    """Its own steps land on any branch there: a solution may be off by 3 rad without a word."""
     dyn = row(1)
     run, told = simulated(dyn, *parallel(dyn, *start), 1.0, method, rtol=1e-8, save=[0.0, 1.0])
     assert run.stats.finished

@@ -1,10 +1,9 @@
 # Torques have the signature they are called with.
 # ruff: noqa: ARG001, ARG002, ARG005
-"""Radau, BDF, LSODA and CVODES: the exact Jacobian, stiff scenes, and runs that go wrong."""
+"""Radau, BDF and LSODA: the exact Jacobian, stiff scenes, and runs that go wrong."""
 
 from __future__ import annotations
 
-import signal
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 import mbkit as mb
 from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
-from mbkit.errors import InputError, MbkitWarning, NumericalError, TorqueError, UnsupportedError
+from mbkit.errors import MbkitWarning, NumericalError, TorqueError
 from mbkit.model import Model, ModelBuilder
 from mbkit.simulate import simulate
 from mbkit.simulate.diagnostics.stiffness import RateJacobian
@@ -24,9 +23,8 @@ from validation import closed_forms
 
 IMPLICIT = ("radau", "bdf", "lsoda")
 SCIPY = ("dop853", *IMPLICIT)
-STIFF = (*IMPLICIT, "cvodes")
 # A tolerance that gives 1e-6 on a scene of a few swings; multistep methods exceed theirs the most.
-ENOUGH = {"dop853": 1e-9, "radau": 1e-8, "bdf": 1e-11, "lsoda": 1e-10, "cvodes": 1e-11}
+ENOUGH = {"dop853": 1e-9, "radau": 1e-8, "bdf": 1e-11, "lsoda": 1e-10}
 
 
 def elastic_pendulum(stiffness: float, damping: float) -> Model:
@@ -132,7 +130,7 @@ def test_where_there_is_no_jacobian_the_last_one_stays() -> None:
 
 
 @pytest.mark.thorough("radau", "bdf")
-@pytest.mark.parametrize("method", STIFF)
+@pytest.mark.parametrize("method", IMPLICIT)
 def test_tolerance_rules_the_error(method: str) -> None:
     dyn = dynamics(catalog.pendulum(), "lagrangian")
     t = np.linspace(0, 3, 7)
@@ -158,7 +156,7 @@ def every_kind() -> tuple[Any, ...]:
 
 
 @pytest.mark.thorough("radau")
-@pytest.mark.parametrize("method", STIFF)
+@pytest.mark.parametrize("method", IMPLICIT)
 def test_every_joint_kind_moves_as_with_dop853(method: str, every_kind: tuple[Any, ...]) -> None:
     model, given, save, truth = every_kind
     run = simulate(*given, method, rtol=ENOUGH[method], save=save)
@@ -209,7 +207,7 @@ def test_stiff_scenes_are_reached_with_few_evaluations(scene: Any, stiffness: fl
     truth = simulate(dyn, *start, "radau", rtol=1e-11, save=[0, 1.0])
     # The reference is held by a method of another family.
     assert apart(model, simulate(dyn, *start, "lsoda", rtol=1e-12, save=[0, 1.0]), truth) < 1e-9
-    for method, rtol in (("radau", 1e-7), ("bdf", 1e-8), ("lsoda", 1e-9), ("cvodes", 1e-8)):
+    for method, rtol in (("radau", 1e-7), ("bdf", 1e-8), ("lsoda", 1e-9)):
         run = simulate(dyn, *start, method, rtol=rtol, save=[0, 1.0])
         assert apart(model, run, truth) < 1e-6, method
         assert run.stats.evaluations < 1000, method
@@ -237,7 +235,7 @@ def test_a_stiff_linear_oscillator_follows_its_closed_form() -> None:
     slow, fast = -k / (c / 2 + root), -(c / 2 + root)
     t = np.linspace(0, 5e-3, 11)
     exact = (fast * np.exp(slow * t) - slow * np.exp(fast * t)) / (fast - slow)
-    for method in STIFF:
+    for method in IMPLICIT:
         run = simulate(dyn, [1.0], [0.0], 5e-3, method, rtol=ENOUGH[method], save=t)
         assert run.q[:, 0] == pytest.approx(exact, abs=1e-6), method
         assert run.stats.evaluations < 5000, method
@@ -247,7 +245,7 @@ def test_a_stiff_linear_oscillator_follows_its_closed_form() -> None:
 
 
 @pytest.mark.thorough("radau", "bdf")
-@pytest.mark.parametrize("method", STIFF)
+@pytest.mark.parametrize("method", IMPLICIT)
 def test_held_torques_start_the_method_anew(method: str) -> None:
     model = catalog.double_pendulum()
     dyn = dynamics(model, "lagrangian")
@@ -269,7 +267,7 @@ def test_held_torques_start_the_method_anew(method: str) -> None:
 
 
 @pytest.mark.thorough("radau", "bdf")
-@pytest.mark.parametrize("method", STIFF)
+@pytest.mark.parametrize("method", IMPLICIT)
 def test_parameters_of_each_of_a_batch(method: str) -> None:
     dyn = dynamics(catalog.pendulum(length=mb.Parameter("l", 1.0)), "lagrangian")
     times, lengths = [0.0, 1.0], [0.5, 2.0]
@@ -281,7 +279,7 @@ def test_parameters_of_each_of_a_batch(method: str) -> None:
     assert one.q == pytest.approx(run.q[1], abs=1e-12)
 
 
-@pytest.mark.parametrize("method", STIFF)
+@pytest.mark.parametrize("method", IMPLICIT)
 def test_the_same_inputs_give_the_same_bits_and_a_batch_may_be_empty(method: str) -> None:
     model = catalog.heavy_top()
     dyn, save = dynamics(model, "lagrangian"), np.linspace(0, 0.2, 21)
@@ -325,7 +323,7 @@ def test_an_engine_that_fails_ends_the_run_close_to_there(method: str, capfd: py
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("method", STIFF)
+@pytest.mark.parametrize("method", IMPLICIT)
 def test_a_state_that_overflows_keeps_what_there_was(method: str, capfd: pytest.CaptureFixture[str]) -> None:
     box = catalog.free_body()
     dyn = dynamics(box, "lagrangian")
@@ -389,79 +387,3 @@ def test_an_interruption_gets_through(method: str) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         simulate(dynamics(catalog.pendulum()), [0.1], [0.0], 1.0, method, torque=interrupted)
-
-
-# CVODES
-
-
-def test_cvodes_tells_how_far_it_is_and_starts_over_seldom(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mbkit.simulate import progress
-
-    monkeypatch.setattr(progress, "_PERIOD", 0.0)
-    dyn = dynamics(catalog.pendulum(), "lagrangian")
-    told: list[float] = []
-    fine = simulate(dyn, [2.0], [0.0], 20.0, "cvodes", rtol=1e-12, save=np.linspace(0, 20, 501), progress=told.append)
-    assert len(told) > 3
-    assert told == sorted(told)
-    assert told[-1] == 1.0
-    coarse = simulate(dyn, [2.0], [0.0], 20.0, "cvodes", rtol=1e-12, save=[0, 20.0])
-    assert fine.stats.steps < 1.2 * coarse.stats.steps
-
-
-@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no interval timer on this system")
-def test_cvodes_can_be_interrupted_while_casadi_runs() -> None:
-    def interrupt(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGALRM, interrupt)
-    try:
-        signal.setitimer(signal.ITIMER_REAL, 0.3)
-        with pytest.raises(KeyboardInterrupt):
-            simulate(
-                dynamics(catalog.double_pendulum(), "lagrangian"), [2.0, 1.0], [0.0, 0.0], 1e5, "cvodes", save=[1e5]
-            )
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-
-
-def cart_without_mass() -> Model:
-    """Where the pole hangs down nothing resists the cart: the mass matrix is singular there."""
-    b = ModelBuilder("cart without mass")
-    b.add_body("cart")
-    b.add_body("pole", mass=1.0, com=(0, 0, -1.0))
-    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
-    b.add_joint("theta", "revolute", parent="cart", child="pole", axis=(0, -1, 0))
-    return b.build()
-
-
-def test_cvodes_keeps_all_that_was_reached(capfd: pytest.CaptureFixture[str]) -> None:
-    dyn = dynamics(cart_without_mass(), "lagrangian")
-    save = np.linspace(0, 2, 201)
-    # The bob falls freely, so θ = 0 is reached after √(2 (1 - cos 1) / g).
-    down = np.sqrt(2 * (1 - np.cos(1.0)) / 9.81)
-    with pytest.warns(MbkitWarning, match=r"cvodes stopped with a step below rounding .* after t = 0\.3 s") as heard:
-        run = simulate(dyn, [0.0, 1.0], [0.0, 0.0], 2.0, "cvodes", save=save)
-    assert len(heard) == 1
-    assert run.stats.ended == "step_too_small"
-    assert run.stats.reached == run.t[-1] == save[save < down][-1]
-    assert np.array_equal(run.t, save[save < down])
-    assert -np.cos(run.q[:, 1]) == pytest.approx(-np.cos(1.0) - 0.5 * 9.81 * run.t**2, abs=1e-6)
-    with pytest.warns(MbkitWarning, match="1 of 2 trajectories ended early"):
-        both = simulate(dyn, [[0.0, 1.0], [0.0, 3.0]], [0.0, 0.0], 0.4, "cvodes", save=save[:41])
-    assert np.isfinite(both.q[1]).all()
-    assert np.array_equal(np.isfinite(both.q[0, :, 0]), both.t < down)
-    assert capfd.readouterr() == ("", "")
-
-
-def test_what_cvodes_cannot_do_is_said() -> None:
-    model = catalog.pendulum()
-    dyn = dynamics(model, "lagrangian")
-    with pytest.raises(UnsupportedError, match=r"cvodes: .*mbkit.dynamics\(model, 'lagrangian'\)"):
-        simulate(dynamics(model), [0.1], [0.0], 1.0, "cvodes", save=[0, 1.0])
-    with pytest.raises(InputError, match="save: cvodes does not tell its own steps"):
-        simulate(dyn, [0.1], [0.0], 1.0, "cvodes")
-    with pytest.raises(UnsupportedError, match="cvodes: torque functions"):
-        simulate(dyn, [0.1], [0.0], 1.0, "cvodes", save=[0, 1.0], torque=lambda t, q, v: -v)
-    with pytest.raises(InputError, match="rtol: expected at least"):
-        simulate(dyn, [0.1], [0.0], 1.0, "cvodes", save=[0, 1.0], rtol=1e-16)

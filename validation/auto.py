@@ -54,7 +54,7 @@ VALUES = {
     "loaded_arm": (1e6, 1e9),
 }
 WAYS = {
-    "lagrangian": ("rk853", "rodas5", "cvodes", "implicit_midpoint", "taylor", "gauss6", "radau", "lsoda", "rk4"),
+    "lagrangian": ("rk853", "rodas5", "implicit_midpoint", "taylor", "gauss6", "radau", "lsoda", "rk4"),
     "pinocchio": ("rk853", "rodas5", "radau", "lsoda", "dop853", "gauss6", "bdf"),
 }
 #: Cases that ring: their velocities are differences over a tenth of a radian, all others' over 0.1 ms.

@@ -126,7 +126,7 @@ _OWN_ENGINES: Final = (
         derived=True,
         brief={"compile": False},
         shown=("rk853", "rk4"),
-        quick=("auto", "rk4", "implicit_midpoint", "rk853", "cvodes"),
+        quick=("auto", "rk4", "implicit_midpoint", "rk853", "rodas5"),
     ),
     _own(
         MUJOCO,

@@ -43,8 +43,6 @@ SERIES_METHOD: Final = "taylor"
 #: SciPy's, on any engine: for motions that are not stiff, and for stiff ones.
 SCIPY_METHOD: Final = "dop853"
 SCIPY_STIFF_METHOD: Final = "radau"
-#: SUNDIALS' multistep method for stiff systems.
-BDF_METHOD: Final = "cvodes"
 #: With a step, for dry friction at many joints.
 FRICTION_METHOD: Final = "moreau"
 #: The most accurate implicit one with a fixed step.
@@ -191,7 +189,6 @@ _ABOUT: Final = {
     SCIPY_STIFF_METHOD: "SciPy's Radau IIA, implicit (Hairer, Wanner 1996, IV.8)",
     "bdf": "SciPy's BDF, orders 1 to 5, implicit (Shampine, Reichelt 1997)",
     "lsoda": "ODEPACK's LSODA: Adams or BDF, whichever suits (Petzold 1983)",
-    BDF_METHOD: "SUNDIALS' CVODES through CasADi: BDF, orders 1 to 5 (Hindmarsh and others 2005)",
     "mujoco_euler": "MuJoCo's own semi-implicit Euler",
     "mujoco_rk4": "MuJoCo's own RK4",
     "newton_featherstone": "SolverFeatherstone of Newton, a semi-implicit Euler",
@@ -262,13 +259,6 @@ _SERIES: Final[dict[str, Any]] = {
     "callables": False,
     "lacks": "gives numbers and no expressions, which a series needs",
 }
-_EXPRESSIONS: Final[dict[str, Any]] = {
-    **_STIFF_OWN,
-    "engines": ("lagrangian",),
-    "events": False,
-    "callables": False,
-    "lacks": "gives numbers and no expressions, which it integrates",
-}
 
 METHODS: Final[dict[str, Method]] = {
     m.name: m
@@ -309,9 +299,6 @@ METHODS: Final[dict[str, Method]] = {
         _scipy(SCIPY_STIFF_METHOD, "Radau", 5, **_STIFF),
         _scipy("bdf", "BDF", None, multistep=True, **_STIFF),
         _scipy("lsoda", "LSODA", None, multistep=True, **_STIFF),
-        _adaptive(
-            BDF_METHOD, None, "cvodes:run_cvodes", scheme="cvodes", least=100 * _EPS, multistep=True, **_EXPRESSIONS
-        ),
         _mujoco("euler", SYMPLECTIC_EULER, EULER_METHOD),
         _mujoco("rk4", _RK4_STABILITY, DEFAULT_METHOD),
         _mujoco("implicit", IMPLICIT_IN_VELOCITY),

@@ -4,7 +4,7 @@ The equation of motion holds f̈ = 0 only, so that f and ḟ drift. One-step met
 iteration with the mass matrix as the weight; it moves a state by the step's own error, so that the order stays. Near a
 singular pose explicit methods project their stages too, since f̈ = 0 divides their errors by J's smallest singular
 value; other methods with a tolerance leave the way across it to rk853. A projection would spoil the history of
-multistep methods (BDF, LSODA, CVODES): only their kept states have it. An engine with soft constraints projects
+multistep methods (BDF, LSODA): only their kept states have it. An engine with soft constraints projects
 nothing: how far its states leave the constraints is part of its answer.
 """
 

@@ -61,8 +61,8 @@ def simulate(
         symplectic, on the own derivation; ``"mujoco_euler"``, ``"mujoco_rk4"``, ``"mujoco_implicit"``,
         ``"mujoco_implicitfast"`` and ``"mujoco_discrete"``, MuJoCo's own on its engine. With a tolerance: ``"rk853"``,
         fastest on the own derivation, and ``"dop853"``, ``"radau"``, ``"bdf"``, ``"lsoda"``, SciPy's, on any engine
-        (the last three are for stiff scenes); ``"taylor"``, heyoka's, and ``"cvodes"``, SUNDIALS', on the own
-        derivation; ``"taylor"`` on the oracle computes with 34 digits. `mbkit.simulate.METHODS` describes them.
+        (the last three are for stiff scenes); ``"taylor"``, heyoka's, on the own derivation, and on the oracle with
+        34 digits. `mbkit.simulate.METHODS` describes them.
     dt : float, optional
         Step of a method with a fixed step, s; 1e-3 by default. An adaptive method has none.
     rtol, atol : float, optional
@@ -75,7 +75,7 @@ def simulate(
         `mbkit.simulate.Policy` one of all states of a batch.
     save : int or (K,) array_like, optional
         Which states to keep: every n-th and the last, or those at these times (for a fixed step, multiples of it after
-        `t0`); by default all. An adaptive method takes times alone; a batch needs them, and so does ``"cvodes"``.
+        `t0`); by default all. An adaptive method takes times alone; a batch needs them, and so do Drake's.
         Steps of ``"dop853"`` and ``"radau"`` end on them; the others' do not depend on them.
     progress : bool or callable, optional
         True shows a bar when the run takes more than 2 s; a callable gets the fraction done.

@@ -103,7 +103,7 @@ def quiet_simulate(*args: object, **kwargs: object) -> Trajectory:
 def cpu_limit(seconds: float) -> Iterator[None]:
     """Raise `TooLongError` after so many seconds of processor time; only in the main thread, which gets signals.
 
-    Interrupts Python, and CasADi while CVODES runs. Other C++ code goes on until its process is ended.
+    Interrupts Python. C++ code goes on until its process is ended.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

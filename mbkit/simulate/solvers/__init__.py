@@ -1,1 +1,1 @@
-"""Solvers: fixed step, adaptive, automatic, and those of SciPy, heyoka, SUNDIALS, MuJoCo and Drake."""
+"""Solvers: fixed step, adaptive, automatic, and those of SciPy, heyoka, MuJoCo and Drake."""

@@ -21,7 +21,6 @@ from mbkit.errors import MbkitError, NumericalError
 from mbkit.methods.registry import (
     ADAPTIVE_METHOD,
     AUTOMATIC_METHOD,
-    BDF_METHOD,
     GAUSS_METHOD,
     METHODS,
     SCIPY_METHOD,
@@ -55,7 +54,6 @@ _WORTHLESS: Final = 1e-3
 _RUNS: Final[tuple[tuple[str, str, float], ...]] = (
     (DERIVED, ADAPTIVE_METHOD, 1e-14),
     *((engine, SCIPY_METHOD, 1e-13) for engine in INDEPENDENT),
-    (DERIVED, BDF_METHOD, 1e-12),
     (DERIVED, GAUSS_METHOD, 1000),
     (PINOCCHIO, SCIPY_STIFF_METHOD, 1e-11),
     (DERIVED, GAUSS_METHOD, 4000),
