@@ -44,8 +44,8 @@ from mbkit.studies.compare.study import Judge
 from mbkit.studies.compare.terms import TERMS, states
 from mbkit.studies.importers.loops import Written, between_joints
 from mbkit.studies.importers.study import stages
+from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.case import Case as StressCase
-from mbkit.studies.stress.case import Problem
 from mbkit.studies.stress.measure import Limits, measure, prepare
 from mbkit.testing import assert_same_dynamics
 from tests import kind_examples

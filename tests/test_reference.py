@@ -129,8 +129,8 @@ def test_each_pair_knows_how_good_it_is() -> None:
     model = catalog.double_pendulum()
     q, v = [2.0, 1.0], [0.0, 0.5]
     motion = checked_motion(model, q, v, 3.0, TIMES)
-    best = taylor_pair(motion, 113, ample())
-    for known in (taylor_pair(motion, 64, ample()), two_engines(motion, ample())):
+    best = taylor_pair(motion, ample(), 113)
+    for known in (taylor_pair(motion, ample(), 64), two_engines(motion, ample())):
         error = np.abs((known.q[0] - best.q[0]) + (known.q[1] - best.q[1])).max(axis=1)
         allowed = module._SAFETY * np.maximum.accumulate(known.apart[0]) + 2 * EPS * (known.how.count(" on ") == 2)
         assert (error <= allowed + 1e-19).all()

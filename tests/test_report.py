@@ -26,8 +26,9 @@ from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS
 from mbkit.studies.compare.result import Comparison, Finding, Omission, RolloutRow, Row
 from mbkit.studies.compare.terms import CONSTRAINT_TERMS, TERMS
+from mbkit.studies.measurement import Measurement
 from mbkit.studies.results import Refusal
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
+from mbkit.studies.work_precision.curve import Curve
 from mbkit.studies.work_precision.result import WorkPrecision
 
 NAN = math.nan
@@ -65,8 +66,9 @@ def rollout(error: float, tolerance: float, *, passed: bool = True, note: str = 
     return RolloutRow("rk4", "pinocchio", "mujoco_rk4", 1e-3, 1.0, error, 5.0, tolerance, *ends)
 
 
-def point(value: float, error: float, seconds: float, *, energy: float = 1e-9, note: str = "") -> PrecisionPoint:
-    return PrecisionPoint("dt", value, error, energy, seconds, 1e-4, 100, 400, 5, note)
+def point(value: float, error: float, seconds: float, *, energy: float = 1e-9, note: str = "") -> Measurement:
+    cost = {"evaluations": 400, "spread": 1e-4, "repeats": 5}
+    return Measurement(value, "finished", error, energy, seconds, 100, note=note, setting="dt", **cost)
 
 
 def curve(engine: str, method: str, seconds: float, order: float, expected: float = 4.0, first: float = 0.5) -> Curve:

@@ -27,7 +27,8 @@ from mbkit.cli import cli
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.report.stress_view import headline
 from mbkit.studies import InterruptedSweepError, StressResult
-from mbkit.studies.stress import Case, CaseResult, Measurement, Row, stress
+from mbkit.studies.stress import Case, CaseResult, Measurement, Problem, Row, stress
+from mbkit.studies.stress.case import problem_of
 from mbkit.studies.stress.measure import (
     Limits,
     Prepared,
@@ -354,6 +355,43 @@ def test_two_runs_that_agree_are_a_truth_and_where_none_do_there_is_none():
     truth, told = reference_motion(own.sprung(1e12), times, 1e-7, 0.5)
     assert truth is None
     assert told.startswith("no truth: ")
+
+
+def test_a_stiff_motion_is_known_by_methods_for_it():
+    """x of ẍ + c ẋ + k x = 0 from rest, whose rates of 1 and 2e7 per second no explicit method can follow."""
+    k = c = 2e7
+    b = mb.ModelBuilder("cart", gravity=(0, 0, 0))
+    b.add_body("cart", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0), stiffness=k, damping=c)
+    times = np.linspace(0, 0.5, 11)
+    problem = Problem(b.build(), np.ones(1), np.zeros(1), duration=0.5)
+    truth, told = reference_motion(problem, times, 1e-7, 10.0)
+    fast = (c + math.sqrt(c * c - 4 * k)) / 2
+    slow = k / fast
+    exact = (fast * np.exp(-slow * times) - slow * np.exp(-fast * times)) / (fast - slow)
+    assert np.abs(truth.q[:, 0] - exact).max() <= truth.floor < 1e-10
+    assert told.startswith("rodas5 on lagrangian and radau on pinocchio")
+
+
+@pytest.mark.parametrize("tau", [[2.0], lambda _t, _q, _v: [2.0]], ids=["constant", "function"])
+def test_a_force_of_the_problem_acts_along_its_runs(tau):
+    b = mb.ModelBuilder("cart", gravity=(0, 0, 0))
+    b.add_body("cart", mass=1.0)
+    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0))
+
+    def pushed(value):
+        return Problem(b.build(), np.zeros(1), np.zeros(1), tau, duration=value, exact=lambda t: t[:, None] ** 2)
+
+    case = replace(own.GLIDING, name="pushed", make=pushed, measure="motion")
+    known = prepare(case, 1.0, 1e-6, 1.0)
+    cell = measure(case, 1.0, "pinocchio", "rk4", Limits(5.0, 1e-2, 1e-8), known.truth)
+    assert cell.error < 1e-14
+    # Its work is not known well enough.
+    assert math.isnan(cell.energy)
+    searched, _ = reference_motion(replace(pushed(1.0), exact=None), known.truth.times, 1e-7, 10.0)
+    assert np.abs(searched.q - known.truth.q).max() < 1e-12
+    with pytest.raises(InputError, match="tau"):
+        problem_of(replace(case, make=lambda value: replace(pushed(value), tau=np.ones(2))), 1.0)
 
 
 def test_conditions_beyond_double_are_known():

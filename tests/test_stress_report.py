@@ -15,8 +15,9 @@ from mbkit.report import stress_view, terminal
 from mbkit.report.figures import stable_steps
 from mbkit.report.page import render
 from mbkit.report.stress_view import against_theory, avoid, content, map_cells, methods, rules, steps, view
+from mbkit.studies.measurement import Measurement
 from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade
-from mbkit.studies.stress.measurements import CaseResult, Measurement, Row, best, lines, name_of, place, recommended
+from mbkit.studies.stress.measurements import CaseResult, Row, best, lines, name_of, place, recommended
 from mbkit.studies.stress.result import StressResult
 
 NAN, INF = math.nan, math.inf

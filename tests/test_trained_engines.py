@@ -23,7 +23,8 @@ from mbkit.engines.remote.served import serve
 from mbkit.errors import EngineProcessError, InputError, UnknownNameError, UnsupportedError
 from mbkit.studies._targets import engine_names
 from mbkit.studies.compare.errors import digits_of, epsilon
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
+from mbkit.studies.measurement import Measurement
+from mbkit.studies.work_precision.curve import Curve
 from tests.random_trees import random_tree
 from tests.test_engine_versions import environments, installer, present  # noqa: F401  # fixtures
 
@@ -112,7 +113,10 @@ def test_digits_and_eps_of_a_significand():
 
 
 def curve(*errors):
-    points = [PrecisionPoint("dt", 10.0**-k, e, np.nan, 1.0, np.nan, 1, 1, 1) for k, e in enumerate(errors, start=1)]
+    points = [
+        Measurement(10.0**-k, error=e, seconds=1.0, steps=1, setting="dt", evaluations=1, repeats=1)
+        for k, e in enumerate(errors, start=1)
+    ]
     return Curve("e", "m", tuple(points), np.nan, 0, 1.0, 0.0)
 
 

@@ -27,9 +27,10 @@ from mbkit._escape import csv_text
 from mbkit.errors import InputError, MbkitWarning, UnknownNameError
 from mbkit.simulate import METHODS
 from mbkit.studies import InterruptedSweepError, Reference, work_precision
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
+from mbkit.studies.measurement import Measurement
+from mbkit.studies.work_precision.curve import Curve, observed_order
 from mbkit.studies.work_precision.result import WorkPrecision
-from mbkit.studies.work_precision.sweep import Problem, _without_heyoka_cache, first_run, plans, repetitions
+from mbkit.studies.work_precision.sweep import CurveMeasurement, _without_heyoka_cache, first_run, plans, repetitions
 from tests.scenes import chain, hinge, slider
 
 FIXED = [m.name for m in METHODS.values() if m.kind != "adaptive"]
@@ -206,15 +207,16 @@ def compiled(monkeypatch):
 
 
 def test_what_is_compiled_once_is_no_run_time_and_is_compiled_again_each_time(monkeypatch, compiled):
-    solve, in_runs = Problem.solve, []
+    solve, in_runs = CurveMeasurement._solve, []
 
-    def counted(*args):
+    def counted(self, dyn, value, save, *args):
         before = len(compiled)
-        run = solve(*args)
-        in_runs.append(len(compiled) - before)
+        run = solve(self, dyn, value, save, *args)
+        # The first steps are of no run.
+        in_runs.extend([len(compiled) - before] if save is self.truth.times else [])
         return run
 
-    monkeypatch.setattr(Problem, "solve", counted)
+    monkeypatch.setattr(CurveMeasurement, "_solve", counted)
     for _ in range(2):
         compiled.clear()
         (curve,) = study(["lagrangian"], ["rk4"], steps=[0.05]).curves
@@ -614,7 +616,7 @@ def results(draw):
     curves = []
     for k in range(draw(st.integers(0, 4))):
         points = tuple(
-            PrecisionPoint("dt", 0.1 / (i + 1), *draw(THREE), math.nan, i, 4 * i, 1, "é\n,")
+            Measurement(0.1 / (i + 1), "finished", *draw(THREE), i, (), "é\n,", 0.0, "dt", 4 * i, math.nan, 1)
             for i in range(draw(st.integers(0, 5)))
         )
         curves.append(Curve("mujoco", f"mujoco_{k}", points, draw(NUMBERS), 3, 4.0, draw(NUMBERS)))

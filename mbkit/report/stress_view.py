@@ -15,11 +15,12 @@ from mbkit.report.document import Bullet, Column, Document, Items, Section, Span
 from mbkit.report.figures import stable_steps
 from mbkit.report.formatting import choice, error_text, time_text
 from mbkit.simulate.plotting.style import engine_index
+from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.results import counted
 from mbkit.studies.stress import measurements as stress
 from mbkit.studies.stress.case import Family
 from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
-from mbkit.studies.stress.measurements import CaseResult, Line, Measurement, Outcome, Row, name_of, place
+from mbkit.studies.stress.measurements import CaseResult, Line, Row, name_of, place
 from mbkit.studies.stress.result import StressResult
 
 #: Outcomes in words that follow "then".

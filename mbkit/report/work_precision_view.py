@@ -12,8 +12,9 @@ from mbkit._check import by_key
 from mbkit.report import document as doc
 from mbkit.report.figures import PAGE, image, page_style, svg
 from mbkit.report.formatting import brief, choice, count_text, error_text, model_facts, time_text
+from mbkit.studies.measurement import Measurement
 from mbkit.studies.results import Refusal
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
+from mbkit.studies.work_precision.curve import Curve
 from mbkit.studies.work_precision.figure import USEFUL, figure
 from mbkit.studies.work_precision.result import WorkPrecision
 
@@ -28,8 +29,8 @@ class Level:
 
     error: float
     curve: Curve
-    point: PrecisionPoint
-    next: tuple[Curve, PrecisionPoint] | None
+    point: Measurement
+    next: tuple[Curve, Measurement] | None
 
     @property
     def factor(self) -> float:
@@ -91,7 +92,7 @@ class CurveLine(NamedTuple):
     """One engine and method in one line."""
 
     curve: Curve
-    best: PrecisionPoint | None  # the fastest of those with the least error that the reference can resolve
+    best: Measurement | None  # the fastest of those with the least error that the reference can resolve
     off: bool  # the observed order is not the method's own
     on_front: bool
 
@@ -238,7 +239,7 @@ def sections(result: WorkPrecision, whole: bool, on: doc.On = "both") -> list[do
     ]
 
 
-def setting_text(point: PrecisionPoint) -> str:
+def setting_text(point: Measurement) -> str:
     """Return the step with its unit, or the tolerance."""
     return f"dt {time_text(point.value)}" if point.setting == "dt" else f"rtol {point.value:.0e}"
 

@@ -6,7 +6,7 @@ from mbkit.studies.compare.result import Comparison, Finding, Omission, RolloutR
 from mbkit.studies.compare.study import compare
 from mbkit.studies.results import Refusal
 from mbkit.studies.stress.result import StressResult
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint
+from mbkit.studies.work_precision.curve import Curve
 from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.study import work_precision
@@ -17,7 +17,6 @@ __all__ = [
     "Finding",
     "InterruptedSweepError",
     "Omission",
-    "PrecisionPoint",
     "Reference",
     "Refusal",
     "RolloutRow",

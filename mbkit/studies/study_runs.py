@@ -1,4 +1,4 @@
-"""Runs of studies: their start, time limit and energy error, and the warnings of the library."""
+"""Runs of studies: their start and time limit, and the warnings of the library."""
 
 from __future__ import annotations
 
@@ -15,9 +15,7 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.engines import Dynamics
 from mbkit.engines.consistent.random_states import states_of
-from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import InputError, MbkitError, MbkitWarning
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
@@ -135,35 +133,3 @@ def heard_warnings() -> Iterator[list[str]]:
     with warnings.catch_warnings(record=True, action="always") as caught:
         yield heard
     heard += dict.fromkeys(" ".join(str(w.message).split()) for w in caught if issubclass(w.category, MbkitWarning))
-
-
-def energy_drift(dyn: Dynamics, run: Trajectory) -> tuple[float, float, float] | None:
-    """Return the largest energy change, the larger of T and the change of V, and the largest of T and V.
-
-    None with dampers, forces without a potential or explicit time, whose work is not known.
-    By the oracle, the change has 34 digits.
-    """
-    model, q, v = dyn.model, run.q, run.v
-    if model.loses_energy or model.constraints_do_work or model.time_parameter is not None:
-        return None
-
-    def energy(name: str, *state: Array) -> tuple[Array, Array]:
-        if isinstance(dyn, OracleDynamics):
-            return dyn.extended(name, *state)
-        high = np.asarray(getattr(dyn, name)(*state))
-        return high, np.zeros_like(high)
-
-    V, T0 = energy("potential_energy", q), None
-    if not model.has_bodies:
-        # Jacobi's integral T2 - T0 + V, which is the energy where there is no T0.
-        T0 = energy("kinetic_energy", q, 0 * v)
-        V = V[0] - T0[0], V[1] - T0[1]
-    if isinstance(dyn, OracleDynamics):
-        T = energy("kinetic_energy", q, v)
-        T = T if T0 is None else (T[0] - T0[0], T[1] - T0[1])
-    else:
-        # By the mass matrix, which no known defect of an engine touches.
-        T = 0.5 * np.einsum("ni,nij,nj->n", v, dyn.mass_matrix(q), v), np.zeros(len(v))
-    gained, change = ((high - high[0]) + (low - low[0]) for high, low in (T, V))
-    size = max(float(T[0].max()), float(np.ptp(V[0])))
-    return float(np.abs(gained + change).max()), size, float(np.abs([T[0], V[0]]).max())

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -11,69 +11,12 @@ import numpy as np
 from mbkit._check import Array, real
 from mbkit.errors import InputError
 from mbkit.model import Model
+from mbkit.studies.measurement import Problem
 
 #: In the order of a study: stiff ones first, those that take longest last.
 Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "friction", "large", "step", "long"]
 #: The error of q along a run, of the energy along a run, or of terms at states.
 Measure = Literal["motion", "energy", "terms"]
-
-
-@dataclass(frozen=True)
-class Truth:
-    """The motion that a run is measured against.
-
-    Attributes
-    ----------
-    times : (K,) array
-        From 0, s.
-    q : (K, nq) array
-    floor : float
-        Its error, rad or m.
-    how : str
-        The closed form with its source, or the runs that agree to the floor.
-    """
-
-    times: Array
-    q: Array
-    floor: float
-    how: str
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One value of a case.
-
-    Attributes
-    ----------
-    model : Model
-    q, v : (nq,) and (nv,) arrays, or (N, nq) and (N, nv) for terms
-        The start of a run, or the states at which terms are measured.
-    tau : (N, nv) array or None
-        Generalized force of the terms' forward dynamics.
-    duration : float
-        Of a run, s; 0 for terms.
-    exact, floor, source : callable or None, float, and str
-        The closed form of the motion, from times (K,) to q (K, nq), its error, rad or m, and where it is from.
-    scale : float
-        Size of the motion, by which an error of q is divided, rad or m; of terms the condition of the rows, by which
-        one of accelerations is.
-    dt : float or None
-        Step of fixed-step methods, s, where the case prescribes it.
-    facts : dict
-        Further numbers for the report, with a unit behind a comma in their names: ``"fastest frequency, rad/s"``.
-    """
-
-    model: Model
-    q: Array
-    v: Array
-    tau: Array | None = None
-    duration: float = 0.0
-    exact: Callable[[Array], Array] | None = None
-    floor: float = 0.0
-    source: str = ""
-    scale: float = 1.0
-    dt: float | None = None
-    facts: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -145,6 +88,8 @@ def problem_of(case: Case, value: float) -> Problem:
         return problem
     if q.ndim != 1 or v.ndim != 1:
         raise InputError(f"{what}: q, v: expected one state for a run, got shapes {q.shape} and {v.shape}")
+    if problem.tau is not None and not callable(problem.tau):
+        model.check_v(problem.tau, "tau")
     real(f"{what}: duration", problem.duration, positive=True)
     real(f"{what}: scale", problem.scale, positive=True)
     real(f"{what}: floor", problem.floor, nonnegative=True)

@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING, Final
 from mbkit._escape import one_line
 from mbkit.errors import UnknownNameError
 from mbkit.simulate.plotting.style import PLAIN, Palette, drawing, engine_mark, figure_of, legend
+from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.stress.measurements import (
     CaseResult,
-    Measurement,
-    Outcome,
     best,
     engines_of,
     lines,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,106 +13,43 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.engines import Dynamics, dynamics
-from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.oracle import OracleDynamics
-from mbkit.engines.registry import DERIVED, INDEPENDENT, PINOCCHIO
 from mbkit.errors import MbkitError, NumericalError
 from mbkit.methods.registry import (
     ADAPTIVE_METHOD,
     AUTOMATIC_METHOD,
-    GAUSS_METHOD,
     METHODS,
-    SCIPY_METHOD,
-    SCIPY_STIFF_METHOD,
     STIFF_METHOD,
 )
-from mbkit.simulate import Trajectory, simulate
+from mbkit.simulate import simulate
 from mbkit.studies.compare.errors import Scales, acceleration_errors, force_errors, interleaved, matrix_errors
 from mbkit.studies.compare.terms import States
-from mbkit.studies.stress.case import Case, Problem, Truth, problem_of, step_of, times_of
-from mbkit.studies.stress.measurements import Measurement
-from mbkit.studies.study_runs import TooLongError, cpu_limit, energy_drift, heard_warnings, patience, quiet_simulate
-from mbkit.studies.work_precision.reference import gap, reference
+from mbkit.studies.measurement import MAX_ERROR, Measurement, Problem, Truth
+from mbkit.studies.stress.case import Case, problem_of, step_of, times_of
+from mbkit.studies.study_runs import TooLongError, cpu_limit, heard_warnings, patience, quiet_simulate
+from mbkit.studies.work_precision.reference import reference
 from mbkit.studies.worker import report_stage
 
-# Reference motions. Where there is no closed form, the difference of two runs that share as little as possible bounds
-# the error of either (Hairer, Nørsett, Wanner 1993, II.4, on why one run alone cannot). Runs go on until two agree:
-# explicit methods of high order on two engines; implicit methods of different families, for stiff motion; Taylor
-# series with 34 digits, for motion that loses digits in double.
-
 _EPS: Final = float(np.finfo(float).eps)
-#: The errors of two runs can partly cancel in their difference.
-_SAFETY: Final = 4.0
-#: A search is not begun with less time than this, s.
-_MIN_SEARCH: Final = 0.05
-#: Taylor series need seconds to derive and compile that the search does not count, s.
-_MIN_SERIES: Final = 5.0
 #: A truth no better than this part of the motion cannot show even gross errors.
 _WORTHLESS: Final = 1e-3
-#: Engine, method, and tolerance or number of steps; the third stands in for the second where that is not installed.
-_RUNS: Final[tuple[tuple[str, str, float], ...]] = (
-    (DERIVED, ADAPTIVE_METHOD, 1e-14),
-    *((engine, SCIPY_METHOD, 1e-13) for engine in INDEPENDENT),
-    (DERIVED, GAUSS_METHOD, 1000),
-    (PINOCCHIO, SCIPY_STIFF_METHOD, 1e-11),
-    (DERIVED, GAUSS_METHOD, 4000),
-)
-#: The part of the time left that one of them may take.
-_PART: Final = 0.2
+
+# Reference motions
 
 
 def reference_motion(problem: Problem, times: Array, wanted: float, seconds: float) -> tuple[Truth | None, str]:
-    """Return the truth of a motion to `wanted`, rad or m, or None, and how it is known or why it is not."""
+    """Return the truth of a motion to `wanted` of it, or None, and how it is known or why it is not."""
     if problem.exact is not None:
         return _closed_form(problem, times)
-    end = time.thread_time() + seconds
-    runs: list[tuple[Array, str]] = []
-    best: Truth | None = None
-    for engine, method, setting in _RUNS:
-        left = end - time.thread_time()
-        if left < _MIN_SEARCH or (best is not None and best.floor <= wanted):
-            break
-        try:
-            q, how = _run(problem, times, engine, method, setting, _PART * left)
-        except MbkitError:
-            # The other runs may do without it.
-            continue
-        for other_q, other in runs:
-            floor = _SAFETY * float(gap(problem.model, other_q, q).max()) + _rounding(q)
-            if best is None or floor < best.floor:
-                best = Truth(times, q, floor, f"{other} and {how}")
-        runs.append((q, how))
-    reasons = [f"{best.how}, which part by {best.floor / _SAFETY:.1e}"] if best else []
-    left = end - time.thread_time()
-    if best is None or best.floor > wanted:
-        try:
-            if left < _MIN_SERIES:
-                raise NumericalError("stopped at its time limit")
-            known = reference(problem.model, problem.q, problem.v, float(times[-1]), times, seconds=left)
-            if len(known.t) < len(times):
-                raise NumericalError(known.how)
-            series = Truth(times, np.asarray(known.q), float(known.floor.max()), known.how)
-            best = series if best is None or series.floor < best.floor else best
-        except MbkitError as error:
-            reasons.append(str(error))
-    if best is None or best.floor > _WORTHLESS * problem.scale:
-        return None, "no truth: " + "; ".join(reasons)
-    return best, f"{best.how}; known to {best.floor:.1e}"
-
-
-def _run(problem: Problem, times: Array, engine: str, method: str, setting: float, seconds: float) -> tuple[Array, str]:
-    """Return q of a run in double to the end, and how it was computed."""
-    fixed = METHODS[method].kind == "fixed"
-    # A whole number of steps to each saved time.
-    each = max(1, round(setting / (len(times) - 1)))
-    step: dict[str, Any] = {"dt": float(times[1]) / each} if fixed else {"rtol": setting}
-    dyn = dynamics(problem.model, engine)
-    with cpu_limit(seconds):
-        run = quiet_simulate(dyn, problem.q, problem.v, float(times[-1]), method, save=times, **step)
-    if not run.stats.finished or len(run.q) < len(times):
-        raise NumericalError(run.stats.message)
-    size = f"{each * (len(times) - 1)} steps" if fixed else f"rtol {setting:.0e}"
-    return run.q, f"{method} on {engine} ({size})"
+    motion = problem.model, problem.q, problem.v, float(times[-1]), times, problem.tau
+    try:
+        known = reference(*motion, seconds=seconds, wanted=wanted, agree=_WORTHLESS)
+    except MbkitError as error:
+        return None, f"no truth: {error}"
+    if len(known.t) < len(times):
+        return None, f"no truth: {known.how}"
+    floor = float(known.floor.max())
+    return Truth(times, known.q, floor, known.how), f"{known.how}; known to {floor:.1e}"
 
 
 def _closed_form(problem: Problem, times: Array) -> tuple[Truth | None, str]:
@@ -145,8 +81,6 @@ TERMS: Final = {"mass_matrix": ("q",), "inverse_dynamics": ("q", "v", "a"), "for
 _MAX_DOUBLE_CONDITION: Final = 1e15
 #: Digits of their singular values.
 _DIGITS: Final = 40
-#: The largest error that a result holds, for JSON has no infinity.
-_MAX_ERROR: Final = 1e300
 
 
 @dataclass(frozen=True)
@@ -205,7 +139,7 @@ def error_of(term: str, value: Array, truth: Terms) -> float:
             error, high = np.ldexp(error, truth.exponent), np.ldexp(high, truth.exponent)
             measured = matrix_errors if term == "mass_matrix" else partial(force_errors, heavy=True)
             errors = measured(error, high, truth.scales)
-        return min(float(errors.relative.max()), _MAX_ERROR)
+        return min(float(errors.relative.max()), MAX_ERROR)
 
 
 def condition(oracle: OracleDynamics, q: Array) -> float:
@@ -246,9 +180,6 @@ _UNTIMED: Final = 2.0
 _MOMENT: Final = 1e-15
 #: Steps of an engine's own integrator from which the time of all steps is estimated.
 _TRIAL: Final = 2000
-#: Roundings of a double energy, and the part of the motion's from which on they can hide its error.
-_ROUNDING: Final = 16.0 * _EPS
-_HIDDEN: Final = 1e-9
 
 
 @dataclass(frozen=True)
@@ -322,8 +253,7 @@ def prepare(case: Case, value: float, bar: float, seconds: float) -> Prepared:
     elif case.measure == "energy":
         how = "the energy at the start, with 34 digits"
     else:
-        wanted = 0.1 * bar * problem.scale
-        truth, how = reference_motion(problem, times_of(problem, case.measure), wanted, seconds)
+        truth, how = reference_motion(problem, times_of(problem, case.measure), 0.1 * bar, seconds)
     return Prepared(how, truth, {name: float(x) for name, x in problem.facts.items()}, problem.dt)
 
 
@@ -357,6 +287,7 @@ def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, t
     adaptive = kind.kind == "adaptive"
     dt = 0.0 if adaptive else step_of(problem, times, limits.dt)
     step: dict[str, Any] = {"rtol": max(limits.rtol, kind.least)} if adaptive else {"dt": dt}
+    step["torque"] = problem.tau
     start, duration = (dyn, problem.q, problem.v), float(times[-1])
     report_stage("method")
     try:
@@ -389,34 +320,16 @@ def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, t
         begun = _clock()
         quiet_simulate(*start, duration, method, save=times, doubt=False, **step)
         seconds.append(_clock() - begun)
-    stats = run.stats
-    note = "; ".join(x for x in (stats.message, stats.chosen) if x)
-    cell = Measurement(value, "finished", seconds=float(np.median(seconds)), steps=stats.steps, note=note)
-    if not stats.finished or len(run.t) != len(times):
-        return replace(cell, end="diverged", note=stats.message or f"ended at t = {run.t[-1]:g} s")
     # Its checks integrate again: their time is not the run's.
     report_stage("check")
+    # A run that is judged by its energy alone needs more digits of it than the run has.
+    cell = problem.measured(value, truth, times, cache.oracle if truth is None else dyn, run)
+    cell = replace(cell, seconds=float(np.median(seconds)))
+    if cell.end == "diverged":
+        return cell
     doubts = (f"{dyn.model.name}: {method}: {one}" for one in run.check().doubts)
     cell = replace(cell, warnings=tuple(dict.fromkeys([*heard, *doubts])))
-    if not (np.isfinite(run.q).all() and np.isfinite(run.v).all()):
-        return replace(cell, end="nan", note="states that are not finite, and nothing was said")
-    # A run that is judged by its energy alone needs more digits of it than the run has.
-    energy = _energy_error(cache.oracle if truth is None else dyn, run)
-    if truth is None:
-        return replace(cell, error=energy if cache.case.measure == "energy" else math.nan, energy=energy)
-    apart = float(np.abs(problem.model.difference(truth.q, run.q)).max()) / problem.scale
-    return replace(cell, error=min(apart, _MAX_ERROR), energy=energy, floor=truth.floor / problem.scale)
-
-
-def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
-    """Return the relative `energy_drift`, NaN where it is not known or only rounding."""
-    try:
-        drift, size, largest = energy_drift(dyn, run) or (0.0, 0.0, 0.0)
-    except MbkitError:
-        return math.nan
-    rounding = 0.0 if dyn.bits > DOUBLE_BITS else _ROUNDING * largest
-    hidden = rounding > _HIDDEN * size and drift <= rounding
-    return min(drift / size, _MAX_ERROR) if size > 0 and not hidden else math.nan
+    return replace(cell, error=cell.energy) if cache.case.measure == "energy" else cell
 
 
 def _evaluate(cache: _ValueCache, term: str, dyn: Dynamics, truth: Terms) -> Measurement:

@@ -1,11 +1,11 @@
-"""Data of a stress study: the measurement of each cell, rows and cases, and how far each row held."""
+"""Data of a stress study: its rows and cases, and how far each row held."""
 
 from __future__ import annotations
 
 import math
 import statistics
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Literal
 
@@ -14,79 +14,33 @@ import numpy as np
 from mbkit.engines.registry import DERIVED, PINOCCHIO
 from mbkit.methods.registry import AUTOMATIC_METHOD
 from mbkit.simulate.plotting.style import engine_index
-
-#: How a run or an evaluation ended, before its error is judged.
-End = Literal["finished", "diverged", "nan", "refused", "slow", "died", "not run"]
-#: With its error: held; above the bar, yet within `GROSS`; grossly wrong with a warning or without one; finished, with
-#: no truth to judge it by this bar; or how it ended.
-Outcome = Literal[
-    "held", "inaccurate", "warned", "silent", "unjudged", "diverged", "nan", "refused", "slow", "died", "not run"
-]
-
-#: The default bar: a relative error that plots cannot hide and papers accept.
-BAR: Final = 1e-6
-#: Where an answer is no longer inaccurate but wrong: a hundredth of the motion, or of the term. A method of low order
-#: misses the bar with every affordable step, and misleads nobody by that.
-GROSS: Final = 1e-2
+from mbkit.studies.measurement import Measurement, Outcome
 
 
 @dataclass(frozen=True)
-class Measurement:
-    """One engine and method at one value of the case's parameter.
-
-    `end` is ``"finished"``; ``"diverged"`` where the run said so itself; ``"nan"`` where numbers are not finite and
-    nothing was said; ``"refused"``, an error of its own; ``"slow"``, stopped at the time allowed; ``"died"``, the
-    process ended or took too much memory; ``"not run"``. `error` is relative to the problem's scale (motion, terms), or
-    of the energy where that is the measure, and NaN where there is none, or no truth to measure it by; `floor` is the
-    error of that truth. `energy` is the largest relative energy error, NaN where forces do work or nothing was
-    integrated. `seconds` are processor time of the run, or of one evaluation of a term, without compilation. `note`
-    says why it ended, and what was chosen.
-    """
-
-    value: float
-    end: End
-    error: float = math.nan
-    energy: float = math.nan
-    seconds: float = math.nan
-    steps: int = 0
-    warnings: tuple[str, ...] = ()
-    note: str = ""
-    floor: float = 0.0
-
-    @property
-    def seen(self) -> float:
-        """The error that counts, its own, or that of the energy where there is no truth.
-
-        A wrong energy speaks against a run, but a right one does not speak for it.
-        """
-        return self.energy if math.isnan(self.error) else self.error
-
-    def outcome(self, bar: float) -> Outcome:
-        """Return the outcome by this bar on the error."""
-        if self.end != "finished":
-            return self.end
-        seen = self.seen
-        if math.isnan(seen) or abs(seen - bar) <= self.floor or (math.isnan(self.error) and seen <= bar):
-            return "unjudged"
-        if seen <= bar:
-            return "held"
-        if seen <= max(bar, GROSS):
-            return "inaccurate"
-        return "warned" if self.warnings else "silent"
-
-
-@dataclass(frozen=True)
-class BreakingPoint:
-    """Where an engine and method breaks.
+class Breaking:
+    """Where one engine and method breaks in one case.
 
     `held` is the last value up to which all milder ones held, too, and None where the mildest did not. `failed`, `how`
     and `cell` are the first value that did not hold, its outcome and measurement; None and empty where all held.
     """
 
+    case: str
+    engine: str
+    method: str
+    setting: str
     held: float | None
     failed: float | None
     how: Outcome | Literal[""]
-    cell: Measurement | None
+    cell: Measurement | None = field(compare=False, repr=False)
+
+    @property
+    def note(self) -> str:
+        """Error, warnings and note of the first value that did not hold."""
+        if self.cell is None:
+            return ""
+        error = f"error {self.cell.seen:.1e}" if math.isfinite(self.cell.seen) else ""
+        return "; ".join(x for x in (error, *self.cell.warnings, self.cell.note) if x)
 
 
 @dataclass(frozen=True)
@@ -103,14 +57,15 @@ class Row:
     setting: str = ""
     theory: float | None = None
 
-    def breaking(self, bar: float) -> BreakingPoint:
+    def breaking(self, bar: float, case: str = "") -> Breaking:
         """Return the last value that held and the first that did not."""
         at = self.reach(bar)
         held = self.cells[at - 1].value if at else None
-        how = self.cells[at].outcome(bar) if at < len(self.cells) else "not run"
-        if how in ("not run", "unjudged"):
-            return BreakingPoint(held, None, "", None)
-        return BreakingPoint(held, self.cells[at].value, how, self.cells[at])
+        cell = self.cells[at] if at < len(self.cells) else None
+        how = "not run" if cell is None else cell.outcome(bar)
+        if cell is None or how in ("not run", "unjudged"):
+            return Breaking(case, self.engine, self.method, self.setting, held, None, "", None)
+        return Breaking(case, self.engine, self.method, self.setting, held, cell.value, how, cell)
 
     def reach(self, bar: float) -> int:
         """Return how many values held before the first that did not."""
@@ -158,9 +113,9 @@ class Line:
         return tuple(cell.outcome(self.case.bar) for cell in self.row.cells)
 
     @cached_property
-    def broken(self) -> BreakingPoint:
+    def broken(self) -> Breaking:
         """Where it breaks."""
-        return self.row.breaking(self.case.bar)
+        return self.row.breaking(self.case.bar, self.case.name)
 
     @property
     def size(self) -> int:

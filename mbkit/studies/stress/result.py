@@ -7,32 +7,19 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from mbkit._check import real
 from mbkit.errors import require_known
+from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.results import NO_LIMIT, Block, Column, ResultTable, Table, Title, columns, counted
 from mbkit.studies.stress.figure import figure
-from mbkit.studies.stress.measurements import CaseResult, Measurement, Outcome, Row
+from mbkit.studies.stress.measurements import Breaking, CaseResult, Row
 from mbkit.studies.study_runs import OUT_OF_TIME
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True)
-class Breaking:
-    """Where one engine and method breaks in one case: a `BreakingPoint`, and the error, warnings and note there."""
-
-    case: str
-    engine: str
-    method: str
-    setting: str
-    held: float | None
-    failed: float | None
-    how: Outcome | Literal[""]
-    note: str
 
 
 @dataclass(frozen=True)
@@ -106,7 +93,7 @@ class StressResult(ResultTable):
 
     def breaking(self, bar: float | None = None) -> tuple[Breaking, ...]:
         """Return where each engine and method breaks in each case, by its own bar or another one."""
-        return tuple(_breaking(case, row, _bar(case, bar)) for case, row in self.rows())
+        return tuple(row.breaking(_bar(case, bar), case.name) for case, row in self.rows())
 
     def silent(self, bar: float | None = None) -> tuple[SilentFailure, ...]:
         """Return all answers that were grossly wrong without a word, by each case's bar or another one."""
@@ -152,7 +139,7 @@ class StressResult(ResultTable):
             then = Column("then", lambda b: "" if b.failed is None else f"{b.failed:g}", right=True)
             names = (Column(name, attrgetter(name)) for name in ("engine", "method", "setting"))
             columns = (*names, held, then, Column("how", attrgetter("how")))
-            yield Table(columns, [_breaking(case, row, case.bar) for row in rows])
+            yield Table(columns, [row.breaking(case.bar, case.name) for row in rows])
 
     def plot(self, case: str | None = None, ax: Axes | None = None) -> Figure:
         """Draw the map of one case, or how far each engine held in all of them, with Matplotlib.
@@ -169,12 +156,3 @@ class StressResult(ResultTable):
 
 def _bar(case: CaseResult, other: float | None) -> float:
     return case.bar if other is None else real("bar", other, positive=True)
-
-
-def _breaking(case: CaseResult, row: Row, bar: float) -> Breaking:
-    broken = row.breaking(bar)
-    note = ""
-    if broken.cell is not None:
-        error = f"error {broken.cell.seen:.1e}" if math.isfinite(broken.cell.seen) else ""
-        note = "; ".join(x for x in (error, *broken.cell.warnings, broken.cell.note) if x)
-    return Breaking(case.name, row.engine, row.method, row.setting, broken.held, broken.failed, broken.how, note)

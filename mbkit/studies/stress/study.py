@@ -24,9 +24,10 @@ from mbkit.methods.registry import METHODS
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies._targets import methods_by_engine, numbers_of
+from mbkit.studies.measurement import BAR, Measurement
 from mbkit.studies.stress.case import Case
 from mbkit.studies.stress.measure import TERMS, Limits, Prepared, condition_number, measure, prepare
-from mbkit.studies.stress.measurements import BAR, CaseResult, Measurement, Row
+from mbkit.studies.stress.measurements import CaseResult, Row
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
 from mbkit.studies.worker import CallError, Worker, describe, in_worker, processors

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.studies.measurement import Measurement
 
 T = TypeVar("T")
 #: Errors below so many times the reference's floor, or the rounding level, are not in the regression.
@@ -21,30 +22,6 @@ _SLOPE_SPREAD: Final = 0.3
 _MIN_POINTS: Final = 3
 #: An error that is so many times as large has turned.
 _WORSE: Final = 1.5
-
-
-@dataclass(frozen=True)
-class PrecisionPoint:
-    """One engine, method and step, s, or tolerance.
-
-    `error` is the largest difference of q to the reference over the saved times, rad or m; NaN where the run did not
-    reach the end. `energy` is the largest ``|E(t) - E(0)|`` at these times, relative to the larger of the largest
-    kinetic energy and the change of potential energy; NaN with dampers or applied forces, whose work is not known well
-    enough. `seconds` is the run time, median of so many `repeats`, without derivation and compilation, and `spread`
-    half their interquartile range, NaN for one run. `steps` and `evaluations` are of one run, 0 where the engine does
-    not report them. `note` says why there is no error, or no energy.
-    """
-
-    setting: Literal["dt", "rtol"]
-    value: float
-    error: float
-    energy: float
-    seconds: float
-    spread: float
-    steps: int
-    evaluations: int
-    repeats: int
-    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -60,7 +37,7 @@ class Curve:
 
     engine: str
     method: str
-    points: tuple[PrecisionPoint, ...]
+    points: tuple[Measurement, ...]
     order: float
     order_points: int
     expected: float
@@ -76,7 +53,7 @@ class Curve:
         return f"{self.engine} {self.method}"
 
     @property
-    def turn(self) -> PrecisionPoint | None:
+    def turn(self) -> Measurement | None:
         """The point of least error of a fixed step, where each finer step is worse by a half and rounding grows.
 
         So it is of an engine in single precision, whose error in the sum of steps is some eps / dt.
@@ -87,7 +64,7 @@ class Curve:
         worse = bool(finer) and all(p.setting == "dt" and p.error > _WORSE * best.error for p in finer if best)
         return best if worse else None
 
-    def reach(self, error: float) -> PrecisionPoint | None:
+    def reach(self, error: float) -> Measurement | None:
         """Return the fastest point with at most this error, if there is one."""
         return min((p for p in self.points if p.error <= error), key=lambda p: p.seconds, default=None)
 

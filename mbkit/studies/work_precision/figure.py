@@ -19,7 +19,8 @@ from mbkit.simulate.plotting.style import (
     log_ticks,
     name_points,
 )
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, pareto_front
+from mbkit.studies.measurement import Measurement
+from mbkit.studies.work_precision.curve import Curve, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 #: Run time, s, error or energy drift, and whose they are.
 _Place = tuple[float, float, Curve]
-_Measure = Callable[[PrecisionPoint], float]
+_Measure = Callable[[Measurement], float]
 
 #: MuJoCo's own integrators stand in the panel of the same formula.
 _SAME_FORMULA: Final = {m.name: m.own for m in METHODS.values() if m.own}
@@ -60,7 +61,7 @@ def figure(
     methods = _methods(curves)
     rows = math.ceil(len(methods) / _COLUMNS)
 
-    def error(p: PrecisionPoint) -> float:
+    def error(p: Measurement) -> float:
         # Below the reference's floor nothing is known; a logarithm has no zero.
         return max(p.error, floor / 10, _MIN_ERROR) if math.isfinite(p.error) else math.nan
 

@@ -32,7 +32,14 @@ from mbkit.engines.base import at_time
 from mbkit.engines.consistent.random_states import states_of
 from mbkit.engines.registry import DERIVED, INDEPENDENT
 from mbkit.errors import InputError, MbkitError, UnsupportedError
-from mbkit.methods.registry import ADAPTIVE_METHOD, METHODS, SCIPY_METHOD, SERIES_METHOD
+from mbkit.methods.registry import (
+    ADAPTIVE_METHOD,
+    METHODS,
+    SCIPY_METHOD,
+    SCIPY_STIFF_METHOD,
+    SERIES_METHOD,
+    STIFF_METHOD,
+)
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
 from mbkit.simulate import Trajectory
@@ -50,11 +57,20 @@ from mbkit.studies.study_runs import quiet_simulate
 _LEGS: Final = 20
 # Tolerance of the second Taylor run: one order less, so with other steps, rounding and truncation.
 _COARSER: Final = 8.0
-#: Engine and method of each of two independent roads, best first.
-_ROADS: Final = (
+#: Engine and method of each of two independent roads, best first; and of roads that stiff motion does not make long.
+_Roads = tuple[tuple[tuple[str, str], ...], ...]
+_ROADS: Final[_Roads] = (
     tuple((DERIVED, method) for method in (SERIES_METHOD, ADAPTIVE_METHOD, SCIPY_METHOD)),
     tuple((engine, SCIPY_METHOD) for engine in INDEPENDENT),
 )
+_QUICK: Final[_Roads] = (_ROADS[0][1:], _ROADS[1])
+_STIFF: Final[_Roads] = (((DERIVED, STIFF_METHOD),), tuple((engine, SCIPY_STIFF_METHOD) for engine in INDEPENDENT))
+#: How well two runs must agree, relative to the size of the motion.
+AGREE: Final = 1e-12
+# Two engines that are farther apart than this, rad or m, have parted for good.
+_PARTED: Final = 1e-6
+# Tolerance of methods for stiff motion, as a part of what is wanted: a smaller one costs them dear.
+_FINER: Final = 1e-3
 
 
 class LateError(Exception):
@@ -194,7 +210,7 @@ def gap(model: Model, a: Any, b: Any) -> Array:
     return np.asarray(np.abs(apart).max(axis=1, initial=0.0))
 
 
-def taylor_pair(motion: Motion, bits: int, deadline: Deadline) -> Known:
+def taylor_pair(motion: Motion, deadline: Deadline, bits: int) -> Known:
     """Return two Taylor runs at different orders, in a format of so many bits, from exactly the doubles of the model.
 
     `UnsupportedError` without heyoka or this format, and for a model too large.
@@ -258,10 +274,15 @@ def _largest(x: Any) -> Array:
     return np.asarray(np.abs(np.asarray(x, dtype=np.float64)).max(axis=1, initial=0.0))
 
 
-def two_engines(motion: Motion, deadline: Deadline) -> Known:
-    """Return runs of two engines, each with a method of its own, marching by turns until they part."""
+def two_engines(
+    motion: Motion, deadline: Deadline, choices: _Roads = _ROADS, rtol: float = 0.0, parted: float = _PARTED
+) -> Known:
+    """Return runs of two engines, each with a method of its own, marching by turns until they part.
+
+    Their tolerance is the least that the methods take, or `rtol`.
+    """
     with deadline.paused():
-        roads = [_road(motion, choices) for choices in _ROADS]
+        roads = [_road(motion, several) for several in choices]
     how = " and ".join(f"{method} on {dyn.engine}" for dyn, method in roads)
     states = [(motion.q0[None], motion.v0[None]) for _ in roads]
     times, why = motion.save, ""
@@ -271,7 +292,7 @@ def two_engines(motion: Motion, deadline: Deadline) -> Known:
         try:
             for i, ((dyn, method), (q, v)) in enumerate(zip(roads, states, strict=True)):
                 part = deadline.part((2 * j + i) / (2 * len(ends)), 1 / (2 * len(ends)))
-                legs.append(_leg(motion, dyn, method, q[-1], v[-1], slice(k, end + 1), part))
+                legs.append(_leg(motion, dyn, method, rtol, q[-1], v[-1], slice(k, end + 1), part))
                 if not legs[-1].stats.finished:
                     why = f"{method} on {dyn.engine} ended early, within {times[k]:.6g} to {times[end]:.6g} s"
         except LateError:
@@ -283,7 +304,7 @@ def two_engines(motion: Motion, deadline: Deadline) -> Known:
             for (q, v), leg in zip(states, legs, strict=True)
         ]
         # What has parted for good need not be followed to the end.
-        if why or gap(motion.model, states[0][0][-1:], states[1][0][-1:])[0] > 1e-6:
+        if why or gap(motion.model, states[0][0][-1:], states[1][0][-1:])[0] > parted:
             break
     (q, v), (other_q, other_v) = states
     apart = np.array([gap(motion.model, q, other_q), _largest(v - other_v)])
@@ -313,24 +334,26 @@ def _require_rigid(dyn: Dynamics) -> None:
         raise UnsupportedError(f"{dyn.engine} holds loops softly")
 
 
-def _leg(motion: Motion, dyn: Dynamics, method: str, q: Array, v: Array, rows: slice, deadline: Deadline) -> Trajectory:
+def _leg(
+    motion: Motion, dyn: Dynamics, method: str, rtol: float, q: Array, v: Array, rows: slice, deadline: Deadline
+) -> Trajectory:
     """Return the motion between two of the saved times."""
     times, torque = motion.save[rows], motion.torque_argument
     if motion.torque.held:
         torque = np.asarray(torque)[rows.start : rows.stop - 1]
     start, length = float(times[0]), float(times[-1] - times[0])
-    settings = {"torque": torque, "save": times, "t0": start, "rtol": METHODS[method].least}
+    settings = {"torque": torque, "save": times, "t0": start, "rtol": max(METHODS[method].least, rtol)}
     return quiet_simulate(dyn, q, v, length, method, progress=deadline.look, **settings)
 
 
-#: How well two runs must agree, relative to the size of the motion.
-AGREE: Final = 1e-12
 # Errors partly cancel in a difference: against more digits, a run was up to three times as wrong as two were apart.
 _SAFETY: Final = 4.0
 # Quadruple numbers cost about this many seconds per operation, order² and step.
 _QUADRUPLE: Final = 1.0e-8
 # Steps per second of motion that a small system takes: a guess before there is a run.
 _STEPS: Final = 40.0
+# Series need seconds to derive and compile that a search does not count: of a quick one they are not worth it.
+_MIN_SERIES: Final = 5.0
 # States at which accelerations are compared.
 _WITNESSED: Final = 64
 # Two doubles hold 106 bits of a number, which can be somewhat larger than the motion.
@@ -397,6 +420,8 @@ def reference(
     torque: ArrayLike | TorqueFunction | None = None,
     *,
     seconds: float = 30.0,
+    wanted: float = AGREE,
+    agree: float = AGREE,
     progress: bool | ProgressFunction | None = None,
 ) -> Reference:
     """Return the motion from a state, known to 12 digits or cut where it is not.
@@ -415,6 +440,10 @@ def reference(
         or a function of (t, q, v), for which only two engines make a reference, as for dry friction.
     seconds : float
         Limit of the search, without derivation and compilation. The best reference by then is returned.
+    wanted, agree : float
+        How well two runs agree, relative to the size of the motion, where the search ends; and at the least, for beyond
+        it the reference is cut. With less than 12 digits wanted, two engines are asked first, explicit methods and then
+        methods for stiff motion.
     progress : bool or callable, optional
         As in `mbkit.simulate`.
 
@@ -447,12 +476,13 @@ def reference(
     if not motion.duration or not model.nv:
         return _at_rest(motion)
     with Progress(progress, f"{model.name}: reference") as bar:
-        pairs, refused = _search(motion, Deadline(seconds, bar.update), seconds)
+        pairs, refused = _search(motion, Deadline(seconds, bar.update), seconds, wanted, agree)
         bar.update(1.0)
     if not pairs:
         raise UnsupportedError(f"reference: {'; '.join(refused)}")
-    # The one that holds longest, and of those the first.
-    best, known = max(((_cut(motion, known), known) for known in pairs), key=lambda pair: pair[0].horizon)
+    # The one that holds longest, and of those the best.
+    cut = ((_cut(motion, known, agree), known) for known in pairs)
+    best, known = max(cut, key=lambda pair: (pair[0].horizon, pair[0].digits))
     return replace(best, how=best.how + _witness(motion, best)) if known.shared else best
 
 
@@ -483,21 +513,29 @@ def _at_rest(motion: Motion) -> Reference:
     return Reference(t, q, v, 0 * q, 0 * v, floor, inf, (1.0, 1.0), float(t[-1]), how)
 
 
-def _search(motion: Motion, deadline: Deadline, seconds: float) -> tuple[list[Known], list[str]]:
+def _search(
+    motion: Motion, deadline: Deadline, seconds: float, wanted: float, agree: float
+) -> tuple[list[Known], list[str]]:
     pairs: list[Known] = []
     refused: list[str] = []
 
-    def holds(way: Any, *bits: int, within: float = inf) -> bool:
+    def holds(way: Any, *more: Any, within: float = inf) -> bool:
         # Whether a way leads to the end is known at its end: the first gets half of the bar.
         tried = len(pairs) + len(refused)
         part = deadline.part(1 - 0.5**tried, 0.5 ** (tried + 1), within)
         try:
-            pairs.append(way(motion, *bits, part))
+            pairs.append(way(motion, part, *more))
         except UnsupportedError as error:
             refused.append(str(error))
             return False
-        return bool(_cut(motion, pairs[-1]).horizon == motion.save[-1])
+        return bool(_cut(motion, pairs[-1], wanted).horizon == motion.save[-1])
 
+    if wanted > AGREE:
+        for roads, rtol, part in ((_QUICK, 0.0, 0.25), (_STIFF, _FINER * wanted, 0.75)):
+            if holds(two_engines, roads, rtol, max(agree, _PARTED), within=part * deadline.left):
+                return pairs, refused
+        if deadline.left < _MIN_SERIES:
+            return pairs, refused
     # A series cannot follow jumps: runs go from one to the next, phase by phase.
     if not (motion.torque.callable or "jump" in motion.model.effects):
         small = _quadruple_seconds(motion, _STEPS * motion.duration) < seconds / 6
@@ -523,7 +561,7 @@ def _quadruple_seconds(motion: Motion, steps: float) -> float:
     return 2 * steps * operations * order**2 * _QUADRUPLE
 
 
-def _cut(motion: Motion, known: Known) -> Reference:
+def _cut(motion: Motion, known: Known, agree: float) -> Reference:
     """Return the reference from a pair of runs, up to where they part."""
     model, (q, q_low), (v, v_low) = motion.model, known.q, known.v
     moved = gap(model, q, np.broadcast_to(q[:1], q.shape))
@@ -531,7 +569,7 @@ def _cut(motion: Motion, known: Known) -> Reference:
     scale = float(moved.max()) or 1.0, float(np.abs(v).max()) or 1.0
     apart = np.maximum.accumulate(known.apart, axis=1)
     relative = np.max(apart / np.array(scale)[:, None], axis=0)
-    holds = relative <= AGREE
+    holds = relative <= agree
     n = len(holds) if holds.all() else int(np.argmin(holds))
     end = float(motion.save[n - 1])
     worst = max(float(relative[:n].max()), _PAIR)

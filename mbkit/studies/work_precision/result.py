@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
+from mbkit.studies.measurement import Measurement
 from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, block_html, columns, counted
 from mbkit.studies.study_runs import OUT_OF_TIME
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, pareto_front
+from mbkit.studies.work_precision.curve import Curve, pareto_front
 from mbkit.studies.work_precision.figure import figure
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ class WorkPrecision(ResultTable):
         *columns(1, "note"),
     )
 
-    def rows(self) -> Iterator[tuple[Curve, PrecisionPoint]]:
+    def rows(self) -> Iterator[tuple[Curve, Measurement]]:
         """Yield every point with its curve."""
         for curve in self.curves:
             for point in curve.points:
@@ -118,12 +119,12 @@ class WorkPrecision(ResultTable):
         return tuple(out)
 
     @property
-    def front(self) -> tuple[tuple[Curve, PrecisionPoint], ...]:
+    def front(self) -> tuple[tuple[Curve, Measurement], ...]:
         """The Pareto front, points that none beats in both error and run time, fastest first."""
         known = [(c, p) for c, p in self.rows() if math.isfinite(p.error) and math.isfinite(p.seconds)]
         return tuple(pareto_front(known, lambda item: (item[1].seconds, item[1].error), self.floor))
 
-    def fastest(self, error: float) -> tuple[Curve, PrecisionPoint] | None:
+    def fastest(self, error: float) -> tuple[Curve, Measurement] | None:
         """Return the curve and point that reach this error in the least time, None if no point does."""
         reached = [(c, p) for c, p in self.rows() if p.error <= error]
         return min(reached, key=lambda item: item[1].seconds, default=None)
@@ -141,7 +142,7 @@ class WorkPrecision(ResultTable):
         ]
         return out
 
-    def _csv_rows(self) -> Iterator[tuple[Curve, PrecisionPoint, bool]]:
+    def _csv_rows(self) -> Iterator[tuple[Curve, Measurement, bool]]:
         front = {(id(c), id(p)) for c, p in self.front}
         return ((c, p, (id(c), id(p)) in front) for c, p in self.rows())
 
@@ -188,7 +189,7 @@ def _run_columns(head: str, at: int) -> tuple[Column, ...]:
     )
 
 
-def _least(curve: Curve, text: Callable[[PrecisionPoint], str], otherwise: str) -> str:
+def _least(curve: Curve, text: Callable[[Measurement], str], otherwise: str) -> str:
     """Return a text about the point with the least error."""
     best = min((p for p in curve.points if math.isfinite(p.error)), key=lambda p: p.error, default=None)
     return text(best) if best else otherwise

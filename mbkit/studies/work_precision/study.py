@@ -20,11 +20,12 @@ from mbkit.simulate.torque import TorqueFunction
 from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies._targets import methods_by_engine, numbers_of, with_values
+from mbkit.studies.measurement import Problem, Truth, farthest
 from mbkit.studies.study_runs import integrable, require_motion, start_state
 from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.reference import reference as compute_reference
 from mbkit.studies.work_precision.result import WorkPrecision
-from mbkit.studies.work_precision.sweep import INTERVALS, Problem, Sweep, TimeBudget, plans
+from mbkit.studies.work_precision.sweep import INTERVALS, Sweep, TimeBudget, plans
 
 #: An exact motion: from a time to q and v.
 Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
@@ -171,14 +172,16 @@ def work_precision(
             *(integrated, *start, asked, force, _FOR_REFERENCE * min(usual, limit)),
             lambda done: checkpoints.report(0.1 * done, "reference"),
         )
-    problem = _problem(integrated, start, force, asked, known)
-    if problem.motion == 0.0:
+    truth = _truth(integrated, start[0], asked, known)
+    duration = float(truth.times[-1])
+    problem = Problem(integrated, *start, force, duration)
+    if farthest(integrated, truth.q) == 0.0:
         raise InputError(
             "q0, v0: expected a start from which something moves, got one at rest in equilibrium, where every method "
             "is exact; choose another start"
         )
-    settings = plans(methods_of, float(problem.times[1]), steps, tolerances)
-    sweep = Sweep(problem, settings, repeats, seed, budget, executor)
+    settings = plans(methods_of, float(truth.times[1]), steps, tolerances)
+    sweep = Sweep(problem, truth, settings, repeats, seed, budget, executor)
     facts = results.model_info(integrated)
     facts["notes"] = [*facts["notes"], *changed]
     soft = [name for name in methods_of if model.constrained and find_engine(name).load().soft_constraints]
@@ -191,12 +194,12 @@ def work_precision(
         return WorkPrecision(
             model=model.name,
             facts=facts,
-            duration=problem.duration,
+            duration=duration,
             asked=asked,
             reference=known.how,
-            floor=problem.floor,
-            q0=tuple(problem.q0.tolist()),
-            v0=tuple(problem.v0.tolist()),
+            floor=truth.floor,
+            q0=tuple(problem.q.tolist()),
+            v0=tuple(problem.v.tolist()),
             curves=tuple(curve for curve, _ in outcomes if curve is not None),
             refusals=tuple(refusal for _, refusal in outcomes if refusal is not None),
             complete=complete,
@@ -211,7 +214,7 @@ def work_precision(
                 "steps": steps,
                 "tolerances": tolerances,
                 "torque": "function" if callable(force) else None if force is None else force.tolist(),
-                "saved": problem.times.tolist(),
+                "saved": truth.times.tolist(),
                 "executor": None if executor is None else type(executor).__name__,
                 "timing": _ALONE if executor is None else _TOGETHER,
             },
@@ -271,8 +274,8 @@ def _computed_reference(
     raise NumericalError(f"{model.name}: no reference holds for even {part / INTERVALS:g} s; {out.how}")
 
 
-def _problem(model: Model, start: tuple[Array, Array], torque: Any, duration: float, reference: Reference) -> Problem:
-    """Return the problem up to where its reference holds."""
+def _truth(model: Model, q0: Array, duration: float, reference: Reference) -> Truth:
+    """Return the motion as far as its reference holds."""
     keep = reference.t <= duration * (1 + 1e-12)
     times, q, floor = reference.t[keep], reference.q[keep], float(reference.floor[keep].max())
     if len(times) < 2 or np.abs(times / times[1] - np.rint(times / times[1])).max() > 1e-9:
@@ -281,9 +284,9 @@ def _problem(model: Model, start: tuple[Array, Array], torque: Any, duration: fl
         )
     if q.shape != (len(times), model.nq):
         raise InputError(f"reference: expected states of {model.nq} coordinates, got {q.shape}; it is of another model")
-    if float(np.abs(model.difference(start[0], q[0])).max()) > _SAME_START:
+    if float(np.abs(model.difference(q0, q[0])).max()) > _SAME_START:
         raise InputError("reference: does not start at q0 (and v0); leave them out, or use the reference of this start")
-    return Problem(model, *start, torque, times, q, floor)
+    return Truth(times, q, floor, reference.how)
 
 
 def _check_executor(executor: Executor | None, torque: object) -> None:

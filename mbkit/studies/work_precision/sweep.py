@@ -27,9 +27,10 @@ from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.methods.registry import METHODS, Method, method_of
 from mbkit.model import Model
 from mbkit.simulate import Trajectory
+from mbkit.studies.measurement import Measurement, Problem, Truth, farthest
 from mbkit.studies.results import Refusal
-from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, energy_drift, patience, quiet_simulate
-from mbkit.studies.work_precision.curve import Curve, PrecisionPoint, observed_order
+from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, patience, quiet_simulate
+from mbkit.studies.work_precision.curve import Curve, observed_order
 from mbkit.studies.worker import run
 
 #: Errors are measured at the ends of this many equal parts of the horizon.
@@ -125,10 +126,10 @@ class Settings:
         """The method as data."""
         return method_of(self.method)
 
-    def work(self, steps: int, evaluations: int) -> int:
+    def work(self, run: Measurement) -> int:
         """Return the cost of a run in compiled evaluations of the forward dynamics, equal on every machine."""
         each = 1 if self.info.runs_compiled(derived=find_engine(self.engine).derived) else _PYTHON_CALL
-        return each * (evaluations or steps * max(self.info.stages, 1))
+        return each * (run.evaluations or run.steps * max(self.info.stages, 1))
 
 
 def plans(
@@ -165,73 +166,42 @@ def _steps(method: Method, interval: float) -> tuple[float, ...]:
     return tuple(coarsest / ratio**k for k in range(count))
 
 
-@dataclass(frozen=True)
-class Problem:
-    """The initial value problem that every method solves, and its reference q at times from 0 to the horizon."""
-
-    model: Model
-    q0: Array
-    v0: Array
-    torque: Any
-    times: Array
-    q: Array
-    floor: float
-
-    @property
-    def duration(self) -> float:
-        """The horizon, s."""
-        return float(self.times[-1])
-
-    @property
-    def motion(self) -> float:
-        """The farthest that any coordinate gets from the start."""
-        return float(np.abs(self.model.difference(np.broadcast_to(self.q[0], self.q.shape), self.q)).max())
-
-    def solve(self, dyn: Dynamics, settings: Settings, value: float, limit: float | None = None) -> Trajectory:
-        """Integrate to the horizon; give up after `limit` seconds."""
-        progress = None if limit is None else patience(limit)
-        return self._simulate(dyn, settings, value, self.times, progress=progress)
-
-    def start(self, dyn: Dynamics, settings: Settings, value: float) -> Trajectory:
-        """Integrate one step, or a thousandth of an interval."""
-        duration = value if settings.setting == "dt" else 1e-3 * float(self.times[1])
-        return self._simulate(dyn, settings, value, np.array([duration]))
-
-    def _simulate(self, dyn: Dynamics, settings: Settings, value: float, save: Array, **more: Any) -> Trajectory:
-        more |= {settings.setting: value, "torque": self.torque, "save": save}
-        return quiet_simulate(dyn, self.q0, self.v0, float(save[-1]), settings.method, **more)
-
-
 @dataclass
 class _Run:
-    """One setting: its result, the seconds of the first run and of preparing it, and the timings."""
+    """One setting: what was measured, the seconds of the first run and of preparing it, and the timings."""
 
     value: float
+    cell: Measurement
     first: float = math.nan
     preparation: float = 0.0
-    error: float = math.nan
-    energy: float = math.nan
-    steps: int = 0
-    evaluations: int = 0
-    note: str = ""
     times: list[float] = field(default_factory=list)
 
-    def point(self, setting: Literal["dt", "rtol"]) -> PrecisionPoint:
-        """Return the curve for a result."""
+    @property
+    def known(self) -> bool:
+        """Whether it has an error."""
+        return math.isfinite(self.cell.error)
+
+    def repeats(self, before: _Run) -> bool:
+        """Whether it took the same steps."""
+        new, old = self.cell, before.cell
+        same = new.steps == old.steps and new.evaluations == old.evaluations > 0
+        return same and self.known and before.known
+
+    def point(self, setting: Literal["dt", "rtol"]) -> Measurement:
+        """Return the measurement with its times."""
         # The first run counts only if it was not repeated.
         times = self.times or [self.first]
         low, median, high = map(float, np.percentile(times, [25, 50, 75]))
         spread = (high - low) / 2 if len(times) > 1 else math.nan
         count = len(times) if math.isfinite(times[0]) else 0
-        cost = (median, spread, self.steps, self.evaluations, count)
-        return PrecisionPoint(setting, self.value, self.error, self.energy, *cost, self.note)
+        return replace(self.cell, setting=setting, seconds=median, spread=spread, repeats=count)
 
 
 class CurveMeasurement:
     """The measurement of one curve."""
 
-    def __init__(self, problem: Problem, settings: Settings) -> None:
-        self.problem, self.settings = problem, settings
+    def __init__(self, problem: Problem, truth: Truth, settings: Settings) -> None:
+        self.problem, self.truth, self.settings = problem, truth, settings
         #: Why the engine and method have no further points.
         self.refusal: Refusal | None = None
         self._left = list(settings.values)
@@ -260,7 +230,7 @@ class CurveMeasurement:
     def work(self) -> float:
         """Estimated counted work of the next run; 0 before the first."""
         last = self._last
-        return 0.0 if last is None else self.settings.work(last.steps, last.evaluations) * self._growth(last)
+        return 0.0 if last is None else self.settings.work(last.cell) * self._growth(last)
 
     def _growth(self, last: _Run) -> float:
         finer = last.value / self._left[0]
@@ -272,60 +242,57 @@ class CurveMeasurement:
         # Where the code depends on the tolerance, the middle one stands for all.
         settings, value = self.settings, self._left[len(self._left) // 2]
         with self._refusing():
-            self._dyn, self._compile = first_run(
-                self.problem.model,
-                settings.engine,
-                settings.method,
-                lambda dyn: self.problem.start(dyn, settings, value),
-            )
+            start = partial(self._start, value=value)
+            self._dyn, self._compile = first_run(self.problem.model, settings.engine, settings.method, start)
 
     def run_next(self, limit: float) -> None:
         """Run the next setting; give up after `limit` seconds."""
-        one = _Run(self._left.pop(0))
+        value = self._left.pop(0)
         with self._refusing():
-            self._run(one, limit)
-            before, self._last = self._last or _Run(math.nan), one
-            same = one.steps == before.steps and one.evaluations == before.evaluations > 0
+            one = self._run(value, limit)
+            before, self._last = self._last, one
             # Coarse tolerances that lead to the same steps are one point.
-            if self.settings.required or not (same and math.isfinite(one.error) and math.isfinite(before.error)):
+            if self.settings.required or before is None or not one.repeats(before):
                 self._runs.append(one)
             if not self.settings.required and self._no_gain():
                 self._left = []
 
-    def _run(self, one: _Run, limit: float) -> None:
+    def _start(self, dyn: Dynamics, value: float) -> None:
+        """Integrate one step, or a thousandth of an interval."""
+        duration = value if self.settings.setting == "dt" else 1e-3 * float(self.truth.times[1])
+        self._solve(dyn, value, np.array([duration]))
+
+    def _solve(self, dyn: Dynamics, value: float, save: Array, limit: float | None = None) -> Trajectory:
+        """Integrate to the last time; give up after `limit` seconds."""
+        problem, progress = self.problem, None if limit is None else patience(limit)
+        more: dict[str, Any] = {self.settings.setting: value, "torque": problem.tau, "progress": progress}
+        return quiet_simulate(dyn, problem.q, problem.v, float(save[-1]), self.settings.method, save=save, **more)
+
+    def _run(self, value: float, limit: float) -> _Run:
         assert self._dyn is not None
-        problem, begun = self.problem, time.perf_counter()
+        dyn, times, begun, preparation = self._dyn, self.truth.times, time.perf_counter(), 0.0
         try:
-            problem.start(self._dyn, self.settings, one.value)
-            one.preparation, begun = time.perf_counter() - begun, time.perf_counter()
-            run = problem.solve(self._dyn, self.settings, one.value, limit)
+            self._start(dyn, value)
+            preparation, begun = time.perf_counter() - begun, time.perf_counter()
+            run = self._solve(dyn, value, times, limit)
         except UnsupportedError:
             raise
         except MbkitError as error:
-            one.first, one.note = time.perf_counter() - begun, str(error)
-            if isinstance(error, TooLongError) and not self.settings.required:
-                self.end(one.note)
-            return
-        one.first = time.perf_counter() - begun
-        one.steps, one.evaluations = run.stats.steps, run.stats.evaluations
-        if not run.stats.finished or len(run.t) != len(problem.times):
-            one.note = run.stats.message or f"ended at t = {run.t[-1]:g} s"
-            return
-        one.error = float(np.abs(problem.model.difference(problem.q, run.q)).max())
-        try:
-            # With applied forces the saved states are too few to know their work.
-            drift, size, _ = (problem.torque is None and energy_drift(self._dyn, run)) or (0.0, 0.0, 0.0)
-            one.energy = drift / size if size > 0 else math.nan
-        except MbkitError as error:
-            one.note = f"no energy: {error}"
+            first, late = time.perf_counter() - begun, isinstance(error, TooLongError)
+            if late and not self.settings.required:
+                self.end(str(error))
+            return _Run(value, Measurement(value, "slow" if late else "refused", note=str(error)), first, preparation)
+        first = time.perf_counter() - begun
+        return _Run(value, self.problem.measured(value, self.truth, times, dyn, run), first, preparation)
 
     def _no_gain(self) -> bool:
         """Return whether the last settings brought no smaller error: at the reference's floor, or at rounding."""
-        floor = self.problem.floor
+        floor = self.truth.floor
         # Steps that end on the saved times can be shorter than a coarse tolerance needs: of settings that hardly
         # add a step, only the first shows whether finer ones help.
-        counted = self._runs[:1]
-        for one in self._runs[1:]:
+        first, *others = (one.cell for one in self._runs)
+        counted = [first]
+        for one in others:
             if not one.error > floor or one.steps >= _FINER * counted[-1].steps:
                 counted.append(one)
         errors = [one.error for one in counted]
@@ -338,7 +305,7 @@ class CurveMeasurement:
     def give_up(self, reason: str) -> None:
         """End here; settings that the caller chose are reported with the reason why they were not run."""
         if self.settings.required:
-            self._runs += [_Run(value, note=reason) for value in self._left]
+            self._runs += [_Run(value, Measurement(value, "not run", note=reason)) for value in self._left]
         elif not self._runs and self.refusal is None:
             self._refuse(reason)
         self.end(reason)
@@ -362,25 +329,26 @@ class CurveMeasurement:
 
     def repeatable(self) -> list[tuple[float, Callable[[], None]]]:
         """Return the runs that are worth timing again: seconds of each, and how to repeat it."""
-        return [(one.first, partial(self._repeat, one)) for one in self._runs if math.isfinite(one.error)]
+        return [(one.first, partial(self._repeat, one)) for one in self._runs if one.known]
 
     def _repeat(self, one: _Run) -> None:
         assert self._dyn is not None
         count = int(np.clip(_SHORT / max(one.first, 1e-9), 1, _MAX_IN_A_ROUND))
         begun = time.perf_counter()
         for _ in range(count):
-            self.problem.solve(self._dyn, self.settings, one.value)
+            self._solve(self._dyn, one.value, self.truth.times)
         one.times.append((time.perf_counter() - begun) / count)
 
     def curve(self) -> Curve | None:
         """Return the curve so far, None without any point."""
         if not self._runs:
             return None
-        settings, problem = self.settings, self.problem
+        settings, truth = self.settings, self.truth
         points = tuple(one.point(settings.setting) for one in self._runs)
         fixed = points if settings.setting == "dt" else ()
         steps, errors = [p.value for p in fixed], [p.error for p in fixed]
-        order, used = observed_order(steps, errors, floor=problem.floor, motion=problem.motion)
+        motion = farthest(self.problem.model, truth.q)
+        order, used = observed_order(steps, errors, floor=truth.floor, motion=motion)
         expected = float(settings.info.order) if fixed and settings.info.order is not None else math.nan
         return Curve(settings.engine, settings.method, points, order, used, expected, self._compile, self._ended)
 
@@ -431,6 +399,7 @@ class Sweep:
     """
 
     problem: Problem
+    truth: Truth
     settings: Sequence[Settings]
     repeats: int
     seed: int
@@ -438,7 +407,8 @@ class Sweep:
     executor: Executor | None = None
 
     def __post_init__(self) -> None:
-        self._curves = [] if self.executor else [CurveMeasurement(self.problem, one) for one in self.settings]
+        here = () if self.executor else self.settings
+        self._curves = [CurveMeasurement(self.problem, self.truth, one) for one in here]
         self._answers: dict[int, Outcome] = {}
 
     def outcomes(self) -> list[Outcome]:
@@ -514,7 +484,7 @@ class Sweep:
         each = 1 / max(len(self.settings), 1)
         part = replace(self.budget, seconds=left * each, usual=min(self.budget.usual, left) * each)
         calls = {
-            str(i): partial(_measure, self.problem, one, self.repeats, self.seed, part)
+            str(i): partial(_measure, self.problem, self.truth, one, self.repeats, self.seed, part)
             for i, one in enumerate(self.settings)
         }
         # Threads that suppress warnings side by side restore each other's filters.
@@ -527,8 +497,8 @@ class Sweep:
                 yield len(self._answers) / len(self.settings), f"{one.method} on {one.engine}"
 
 
-def _measure(problem: Problem, settings: Settings, repeats: int, seed: int, budget: TimeBudget) -> Outcome:
+def _measure(problem: Problem, truth: Truth, one: Settings, repeats: int, seed: int, budget: TimeBudget) -> Outcome:
     """Measure one curve in a worker."""
-    sweep = Sweep(problem, [settings], repeats, seed, replace(budget, begun=time.process_time()))
+    sweep = Sweep(problem, truth, [one], repeats, seed, replace(budget, begun=time.process_time()))
     deque(sweep.steps(), maxlen=0)
     return sweep.outcomes()[0]

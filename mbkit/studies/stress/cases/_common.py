@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import Array
 from mbkit.model import Model
-from mbkit.studies.stress.case import Case, Family, Problem
+from mbkit.studies.measurement import Problem
+from mbkit.studies.stress.case import Case, Family
 
 #: From times (K,) to q (K, nq).
 Exact = Callable[[Array], Array]

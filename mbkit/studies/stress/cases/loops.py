@@ -18,7 +18,7 @@ from mbkit.engines.consistent.random_states import states_of
 from mbkit.engines.registry import PINOCCHIO
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.parts import Prescribed
-from mbkit.studies.stress.case import Problem
+from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.cases._common import EPS, Series, motion, powers, rows
 
 #: Of the four-bar that is cut down to a change point: crank, coupler, rocker, m.

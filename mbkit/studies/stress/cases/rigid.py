@@ -15,7 +15,7 @@ from mbkit import catalog, lagrangian
 from mbkit._check import Array
 from mbkit.load import load
 from mbkit.model import Body, Model, ModelBuilder
-from mbkit.studies.stress.case import Problem
+from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.cases import exact_motions
 from mbkit.studies.stress.cases._common import EPS, SWING, Exact, Facts, Series, motion, powers, rows, terms_at
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mbkit._check import Array
 from mbkit.model import Model, ModelBuilder
-from mbkit.studies.stress.case import Problem
+from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.cases._common import EPS, Series, motion, powers
 
 _rubbed = partial(Series, "friction")

@@ -12,7 +12,7 @@ import numpy as np
 from mbkit import catalog
 from mbkit._check import Array
 from mbkit.model import Model, ModelBuilder
-from mbkit.studies.stress.case import Problem
+from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.cases import exact_motions
 from mbkit.studies.stress.cases._common import EPS, SWING, Facts, Series, motion, powers, rows
 
