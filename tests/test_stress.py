@@ -7,12 +7,14 @@ import io
 import itertools
 import json
 import math
+import multiprocessing
 import os
 import pickle
 import signal
 import subprocess
 import sys
 import textwrap
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -43,6 +45,10 @@ from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, cpu_limit
 from tests import stress_cases as own
 
 METHODS = ("rk4", *own.ENDS)
+
+
+def spawning(workers: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
 
 @pytest.fixture(scope="module")
@@ -404,6 +410,23 @@ def test_conditions_beyond_double_are_known():
 # How it is asked
 
 
+@pytest.mark.parametrize("pool", [ThreadPoolExecutor, spawning], ids=["threads", "processes"])
+def test_an_executor_finds_the_same_errors(pool):
+    given = {"engines": ["pinocchio"], "methods": ["rk4"], "values": (1e-3, 1e-2)}
+    told = []
+    with pool(1) as executor:
+        result = stress(own.GLIDING, **given, executor=executor, progress=lambda *x: told.append(x))
+    alone = stress(own.GLIDING, **given, jobs=1)
+    assert [c.error for c in cells(result, "gliding", "rk4")] == [c.error for c in cells(alone, "gliding", "rk4")]
+    assert result.case("gliding").truths == alone.case("gliding").truths
+    assert (result.settings["executor"], result.settings["jobs"]) == (type(executor).__name__, None)
+    assert told == [(1.0, "gliding"), (1.0, "done")]
+    # It was shut down above.
+    late = stress(own.GLIDING, **given, executor=executor)
+    assert {c.end for c in cells(late, "gliding", "rk4")} == {"not run"}
+    assert "the executor takes no more calls" in cells(late, "gliding", "rk4")[0].note
+
+
 def test_ctrl_c_keeps_what_was_finished(tmp_path):
     def interrupt(done, _text):
         if done > 0.4:
@@ -461,6 +484,8 @@ def test_bad_input_is_named_before_anything_starts():
     for name in ("dt", "rtol", "bar", "seconds", "budget"):
         bad(name, own.GLIDING, **{name: -1.0})
     bad("jobs", own.GLIDING, jobs=0)
+    bad("executor: expected a concurrent.futures.Executor, got int", own.GLIDING, executor=4)
+    bad("jobs: expected none beside an executor", own.GLIDING, jobs=1, executor=ThreadPoolExecutor(1))
     bad("cannot be sent to other processes", replace(own.GLIDING, make=lambda _: None))
 
 

@@ -12,7 +12,7 @@ import os
 import pickle
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from functools import partial
 from math import inf
 from multiprocessing import spawn
@@ -23,7 +23,7 @@ from typing import Any, Final, TypeVar
 from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError
 from mbkit.engines.registry import registered_engines
 from mbkit.engines.remote.served.serve import attend
-from mbkit.errors import MbkitError
+from mbkit.errors import InputError, MbkitError
 from mbkit.methods.registry import METHODS, registered_methods
 
 T = TypeVar("T")
@@ -176,21 +176,27 @@ def processors() -> int:
 
 
 class WorkerPool(ThreadPoolExecutor):
-    """An executor of so many threads, each of which makes its calls in a worker of its own."""
+    """An executor of so many threads, each of which makes its calls in a worker of its own; see `Worker`."""
 
-    def __init__(self, jobs: int) -> None:
+    def __init__(
+        self, jobs: int, home: Path | None = None, memory: int = 0, environment: Mapping[str, str] | None = None
+    ) -> None:
         super().__init__(jobs)
-        self._idle = [Worker() for _ in range(jobs)]
+        self._idle = [Worker(home, memory, environment) for _ in range(jobs)]
         self._all = tuple(self._idle)
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """Make a call in one of the workers."""
-        return super().submit(self._call, fn, args, kwargs)
+        return self.lend(lambda worker: worker.call(partial(fn, *args, **kwargs)))
 
-    def _call(self, fn: Callable[..., T], args: tuple[Any, ...], kwargs: dict[str, Any]) -> T:
+    def lend(self, work: Callable[..., T], *args: Any) -> Future[T]:
+        """Call a function here, with one of the workers as its first argument."""
+        return super().submit(self._with_worker, work, args)
+
+    def _with_worker(self, work: Callable[..., T], args: tuple[Any, ...]) -> T:
         worker = self._idle.pop()
         try:
-            return worker.call(partial(fn, *args, **kwargs))
+            return work(worker, *args)
         finally:
             self._idle.append(worker)
 
@@ -201,6 +207,22 @@ class WorkerPool(ThreadPoolExecutor):
         self.shutdown(wait=True, cancel_futures=True)
         for worker in self._all:
             worker.end()
+
+
+def check_executor(executor: object, **sent: object) -> None:
+    """Refuse what is no executor, and arguments that cannot be sent to its processes."""
+    if executor is not None and not isinstance(executor, Executor):
+        raise InputError(
+            f"executor: expected a concurrent.futures.Executor, got {type(executor).__name__}; "
+            "use a ProcessPoolExecutor, or the result of Dask's client.get_executor()"
+        )
+    for name, value in sent.items() if isinstance(executor, ProcessPoolExecutor) else ():
+        try:
+            pickle.dumps(value)
+        except Exception as error:  # pickle raises errors of several kinds
+            raise InputError(
+                f"{name}: cannot be sent to the executor's processes ({error}); define the function in a module"
+            ) from None
 
 
 def run(

@@ -8,9 +8,9 @@ import pickle
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from mbkit.studies.stress.measure import TERMS, Limits, Prepared, condition_numb
 from mbkit.studies.stress.measurements import CaseResult, Row
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
-from mbkit.studies.worker import CallError, Worker, describe, in_worker, processors
+from mbkit.studies.worker import CallError, Worker, WorkerPool, check_executor, describe, in_worker, processors, run
 
 #: Seconds that a run may take, and the whole study, quick and not.
 _SECONDS: Final = {True: 0.5, False: 2.0}
@@ -98,9 +98,12 @@ class CaseSweep:
     pairs: Sequence[tuple[str, str]]
     bar: float
     limits: Limits
-    report: Callable[[str], object]
+    #: Gets the text of what is done; by default nobody reads it.
+    report: Callable[[str], object] = str
     deadline: float = math.inf
     clock: Callable[[], float] = time.perf_counter
+    #: Why there are no more cells.
+    why: str = OUT_OF_TIME
 
     def __post_init__(self) -> None:
         theory = self.case.theory or (lambda _engine, _method: None)
@@ -227,7 +230,7 @@ class CaseSweep:
 
     def result(self) -> CaseResult:
         """Return the result up to now."""
-        prepared = [self._prepared.get(i, Prepared(OUT_OF_TIME)) for i in range(len(self.values))]
+        prepared = [self._prepared.get(i, Prepared(self.why)) for i in range(len(self.values))]
         return CaseResult(
             **(self.case.facts() | {"bar": self.bar}),
             values=self.values,
@@ -237,7 +240,7 @@ class CaseSweep:
         )
 
     def _result_row(self, row: _Row, given: set[float | None]) -> Row:
-        unknown = row.stopped or OUT_OF_TIME
+        unknown = row.stopped or self.why
         cells = (row.cells.get(i, Measurement(value, "not run", note=unknown)) for i, value in enumerate(self.values))
         setting = row.setting
         if given and setting.startswith("dt"):
@@ -284,32 +287,41 @@ def run_sweeps(sweeps: Sequence[CaseSweep], home: Path, memory: int, jobs: int, 
     # removed for it.
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     caches = {"MBKIT_CACHE_DIR": str(home / "code"), "HEYOKA_CACHE_DIR": str(home / "code-heyoka")}
-    workers = [Worker(home, memory, {**os.environ, **threads, **caches}) for _ in range(jobs)]
-    idle = list(workers)
-    running: dict[Future[bool], tuple[_Task, Worker]] = {}
-    with ExitStack() as stack:
-        for worker in workers:
-            stack.callback(worker.end)
-        pool = stack.enter_context(ThreadPoolExecutor(jobs))
-        for worker in workers:
-            stack.callback(worker.close)
+    running: dict[Future[bool], _Task] = {}
+    with WorkerPool(jobs, home, memory, {**os.environ, **threads, **caches}) as pool:
         while True:
-            while idle and (ready := [task for task in tasks if task.ready]):
-                task, worker = min(ready, key=lambda task: task.rounds), idle.pop()
+            while len(running) < jobs and (ready := [task for task in tasks if task.ready]):
+                task = min(ready, key=lambda task: task.rounds)
                 task.rounds, task.state = task.rounds + 1, "running"
                 # Those of this round: the others wait for the time that it leaves.
                 waiting = 1 + sum(t.state == "waiting" and t.rounds < task.rounds for t in tasks)
                 begun = time.perf_counter()
                 left = max(deadline - begun, 0.0)
                 until = begun + min(left, left * jobs / waiting)
-                running[pool.submit(task.work, worker, until)] = task, worker
+                running[pool.lend(task.work, until)] = task
             if not running:
                 return
             for future in wait(running, _TICK, FIRST_COMPLETED).done:
-                task, worker = running.pop(future)
-                idle.append(worker)
+                task = running.pop(future)
                 task.state = "done" if future.result() or time.perf_counter() >= deadline else "waiting"
             yield
+
+
+def _alone(
+    memory: int,
+    seconds: float,
+    case: Case,
+    values: tuple[float, ...],
+    pairs: Sequence[tuple[str, str]],
+    bar: float,
+    limits: Limits,
+) -> CaseResult:
+    """Work through a case with a worker of its own, in a process of an executor."""
+    deadline = time.perf_counter() + seconds
+    one = CaseSweep(case, values, pairs, bar, limits, deadline=deadline)
+    with tempfile.TemporaryDirectory(prefix="mbkit-stress-", ignore_cleanup_errors=True) as home:
+        deque(run_sweeps([one], Path(home), memory, 1, deadline), maxlen=0)
+    return one.result()
 
 
 # The study
@@ -329,6 +341,7 @@ def stress(
     memory: int | None = None,
     budget: float | None = None,
     jobs: int | None = None,
+    executor: Executor | None = None,
     progress: Progress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> StressResult:
@@ -359,6 +372,9 @@ def stress(
         Bytes of a worker process, 2 GiB by default; enforced on Linux.
     jobs : int, optional
         Processes side by side, by default one per processor, at most 16. Run times are those of a busy machine.
+    executor : concurrent.futures.Executor, optional
+        Works through one case a call, with a worker process there: a pool of processes, Dask's or MPI's. Each case then
+        has its part of the budget, however many run side by side. Errors do not depend on it.
     progress : callable, optional
         Called as ``progress(fraction, text)``. An exception of it ends the study, after `checkpoint` has the result.
     checkpoint : path or callable, optional
@@ -407,7 +423,10 @@ def stress(
     bar = real("bar", bar, positive=True)
     memory = _MEMORY if memory is None else count("memory", memory, least=_MIN_MEMORY)
     budget = _BUDGET[quick] if budget is None else real("budget", budget, positive=True)
-    jobs = min(processors(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
+    width = min(processors(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
+    check_executor(executor)
+    if executor is not None and jobs is not None:
+        raise InputError("jobs: expected none beside an executor, which has its own; leave it out")
     checkpoints = Checkpointer(progress, checkpoint)
     swept = _swept(cases, values, quick=quick)
     methods_of = methods_by_engine(engines, _quick_methods(engines) if quick and methods is None else methods)
@@ -421,25 +440,40 @@ def stress(
         "seconds": limits.seconds,
         "memory": memory,
         "budget": budget,
-        "jobs": jobs,
+        "jobs": None if executor else width,
+        "executor": type(executor).__name__ if executor else None,
     }
     doing, deadline = deque([""], maxlen=1), begun + budget
-    sweeps = [
-        CaseSweep(case, own, _rows(case, methods_of), case.bar or bar, limits, doing.append, deadline)
-        for case, own in swept
-    ]
+    parts = [(case, own, _rows(case, methods_of), case.bar or bar, limits) for case, own in swept]
+    sweeps = [CaseSweep(*part, doing.append, deadline) for part in parts]
+    #: What an executor has answered.
+    answers: dict[str, CaseResult] = {}
 
     def result(*, complete: bool) -> StressResult:
         return StressResult(
-            cases=tuple(sweep.result() for sweep in sweeps),
+            cases=tuple(answers.get(sweep.case.name) or sweep.result() for sweep in sweeps),
             complete=complete,
             **results.provenance(begun),
             settings=settings,
         )
 
+    def elsewhere(executor: Executor) -> Iterator[tuple[float, str]]:
+        by_name = {sweep.case.name: sweep for sweep in sweeps}
+        calls = {part[0].name: partial(_alone, memory, budget / len(parts), *part) for part in parts}
+        for k, (name, answer) in enumerate(run(calls, executor=executor)):
+            if isinstance(answer, (CallError, WorkerStartError)):
+                raise answer
+            if isinstance(answer, Exception):
+                by_name[name].why = f"not run: {describe(answer)}"
+            else:
+                answers[name] = answer
+            yield (k + 1) / len(calls), name
+
     size = sum(sweep.size for sweep in sweeps)
-    width = min(jobs, max(1, sum(1 + len(sweep.engines) for sweep in sweeps)))
+    width = min(width, max(1, sum(1 + len(sweep.engines) for sweep in sweeps)))
     try:
+        if executor is not None:
+            return checkpoints.run(elsewhere(executor), result)
         with (
             tempfile.TemporaryDirectory(prefix="mbkit-stress-", ignore_cleanup_errors=True) as home,
             closing(run_sweeps(sweeps, Path(home), memory, width, deadline)) as ticks,

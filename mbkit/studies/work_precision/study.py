@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor
 from typing import Any, Final
 
 import numpy as np
@@ -26,6 +25,7 @@ from mbkit.studies.work_precision.reference import Reference
 from mbkit.studies.work_precision.reference import reference as compute_reference
 from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.sweep import INTERVALS, Sweep, TimeBudget, plans
+from mbkit.studies.worker import check_executor
 
 #: An exact motion: from a time to q and v.
 Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
@@ -155,7 +155,7 @@ def work_precision(
     # Of runs that are kept short, fewer are timed again, the longest least.
     budget = TimeBudget(limit, min(usual * min(max(most / whole, _LEAST_USUAL), 1.0), limit), most)
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
-    _check_executor(executor, torque)
+    check_executor(executor, torque=torque)
     checkpoints = Checkpointer(progress, checkpoint)
     methods_of = methods_by_engine(engines, methods)
     native = any(METHODS[m].kind == "native" for names in methods_of.values() for m in names)
@@ -287,23 +287,6 @@ def _truth(model: Model, q0: Array, duration: float, reference: Reference) -> Tr
     if float(np.abs(model.difference(q0, q[0])).max()) > _SAME_START:
         raise InputError("reference: does not start at q0 (and v0); leave them out, or use the reference of this start")
     return Truth(times, q, floor, reference.how)
-
-
-def _check_executor(executor: Executor | None, torque: object) -> None:
-    if executor is None:
-        return
-    if not isinstance(executor, Executor):
-        raise InputError(
-            f"executor: expected a concurrent.futures.Executor, got {type(executor).__name__}; "
-            "use a ProcessPoolExecutor, or the result of Dask's client.get_executor()"
-        )
-    if isinstance(executor, ProcessPoolExecutor):
-        try:
-            pickle.dumps(torque)
-        except Exception as error:  # pickle raises errors of several kinds
-            raise InputError(
-                f"torque: cannot be sent to the executor's processes ({error}); define the function in a module"
-            ) from None
 
 
 def _constant_torque(torque: ArrayLike | TorqueFunction | None, model: Model) -> Any:
