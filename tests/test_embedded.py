@@ -17,7 +17,7 @@ from mbkit import catalog
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError
 from mbkit.methods.registry import Tolerances
-from mbkit.methods.tableaus import EmbeddedTableau, dormand_prince_853
+from mbkit.methods.tableaus import dormand_prince_853
 from mbkit.model import Model, ModelBuilder
 from mbkit.model.integration_space import Space
 from mbkit.simulate import Event, Trajectory, at_section, simulate
@@ -87,15 +87,6 @@ def test_the_pair_has_its_orders_and_travels() -> None:
     assert (pair.stages, pair.order, len(pair.errors)) == (12, 8, 2)
     again = pickle.loads(pickle.dumps(pair))
     assert all(np.array_equal(x, y) for x, y in zip(again.errors, pair.errors, strict=True))
-    # The constructor finds an order that is not there, also of an embedded method.
-    with pytest.raises(InputError, match="order 9 condition"):
-        EmbeddedTableau("x", pair.A, pair.b, 9, [])
-    with pytest.raises(InputError, match=r"embedded.*order 6 condition"):
-        EmbeddedTableau("x", pair.A, pair.b, 8, [(6, pair.errors[0])])
-    with pytest.raises(InputError, match=r"embedded.*order 4 condition"):
-        EmbeddedTableau("x", pair.A, pair.b, 8, [(4, pair.errors[1])])
-    with pytest.raises(InputError, match=r"expected \(12,\) errors"):
-        EmbeddedTableau("x", pair.A, pair.b, 8, [(5, pair.errors[0][:3])])
 
 
 def test_the_coefficients_are_scipys() -> None:

@@ -174,11 +174,11 @@ def test_hold_is_the_linear_limit_of_every_method(tree):
     assert (ratio > [3.5, 3.5, 6.0]).all()
 
 
-def test_an_unknown_hold_is_refused():
+def test_a_hold_of_no_time_or_beyond_all_numbers_is_refused():
     linear = mb.dynamics(mb.catalog.pendulum(), "lagrangian").linearize([0.0], [0.0], [0.0])
-    for arguments in ((0.0,), (np.nan,), (0.1, "tustin"), (0.1, "rk4")):
-        with pytest.raises(InputError):
-            linear.discretize(*arguments)
+    for dt in (0.0, np.nan):
+        with pytest.raises(InputError, match="dt"):
+            linear.discretize(dt)
     with pytest.raises(NumericalError, match="overflows"), np.errstate(all="ignore"):
         mb.dynamics(mb.catalog.pendulum(), "lagrangian").linearize([np.pi], [0.0], [0.0]).discretize(1e4)
     # A step that ends nowhere.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ import mbkit as mb
 from mbkit.cli import cli
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, UnsupportedError
-from mbkit.methods.tableaus import EmbeddedTableau, dormand_prince_853, rodas5p
 from mbkit.simulate import METHODS, RK4, ImplicitTableau, Method, Tableau, register_method, simulate
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.solvers import compiled_fixed_step
@@ -171,16 +169,8 @@ def test_it_is_refused_by_name_where_it_cannot_run() -> None:
 
 
 def test_a_ragged_argument_of_a_tableau_is_named() -> None:
-    pair, own = dormand_prince_853(), rodas5p()
     ragged = [[], [1.0]]
     with pytest.raises(InputError, match=r"tableau 'x': A: expected an array of numbers, got \[\[\], \[1.0\]\]"):
         Tableau("x", ragged, [0.5, 0.5], 2)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="tableau 'x': b: expected an array of numbers"):
         ImplicitTableau("x", [[0.5]], [[1.0], []], 2)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="tableau 'x': lower, of order 5: expected an array of numbers"):
-        EmbeddedTableau("x", pair.A, pair.b, 8, [(5, ragged)])  # type: ignore[list-item]
-    for name in ("A", "C", "b", "error", "dense"):
-        with pytest.raises(InputError, match=f"tableau 'rodas5p': {name}: expected an array of numbers"):
-            replace(own, **{name: ragged})
-        with pytest.raises(InputError, match=f"tableau 'rodas5p': {name}: expected finite numbers"):
-            replace(own, **{name: np.nan * getattr(own, name)})

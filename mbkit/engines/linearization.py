@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array, arrays_shown, real, shown
+from mbkit._check import Array, arrays_shown, real
 from mbkit.engines.steps import Slopes, differentiable_method, step_derivatives
 from mbkit.errors import InputError, NumericalError, UnsupportedError, require_known
 from mbkit.methods.registry import DEFAULT_METHOD, Method
@@ -32,7 +32,7 @@ from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
 
 if TYPE_CHECKING:
-    from typing import Literal
+    pass
 
 LINEARIZE: Final = Path("linearize", "linearize: not known of", ALL)
 #: Quantities that `parameter_derivatives` differentiates.
@@ -87,30 +87,24 @@ class Linearization(NamedTuple):
         rows = [graded(A, vectors=False)[0] for A in self.A.reshape(-1, *self.A.shape[-2:])]
         return np.array(rows, dtype=complex).reshape(self.A.shape[:-1])
 
-    def discretize(self, dt: float, method: Literal["zoh"] = "zoh") -> DiscreteLinearization:
-        """Return the linear system's exact solution over dt seconds, with the force held.
+    def discretize(self, dt: float) -> DiscreteLinearization:
+        """Return the linear system's exact solution over dt seconds, with the force held (zero-order hold).
+
+        A is exp(A dt), and B and f are integrals of it. A and B stay those of this state, though the state moves on:
+        good to order dt² where it is no equilibrium. `Dynamics.discretize` has the exact derivative of a method's step.
 
         Parameters
         ----------
         dt : float
             s, above 0.
-        method : {"zoh"}
-            Zero-order hold, by the matrix exponential: A is exp(A dt), and B and f are integrals of it. A and B stay
-            those of this state, though the state moves on: good to order dt² where it is no equilibrium.
-            `Dynamics.discretize` has the exact derivative of a method's step.
 
         Raises
         ------
         InputError
-            dt is not positive, or another method.
+            dt is not positive.
         """
         from scipy.linalg import expm
 
-        if method != "zoh":
-            raise InputError(
-                f"method: expected 'zoh', got {shown(method)}; dyn.discretize(q, v, tau, dt, method) has the exact "
-                "derivative of a step of a method of integration"
-            )
         h, n, m = real("dt", dt, positive=True), self.A.shape[-1], self.B.shape[-1]
         # exp of [[A, B], [0, 0]] holds the integral too (Van Loan 1978, Computing integrals involving the matrix
         # exponential).

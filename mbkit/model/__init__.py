@@ -6,7 +6,7 @@ from mbkit.model.elements.forces import Bushing, FrameForce, GravityCompensation
 from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.kinds import Needs
 from mbkit.model.elements.motion_laws import FormulaMotion, SplineMotion
-from mbkit.model.joint_types import KINDS, JointKind, JointType, kind_of, register_joint_type
+from mbkit.model.joint_types import KINDS, JointType, kind_of, register_joint_type
 from mbkit.model.model import Model
 from mbkit.model.parameters import Expression, Number, Parameter, known, nominal
 from mbkit.model.parts import Body, Coupler, Frame, Joint, JointCoupling, Loop, Mimic, NoSlip, PointSpring, Prescribed
@@ -26,7 +26,6 @@ __all__ = [
     "Joint",
     "JointCoupling",
     "JointForce",
-    "JointKind",
     "JointType",
     "Loop",
     "Mimic",

@@ -240,10 +240,6 @@ class JointType:
         return [np.array(self.twist(_REAL, joint, q, unit[i])[1], dtype=np.float64) for i in self.angular]
 
 
-#: The name of `JointType` in earlier versions.
-JointKind = JointType
-
-
 class _Fixed(JointType):
     name, nq, nv, suffixes, velocity_suffixes = "fixed", 0, 0, (), ()
 
