@@ -29,13 +29,7 @@ MOBILITY: Final = {
     "slider_crank": (1, 2),
     "four_bar": (1, 2),
     "four_bars": (1, 4),
-    "inverted_slider_crank": (1, 2),
     "five_bar": (2, 2),
-    "pantograph": (2, 2),
-    "peaucellier": (1, 6),
-    "watt": (1, 2),
-    "chebyshev": (1, 2),
-    "hoecken": (1, 2),
     "scissor": (1, 6),
     "parallel_gripper": (1, 4),
     "planar_3rrr": (3, 6),
@@ -52,13 +46,7 @@ OTHER: Final[dict[str, dict[str, Any]]] = {
     "slider_crank": {"crank": 0.13, "rod": 0.41},
     "four_bar": {"crank": 0.37, "coupler": 1.3, "rocker": 1.1, "ground": 1.45},
     "four_bars": {"n": 3, "length": 0.7},
-    "inverted_slider_crank": {"crank": 0.23, "ground": 0.17},
     "five_bar": {"ground": 0.35, "proximal": 0.41, "distal": 0.62},
-    "pantograph": {"arm": 0.73, "ratio": 2.7},
-    "peaucellier": {"arm": 0.61, "side": 0.22, "crank": 0.24},
-    "watt": {"arm": 0.7, "coupler": 0.3},
-    "chebyshev": {"rocker": 0.63, "coupler": 0.21, "ground": 0.47},
-    "hoecken": {"crank": 0.12, "ground": 0.21, "rocker": 0.34},
     "scissor": {"n": 4, "rod": 0.37},
     "parallel_gripper": {"arm": 0.13, "base": 0.04, "palm": 0.06},
     "planar_3rrr": {"base_radius": 0.61, "platform_radius": 0.17, "proximal": 0.31, "distal": 0.37},
@@ -206,7 +194,7 @@ def test_links_are_as_near_to_the_ground_as_the_loops_allow(name: str) -> None:
         return 0 if body == "world" else 1 + depth(parents[body])
 
     deepest = {"scissor": 4, "stewart_platform": 4, "delta_robot": 4, "bricard": 3, "flyball_governor": 3}
-    deepest |= {"double_cardan_shaft": 3, "pantograph": 3}
+    deepest |= {"double_cardan_shaft": 3}
     assert max(depth(b.name) for b in model.bodies) == deepest.get(name, 2)
 
 
@@ -241,10 +229,6 @@ REFUSED = [
     ("four_bar", {"ground": 0.3}, "ground - crank, coupler, rocker"),
     ("four_bar", {"coupler": 0.1, "rocker": 0.1}, "ground - crank, coupler, rocker"),
     ("five_bar", {"distal": 0.3}, "ground, distal, distal"),
-    ("pantograph", {"ratio": 1.0}, "ratio"),
-    ("peaucellier", {"side": 0.1}, "outer - inner corner, side, side"),
-    ("chebyshev", {"rocker": 0.3}, r"ground \+ coupler, rocker, rocker"),
-    ("hoecken", {"rocker": 0.05}, "ground - crank, rocker, rocker"),
     ("planar_3rrr", {"distal": 0.01}, "base_radius - platform_radius, proximal, distal"),
     ("delta_robot", {"rod": 0.3}, r"rod, base_radius \+ arm - platform_radius"),
     ("double_cardan_shaft", {"angle": 2.0}, "angle"),
@@ -266,13 +250,7 @@ def test_lengths_that_do_not_meet_are_named(name: str, values: dict[str, Any], s
 RODS: Final[dict[str, tuple[float | None, str]]] = {
     "four_bar": (2.0, ""),
     "four_bars": (1.0, ""),
-    "inverted_slider_crank": (2.0, "block"),
     "five_bar": (2.0, ""),
-    "pantograph": (0.5, ""),
-    "peaucellier": (1.0, ""),
-    "watt": (1.0, ""),
-    "chebyshev": (1.0, ""),
-    "hoecken": (1.0, ""),
     "scissor": (1.0, "roller"),
     "planar_3rrr": (2.0, "disc"),
     "flyball_governor": (0.3, "sleeve arm"),
@@ -374,20 +352,6 @@ def test_four_bars_of_iftomm_a02_reach_the_exact_state() -> None:
     assert got == pytest.approx(published()["iftomm_A02_double_four_bar"]["exact_x_y_vx_vy_of_B0"]["1"], abs=1e-8)
 
 
-@pytest.mark.thorough("0.6-values0", "2.5-values0", "2.5-values1")
-@pytest.mark.parametrize("values", [{}, OTHER["inverted_slider_crank"]])
-@pytest.mark.parametrize("theta", [0.6, 2.5, -1.7])
-def test_inverted_slider_crank_has_the_law_of_cosines(values: dict[str, float], theta: float) -> None:
-    c, g = ({"crank": 0.1, "ground": 0.2} | values).values()
-    _, psi, x = mechanism("inverted_slider_crank", **values).driven(theta=theta)
-    assert psi == pytest.approx(math.atan2(c * math.sin(theta), g + c * math.cos(theta)), abs=1e-13)
-    assert g + c + x == pytest.approx(math.sqrt(g**2 + c**2 + 2 * g * c * math.cos(theta)), abs=1e-13)
-    # Quick return: the rod turns back where the crank is square to it.
-    if not values and theta == 0.6:
-        turn = math.pi - math.acos(c / g)
-        assert mechanism("inverted_slider_crank").driven(theta=turn)[1] == pytest.approx(math.asin(c / g), abs=1e-13)
-
-
 @pytest.mark.thorough("2.5-values0", "2.5-values1", "-1.7-values1")
 @pytest.mark.parametrize("values", [{}, OTHER["slider_crank"]])
 @pytest.mark.parametrize("theta", [0.6, 2.5, -1.7])
@@ -408,80 +372,6 @@ def test_five_bars_tip_is_where_two_circles_meet(values: dict[str, float], drive
     above = np.array([-span[2], 0.0, span[0]]) / np.linalg.norm(span)
     tip = (elbows[0] + elbows[1]) / 2 + above * math.sqrt(s**2 - span @ span / 4)
     assert m.point(q, "tip") == pytest.approx(tip, abs=1e-13)
-
-
-@pytest.mark.parametrize("values", [{}, OTHER["pantograph"]])
-def test_pantographs_pen_draws_larger_by_the_ratio(values: dict[str, float]) -> None:
-    m, ratio = mechanism("pantograph", **values), ({"ratio": 2.0} | values)["ratio"]
-    for driven in ({"theta": 0.5, "phi": 0.7}, {"theta": -0.6, "phi": -0.5}, {"theta": 1.1, "phi": 0.0}):
-        q = m.driven(**driven)
-        assert np.abs(q - m.model.neutral()).max() > 0.4
-        assert m.point(q, "pen") == pytest.approx(ratio * m.point(q, "tracer"), abs=1e-13)
-
-
-@pytest.mark.thorough("values1")
-@pytest.mark.parametrize("values", [{}, OTHER["peaucellier"]])
-def test_peaucelliers_pen_is_on_its_line(values: dict[str, float]) -> None:
-    m = mechanism("peaucellier", **values)
-    arm, side, crank = ({"arm": 0.52, "side": 0.25, "crank": 0.165} | values).values()
-    line = (arm**2 - side**2) / (2 * crank)
-    for theta in (-1.0, -0.4, 0.3, 0.8, 1.1):
-        q = m.driven(theta=theta)
-        inner = np.array([crank * (1 + math.cos(theta)), 0.0, crank * math.sin(theta)])
-        pen = m.point(q, "pen")
-        assert pen == pytest.approx([line, 0.0, line * math.tan(theta / 2)], abs=1e-12)
-        assert inner @ pen == pytest.approx(arm**2 - side**2, abs=1e-12)
-
-
-@pytest.mark.parametrize("values", [{}, OTHER["watt"]])
-def test_watts_pen_draws_watts_curve(values: dict[str, float]) -> None:
-    m = mechanism("watt", **values)
-    b, c = ({"arm": 0.5, "coupler": 0.4} | values).values()
-    c /= 2
-    a = math.hypot(b, c)
-    for part in (-0.6, 0.2, 0.35, 0.5):
-        x, _, z = m.point(m.driven(theta1=part * 2 * c / b), "pen")
-        # Angle from the line between the pivots.
-        polar = math.atan2(z, x) - math.atan2(-c, b)
-        root = math.sqrt(max(0.0, c**2 - (a * math.cos(polar)) ** 2))
-        square = min(
-            (b**2 - (a * math.sin(polar) + s * root) ** 2 for s in (1, -1)), key=lambda y: abs(y - x * x - z * z)
-        )
-        assert x * x + z * z == pytest.approx(square, abs=1e-13)
-    # Near the origin x is of the third order in z, at the least.
-    x, _, z = m.point(m.driven(theta1=0.1), "pen")
-    assert abs(x) < 0.05 * abs(z) ** 2
-
-
-def test_chebyshevs_pen_has_the_same_height_in_three_poses() -> None:
-    m = mechanism("chebyshev")
-    # The coupler is upright where one rocker is the hypotenuse of 3 and 4 and the other stands up.
-    turn = math.pi / 2 - math.atan2(4, 3)
-    upright, other = m.driven(theta2=-turn), m.driven(theta1=turn)
-    for q, x in ((m.model.neutral(), 0.2), (upright, 0.4), (other, 0.0)):
-        assert m.point(q, "pen") == pytest.approx([x, 0.0, 0.4], abs=1e-12)
-    between = m.point(m.driven(theta1=0.5 * turn), "pen")[2]
-    assert 1e-5 < abs(between - 0.4) < 4e-3
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("values", [{}, OTHER["hoecken"]])
-def test_hoeckens_pen_obeys_thales(values: dict[str, float]) -> None:
-    m = mechanism("hoecken", **values)
-    crank, ground, rocker = ({"crank": 0.1, "ground": 0.2, "rocker": 0.25} | values).values()
-    heights = []
-    for theta in np.linspace(0.4, 2 * math.pi - 0.4, 9):
-        pen = m.point(m.driven(theta=theta), "pen")
-        x, z = crank * math.cos(theta) - ground, crank * math.sin(theta)
-        away = math.sqrt(4 * rocker**2 - x * x - z * z)
-        assert pen == pytest.approx(
-            np.array([ground, 0, 0]) + away / math.hypot(x, z) * np.array([z, 0, -x]), abs=1e-12
-        )
-        if math.pi / 2 <= theta <= 3 * math.pi / 2:
-            heights.append(pen[2])
-    if not values:
-        assert np.ptp(heights) < 0.002
-        assert len(heights) >= 5
 
 
 @pytest.mark.thorough("values0")

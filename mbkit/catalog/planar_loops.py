@@ -10,24 +10,17 @@ from __future__ import annotations
 from typing import Any, Final
 
 from mbkit.catalog._links import ORIGIN, THIRDS, TURN, Pair, X, Z, add_link, add_pin, add_rod, at, times, triangle
-from mbkit.catalog._system import down, positive, system
-from mbkit.errors import InputError
-from mbkit.model import Model, ModelBuilder, Number, known, nominal
+from mbkit.catalog._system import down, system
+from mbkit.model import Model, ModelBuilder, Number
 
 __all__ = [
     "andrews_squeezer",
-    "chebyshev",
     "five_bar",
     "four_bar",
     "four_bars",
-    "hoecken",
-    "inverted_slider_crank",
-    "pantograph",
     "parallel_gripper",
-    "peaucellier",
     "planar_3rrr",
     "scissor",
-    "watt",
 ]
 
 
@@ -99,42 +92,6 @@ def four_bars(*, n: int = 2, length: Number = 1.0, mass: Number = 1.0, gravity: 
     return b.build()
 
 
-@system(block_mass=positive)
-def inverted_slider_crank(
-    *,
-    crank: Number = 0.1,
-    ground: Number = 0.2,
-    rod: Number = 0.4,
-    density: Number = 2.0,
-    block_mass: Number = 0.2,
-    gravity: Number = 9.81,
-) -> Model:
-    """Return the inverted slider-crank: a crank drives a rod to and fro through a block that slides on it.
-
-    The crank turns about the origin, the rod about (-ground, 0, 0). The block, a point mass, slides on the rod, and the
-    loop ``pin`` joins it to the crank's end. Three coordinates, with one degree of freedom: ``theta``, the crank's
-    angle from +x; ``psi``, the rod's angle from +x; ``x``, the block's way out along the rod from ground + crank. At
-    zero crank and rod lie along +x. The rod is a uniform thin one of length `rod`; the block may go beyond its end.
-
-    Notes
-    -----
-    tan ψ = crank sin θ/(ground + crank cos θ), and (ground + crank + x)² = ground² + crank² + 2 ground crank cos θ. A
-    crank that is shorter than the ground swings the rod between ±asin(crank/ground), forth and back in unequal times: a
-    shaper's quick return. A longer one turns the rod all round (Whitworth). Of equal ones the pose θ = π is singular.
-
-    References
-    ----------
-    Norton 2012, Design of Machinery, ch. 4, inverted slider-crank, and ch. 3 on quick returns.
-    """
-    b = ModelBuilder("inverted_slider_crank", gravity=down(gravity))
-    add_link(b, "theta", "crank", density * crank, (crank, 0.0))
-    add_link(b, "psi", "rod", density * rod, (rod, 0.0), start=(-ground, 0.0))
-    b.add_body("block", mass=block_mass)
-    b.add_joint("x", "prismatic", parent="rod", child="block", axis=X, translation=at((ground + crank, 0.0)))
-    add_pin(b, "pin", "crank", (crank, 0.0), "block")
-    return b.build()
-
-
 @system
 def five_bar(
     *, ground: Number = 0.6, proximal: Number = 0.3, distal: Number = 0.5, density: Number = 2.0, gravity: Number = 9.81
@@ -162,181 +119,6 @@ def five_bar(
         add_link(b, f"phi{k}", f"distal{k}", density * distal, (side * x, z), f"proximal{k}", (0.0, proximal))
     add_pin(b, "tip", "distal1", (x, z), "distal2", (-x, z))
     b.add_frame("tip", body="distal1", translation=at((x, z)))
-    return b.build()
-
-
-def _above_one(name: str, value: Any) -> Number:
-    ratio = positive(name, value)
-    if known(ratio) and nominal(ratio) <= 1:
-        raise InputError(f"{name}: expected a number above 1, got {nominal(ratio):g}")
-    return ratio
-
-
-@system(ratio=_above_one)
-def pantograph(*, arm: Number = 0.5, ratio: Number = 2.0, density: Number = 0.5, gravity: Number = 9.81) -> Model:
-    """Return the pantograph of thin rods that draws a figure larger by `ratio`.
-
-    Two arms of length `arm` are hinged to each other: the first turns about the origin O, the second carries the frame
-    ``pen`` at its end. Two shorter rods make a parallelogram with them, and their common end, the loop ``tracer``, is
-    where the frame ``tracer`` is. Four coordinates, with two degrees of freedom: ``theta``, the first arm's turn;
-    ``phi``, the second arm's against the first; ``alpha``, the turn against the first arm of the rod that lies along
-    the second one; ``beta``, against the second arm, of the rod that lies along the first. At zero the first arm rises
-    along (0.6, 0, 0.8) and the second falls along (0.6, 0, -0.8): tracer and pen are on the x axis.
-
-    Notes
-    -----
-    Exactly pen = ratio tracer, as vectors from O, in every pose in which the four rods are a parallelogram. Singular
-    where the arms are in line.
-
-    References
-    ----------
-    Scheiner 1631, Pantographice seu ars delineandi.
-    """
-    b = ModelBuilder("pantograph", gravity=down(gravity))
-    short = arm / ratio
-    rest = arm - short
-    up, fall = (0.6, 0.8), (0.6, -0.8)
-    add_link(b, "theta", "arm1", density * arm, times(arm, *up))
-    add_link(b, "phi", "arm2", density * arm, times(arm, *fall), "arm1", times(arm, *up))
-    add_link(b, "alpha", "rod1", density * short, times(short, *fall), "arm1", times(short, *up))
-    add_link(b, "beta", "rod2", density * rest, times(-rest, *up), "arm2", times(short, *fall))
-    add_pin(b, "tracer", "rod1", times(short, *fall), "rod2", times(-rest, *up))
-    b.add_frame("tracer", body="rod1", translation=at(times(short, *fall)))
-    b.add_frame("pen", body="arm2", translation=at(times(arm, *fall)))
-    return b.build()
-
-
-# Guides on a straight line
-
-
-@system
-def peaucellier(
-    *, arm: Number = 0.52, side: Number = 0.25, crank: Number = 0.165, density: Number = 1.0, gravity: Number = 9.81
-) -> Model:
-    """Return the linkage of Peaucellier and Lipkin, which leads a point exactly on a straight line.
-
-    Two arms turn about the origin O and carry opposite corners of a rhombus with sides `side`; a crank that turns about
-    (crank, 0, 0) leads its inner corner P on a circle through O. Its outer corner Q, the frame ``pen``, moves along a
-    line parallel to z. Seven coordinates, with one degree of freedom: ``theta``, the crank's angle from +x; ``alpha1``
-    and ``alpha2``, the turns of the upper and the lower arm; against these ``beta1``, ``beta2`` of the sides to P, and
-    ``gamma1``, ``gamma2`` of the sides to Q. At zero P = (2 crank, 0, 0), and Q is on the x axis. The loops ``inner1``,
-    ``inner2`` join the sides to the crank's end, ``outer`` joins the other two to each other.
-
-    Notes
-    -----
-    O, P and Q are in line with OP · OQ = arm² - side²; so the circle of P becomes the line x = (arm² - side²)/(2 crank)
-    of Q, at the height x tan(θ/2).
-
-    References
-    ----------
-    Peaucellier 1864; Kempe 1877, How to Draw a Straight Line.
-    """
-    inner = 2 * crank
-    outer = (arm**2 - side**2) / inner
-    foot, height = triangle("outer - inner corner, side, side", outer - inner, side, side)
-    b = ModelBuilder("peaucellier", gravity=down(gravity))
-    add_link(b, "theta", "crank", density * crank, (crank, 0.0), start=(crank, 0.0))
-    for k, up in ((1, 1.0), (2, -1.0)):
-        corner = (inner + foot, up * height)
-        add_link(b, f"alpha{k}", f"arm{k}", density * arm, corner)
-        add_link(b, f"beta{k}", f"inner_side{k}", density * side, (-foot, -up * height), f"arm{k}", corner)
-        add_link(b, f"gamma{k}", f"outer_side{k}", density * side, (foot, -up * height), f"arm{k}", corner)
-        add_pin(b, f"inner{k}", f"inner_side{k}", (-foot, -up * height), "crank", (crank, 0.0))
-    add_pin(b, "outer", "outer_side1", (foot, -height), "outer_side2", (foot, height))
-    b.add_frame("pen", body="outer_side1", translation=at((foot, -height)))
-    return b.build()
-
-
-@system
-def watt(*, arm: Number = 0.5, coupler: Number = 0.4, density: Number = 1.0, gravity: Number = 9.81) -> Model:
-    """Return Watt's linkage: two equal arms, whose coupler's middle stays near a straight line.
-
-    The left arm turns about (-arm, 0, coupler/2), the right one about (arm, 0, -coupler/2); their ends are joined by
-    the coupler, which hangs on the left arm and is closed with the right one by the loop ``pin``. Three coordinates,
-    with one degree of freedom: ``theta1`` and ``theta2``, the turns of the arms, and ``phi``, the turn of the coupler
-    against the left arm. At zero the arms are level, the coupler is upright, and its middle, the frame ``pen``, is at
-    the origin.
-
-    Notes
-    -----
-    The pen draws Watt's curve: r² = b² - (a sin ϑ ± √(c² - a² cos² ϑ))² with b = arm, c = coupler/2, a² = b² + c², and
-    the angle ϑ from the line between the two pivots. It has an inflection of high order at the origin, along z.
-
-    References
-    ----------
-    Watt 1784, patent 1432; Kempe 1877, How to Draw a Straight Line.
-    """
-    b = ModelBuilder("watt", gravity=down(gravity))
-    half = coupler / 2
-    add_link(b, "theta1", "arm1", density * arm, (arm, 0.0), start=(-arm, half))
-    add_link(b, "theta2", "arm2", density * arm, (-arm, 0.0), start=(arm, -half))
-    add_link(b, "phi", "coupler", density * coupler, (0.0, -coupler), "arm1", (arm, 0.0))
-    add_pin(b, "pin", "coupler", (0.0, -coupler), "arm2", (-arm, 0.0))
-    b.add_frame("pen", body="coupler", translation=at((0.0, -half)))
-    return b.build()
-
-
-@system
-def chebyshev(
-    *, rocker: Number = 0.5, coupler: Number = 0.2, ground: Number = 0.4, density: Number = 1.0, gravity: Number = 9.81
-) -> Model:
-    """Return Chebyshev's linkage: two crossed rockers, whose coupler's middle stays near a level line.
-
-    The rockers turn about the origin and (ground, 0, 0). At zero they cross symmetrically, and the coupler between
-    their ends is level above the middle of the ground line; it hangs on the first rocker and is closed with the second
-    one by the loop ``pin``. Three coordinates, with one degree of freedom: ``theta1`` and ``theta2``, the turns of the
-    rockers, and ``phi``, the turn of the coupler against the first. The frame ``pen`` is the coupler's middle.
-
-    Notes
-    -----
-    With rocker : coupler : ground = 5 : 2 : 4, the defaults, the height of the pen is that of the ground line's length
-    in three poses exactly: above the middle, and above either pivot, where the coupler is upright.
-
-    References
-    ----------
-    Chebyshev 1854, Théorie des mécanismes connus sous le nom de parallélogrammes; Kempe 1877, How to Draw a Straight
-    Line.
-    """
-    across = ground + coupler
-    half, height = triangle("ground + coupler, rocker, rocker", across, rocker, rocker)
-    b = ModelBuilder("chebyshev", gravity=down(gravity))
-    add_link(b, "theta1", "rocker1", density * rocker, (half, height))
-    add_link(b, "theta2", "rocker2", density * rocker, (-half, height), start=(ground, 0.0))
-    add_link(b, "phi", "coupler", density * coupler, (-coupler, 0.0), "rocker1", (half, height))
-    add_pin(b, "pin", "coupler", (-coupler, 0.0), "rocker2", (-half, height))
-    b.add_frame("pen", body="coupler", translation=at((-coupler / 2, 0.0)))
-    return b.build()
-
-
-@system
-def hoecken(
-    *, crank: Number = 0.1, ground: Number = 0.2, rocker: Number = 0.25, density: Number = 1.0, gravity: Number = 9.81
-) -> Model:
-    """Return Hoecken's linkage: a four-bar that leads its coupler's end near a level line for half a turn.
-
-    The crank turns about the origin, the rocker about D = (ground, 0, 0). The coupler has twice the rocker's length: it
-    hangs on the crank's end A and is closed with the rocker at its middle by the loop ``pin``. Three coordinates, with
-    one degree of freedom: ``theta``, the crank's angle from +x; ``phi``, the coupler's turn against the crank, and
-    ``psi``, the rocker's, both from their values at theta = 0. The frame ``pen`` is the coupler's end, above D there.
-
-    Notes
-    -----
-    The pin has the same distance from A, D and the pen. By Thales' theorem the pen is at right angles to DA: pen = D +
-    n √(4 rocker² - ‖DA‖²) with the unit vector n, which is DA turned by -90° in the x-z plane. With crank : ground :
-    rocker = 2 : 4 : 5, the defaults, the pen is near to a line over the half turn about θ = π.
-
-    References
-    ----------
-    Hoecken 1926; Norton 2012, Design of Machinery, ch. 3, on linkages for straight lines.
-    """
-    x, z = triangle("ground - crank, rocker, rocker", ground - crank, rocker, rocker)
-    b = ModelBuilder("hoecken", gravity=down(gravity))
-    end, pin = (2 * x, 2 * z), (x + crank - ground, z)
-    add_link(b, "theta", "crank", density * crank, (crank, 0.0))
-    add_link(b, "phi", "coupler", density * (2 * rocker), end, "crank", (crank, 0.0))
-    add_link(b, "psi", "rocker", density * rocker, pin, start=(ground, 0.0))
-    add_pin(b, "pin", "coupler", (x, z), "rocker", pin)
-    b.add_frame("pen", body="coupler", translation=at(end))
     return b.build()
 
 
