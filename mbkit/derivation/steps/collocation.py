@@ -43,7 +43,7 @@ _STRAIGHT: Final = 0.5
 
 
 class Collocation:
-    """The parts of a step from (q, w), with the names that `mbkit.simulate.solvers.compiled_fixed_step` chains.
+    """The parts of a step from (q, w), with the names that `mbkit.simulate.solvers.machine_code` chains.
 
     An unknown x has all stages, one behind the other: k, then r of the rotations, then λ. Behind them stand the size of
     the last correction and the worst ratio of one to the one before: where Newton's iteration wanders from its guess it

@@ -54,7 +54,7 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
         (pi0,) = called(dyn, midpoint.momentum, None, problem.start, q0, problem.v)
         if _machine_code(dyn, midpoint, problem):
             # It loads LLVM, which interpreting never needs.
-            from mbkit.simulate.solvers.compiled_fixed_step import run_implicit
+            from mbkit.simulate.solvers.machine_code.implicit_steps import run_implicit
 
             def velocity(t: float, q: Array, pi: Array, members: Indices) -> Array:
                 return _velocities(dyn, midpoint, members, t, q, pi)

@@ -1,0 +1,1 @@
+"""Blocks of fixed steps in machine code, of many states side by side."""

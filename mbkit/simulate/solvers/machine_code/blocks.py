@@ -1,0 +1,330 @@
+"""Blocks of steps of many states side by side, and the threads that share a batch of them.
+
+A block runs to its end without looking back. What samples stops it, where all parts of a batch meet.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbkit._check import Array
+from mbkit.codegen.compiled import Call, Compiled, aligned
+from mbkit.codegen.jit import host
+from mbkit.derivation.steps.fixed import Part
+from mbkit.errors import FunctionError
+from mbkit.simulate.problem import IntegrationProblem
+from mbkit.simulate.solvers.fixed_step import GridRecord
+from mbkit.simulate.time_grid import Grid, Indices
+
+#: Half of what a core has in its second cache, bytes.
+CACHE: Final = 2**19
+#: Steps of a block, at least.
+SHORTEST: Final = 16
+#: Numbers of a cache line.
+LANES: Final = 8
+
+
+class BlockLoop:
+    """Room for the states of a block of steps side by side, one trajectory in each column.
+
+    Columns beyond the `count` states repeat the last one. `sizes` has for each name the number of places, one, two that
+    take turns or one for each step, and of rows. `block` is the number of steps of the next block, at most; `carried`
+    names q and what goes with it; `clock` is the place of the time among the parameters, if it enters.
+
+    A run may stop at any step of a block, read `now`, set other torques by `hold`, and go on.
+    """
+
+    block: int
+    #: Each step of a block has a torque of its own.
+    each_step: bool
+    #: Each state of a block can be read, not only the last.
+    all_kept = True
+    carried: tuple[str, str] = ("q", "w")
+    #: The time that the parameters hold in a step, in steps behind its start.
+    evaluated: float = 0.0
+
+    def __init__(self, sizes: Mapping[str, tuple[int, int]], count: int, clock: int | None) -> None:
+        width, lanes = padded(count), host().width
+        self._room = {}
+        for name, (places, rows) in sizes.items():
+            self._room[name] = aligned(places * rows * width).reshape(places, rows, width)
+            self._room[name][:] = 0.0
+        self._count, self._taken, self._clock = count, 0, clock
+        # Whole vectors of the processor.
+        self._columns = -(-count // lanes) * lanes
+
+    def _call(self, code: Compiled, part: Part, step: int, period: int, places: Mapping[str, tuple[str, int]]) -> Call:
+        """Return a part's call in a step of the first `period`; `places` has names that stand in another room."""
+        arrays, moves = list[Array](), list[int]()
+        for name in (*part.reads, *part.writes):
+            own, place = places.get(name, (name, step))
+            room = self._room[own]
+            arrays.append(room[place % len(room)].T[: self._columns])
+            moves.append(period * room.strides[0] if len(room) > 2 else 0)
+        reads = len(part.reads)
+        return Call(code, arrays[:reads], arrays[reads:], moves)
+
+    def _fill(self, name: str, first: int, columns: Array) -> None:
+        """Put columns, (steps or 1, rows, n or 1), where they fit from this place on."""
+        room = self._room[name]
+        room = room[first if len(room) > 1 else 0 :][: len(columns)]
+        columns = columns[: len(room)]
+        if columns.shape[-1] == 1:
+            room[:] = columns
+        else:
+            room[..., : self._count] = columns
+            room[..., self._count :] = columns[..., -1:]
+
+    def _begin(self, parameters: Array, **states: Array) -> None:
+        """Put in states, (n, rows), and the values of parameters, (p,) or (n, p)."""
+        self._count, self._taken = len(states["q"]), 0
+        for name in self._room.keys() & states.keys():
+            self._fill(name, 0, states[name].T[None])
+        if parameters.size and "parameters" in self._room:
+            every = np.atleast_2d(parameters).T
+            self._fill("parameters", 0, np.broadcast_to(every, (len(self._room["parameters"]), *every.shape)))
+
+    def hold(self, torques: Array) -> None:
+        """Set the torques of the steps from the present one on, (steps or 1, nv, n or 1)."""
+        self._fill("tau", self._taken, torques)
+
+    def set_times(self, grid: Grid, first: int, steps: int) -> None:
+        """Set length and times of the next steps, which are of equal length and the run's from `first` on."""
+        self._room["dt"][:] = dt = grid.step(first)
+        if self._clock is not None:
+            times = grid.times_of(np.arange(first, first + steps)) + self.evaluated * dt
+            self._room["parameters"][self._taken :][:steps, self._clock] = times[:, None]
+
+    @property
+    def taken(self) -> int:
+        """Steps of the block so far."""
+        return self._taken
+
+    def run_to(self, step: int) -> None:
+        """Take the steps from where the last ones ended to this one of the block."""
+        raise NotImplementedError
+
+    def again(self) -> None:
+        """Make the last state the first one of the next block."""
+        raise NotImplementedError
+
+    @property
+    def good(self) -> Indices | None:
+        """Good steps of the block so far, (n,); None where nobody looks."""
+        return None
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """Which of the present states are good, (n,)."""
+        raise NotImplementedError
+
+    def to_body_velocity(self, q: Array, w: Array) -> Array:  # noqa: ARG002
+        """Return the saved w, (n, steps, nv)."""
+        return w
+
+    def now(self, name: str) -> Array:
+        """Return q, w, ... of the present states, (rows, n), which stay as they are until the next step."""
+        room = self._room[name]
+        return np.asarray(room[self._taken % len(room), :, : self._count])
+
+    def states(self, name: str, which: Sequence[int] | Indices) -> Array:
+        """Return q, w, ... after these many steps of the block, (n, steps, rows)."""
+        room = self._room[name]
+        places: Any = np.asarray(which) % len(room)
+        if places[-1] - places[0] == len(places) - 1:
+            places = slice(places[0], places[-1] + 1)
+        return np.asarray(room[places, :, : self._count].transpose(2, 0, 1))
+
+
+_Loop = TypeVar("_Loop", bound=BlockLoop)
+
+
+def padded(count: int) -> int:
+    """Return the number of columns for so many states: whole cache lines, and an odd number of them.
+
+    So no two rows fall on the same lines of a cache that is split by powers of two: 20 % of the time at 1024 states.
+    """
+    return -(-count // LANES) * LANES | LANES
+
+
+class SampleBarrier:
+    """Asks a torque that samples, once at each sample for all parts of a batch, which wait there for one another.
+
+    velocity(t, q, w, members) is mbkit's velocity of states (n, nq) and (n, nv).
+    """
+
+    def __init__(
+        self, problem: IntegrationProblem, parts: int, velocity: Callable[[float, Array, Array, Indices], Array]
+    ) -> None:
+        self._problem, self._velocity, self._k = problem, velocity, 0
+        self._loops: list[tuple[BlockLoop, Indices]] = []
+        self._barrier, self._left = threading.Barrier(parts, self._ask) if parts > 1 else None, False
+        #: Of a torque function that failed.
+        self.error: FunctionError | None = None
+
+    def join(self, loop: BlockLoop, members: Indices) -> None:
+        """Add a part."""
+        self._loops.append((loop, members))
+
+    def __call__(self, k: int) -> bool:
+        """Ask at a step, when all parts are there; return whether to go on."""
+        self._k = k
+        if self._barrier is None:
+            self._ask()
+        elif self._left:
+            # Who leaves would wait for a turn beside many parts that meet often.
+            raise threading.BrokenBarrierError
+        else:
+            self._barrier.wait()
+        return self.error is None
+
+    def leave(self) -> None:
+        """Let nobody wait for a part that goes no further."""
+        self._left = True
+        if self._barrier is not None:
+            self._barrier.abort()
+
+    def _ask(self) -> None:
+        problem, k, t = self._problem, self._k, self._problem.grid.time(self._k)
+        members: Indices = np.concatenate([who[loop.alive] for loop, who in self._loops])
+        if not len(members):
+            return
+        order, states = np.argsort(members), list[Array]()
+        for name in self._loops[0][0].carried:
+            states.append(np.concatenate([loop.now(name).T[loop.alive] for loop, _ in self._loops])[order])
+        q, w = states
+        v = self._velocity(t, q, w, members[order])
+        try:
+            if problem.batch is None:
+                problem.torque.sample(k, t, q[0], v[0])
+            else:
+                problem.torque.sample(k, t, q, v, members[order])
+        except FunctionError as error:
+            self.error = error
+
+
+def run_blocks(
+    problem: IntegrationProblem,
+    record: GridRecord,
+    loop: BlockLoop,
+    members: Indices,
+    barrier: SampleBarrier | None = None,
+) -> Iterator[tuple[int, dict[int, list[Array]]]]:
+    """Take members of the batch, which are in the loop, through the run in blocks.
+
+    Yields the number of steps after each block, and the last good state of the trajectories that were lost in it.
+    Within a block it stops at samples, where all parts of a batch meet.
+    """
+    grid, torque, kept = problem.grid, problem.torque, record.kept
+    k, torques, alive = 0, np.empty(0), np.full(len(members), True)
+    samples, going = [*reversed(torque.changes(grid.steps))], True
+    # Most parts of a batch are contiguous, which is read and written faster.
+    whole = slice(int(members[0]), int(members[-1]) + 1)
+    which: slice | Indices = whole if whole.stop - whole.start == len(members) else members
+    # The last step may have a length of its own.
+    ends = () if loop.all_kept else kept.tolist()
+    stops = {*ends, grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps}
+    for stop in sorted(stops):
+        while k < stop:
+            n, at = min(loop.block, stop - k), k
+            loop.set_times(grid, k, n)
+            while at < k + n:
+                if samples and samples[-1] == at:
+                    samples.pop()
+                    going = barrier is None or barrier(at)
+                    if not going:
+                        break
+                end = min(k + n, samples[-1]) if samples else k + n
+                if torque.held or not torques.size:
+                    torques = torque.columns(which, at, end if loop.each_step else at + 1)
+                loop.hold(torques)
+                loop.run_to(end - k)
+                at = end
+            n = at - k
+            rows, good, last = record.rows(k + 1, k + n), loop.good, dict[int, list[Array]]()
+            if rows.start < rows.stop:
+                q, w = (loop.states(name, kept[rows] - k) for name in loop.carried)
+                record.q[which, rows], record.v[which, rows] = q, loop.to_body_velocity(q, w)
+            if good is None:
+                record.steps[which] = k + n
+            else:
+                record.steps[members[alive]] = k + good[alive]
+                for m in np.flatnonzero(alive & (good < n)).tolist():
+                    last[int(members[m])] = [loop.states(name, [good[m]])[m, 0] for name in loop.carried]
+                alive &= good == n
+            yield k + n, last
+            if not going or (last and barrier is None and not alive.any()):
+                return
+            loop.again()
+            k += n
+
+
+def run_members(
+    problem: IntegrationProblem,
+    record: GridRecord,
+    members: Indices,
+    parts: Sequence[slice],
+    workers: int,
+    new_loop: Callable[[], Callable[[Indices], _Loop]],
+    velocity: Callable[[float, Array, Array, Indices], Array],
+    after_block: Callable[[_Loop, Indices, int, dict[int, list[Array]]], None],
+    after_part: Callable[[_Loop, slice], None],
+) -> FunctionError | None:
+    """Take members of a batch to the end; return the error of a torque function that samples.
+
+    Their parts run in threads, at most `workers`; parts that meet at samples wait for one another, in a thread each.
+    new_loop(), called in each thread, returns begin(members), the loop with these states in it. `after_block` gets the
+    loop, its members and what `run_blocks` yields; velocity is as in `SampleBarrier`.
+    """
+    barrier = None if problem.torque.samples is None else SampleBarrier(problem, len(parts), velocity)
+    done, left, stop, bar = [0] * len(parts), iter(list(enumerate(parts))), threading.Event(), problem.bar
+    total = max(len(parts) * problem.grid.steps, 1)
+
+    def work(report: Callable[[], None]) -> None:
+        begin = new_loop()
+        # A list's iterator hands each part to one thread.
+        for i, part in left:
+            own = members[part]
+            loop = begin(own)
+            if barrier is not None:
+                barrier.join(loop, own)
+            try:
+                for done[i], lost in run_blocks(problem, record, loop, own, barrier):
+                    after_block(loop, own, done[i], lost)
+                    report()
+                    if stop.is_set():
+                        return
+            except threading.BrokenBarrierError:
+                # Another part was stopped.
+                pass
+            except BaseException:
+                if barrier is not None:
+                    barrier.leave()
+                raise
+            after_part(loop, part)
+
+    workers = min(workers, len(parts)) if barrier is None else len(parts)
+    if workers < 2:
+        if parts:
+            work(lambda: bar.update(sum(done) / total))
+    else:
+        with ThreadPoolExecutor(workers) as pool:
+            waiting: set[Future[None]] = {pool.submit(work, lambda: None) for _ in range(workers)}
+            try:
+                while waiting:
+                    finished, waiting = wait(waiting, timeout=0.1, return_when=FIRST_EXCEPTION)
+                    for future in finished:
+                        future.result()
+                    bar.update(sum(done) / total)
+            finally:
+                stop.set()
+                if barrier is not None:
+                    # A block may take as long as all its samples.
+                    barrier.leave()
+    return None if barrier is None else barrier.error
