@@ -99,8 +99,8 @@ def integrate(
             if hold:
                 jumps, begins, table = _intervals(times, start, duration, hold[0], rows=read.held)
                 read, times = read.sampled(hold[1], begins, table), jumps if times is None else times
-            problem = IntegrationProblem(own, request.method, q, v, start, duration, setting, read, times, wanted, bar)
-            problem = replace(problem, jumps=jumps)
+            motion = q, v, start, duration
+            problem = IntegrationProblem(own, request.method, *motion, setting, read, times, wanted, bar, jumps)
         else:
             setting = dt
             _refuse_tolerances(chosen, request.rtol, request.atol)

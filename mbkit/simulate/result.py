@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from mbkit._check import Array
 from mbkit.errors import FunctionError
@@ -63,6 +63,9 @@ class Stats:
         return f"{self.steps} steps, {self.evaluations} evaluations, {self.seconds:.3g} s; {end}{chosen}"
 
 
+_FIGURES: Final = tuple(x.name for x in fields(Stats))
+
+
 @dataclass(frozen=True, kw_only=True)
 class SolverResult(Stats):
     """Kept states of a run, with its cost and end.
@@ -80,4 +83,4 @@ class SolverResult(Stats):
 
     def stats(self, **more: Any) -> Stats:
         """Return the cost and the end alone, with what else is known of them."""
-        return Stats(**{x.name: getattr(self, x.name) for x in fields(Stats)} | more)
+        return Stats(**{name: getattr(self, name) for name in _FIGURES} | more)

@@ -231,19 +231,24 @@ def _when(t: float, member: int | None) -> str:
     return f"at t = {t:.9g} s" + ("" if member is None else f" for trajectory {member}")
 
 
+#: Numbers of a force, and the function that returns them.
+Functions = tuple[tuple[slice, TorqueCallback], ...]
+
+
+def _on_one(functions: Functions, row: Array, t: float, q: Array, v: Array, member: int | None = None) -> Array:
+    """Return the force on one state, with the held numbers of a row."""
+    out = row.copy()
+    for part, function in functions:
+        out[part] = function.one(t, q, v, member)
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class ForceFunctions:
     """A force of which some numbers are functions of the state; `held` has the others."""
 
     held: PiecewiseConstantTorque
-    functions: tuple[tuple[slice, TorqueCallback], ...]
-
-    def one(self, row: Array, t: float, q: Array, v: Array, member: int | None = None) -> Array:
-        """Return the force on one state, with the held numbers of a row."""
-        out = row.copy()
-        for part, function in self.functions:
-            out[part] = function.one(t, q, v, member)
-        return out
+    functions: Functions
 
     def sampled(self, t: Array, q: Array, v: Array, *, strict: bool) -> SampledTorque:
         """Return the values at saved states; NaN where one is not finite or, unless strict, a function fails."""
@@ -254,7 +259,7 @@ class ForceFunctions:
             if np.isfinite(q[index]).all() and np.isfinite(v[index]).all():
                 member = index[0] if len(index) == 2 else None
                 try:
-                    out[index] = self.one(rows[index], float(t[index[-1]]), q[index], v[index], member)
+                    out[index] = _on_one(self.functions, rows[index], float(t[index[-1]]), q[index], v[index], member)
                 except TorqueError:
                     if strict:
                         raise
@@ -316,7 +321,7 @@ class Torque:
     ) -> None:
         parts: list[tuple[slice, Array]] = []
         functions: list[tuple[slice, TorqueCallback]] = []
-        self._size = self._nv = model.nv
+        size, self._nv, self._batch = model.nv, model.nv, batch
         #: Of a torque that is nothing else.
         self.feedback = torque if isinstance(torque, StateFeedback) and not wrenches else None
         if isinstance(torque, StateFeedback) and torque.gain.shape != (model.nv, model.nq + model.nv):
@@ -329,51 +334,143 @@ class Torque:
         elif torque is not None:
             parts.append((slice(0, model.nv), _read(torque, model, batch, steps)))
         for frame, wrench in (wrenches or {}).items():
-            part, self._size = slice(self._size, self._size + 6), self._size + 6
+            part, size = slice(size, size + 6), size + 6
             if callable(wrench):
                 functions.append((part, TorqueCallback(wrench, 6, f"wrench on {frame!r}")))
             else:
                 parts.append((part, _read_wrench(f"wrench on {frame!r}", wrench, batch, steps)))
-        shape = np.broadcast_shapes(*(x.shape[:-1] for _, x in parts))
-        # (n,) or (N, 1, n) all the time; or (steps, n) or (N, steps, n).
-        whole = np.zeros((*shape, self._size))
+        #: Whether the force jumps between steps.
+        self.held = any(x.ndim > 1 and (x.shape[:-1] != (batch, 1) or steps == 1) for _, x in parts)
+        #: Rows that are held, one for each step, or sample, or one for all: (rows, n), or (N, rows, n).
+        self.table = np.zeros((*(np.broadcast_shapes(*(x.shape[:-1] for _, x in parts)) or (1,)), size))
         for part, x in parts:
-            whole[..., part] = x
-        constant = all(x.ndim == 1 or x.shape[:-1] == (batch, 1) != (batch, steps) for _, x in parts)
-        self._rows: Array | None = None if constant else whole
-        self._constant: Array = whole if constant else np.zeros(self._size)
-        self._of_all = self._constant
-        if batch is not None:
-            each = whole[:, 0] if constant and whole.ndim == 3 else self._constant
-            self._of_all = np.ascontiguousarray(np.broadcast_to(each, (batch, self._size)))
-        self._functions = tuple(functions)
-        self._with_functions = ForceFunctions(PiecewiseConstantTorque(self._constant, None), self._functions)
+            self.table[..., part] = x
+        self._functions: Functions = tuple(functions)
 
     @classmethod
     def of_force(cls, force: Array, model: Model) -> Torque:
         """Return a constant force, (n,) or of a batch (N, n): τ, and behind it what wrenches there are."""
-        out, constant = cls(None, model, None, None), force if force.ndim == 1 else force[:, None]
-        out._size, out._constant, out._of_all = force.shape[-1], constant, force
-        out._with_functions = ForceFunctions(PiecewiseConstantTorque(constant, None), ())
+        out = cls(None, model, None if force.ndim == 1 else len(force), None)
+        out.table = force[..., None, :]
         return out
+
+    @property
+    def in_each_step(self) -> bool:
+        """Whether each step may have another force, and not each sample alone."""
+        return self.held and (self.samples is None or self.samples.fine)
+
+    @property
+    def callable(self) -> bool:
+        """Whether the force is a function of the state."""
+        return bool(self._functions)
+
+    # The rows
+
+    def rows(self, k: range | Indices, members: int | Indices | slice | None = None) -> Array:
+        """Return what is held in steps k: (count, n), or (m, count, n) where members of a batch differ.
+
+        Steps in an array may be those of each member, (m, count); behind the last step, or the last answer of a
+        controller, they are the last one.
+        """
+        table, places = self.table, self._places(k, members)
+        if table.ndim == 2:
+            return np.asarray(table[places])
+        if members is None:
+            members = slice(None)
+        elif isinstance(members, np.ndarray) and not isinstance(places, slice):
+            members = members[:, None]
+        return np.asarray(table[members, places])
+
+    def _places(self, k: range | Indices, members: Any) -> slice | Indices:
+        """Return which rows of the table act in steps."""
+        samples = self.samples
+        if isinstance(k, range) and (self.in_each_step or len(k) == 1):
+            place = self._place(k.start)
+            return slice(place, place + len(k))
+        steps = np.asarray(k) + self._first
+        if not self.held:
+            return np.zeros(steps.shape, dtype=np.intp)
+        if samples is not None and not samples.fine:
+            steps = np.searchsorted(samples.begins, steps, side="right") - 1
+        if isinstance(k, range):
+            return steps
+        last: Any = self.table.shape[-2] - 1
+        if samples is not None:
+            asked = samples.asked[slice(None) if members is None else members]
+            last = (np.array(samples.begins)[asked] if samples.fine else asked) - 1
+            last = last[:, None] if isinstance(members, np.ndarray) else last
+        return np.asarray(np.minimum(steps, last))
+
+    def _place(self, k: int) -> int:
+        """Return which row of the table acts in a step."""
+        step = self._first + k
+        return 0 if not self.held else step if self.samples is None else self.samples.row(step)
+
+    def columns(self, members: Indices | slice, start: int, stop: int) -> Array:
+        """Return the rows of steps start to stop side by side, (steps, n, members or 1)."""
+        rows = self.rows(range(start, stop), members)
+        return rows[:, :, None] if rows.ndim == 2 else np.ascontiguousarray(rows.transpose(1, 2, 0))
+
+    def during(self, k: int, members: int | Indices | None) -> Force:
+        """Return the force during step k on a single state, on one of a batch, or on these members of it."""
+        row, functions = self.table[..., self._place(k), :], self._functions
+        if members is None or isinstance(members, int):
+            row = row if row.ndim == 1 else row[members]
+            return partial(_on_one, functions, row, member=members) if functions else row
+        rows = row[members] if row.ndim == 2 else np.broadcast_to(row, (len(members), len(row)))
+        if not functions:
+            return rows
+
+        def many(t: float, q: Array, v: Array, part: Any = slice(None)) -> Array:
+            out = np.array(rows[part])
+            for place, function in functions:
+                out[:, place] = function.many(t, q, v, members[part])
+            return out
+
+        return many
+
+    def of_member(self, i: int | None) -> Callable[[int], Force]:
+        """Return a function of the step that returns the force on one state (of a batch)."""
+        return partial(self.during, members=i)
+
+    # Parts of a run
+
+    def of_part(self, member: int | None, start: int) -> Torque:
+        """Return the force of one trajectory from step `start` on, as that of a run of one state."""
+        out = copy(self)
+        out._first = self._first + start
+        if member is not None:
+            out._member, out._batch = member, None
+            out.table = self.table[member] if self.table.ndim == 3 else self.table
+            if self.samples is not None:
+                out.samples = replace(self.samples, asked=self.samples.asked[member : member + 1])
+        return out
+
+    def of_steps(self, members: Indices | None, starts: Indices | int, count: int) -> Torque:
+        """Return the force over `count` steps, from a step of its own on for each of these members of a batch."""
+        out = copy(self)
+        if self.held:
+            steps = np.arange(count) + (starts if members is None else np.asarray(starts)[:, None])
+            out.table, out.samples, out._first = self.rows(steps, members), None, 0
+        elif members is not None and self.table.ndim == 3:
+            out.table = self.table[members]
+        return out
+
+    # Samples
 
     def sampled(self, controller: TorqueFunction, begins: list[int], table: Indices | None = None) -> Torque:
         """Return this force with the torque that a controller gives for the steps from each of `begins` to the next.
 
         Where the force has rows, `table` has the row of each step; by default one after the other.
         """
-        out, lead = copy(self), self._of_all.shape[:-1]
-        count, rows = len(begins) - 1, self._rows
-        if rows is None:
-            rows = np.broadcast_to(self._of_all[..., None, :], (*lead, count, self._size)).copy()
-        else:
-            rows = rows if table is None else rows[..., table, :]
-            rows = np.broadcast_to(rows, (*lead, *rows.shape[-2:])).copy()
+        out, lead = copy(self), () if self._batch is None else (self._batch,)
+        rows = self.table if table is None or not self.held else self.table[..., table, :]
+        count = rows.shape[-2] if self.held else len(begins) - 1
+        out.table, out.held = np.broadcast_to(rows, (*lead, count, rows.shape[-1])).copy(), True
         # Of what was never sampled nothing is known.
-        rows[..., : self._nv] = np.nan
+        out.table[..., : self._nv] = np.nan
         asked = np.zeros(lead or 1, dtype=np.intp)
-        out._rows, fine = rows, self._rows is not None
-        out.samples = Samples(TorqueCallback(controller, self._nv), begins, asked, fine)
+        out.samples = Samples(TorqueCallback(controller, self._nv), begins, asked, fine=self.held)
         return out
 
     def sample(self, k: int, t: float, q: Array, v: Array, members: Indices | None = None) -> None:
@@ -385,32 +482,17 @@ class Torque:
         if samples is None:
             return
         s = samples.at(self._first + k)
-        assert self._rows is not None
         if members is None:
             if samples.asked[0] <= s:
-                self._rows[samples.rows(s), : self._nv] = samples.controller.one(t, q, v, self._member)
+                self.table[samples.rows(s), : self._nv] = samples.controller.one(t, q, v, self._member)
                 samples.asked[0] = s + 1
             return
         new = samples.asked[members] <= s
         if new.any():
             who = members[new]
             answers = samples.controller.many(t, q[new], v[new], who)
-            self._rows[who, samples.rows(s), : self._nv] = answers[:, None]
+            self.table[who, samples.rows(s), : self._nv] = answers[:, None]
             samples.asked[who] = s + 1
-
-    def as_table(self, count: int) -> Torque:
-        """Return the force of the next steps, which a sampled torque has answered already."""
-        if self.samples is None:
-            return self
-        out = copy(self)
-        out._rows, out.samples, out._first = self.over(0, count), None, 0
-        return out
-
-    @property
-    def sampled_rows(self) -> Array:
-        """The forces of one trajectory in each sample, (samples, n)."""
-        assert self._rows is not None
-        return self._rows
 
     def next_sample(self, k: int, steps: int) -> int:
         """Return the first step behind k at which a sampled torque is asked, or how many `steps` there are."""
@@ -420,145 +502,20 @@ class Torque:
 
     def changes(self, steps: int) -> list[int]:
         """Return the steps, of so many, at which a sampled torque is asked."""
-        if self.samples is None:
-            return []
-        if not self._first:
-            return self.samples.begins[:-1]
-        return [k - self._first for k in self.samples.begins if 0 <= k - self._first < steps]
-
-    def _row(self, k: int) -> int:
-        return self._first + k if self.samples is None else self.samples.row(self._first + k)
-
-    @property
-    def held(self) -> bool:
-        """Whether the force jumps between steps."""
-        return self._rows is not None
-
-    @property
-    def in_each_step(self) -> bool:
-        """Whether each step may have another force, and not each sample alone."""
-        return self._rows is not None and (self.samples is None or self.samples.fine)
-
-    @property
-    def callable(self) -> bool:
-        """Whether the force is a function of the state."""
-        return bool(self._functions)
-
-    def during(self, k: int, members: Indices | None) -> Force:
-        """Return the force during step k on a single state, or on these members of a batch."""
-        row, one = self._of_all if self._rows is None else self._rows[..., self._row(k), :], self._with_functions.one
-        if members is None:
-            return partial(one, row) if self._functions else row
-        rows = row[members] if row.ndim == 2 else np.broadcast_to(row, (len(members), self._size))
-        if not self._functions:
-            return rows
-
-        def many(t: float, q: Array, v: Array, part: Any = slice(None)) -> Array:
-            out = np.array(rows[part])
-            for place, function in self._functions:
-                out[:, place] = function.many(t, q, v, members[part])
-            return out
-
-        return many
-
-    def of_member(self, i: int | None) -> Callable[[int], Force]:
-        """Return a function of the step that returns the force on one state (of a batch)."""
-        if i is None:
-            return lambda k: self.during(k, None)
-        arrays = self._of_all if self._rows is None else self._rows
-
-        def during(k: int) -> Force:
-            row = arrays if self._rows is None else arrays[..., self._row(k), :]
-            row = row[i] if row.ndim == 2 else row
-            return partial(self._with_functions.one, row, member=i) if self._functions else row
-
-        return during
-
-    def of_part(self, member: int | None, start: int) -> Torque:
-        """Return the force of one trajectory from step `start` on, as that of a run of one state."""
-        out = copy(self)
-        out._first = self._first + start
-        if member is not None:
-            out._member, out._constant = member, self._of_all[member]
-            if self._rows is not None and self._rows.ndim == 3:
-                out._rows = self._rows[member]
-            if self.samples is not None:
-                out.samples = replace(self.samples, asked=self.samples.asked[member : member + 1])
-        out._of_all = out._constant
-        out._with_functions = ForceFunctions(PiecewiseConstantTorque(out._constant, None), self._functions)
-        return out
-
-    def of_steps(self, members: Indices, starts: Indices, count: int) -> Torque:
-        """Return the force on members of a batch over `count` steps, from a step of its own on for each of them."""
-        out = copy(self)
-        if self._rows is not None:
-            out._rows, out.samples, out._first = self.at_steps(members, starts, count), None, 0
-        elif self._constant.ndim > 1:
-            out._constant = self._constant[members]
-        out._of_all = self._of_all[members]
-        return out
-
-    def at_steps(self, members: Indices, starts: Indices, count: int) -> Array:
-        """Return the rows of `of_steps`, (m, count, n); behind the last step, or answer, they are those of the last."""
-        if self._rows is None:
-            return np.broadcast_to(self._of_all[members][:, None], (len(members), count, self._size))
-        last: Any = self._rows.shape[-2] - 1
-        if self.samples is not None:
-            asked = self.samples.asked[members][:, None]
-            last = (np.array(self.samples.begins)[asked] if self.samples.fine else asked) - 1
-        k = np.minimum(self._places(starts[:, None] + np.arange(count)), last)
-        return np.asarray(self._rows[k] if self._rows.ndim == 2 else self._rows[members[:, None], k])
-
-    def over_states(self, member: int | None, start: int, count: int) -> Array | None:
-        """Return the force that leads to each of some states of one trajectory, (count, n); None of functions."""
-        if self._functions:
-            return None
-        rows = self.of_part(member, start).over(0, count)
-        return np.zeros((count, self._size)) if rows is None else rows
-
-    def columns(self, members: Indices | slice, start: int, stop: int) -> Array:
-        """Return an array's rows of steps start to stop for members of a batch: (steps, n, members or 1)."""
-        if self._rows is None:
-            constant = self._constant
-            columns: Array = constant[:, None] if constant.ndim == 1 else constant[members, 0].T
-            return np.broadcast_to(columns, (stop - start, *columns.shape))
-        if stop - start == 1:
-            row = self._rows[..., self._row(start), :]
-            return row[None, :, None] if row.ndim == 1 else np.ascontiguousarray(row[members].T[None])
-        rows = self._of_steps(start, stop)
-        if self._rows.ndim == 2:
-            return self._rows[rows, :, None]
-        return np.ascontiguousarray(self._rows[members][:, rows].transpose(1, 2, 0))
-
-    def over(self, start: int, stop: int) -> Array | None:
-        """Return the rows of steps start to stop, (steps, nv) or (N, steps, nv); None where all are zero."""
-        if self._rows is not None:
-            return self._rows[..., self._of_steps(start, stop), :]
-        return np.asarray(np.tile(self._constant, (stop - start, 1))) if self._constant.any() else None
-
-    def _of_steps(self, start: int, stop: int) -> slice | Indices:
-        """Return the rows of the table that act in these steps."""
-        if self.samples is None or self.samples.fine:
-            return slice(self._first + start, self._first + stop)
-        return self._places(np.arange(start, stop))
-
-    def _places(self, k: Indices) -> Indices:
-        """Return the rows of the table that act in steps, of the shape of k."""
-        k = self._first + k
-        if self.samples is None or self.samples.fine:
-            return k
-        return np.searchsorted(self.samples.begins, k, side="right") - 1
+        begins = [] if self.samples is None else self.samples.begins[:-1]
+        return [k - self._first for k in begins if 0 <= k - self._first < steps] if self._first else begins
 
     def applied(self, bounds: Array | None) -> PiecewiseConstantTorque | ForceFunctions | None:
         """Return the force of a finished run, whose rows were held between `bounds`, s; None where it was zero."""
-        held = PiecewiseConstantTorque(self._constant, None)
-        if self._rows is not None:
+        if self.held:
             assert bounds is not None  # rows are read only where there are intervals
-            which = slice(-1) if self.samples is None or self.samples.fine else self.samples.begins[:-1]
-            held = PiecewiseConstantTorque(self._rows, bounds[which])
+            which = slice(-1) if self.in_each_step or self.samples is None else self.samples.begins[:-1]
+            held = PiecewiseConstantTorque(self.table, bounds[which])
+        else:
+            held = PiecewiseConstantTorque(self.table if self.table.ndim == 3 else self.table[0], None)
         if self._functions:
             return ForceFunctions(held, self._functions)
-        return held if held.rows.any() or self.held else None
+        return held if self.held or held.rows.any() else None
 
 
 def _read(torque: ArrayLike, model: Model, batch: int | None, steps: int | None) -> Array:

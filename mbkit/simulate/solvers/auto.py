@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -407,10 +407,12 @@ def run_auto(problem: IntegrationProblem) -> SolverResult:
     records = [controller.record for controller in controllers]
     run_groups(problem, context.space, explicit, records, to_end)
     evaluations, jacobians = (sum(getattr(x, name) for x in context.attempts) for name in ("evaluations", "jacobians"))
-    outcome = assemble_result(problem, records, evaluations=evaluations, jacobians=jacobians)
-    finished = outcome.ended in ("finished", "event")
-    doubts = tuple(dict.fromkeys(controller.doubt for controller in controllers if controller.doubt and finished))
-    return replace(outcome, chosen=_chosen(controllers, problem.batch), doubts=(*outcome.doubts, *doubts))
+    if records:
+        records[0].chosen = _chosen(controllers, problem.batch)
+    if all(record.ended in ("finished", "event") for record in records):
+        for controller in controllers:
+            controller.record.doubts += [controller.doubt] if controller.doubt else []
+    return assemble_result(problem, records, evaluations=evaluations, jacobians=jacobians)
 
 
 def _chosen(controllers: Sequence[SwitchingController], batch: int | None) -> str:

@@ -211,7 +211,7 @@ def run_rollout(
 
     def why(i: int) -> str:
         k, (q, w) = int(record.steps[i]), lost[i]
-        force = np.asarray(problem.torque.columns(np.array([i]), k, k + 1)[0][:, 0])
+        force = problem.torque.columns(np.array([i]), k, k + 1)[0, :, 0]
         if law is not None:
             force = law(grid.time(k), q, to_body_velocity(space, q, w))
         return divergence_reason(dyn.of_samples([i]), method, grid.time(k), grid.step(k), q[None], w[None], force[None])
@@ -236,7 +236,7 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
     The loop is flat, and its checks are those of the machine code where they can be: Python's share is a microsecond.
     """
     dyn, grid, record, torque, method = problem.dyn, problem.grid, GridRecord(problem), problem.torque, problem.method
-    samples, forces = torque.samples, torque.sampled_rows
+    samples, forces = torque.samples, torque.table
     assert isinstance(dyn, LagrangianDynamics)
     assert samples is not None
     controller, begins = samples.controller, [*torque.changes(grid.steps), grid.steps]

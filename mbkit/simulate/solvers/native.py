@@ -45,7 +45,7 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
         except FunctionError as failed:
             error = failed
             break
-        tau = torque.over(k, end)
+        tau = torque.rows(range(k, end)) if torque.held or torque.table.any() else None
         if tau is not None and torque.samples is not None:
             # Nobody is asked for the torque of what diverged.
             tau = np.nan_to_num(tau)

@@ -315,7 +315,7 @@ def assemble_result(
         error=next((record.error for record in records if record.error), None),
         last=next((record.last for record in records if record.ended in ("diverged", "step_too_small")), None),
         chosen=next((record.chosen for record in records if record.chosen), ""),
-        doubts=tuple(dict.fromkeys([*([poses] if poses else ()), *(x for record in records for x in record.doubts)])),
+        doubts=tuple(dict.fromkeys(filter(None, (poses, *(x for record in records for x in record.doubts))))),
     )
 
 

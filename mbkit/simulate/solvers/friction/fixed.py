@@ -157,7 +157,7 @@ class _Members:
         torque = self.problem.torque
         if torque.feedback is not None:
             return torque.feedback
-        return torque.at_steps(self.members[rows], self.k[rows], 1)[:, 0]
+        return torque.rows(self.k[rows, None], self.members[rows])[:, 0]
 
     def _of_states(
         self, rows: Indices, phase: Phase, row: Indices, step: Indices, t: Array, q: Array, v: Array
@@ -166,15 +166,17 @@ class _Members:
         friction = self.friction
         if self._force is None:
             torque = self.problem.torque
-            own: Any = torque.feedback or torque.at_steps(self.members[rows[row]], self.k[rows[row]] + step, 1)[:, 0]
+            k = self.k[rows[row]] + step
+            own: Any = torque.feedback or torque.rows(k[:, None], self.members[rows[row]])[:, 0]
             return friction.margins(phase.take(row), t, q, v, own)
         first = int(self.k[0])
-        forces = self.problem.torque.over_states(self._alone, first, int(step[-1]) + 1)
+        torque = self.problem.torque
+        forces = None if torque.callable else torque.rows(first + step, self._alone)
         if forces is not None and (not self._timed or phase.dyn.takes_parameters):
-            return friction.margins(phase, t, q, v, forces[step])
+            return friction.margins(phase, t, q, v, forces)
         each = []
         for i, (j, when) in enumerate(zip(step.tolist(), t.tolist(), strict=True)):
-            force: Any = _of_each(self._force(first + j)) if forces is None else forces[j, None]
+            force: Any = _of_each(self._force(first + j)) if forces is None else forces[i, None]
             each.append(friction.margins(phase, when, q[i : i + 1], v[i : i + 1], force))
         return np.concatenate(each)
 
@@ -277,8 +279,8 @@ class _Members:
     def _margins_of(self, phase: Phase, t: Array, q: Array, v: Array) -> Array:
         """Return the least margins of the states of a block of one trajectory, (1, n)."""
         dyn: Any = phase.dyn
-        part, force = self.margin_part, self.problem.torque.over_states(self._alone, int(self.k[0]), len(q))
-        assert force is not None  # no function is compiled
+        part, k = self.margin_part, self.k[0] + np.arange(len(q))
+        force = self.problem.torque.rows(k, self._alone)
         states = q, Space(dyn.model).to_integrator_velocity(q, v), force, np.zeros((1, 1))
         given = (
             np.broadcast_to(x, (len(q), np.shape(x)[1]))
@@ -293,7 +295,7 @@ class _Members:
             torque: Any = problem.torque.of_steps(self.members[rows], k, n)
             q, v = self.q[rows], self.v[rows]
         else:
-            torque = problem.torque.of_part(self._alone, int(k[0])).as_table(n)
+            torque = problem.torque.of_part(self._alone, int(k[0])).of_steps(None, 0, n)
             q, v = self.q[0], self.v[0]
         silent, every = Progress(None, ""), np.arange(n + 1, dtype=np.intp)
         own = IntegrationProblem.on_grid(phase.dyn, problem.method, q, v, grid, every, torque, silent)
