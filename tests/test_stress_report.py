@@ -17,7 +17,7 @@ from mbkit.report.page import render
 from mbkit.report.stress_view import against_theory, avoid, content, map_cells, methods, rules, steps, view
 from mbkit.studies.measurement import Measurement
 from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade
-from mbkit.studies.stress.measurements import CaseResult, Row, best, lines, name_of, place, recommended
+from mbkit.studies.stress.measurements import CaseResult, Overview, Row, name_of, place
 from mbkit.studies.stress.result import StressResult
 
 NAN, INF = math.nan, math.inf
@@ -185,11 +185,11 @@ def page() -> str:
 
 
 def line(case: CaseResult, engine: str, method: str):
-    return next(x for x in lines(case) if (x.row.engine, x.row.method) == (engine, method))
+    return next(x for x in Overview(case).lines if (x.row.engine, x.row.method) == (engine, method))
 
 
 def test_rows_stand_in_the_order_of_how_far_they_held():
-    told = [(x.row.engine, x.row.method, x.reach, x.usable) for x in lines(SPRING)]
+    told = [(x.row.engine, x.row.method, x.reach, x.usable) for x in Overview(SPRING).lines]
     assert told == [
         ("lagrangian", "auto", 4, 4),
         ("pinocchio", "radau", 3, 3),
@@ -199,19 +199,20 @@ def test_rows_stand_in_the_order_of_how_far_they_held():
         ("drake", "rk3", 0, 0),
     ]
     assert line(SPRING, "drake", "rk3").left_out
-    assert recommended(SPRING) is not None
-    assert recommended(TERMS) is None
+    assert Overview(SPRING).choice is not None
+    assert Overview(TERMS).choice is None
 
 
 def test_an_engine_is_judged_by_its_furthest_method_but_by_the_first_of_its_terms_to_break():
-    assert {e: x.row.method for e, x in best(SPRING).items()} == {
+    assert {e: x.row.method for e, x in Overview(SPRING).best.items()} == {
         "lagrangian": "auto",
         "pinocchio": "radau",
         "mujoco": "rk4",
         "drake": "rk3",
     }
     # A term that it does not have is none that breaks.
-    assert {e: x.row.method for e, x in best(TERMS).items()} == {"pinocchio": "forward_dynamics", "mujoco": "M"}
+    first = {e: x.row.method for e, x in Overview(TERMS).best.items()}
+    assert first == {"pinocchio": "forward_dynamics", "mujoco": "M"}
 
 
 @pytest.mark.parametrize(
@@ -326,7 +327,7 @@ def test_methods_are_counted_by_family_with_their_price():
 
 def test_steps_are_set_against_linear_theory_and_make_a_rule():
     found = steps(stress_view.overview(RESULT))
-    assert [(x.row.method, against_theory(x, found[0].case)) for x in found[0].lines] == [
+    assert [(x.row.method, against_theory(x)) for x in found[0].ran] == [
         ("gauss4", "as theory says"),
         ("rk4", "as theory says"),
         ("semi_implicit_euler", "breaks 2 × earlier"),
@@ -339,13 +340,13 @@ def test_steps_are_set_against_linear_theory_and_make_a_rule():
     }
     further = replace(STEP.rows[0], theory=1.2e-3)
     (case,) = steps(stress_view.overview(replace(RESULT, cases=(replace(STEP, rows=(further,), facts=()),))))
-    assert against_theory(case.lines[0], case.case) == "holds 1.7 × further"
+    assert against_theory(case.ran[0]) == "holds 1.7 × further"
     # Without a frequency there is no rule, and a step all the same.
     assert rules([case]) == []
     # What was too slow tells nothing of stability.
     slow = replace(STEP, rows=(replace(STEP.rows[0], cells=cells(STEPS, 1e-5, "slow")),))
     (case,) = steps(stress_view.overview(replace(RESULT, cases=(slow,))))
-    assert (against_theory(case.lines[0], case.case), rules([case])) == ("", [])
+    assert (against_theory(case.ran[0]), rules([case])) == ("", [])
 
 
 def test_a_damper_has_a_rule_of_its_own():
@@ -358,20 +359,19 @@ def test_a_damper_has_a_rule_of_its_own():
 
 def test_the_map_marks_where_it_breaks_and_where_theory_lets_it():
     (pinocchio, mujoco, euler) = (
-        map_cells(line(SPRING, *row), SPRING)
-        for row in (("pinocchio", "rk4"), ("mujoco", "rk4"), ("mujoco", "mujoco_euler"))
+        map_cells(line(SPRING, *row)) for row in (("pinocchio", "rk4"), ("mujoco", "rk4"), ("mujoco", "mujoco_euler"))
     )
     assert [c.style for c in pinocchio] == ["h1", "w3 brk", "gross lim", "end"]
     assert [c.style for c in mujoco] == ["h1", "w3 brk", "gross sil lim", "gross sil"]
     assert [c.text for c in euler] == ["1e-3", "NaN", "died", ""]
     assert "dt ω is 31" in pinocchio[2].title
-    assert against_theory(line(SPRING, "pinocchio", "rk4"), SPRING) == "breaks 100 × earlier"
+    assert against_theory(line(SPRING, "pinocchio", "rk4")) == "breaks 100 × earlier"
     assert "drake rk3, k" not in stress_page(RESULT)
 
 
 def test_an_interrupted_row_is_filled_with_empty_cells():
     cut = replace(SPRING, rows=(replace(SPRING.rows[1], cells=SPRING.rows[1].cells[:2]),))
-    assert [c.style for c in map_cells(lines(cut)[0], cut)] == ["h0", "h0", "none", "none"]
+    assert [c.style for c in map_cells(Overview(cut).lines[0])] == ["h0", "h0", "none", "none"]
     page = " ".join(Tags(stress_page(replace(RESULT, cases=(cut,), complete=False))).text.split())
     assert "auto, then not run" in page
     assert "interrupted" in page
@@ -485,7 +485,7 @@ def test_figures_draw_a_case_or_all_and_refuse_what_there_is_not():
 
 def test_the_figure_of_steps_is_valid_svg_and_the_same_every_time():
     for result in (RESULT, NASTY):
-        found = [(o.case, o.lines) for o in steps(stress_view.overview(result))]
+        found = [(o.case, o.ran) for o in steps(stress_view.overview(result))]
         drawn = stable_steps(found)
         assert drawn == stable_steps(found)
         assert ElementTree.fromstring(drawn).tag.endswith("svg")

@@ -7,7 +7,7 @@ import math
 import statistics
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, get_args
 
 from mbkit._check import by_key
@@ -17,10 +17,9 @@ from mbkit.report.formatting import choice, error_text, time_text
 from mbkit.simulate.plotting.style import engine_index
 from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.results import counted
-from mbkit.studies.stress import measurements as stress
 from mbkit.studies.stress.case import Family
 from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
-from mbkit.studies.stress.measurements import CaseResult, Line, Row, name_of, place
+from mbkit.studies.stress.measurements import CaseResult, Line, Overview, Row, engines_of, name_of, place
 from mbkit.studies.stress.result import StressResult
 
 #: Outcomes in words that follow "then".
@@ -56,43 +55,18 @@ _METHODS: Final = 6
 _PLACES: Final = 2
 
 
-@dataclass(frozen=True)
-class Overview:
-    """A case, and how far each of its rows held."""
-
-    case: CaseResult
-    anchor: str  # the case's place on the page, whatever its name holds
-    lines: tuple[Line, ...]  # the furthest first
-    best: dict[str, Line]  # by engine
-    choice: Line | None  # of method auto
-    furthest: int  # how many values the best held
-
-    @property
-    def behind(self) -> bool:
-        """Whether another held further than mbkit's own choice."""
-        return self.choice is not None and self.choice.reach < self.furthest
-
-    @property
-    def leader(self) -> Line | None:
-        """What held furthest; of terms, the first to break of the engine that is best in all of them."""
-        return max((x for x in self.best.values() if not x.left_out), key=lambda line: line.reach, default=None)
-
-    @property
-    def left_out(self) -> list[tuple[str, str]]:
-        """Names and reasons of the rows that never ran, those of one reason together."""
-        reasons = []
-        for line in (x for x in self.lines if x.left_out):
-            reason = remarks(line.row.cells[0]) if line.row.cells else ""
-            reasons.append((reason or HOW[line.outcomes[0] if line.outcomes else "not run"], name_of(line.row)))
-        return [(", ".join(alike), reason) for reason, alike in by_key(reasons).items()]
-
-
 def overview(result: StressResult) -> list[Overview]:
     """Return every case with its rows."""
-    return [
-        Overview(c, f"case-{k}", tuple(stress.lines(c)), stress.best(c), stress.recommended(c), stress.furthest(c))
-        for k, c in enumerate(result.cases, 1)
-    ]
+    return [Overview(case, f"case-{k}") for k, case in enumerate(result.cases, 1)]
+
+
+def _left_out(o: Overview) -> list[tuple[str, str]]:
+    """Return names and reasons of the rows that never ran, those of one reason together."""
+    reasons = []
+    for line in (x for x in o.lines if x.left_out):
+        reason = remarks(line.row.cells[0]) if line.row.cells else ""
+        reasons.append((reason or HOW[line.outcomes[0] if line.outcomes else "not run"], name_of(line.row)))
+    return [(", ".join(alike), reason) for reason, alike in by_key(reasons).items()]
 
 
 def families(cases: Iterable[Overview]) -> list[tuple[str, list[Overview]]]:
@@ -100,11 +74,6 @@ def families(cases: Iterable[Overview]) -> list[tuple[str, list[Overview]]]:
     groups = by_key((each.case.family, each) for each in cases)
     order = [*_FAMILIES, *groups]
     return [(name, groups[name]) for name in sorted(groups, key=order.index)]
-
-
-def ranks(case: CaseResult) -> bool:
-    """Return whether a case ranks methods: terms have none, and a sweep of the step asks for stability alone."""
-    return case.measure != "terms" and case.family != "step"
 
 
 # Words.
@@ -117,11 +86,15 @@ def value_text(x: float | None, case: CaseResult, unit: bool = True) -> str:
     return number_text(x) + (f" {case.unit}" if unit and case.unit and math.isfinite(x) else "")
 
 
-def held_text(line: Line, case: CaseResult) -> str:
+def held_text(line: Line) -> str:
     """Return how far a row held, in words."""
+    return f"held {'' if line.whole or line.broken.held is None else 'to '}{_reached(line)}"
+
+
+def _reached(line: Line) -> str:
     if line.whole:
-        return "held all"
-    return "held nothing" if line.broken.held is None else f"held to {value_text(line.broken.held, case)}"
+        return "all"
+    return "nothing" if line.broken.held is None else value_text(line.broken.held, line.case)
 
 
 def remarks(cell: Measurement | None) -> str:
@@ -142,9 +115,9 @@ def headline(result: StressResult) -> str:
 
 
 def _leaders(result: StressResult) -> str:
-    ran = [c for c in result.cases if c.rows]
-    ranked = [c for c in ran if ranks(c)] or ran
-    counts = Counter(name for case in ranked for name in _ahead(case))
+    ran = [o for o in overview(result) if o.case.rows]
+    ranked = [o for o in ran if o.ranks] or ran
+    counts = Counter(name for o in ranked for name in o.unbeaten)
     if not counts:
         return f"nothing held in {counted(len(ranked), 'case')}"
     most = max(counts.values())
@@ -154,16 +127,6 @@ def _leaders(result: StressResult) -> str:
     elif len(names) > 1:
         names = [", ".join(names[:-1]), names[-1]]
     return f"{' and '.join(names)} held furthest, or as far as any, in {most} of {counted(len(ranked), 'case')}"
-
-
-def _ahead(case: CaseResult) -> list[str]:
-    """Return what held as far as any: engine and method, or of terms the engine in all of them."""
-    most = stress.furthest(case)
-    if not most:
-        return []
-    if case.measure == "terms":
-        return [engine for engine, line in stress.best(case).items() if line.reach == most]
-    return [name_of(line.row) for line in stress.lines(case) if line.reach == most]
 
 
 # Which method for which kind of scene: how often none held further, and at what price.
@@ -186,13 +149,10 @@ def methods(result: StressResult) -> list[MethodLine]:
     """Return every engine and method that ran, the one that was most often unbeaten first."""
     # Family, line, whether it held furthest, its time over the least of those that did.
     scores: list[tuple[tuple[str, str], tuple[str, Line, bool, float]]] = []
-    for case in filter(ranks, result.cases):
-        ranked = stress.lines(case)
-        most = max((x.reach for x in ranked), default=0)
-        least = min((x.seconds for x in ranked if x.reach == most and x.seconds > 0), default=math.nan)
-        scores += [
-            ((x.row.engine, x.row.method), (case.family, x, x.reach == most > 0, x.seconds / least)) for x in ranked
-        ]
+    for o in (o for o in overview(result) if o.ranks):
+        most, family = o.furthest, o.case.family
+        least = min((x.seconds for x in o.lines if x.reach == most and x.seconds > 0), default=math.nan)
+        scores += [((x.row.engine, x.row.method), (family, x, x.reach == most > 0, x.seconds / least)) for x in o.lines]
     out = []
     for group in by_key(scores).values():
         _, lines, ahead, factors = zip(*group, strict=True)
@@ -305,24 +265,23 @@ def _two(x: float) -> str:
 
 
 def steps(cases: Iterable[Overview]) -> list[Overview]:
-    """Return the cases whose step is swept, with the rows that ran."""
-    swept = (replace(o, lines=tuple(x for x in o.lines if not x.left_out)) for o in cases if o.case.family == "step")
-    return [o for o in swept if o.lines]
+    """Return the cases whose step is swept, and of which a row ran."""
+    return [o for o in cases if o.case.family == "step" and o.ran]
 
 
 def rules(cases: Iterable[Overview]) -> list[Rule]:
     """Return each method's rule over all engines and cases that tell a frequency or rate, the largest step first."""
     bounds: dict[str, dict[str, list[Bound]]] = {}
     for o in cases:
-        for line in o.lines:
-            for kind, bound in _bounds(line, o.case):
+        for line in o.ran:
+            for kind, bound in _bounds(line):
                 bounds.setdefault(line.row.method, {}).setdefault(kind, []).append(bound)
     out = [Rule(method, {kind: _least(group) for kind, group in of.items()}) for method, of in bounds.items()]
     return sorted(out, key=lambda rule: (-min(b.held for b in rule.bounds.values()), rule.method))
 
 
-def _bounds(line: Line, case: CaseResult) -> Iterator[tuple[str, Bound]]:
-    held, failed = line.broken.held, line.broken.failed
+def _bounds(line: Line) -> Iterator[tuple[str, Bound]]:
+    held, failed, case = line.broken.held, line.broken.failed, line.case
     if line.rest is not None and (failed is None or line.rest in _OTHER):
         # What stopped it there has nothing to do with the step.
         return
@@ -346,14 +305,14 @@ def _least(group: list[Bound]) -> Bound:
     return Bound(min(b.held for b in group if math.isnan(failed) or not math.isnan(b.failed)), failed, theory)
 
 
-def against_theory(line: Line, case: CaseResult) -> str:
+def against_theory(line: Line) -> str:
     """Return how the measured breaking point compares with linear theory; empty where one is unknown."""
-    limit, failed = _limit(line), line.broken.failed
-    at = place(case.values, limit)
+    limit, failed, values = _limit(line), line.broken.failed, line.case.values
+    at = place(values, limit)
     if math.isnan(at):
         return ""
     if line.reach and at < line.reach - 1:
-        return f"holds {_times(case.values[line.reach - 1], limit)}further"
+        return f"holds {_times(values[line.reach - 1], limit)}further"
     if line.rest is not None and (failed is None or line.rest in _OTHER):
         return ""
     if failed is not None and at > line.reach:
@@ -376,8 +335,9 @@ class MapCell(NamedTuple):
     title: str
 
 
-def map_cells(line: Line, case: CaseResult) -> list[MapCell]:
+def map_cells(line: Line) -> list[MapCell]:
     """Return a row of a case's map."""
+    case = line.case
     at = place(case.values, _limit(line))
     beyond = -1 if math.isnan(at) else math.floor(at) + 1
     out = []
@@ -438,13 +398,13 @@ def content(result: StressResult) -> dict[str, Any]:
         "asked": [o for o in cases if o.choice is not None],
         "behind": [o for o in cases if o.behind],
         "methods": methods(result),
-        "run_families": families(o for o in cases if ranks(o.case)),
+        "run_families": families(o for o in cases if o.ranks),
         "families": families(cases),
-        "engines": stress.engines_of(result.cases),
+        "engines": engines_of(result.cases),
         "steps": swept,
         "rules": step_rules,
         "kinds": list(dict.fromkeys(kind for rule in step_rules for kind in rule.bounds)),
-        "step_figure": stable_steps([(o.case, o.lines) for o in swept]) if swept else None,
+        "step_figure": stable_steps([(o.case, o.ran) for o in swept]) if swept else None,
         "bars": by_key(((case.bar, case.why), case.name) for case in result.cases),
     }
 
@@ -468,6 +428,7 @@ FILTERS: Final[Mapping[str, Any]] = {
     "limit": _limit_text,
     "value": value_text,
     "held": held_text,
+    "left_out": _left_out,
     "how": lambda outcome: HOW.get(outcome, ""),
     "remarks": remarks,
     "rowname": name_of,
@@ -494,7 +455,7 @@ def view(result: StressResult) -> Document:
     columns = (
         Column("case", lambda o: o.case.name, most=22, fill=True),
         Column("furthest", _leader, most=24, fill=True),
-        Column("held to", lambda o: _held(o.leader, o.case) if o.leader else "", fill=True),
+        Column("held to", lambda o: _reached(o.leader) if o.leader else "", fill=True),
         *(auto if any(o.choice for o in cases) else []),
         Column("✗", lambda o: Span(str(sum(x.outcomes.count("silent") for x in o.lines) or ""), "bad"), right=True),
         Column("first to break", lambda o: Span(_first(o), "muted"), fill=True),
@@ -502,7 +463,7 @@ def view(result: StressResult) -> Document:
     behind = [
         Bullet(
             o.case.name,
-            f"auto {held_text(o.choice, o.case)}, {name_of(o.lines[0].row)} {held_text(o.lines[0], o.case)}",
+            f"auto {held_text(o.choice)}, {name_of(o.lines[0].row)} {held_text(o.lines[0])}",
             "!",
             "allowed",
         )
@@ -540,15 +501,9 @@ def _leader(o: Overview) -> str:
     return f"{o.leader.row.engine} (terms)" if o.case.measure == "terms" else name_of(o.leader.row)
 
 
-def _held(line: Line, case: CaseResult) -> str:
-    if line.whole:
-        return "all"
-    return "nothing" if line.broken.held is None else value_text(line.broken.held, case)
-
-
 def _first(o: Overview) -> str:
     """Return which row is the first that is of no use, and how."""
-    line = min((x for x in o.lines if x.ended and not x.left_out), key=lambda x: x.usable, default=None)
+    line = min((x for x in o.ran if x.ended), key=lambda x: x.usable, default=None)
     if line is None or line.ended is None:
         return ""
     cell, how = line.ended

@@ -109,14 +109,9 @@ def curve_lines(result: WorkPrecision) -> list[CurveLine]:
     return out
 
 
-def _name(curve: Curve) -> str:
-    """Return engine and method; MuJoCo's own integrators have the engine in their names."""
-    return curve.method if curve.method.startswith(f"{curve.engine}_") else f"{curve.engine} {curve.method}"
-
-
 def front_names(result: WorkPrecision) -> list[str]:
     """Return the names of the curves on the front, the fastest first; no answers are left out."""
-    return list(dict.fromkeys(_name(c) for c, p in result.front if p.error <= USEFUL))
+    return list(dict.fromkeys(c.name for c, p in result.front if p.error <= USEFUL))
 
 
 def headline(result: WorkPrecision) -> str:
@@ -133,7 +128,7 @@ def _sentence(result: WorkPrecision) -> str:
 
 def _fastest(result: WorkPrecision) -> str:
     stopped = "" if result.complete else "interrupted; what was finished: "
-    groups = itertools.groupby(levels(result), key=lambda level: _name(level.curve))
+    groups = itertools.groupby(levels(result), key=lambda level: level.curve.name)
     parts = [f"{name} for an error of {_range(list(group))}" for name, group in groups]
     if not parts:
         return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m"

@@ -167,6 +167,11 @@ class Measurement:
         return "warned" if self.warnings else "silent"
 
 
+def run_name(engine: str, method: str) -> str:
+    """Return engine and method; an engine's own integrators have it in their names."""
+    return method if method.startswith(f"{engine}_") else f"{engine} {method}"
+
+
 def farthest(model: Model, q: Array) -> float:
     """Return the farthest that any coordinate of a motion, (K, nq), gets from its start, rad or m."""
     return float(np.abs(model.difference(np.broadcast_to(q[0], q.shape), q)).max())

@@ -17,15 +17,7 @@ from mbkit._escape import one_line
 from mbkit.errors import UnknownNameError
 from mbkit.simulate.plotting.style import PLAIN, Palette, drawing, engine_mark, figure_of, legend
 from mbkit.studies.measurement import Measurement, Outcome
-from mbkit.studies.stress.measurements import (
-    CaseResult,
-    best,
-    engines_of,
-    lines,
-    name_of,
-    place,
-    recommended,
-)
+from mbkit.studies.stress.measurements import CaseResult, Overview, engines_of, name_of, place
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -135,7 +127,7 @@ def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
     """Draw one case."""
     from matplotlib.patches import Rectangle
 
-    ranked, count = lines(case), len(case.values)
+    ranked, count = Overview(case).lines, len(case.values)
     names = [one_line(f"{name_of(x.row)}  {x.row.setting}".rstrip(), 44) for x in ranked]
     ax = _axes(given, len(ranked), 0.24)
     for y, line in enumerate(ranked):
@@ -196,7 +188,8 @@ def _overview(cases: Sequence[CaseResult], palette: Palette, given: Axes | None)
     # Marks of a row stand one below the other, none on another.
     apart = 0.8 / max(len(engines), 3)
     for y, case in enumerate(cases):
-        size, leaders, choice = len(case.values), best(case), recommended(case)
+        size, own = len(case.values), Overview(case)
+        leaders, choice = own.best, own.choice
         for k, engine in enumerate(engines):
             if engine in leaders:
                 shift = (k - (len(engines) - 1) / 2) * apart

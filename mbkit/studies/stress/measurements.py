@@ -14,7 +14,7 @@ import numpy as np
 from mbkit.engines.registry import DERIVED, PINOCCHIO
 from mbkit.methods.registry import AUTOMATIC_METHOD
 from mbkit.simulate.plotting.style import engine_index
-from mbkit.studies.measurement import Measurement, Outcome
+from mbkit.studies.measurement import Measurement, Outcome, run_name
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ class CaseResult:
 
 # How far each row held
 
-#: The method that mbkit recommends, and the engines that it is recommended on.
-RECOMMENDED: Final = AUTOMATIC_METHOD
+#: The engines on which mbkit recommends its automatic method.
+_OURS: Final = (PINOCCHIO, DERIVED)
 
 
 @dataclass(frozen=True)
@@ -171,43 +171,78 @@ def _count(outcomes: Sequence[Outcome], wanted: Sequence[Outcome]) -> int:
     return next((k for k, how in enumerate(outcomes) if how not in wanted), len(outcomes))
 
 
-def lines(case: CaseResult) -> list[Line]:
-    """Return the rows of a case, the furthest first: by what held, by what was usable, by run time."""
-
-    def rank(line: Line) -> tuple[float, ...]:
-        seconds = math.inf if math.isnan(line.seconds) else line.seconds
-        return -line.reach, -line.usable, line.outcomes.count("silent"), seconds
-
-    return sorted((Line(row, case) for row in case.rows), key=rank)
-
-
 def name_of(row: Row) -> str:
     """Return engine and method; MuJoCo's own integrators have the engine in their names."""
-    return row.method if row.method.startswith(f"{row.engine}_") else f"{row.engine} {row.method}"
+    return run_name(row.engine, row.method)
+
+
+@dataclass(frozen=True, eq=False)
+class Overview:
+    """A case, and how far each of its rows held; `anchor` is its place on a page, whatever its name holds."""
+
+    case: CaseResult
+    anchor: str = ""
+
+    @cached_property
+    def lines(self) -> list[Line]:
+        """The rows, the furthest first: by what held, by what was usable, by run time."""
+
+        def rank(line: Line) -> tuple[float, ...]:
+            seconds = math.inf if math.isnan(line.seconds) else line.seconds
+            return -line.reach, -line.usable, line.outcomes.count("silent"), seconds
+
+        return sorted((Line(row, self.case) for row in self.case.rows), key=rank)
+
+    @property
+    def ran(self) -> list[Line]:
+        """The rows that ran at all."""
+        return [line for line in self.lines if not line.left_out]
+
+    @cached_property
+    def best(self) -> dict[str, Line]:
+        """What speaks for each engine: its furthest method, or of the terms that it has the first to break."""
+        ranked = self.lines
+        if self.case.measure == "terms":
+            ranked = sorted(ranked, key=lambda line: (line.left_out, line.reach, line.usable))
+        return {line.row.engine: line for line in reversed(ranked)}
+
+    @property
+    def leader(self) -> Line | None:
+        """What held furthest; of terms, the first to break of the engine that is best in all of them."""
+        return max((x for x in self.best.values() if not x.left_out), key=lambda line: line.reach, default=None)
+
+    @property
+    def furthest(self) -> int:
+        """How many values the best held; of terms, the best engine in all of them."""
+        return max((line.reach for line in self.best.values()), default=0)
+
+    @property
+    def choice(self) -> Line | None:
+        """mbkit's own choice of method, on the engine where it held furthest, if it was run."""
+        return next((x for x in self.ran if x.row.method == AUTOMATIC_METHOD and x.row.engine in _OURS), None)
+
+    @property
+    def behind(self) -> bool:
+        """Whether another held further than mbkit's own choice."""
+        return self.choice is not None and self.choice.reach < self.furthest
+
+    @property
+    def ranks(self) -> bool:
+        """Whether it ranks methods: terms have none, and a sweep of the step asks for stability alone."""
+        return self.case.measure != "terms" and self.case.family != "step"
+
+    @property
+    def unbeaten(self) -> list[str]:
+        """What held as far as any: engine and method, or of terms the engine in all of them."""
+        most = self.furthest
+        if self.case.measure == "terms":
+            return [engine for engine, line in self.best.items() if line.reach == most > 0]
+        return [name_of(line.row) for line in self.lines if line.reach == most > 0]
 
 
 def engines_of(cases: Iterable[CaseResult]) -> list[str]:
     """Return the engines that are in any row, in the order of every figure."""
     return sorted(dict.fromkeys(row.engine for case in cases for row in case.rows), key=engine_index)
-
-
-def best(case: CaseResult) -> dict[str, Line]:
-    """Return what speaks for each engine: its furthest method, or of the terms that it has the first to break."""
-    ranked = lines(case)
-    if case.measure == "terms":
-        ranked.sort(key=lambda line: (line.left_out, line.reach, line.usable))
-    return {line.row.engine: line for line in reversed(ranked)}
-
-
-def recommended(case: CaseResult) -> Line | None:
-    """Return mbkit's own choice of method, on the engine where it held furthest, if it was run."""
-    own = (x for x in lines(case) if x.row.method == RECOMMENDED and x.row.engine in (PINOCCHIO, DERIVED))
-    return next((x for x in own if not x.left_out), None)
-
-
-def furthest(case: CaseResult) -> int:
-    """Return how many values the best held; of terms, the best engine in all of them."""
-    return max((line.reach for line in best(case).values()), default=0)
 
 
 def place(values: Sequence[float], x: float) -> float:

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 
 from mbkit._check import Array
-from mbkit.studies.measurement import Measurement
+from mbkit.studies.measurement import Measurement, run_name
 
 T = TypeVar("T")
 #: Errors below so many times the reference's floor, or the rounding level, are not in the regression.
@@ -46,11 +46,8 @@ class Curve:
 
     @property
     def name(self) -> str:
-        """Engine and method; an engine's own method is called so."""
-        own = f"{self.engine}_"
-        if self.method.startswith(own):
-            return f"{self.engine}'s own {self.method.removeprefix(own)}"
-        return f"{self.engine} {self.method}"
+        """Engine and method; an engine's own integrators have it in their names."""
+        return run_name(self.engine, self.method)
 
     @property
     def turn(self) -> Measurement | None:
