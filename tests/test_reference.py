@@ -21,10 +21,9 @@ from mbkit.engines import dynamics
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import simulate
+from mbkit.studies.study_runs import Deadline, TooLongError
 from mbkit.studies.work_precision import reference as module
 from mbkit.studies.work_precision.reference import (
-    Deadline,
-    LateError,
     Reference,
     checked_motion,
     gap,
@@ -184,7 +183,7 @@ def test_time_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def look(self: Deadline, done: float) -> None:
         if done > 0.4:
-            raise LateError
+            raise TooLongError("late")
 
     monkeypatch.setattr(Deadline, "look", look)
     found = reference(catalog.pendulum(), [2.0], [0.0], 3.0, np.linspace(0, 3, 301))
@@ -206,7 +205,7 @@ def test_a_way_that_is_too_slow_leaves_time_for_the_next(monkeypatch: pytest.Mon
     now[0] += 2.0
     assert (part.left, deadline.left) == (8.0, 97.0)
     now[0] += 9.0
-    with pytest.raises(LateError):
+    with pytest.raises(TooLongError):
         part.look(0.5)
     monkeypatch.setattr(module, "_quadruple_seconds", lambda motion, steps: 1e9)
     found = reference(catalog.pendulum(), [2.0], [0.0], 1.0, [0, 1.0])

@@ -338,24 +338,21 @@ def test_a_method_of_which_no_run_came_to_an_end_is_named_with_its_reason():
 
 def test_an_engine_that_comes_next_stands_once_whatever_lies_between():
     first, pin, mujoco = (Curve(e, "rk4", (), NAN, 0, 4.0, 0.1) for e in ("lagrangian", "pinocchio", "mujoco"))
-    behind = ((pin, 1.3), (mujoco, 4.0), (pin, 5.0))
-    found = [
-        work_precision_view.Level(10.0**-k, first, point(0.1, 1e-9, 1.0), (curve, point(0.1, 1e-9, seconds)))
-        for k, (curve, seconds) in enumerate(behind)
-    ]
-    assert work_precision_view.Lead(tuple(found)).nexts == [("pinocchio", "rk4", "1.3 to 5"), ("mujoco", "rk4", "4")]
+    behind = [(c, point(0.1, 1e-9, s)) for c, s in ((pin, 1.3), (mujoco, 4.0), (pin, 5.0))]
+    lead = work_precision_view.Lead(first, point(0.1, 1e-9, 1.0), [1.0, 0.1, 0.01], behind)
+    assert work_precision_view.next_engines(lead) == "pinocchio × 1.3 to 5, mujoco × 4"
 
 
 def test_a_run_that_is_the_fastest_for_several_errors_is_one_row():
     # lagrangian rk4 at 0.1 / 2^k has errors of 1e-3 / 16^k, and nobody is faster.
     found = work_precision_view.leads(STUDY)
-    assert [x.errors for x in found] == ["1e-02", "1e-04", "1e-06"]
+    assert [x.errors for x in found] == [[1e-2], [1e-4], [1e-6]]
     far = replace(
         STUDY, curves=tuple(replace(c, points=(point(0.1, 1e-9, c.points[0].seconds),)) for c in STUDY.curves)
     )
     (one,) = work_precision_view.leads(far)
-    assert one.errors == "1e-02 to 1e-08"
-    assert one.nexts == [("mujoco", "mujoco_rk4", "2")]
+    assert one.errors == pytest.approx([1e-2, 1e-4, 1e-6, 1e-8])
+    assert work_precision_view.next_engines(one) == "mujoco × 2"
     rows = [line for line in printed(bench_table(far), 120).splitlines() if line.startswith("1e-")]
     assert [" ".join(r.split()[:3]) for r in rows] == ["1e-02 to 1e-08"]
     assert Tags(check_page(replace(AGREEING, precision=far))).text.count("1e-02 to 1e-08") == 1
@@ -533,18 +530,17 @@ def test_a_colour_and_marker_belong_to_an_engine_and_a_picture_is_the_same_every
     assert made == work_precision_view.picture(STUDY)
 
 
-def test_levels_end_where_no_run_or_the_reference_ends():
-    found = work_precision_view.levels(STUDY)
-    assert [f"{x.error:.0e}" for x in found] == ["1e-02", "1e-04", "1e-06"]
+def test_leads_end_where_no_run_or_the_reference_ends():
+    found = work_precision_view.leads(STUDY)
+    assert [f"{e:.0e}" for x in found for e in x.errors] == ["1e-02", "1e-04", "1e-06"]
     assert {x.curve.engine for x in found} == {"lagrangian"}
-    assert found[0].next is not None
-    assert found[0].next[0].method == "mujoco_rk4"
-    assert found[0].factor == pytest.approx(2)
+    assert found[0].nexts[0][0].method == "mujoco_rk4"
+    assert work_precision_view.next_engines(found[0]) == "mujoco × 2"
     # An error that the reference itself may have is not told of.
-    assert len(work_precision_view.levels(replace(STUDY, floor=1e-5))) == 2
-    only = work_precision_view.levels(replace(STUDY, curves=STUDY.curves[:1]))
-    assert only[0].next is None
-    assert math.isnan(only[0].factor)
+    assert len(work_precision_view.leads(replace(STUDY, floor=1e-5))) == 2
+    only = work_precision_view.leads(replace(STUDY, curves=STUDY.curves[:1]))
+    assert only[0].nexts == [None]
+    assert work_precision_view.next_engines(only[0]) == "none"
 
 
 def test_a_run_that_is_no_answer_is_on_no_front_and_the_headline_tells_where_the_lead_changes():

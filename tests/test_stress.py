@@ -35,7 +35,6 @@ from mbkit.studies.stress.measure import (
     Limits,
     Prepared,
     condition,
-    condition_number,
     measure,
     prepare,
     reference_motion,
@@ -251,8 +250,8 @@ class FakeWorker:
 
     def call(self, function, _case, value, *args, **_limits):
         self.generation, self._runs = self.generation + (not self._runs), True
-        key = {prepare: "case", condition_number: "condition"}.get(function) or args[1]
-        default = {"case": Prepared("known"), "condition": 1.0}.get(key, Measurement(value, "finished", 0.0))
+        key = "case" if function is prepare else args[1]
+        default = Prepared("known") if key == "case" else Measurement(value, "finished", 0.0)
         found = self.answers.get((key, value), default)
         self.stage = "run" if function is measure else ""
         if isinstance(found, tuple):

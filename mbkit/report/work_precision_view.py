@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from mbkit._check import by_key
@@ -23,69 +22,42 @@ ORDER_TOLERANCE: Final = 0.2
 _EXPONENTS: Final = range(-2, -15, -2)
 
 
-@dataclass(frozen=True)
-class Level:
-    """The fastest run that reaches an error, and the fastest of another engine that does (`next`)."""
+class Lead(NamedTuple):
+    """A run, the errors for which it is the fastest, and for each the fastest of another engine that reaches it."""
 
-    error: float
     curve: Curve
     point: Measurement
-    next: tuple[Curve, Measurement] | None
-
-    @property
-    def factor(self) -> float:
-        """How many times as long the next engine takes; NaN where none reaches the error."""
-        return self.next[1].seconds / self.point.seconds if self.next else math.nan
+    errors: list[float]
+    nexts: list[tuple[Curve, Measurement] | None]
 
 
-@dataclass(frozen=True)
-class Lead:
-    """One run, and all the errors for which it is the fastest: from the largest to the least."""
-
-    levels: tuple[Level, ...]
-
-    @property
-    def run(self) -> Level:
-        """Engine, method and run."""
-        return self.levels[0]
-
-    @property
-    def errors(self) -> str:
-        """The errors, as a range where there are several."""
-        return _range(self.levels)
-
-    @property
-    def nexts(self) -> list[tuple[str, str, str]]:
-        """Engine, methods and times as long of the fastest of other engines, which may change with the error."""
-        out = []
-        for engine in dict.fromkeys(x.next[0].engine if x.next else "none" for x in self.levels):
-            alike = [x for x in self.levels if (x.next[0].engine if x.next else "none") == engine]
-            methods = ", ".join(dict.fromkeys(x.next[0].method for x in alike if x.next))
-            factors = [x.factor for x in alike]
-            ends = dict.fromkeys(count_text(x) for x in (min(factors), max(factors)))
-            out.append((engine, methods, " to ".join(ends)))
-        return out
-
-
-def _range(levels: Sequence[Level]) -> str:
-    return " to ".join(dict.fromkeys(f"{x.error:.0e}" for x in (levels[0], levels[-1])))
-
-
-def levels(result: WorkPrecision) -> list[Level]:
-    """Return the fastest for each error that anyone reaches, as far as the reference can tell."""
-    out = []
+def leads(result: WorkPrecision) -> list[Lead]:
+    """Return the fastest run for each error that anyone reaches, as far as the reference can tell, each run once."""
+    out: dict[int, Lead] = {}
     for error in (10.0**exponent for exponent in _EXPONENTS):
         first = result.fastest(error)
         if first is None or error < result.floor:
             break
         beside = [(c, p) for c, p in result.rows() if p.error <= error and c.engine != first[0].engine]
-        out.append(Level(error, *first, min(beside, key=lambda item: item[1].seconds, default=None)))
-    return out
+        lead = out.setdefault(id(first[1]), Lead(*first, [], []))
+        lead.errors.append(error)
+        lead.nexts.append(min(beside, key=lambda item: item[1].seconds, default=None))
+    return list(out.values())
 
 
-def leads(result: WorkPrecision) -> list[Lead]:
-    """Return the fastest runs, each once, with the errors for which it is the fastest."""
-    return [Lead(tuple(group)) for _, group in itertools.groupby(levels(result), key=lambda level: id(level.point))]
+def _range(errors: Sequence[float]) -> str:
+    """Return the largest and the least of some errors."""
+    return " to ".join(dict.fromkeys(f"{x:.0e}" for x in (errors[0], errors[-1])))
+
+
+def next_engines(lead: Lead) -> str:
+    """Return the engines that are next, which may change with the error, and how many times as long they take."""
+    texts = []
+    for engine, alike in by_key((x[0].engine if x else "", x) for x in lead.nexts).items():
+        factors = [x[1].seconds / lead.point.seconds for x in alike if x]
+        ends = dict.fromkeys(count_text(x) for x in (min(factors), max(factors))) if factors else ()
+        texts.append(f"{engine} × {' to '.join(ends)}" if factors else "none")
+    return ", ".join(texts)
 
 
 class CurveLine(NamedTuple):
@@ -128,8 +100,8 @@ def _sentence(result: WorkPrecision) -> str:
 
 def _fastest(result: WorkPrecision) -> str:
     stopped = "" if result.complete else "interrupted; what was finished: "
-    groups = itertools.groupby(levels(result), key=lambda level: level.curve.name)
-    parts = [f"{name} for an error of {_range(list(group))}" for name, group in groups]
+    groups = itertools.groupby(leads(result), key=lambda lead: lead.curve.name)
+    parts = [f"{name} for an error of {_range([e for lead in some for e in lead.errors])}" for name, some in groups]
     if not parts:
         return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m"
     count = f"{len(result.curves)} curve{'s' * (len(result.curves) != 1)}"
@@ -244,20 +216,16 @@ def _known(x: float) -> str:
 
 
 _LEADS: Final = (
-    doc.Column("error ≤", lambda x: x.errors, right=True),
-    doc.Column("engine", lambda x: x.run.curve.engine),
-    doc.Column("method", lambda x: x.run.curve.method),
-    doc.Column("setting", lambda x: setting_text(x.run.point), right=True),
-    doc.Column("run time", lambda x: time_text(x.run.point.seconds), right=True),
-    doc.Column("±", lambda x: doc.Span(time_text(x.run.point.spread), "muted"), right=True, on="page"),
-    doc.Column("first run", lambda x: time_text(x.run.curve.compile + x.run.point.seconds) or "–", right=True),
-    doc.Column("next engine", lambda x: doc.Span(_next(x), "muted")),
-    doc.Column("its method", lambda x: ", ".join(methods for _, methods, _ in x.nexts), on="page"),
+    doc.Column("error ≤", lambda x: _range(x.errors), right=True),
+    doc.Column("engine", lambda x: x.curve.engine),
+    doc.Column("method", lambda x: x.curve.method),
+    doc.Column("setting", lambda x: setting_text(x.point), right=True),
+    doc.Column("run time", lambda x: time_text(x.point.seconds), right=True),
+    doc.Column("±", lambda x: doc.Span(time_text(x.point.spread), "muted"), right=True, on="page"),
+    doc.Column("first run", lambda x: time_text(x.curve.compile + x.point.seconds) or "–", right=True),
+    doc.Column("next engine", lambda x: doc.Span(next_engines(x), "muted")),
+    doc.Column("its method", lambda x: ", ".join(dict.fromkeys(n[0].method for n in x.nexts if n)), on="page"),
 )
-
-
-def _next(lead: Lead) -> str:
-    return ", ".join(f"{engine} × {factor}" if factor else engine for engine, _, factor in lead.nexts)
 
 
 def _order(line: CurveLine) -> doc.Text:

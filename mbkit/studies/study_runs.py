@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import replace
 from types import FrameType
 from typing import Final
@@ -80,15 +82,51 @@ class TooLongError(MbkitError):
     """A run took longer than it is worth."""
 
 
-def patience(seconds: float, clock: Callable[[], float] = time.perf_counter) -> Callable[[float], None]:
-    """Return a progress function that ends a run after so many seconds, of the wall's or another clock."""
-    end = clock() + seconds
+class Deadline:
+    """The time limit of a run or a search, by the wall's or another clock, and its progress.
 
-    def look(done: float) -> None:
-        if clock() > end:
-            raise TooLongError(f"stopped after {seconds:g} s, {done:.0%} done: stiff, or very fast motion")
+    `tell` gets the fraction done; by default nobody does.
+    """
 
-    return look
+    def __init__(
+        self,
+        seconds: float,
+        tell: Callable[[float], object] = float,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self._tell, self._clock = tell, clock
+        #: Seconds that do not count, of all parts together.
+        self._uncounted = [0.0]
+        self._seconds, self._end = seconds, self._now() + seconds
+        self._start, self._length = 0.0, 1.0
+
+    def _now(self) -> float:
+        return self._clock() - self._uncounted[0]
+
+    @property
+    def left(self) -> float:
+        """Seconds."""
+        return self._end - self._now()
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Stop the clock of this and all parts, for derivation and compilation."""
+        start = self._clock()
+        yield
+        self._uncounted[0] += self._clock() - start
+
+    def part(self, start: float, length: float, seconds: float = math.inf) -> Deadline:
+        """Return the limit for a part of the way, which may have a shorter time."""
+        part = copy(self)
+        part._end = min(self._end, self._now() + seconds)
+        part._start, part._length = self._start + start * self._length, length * self._length
+        return part
+
+    def look(self, done: float) -> None:
+        """Report the fraction done of this part, and raise `TooLongError` when its time is up."""
+        self._tell(min(self._start + self._length * done, 1.0))
+        if self.left < 0:
+            raise TooLongError(f"stopped after {self._seconds:g} s, {done:.0%} done: stiff, or very fast motion")
 
 
 def quiet_simulate(*args: object, **kwargs: object) -> Trajectory:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, Final
@@ -26,7 +28,7 @@ from mbkit.studies.compare.errors import Scales, acceleration_errors, force_erro
 from mbkit.studies.compare.terms import States
 from mbkit.studies.measurement import MAX_ERROR, Measurement, Problem, Truth
 from mbkit.studies.stress.case import Case, problem_of, step_of, times_of
-from mbkit.studies.study_runs import TooLongError, cpu_limit, heard_warnings, patience, quiet_simulate
+from mbkit.studies.study_runs import Deadline, TooLongError, cpu_limit, heard_warnings, quiet_simulate
 from mbkit.studies.work_precision.reference import reference
 from mbkit.studies.worker import report_stage
 
@@ -254,13 +256,11 @@ def prepare(case: Case, value: float, bar: float, seconds: float) -> Prepared:
         how = "the energy at the start, with 34 digits"
     else:
         truth, how = reference_motion(problem, times_of(problem, case.measure), 0.1 * bar, seconds)
-    return Prepared(how, truth, {name: float(x) for name, x in problem.facts.items()}, problem.dt)
-
-
-def condition_number(case: Case, value: float) -> float:
-    """Return the condition number of the mass matrix at a value; see `reference.condition`."""
-    cache = _value_of(case, value)
-    return condition(cache.oracle, cache.problem.q)
+    facts = {name: float(x) for name, x in problem.facts.items()}
+    with suppress(MbkitError):
+        number = condition(cache.oracle, problem.q)
+        facts |= {} if "cond(M)" in facts or math.isnan(number) else {"cond(M)": number}
+    return Prepared(how, truth, facts, problem.dt)
 
 
 def measure(
@@ -310,7 +310,7 @@ def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, t
                 return Measurement(value, "slow", note=f"not run: {steps} steps would take {expected:.2g} s")
         with heard_warnings() as heard:
             begun = _clock()
-            look = patience(limits.seconds, _clock)
+            look = Deadline(limits.seconds, clock=_clock).look
             with cpu_limit(_LATER * limits.seconds):
                 run = simulate(*start, duration, method, save=times, progress=look, doubt=False, **step)
             seconds = [_clock() - begun]

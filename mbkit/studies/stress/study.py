@@ -18,7 +18,7 @@ from typing import Any, Final, Literal
 
 from mbkit._check import count, real
 from mbkit._child_process import OUT_OF_MEMORY, WorkerClosedError, WorkerDiedError, WorkerStartError, WorkerTimeoutError
-from mbkit.engines.registry import DERIVED, ENGINES, INDEPENDENT, compared
+from mbkit.engines.registry import DERIVED, INDEPENDENT, find_engine
 from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
 from mbkit.studies import results
@@ -26,7 +26,7 @@ from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies._targets import methods_by_engine, numbers_of
 from mbkit.studies.measurement import BAR, Measurement
 from mbkit.studies.stress.case import Case
-from mbkit.studies.stress.measure import TERMS, Limits, Prepared, condition_number, measure, prepare
+from mbkit.studies.stress.measure import TERMS, Limits, Prepared, measure, prepare
 from mbkit.studies.stress.measurements import CaseResult, Row
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
@@ -185,14 +185,8 @@ class CaseSweep:
             share = left / (len(self.values) - i)
             seconds = _TERMS if self.case.measure == "terms" else share + _MIN_TRUTH
             answer = self._call(worker, value, prepare, self.bar, _SEARCH * share, truth=seconds)
-            if isinstance(answer, Prepared):
-                number = self._call(worker, value, condition_number)
-                if not isinstance(number, Measurement) and math.isfinite(number):
-                    answer = replace(answer, facts={**answer.facts, "cond(M)": answer.facts.get("cond(M)", number)})
-            elif worker.stage:
-                answer = Prepared(f"no truth: {answer.note}")
-            else:
-                answer = Prepared(answer.note, failure=answer)
+            if isinstance(answer, Measurement):
+                answer = Prepared(f"no truth: {answer.note}") if worker.stage else Prepared(answer.note, failure=answer)
             self._prepared[i] = answer
         return True
 
@@ -429,7 +423,11 @@ def stress(
         raise InputError("jobs: expected none beside an executor, which has its own; leave it out")
     checkpoints = Checkpointer(progress, checkpoint)
     swept = _swept(cases, values, quick=quick)
-    methods_of = methods_by_engine(engines, _quick_methods(engines) if quick and methods is None else methods)
+    methods_of = methods_by_engine(engines, methods)
+    if quick and methods is None:
+        methods_of = {
+            e: tuple(m for m in find_engine(e).quick if m in METHODS) or all_ for e, all_ in methods_of.items()
+        }
     settings: dict[str, Any] = {
         "engines": list(methods_of),
         "methods": {engine: list(names) for engine, names in methods_of.items()},
@@ -484,14 +482,6 @@ def stress(
         raise InputError(
             f"cases: a case of your own cannot be used in other processes: {error}; define its functions in a module"
         ) from None
-
-
-def _quick_methods(engines: object) -> dict[str, tuple[str, ...]] | None:
-    """Return the quick methods of these engines; None for other engines, which are then refused by name."""
-    known = {name for name in compared() if ENGINES[name].quick}
-    if isinstance(engines, str) or not isinstance(engines, Iterable) or not {*engines} <= known:
-        return None
-    return {engine: tuple(m for m in ENGINES[engine].quick if m in METHODS) for engine in engines}
 
 
 def _swept(cases: object, values: object, *, quick: bool) -> list[tuple[Case, tuple[float, ...]]]:

@@ -6,10 +6,7 @@ precision, or two engines with a method each in double precision. Where they par
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from copy import copy
+from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -49,7 +46,7 @@ from mbkit.simulate.solvers.taylor import TaylorSteps
 from mbkit.simulate.solvers.trajectory_record import StoppedError
 from mbkit.simulate.time_grid import save_times
 from mbkit.simulate.torque import Torque, TorqueFunction
-from mbkit.studies.study_runs import quiet_simulate
+from mbkit.studies.study_runs import Deadline, TooLongError, quiet_simulate
 
 # Pairs of runs of one motion: their difference bounds the error of either.
 
@@ -71,51 +68,6 @@ AGREE: Final = 1e-12
 _PARTED: Final = 1e-6
 # Tolerance of methods for stiff motion, as a part of what is wanted: a smaller one costs them dear.
 _FINER: Final = 1e-3
-
-
-class LateError(Exception):
-    """The time is up; internal to `mbkit.studies`."""
-
-
-class Deadline:
-    """The time limit of a search, and its progress: `tell` gets the fraction done."""
-
-    def __init__(
-        self, seconds: float, tell: Callable[[float], None], clock: Callable[[], float] = time.perf_counter
-    ) -> None:
-        self._tell, self._clock = tell, clock
-        #: Seconds that do not count, of all parts together.
-        self._uncounted = [0.0]
-        self._end = self._now() + seconds
-        self._start, self._length = 0.0, 1.0
-
-    def _now(self) -> float:
-        return self._clock() - self._uncounted[0]
-
-    @property
-    def left(self) -> float:
-        """Seconds."""
-        return self._end - self._now()
-
-    @contextmanager
-    def paused(self) -> Iterator[None]:
-        """Stop the clock of this and all parts, for derivation and compilation."""
-        start = self._clock()
-        yield
-        self._uncounted[0] += self._clock() - start
-
-    def part(self, start: float, length: float, seconds: float = inf) -> Deadline:
-        """Return the limit for a part of the way, which may have a shorter time."""
-        part = copy(self)
-        part._end = min(self._end, self._now() + seconds)
-        part._start, part._length = self._start + start * self._length, length * self._length
-        return part
-
-    def look(self, done: float) -> None:
-        """Report the fraction done of this part, and raise `LateError` when its time is up."""
-        self._tell(min(self._start + self._length * done, 1.0))
-        if self.left < 0:
-            raise LateError
 
 
 #: (high, low) parts of numbers with twice a double's digits.
@@ -257,7 +209,7 @@ def _states(motion: Motion, kind: Any, steps: TaylorSteps, deadline: Deadline, m
             deadline.look(t / motion.duration)
     except StoppedError as error:
         return states, count, f"{error} after t = {steps.t:.6g} s"
-    except LateError:
+    except TooLongError:
         return states, count, f"the seconds allowed for it were used up at t = {steps.t:.6g} s"
     return states, count, ""
 
@@ -295,7 +247,7 @@ def two_engines(
                 legs.append(_leg(motion, dyn, method, rtol, q[-1], v[-1], slice(k, end + 1), part))
                 if not legs[-1].stats.finished:
                     why = f"{method} on {dyn.engine} ended early, within {times[k]:.6g} to {times[end]:.6g} s"
-        except LateError:
+        except TooLongError:
             why = f"the seconds allowed for it were used up after t = {times[k]:.6g} s"
             break
         n = min(len(leg.t) for leg in legs)

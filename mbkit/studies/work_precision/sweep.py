@@ -29,7 +29,7 @@ from mbkit.model import Model
 from mbkit.simulate import Trajectory
 from mbkit.studies.measurement import Measurement, Problem, Truth, farthest
 from mbkit.studies.results import Refusal
-from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, patience, quiet_simulate
+from mbkit.studies.study_runs import OUT_OF_TIME, Deadline, TooLongError, quiet_simulate
 from mbkit.studies.work_precision.curve import Curve, observed_order
 from mbkit.studies.worker import run
 
@@ -264,7 +264,7 @@ class CurveMeasurement:
 
     def _solve(self, dyn: Dynamics, value: float, save: Array, limit: float | None = None) -> Trajectory:
         """Integrate to the last time; give up after `limit` seconds."""
-        problem, progress = self.problem, None if limit is None else patience(limit)
+        problem, progress = self.problem, None if limit is None else Deadline(limit).look
         more: dict[str, Any] = {self.settings.setting: value, "torque": problem.tau, "progress": progress}
         return quiet_simulate(dyn, problem.q, problem.v, float(save[-1]), self.settings.method, save=save, **more)
 
