@@ -324,7 +324,8 @@ def _residuals(x: Array) -> str:
 
 def manifold_of(dyn: Dynamics) -> Manifold:
     """Return the consistent states of dynamics; those of another engine by the own derivation."""
-    ROWS.admit(dyn.model, "consistent states: not known of")
+    if not dyn.model.constrained:
+        ROWS.admit(dyn.model, "consistent states: not known of")
     if isinstance(dyn, LagrangianDynamics):
         return Manifold(dyn)
     # Deriving costs more than most runs: once for each engine's object.

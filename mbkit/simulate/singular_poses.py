@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit._reproducible import singular_values
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_times, first_names
 from mbkit.engines.constrained import TAKES_PART
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Tolerance that rk853 may take near a singular pose, where rounding keeps it from a tighter one.
 LOOSEST: Final = 1e-9
-#: Steps ahead in which a pose would be singular at the present pace.
+#: Steps within which a pose is near. At a third of the way a series of the tightest tolerance never arrives.
 _AHEAD: Final = 4
 #: Steps' ends that decide on one interval.
 _WINDOW: Final = 4
@@ -36,9 +35,6 @@ _WINDOW: Final = 4
 _STILL: Final = 1e-7
 #: Of what γ can be at velocities of this size: its rest at one that stays on a branch to the digits of a loose run.
 _ON_BRANCH: Final = 1e-5
-#: Of J's largest singular value, the smallest one below which a step is one across the pose. v̇ from the equation of
-#: motion loses eps/σ of itself, `LOOSEST` at a tenth of this; begun there, the step's own stages would be in the pose.
-_WORSE: Final = 10 * float(np.finfo(float).eps) / LOOSEST
 #: Of the motion's time scale: the difference of times by which J's rate is found.
 _APART: Final = 1e-4
 #: Where a step of rk853 has the pose: in the middle of the widest gap between its stages, 1/3 and 0.6.
@@ -175,67 +171,67 @@ def at_singular_poses(dyn: Dynamics, t: float, q: Array, v: Array, tau: Array) -
 
 
 class Approach:
-    """Whether a run comes near a singular pose, by the smallest singular value σ of J at the ends of its steps.
+    """Whether a run comes near a singular pose, of one state or a batch.
 
     Attributes
     ----------
+    ahead : float or array
+        When J's smallest singular value will be zero at its present rate, s from the last end of a step; negative
+        where it was before, and infinite where the last step says already that no pose is near.
     near : bool
-        Whether σ would be zero within a few steps like the last one, of any state of a batch; true until two ends are
-        known.
-    ahead : float
-        Of one state: when σ will be zero at its present rate, s from the last end; negative where it was before.
-    worse : bool
-        Whether v̇ from the equation of motion has too few digits there for a series.
+        Whether that is within a few steps, of any state.
     """
 
     def __init__(self) -> None:
-        self.near, self.ahead = True, np.inf
-        self._sizes: Array | float = np.inf
-        self.worse = False
+        self.near, self.ahead = True, np.asarray(np.inf)
+        self._t, self._distance, self._pace = -np.inf, np.asarray(np.inf), np.asarray(np.nan)
+        self._unseen: tuple[Dynamics, float, Array, Array] | None = None
 
     def saw(self, dyn: Dynamics, t: float, q: Array, v: Array) -> None:
-        """Take in the end of a step, of one state or a batch."""
-        from mbkit.engines.constraint_manifold import AT_POSE
+        """Take in the end of a step."""
+        since, last = t - self._t, self._distance
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self._t, self._distance = t, manifold_at(dyn, t).dependence(q) ** -0.5
+            self._pace = np.abs(self._distance - last) / since
+        self._unseen, self.ahead = (dyn, t, q, v), np.asarray(np.inf)
+        self.crosses(since)
 
-        states, alone = [manifold_at(dyn, t).jacobian(q)], q.ndim == 1 and bool(v.any()) and bool(np.isfinite(v).all())
-        apart = _APART / float(np.abs(v).max()) if alone else 0.0
-        if alone:
-            for x in (apart, -apart):
-                manifold = manifold_at(dyn, _known(dyn, t + x))
-                states.append(manifold.jacobian(manifold.dyn.model.integrate(q, x * v)))
-        # Without vectors, which would cost far more.
-        sizes = singular_values(np.stack(states))
-        least, *beside = sizes[..., -1]
-        known = np.shape(self._sizes) == np.shape(least)
-        change = np.abs(least - self._sizes) if known else np.full(np.shape(least), np.inf)
-        self.near, self._sizes, self.ahead = bool((~(least >= _AHEAD * change)).any()), least, np.inf
-        self.worse = bool((least <= _WORSE * sizes[0, ..., 0]).any())
-        if q.ndim == 1:
-            rate = (beside[0] - beside[1]) / (2 * apart) if alone else 0.0
-            if least <= AT_POSE * sizes[0, 0]:
-                self.ahead = 0.0
-            elif rate:
-                self.ahead = float(-least / rate)
+    def crosses(self, h: float) -> bool:
+        """Return whether a pose is within a few steps of length h, ahead or behind; then it is `near`."""
+        # A pace that is not known is not above.
+        self.near = not (self._distance > _AHEAD * h * self._pace).all()
+        if self.near and self._unseen is not None:
+            self.ahead, self._unseen = _time_ahead(*self._unseen), None
+        self.near = self.near and bool((np.abs(self.ahead) <= _AHEAD * h).any())
+        return self.near
 
     def length(self, h: float) -> float:
         """Return the length, up to h, of the next step of rk853 with which no stage comes close to a pose ahead."""
-        d = self.ahead
+        d = float(self.ahead)
         if not 0.02 * h < d < 1.45 * h:
             return h
         # A little longer is better than a short step before it.
         return d / _BETWEEN if d <= 1.05 * _BETWEEN * h else min(h, d - 0.45 * h)
 
-    def crosses(self, h: float) -> bool:
-        """Return whether a pose is as near as a step of length h, ahead or behind; then it is `near`."""
-        out = abs(self.ahead) < 2 * h
-        self.near = self.near or out
-        return out
+
+def _time_ahead(dyn: Dynamics, t: float, q: Array, v: Array) -> Array:
+    """Return when J's smallest singular value will be zero at its present rate, s from now; 0 at a singular pose."""
+    from mbkit.engines.constraint_manifold import AT_POSE
+
+    manifold = manifold_at(dyn, t)
+    apart = _APART / np.maximum(np.abs(v).max(axis=-1, keepdims=True), np.finfo(float).tiny)
+    J, beside = (manifold.jacobian(x) for x in (q, dyn.model.integrate(q, apart * v)))
+    U, sizes, V = np.linalg.svd(np.where(np.isfinite(J), J, 0.0), full_matrices=False)
+    # By the vectors, as the value itself turns round where it is zero.
+    change = (U[..., None, :, -1] @ (beside - J) @ V[..., -1, :, None])[..., 0, 0]
+    ahead = np.divide(-sizes[..., -1] * apart[..., 0], change, out=np.full(change.shape, np.inf), where=change != 0)
+    return np.where(sizes[..., -1] <= AT_POSE * sizes[..., 0], 0.0, ahead)[()]
 
 
 class SingularPoses:
-    """The singular poses that one trajectory passes, by J's smallest singular value at the ends of steps.
+    """The singular poses that one trajectory passes, by how far from one the ends of its steps are.
 
-    Through a singular pose the value is smooth once its sign is changed there.
+    Through a singular pose this distance, 1/√`dependence`, is smooth once its sign is changed there.
     """
 
     def __init__(self, dyn: Dynamics) -> None:
@@ -246,46 +242,47 @@ class SingularPoses:
 
     def began(self, t: float, q: Array) -> None:
         """Take in the start."""
-        manifold = manifold_at(self._dyn, t)
-        if manifold.at_pose(q):
-            self.times.append(t)
-            self._rows = Passage(manifold, t, q, np.zeros(manifold.dyn.model.nv)).rows
+        if manifold_at(self._dyn, t).at_pose(q):
+            self._passed(t, t, q)
+
+    def _passed(self, t: float, near: float, q: Array) -> None:
+        """Keep the time of a pose, and the rows that depend on each other at the state nearest to it."""
+        manifold = manifold_at(self._dyn, near)
+        self._rows = Passage(manifold, near, q, np.zeros(manifold.dyn.model.nv)).rows
+        self.times.append(t)
 
     def saw(self, t: float, q: Array) -> None:
         """Take in the end of a step."""
-        self.saw_all(np.array([t]), np.reshape(q, (1, -1)))
+        self.take(t, float(manifold_at(self._dyn, t).dependence(q)), q)
 
     def saw_all(self, t: Array, q: Array) -> None:
         """Take in the ends of steps, (n,) and (n, nq)."""
         from mbkit.engines.constraint_manifold import manifold_of
 
-        J = manifold_of(at_times(manifold_of(self._dyn).dyn, t, 1)).jacobian(q)
-        for at, size, slopes in zip(t.tolist(), singular_values(J)[:, -1].tolist(), J, strict=True):
-            self.take(at, size, slopes)
+        depends = manifold_of(at_times(manifold_of(self._dyn).dyn, t, 1)).dependence(q)
+        for end in zip(t.tolist(), depends.tolist(), q, strict=True):
+            self.take(*end)
 
-    def take(self, t: float, size: float, slopes: Array) -> None:
-        """Take in the end of a step by J's smallest singular value and J; one that is not finite says nothing."""
-        if size != size:
+    def take(self, t: float, dependence: float, q: Array) -> None:
+        """Take in the end of a step by the `dependence` of rows there; one that is not finite says nothing."""
+        if dependence != dependence:
             return
-        self._seen = [*self._seen[1 - _WINDOW :], (t, size, slopes)]
+        self._seen = [*self._seen[1 - _WINDOW :], (t, dependence**-0.5, q)]
         if len(self._seen) == _WINDOW:
             self._decide()
 
     def _decide(self) -> None:
-        (first, s0, _), (_, s1, _), (_, s2, _), (_, s3, _) = self._seen
-        if not (s1 <= s0 and s2 <= s3) or (self.times and self.times[-1] >= first):
+        times, (s0, s1, s2, s3), q = zip(*self._seen, strict=True)
+        if not (s1 <= s0 and s2 <= s3) or (self.times and self.times[-1] >= times[0]):
             return
-        times = [t for t, *_ in self._seen]
-        plain, turned = _bend(times, [s0, s1, s2, s3]), _bend(times, [s0, s1, -s2, -s3])
-        if not turned < plain:
+        if not _bend(times, [s0, s1, -s2, -s3]) < _bend(times, [s0, s1, s2, s3]):
             return
         middle = np.array(times) - times[1]
         roots = np.roots(np.polyfit(middle, [s0, s1, -s2, -s3], 3))
         within = roots[np.isreal(roots) & (roots.real >= 0) & (roots.real <= middle[2])].real
         if len(within):
             nearest = 1 if s1 < s2 else 2
-            self._rows = np.flatnonzero(np.abs(np.linalg.svd(self._seen[nearest][2])[0][:, -1]) > TAKES_PART).tolist()
-            self.times.append(times[1] + float(within[0]))
+            self._passed(times[1] + float(within[0]), times[nearest], q[nearest])
 
     def describe(self) -> str:
         """Return the poses in a sentence; empty where there are none."""
@@ -310,9 +307,8 @@ class SingularPosesOfBatch:
 
     def saw(self, dyn: Dynamics, t: float, q: Array, members: Iterable[int]) -> None:
         """Take in the ends of the steps of these members, whose dynamics are `dyn`."""
-        J = manifold_at(dyn, t).jacobian(q)
-        for i, size, slopes in zip(members, singular_values(J)[..., -1].tolist(), J, strict=True):
-            self._members[int(i)].take(t, size, slopes)
+        for i, depends, at in zip(members, manifold_at(dyn, t).dependence(q).tolist(), q, strict=True):
+            self._members[int(i)].take(t, depends, at)
 
     def saw_run(self, member: int, t: Array, q: Array) -> None:
         """Take in the ends of all steps of one member, (n,) and (n, nq)."""
@@ -334,7 +330,7 @@ def describe_poses(members: Mapping[int, SingularPoses], batch: int | None) -> s
     return f"{len(passed)} of {batch} trajectories passed singular poses; trajectory {first} {poses.describe()}"
 
 
-def _bend(t: list[float], x: list[float]) -> float:
+def _bend(t: Iterable[float], x: Iterable[float]) -> float:
     """Return how much the slope of a line through points changes, in all."""
     slopes = [(x1 - x0) / (t1 - t0) for (t0, t1), (x0, x1) in zip(pairwise(t), pairwise(x), strict=True)]
     return sum(abs(b - a) for a, b in pairwise(slopes))

@@ -87,7 +87,8 @@ class _Solve:
                 first, solver = None if self._method.multistep else solver.h_abs, None
             while t < stop:
                 if across is not None and across.crosses(t, y, _length(solver)):
-                    (t, y), first, solver = across.cross(interval, stop), None, None
+                    # Not to a time that is saved, which may be so near the pose that no step goes on from there.
+                    (t, y), first, solver = across.cross(interval, problem.stops[interval]), None, None
                     yield t, y, across.at
                     continue
                 if solver is None:

@@ -168,8 +168,10 @@ class RungeKuttaAttempts:
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
         if self._dropped or self._t >= self._stop or self.stuck(0) is not None:
             return []
-        approach = self._field.approach
-        length = approach.length(self._h) if approach.crosses(self._h) else self._h
+        approach, length = self._field.approach, self._h
+        if approach.crosses(length):
+            # A step that is to end behind the pose may not come close to it with its end.
+            length = approach.length(min(length, self._stop - self._t))
         t = end_of_attempt(SCALARS, self._t, length, self._stop)
         step = t - self._t
         ends = [(self._t, self._q, self._w)]
@@ -288,12 +290,10 @@ class AcrossPoses(RungeKuttaAttempts):
         q, v = unit_quaternions(self._model, y[: self._model.nq])[0], y[self._model.nq :]
         w = self._space.to_integrator_velocity(q, v)
         self._begin(t, q, w)
-        # A series of a tight tolerance has short steps beside a pose, as it meets the digits that v̇ loses there.
-        out = self.approach.crosses(h) or self.approach.worse
+        out = self.approach.crosses(h)
         if out:
             # A method of several steps leaves the constraints by its errors.
             self._q, self._w = self._field.settled(t, q, w)
-            self.approach.near = True
         return out
 
     def cross(self, k: int, stop: float) -> tuple[float, Array]:
