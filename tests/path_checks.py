@@ -342,6 +342,13 @@ def by_phases_and_moreau(model: mb.Model, folder: Path) -> None:
     by_running("moreau", 1e-6, dt=1e-6)(model, folder)
 
 
+def by_phases_beside_soft_constraints(model: mb.Model, folder: Path) -> None:
+    PATHS["friction beside soft constraints"].admit(model)
+    if not model.needs.friction:
+        raise NotAskedError("nothing jumps")
+    by_running("rk4", 1e-9, "mujoco", dt=_STEP)(model, folder)
+
+
 def by_exciting(model: mb.Model, folder: Path) -> None:
     """The motion is one: velocities are the rates of its coordinates."""
     motion = mb.excitation(model, duration=2.0, harmonics=2, rate=200.0, iterations=1)
@@ -372,6 +379,7 @@ CHECKS: dict[str, Check] = {
     "gpu under force": on_a_gpu,
     "symplectic runs": by_running("implicit_midpoint", 1e-6, dt=_STEP),
     "runs": by_phases_and_moreau,
+    "friction beside soft constraints": by_phases_beside_soft_constraints,
     "runs without phases": by_mujocos_steps,
     "excitation": by_exciting,
 }

@@ -604,12 +604,7 @@ def test_samples_of_a_batch_have_their_own_parameters() -> None:
             assert times == pytest.approx([e.t for e in alone.events], rel=4 * EPS, abs=0)
 
 
-def test_runs_beside_loops_and_by_an_engine_s_own_integrator_are_refused_with_a_way_out() -> None:
-    bar = mb.dynamics(four_bar(np.ones(3)), "lagrangian")
-    q, v = bar.project([1.2, -0.6, 1.5], np.zeros(3))
-    for method, more in (("rk4", {"dt": 1e-2}), ("rk853", {}), ("moreau", {"dt": 1e-2})):
-        with pytest.raises(UnsupportedError, match=r"without\('friction'\)"):
-            mb.simulate(bar, q, v, 0.1, method, **more)
+def test_runs_by_an_engine_s_own_integrator_are_refused_with_a_way_out() -> None:
     with pytest.raises(UnsupportedError, match=r"does not know dry friction.*without\('friction'\)"):
         mb.simulate(mb.dynamics(slider(friction=1.0), "mujoco"), [1.0], [0.0], 0.1, "mujoco_rk4", dt=1e-2)
 

@@ -21,10 +21,8 @@ from mbkit.simulate.progress import Progress
 from mbkit.simulate.time_grid import Grid, Indices, check_room, check_save
 from mbkit.simulate.torque import Torque
 
-_TOO_MANY: Final = "joints at rest may leave too many rows; forward_dynamics has both, model.without('friction') runs"
-_APART: Final = ("jump", "row", _TOO_MANY), ("jump", "speed", _TOO_MANY)
 #: Runs whose jumps are those of phases, or of the method.
-RUNS: Final = Path("runs", "simulate: not known of", ALL, apart=_APART)
+RUNS: Final = Path("runs", "simulate: not known of", ALL)
 
 
 @dataclass(frozen=True, eq=False)

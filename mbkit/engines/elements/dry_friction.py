@@ -201,7 +201,7 @@ class DryFriction(AddedForce):
                 if dyn.bits > _DOUBLE:
                     return self._in_phase(quantity, dyn, q, v, tau, rest, resting)
                 held, still = self._each(dyn, quantity, moving, q, v, tau, rest, resting)
-                out = moving(q, v, tau + _padded(held, tau), *rest)
+                out = moving(q, v, tau + padded(held, tau), *rest)
                 # What friction holds does not move, not even by a rounding.
                 return np.where(still, 0.0, out) if quantity.startswith(_FORWARD) else out
 
@@ -278,7 +278,7 @@ class DryFriction(AddedForce):
         b = np.asarray(accelerate(tau), dtype=np.float64)
         # Where there are no accelerations nothing is held, and the engine says why there are none.
         none = np.asarray(~np.isfinite(b).all(axis=-1, keepdims=True))
-        A = np.where(none[..., None], 0.0, self._responses(dyn, accelerate, q, tau, b))
+        A = np.where(none[..., None], 0.0, self.responses(dyn, accelerate, q, tau, b))
         resting, b, n = resting & ~none, np.where(none, 0.0, b), shape[-1]
         A, b, on = A.reshape(-1, n, n), b.reshape(-1, n), resting.reshape(-1, n)
         bound, less = (np.broadcast_to(x, on.shape) for x in (law.bound, law.just_moving))
@@ -286,12 +286,12 @@ class DryFriction(AddedForce):
         definite = not self._constrained
         forces, holds = friction_forces(A, b, bound, less, on, known, definite=definite)
         # A has the rounding of M; what the engine's own accelerations still leave corrects that.
-        left = accelerate(tau + _padded(forces.reshape(shape), tau))
+        left = accelerate(tau + padded(forces.reshape(shape), tau))
         left = np.asarray(left, dtype=np.float64).reshape(on.shape)
         forces = forces - _restricted(A, left, holds, definite=definite)
         return forces.reshape(shape), holds.reshape(shape)
 
-    def _responses(self, dyn: Any, accelerate: Callable[[Array], Array], q: Array, tau: Array, a: Array) -> Array:
+    def responses(self, dyn: Any, accelerate: Callable[[Array], Array], q: Array, tau: Array, a: Array) -> Array:
         """Return the accelerations of joints per force on each of them, (nv, nv) or (N, nv, nv)."""
         if not self._constrained:
             return np.asarray(np.linalg.inv(np.asarray((dyn._bare or dyn).mass_matrix(q))))
@@ -300,7 +300,7 @@ class DryFriction(AddedForce):
         out, size = np.zeros((*a.shape, a.shape[-1])), max(1.0, float(np.abs(tau).max()), float(law.bound.max()))
         for j in law.which:
             unit = np.broadcast_to(size * np.eye(a.shape[-1])[j], a.shape)
-            out[..., j] = (np.asarray(accelerate(tau + _padded(unit, tau)), dtype=np.float64) - a) / size
+            out[..., j] = (np.asarray(accelerate(tau + padded(unit, tau)), dtype=np.float64) - a) / size
         # A joint that loops hold responds by rounding alone, of either sign; the least response keeps A definite.
         masses, own = (np.einsum("...ii->...i", np.asarray(x)) for x in ((dyn._bare or dyn).mass_matrix(q), out))
         own[...] = np.maximum(own, _PROXIMAL / np.where(masses > 0, masses, np.inf))
@@ -316,6 +316,8 @@ class DryFriction(AddedForce):
             if len(held) >= _PHASES:
                 held.clear()
             held[key] = bare._of_model(sliding.at(sides, still, dyn.model), sliding.form)
+            # The dynamics with friction have looked at the state, and what a phase goes through is open by rounding.
+            held[key].looks = False
         return held[key]._under(*dyn._acting) if dyn._acting[0] else held[key]
 
     def phases(self, dyn: Any, sides: Array, still: Mask) -> Any:
@@ -328,6 +330,7 @@ class DryFriction(AddedForce):
         values = {name: np.where(still, 0.0, sides)[:, i] for i, name in sliding.sides.items()}
         values |= {name: RESTING * still[:, i] for i, name in sliding.locks.items()}
         own = own._with(own.model, {**own._batched, **values})
+        own.looks = False
         return own._under(*dyn._acting) if dyn._acting[0] else own
 
     @cached_property
@@ -358,7 +361,7 @@ class DryFriction(AddedForce):
         return np.concatenate([one(i) for i in range(len(v))])
 
 
-def _padded(force: Array, tau: Array) -> Array:
+def padded(force: Array, tau: Array) -> Array:
     """Return a force with zeros for the wrenches that stand behind τ."""
     lacking = tau.shape[-1] - force.shape[-1]
     return np.concatenate([force, np.zeros((*force.shape[:-1], lacking))], axis=-1) if lacking else force

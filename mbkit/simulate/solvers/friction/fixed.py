@@ -268,7 +268,9 @@ class _Members:
 
     def _compiled(self, dyn: Dynamics) -> bool:
         """Return whether the margins of states are machine code with the steps."""
+        # Beside constraints, forces at rest are shared by what rests together.
         known = dyn.derived and method_of(self.problem.method).explicit and not self.problem.torque.callable
+        known = known and not dyn.model.constrained
         return known and getattr(dyn, "compiles_steps", False) and getattr(dyn, "device", None) is None
 
     @cached_property
@@ -351,7 +353,8 @@ class _Members:
             q, v, margins = part.ahead(every, left)
             over = margins < 0
             self.q[rows[~over]], self.v[rows[~over]] = q[~over], v[~over]
-            self._phase.sides[rows[~over]], self._phase.still[rows[~over]] = phase.sides[~over], phase.still[~over]
+            for kept, x in zip(self._phase.pattern, phase.pattern, strict=True):
+                kept[rows[~over]] = x[~over]
             rows, start, left, every = rows[over], start[over], left[over], every[over]
             if not len(rows):
                 break
@@ -364,7 +367,7 @@ class _Members:
             if not decided.all():
                 rows, start, left = rows[decided], start[decided], left[decided]
                 phase = phase.take(np.flatnonzero(decided))
-        self._phase = self.friction.given(self._phase.sides, self._phase.still, self._phase.rubbed)
+        self._phase = self.friction.given(*self._phase.pattern, self._phase.rubbed)
         whole = whole[self._going[whole]]
         self.k[whole] += 1
         self._keep(whole, self.k[whole], self.q[whole], self.v[whole])
@@ -455,8 +458,8 @@ class _PartOfStep:
                 states = out.q, out.v
             for now, x in zip(ends, states, strict=True):
                 now[j] = x.reshape(-1, x.shape[-1])[-1]
-        q, v = run.friction.held(phase.still, q, *ends)
-        return q, v, run.friction.margins(phase, run.times(self._t[i] + s), q, v, force).min(axis=1)
+        margins = run.friction.margins(phase, run.times(self._t[i] + s), *ends, force).min(axis=1)
+        return *run.friction.held(phase.still, q, *ends), margins
 
     def ends(self, i: Indices, length: Array, over: Array) -> Array:
         """Return after how many seconds phases end, before `length`, where margins are `over`; 0 if they do at once."""

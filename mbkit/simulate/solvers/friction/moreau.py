@@ -1,7 +1,7 @@
 """Runs by Moreau and Jean's step: dry friction with a fixed step, any number of joints, no events.
 
-On the own derivation the step with its choice of sides is machine code; elsewhere, and under torques that are
-functions, the same problem is solved in Python for each step.
+On the own derivation the step with its choice of sides is machine code; elsewhere, beside constraints, and under
+torques that are functions, the same problem is solved in Python for each step.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.engines.elements.dry_friction import friction_forces
+from mbkit.engines.elements.dry_friction import friction_forces, padded
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
@@ -34,7 +34,7 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
     dyn = problem.dyn
     record, reasons, evaluations = GridRecord(problem), dict[int, str](), 0
     compiled = dyn.derived and not problem.torque.callable and "jump" in dyn.model.effects
-    compiled = compiled and getattr(dyn, "compiles_steps", False)
+    compiled = compiled and getattr(dyn, "compiles_steps", False) and not dyn.model.constrained
     for i in range(len(problem.q)):
         member = problem.member(i)
         own = dyn if member is None else dyn._of_sample(i)
@@ -60,7 +60,7 @@ class _InPython:
     ) -> None:
         self._problem, self._dyn, self._record, self._i = problem, dyn, record, i
         self._force = problem.torque.of_member(member)
-        self._law, self._space = dyn._friction.law_of(dyn), Space(dyn.model)
+        self._law, self._space, self._friction = dyn._friction.law_of(dyn), Space(dyn.model), Friction(dyn)
         self._which = np.flatnonzero(self._law.bound > 0)
         none = np.zeros(dyn.model.nv)
         # Without friction: neither a side nor rest.
@@ -87,21 +87,29 @@ class _InPython:
 
     def _step(self, t: float, h: float, q: Array, v: Array, force: Any) -> tuple[Array, Array]:
         dyn, tau, which, space = at_time(self._smooth, t), applied(force, t, q, v), self._which, self._space
-        free = v + h * dyn.forward_dynamics(q, v, tau)
+
+        def accelerate(force: Array) -> Array:
+            return np.asarray(dyn.forward_dynamics(q, v, force))
+
+        a = accelerate(tau)
+        free, holds, bound = v + h * a, v != v, dyn.model.constrained
         if len(which):
-            inverse, rubs = np.linalg.inv(dyn.mass_matrix(q)), self._law.bound > 0
+            inverse = self._dyn._friction.responses(dyn, accelerate, q, tau, a)
+            rubs = self._law.bound > 0
             slides = np.abs(self._law.force_at(v))
             less, none, rests, smooth = h * slides[None], np.zeros((1, len(v))), v == 0, free
             # What stops or turns may be held by its stiction.
             while True:
                 most = h * np.where(rests, self._law.bound, slides)[None]
-                (impulse,), (holds,) = friction_forces(inverse[None], smooth[None], most, less, rubs[None], none)
-                free = np.where(holds, 0.0, smooth + inverse @ impulse)
+                problem = inverse[None], smooth[None], most, less, rubs[None], none
+                (impulse,), (holds,) = friction_forces(*problem, definite=not bound)
+                pushed = v + h * accelerate(tau + padded(impulse, tau) / h) if bound else smooth + inverse @ impulse
+                free = np.where(holds, 0.0, pushed)
                 if not (turns := rubs & ~rests & (v * free <= 0) & (slides < self._law.bound)).any():
                     break
                 rests = rests | turns
         q1 = space.retract(q, h * space.to_integrator_velocity(q, free))
-        return q1, free
+        return self._friction.onto_rows(t + h, holds, q, q1, free) if bound else (q1, free)
 
 
 class _Compiled:

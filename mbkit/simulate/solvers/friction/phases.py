@@ -3,41 +3,61 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mbkit._check import Array
+from mbkit._reproducible import unit_rows
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
+from mbkit.engines.elements.dry_friction import Mask
 from mbkit.model.changes.dry_friction import ROUNDING
+from mbkit.model.elements.paths import ALL, Path
+from mbkit.simulate.solvers.friction.beside_rows import independent, shares, slow, stopped
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
+
+_GIVES_WAY: Final = "this engine's constraints give way, and so would what rests; pinocchio and lagrangian hold both"
+BESIDE_SOFT_ROWS: Final = Path(
+    *("friction beside soft constraints", "simulate: not known of", ALL),
+    apart=(("jump", "row", _GIVES_WAY), ("jump", "speed", _GIVES_WAY)),
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Phase:
     """Smooth dynamics in which velocities have signs, (nv,), or rest; of trajectories side by side (m, nv).
 
+    `locked` are those at rest that have rotors which nothing moves. Constraints let the others rest with them.
     `rubbed` are the dynamics with friction of the same trajectories.
     """
 
     dyn: Dynamics
     sides: Array
-    still: NDArray[np.bool_]
+    still: Mask
+    locked: Mask
     rubbed: Dynamics
+
+    @property
+    def pattern(self) -> tuple[Array, Mask, Mask]:
+        """The sides, and what rests and is locked."""
+        return self.sides, self.still, self.locked
 
     def take(self, which: Indices) -> Phase:
         """Return the phases of these trajectories, by index, which may repeat."""
         dyn, rubbed = self.dyn.of_samples(which), self.rubbed.of_samples(which)
-        return Phase(dyn, self.sides[which], self.still[which], rubbed)
+        return Phase(dyn, self.sides[which], self.still[which], self.locked[which], rubbed)
 
 
 class Friction:
     """Dry friction of one trajectory's dynamics, or of trajectories `side_by_side` on the own derivation."""
 
     def __init__(self, dyn: Dynamics, *, side_by_side: bool = False) -> None:
+        #: Whether constraints may hold with friction what rests.
+        self._bound = dyn.model.constrained
+        if self._bound and dyn.soft_constraints:
+            BESIDE_SOFT_ROWS.admit(dyn.model)
         self._dyn, self._own, self._side_by_side = dyn, dyn._friction, side_by_side
         self._names = dyn.model.velocity_names
         #: Velocities with friction.
@@ -77,29 +97,44 @@ class Friction:
                 *(q[rows], tau[rows], resting[rows], None if leaving is None else leaving[rows]),
                 law=self._own.law_of(own),
             )
-        return self.given(np.where(resting, -np.sign(held), signs), still, rubbed)
+        locked = still.copy()
+        if self._bound and still.any():
+            free = self._directions(rubbed, t, q)
+            locked = np.array([independent(*one) for one in zip(_rows(free, 2), _rows(still), strict=True)])
+        return self.given(np.where(resting, -np.sign(held), signs), still, locked.reshape(still.shape), rubbed)
 
-    def given(self, sides: Array, still: NDArray[np.bool_], rubbed: Dynamics) -> Phase:
+    def given(self, sides: Array, still: Mask, locked: Mask, rubbed: Dynamics) -> Phase:
         """Return a phase that is known."""
-        return Phase(self._dynamics(rubbed, sides, still), sides, still, rubbed)
+        return Phase(self._dynamics(rubbed, np.where(still, 0.0, sides), locked), sides, still, locked, rubbed)
 
-    def _dynamics(self, rubbed: Dynamics, sides: Array, still: NDArray[np.bool_]) -> Dynamics:
+    def _dynamics(self, rubbed: Dynamics, sides: Array, still: Mask) -> Dynamics:
         if self._side_by_side:
             return self._own.phases(rubbed, sides, still)  # type: ignore[no-any-return]  # of the same engine
-        one: Dynamics = self._own.phase(rubbed, *(x.reshape(-1, x.shape[-1])[0] for x in (sides, still)))
+        one: Dynamics = self._own.phase(rubbed, *(_rows(x)[0] for x in (sides, still)))
         return one
 
-    def held(self, still: NDArray[np.bool_], start: Array, q: Array, v: Array) -> tuple[Array, Array]:
+    def _directions(self, dyn: Dynamics, t: float | Array, q: Array) -> Array:
+        """Return a basis of the velocities that constraints allow at configurations, (nv, k) or (N, nv, k)."""
+        J = at_time(dyn, t).constraint_jacobian(q)[..., list(dyn._row_choice.independent), :]
+        return np.asarray(np.linalg.svd(unit_rows(J))[2][..., J.shape[-2] :, :].mT)
+
+    def held(self, still: Mask, start: Array, q: Array, v: Array) -> tuple[Array, Array]:
         """Return states of a phase from `start` on in which what rests keeps its place and no velocity, to the bit."""
         if not still.any():
             return q, v
         return np.where(self.places(still), start, q), np.where(still, 0.0, v)
 
-    def places(self, still: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def places(self, still: Mask) -> Mask:
         """Return which coordinates keep their place, (..., nq)."""
         rests = np.zeros((*still.shape[:-1], self._dyn.model.nq), dtype=bool)
         rests[..., self._places] = still[..., self.which]
         return rests
+
+    def onto_rows(self, t: float, still: Mask, start: Array, q: Array, v: Array) -> tuple[Array, Array]:
+        """Return the consistent state beside one in which joints rest that were there at the `start`."""
+        locked = independent(self._directions(self._dyn, t, q), still)
+        rests = self._own.phase(self._dyn, np.zeros(v.shape), locked)
+        return self.held(still, start, *rests._pulled(t, q, v))
 
     def margins(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).
@@ -108,8 +143,13 @@ class Friction:
         """
         out, still = (phase.sides * v)[..., self.which], phase.still[..., self.which]
         if still.any():
-            used = np.abs(self.holding(phase, t, q, v, force)[..., self.which]) / self.bounds(phase)
+            held = np.where(phase.still, 0.0, v)
+            used = np.abs(self.holding(phase, t, q, held, force)[..., self.which]) / self.bounds(phase)
             out = np.where(still, 1 + ROUNDING - used, out)
+            if self._bound:
+                # What rows alone hold moves as soon as they do.
+                moved = np.abs(v) / slow(v)
+                out = np.where(still & ~phase.locked[..., self.which], np.minimum(out, 1 - moved[..., self.which]), out)
         return out
 
     def margin_part(self, dyn: Any) -> Any:
@@ -130,7 +170,18 @@ class Friction:
         pulled = loose.inverse_dynamics(q, v, a) - tau[..., : v.shape[-1]]
         if dyn._acting[0]:
             pulled = pulled - _of_wrenches(phase.rubbed, q, tau)
-        return np.where(phase.still, pulled, 0.0)
+        if not self._bound:
+            return np.where(phase.still, pulled, 0.0)
+        bound, out = np.ones(v.shape), np.zeros(v.shape)
+        bound[..., self.which] = self.bounds(phase)
+        N, needed, most = self._directions(phase.rubbed, t, q), _rows(pulled), _rows(bound)
+        patterns = _rows(np.concatenate([phase.still, phase.locked], axis=-1))
+        patterns, which = np.unique(patterns, axis=0, return_inverse=True)
+        which = np.broadcast_to(which, len(needed))
+        for i, pattern in enumerate(patterns):
+            its, (still, locked) = which == i, np.split(pattern, 2)
+            _rows(out)[its] = shares(_rows(N, 2)[its], needed[its], most[its], still, locked)
+        return out
 
     def bounds(self, phase: Phase) -> Array:
         """Return the largest forces at rest of velocities with friction, 1 where there are none; (k,) or (m, k)."""
@@ -147,6 +198,10 @@ class Friction:
         ended[..., self.which] = margins <= np.maximum(margins.min(axis=-1, keepdims=True), 0.0) + 1e-15
         lets_go = ended & phase.still
         out, leaving = np.where(phase.still | ended, 0.0, v), np.zeros(v.shape)
+        if self._bound:
+            rests, rubs = phase.still | ended, np.isin(np.arange(v.shape[-1]), self.which)
+            states = _rows(self._directions(phase.rubbed, t, q), 2), _rows(v), _rows(rests)
+            out = np.array([stopped(*state, rubs) for state in zip(*states, strict=True)]).reshape(v.shape)
         if lets_go.any():
             leaving = np.where(lets_go, -np.sign(self.holding(phase, t, q, v, force)), 0.0)
         return out, leaving
@@ -172,3 +227,8 @@ def _of_wrenches(dyn: Dynamics, q: Array, tau: Array) -> Array:
 def applied(force: Force, t: float | Array, q: Array, v: Array) -> Array:
     """Return the force at one state, (n,), or at several of a trajectory, (N, n)."""
     return np.asarray(force(t, q, v) if callable(force) else force)
+
+
+def _rows(x: Any, axes: int = 1) -> Any:
+    """Return numbers of one state or of several as those of several."""
+    return x.reshape(-1, *x.shape[x.ndim - axes :])

@@ -108,7 +108,7 @@ def _adaptive(run: _Member) -> None:
 
         def end(s: float, q: Array, v: Array, own: Phase = own, begun: float = begun, k: int = k) -> float:
             row = run.force(max(k, int(np.searchsorted(stops, s, side="left"))))
-            out = float(run.friction.margins(own, s, q, np.where(own.still, 0.0, v), row).min())
+            out = float(run.friction.margins(own, s, q, v, row).min())
             return max(out, _EPS) if s == begun else out
 
         save = None if rows is None else np.append(rows[(rows > t) & (rows < problem.end)], problem.end)
