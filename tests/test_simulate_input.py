@@ -18,6 +18,7 @@ import pytest
 
 import mbkit as mb
 from mbkit import catalog
+from mbkit._check import finite_array
 from mbkit.engines import Dynamics, dynamics
 from mbkit.errors import InputError, MbkitWarning, TorqueError
 from mbkit.simulate import Event, simulate
@@ -429,6 +430,28 @@ def test_a_native_run_ends_at_ctrl_c(study: bool) -> None:
         process.kill()
     assert process.returncode
     assert "Interrupt" in said
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+def test_a_large_table_is_read_in_pieces_between_which_ctrl_c_is_heard() -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    # One number, repeated: it takes no memory, and half a second to be read.
+    table, before = np.broadcast_to(1.0, 2**28), signal.signal(signal.SIGPROF, stop)
+    try:
+        begin = time.process_time()
+        signal.setitimer(signal.ITIMER_PROF, 0.05)
+        with pytest.raises(KeyboardInterrupt):
+            finite_array("torque", table, table.shape)
+        assert time.process_time() - begin < 0.15
+    finally:
+        signal.signal(signal.SIGPROF, before)
+    # A wrong number in the middle is named as in a small one.
+    table = np.zeros((3, 2**16))
+    table[1, 7] = np.nan
+    with pytest.raises(InputError, match=r"nan at index \(1, 7\)"):
+        finite_array("torque", table, table.shape)
 
 
 @pytest.mark.parametrize("compiled", [True, False])

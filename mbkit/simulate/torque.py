@@ -342,9 +342,12 @@ class Torque:
         #: Whether the force jumps between steps.
         self.held = any(x.ndim > 1 and (x.shape[:-1] != (batch, 1) or steps == 1) for _, x in parts)
         #: Rows that are held, one for each step, or sample, or one for all: (rows, n), or (N, rows, n).
-        self.table = np.zeros((*(np.broadcast_shapes(*(x.shape[:-1] for _, x in parts)) or (1,)), size))
-        for part, x in parts:
-            self.table[..., part] = x
+        if len(parts) == 1 and size == model.nv:
+            self.table = np.atleast_2d(parts[0][1])
+        else:
+            self.table = np.zeros((*(np.broadcast_shapes(*(x.shape[:-1] for _, x in parts)) or (1,)), size))
+            for part, x in parts:
+                self.table[..., part] = x
         self._functions: Functions = tuple(functions)
 
     @classmethod
@@ -466,9 +469,9 @@ class Torque:
         out, lead = copy(self), () if self._batch is None else (self._batch,)
         rows = self.table if table is None or not self.held else self.table[..., table, :]
         count = rows.shape[-2] if self.held else len(begins) - 1
-        out.table, out.held = np.broadcast_to(rows, (*lead, count, rows.shape[-1])).copy(), True
         # Of what was never sampled nothing is known.
-        out.table[..., : self._nv] = np.nan
+        out.table, out.held = np.full((*lead, count, rows.shape[-1]), np.nan), True
+        out.table[..., self._nv :] = rows[..., self._nv :]
         asked = np.zeros(lead or 1, dtype=np.intp)
         out.samples = Samples(TorqueCallback(controller, self._nv), begins, asked, fine=self.held)
         return out
