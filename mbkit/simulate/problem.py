@@ -110,9 +110,9 @@ class IntegrationProblem:
     def sample(self, i: int, k: int, t: float, y: Array) -> None:
         """Ask a torque that samples for its value from interval k on, where the i-th trajectory is in a state y."""
         if self.torque.samples is not None:
-            model, one = self.dyn.model, self.batch is None
+            model = self.dyn.model
             q, v = unit_quaternions(model, y[: model.nq])[0], y[model.nq :]
-            self.torque.sample(k, t, q if one else q[None], v if one else v[None], None if one else np.array([i]))
+            self.torque.sample(k, t, q[None], v[None], np.array([i]))
 
     def member(self, i: int) -> int | None:
         """Return the place of the i-th state in the batch, None where there is none."""

@@ -477,7 +477,7 @@ class Torque:
         return out
 
     def sample(self, k: int, t: float, q: Array, v: Array, members: Indices | None = None) -> None:
-        """Ask a sampled torque for its value from step k on: of a state, or of the states of these members.
+        """Ask a sampled torque for its value from step k on, of the states of these members; a single run has one.
 
         A trajectory that was asked there already is not asked again, so that whoever begins with a step may ask.
         """
@@ -485,9 +485,10 @@ class Torque:
         if samples is None:
             return
         s = samples.at(self._first + k)
-        if members is None:
+        if self._batch is None or members is None:
             if samples.asked[0] <= s:
-                self.table[samples.rows(s), : self._nv] = samples.controller.one(t, q, v, self._member)
+                state = np.atleast_2d(q)[0], np.atleast_2d(v)[0]
+                self.table[samples.rows(s), : self._nv] = samples.controller.one(t, *state, self._member)
                 samples.asked[0] = s + 1
             return
         new = samples.asked[members] <= s

@@ -164,8 +164,7 @@ class CompiledAttempts:
             state = self._outer.state[:, places]
             t, q, w = float(state[self._row["t"], 0]), state[self._at["q"]].T.copy(), state[self._at["w"]].T
             v = self._space.to_body_velocity(q, w.copy())
-            members = None if self._batch is None else np.array(self._which)[places]
-            self._torque.sample(k, t, q[0] if members is None else q, v[0] if members is None else v, members)
+            self._torque.sample(k, t, q, v, np.array(self._which)[places])
 
     def _first(self, stop: float) -> Array:
         arena = self._outer

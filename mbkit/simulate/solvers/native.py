@@ -38,10 +38,8 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
             break
         q, v = (np.where(good[..., None], x, first) for x, first in zip(now, (q0, v0), strict=True))
         try:
-            if problem.batch is None:
-                torque.sample(k, grid.time(k), q, v)
-            else:
-                torque.sample(k, grid.time(k), q[good], v[good], np.flatnonzero(good))
+            who = np.flatnonzero(good)
+            torque.sample(k, grid.time(k), np.atleast_2d(q)[who], np.atleast_2d(v)[who], who)
         except FunctionError as failed:
             error = failed
             break

@@ -145,10 +145,7 @@ class RungeKuttaAttempts:
     def hold(self, k: int, stop: float) -> None:
         if self._torque.samples is not None and not self._dropped:
             v = self._space.to_body_velocity(self._q, self._w)
-            if self._batch is None:
-                self._torque.sample(k, self._t, self._q, v)
-            else:
-                self._torque.sample(k, self._t, self._q[None], v[None], np.array([self._member]))
+            self._torque.sample(k, self._t, self._q[None], v[None], np.array([self._member]))
         self._force, self._stop, self._fresh = self._of_interval(k), stop, True
         if not self._h and not self._dropped:
             self._h = self._first()

@@ -140,10 +140,7 @@ class _Members:
             return
         k = int(self.k[rows].min())
         rows, t = rows[self.k[rows] == k], self.problem.grid.time(k)
-        if self.side_by_side:
-            torque.sample(k, t, self.q[rows], self.v[rows], self.members[rows])
-        else:
-            self.problem.sample(int(self.members[0]), k, t, np.concatenate([self.q[0], self.v[0]]))
+        torque.sample(k, t, self.q[rows], self.v[rows], self.members[rows])
 
     def times(self, t: Array) -> Any:
         """Return times as dynamics and forces take them: one of each trajectory, or that of one."""

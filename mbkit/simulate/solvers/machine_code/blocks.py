@@ -201,10 +201,7 @@ class SampleBarrier:
         q, w = states
         v = self._velocity(t, q, w, members[order])
         try:
-            if problem.batch is None:
-                problem.torque.sample(k, t, q[0], v[0])
-            else:
-                problem.torque.sample(k, t, q, v, members[order])
+            problem.torque.sample(k, t, q, v, members[order])
         except FunctionError as error:
             self.error = error
 
