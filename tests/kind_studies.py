@@ -43,7 +43,7 @@ from mbkit.studies._targets import with_values
 from mbkit.studies.compare.study import Judge
 from mbkit.studies.compare.terms import TERMS, states
 from mbkit.studies.importers.loops import Written, between_joints
-from mbkit.studies.importers.study import stages
+from mbkit.studies.importers.study import compared
 from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.case import Case as StressCase
 from mbkit.studies.stress.measure import Limits, measure, prepare
@@ -234,13 +234,18 @@ def _importers(x: Example, folder: Path) -> Told:
     back = mb.load(path)
     loops = Written(*[between_joints(back, back.constraints)] * 2)
     read = reader("mbkit.engines.mujoco.importer")
-    own = stages(back, loops, read(path.read_text(), "mjcf", False, {}), 2, 0, CLOSE)
-    if bad := [s for s in own if s.same is False]:
-        raise AssertionError(str(bad))
-    if (less := without_part(x)) is not None:
-        other = read(_written(less, folder, "mjcf", "less")[0].read_text(), "mjcf", False, {})
-        if all(s.same is not False for s in stages(back, loops, other, 2, 0, CLOSE)):
-            return np.inf, notes
+    asked = {"samples": 2, "seed": 0, "tolerance": CLOSE}
+    tree = replace(back, loops=(), couplers=())
+
+    def differing(text: str) -> list[Any]:
+        found = compared("mujoco", read(text, "mjcf", False, {}), tree, loops, "file", asked)
+        assert found.explanation is not None
+        return [s for s in found.stages if s.same is False] + list(found.explanation.causes)
+
+    assert not (bad := differing(path.read_text())), bad
+    less = without_part(x)
+    if less is not None and not differing(_written(less, folder, "mjcf", "less")[0].read_text()):
+        return np.inf, notes
     return 0.0
 
 

@@ -84,12 +84,12 @@ def test_three_importers_of_one_sound_file(tmp_path: Path) -> None:
     assert "1 kg" in causes(result, "mujoco")["base mass"][0]
     assert causes(result, "drake").keys() == {"limits"}
     stages = {s.name: s for s in result.importers[1].stages}
-    assert stages["total mass"].same is False
+    assert [*stages] == ["joints", "mimic", "loops", "couplers", "M", "g", "nle", "passive"]
     assert stages["M"].worst < 1e-14
     told = json.loads(result.to_json())
     assert told["agree"]
-    assert "| total mass | same |" in result.to_markdown()
-    assert "total mass" in result._repr_html_()
+    assert "| M | same |" in result.to_markdown()
+    assert "base mass" in result._repr_html_()
 
 
 def test_dry_friction_that_an_importer_drops_is_another_motion(tmp_path: Path) -> None:
@@ -438,7 +438,7 @@ def test_the_page_tells_it_all_and_obeys_nothing(tmp_path: Path) -> None:
     assert "alert" in page
     assert page.count("<script") == 1
     assert "<" not in result.to_markdown()
-    for told in ("the base floats", "a ball of water put in its place", "✓ same", "✗ differs", "! differs", "mujoco 4"):
+    for told in ("the base floats", "a ball of water put in its place", "✓ same", "✗ differs", "mujoco 4"):
         assert told in page
     # A refusal has its reason.
     result = mb.compare_parsers(write(tmp_path, arm(tool=LINK.format("tool", 0.3, 1e-3, 1e-3, 9e-3, ""))), samples=1)

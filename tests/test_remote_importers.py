@@ -56,7 +56,7 @@ def test_newton_reads_joints_of_one_body_at_one_place(tmp_path: Path) -> None:
     result = mb.compare_parsers(write(tmp_path, text, "arm.xml"), ["mujoco", "newton"])
     mujoco, newton = result.importers
     assert mujoco.agrees
-    assert {s.name for s in newton.stages if s.same is False} >= {"places", "M"}
+    assert "M" in {s.name for s in newton.stages if s.same is False}
     assert {"gravity", "joint origin"} <= causes(result, newton.engine).keys()
 
 

@@ -61,13 +61,13 @@ def _causes(causes: Iterable[Cause], apart: tuple[str, ...] = ()) -> list[Block]
 # One file through several importers.
 
 _LEGEND: Final = (
-    "✓ the same. ✗ another motion: these stages decide whether an importer agrees. ! another number, which decides "
-    "nothing by itself: what it does shows in M, g, nle and passive. – cannot be compared."
+    "✓ the same. ✗ another motion, which decides whether an importer agrees. ! in no term, so it decides nothing. "
+    "– cannot be compared."
 )
 
 
 def importers_view(result: ParserComparison) -> Document:
-    """Return the document of several importers of one file: stage by stage, and why they differ."""
+    """Return the document of several importers of one file: their own terms, and why they differ."""
     name = PurePath(result.source).name
     read = [p for p in result.importers if p.stages]
     alone = [p for p in result.importers if not p.stages and not p.refused]
@@ -95,7 +95,7 @@ def importers_view(result: ParserComparison) -> Document:
         opening=[Paragraph(_setting(result, read, alone), on="page")],
         sections=[
             Section(
-                "Stage by stage" + (f", against the {result.against}" if result.against else ""),
+                "Terms of each engine" + (f", against the {result.against}" if result.against else ""),
                 [
                     Table(columns, range(len(rows[0])), style="stages"),
                     Paragraph(_LEGEND, on="page", note=True),

@@ -15,7 +15,7 @@ TERMS: Final = ("M", "g", "nle", "passive")
 #: The version of an importer that is not there; it has refused nothing.
 MISSING: Final = "not installed"
 #: The stages that say whether two readings move alike.
-DECIDING: Final = ("joints", "kinds", *TERMS)
+DECIDING: Final = ("joints", *TERMS)
 #: Stages that no term shows: an agreement leaves them out.
 _APART: Final = {"mimic": "mimic joints", "limits": "limits", "loops": "loops", "couplers": "couplers"}
 _MARK: Final = {True: "same", False: "differs", None: "not comparable"}
@@ -23,11 +23,10 @@ _MARK: Final = {True: "same", False: "differs", None: "not comparable"}
 
 @dataclass(frozen=True)
 class Stage:
-    """One kind of number of one importer against the reference.
+    """A term of one importer, or what holds its joints, against the reference.
 
-    `same` is None where it cannot be compared. `worst` is the largest difference, relative for masses, inertias and
-    terms, else in m or its unit, and NaN without one; `where` is the joint or body where it is largest; `says` tells
-    the difference in words.
+    `same` is None where it cannot be compared. `worst` is the largest difference, relative for terms, else in m or its
+    unit, and NaN without one; `where` is the joint where it is largest; `says` tells the difference in words.
     """
 
     name: str
@@ -107,6 +106,7 @@ class ParserComparison(ResultTable):
         against = "" if self.reference == "file" else f" from the {self.against}"
         alone = [p.engine for p in self.importers if not p.stages and not p.refused]
         other = {s.name for p in self.importers if p.agrees for s in p.stages if not s.same}
+        other |= {c.kind for p in self.importers if p.agrees and p.explanation for c in p.explanation.causes}
         apart = [what for name, what in _APART.items() if name in other]
         parts = [f"{_listed(same)} agree{_s(same)} with the {self.against.split(',')[0]}"] if same else []
         parts = [f"{x}, {_listed(apart)} apart" if apart else x for x in parts]

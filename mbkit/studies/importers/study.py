@@ -31,17 +31,13 @@ from mbkit.load import loader
 from mbkit.load.mjcf import model_of_mjcf
 from mbkit.load.sanitized_text import Stripped, strip
 from mbkit.load.urdf_reader import urdf_links
-from mbkit.model import Body, Joint, Model
+from mbkit.model import Model
 from mbkit.model.changes.dry_friction import DryFrictionLaw
 from mbkit.model.elements.forces import by_functions
 from mbkit.model.model import unchecked
-from mbkit.model.parts import rules_of
 from mbkit.model.validation import listing
 from mbkit.studies import results
-from mbkit.studies.explain.hypotheses import BOUNDS, OF_ALL
-from mbkit.studies.explain.joint_matching import align_frames, reconcile_joint_sets, rename_joints
-from mbkit.studies.explain.loop_differences import turn_of
-from mbkit.studies.explain.merged_model import MergedModel, Tolerances, number_text
+from mbkit.studies.explain.merged_model import Tolerances
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
@@ -49,13 +45,6 @@ from mbkit.studies.importers.loops import Written, activated, between_joints, co
 from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import Worker, describe
-
-#: Stages of fields that are compared each by itself.
-_STAGES: Final = (
-    {"parent": "parents", "axes": "axes", "mass": "masses", "com": "centres of mass", "inertia": "inertias"}
-    | dict(zip(OF_ALL, OF_ALL, strict=True))
-    | dict.fromkeys(BOUNDS, "limits")
-)
 
 #: The least tolerance of an importer that holds single precision. Of robots that Newton reads rightly, M of tiago_pro
 #: is off by most: 9e-6, 150 times its unit roundoff.
@@ -132,44 +121,46 @@ def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
 
 
 def stages(
-    reference: Model | Imported, loops: Written, imported: Imported, samples: int, seed: int, tolerance: float
+    reference: Model | Imported,
+    loops: Written,
+    imported: Imported,
+    why: Explanation,
+    samples: int,
+    seed: int,
+    tolerance: float,
 ) -> tuple[Stage, ...]:
-    """Compare an importer's model with the reference, from the tree to the terms, which its own engine computes."""
+    """Compare what no description shows: the terms that the importer's own engine computes, and what holds joints."""
     described = reference.model if isinstance(reference, Imported) else reference
     # Importers leave mimic joints free.
-    whole = free_of_mimic(described)
-    # What holds weights acts on single bodies, which are merged here; the terms have it.
-    free = whole.without("forces")
-    near = Tolerances.of(free, tolerance)
-    one, other, matching, structural = reconcile_joint_sets(free, imported.model.without("forces"), near)
-    there, _ = align_frames(rename_joints(other, one.model, matching), one.model, near)
+    free = free_of_mimic(described)
+    back, there = ({x: y for m in why.matches for x, y in [(m.b, m.a)[::step]]} for step in (1, -1))
     theirs = {j.name: j.mimic for j in imported.model.joints}
-    mimics = [j.name for j in described.joints if j.mimic and not theirs.get(matching.to_b.get(j.name, ""))]
-    out = [_missing("joints", [h.subject for h in structural], "without a counterpart")]
-    for name, some in _differences(one, there, near).items():
-        if name == "total mass":
-            out.append(_missing("mimic", mimics, f"held {held}" if (held := imported.holds_mimics) else "left free"))
-        out.append(_worst(name, some))
-    back = {m.b: m.a for m in matching.pairs}
+    mimics = [j.name for j in described.joints if j.mimic and not theirs.get(there.get(j.name, ""))]
+    lost = [*why.only_a, *why.only_b]
+    held = f"held {imported.holds_mimics}" if imported.holds_mimics else "left free"
+    out = [_missing("joints", lost, "without a counterpart"), _missing("mimic", mimics, held)]
     constraints = between_joints(imported.model, imported.constraints, back)
+    near = Tolerances.of(free, tolerance)
     for name, faults, compare in (
         ("loops", loops.faults or imported.hidden, partial(loop_differences, near=near)),
         ("couplers", loops.faults, partial(coupler_differences, file=described, names=back, tolerance=tolerance)),
     ):
-        some = [] if faults else compare(written=loops, read=constraints)
-        every = "; ".join(f"{where}: {says}" for _, where, says in some)
-        out.append(Stage(name, None, math.nan, "", faults) if faults else replace(_worst(name, some), says=every))
+        if faults:
+            out.append(Stage(name, None, math.nan, "", faults))
+            continue
+        some = compare(written=loops, read=constraints)
+        size, where, _ = max(some, key=itemgetter(0), default=(0.0, "", ""))
+        out.append(Stage(name, not some, size, where, "; ".join(f"{where}: {says}" for _, where, says in some)))
     apart = Gaps(comparable=False)
-    if not structural:
-        at = states_of(one.model, samples, seed)
-        smooth = whole.smooth
-        own = Imported(whole, lambda q, v, _: model_terms(smooth, States(q, v)), ())
+    if not lost:
+        at = states_of(free, samples, seed)
+        own = Imported(free, lambda q, v, _: model_terms(free.smooth, States(q, v)), ())
         sides = (
-            (reference if isinstance(reference, Imported) else own, {x: x for x in back.values()}),
-            (imported, matching.to_b),
+            (reference if isinstance(reference, Imported) else own, {x: x for x in there}),
+            (imported, there),
         )
-        ours, read = (_own_terms_of(one.model, *side, at) for side in sides)
-        apart = gaps(ours, read, at.v, one.model.velocity_joints)
+        ours, read = (_own_terms_of(free, *side, at) for side in sides)
+        apart = gaps(ours, read, at.v, free.velocity_joints)
     by_term = {g.term: g for g in apart.terms}
     for name in TERMS:
         if g := by_term.get(name):
@@ -180,54 +171,9 @@ def stages(
     return tuple(out)
 
 
-def _worst(name: str, some: list[tuple[float, str, str]]) -> Stage:
-    size, where, says = max(some, key=itemgetter(0), default=(0.0, "", ""))
-    more = f" (and {len(some) - 1} more)" if len(some) > 1 else ""
-    return Stage(name, not some, size, where, f"{where}: {says}{more}" if some else "")
-
-
 def _missing(name: str, missing: list[str], what: str) -> Stage:
     says = f"{len(missing)} {what}: {', '.join(missing)}" if missing else ""
     return Stage(name, not missing, float(len(missing)), missing[0] if missing else "", says)
-
-
-def _differences(one: MergedModel, other: MergedModel, near: Tolerances) -> dict[str, list[tuple[float, str, str]]]:
-    """Return for each stage what differs: by how much, where, and in words."""
-    out: dict[str, list[tuple[float, str, str]]] = {
-        name: [] for name in ("kinds", "parents", "places", "axes", "total mass")
-    }
-    out |= {name: [] for name in _STAGES.values() if name not in out}
-    ours, theirs = (sum(b.mass for b in x.model.bodies) + x.ground.mass for x in (one, other))
-    if not near.number(ours, theirs):
-        base = " (the base's)" if near.number(ours - theirs, one.ground.mass - other.ground.mass) else ""
-        says = f"{number_text(theirs)} kg for {number_text(ours)} kg{base}"
-        out["total mass"].append((abs(theirs / ours - 1), "all", says))
-    sides: list[list[Any]] = [[*x.model.joints, *x.model.bodies] for x in (one, other)]
-    there = {(x.section, x.name): x for x in sides[1]}
-    for a in sides[0]:
-        if not (b := there.get((a.section, a.name))):
-            continue
-        apart = near.differing(a, b)
-        if isinstance(a, Joint) and a.type.motion != b.type.motion:
-            out["kinds"].append((1.0, a.name, f"{b.kind} for {a.kind}"))
-        if {"rotation", "translation"} & {*apart}:
-            far = float(np.linalg.norm(a.translation - b.translation))
-            turn = float(np.linalg.norm(turn_of(a.rotation.T @ b.rotation)))
-            out["places"].append((max(far, turn), a.name, f"{far:.3g} m and {turn:.3g} rad off"))
-        for field in (x for x in apart if x in _STAGES):
-            old, new, stage = getattr(a, field), getattr(b, field), _STAGES[field]
-            if isinstance(old, str):
-                out[stage].append((1.0, a.name, f"on {new} for {old}"))
-            elif np.shape(old) == np.shape(new):
-                moved = np.where(np.isfinite(old) & np.isfinite(new), np.subtract(new, old), np.inf)
-                size = float(np.linalg.norm(moved) if field == "com" else np.abs(moved).max())
-                size /= np.abs([old, new]).max() if field in ("mass", "inertia") else 1.0
-                label = f"{field.replace('_', ' ')} " if stage == "limits" else ""
-                unit = f" {rules_of(Body)[field].unit}" if isinstance(a, Body) else ""
-                read, written = ("none" if np.isinf(x).all() else number_text(x) for x in (new, old))
-                says = f"{label}{read}{unit * (field == 'mass')} for {written}{unit}"
-                out[stage].append((size, a.name, says))
-    return out
 
 
 def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
@@ -322,14 +268,13 @@ def compare_parsers(
     and the meshes from which its bodies take their inertia. Each runs in a process of its own, kept until this one
     ends: a crash or an endless loop there is reported like any other refusal.
 
-    The readings are compared stage by stage: joints, kinds, parents, places, axes, mimic joints, masses, centres of
-    mass, inertias, numbers of joints, limits, the loops and couplers of an MJCF, and M, g, nle and passive by
-    joint name, by the engine itself on its own model, with all that it holds beside bodies and joints: flags, tendons,
-    actuators at zero control, fluid, gravity compensation. Here passive holds the dry friction. Links that
-    an importer fuses are fused on the other side too. Why one differs is in its ``explanation``. Mimic joints,
-    limits, loops and couplers are in no term: they decide nothing, and the verdict names those that differ. Where mbkit
-    does not read the file, an MJCF is compared with MuJoCo's own reading, and any other file with nothing: the
-    importers that read it are only listed.
+    An importer's ``explanation`` names each number that it reads otherwise than the file has it, as `explain` does of
+    two descriptions. Its ``stages`` have what no description shows: M, g, nle and passive by joint name, by the engine
+    itself on its own model, with all that it holds beside bodies and joints: flags, tendons, actuators at zero control,
+    fluid, gravity compensation; here passive holds the dry friction. And what is in no term: mimic joints, and the
+    loops and couplers of an MJCF, which decide nothing, as limits; the verdict names those that differ. Links that an
+    importer fuses are fused on the other side too. Where mbkit does not read the file, an MJCF is compared with
+    MuJoCo's own reading, and any other file with nothing: the importers that read it are only listed.
 
     Parameters
     ----------
@@ -378,7 +323,7 @@ def compare_parsers(
             single = engine in elsewhere and elsewhere[engine].package.bits < DOUBLE_BITS
             near = {"tolerance": max(asked["tolerance"], _SINGLE)} if single else {}
             try:
-                parsed[engine] = _compared(engine, imported, reference, loops, label, asked | near)
+                parsed[engine] = compared(engine, imported, reference, loops, label, asked | near)
             except ImporterError as error:
                 refused[engine] = str(error)
     parsed |= {engine: Parsed(engine, _version(engine), why) for engine, why in refused.items()}
@@ -424,7 +369,7 @@ def _readings(
     return read, refused
 
 
-def _compared(
+def compared(
     engine: str,
     imported: Imported,
     reference: Model | Imported,
@@ -443,7 +388,7 @@ def _compared(
     )
     # Links that are fused may be matter that cannot be, as the file or the importer has it.
     with unchecked():
-        compared = stages(reference, loops, imported, **asked)
+        apart = stages(reference, loops, imported, explanation, **asked)
     causes, idle, held = own_terms(engine, imported, **asked)
     if isinstance(reference, Imported):
         theirs, _, also = own_terms(label, reference, **asked)
@@ -451,13 +396,13 @@ def _compared(
     notes = (*explanation.notes, *imported.notes, *idle)
     if unmatched:
         notes = (*notes, f"compared by what they do to passive forces alone: {listing([*map(str, unmatched)], 6)}")
-    explanation = with_own_terms(explanation, compared, causes, held)
+    explanation = with_own_terms(explanation, apart, causes, held)
     if way := imported.holds_mimics:
         # Their constraints are outside of all terms.
         free, tied = "leaves it free, which", f"holds it {way}, outside its terms; it"
         causes = [replace(c, says=c.says.replace(free, tied)) for c in explanation.causes]
         explanation = replace(explanation, causes=tuple(causes))
-    return Parsed(engine, _version(engine), "", compared, explanation, notes)
+    return Parsed(engine, _version(engine), "", apart, explanation, notes)
 
 
 def written(source: str | os.PathLike[str]) -> Model:
