@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-import itertools
 import json
 import math
 import multiprocessing
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import textwrap
@@ -40,7 +38,7 @@ from mbkit.studies.stress.measure import (
     reference_motion,
 )
 from mbkit.studies.stress.study import CaseSweep
-from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError, cpu_limit
+from mbkit.studies.study_runs import OUT_OF_TIME
 from tests import stress_cases as own
 
 METHODS = ("rk4", *own.ENDS)
@@ -334,15 +332,6 @@ def test_a_cell_that_is_stopped_by_the_end_of_the_study_is_not_slow():
     assert sweep.run("pinocchio", Late({("rk4", 1): ("run", WorkerTimeoutError(1.0))}), 10.0)
     cell = sweep.result().rows[0].cells[0]
     assert (cell.end, cell.note) == ("not run", OUT_OF_TIME)
-
-
-def test_a_bound_of_time_ends_what_does_not_ask():
-    with pytest.raises(TooLongError, match=r"stopped after 0\.05 s"), cpu_limit(0.05):
-        any(False for _ in itertools.count())
-    with pytest.raises(KeyboardInterrupt), cpu_limit(10.0):
-        raise KeyboardInterrupt
-    # And nothing is left of it.
-    assert signal.getitimer(signal.ITIMER_PROF) == (0.0, 0.0)
 
 
 # Truths

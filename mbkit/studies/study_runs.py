@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-import signal
-import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
-from types import FrameType
 from typing import Final
 
 import numpy as np
@@ -27,8 +24,6 @@ from mbkit.simulate import Trajectory, simulate
 
 #: The note of what was left out because no time was left.
 OUT_OF_TIME: Final = "not run: the time allowed was used up"
-#: Seconds after which the signal of a time limit is sent again, for C++ code may lose it.
-_REPEAT: Final = 0.25
 
 
 def state_within_limits(model: Model, rng: np.random.Generator, share: float = 0.5) -> tuple[Array, Array]:
@@ -133,35 +128,6 @@ def quiet_simulate(*args: object, **kwargs: object) -> Trajectory:
     """Simulate without the warning of a divergence, which the caller reads from the statistics."""
     with warnings.catch_warnings(action="ignore", category=MbkitWarning):
         return simulate(*args, **kwargs)  # type: ignore[arg-type]
-
-
-@contextmanager
-def cpu_limit(seconds: float) -> Iterator[None]:
-    """Raise `TooLongError` after so many seconds of processor time; only in the main thread, which gets signals.
-
-    Interrupts Python. C++ code goes on until its process is ended.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    sent = threading.Event()
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        sent.set()
-        raise TooLongError(f"stopped after {seconds:.2g} s")
-
-    before = signal.signal(signal.SIGPROF, stop)
-    signal.setitimer(signal.ITIMER_PROF, seconds, _REPEAT)
-    try:
-        yield
-    except KeyboardInterrupt:
-        if not sent.is_set():
-            raise
-        # CasADi answers any signal with it.
-        raise TooLongError(f"stopped after {seconds:.2g} s") from None
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0.0)
-        signal.signal(signal.SIGPROF, before)
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from mbkit.studies.compare.errors import Scales, acceleration_errors, force_erro
 from mbkit.studies.compare.terms import States
 from mbkit.studies.measurement import MAX_ERROR, Measurement, Problem, Truth
 from mbkit.studies.stress.case import Case, problem_of, step_of, times_of
-from mbkit.studies.study_runs import Deadline, TooLongError, cpu_limit, heard_warnings, quiet_simulate
+from mbkit.studies.study_runs import Deadline, TooLongError, heard_warnings, quiet_simulate
 from mbkit.studies.work_precision.reference import reference
 from mbkit.studies.worker import report_stage
 
@@ -172,8 +172,6 @@ _MIN_PREPARATION: Final = 6.0
 #: A run shorter than this is timed so many times in all, s.
 _SHORT: Final = 5e-3
 _REPEATS: Final = 3
-#: Solvers that do not poll the deadline are interrupted so much later.
-_LATER: Final = 1.1
 #: Methods that another may switch to, which are compiled before it is timed.
 _SWITCHES_TO: Final = {AUTOMATIC_METHOD: (ADAPTIVE_METHOD, STIFF_METHOD)}
 #: Times the run's seconds that an untimed run may take, which compiles what it needs on its way.
@@ -291,14 +289,13 @@ def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, t
     start, duration = (dyn, problem.q, problem.v), float(times[-1])
     report_stage("method")
     try:
-        with cpu_limit(limits.preparation):
-            short = _MOMENT * float(times[1]) if adaptive else dt
-            for name in (*_SWITCHES_TO.get(method, ()), method):
-                quiet_simulate(*start, short, name, save=[short], **step)
+        short = _MOMENT * float(times[1]) if adaptive else dt
+        for name in (*_SWITCHES_TO.get(method, ()), method):
+            quiet_simulate(*start, short, name, save=[short], **step)
         if method in _SWITCHES_TO:
             # The controller's own functions are compiled when it first uses them.
-            with cpu_limit(_UNTIMED * limits.seconds):
-                quiet_simulate(*start, duration, method, save=times, **step)
+            look = Deadline(_UNTIMED * limits.seconds, clock=_clock).look
+            quiet_simulate(*start, duration, method, save=times, progress=look, **step)
         report_stage("run")
         steps = round(duration / dt) if kind.kind == "native" else 0
         if steps >= 2 * _TRIAL:
@@ -311,8 +308,7 @@ def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, t
         with heard_warnings() as heard:
             begun = _clock()
             look = Deadline(limits.seconds, clock=_clock).look
-            with cpu_limit(_LATER * limits.seconds):
-                run = simulate(*start, duration, method, save=times, progress=look, doubt=False, **step)
+            run = simulate(*start, duration, method, save=times, progress=look, doubt=False, **step)
             seconds = [_clock() - begun]
     except TooLongError as error:
         return Measurement(value, "slow", note=str(error))
