@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Final
 
 import mpmath as mp
@@ -24,8 +24,9 @@ from mbkit.methods.registry import (
     STIFF_METHOD,
 )
 from mbkit.simulate import simulate
-from mbkit.studies.compare.errors import Scales, acceleration_errors, force_errors, interleaved, matrix_errors
-from mbkit.studies.compare.terms import States
+from mbkit.studies.compare.errors import Scales, interleaved
+from mbkit.studies.compare.terms import FORWARD_DYNAMICS, States
+from mbkit.studies.compare.terms import TERMS as COMPARED
 from mbkit.studies.measurement import MAX_ERROR, Measurement, Problem, Truth
 from mbkit.studies.stress.case import Case, problem_of, step_of, times_of
 from mbkit.studies.study_runs import Deadline, TooLongError, heard_warnings, quiet_simulate
@@ -77,8 +78,8 @@ def _rounding(q: Array) -> float:
 # divided by cond(M), to judge engines; here it is not, because a user of an acceleration has its whole error, about
 # eps cond(M) of what acts.
 
-#: Method of `Dynamics` -> its arguments, fields of `States`.
-TERMS: Final = {"mass_matrix": ("q",), "inverse_dynamics": ("q", "v", "a"), "forward_dynamics": ("q", "v", "tau")}
+#: By the method of `Dynamics`.
+TERMS: Final = {x.quantity: x for x in COMPARED if x.name in ("M", "inverse dynamics", "forward dynamics")}
 #: Beyond this condition number doubles do not know the smallest eigenvalue of a matrix.
 _MAX_DOUBLE_CONDITION: Final = 1e15
 #: Digits of their singular values.
@@ -90,10 +91,8 @@ class Terms:
     """The states of a problem, and the oracle's values there."""
 
     at: States
-    #: Term -> high and low part.
-    values: dict[str, tuple[Array, Array]]
-    #: Term -> why the oracle has no value.
-    missing: dict[str, str]
+    #: Term -> high and low part, or why the oracle has no value.
+    values: dict[str, tuple[Array, Array] | str]
     #: In units of 2**exponent kg, m and s, in which nothing overflows.
     scales: Scales
     exponent: int
@@ -104,16 +103,17 @@ def reference_terms(problem: Problem, oracle: OracleDynamics) -> Terms:
     model = problem.model
     q, v = (np.atleast_2d(x) for x in (model.check_q(problem.q), model.check_v(problem.v)))
     n = max(len(q), len(v))
-    q, v = np.broadcast_to(q, (n, model.nq)), np.broadcast_to(v, (n, model.nv))
     tau = np.zeros(model.nv) if problem.tau is None else model.check_v(problem.tau, "tau")
     a = np.random.default_rng(0).standard_normal((n, model.nv))
-    at = States(q, v, a, np.broadcast_to(tau, (n, model.nv)), ("given",) * n)
-    values, missing = {}, {}
-    for term, arguments in TERMS.items():
+    # Writeable arrays, as users have them: engines have a fast path for those.
+    q, v, tau = (np.array(np.broadcast_to(x, (n, x.shape[-1]))) for x in (q, v, tau))
+    at = States(q, v, a, tau, ("given",) * n)
+    values: dict[str, tuple[Array, Array] | str] = {}
+    for name, term in TERMS.items():
         try:
-            values[term] = oracle.extended(term, *(getattr(at, x) for x in arguments))
+            values[name] = term.reference(oracle, at)
         except NumericalError as error:
-            missing[term] = f"no truth: {error}"
+            values[name] = f"no truth: {error}"
     M = oracle.mass_matrix(q)
     exponent = _exponent(M)
     acting = np.abs(at.tau) + np.abs(oracle.nle(q, v)) + np.abs(oracle.passive(q, v))
@@ -121,27 +121,12 @@ def reference_terms(problem: Problem, oracle: OracleDynamics) -> Terms:
     weight = gravity * float(np.sqrt(np.ldexp(model.mass, exponent))) if gravity and model.has_bodies else 0.0
     with np.errstate(all="ignore"):
         scales = Scales.of(np.ldexp(M, exponent), v, np.ldexp(acting, exponent), weight)
-    return Terms(at, values, missing, replace(scales, condition=np.ones(n)), exponent)
+    return Terms(at, values, replace(scales, condition=np.ones(n)), exponent)
 
 
 def _exponent(M: Array) -> int:
     """Return the power of 2 that scales the largest number of a matrix to 1/2 ... 1."""
     return -int(np.frexp(np.abs(M).max())[1])
-
-
-def error_of(term: str, value: Array, truth: Terms) -> float:
-    """Return the worst error of a term over the states."""
-    high, low = truth.values[term]
-    with np.errstate(all="ignore"):
-        error = (value - high) - low
-        if term == "forward_dynamics":
-            errors = acceleration_errors(error, high, truth.scales)
-        else:
-            # Forces and inertias are both proportional to kg.
-            error, high = np.ldexp(error, truth.exponent), np.ldexp(high, truth.exponent)
-            measured = matrix_errors if term == "mass_matrix" else partial(force_errors, heavy=True)
-            errors = measured(error, high, truth.scales)
-        return min(float(errors.relative.max()), MAX_ERROR)
 
 
 def condition(oracle: OracleDynamics, q: Array) -> float:
@@ -331,18 +316,20 @@ def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, t
 def _evaluate(cache: _ValueCache, term: str, dyn: Dynamics, truth: Terms) -> Measurement:
     """Return the error of a term over all states, and the time of one evaluation."""
     report_stage("method")
-    arguments = [getattr(truth.at, name) for name in TERMS[term]]
-    function: Callable[..., Any] = getattr(dyn, term)
+    quantity, known = TERMS[term], truth.values[term]
     with heard_warnings() as heard:
-        computed = np.asarray(function(*arguments))
+        computed = quantity.call(dyn, truth.at)
     report_stage("run")
-    # Writeable arrays, as users have them: engines have a fast path for those.
-    one = [np.array(x[0]) for x in arguments]
-    ns, _ = interleaved({"": lambda: function(*one)}, rounds=3)[""]
+    ns, _ = interleaved({"": quantity.single(dyn, truth.at)}, rounds=3)[""]
     cell = Measurement(cache.value, "finished", seconds=1e-9 * ns, warnings=tuple(heard))
     if not np.isfinite(computed).all():
         return replace(cell, end="nan", note="numbers that are not finite, and nothing was said")
-    if term not in truth.values:
-        return replace(cell, note=truth.missing[term])
-    condition = cache.problem.scale if term == "forward_dynamics" else 1.0
-    return replace(cell, error=error_of(term, computed, truth) / condition)
+    if isinstance(known, str):
+        return replace(cell, note=known)
+    # Forces and inertias are both proportional to kg, accelerations are not.
+    accelerations = term == FORWARD_DYNAMICS
+    exponent = 0 if accelerations else truth.exponent
+    with np.errstate(all="ignore"):
+        error, high = (np.ldexp(x, exponent) for x in ((computed - known[0]) - known[1], known[0]))
+        worst = min(float(quantity.errors(error, high, truth.scales).relative.max()), MAX_ERROR)
+    return replace(cell, error=worst / cache.problem.scale if accelerations else worst)
