@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -78,9 +77,9 @@ class TooLongError(MbkitError):
 
 
 class Deadline:
-    """The time limit of a run or a search, by the wall's or another clock, and its progress.
+    """The time limit of a run or a search, by the wall's or another clock.
 
-    `tell` gets the fraction done; by default nobody does.
+    `tell` gets the part of the time that is over; by default nobody does.
     """
 
     def __init__(
@@ -92,8 +91,8 @@ class Deadline:
         self._tell, self._clock = tell, clock
         #: Seconds that do not count, of all parts together.
         self._uncounted = [0.0]
-        self._seconds, self._end = seconds, self._now() + seconds
-        self._start, self._length = 0.0, 1.0
+        self._seconds, self._begun = seconds, self._now()
+        self._end = self._begun + seconds
 
     def _now(self) -> float:
         return self._clock() - self._uncounted[0]
@@ -110,16 +109,15 @@ class Deadline:
         yield
         self._uncounted[0] += self._clock() - start
 
-    def part(self, start: float, length: float, seconds: float = math.inf) -> Deadline:
-        """Return the limit for a part of the way, which may have a shorter time."""
+    def part(self, seconds: float) -> Deadline:
+        """Return the limit for a part of the way, which has less time."""
         part = copy(self)
         part._end = min(self._end, self._now() + seconds)
-        part._start, part._length = self._start + start * self._length, length * self._length
         return part
 
     def look(self, done: float) -> None:
-        """Report the fraction done of this part, and raise `TooLongError` when its time is up."""
-        self._tell(min(self._start + self._length * done, 1.0))
+        """Raise `TooLongError` when the time is up."""
+        self._tell(min((self._now() - self._begun) / self._seconds, 1.0))
         if self.left < 0:
             raise TooLongError(f"stopped after {self._seconds:g} s, {done:.0%} done: stiff, or very fast motion")
 

@@ -175,7 +175,7 @@ def taylor_pair(motion: Motion, deadline: Deadline, bits: int) -> Known:
     runs: list[list[Any]] = []
     steps, why = 0, ""
     for i, tolerance in enumerate(tolerances):
-        half = deadline.part(i / 2, 0.5, inf if i else deadline.left / 2)
+        half = deadline if i else deadline.part(deadline.left / 2)
         with ExitStack() as stack:
             with deadline.paused():
                 integrator = stack.enter_context(system.integrator(kind, tolerance))
@@ -239,12 +239,11 @@ def two_engines(
     states = [(motion.q0[None], motion.v0[None]) for _ in roads]
     times, why = motion.save, ""
     ends = np.unique(np.linspace(0, len(times) - 1, min(_LEGS, len(times) - 1) + 1).astype(int))
-    for j, (k, end) in enumerate(pairwise(ends.tolist())):
+    for k, end in pairwise(ends.tolist()):
         legs: list[Trajectory] = []
         try:
-            for i, ((dyn, method), (q, v)) in enumerate(zip(roads, states, strict=True)):
-                part = deadline.part((2 * j + i) / (2 * len(ends)), 1 / (2 * len(ends)))
-                legs.append(_leg(motion, dyn, method, rtol, q[-1], v[-1], slice(k, end + 1), part))
+            for (dyn, method), (q, v) in zip(roads, states, strict=True):
+                legs.append(_leg(motion, dyn, method, rtol, q[-1], v[-1], slice(k, end + 1), deadline))
                 if not legs[-1].stats.finished:
                     why = f"{method} on {dyn.engine} ended early, within {times[k]:.6g} to {times[end]:.6g} s"
         except TooLongError:
@@ -472,11 +471,9 @@ def _search(
     refused: list[str] = []
 
     def holds(way: Any, *more: Any, within: float = inf) -> bool:
-        # Whether a way leads to the end is known at its end: the first gets half of the bar.
-        tried = len(pairs) + len(refused)
-        part = deadline.part(1 - 0.5**tried, 0.5 ** (tried + 1), within)
+        # Whether a way leads to the end is known at its end.
         try:
-            pairs.append(way(motion, part, *more))
+            pairs.append(way(motion, deadline.part(within), *more))
         except UnsupportedError as error:
             refused.append(str(error))
             return False
