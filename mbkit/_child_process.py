@@ -43,6 +43,11 @@ _STUCK: Final = 60.0
 _TAIL, _LAST = 20_000, 300
 
 
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class WorkerDiedError(RuntimeError):
     """The process ended without an answer: how, by which signal (such as SIGSEGV), and its last line of output.
 

@@ -12,7 +12,6 @@ states within 1e-11 after 200 steps of 1 ms.
 from __future__ import annotations
 
 import json
-import os
 import time
 
 import mujoco
@@ -20,6 +19,7 @@ import mujoco.rollout
 import numpy as np
 
 import mbkit as mb
+from mbkit._child_process import cores
 from validation.stamp import results, stamp
 
 ROUNDS, STEPS, DT = 7, 200, 1e-3
@@ -62,10 +62,6 @@ def bare(dyn, q, v, pool, steps=STEPS):
     sensors = np.empty((n, steps, m.nsensordata))
     data = [mujoco.MjData(m) for _ in range(cores())]
     return lambda: pool.rollout(m, data, start, nstep=steps, state=out, sensordata=sensors)
-
-
-def cores():
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
 def seconds(f):

@@ -39,8 +39,8 @@ import numpy as np
 import pinocchio as pin
 
 import mbkit as mb
+from mbkit._child_process import cores
 from mbkit.codegen import jit
-from mbkit.codegen.compiled import cores
 from mbkit.codegen.program import program
 from mbkit.engines.mujoco import model as mujoco_model
 from mbkit.engines.pinocchio import model as pinocchio_model

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 import mbkit as mb
-from mbkit.codegen.compiled import cores
+from mbkit._child_process import cores
 from mbkit.codegen.cuda.arrays import DeviceArray
 from mbkit.codegen.cuda.driver import device_of
 from mbkit.codegen.cuda.kernels import kernel_code, ptx, steps_code

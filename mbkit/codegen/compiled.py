@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from mbkit._check import Array
+from mbkit._child_process import cores
 from mbkit._version import __version__
 from mbkit.codegen import disk_cache as disk
 from mbkit.codegen import jit
@@ -30,13 +31,6 @@ _SHARE: Final = 2_000_000
 _ROWS: Final = 48
 #: Samples in such a block. No power of two: rows would meet in the same cache sets.
 _BLOCK: Final = 1032
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def aligned(size: int) -> Array:

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError
+from mbkit._child_process import Child, WorkerDiedError, WorkerStartError, WorkerTimeoutError, cores
 from mbkit.engines.registry import registered_engines
 from mbkit.engines.remote.served.serve import attend
 from mbkit.errors import InputError, MbkitError
@@ -170,11 +170,6 @@ def _answer(message: bytes) -> bytes:
 # Many calls
 
 
-def processors() -> int:
-    """Return how many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 class WorkerPool(ThreadPoolExecutor):
     """An executor of so many threads, each of which makes its calls in a worker of its own; see `Worker`."""
 
@@ -236,7 +231,7 @@ def run(
         return
     with contextlib.ExitStack() as stack:
         if executor is None:
-            executor = stack.enter_context(WorkerPool(min(jobs or processors(), len(calls))))
+            executor = stack.enter_context(WorkerPool(min(jobs or cores(), len(calls))))
         running: dict[Future[T], str] = {}
         refused = []
         try:

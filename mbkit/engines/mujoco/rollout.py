@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from typing import Any, Final
@@ -13,6 +12,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
+from mbkit._child_process import cores
 from mbkit._warn import warn
 from mbkit.engines.mujoco.model import MujocoModel, heard_warnings
 from mbkit.errors import DoubtfulRunWarning, UnsupportedError, require_known
@@ -59,7 +59,7 @@ def rollout(
         qpos = start[:, 1:end_q] = q0[:, compiled.q_index]
         start[:, end_q : end_q + m.nv] = _turned(compiled, qpos, v0[:, compiled.v_index])
         control = None if tau is None else _forces(compiled, np.broadcast_to(tau, (n, steps, description.nv)))
-        data = [mujoco.MjData(m) for _ in range(max(1, min(n, os.cpu_count() or 1)))]
+        data = [mujoco.MjData(m) for _ in range(max(1, min(n, cores())))]
         # A divergence is read off the states themselves.
         with heard_warnings():
             states = _run(m, data, start, control, steps, progress)

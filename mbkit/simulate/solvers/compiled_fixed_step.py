@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit.codegen.compiled import Call, KernelSequence, cores
+from mbkit._child_process import cores
+from mbkit.codegen.compiled import Call, KernelSequence
 from mbkit.derivation.steps.fixed import LAW, Part
 from mbkit.engines.compiled_calls import Plan
 from mbkit.engines.lagrangian import LagrangianDynamics

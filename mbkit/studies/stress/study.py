@@ -17,7 +17,14 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from mbkit._check import count, real
-from mbkit._child_process import OUT_OF_MEMORY, WorkerClosedError, WorkerDiedError, WorkerStartError, WorkerTimeoutError
+from mbkit._child_process import (
+    OUT_OF_MEMORY,
+    WorkerClosedError,
+    WorkerDiedError,
+    WorkerStartError,
+    WorkerTimeoutError,
+    cores,
+)
 from mbkit.engines.registry import DERIVED, INDEPENDENT, find_engine
 from mbkit.errors import InputError
 from mbkit.methods.registry import METHODS
@@ -30,7 +37,7 @@ from mbkit.studies.stress.measure import TERMS, Limits, Prepared, measure, prepa
 from mbkit.studies.stress.measurements import CaseResult, Row
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
-from mbkit.studies.worker import CallError, Worker, WorkerPool, check_executor, describe, in_worker, processors, run
+from mbkit.studies.worker import CallError, Worker, WorkerPool, check_executor, describe, in_worker, run
 
 #: Seconds that a run may take, and the whole study, quick and not.
 _SECONDS: Final = {True: 0.5, False: 2.0}
@@ -417,7 +424,7 @@ def stress(
     bar = real("bar", bar, positive=True)
     memory = _MEMORY if memory is None else count("memory", memory, least=_MIN_MEMORY)
     budget = _BUDGET[quick] if budget is None else real("budget", budget, positive=True)
-    width = min(processors(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
+    width = min(cores(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
     check_executor(executor)
     if executor is not None and jobs is not None:
         raise InputError("jobs: expected none beside an executor, which has its own; leave it out")

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
-from mbkit.codegen.compiled import KernelSequence, cores
+from mbkit._child_process import cores
+from mbkit.codegen.compiled import KernelSequence
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation.steps.collocation import Collocation
 from mbkit.derivation.steps.fixed import Part
