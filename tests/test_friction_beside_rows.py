@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import mpmath
 import numpy as np
 import pytest
+from numpy.polynomial import Polynomial
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
@@ -116,31 +119,31 @@ def four_bar(stiction: float = 1.0, gravity: float = 9.81) -> Model:
     return b.build()
 
 
+def four_bar_terms(theta: Any, m: Any = np) -> tuple[Any, ...]:
+    """Return the absolute angle of the coupler and its rate at θ̇ = 1, those of the rocker, I(θ) and V(θ)."""
+    sin, cos = m.sin(theta), m.cos(theta)
+    x, y = 1 - 3 * cos / 10, -3 * sin / 10
+    far = m.sqrt(x * x + y * y)
+    b = m.atan(y / x) + m.acos((far + 32 / (100 * far)) * 5 / 9)
+    # The end of the rocker from its pin; its length does not change.
+    rx, ry = 9 * m.cos(b) / 10 - x, 9 * m.sin(b) / 10 - y
+    turn = (rx * sin - ry * cos) / (3 * (ry * m.cos(b) - rx * m.sin(b)))
+    ux, uy = -3 * sin / 10 - 9 * turn * m.sin(b) / 20, 3 * cos / 10 + 9 * turn * m.cos(b) / 20
+    rocks = (rx * (2 * uy - 3 * cos / 10) - ry * (2 * ux + 3 * sin / 10)) * 100 / 49
+    inertia = (54 + 5400 * (ux**2 + uy**2) + 364.5 * turn**2 + 686 * rocks**2) / 3000
+    potential = 981 * (9 * sin / 100 + 18 * (3 * sin / 10 + 9 * m.sin(b) / 20) / 10 + 7 * ry / 10) / 100
+    return b, turn, m.atan(ry / rx), rocks, inertia, potential
+
+
 def four_bar_pose(theta: float) -> tuple[np.ndarray, np.ndarray]:
     """Return q, and dq/dθ."""
-    x, y = 1.0 - 0.3 * np.cos(theta), -0.3 * np.sin(theta)
-    far = np.hypot(x, y)
-    coupler = np.arctan2(y, x) + np.arccos((far**2 + 0.9**2 - 0.7**2) / (2 * far * 0.9))
-    rocker = np.arctan2(0.3 * np.sin(theta) + 0.9 * np.sin(coupler), 0.9 * np.cos(coupler) - x)
-    # The loop's rate: crank, coupler and rocker turn their ends.
-    ends = np.array([[-0.9 * np.sin(coupler), 0.7 * np.sin(rocker)], [0.9 * np.cos(coupler), -0.7 * np.cos(rocker)]])
-    turns = np.linalg.solve(ends, [0.3 * np.sin(theta), -0.3 * np.cos(theta)])
-    return np.array([theta, coupler - theta, rocker]), np.array([1.0, turns[0] - 1.0, turns[1]])
+    b, turn, r, rocks, *_ = four_bar_terms(theta)
+    return np.array([theta, b - theta, r % np.pi]), np.array([1.0, turn - 1.0, rocks])
 
 
 def four_bar_weight(theta: float) -> float:
     """Return dV/dθ."""
-
-    def potential(x: complex) -> Any:
-        (a, b, c), _ = four_bar_pose(x.real)
-        return 0.6 * 0.15 * np.sin(a) + 1.8 * (0.3 * np.sin(a) + 0.45 * np.sin(a + b)) + 1.4 * 0.35 * np.sin(c)
-
-    h = 1e-5
-    return (
-        9.81
-        * (8 * (potential(theta + h) - potential(theta - h)) - potential(theta + 2 * h) + potential(theta - 2 * h))
-        / (12 * h)
-    )
+    return float(four_bar_terms(theta + 1e-40j)[-1].imag / 1e-40)
 
 
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
@@ -163,3 +166,340 @@ def test_a_four_bar_lets_go_where_the_virtual_work_passes_that_of_all_its_pins(
     assert (run.v[rests] == 0).all()
     assert np.sign(run.v[-1]).tolist() == np.sign(slope).tolist()
     assert np.abs(dyn.constraint_residual(run.q[-1])).max() < 1e-12
+
+
+# Couplers, mimics, rolling contacts
+
+
+def rotors(kind: str, ratio: float, friction: tuple[float, float], stiction: float) -> Model:
+    """Return two rotors, the second of which turns `ratio` times as fast as the first."""
+    b = mb.ModelBuilder(kind, gravity=(0, 0, 0))
+    for name, inertia, f in zip("ab", (0.5, 0.2), friction, strict=True):
+        b.add_body(name, mass=1.0, inertia=(1.0, 1.0, inertia))
+        more = {"mimic": ("a", ratio, 0.0)} if (kind, name) == ("mimic", "b") else {}
+        numbers = {"friction": f, "stiction": stiction * f}
+        b.add_joint(name, "continuous", parent="world", child=name, axis=(0, 0, 1), **numbers, **more)
+    if kind == "geared":
+        b.add_coupler("gear", "b", "a", ratio=ratio)
+    return b.build()
+
+
+@pytest.mark.parametrize("kind", ["geared", "mimic"])
+@pytest.mark.parametrize(("method", "more"), [("rk853", ADAPTIVE), ("rk4", {"dt": 0.01}), ("moreau", {"dt": 0.01})])
+def test_a_gear_comes_to_rest_and_is_pulled_loose_as_one_rotor(kind: str, method: str, more: dict[str, float]) -> None:
+    ratio, friction, stiction = -3.0, (0.4, 0.1), 1.5
+    dyn = mb.dynamics(rotors(kind, ratio, friction, stiction), "lagrangian")
+    inertia, f = 0.5 + ratio**2 * 0.2, friction[0] + abs(ratio) * friction[1]
+    n = dyn.model.nv
+    slope = np.array([1.0, ratio])[:n]
+    stop = 2.0 * inertia / f
+    run = simulated(dyn, 0.3 * slope, 2.0 * slope, stop + 1.0, method, **more)
+    close = 0.05 if method == "moreau" else 1e-10
+    assert run.q[-1] == pytest.approx((0.3 + 2.0 * stop - f / inertia * stop**2 / 2) * slope, abs=close)
+    assert (run.v[-1] == 0).all()
+    assert (run.q[run.t > stop + 0.01] == run.q[-1]).all()
+    assert np.abs(run.power_balance()).max() < 10 * close
+    # A ramp lets it go where its stiction ends.
+    time = stiction * f / 0.5
+    pulled = simulated(
+        dyn, 0 * slope, 0 * slope, time + 1.0, method, torque=lambda t, *_: 0.5 * t * np.eye(n)[0], **more
+    )
+    assert (pulled.v[pulled.t <= time - 0.02] == 0).all()
+    # (c t - f) / I from there on.
+    speed = (0.5 * (time + 0.5) - f) / inertia
+    assert pulled.v[-1] == pytest.approx(speed * slope, abs=close)
+    if method != "moreau":
+        assert [e.t for e in run.events] == pytest.approx([stop] * n, rel=1e-11)
+        assert [e.t for e in pulled.events] == pytest.approx([time] * n, rel=1e-11)
+
+
+def test_a_cart_on_a_wheel_that_rolls_has_the_friction_of_its_axle() -> None:
+    """Rows of height and of the side say nothing new there."""
+    b = mb.ModelBuilder("cart", gravity=(2.0, 0, -9.81))
+    b.add_body("cart", mass=2.0, inertia=np.ones(3))
+    b.add_joint("x", "prismatic", parent="world", child="cart", axis=(1, 0, 0), translation=(0, 0, 0.25), friction=1.0)
+    b.add_body("wheel", mass=1.0, inertia=(1.0, 0.03, 1.0))
+    b.add_joint("axle", "continuous", parent="cart", child="wheel", axis=(0, 1, 0), friction=0.5)
+    b.add_rolling("road", "disc", body_a="wheel", radius=0.25, axis_a=(0, 1, 0))
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    rate, slope = (2.0 * 3.0 - 1.0 - 0.5 / 0.25) / (3.0 + 0.03 / 0.25**2), np.array([1.0, 4.0])
+    for method, more in (("rk853", ADAPTIVE), ("rk4", {"dt": 0.01})):
+        run = simulated(dyn, [0.0, 0.0], -0.5 * slope, 1.0, method, **more)
+        # Uphill it is braked by the slope and by friction.
+        braked = (2.0 * 3.0 + 1.0 + 0.5 / 0.25) / (3.0 + 0.03 / 0.25**2)
+        stop = 0.5 / braked
+        assert names(run) == ["x turns", "axle turns"]
+        assert run.events[0].t == pytest.approx(stop, rel=1e-11)
+        assert run.v[-1] == pytest.approx(rate * (1.0 - stop) * slope, rel=1e-10)
+
+
+# Prescribed motions
+
+
+def shaken(phase: float = 0.0, of_table: float = 0.7) -> Model:
+    """Return a block of 1.5 kg on a table that is shaken, in coordinates of the table."""
+    b = mb.ModelBuilder("table", gravity=(0, 0, 0))
+    b.add_body("table", mass=5.0)
+    b.add_joint("x", "prismatic", parent="world", child="table", axis=(1, 0, 0), friction=of_table)
+    b.add_body("block", mass=1.5)
+    b.add_joint("y", "prismatic", parent="table", child="block", axis=(1, 0, 0), friction=2.0, stiction=3.0)
+    b.prescribe("x", amplitude=0.5, frequency=3.0, phase=phase)
+    return b.build()
+
+
+def slid(start: float, end: float, side: float) -> tuple[float, float]:
+    """Return the way and the speed at the end of a block that begins to slide on the table."""
+    push = -side * 2.0 / 1.5
+    # ÿ = 4.5 sin 3t + push.
+    speed = 1.5 * (np.cos(3 * start) - np.cos(3 * end)) + push * (end - start)
+    way = 1.5 * np.cos(3 * start) * (end - start) - 0.5 * (np.sin(3 * end) - np.sin(3 * start))
+    return way + push * (end - start) ** 2 / 2, speed
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize(("method", "more", "most"), [("rk853", ADAPTIVE, 1e-9), ("rk4", {"dt": 0.01}, 1e-7)])
+def test_a_block_on_a_shaken_table_sticks_and_slides(
+    engine: str, method: str, more: dict[str, float], most: float
+) -> None:
+    dyn = mb.dynamics(shaken(), engine)
+    loose = np.arcsin(3.0 / 1.5 / 4.5) / 3
+    turn = brentq(lambda t: slid(loose, t, 1.0)[1], loose + 0.5, 2.0, xtol=1e-14)
+    run = simulated(dyn, [0.0, 0.0], [1.5, 0.0], 2.0, method, **more)
+    way = slid(loose, turn, 1.0)[0]
+    after = slid(turn, 2.0, -1.0)
+    assert names(run) == ["y lets go", "x turns", "y turns", "x turns"]
+    assert [e.t for e in run.events] == pytest.approx([loose, np.pi / 6, turn, np.pi / 2], rel=most)
+    assert run.q[-1] == pytest.approx([0.5 * np.sin(6.0), way + after[0]], abs=most)
+    assert run.v[-1] == pytest.approx([1.5 * np.cos(6.0), after[1]], abs=most)
+    rests = run.t < loose
+    assert (run.q[rests, 1] == 0).all()
+    # The drive gives what friction takes, and what the table's motion needs.
+    if method == "rk853":
+        assert np.abs(run.power_balance("lagrangian")).max() < 1e-3
+        assert (run.v[rests, 1] == 0).all()
+
+
+def test_what_has_no_friction_is_in_no_event() -> None:
+    run = simulated(mb.dynamics(shaken(of_table=0.0), "lagrangian"), [0.0, 0.0], [1.5, 0.0], 2.0, "rk853", **ADAPTIVE)
+    assert names(run) == ["y lets go", "y turns"]
+
+
+def test_what_a_drive_lets_rest_goes_on_with_it() -> None:
+    """The table moves from 1 s to 2 s; the block slides on it, and rests by itself later on."""
+    b = mb.ModelBuilder("dwell", gravity=(0, 0, 0))
+    b.add_body("table", mass=5.0)
+    b.add_joint("x", "prismatic", parent="world", child="table", axis=(1, 0, 0), friction=0.7)
+    b.add_body("block", mass=1.5)
+    b.add_joint("y", "prismatic", parent="table", child="block", axis=(1, 0, 0), friction=1.0)
+    from scipy.interpolate import PPoly
+
+    moves = [[0, 6, 0], [0, -15, 0], [0, 10, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1.0]]
+    b.prescribe("x", PPoly(np.array(moves), [0.0, 1.0, 2.0, 5.0]))
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    table, f = Polynomial([0, 0, 0, 10, -15, 6]), 1.0 / 1.5
+    speed, push = table.deriv(), table.deriv(2)
+    begin = brentq(lambda s: push(s) - f, 0, 0.2)
+    turn = brentq(lambda s: speed(begin) - speed(s) + f * (s - begin), 0.5, 1.0)
+    back = table(begin) - table(turn) + speed(begin) * (turn - begin) + f * (turn - begin) ** 2 / 2
+    left = speed(turn) - f * (1 - turn)
+    on = table(turn) - 1 + speed(turn) * (1 - turn) - f * (1 - turn) ** 2 / 2 + left**2 / (2 * f)
+    for method, more in (("rk853", ADAPTIVE), ("rk4", {"dt": 0.01}), ("gauss4", {"dt": 0.01})):
+        run = simulated(dyn, [0.0, 0.0], [0.0, 0.0], 5.0, method, **more)
+        times = {e.name: e.t for e in run.events}
+        assert times["y lets go"] == pytest.approx(1 + begin, abs=1e-7)
+        assert times["y stops"] == pytest.approx(2 + left / f, abs=1e-7)
+        assert run.q[-1] == pytest.approx([1.0, back + on], abs=1e-7)
+        assert (run.v[run.t > times["y stops"], 1] == 0).all()
+
+
+# Two degrees of freedom
+
+FIVE = np.array([1.0, 0.7, 0.4, 0.8, 0.5])
+
+
+def five_bar(stiction: float) -> Model:
+    b = mb.ModelBuilder("five_bar", gravity=(0, -3.0, 0))
+    for (name, parent, x, length), f in zip(
+        (("a", "world", 0.0, 0.4), ("b", "a", 0.4, 0.6), ("c", "world", 0.5, 0.4), ("d", "c", 0.4, 0.6)),
+        FIVE,
+        strict=False,
+    ):
+        rod(b, name, parent, x, length, friction=f, stiction=stiction * f)
+    b.add_body("tip", mass=0.1, inertia=1e-3 * np.ones(3))
+    pin = {"axis": (0, 0, 1), "translation": (0.6, 0, 0), "friction": FIVE[4], "stiction": stiction * FIVE[4]}
+    b.add_joint("e", "continuous", parent="b", child="tip", **pin)
+    b.add_loop("pin", "frame", body_a="tip", body_b="d", translation_b=(0.6, 0, 0))
+    return b.build()
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_a_five_bar_lets_go_where_no_share_of_its_pins_is_within_their_bounds(engine: str) -> None:
+    """The forces of five pins along two freedoms fill a polygon; its edges are those of its vertices' hull."""
+    stiction, pull = 1.4, np.array([1.0, 0.3, -0.5, 0.2, 0.0])
+    dyn = mb.dynamics(five_bar(stiction), engine)
+    bare = mb.dynamics(five_bar(stiction).without("friction"), "lagrangian")
+    q, none = bare.project([1.9, -1.0, 1.1, 1.0, 0.0], np.zeros(5))
+    # Velocities of the pins by the absolute angles of the rods, of which the loop leaves two.
+    a, b, c, d = q[0], q[0] + q[1], q[2], q[2] + q[3]
+    ends = [[-0.4 * np.sin(a), -0.6 * np.sin(b), 0.4 * np.sin(c), 0.6 * np.sin(d)]]
+    ends += [[0.4 * np.cos(a), 0.6 * np.cos(b), -0.4 * np.cos(c), -0.6 * np.cos(d)]]
+    turns = np.linalg.svd(np.array(ends))[2][2:].T
+    pins = np.array([[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 1], [0, -1, 0, 1]]) @ turns
+    weight, push = pins.T @ bare.nle(q, none), pins.T @ pull
+    bounds = stiction * FIVE
+
+    def used(t: float) -> float:
+        normals = [np.array([-row[1], row[0]]) for row in pins]
+        return max(abs(n @ (t * push - weight)) / (bounds @ np.abs(pins @ n)) for n in normals)
+
+    assert used(0.0) < 1
+    time = brentq(lambda t: used(t) - 1, 0.0, 60.0, xtol=1e-14)
+    for method, more in (("dop853", ADAPTIVE), ("rk4", {"dt": time / 40.5})):
+        run = simulated(dyn, q, none, time + 0.05, method, torque=lambda t, *_: t * pull, **more)
+        assert run.events[0].t == pytest.approx(time, rel=1e-10)
+        assert {e.t for e in run.events[:3]} == {run.events[0].t}
+        rests = run.t < time
+        assert (run.q[rests] == q).all()
+        assert (run.v[rests] == 0).all()
+        assert np.abs(run.v[-1]).max() > 1e-4
+        assert np.abs(dyn.constraint_residual(run.q[-1])).max() < 1e-12
+
+
+# Stribeck's curve in the crank of a four-bar, to 34 digits
+
+CURVE = (1.0, 2.0, 0.8)
+
+
+def curved() -> Model:
+    f, s, w = CURVE
+    b = mb.ModelBuilder("stribeck", gravity=(0, -9.81, 0))
+    for name, parent, x, length in (
+        ("crank", "world", 0.0, 0.3),
+        ("coupler", "crank", 0.3, 0.9),
+        ("rocker", "world", 1.0, 0.7),
+    ):
+        numbers = {"friction": f, "stiction": s, "stribeck_velocity": w} if name == "crank" else {}
+        rod(b, name, parent, x, length, **numbers)
+    b.add_loop("pin", "point", body_a="coupler", body_b="rocker", translation_a=(0.9, 0, 0), translation_b=(0.7, 0, 0))
+    return b.build()
+
+
+def extrapolated(f: Any, y: Any, length: Any, columns: int = 13) -> Any:
+    """Return y after one long step, by Gragg's midpoint rule and extrapolation in h² (Hairer et al. 1993, II.9)."""
+    table: list[Any] = []
+    for j in range(1, columns + 1):
+        n = 2 * j
+        h, before, now = length / n, y, y + length / n * f(y)
+        for _ in range(n - 1):
+            before, now = now, before + 2 * h * f(now)
+        row = [(before + now + h * f(now)) / 2]
+        for k, last in enumerate(table):
+            row.append(row[k] + (row[k] - last) / ((mpmath.mpf(n) / (2 * (j - k - 1))) ** 2 - 1))
+        table = row
+    return table[-1]
+
+
+#: Times and crank's angles at which it turns, and where it stops.
+TURNS = (
+    (1.06783165976416583967, -3.50000387472906593455),
+    (1.62299001895946576759, -0.82062729589982051862),
+    (2.12427645746628997846, -2.60695085984121592248),
+    (2.52502318241519921111, -1.59091154303826120673),
+)
+
+
+@pytest.mark.thorough
+def test_the_turns_of_a_four_bar_with_stribeck_friction_are_those_of_34_digits() -> None:
+    f, s, w = (mpmath.mpf(round(100 * x)) / 100 for x in CURVE)
+    with mpmath.workdps(34):
+        tiny = mpmath.mpf(10) ** -60
+
+        def rate(y: Any, side: int) -> Any:
+            with mpmath.workdps(80):
+                *_, inertia, potential = four_bar_terms(mpmath.mpc(y[0], tiny), mpmath)
+            friction = side * (f + (s - f) * mpmath.exp(-((y[1] / w) ** 2)))
+            pull = inertia.imag * y[1] ** 2 / 2 + potential.imag
+            return mpmath.matrix([y[1], (-pull / tiny - friction) / inertia.real])
+
+        y, t, found, side, step = mpmath.matrix([mpmath.mpf(9) / 10, 0]), mpmath.mpf(0), [], -1, mpmath.mpf(1) / 50
+        while len(found) < len(TURNS):
+            moved = extrapolated(lambda x, side=side: rate(x, side), y, step)
+            if side * moved[1] >= 0 or not t:
+                y, t = moved, t + step
+                continue
+            # Newton's iteration on the speed gives the end of the phase.
+            part, correction = step / 2, mpmath.mpf(1)
+            while abs(correction) > mpmath.mpf(10) ** -25:
+                at = extrapolated(lambda x, side=side: rate(x, side), y, part)
+                correction = at[1] / rate(at, side)[1]
+                part -= correction
+            y, t, side = extrapolated(lambda x, side=side: rate(x, side), y, part), t + part, -side
+            y[1] = mpmath.mpf(0)
+            found.append((t, y[0]))
+    assert np.array(found, dtype=float) == pytest.approx(np.array(TURNS), rel=1e-15)
+
+
+@pytest.mark.parametrize("method", ["rk853", "dop853", "rk4"])
+def test_stribeck_friction_in_a_four_bar_turns_and_stops_where_34_digits_say(method: str) -> None:
+    dyn = mb.dynamics(curved(), "lagrangian")
+    more, most = ({"rtol": 1e-13, "atol": 1e-14}, 1e-11) if method != "rk4" else ({"dt": 2e-3}, 1e-7)
+    run = simulated(dyn, four_bar_pose(0.9)[0], np.zeros(3), TURNS[-1][0] + 0.3, method, **more)
+    assert names(run) == ["crank turns"] * (len(TURNS) - 1) + ["crank stops"]
+    assert [(e.t, e.q[0]) for e in run.events] == [pytest.approx(x, rel=most) for x in TURNS]
+
+
+# Uses of runs
+
+
+def started(speeds: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return states of the four-bar at several angles, with these speeds of the crank."""
+    states = [four_bar_pose(1.2 + 0.1 * k) for k in range(len(speeds))]
+    return np.array([q for q, _ in states]), np.array([x * slope for (_, slope), x in zip(states, speeds, strict=True)])
+
+
+@pytest.mark.parametrize("method", ["rk4", "gauss4", "moreau"])
+def test_members_of_a_batch_slide_stop_and_rest_as_they_do_alone(method: str) -> None:
+    dyn, tau = (
+        mb.dynamics(four_bar(1.2), "lagrangian"),
+        np.array([[0.0, 0, 0], [9.0, 0, 0], [four_bar_weight(1.4), 0, 0], [0.0, 0, 1]]),
+    )
+    q, v = started([3.0, 0.0, 0.0, -2.0])
+    both = {"torque": tau[:, None].repeat(60, axis=1)}
+    run = simulated(dyn, q, v, 0.6, method, dt=0.01, **both)
+    for i in range(len(q)):
+        alone = simulated(dyn, q[i], v[i], 0.6, method, dt=0.01, torque=tau[i])
+        assert np.abs(run.q[i] - alone.q).max() < 1e-12
+        assert np.abs(run.v[i] - alone.v).max() < 1e-12
+        assert [(e.name, e.t) for e in run.events if e.member == i] == [
+            (e.name, pytest.approx(e.t, rel=1e-12)) for e in alone.events
+        ]
+    assert (run.v[0, -1] == 0).all()
+    assert np.abs(run.v[1, -1]).max() > 1
+    if method != "moreau":
+        assert {e.member for e in run.events} == {0, 1, 3}
+
+
+def test_steps_samples_files_and_wrenches_are_those_of_one_run(tmp_path: Path) -> None:
+    dyn, dt = mb.dynamics(four_bar(1.2), "lagrangian"), 0.01
+    (q,), (v,) = started([2.0])
+    tau = np.array([1.0, 0.2, -0.3])
+    run = simulated(dyn, q, v, 0.4, "rk4", dt=dt, torque=tau)
+    assert names(run) == [f"{x} stops" for x in ("crank", "coupler", "rocker")]
+    at = q, v
+    for k in range(40):
+        at = dyn.step(*at, tau, dt)
+        assert np.abs(at[0] - run.q[k + 1]).max() < 1e-12
+        assert np.abs(at[1] - run.v[k + 1]).max() < 1e-12
+    assert not run.check().doubts
+    run.save(tmp_path / "run.npz")
+    back = mb.Trajectory.load(tmp_path / "run.npz", dyn.model)
+    assert names(back) == names(run)
+    assert (back.q == run.q).all()
+    assert (back.work() == run.work()).all()
+    held = simulated(dyn, q, v, 0.4, "rk4", dt=dt, torque=lambda *_: tau, hold=0.05)
+    assert names(held) == names(run)
+    assert np.abs(held.q - run.q).max() < 1e-13
+    # A force on the rocker is its moment, whether it rests or moves.
+    pushed = simulated(dyn, q, v, 0.4, "rk4", dt=dt, torque=tau * [1, 1, 0], wrenches={"rocker": [0, 0, 0, 0, 0, -0.3]})
+    assert np.abs(pushed.q - run.q).max() < 1e-12
+    assert names(pushed) == names(run)

@@ -116,9 +116,8 @@ def integrate(
             # No step does.
             read.sample(0, start, q, v, None if batch is None else np.arange(batch))
         applied = read.applied(jumps)
-        outcome = _outcome(problem, chosen) if solver is None else solver(problem)
+        outcome = _outcome(problem, chosen) if solver is None else along_constraints(dyn, solver(problem))
     seconds = time.perf_counter() - started
-    outcome = along_constraints(dyn, outcome)
     settings = RunSettings(start, q.copy(), v.copy(), setting, outcome.doubts)
     doubts = outcome.doubts
     if request.doubt and outcome.ended in ("finished", "event"):
@@ -207,11 +206,17 @@ def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
         SMOOTH_RUNS.admit(dyn.model, f"{method.name}{soft}: not known of")
     elif not dyn.soft_friction:
         RUNS.admit(dyn.model)
-    if "jump" not in dyn.model.effects or dyn.soft_friction or method.dry_friction:
+    if method.dry_friction:
         return _solver(dyn, method, read)(problem)
+
+    def solver(smooth: Dynamics) -> Callable[[IntegrationProblem], SolverResult]:
+        return lambda part: along_constraints(smooth, _solver(smooth, method, read)(part))
+
+    if "jump" not in dyn.model.effects or dyn.soft_friction:
+        return solver(dyn)(problem)
     from mbkit.simulate.solvers.friction.runs import run_in_phases
 
-    return run_in_phases(problem, lambda phase: _solver(phase, method, read))
+    return run_in_phases(problem, solver)
 
 
 def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Callable[[IntegrationProblem], SolverResult]:

@@ -295,7 +295,17 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
     model = dyn.model
     lossy = dyn.soft_friction or model.needs.damping or model.forces or not model.has_bodies or _driven(dyn)
     losing, turned = bool(lossy or wrenches.any()), len(plain) < nv and bool(pushed.any())
-    ends = [(q[..., i : len(h) + i, :], v[..., i : len(h) + i, :]) for i in (0, 1)]
+    moved, jumps = np.diff(q, axis=-2)[..., coordinates], "jump" in model.effects and not dyn.soft_friction
+    # Forces that jump keep their sides up to the states in which they change them, and what rests is held up to there.
+    sides, keeps = np.zeros(pushed.shape), np.zeros(pushed.shape, dtype=bool)
+    sides[..., plain], keeps[..., plain] = np.sign(moved), jumps
+    keeps &= (sides * v[..., :-1, :] >= 0) & (sides * v[..., 1:, :] >= 0)
+    keeps &= (sides != 0) | ((v[..., :-1, :] == 0) & (v[..., 1:, :] == 0))
+
+    def sided(v: Array) -> Array:
+        return np.where(keeps, sides * np.maximum(sides * v, np.finfo(float).tiny), v)
+
+    ends = [(q[..., i : len(h) + i, :], sided(v[..., i : len(h) + i, :])) for i in (0, 1)]
     owns = [_at_end(dyn, v.shape[:-1], i) for i in (0, 1)]
     a = [np.zeros(0)] * 2
     if losing or turned:
@@ -307,16 +317,16 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
     distance = np.zeros(pushed.shape)
     if turned:
         distance = _corrected(h[:, None], *((v, rate) for (_, v), rate in zip(ends, a, strict=True)))
-    distance[..., plain] = np.diff(q, axis=-2)[..., coordinates]
+    distance[..., plain] = moved
     out = np.sum(pushed * distance, axis=-1)
     if losing:
 
         def power(own: Dynamics, q: Array, v: Array) -> Array:
-            force = _generalized(own, q, held, acting)
+            force, v = _generalized(own, q, held, acting), sided(v)
             return np.asarray(along(own, (), _lost_power, q, v, force) + np.sum((force - pushed) * v, axis=-1))
 
-        each = zip(owns, ends, a, strict=True)
-        pairs = (_with_rate(own, power, h[:, None], *end, rate) for own, end, rate in each)
+        each = zip(owns, ends, a, (jumps, -jumps), strict=True)
+        pairs = (_with_rate(own, power, h[:, None], *end, rate, inward) for own, end, rate, inward in each)
         out = out + _corrected(h, *pairs)
     return np.asarray(out)
 
@@ -347,9 +357,9 @@ def _generalized(dyn: Dynamics, q: Array, force: Array, acting: Acting | None) -
 
 
 def _with_rate(
-    dyn: Dynamics, power: Callable[[Dynamics, Array, Array], Array], h: Array, q: Array, v: Array, a: Array
+    dyn: Dynamics, power: Callable[[Dynamics, Array, Array], Array], h: Array, q: Array, v: Array, a: Array, inward: int
 ) -> tuple[Array, Array]:
-    """Return a power of (q, v), and its rate along the motion."""
+    """Return a power of (q, v), and its rate along the motion; by states on one side where `inward` is 1 or -1."""
     model, clock = dyn.model, dyn.model.time_parameter
     of_samples: Any = dyn
     up = down = np.broadcast_to(_NEAR * h, (*q.shape[:-1], 1))
@@ -362,6 +372,11 @@ def _with_rate(
         there = (integrate_finite(model, q, s * v), v + s * a)
         return power(dyn if clock is None else dyn.at(**{clock: (times + s).ravel()}), *there)
 
+    if inward:
+        # At its end what rests is at its bound, and may let go.
+        s = up if inward > 0 else -down
+        near, far = after(0.5 * s), after(s)
+        return 2 * near - far, (far - near) / (0.5 * s)[..., 0]
     return power(dyn, q, v), (after(up) - after(-down)) / (up + down)[..., 0]
 
 

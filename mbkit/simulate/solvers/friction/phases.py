@@ -14,6 +14,7 @@ from mbkit.engines.base import at_time
 from mbkit.engines.elements.dry_friction import Mask
 from mbkit.model.changes.dry_friction import ROUNDING
 from mbkit.model.elements.paths import ALL, Path
+from mbkit.simulate.constraint_projection import settled
 from mbkit.simulate.solvers.friction.beside_rows import independent, shares, slow, stopped
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
@@ -134,7 +135,7 @@ class Friction:
         """Return the consistent state beside one in which joints rest that were there at the `start`."""
         locked = independent(self._directions(self._dyn, t, q), still)
         rests = self._own.phase(self._dyn, np.zeros(v.shape), locked)
-        return self.held(still, start, *rests._pulled(t, q, v))
+        return self.held(still, start, *settled(rests, t, q, v))
 
     def margins(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).
@@ -209,7 +210,8 @@ class Friction:
     def changes(self, before: Phase, after: Phase) -> list[tuple[int, str]]:
         """Return which trajectory's velocity stops, lets go or turns from one phase to the next, in words."""
         rested, rests = np.atleast_2d(before.still, after.still)
-        turned = np.atleast_2d(before.sides * after.sides < 0) & ~(rested | rests)
+        turned = np.atleast_2d((before.sides * after.sides < 0) & np.isin(np.arange(rests.shape[1]), self.which))
+        turned &= ~(rested | rests)
         out = []
         for row, i in zip(*(x.tolist() for x in np.nonzero((rested != rests) | turned)), strict=True):
             what = "stops" if rests[row, i] else "lets go" if rested[row, i] else "turns"
