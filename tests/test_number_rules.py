@@ -18,7 +18,7 @@ from mbkit.model.description import Description
 from mbkit.model.elements.formula import Formula
 from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.elements.references import KINDS_OF_PARTS
-from mbkit.model.parts import Mimic, NumberRule, _Frozen, numbers, rules_of
+from mbkit.model.parts import Mimic, NumberRule, _Frozen, acting, numbers, rules_of
 from tests.test_matrix import EXAMPLES, accelerations, example
 
 #: Gravity, m/s², along -z.
@@ -41,6 +41,17 @@ def test_each_field_of_a_part_is_a_name_or_has_a_rule() -> None:
         for name in others:
             kinds = {*get_args(hints[name]), hints[name]} if get_args(hints[name]) else {hints[name]}
             assert kinds & {str, Formula, Mimic, tuple[str, ...]}, (cls, name)
+
+
+def test_another_number_acts_where_one_is_not_given() -> None:
+    """Without stiction friction holds what rests, and no curve falls."""
+    without, given = example("joint.friction").joints[-1], example("joint.stiction").joints[-1]
+    assert (without.stiction, without.stribeck_velocity) == (None, None)
+    assert acting(without, "stiction").tolist() == acting(without, "friction").tolist() == without.friction.tolist()
+    assert acting(without, "stribeck_velocity").tolist() == [0.0]
+    assert acting(given, "stiction").tolist() == given.stiction.tolist() != given.friction.tolist()
+    assert acting(given, "stribeck_velocity").tolist() == given.stribeck_velocity.tolist()
+    assert acting(given, "mimic") is None
 
 
 def test_a_field_without_a_rule_is_refused_by_name() -> None:

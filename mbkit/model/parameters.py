@@ -83,9 +83,8 @@ Number = float | Expression
 class Parameter(Expression):
     """A named number of a description, such as a mass that a study varies.
 
-    It may stand for a mass, a centre of mass, an inertia, a length, a spring's or damper's constant, dry friction and
-    stiction, a rotor, a mimic joint's ratio and offset, a number of a motion in time, or gravity. Not for orientations,
-    axes and limits.
+    It may stand for any number of a part that acts, for a point or a length, and for gravity; not for orientations,
+    axes, limits and Stribeck's curve. The error for those says why.
 
     Parameters
     ----------

@@ -57,8 +57,8 @@ class NumberRule:
     acts: bool = True
     #: It is an orientation or an axis.
     direction: bool = False
-    #: It may be None.
-    optional: bool = False
+    #: Number of the part that acts in its place where it is None, or a value; without this it may not be None.
+    absent: str | float | None = None
 
     @property
     def place(self) -> bool:
@@ -107,6 +107,17 @@ def numbers(part: Any) -> Iterator[tuple[str, NumberRule, Any]]:
         yield from numbers(mimic)
 
 
+def acting(part: Any, field: str) -> Any:
+    """Return a number of a part as it acts, also where it is not given."""
+    value = getattr(part, field)
+    rule = None if value is not None else rules_of(type(part)).get(field)
+    if rule is None or rule.absent is None:
+        return value
+    if isinstance(rule.absent, str):
+        return getattr(part, rule.absent)
+    return np.full(tuple(map(len, rule.entries(part) or ())), rule.absent)
+
+
 _ORIENTED: Final = "orientations and axes are no parameters"
 _IS_DATA: Final = "it is data"
 _CURVE: Final = "Stribeck's curve is a number in every engine, as set_joint sets it"
@@ -137,7 +148,7 @@ class _Frozen:
     def __post_init__(self) -> None:
         for name, rule in rules_of(type(self)).items():
             value = getattr(self, name)
-            if value is None and rule.optional:
+            if value is None and rule.absent is not None:
                 continue
             try:
                 # + 0.0 makes one of the two zeros, which are equal and hash apart.
@@ -275,10 +286,10 @@ class Joint(_Frozen):
     stiffness: Annotated[Array, NumberRule("N m/rad, N/m", OF_V, least=0.0, does="V")]
     rest: Annotated[Array, NumberRule("rad, m", OF_V, added=True)]
     mimic: Mimic | None = None
-    stiction: Annotated[Array | None, NumberRule("N m, N", OF_V, least=0.0, optional=True)] = None
-    stribeck_velocity: Annotated[
-        Array | None, NumberRule("rad/s, m/s", OF_V, least=0.0, fixed=_CURVE, optional=True)
-    ] = None
+    stiction: Annotated[Array | None, NumberRule("N m, N", OF_V, least=0.0, absent="friction")] = None
+    stribeck_velocity: Annotated[Array | None, NumberRule("rad/s, m/s", OF_V, least=0.0, fixed=_CURVE, absent=0.0)] = (
+        None
+    )
 
     def __repr__(self) -> str:
         follows = f", follows {self.mimic.joint!r}" if self.mimic else ""
@@ -304,7 +315,7 @@ class Joint(_Frozen):
             dict[str, Any](axes=np.empty((0, 3)), pitch=0.0),
         )
         for field_, rule in rules_of(cls).items():
-            if rule.shape in sizes and not rule.optional:
+            if rule.shape in sizes and rule.absent is None:
                 values[field_] = np.full(sizes[rule.shape], rule.nothing)
         return cls(name, kind, parent, child, rotation, translation, **values | own)
 

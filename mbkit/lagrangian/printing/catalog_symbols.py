@@ -133,7 +133,7 @@ def _content(model: Model) -> tuple[list[Any], list[Any]]:
         for part in getattr(model, where):
             held, rules = {f.name: getattr(part, f.name) for f in fields(part)}, rules_of(type(part))
             # Data and what jumps are those of the model.
-            own = (f for f, rule in rules.items() if rule.direction or not (rule.fixed or rule.optional))
+            own = (f for f, rule in rules.items() if rule.direction or (not rule.fixed and rule.absent is None))
             numbers += [held[f] for f in own if "jump" not in rules[f].does]
             names += [(where, f, x) for f, x in held.items() if f not in rules]
     return names, numbers

@@ -22,7 +22,7 @@ from mbkit.model.elements.forces import JointForce
 from mbkit.model.elements.formula import written
 from mbkit.model.model import Model, unchecked
 from mbkit.model.parameters import Binding, Expression, Parameter
-from mbkit.model.parts import RESTING, Joint
+from mbkit.model.parts import RESTING, Joint, acting
 
 #: The number that holds what rests.
 _ROTOR: Final = Joint.adding_to("T")[0]
@@ -46,10 +46,8 @@ class FrictionNumbers(NamedTuple):
     def of(cls, joints: Sequence[Joint]) -> FrictionNumbers:
         """Read them off joints, at nominal values of parameters."""
         none = np.zeros(0)
-        sliding = np.concatenate([none, *(j.friction for j in joints)])
-        bound = np.concatenate([none, *(j.friction if j.stiction is None else j.stiction for j in joints)])
-        curve = (np.zeros(j.type.nv) if j.stribeck_velocity is None else j.stribeck_velocity for j in joints)
-        return cls(sliding, bound, np.concatenate([none, *curve]))
+        fields = "friction", "stiction", "stribeck_velocity"
+        return cls(*(np.concatenate([none, *(acting(j, field) for j in joints)]) for field in fields))
 
     @classmethod
     def at_values(cls, model: Model, values: Mapping[str, Any]) -> FrictionNumbers:

@@ -110,7 +110,7 @@ class Kind:
 
     def _nothing(self, part: Any) -> dict[str, Any]:
         rules = [(f, rules_of(type(part))[f], getattr(part, f)) for f in self.numbers]
-        return {f: None if rule.optional else np.full(np.shape(x), rule.nothing) for f, rule, x in rules}
+        return {f: None if rule.absent is not None else np.full(np.shape(x), rule.nothing) for f, rule, x in rules}
 
 
 #: Kinds by name, in the order of registration; `kind` also knows those of joint types.

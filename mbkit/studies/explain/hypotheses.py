@@ -22,14 +22,13 @@ from mbkit.model.description import CONSTRAINT_FEATURES
 from mbkit.model.elements.formula import NUMPY
 from mbkit.model.elements.motion_laws import MOTION_LAWS, Motion, interval, position
 from mbkit.model.elements.references import called
-from mbkit.model.parts import Coupler, Loop, rules_of
+from mbkit.model.parts import Coupler, Loop, acting, rules_of
 from mbkit.studies.explain.loop_differences import loop_differences, turn_of
 from mbkit.studies.explain.merged_model import (
     OTHERS,
     LinkInBody,
     MergedModel,
     Tolerances,
-    acting,
     composite,
     number_text,
 )
@@ -53,7 +52,7 @@ BOUNDS: Final = tuple(name for name, rule in rules_of(Joint).items() if not rule
 _PLACE: Final = ("rotation", "translation", "axes", "pitch", "rest")
 NUMBERS: Final = tuple(name for name in rules_of(Joint) if name not in (*_PLACE, *BOUNDS))
 #: Those of them that every joint has.
-OF_ALL: Final = tuple(name for name in NUMBERS if not rules_of(Joint)[name].optional)
+OF_ALL: Final = tuple(name for name in NUMBERS if rules_of(Joint)[name].absent is None)
 #: Numbers that a sentence says all of.
 _FEW: Final = 9
 
@@ -383,7 +382,7 @@ def _joint_differences(a: Joint, b: Joint, near: Tolerances) -> Iterator[Mistake
     for name in (n for n in NUMBERS if n in apart):
         kind = _NUMBER.get(name, name.replace("_", " "))
         more = ["rest"] if name == "stiffness" else []
-        yield Mistake(kind, _other_number(kind, acting(name, a), acting(name, b)), _fields(b, [name, *more]))
+        yield Mistake(kind, _other_number(kind, acting(a, name), acting(b, name)), _fields(b, [name, *more]))
     if a.stiffness.any() and "rest" in apart and "stiffness" not in apart:
         says = f"has the spring at rest at {number_text(b.rest)}, not {number_text(a.rest)}"
         yield Mistake("spring", says, {"rest": b.rest})

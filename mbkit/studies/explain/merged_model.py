@@ -15,11 +15,10 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.load.shapes import NOTHING, MassProperties, together
 from mbkit.model import Body, Frame, Joint, Mimic, Model
-from mbkit.model.changes.dry_friction import FrictionNumbers
 from mbkit.model.elements.forces import FrameForce, by_functions
 from mbkit.model.elements.formula import NUMPY, Formula
 from mbkit.model.elements.references import KINDS_OF_PARTS, hung_on, with_names
-from mbkit.model.parts import OF_Q, OF_V, NumberRule, rules_of
+from mbkit.model.parts import OF_Q, OF_V, NumberRule, acting, rules_of
 from mbkit.studies._targets import with_values
 
 #: Kinds of parts that are compared by their fields alone.
@@ -66,7 +65,7 @@ class Tolerances:
     def differing(self, a: Any, b: Any, *names: str) -> list[str]:
         """Return the fields in which two parts of one kind differ, of all but the name or of these, each by its rule.
 
-        A force's formulas differ by their values, and a joint's friction by the force that acts.
+        A force's formulas differ by their values, and a number that is not given by what acts in its place.
         """
         rules = rules_of(Body if isinstance(a, MassProperties) else type(a))
         of = names or [f.name for f in fields(a) if f.name != "name"]
@@ -77,7 +76,7 @@ class Tolerances:
     def _same(self, name: str, rule: NumberRule | None, a: Any, b: Any) -> bool:
         if getattr(a, name) is getattr(b, name) is None:
             return True
-        x, y = (acting(name, part) for part in (a, b))
+        x, y = (as_it_acts(name, part) for part in (a, b))
         if isinstance(x, Mimic) and isinstance(y, Mimic):
             return self.same(x, y)
         if rule is None and isinstance(x, np.ndarray) and x.shape == np.shape(y):
@@ -95,11 +94,9 @@ class Tolerances:
         return self.vector(x, y, float(np.abs([x, y]).max(initial=0.0)))
 
 
-def acting(name: str, part: Any) -> Any:
-    """Return a field as it acts: of dry friction what a joint then moves by, of a formula its values."""
-    given = getattr(part, name)
-    if isinstance(part, Joint) and name in _AT_REST:
-        return getattr(FrictionNumbers.of([part]), _AT_REST[name])
+def as_it_acts(name: str, part: Any) -> Any:
+    """Return a field as it acts, of a formula its values."""
+    given = acting(part, name)
     if not isinstance(given, Formula):
         return given
     # Random arguments of many sizes, which each name has for itself.
@@ -109,10 +106,6 @@ def acting(name: str, part: Any) -> Any:
         values = given(at | dict(zip(part.symbols, part.numbers, strict=True)), NUMPY)
     known = np.nan_to_num([np.broadcast_to(x, 64) for x in values], posinf=0.0, neginf=0.0)
     return known if known.any() else given
-
-
-#: Optional numbers of a joint, and what acts without them.
-_AT_REST: Final = {"stiction": "bound", "stribeck_velocity": "stribeck"}
 
 
 @dataclass(frozen=True)
