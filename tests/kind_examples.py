@@ -718,6 +718,9 @@ class _Pendulum(Case):
     def potential(self, q: np.ndarray) -> Any:
         return -9.81 * np.cos(q[0])
 
+    def slope(self, q: np.ndarray) -> np.ndarray:
+        return 9.81 * np.sin(q)
+
 
 def _energies(name: str) -> Example:
     a = arm(name, 1)

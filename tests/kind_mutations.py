@@ -34,10 +34,14 @@ SEES: dict[str, frozenset[str]] = {
     **{f"{e}: frames": frozenset() for e in ENGINES},
     **dict.fromkeys(("regressor", "base parameters"), frozenset({"gravity"})),
     **dict.fromkeys(("impact", "operational space"), frozenset({"T", "row", "speed"})),
-    **dict.fromkeys(("picture", "lint"), frozenset()),
+    # "without" takes the part out itself.
+    **dict.fromkeys(("picture", "lint", "without"), frozenset()),
     # What its rows push at rest is nothing in examples without weight.
     "equilibrium": frozenset({"V", "force"}),
     "mobility": frozenset({"row", "speed"}),
+    # What is linear in motion has none.
+    "second derivatives": frozenset({"gravity", "body.rotor", "point.spring", "point.damper", "joint.stiction"})
+    | {"force.joint", "force.frame", "force.bushing", "force.compensation", "force.compensation.partial"},
 }
 #: A force without a potential has no energy.
 WITHOUT_ENERGY = ("force.frame",)
@@ -81,7 +85,7 @@ def seen(x: Example) -> Iterator[None]:
     """Let columns see an example in the place of its kind's own; their truths are kept."""
 
     def forget() -> None:
-        for kept in (kind_paths.engine, kind_paths.kept, kind_paths.program_of):
+        for kept in (kind_paths.engine, kind_paths.kept, kind_paths.program_of, kind_paths.on_paper):
             kept.cache_clear()
 
     forget()

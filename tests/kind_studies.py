@@ -31,15 +31,17 @@ from mbkit.cli import cli
 from mbkit.codegen.c_source import export_c
 from mbkit.engines.imported import reader
 from mbkit.engines.oracle import OracleDynamics
+from mbkit.engines.remote import environment
 from mbkit.engines.remote.packages import PACKAGES
-from mbkit.lagrangian import from_model
-from mbkit.lagrangian.printing.summary import SystemSummary
+from mbkit.lagrangian.printing.summary import SystemSummary, python_code
 from mbkit.model import Model
 from mbkit.model.elements.kinds import PART_KINDS
+from mbkit.model.elements.paths import PATHS as GATES
 from mbkit.pytest_plugin import MbkitBaseline
 from mbkit.report import compare_view
 from mbkit.report.page import render
 from mbkit.studies._targets import with_values
+from mbkit.studies.baseline.file import Rollout
 from mbkit.studies.compare.study import Judge
 from mbkit.studies.compare.terms import TERMS, states
 from mbkit.studies.importers.loops import Written, between_joints
@@ -49,7 +51,7 @@ from mbkit.studies.stress.case import Case as StressCase
 from mbkit.studies.stress.measure import Limits, measure, prepare
 from mbkit.testing import assert_same_dynamics
 from tests import kind_examples
-from tests.kind_examples import EXAMPLES, Arm, Example, size_of
+from tests.kind_examples import Example, size_of
 from tests.kind_paths import (
     CLOSE,
     COLUMNS,
@@ -63,17 +65,20 @@ from tests.kind_paths import (
     aligned,
     cell,
     column,
+    derived,
     dynamics,
     engine,
+    flow,
     kept,
     more_inputs,
     named,
     off,
+    on_paper,
     program_of,
     registered,
     without_part,
 )
-from tests.path_checks import resting
+from tests.path_checks import CHECKS, resting
 from tests.plain_mechanics import Case, derivative, rotation
 from tests.test_engine_versions import present
 from tests.written_math import assigned, lines_of_latex, lines_of_text, number, plain
@@ -93,7 +98,7 @@ def _elsewhere(engine: str) -> Any:
 
 
 def _sent(x: Example, which: str) -> mb.Dynamics:
-    dyn = mb.dynamics(x.model, _elsewhere(which))
+    dyn = mb.dynamics(x.model, which if PACKAGES[which].tested else _elsewhere(which))
     return dyn.at(**{x.model.time_parameter: x.t}) if x.model.time_parameter else dyn
 
 
@@ -120,6 +125,34 @@ def _remote_run(x: Example, folder: Path) -> Told:
     wanted = x.state(x.flow([DURATION], lambda t, q, v: 0 * v)[-1])
     return max(off(aligned(q[-1], x, wanted[0]), wanted[0]), off(v[-1], wanted[1]))
 
+
+class _TakenError(Exception):
+    """A model passed the gate of an engine whose environment is not here."""
+
+
+def _trained(x: Example, folder: Path, which: str) -> Told:
+    """The terms where the engine's environment is; else its gate alone, before a process is asked for."""
+    package = PACKAGES[which]
+    if environment.exists(package.distribution, package.tested[-1]):
+        return _remote(x, folder, which)
+
+    def interpreter(*_: Any, **__: Any) -> Path:
+        raise _TakenError
+
+    with patch.object(environment, "interpreter", interpreter):
+        try:
+            mb.dynamics(x.model, which)
+        except _TakenError:
+            lost = package.path.refuses(x.model)
+            if lost:
+                raise AssertionError(f"not asked: {lost}") from None
+            raise NotAskedError("its gate takes it, and its environment is not here") from None
+    raise AssertionError("no process was asked for")
+
+
+column("other environments", "Newton", "newton", close=1e-4, which="newton")(_trained)
+column("other environments", "MuJoCo Warp", close=1e-4, which="mujoco-warp")(_trained)
+column("other environments", "MJX", which="mjx")(_trained)
 
 # Files in the engines' own importers
 
@@ -216,14 +249,16 @@ def _in_pinocchio(x: Example, folder: Path) -> Told:
     worst = off(force, x.force(a, bodies=True))
     M = np.triu(pin.crba(m, m.createData(), q))
     worst = max(worst, off(T.T @ (M + np.triu(M, 1).T) @ T, x.mass_matrix(x.plain.q)))
-    for j in (j for j in x.model.independent_joints if j.type.nv == 1):
+    for j in (j for j in kind_examples.example(x.name).model.independent_joints if j.type.nv == 1):
         own = m.joints[m.getJointId(j.name)]
         k = own.idx_v
         loss = [*m.damping[[k]], *m.upperDryFrictionLimit[[k]], *m.upperVelocityLimit[[k]], *m.upperEffortLimit[[k]]]
         given = [*j.damping, *j.friction, *j.velocity_limit, *j.effort_limit]
         bounds = [m.lowerPositionLimit[own.idx_q], m.upperPositionLimit[own.idx_q]] if own.nq == 1 else []
         given += [*j.lower, *j.upper][: len(bounds)]
-        worst = max(worst, off(*(np.clip(z, -1e9, 1e9) for z in (np.array([*loss, *bounds]), np.array(given)))))
+        # Limits that are none would set the scale by which all are compared.
+        two = (np.where(np.abs(z) > 1e8, 10 * np.sign(z), z) for z in (np.array([*loss, *bounds]), np.array(given)))
+        worst = max(worst, off(*two))
     return worst, notes
 
 
@@ -255,7 +290,8 @@ def _importers(x: Example, folder: Path) -> Told:
 @column("texts", "C: its header", "c")
 def _header(x: Example, folder: Path) -> Told:
     """It names what the code holds, and what it leaves out."""
-    text = export_c(x.model, ["forward_dynamics"], name="case").header
+    with derived(x):
+        text = export_c(x.model, ["forward_dynamics"], name="case").header
     k = PART_KINDS.get(x.name)
     if not k or not k.features:
         raise NotAskedError("it is no part that can be taken out")
@@ -291,12 +327,19 @@ def _program_in_c(x: Example, folder: Path) -> Told:
     return off(out, x.accelerated())
 
 
-class _Flat(Arm):
-    """An arm in a plane, whose equations are short."""
-
-    def add(self, joint: str, type_: str, *names: str, **numbers: Any) -> None:
-        axes = ((0, 1, 0), (1, 0, 0))
-        super().add(joint, type_, *names, **numbers | ({"axes": axes} if "axes" in numbers else {}))
+@column("texts", "Python module of equations", "paper", "python module")
+def _module(x: Example, folder: Path) -> Told:
+    """A model with bodies comes there as its energies."""
+    if x.model.has_bodies:
+        GATES["paper"].admit(x.model)
+        GATES["python module"].admit(x.model)
+    if x.model.nv > 4:
+        raise NotAskedError("more than four joints take long to write")
+    x, lag = on_paper(x.name, flat=len(x.plain.kinds) > 2) if x.model.has_bodies else (x, x.model.form)
+    names: dict[str, Any] = {}
+    exec(python_code(lag), names)
+    given = {"t": x.t} if x.model.time_parameter else {}
+    return off(names["forward_dynamics"](x.plain.q, x.v, x.tau, **given), x.accelerated())
 
 
 @column("texts", "equations of motion and LaTeX, read", "paper", close=1e-8)
@@ -306,12 +349,9 @@ def _read_equations(x: Example, folder: Path) -> Told:
     wide = x.name in ("joint_type.ball", "joint_type.spherical_zyx", "joint_type.universal")
     if wide or len(x.plain.kinds) > 4 or (k and k.does == {"bound"}) or x.name.endswith(".several"):
         raise NotAskedError("its equations are those of others, or fill pages")
-    if x.name in EXAMPLES and len(x.plain.kinds) > 2:
-        with patch.object(kind_examples, "Arm", _Flat):
-            x = EXAMPLES[x.name](x.name)
-    lag = from_model(x.model, **({"drives": True} if x.model.prescribed else {})) if x.model.has_bodies else None
-    if lag is None:
+    if not x.model.has_bodies:
         raise NotAskedError("it is written as energies")
+    x, lag = on_paper(x.name, flat=len(x.plain.kinds) > 2)
     e, c = lag.equations(), x.plain
     a = x.acceleration(x.t, c.q, c.v, 0 * x.tau)
     coordinates = c.q if len(e.coordinates) == c.n else x.q
@@ -466,11 +506,11 @@ def _variants(x: Example, folder: Path) -> Told:
     return worst
 
 
-@column("use of runs", "film")
+@column("use of runs", "film", "picture")
 def _film(x: Example, folder: Path) -> Told:
     """Bodies stand where NumPy has them, with the vertical upwards."""
     scene = kept(x.name).animate(folder / "film.html", shapes="sticks").scene
-    y = x.flow([DURATION])[-1][: x.plain.n]
+    y = flow(x.name)[: x.plain.n]
     g = x.plain.weight
     up = np.eye(3) if not g.any() else scene.rotations[0, 0]
     worst = 0.0
@@ -480,6 +520,25 @@ def _film(x: Example, folder: Path) -> Told:
         worst = max(worst, off(scene.rotations[-1, at], up @ R), off(scene.translations[-1, at], up @ p))
     return max(worst, off(up @ g, [0, 0, -np.linalg.norm(g)]) if g.any() else 0.0)
 
+
+# Paths with a check of their own
+
+
+def _by_check(x: Example, folder: Path, gate: str, of_rows: bool = False) -> Told:
+    if of_rows and not x.rows:
+        raise NotAskedError("no rows")
+    CHECKS[gate](x.model, folder)
+    return 0.0
+
+
+for _group, _name, _gate, _of_rows in (
+    ("quantities", "rows of constraints", "constraint rows", True),
+    ("quantities", "GPU: arrays that lie there", "gpu under force", False),
+    ("engine mujoco", "mujoco: law of constraints", "constraint law", True),
+    ("changes", "independent coordinates", "embedded", True),
+    ("studies", "excitation", "excitation", False),
+):
+    column(_group, _name, _gate, gate=_gate, of_rows=_of_rows)(_by_check)
 
 # Studies
 
@@ -563,7 +622,8 @@ def _check(x: Example, folder: Path) -> Told:
         if (less := without_part(x)) is None or PART_KINDS[x.name].does == {"bound"}:
             return 0.0
         model, less = with_values(x.model), less if less.time_parameter else with_values(less)
-        study = Judge(model, {"less": dynamics(x, less)}, OracleDynamics(model), states(model, 1, 0), 1e-12)
+        exact = engine(x.name, "oracle") if model is x.model else OracleDynamics(model)
+        study = Judge(model, {"less": dynamics(x, less)}, exact, states(model, 1, 0), 1e-12)
         study.terms = TERMS
         rows, _ = study.rows(lambda *_: None)
     return np.inf if all(r.passed for r in rows) else 0.0
@@ -575,7 +635,8 @@ def _plugin(x: Example, folder: Path) -> Told:
     node = SimpleNamespace(name="test", nodeid="test", user_properties=[])
     config = SimpleNamespace(getoption=lambda _: True, rootpath=folder)
     fixture = MbkitBaseline(SimpleNamespace(path=folder / "test_x.py", node=node, config=config))  # type: ignore[arg-type]
-    fixture(x.model, "x", engines=["lagrangian"], samples=1)
+    with patch("mbkit.studies.baseline.study._ROLLOUT", Rollout(STEP, 4)):
+        fixture(x.model, "x", engines=["lagrangian"], samples=1)
     config.getoption = lambda _: False
     if (less := without_part(x)) is None:
         fixture(x.model, "x")
@@ -628,12 +689,9 @@ def _work_precision(x: Example, folder: Path) -> Told:
 @column("studies", "steady motion", close=1e-8)
 def _steady(x: Example, folder: Path) -> Told:
     """Where the first hinge turns steadily and all else rests, nothing accelerates."""
-    if x.name in EXAMPLES and x.model.has_bodies:
-        with patch.object(kind_examples, "Arm", _Flat):
-            x = EXAMPLES[x.name](x.name)
     if not x.model.has_bodies or len(x.plain.kinds) > 4 or x.name.endswith("several"):
         raise NotAskedError("it is written as energies, or its equations fill pages")
-    lag = from_model(x.model, **({"drives": True} if x.model.prescribed else {}))
+    x, lag = on_paper(x.name, flat=len(x.plain.kinds) > 2)
     cyclic = [str(q) for q in lag.cyclic_coordinates()]
     if lag.time is None and not cyclic:
         raise NotAskedError("no coordinate is cyclic")

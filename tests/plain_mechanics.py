@@ -27,10 +27,19 @@ def derivative(f: Callable[[np.ndarray], Any], x: np.ndarray) -> np.ndarray:
     return np.stack([np.imag(f(x + 1j * _STEP * e)) / _STEP for e in np.eye(len(x))], axis=-1)
 
 
+def skew(a: np.ndarray) -> np.ndarray:
+    x, y, z = a
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
 def rotation(axis: np.ndarray, angle: Any) -> np.ndarray:
-    x, y, z = axis
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    K = skew(axis)
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a × b along the last axis, in a tenth of `numpy.cross`'s time."""
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
 def norm(x: np.ndarray) -> Any:
@@ -85,6 +94,8 @@ class Case:
     pitch: dict[int, float] = field(default_factory=dict)
     weight: np.ndarray = field(default_factory=lambda: GRAVITY)
     _at: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    #: What no coordinate changes, by the number of links.
+    _fixed: dict[int, tuple[np.ndarray, ...]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
     def n(self) -> int:
@@ -117,21 +128,33 @@ class Case:
         key = q.tobytes(), len(self.kinds)
         if key in self._at:
             return self._at[key]
-        x = self.G @ q + self.c
+        x, (own, once, twice, along, _, _) = self.G @ q + self.c, self._joints()
+        turned = own + np.sin(x)[:, None, None] * once + (1 - np.cos(x))[:, None, None] * twice
+        places = self.p + along * x[:, None]
         out: list[tuple[np.ndarray, np.ndarray]] = []
-        for k, kind in enumerate(self.kinds):
+        for k in range(len(self.kinds)):
             i = self.parents[k] if self.parents else k - 1
             R, p = out[i] if i >= 0 else (np.eye(3), np.zeros(3))
-            p, R = p + R @ self.p[k], R @ self.R[k]
-            advance = 1.0 if kind == "prismatic" else self.pitch.get(k, 0.0)
-            p = p + R @ self.axes[k] * advance * x[k]
-            if kind == "revolute":
-                R = R @ rotation(self.axes[k], x[k])
-            out.append((R, p))
+            out.append((R @ turned[k], p + R @ places[k]))
         if len(self._at) > 100:
             self._at.clear()
         self._at[key] = out
         return out
+
+    def _joints(self) -> tuple[np.ndarray, ...]:
+        """Return each joint's rotation, what sin and 1 - cos of its angle add, and the way of its body by coordinate.
+
+        And the axes about which links turn and along which they move.
+        """
+        if len(self.kinds) not in self._fixed:
+            turns = np.array([[float(kind == "revolute")] for kind in self.kinds])
+            advance = 1 - turns
+            for k, pitch in self.pitch.items():
+                advance[k] = pitch
+            own, K = np.array(self.R), np.array([skew(a) for a in turns * self.axes])
+            along = (own @ (advance * self.axes)[..., None])[..., 0]
+            self._fixed = {len(self.kinds): (own, own @ K, own @ K @ K, along, turns, advance)}
+        return self._fixed[len(self.kinds)]
 
     def way(self, k: int) -> list[int]:
         """Return the links from the world to link k, and it."""
@@ -146,43 +169,71 @@ class Case:
         R, p = self.pose(body, q)
         return p + R @ np.asarray(at)
 
+    def lines(self, q: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return the links' axes and origins in the world, (L, 3); and (L, L) which of them are on the way to each."""
+        key = "lines", q.tobytes(), len(self.kinds)
+        if key not in self._at:
+            poses, links = self.poses(q), len(self.kinds)
+            axes, way = np.array([R @ a for (R, _), a in zip(poses, self.axes, strict=True)]), np.zeros((links, links))
+            for k in range(links):
+                way[k, self.way(k)] = 1.0
+            *_, turns, advance = self._joints()
+            self._at[key] = axes, np.array([p for _, p in poses]), way, turns * axes, advance * axes
+        return self._at[key]
+
     def turning(self, k: int, q: np.ndarray) -> np.ndarray:
         """Return the angular Jacobian of body k, (3, n); it stays exact for complex q."""
-        J, poses, way = np.zeros((3, len(self.kinds)), dtype=q.dtype), self.poses(q), self.way(k)
-        J[:, way] = np.stack([poses[i][0] @ self.axes[i] * (self.kinds[i] == "revolute") for i in way], axis=-1)
-        return J @ self.G
+        _, _, way, turns, _ = self.lines(q)
+        return (way[k, :, None] * turns).T @ self.G
 
     def moving(self, k: int, at: Any, q: np.ndarray) -> np.ndarray:
         """Return the linear Jacobian of a point of body k, (3, n)."""
-        J, poses, way = np.zeros((3, len(self.kinds)), dtype=q.dtype), self.poses(q), self.way(k)
-        a = np.stack([poses[i][0] @ self.axes[i] for i in way])
-        arms = poses[k][1] + poses[k][0] @ np.asarray(at) - np.stack([poses[i][1] for i in way])
-        turns = np.array([[self.kinds[i] == "revolute"] for i in way])
-        advance = np.array([[self.pitch.get(i, 0.0)] for i in way])
-        J[:, way] = np.where(turns, np.cross(a, arms) + advance * a, a).T
-        return J @ self.G
+        R, p = self.poses(q)[k]
+        _, origins, way, turns, advance = self.lines(q)
+        return (way[k, :, None] * (cross(turns, p + R @ np.asarray(at) - origins) + advance)).T @ self.G
+
+    def bodies(self, q: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return masses, Jacobians of centres of mass and of turns, and inertias in the world, of all that weigh."""
+        key = "bodies", q.tobytes(), len(self.kinds)
+        if key not in self._at:
+            heavy, R = [k for k, m in enumerate(self.mass) if m], [x for x, _ in self.poses(q)]
+            J = [self.moving(k, self.com[k], q) for k in heavy]
+            W = [self.turning(k, q) for k in heavy]
+            world = [R[k] @ self.I[k] @ R[k].T for k in heavy]
+            self._at[key] = self.mass[heavy, None, None], *map(np.array, (J, W, world))
+        return self._at[key]
 
     # Equations
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        M = np.zeros((self.n, self.n), dtype=q.dtype)
-        for k, (R, _) in enumerate(self.poses(q)):
-            if not self.mass[k]:
-                continue
-            J, W = self.moving(k, self.com[k], q), self.turning(k, q)
-            M = M + self.mass[k] * J.T @ J + W.T @ R @ self.I[k] @ R.T @ W
+        if not self.mass.any():
+            return np.zeros((self.n, self.n)) + sum(part.inertia(self, q) for part in self.parts)
+        m, J, W, I = self.bodies(q)
+        M = (m * J.swapaxes(1, 2) @ J + W.swapaxes(1, 2) @ I @ W).sum(axis=0)
         return M + sum(part.inertia(self, q) for part in self.parts)
 
     def of_velocities(self, q: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return C v: the bodies' forces at q̈ = 0, whose accelerations are complex steps along v."""
-        M = derivative(lambda x: np.zeros((self.n, self.n)) + sum(part.inertia(self, x) for part in self.parts), q)
-        out, ahead = np.einsum("ijk,j,k->i", M, v, v) - np.einsum("jki,j,k->i", M, v, v) / 2, q + 1j * _STEP * v
-        for k, (R, _) in enumerate(self.poses(q)):
-            if not self.mass[k]:
-                continue
-            J, W, I = self.moving(k, self.com[k], q), self.turning(k, q), R @ self.I[k] @ R.T
-            a, turned = (np.imag(x @ v) / _STEP for x in (self.moving(k, self.com[k], ahead), self.turning(k, ahead)))
-            out = out + self.mass[k] * J.T @ a + W.T @ (I @ turned + np.cross(W @ v, I @ W @ v))
+        out = np.zeros(self.n)
+        if inert := [part for part in self.parts if part.inertia is not Part.inertia]:
+            M = derivative(lambda x: sum(part.inertia(self, x) for part in inert), q)
+            out = np.einsum("ijk,j,k->i", M, v, v) - np.einsum("jki,j,k->i", M, v, v) / 2
+        if not self.mass.any():
+            return out
+        m, J, W, I = self.bodies(q)
+        a, turned = (np.imag(x @ v)[..., None] / _STEP for x in self.bodies(q + 1j * _STEP * v)[1:3])
+        w = W @ v
+        moment = I @ turned + cross(w, (I @ w[..., None])[..., 0])[..., None]
+        return out + (m * J.swapaxes(1, 2) @ a + W.swapaxes(1, 2) @ moment).sum(axis=0)[:, 0]
+
+    def slope(self, q: np.ndarray) -> np.ndarray:
+        """Return the derivative of the potential."""
+        out = np.zeros(self.n)
+        if self.mass.any():
+            m, J, *_ = self.bodies(q)
+            out = -(m * J.swapaxes(1, 2) @ self.weight[:, None]).sum(axis=0)[:, 0]
+        if elastic := [part for part in self.parts if part.energy is not Part.energy]:
+            out = out + derivative(lambda x: sum(part.energy(self, x) for part in elastic), q)
         return out
 
     def potential(self, q: np.ndarray) -> Any:
@@ -204,7 +255,7 @@ class Case:
     ) -> np.ndarray:
         """Return v̇ by the multipliers of all rows; velocities in `hold` stay zero."""
         h = self.of_velocities(q, v)
-        f = tau + self.loads(t, q, v) - h - derivative(self.potential, q)
+        f = tau + self.loads(t, q, v) - h - self.slope(q)
         J, bias = np.zeros((0, self.n)), np.zeros(0)
         if any(part.rows for part in self.parts):
             J = derivative(lambda x: self.rows(t, x), q)

@@ -13,10 +13,15 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+
+# SymPy forgets what it knows of expressions, which kinds share, after a thousand of them.
+os.environ.setdefault("SYMPY_CACHE_SIZE", "None")
 
 from mbkit.model.elements.kinds import PART_KINDS, joint_types, kind
 from tests import kind_mutations, kind_pairs
@@ -47,14 +52,19 @@ def row(name: str, paths: tuple[str, ...]) -> dict[str, Any]:
     os.environ["MBKIT_COMPILE"] = "0"
     cells, seconds = {}, {}
     registered()
-    for path in paths:
-        begun = time.perf_counter()
-        with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:
+        for path in paths:
+            begun = spent()
             out = cell(name, path, Path(folder))
             text = out.text.replace(f"{folder}/", "")
-        seconds[path] = round(time.perf_counter() - begun, 2)
-        cells[path] = [out.outcome, None if out.error is None else float(f"{out.error:.1e}"), text[:MOST]]
+            seconds[path] = spent() - begun
+            cells[path] = [out.outcome, None if out.error is None else float(f"{out.error:.1e}"), text[:MOST]]
     return {"kind": name, "cells": cells, "seconds": seconds}
+
+
+def spent() -> float:
+    """Return the processor's seconds of this process and of those that it has waited for."""
+    return sum(os.times()[:4])
 
 
 def takes() -> dict[str, list[str]]:
@@ -83,12 +93,14 @@ def mutations() -> dict[str, Any]:
     return out
 
 
-def rows() -> list[dict[str, Any]]:
-    """Return all rows; two processes share them."""
+@contextmanager
+def shared() -> Iterator[Callable[..., Iterable[Any]]]:
+    """Yield a function as `map`, whose calls processes share."""
     if not PROCESSES:
-        return [row(name, PATHS) for name in KINDS]
+        yield map
+        return
     with ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")) as pool:
-        return list(pool.map(row, KINDS, [PATHS] * len(KINDS)))
+        yield pool.map
 
 
 def model_of_pairs(name: str) -> list[tuple[str, str, Cell, float]]:
@@ -96,30 +108,24 @@ def model_of_pairs(name: str) -> list[tuple[str, str, Cell, float]]:
     os.environ["MBKIT_COMPILE"] = "0"
     kind_pairs.names()
     out = []
-    for path in kind_pairs.paths(name):
-        begun = time.process_time()
-        with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:
+        for path in kind_pairs.paths(name):
+            begun = spent()
             got = kind_pairs.pair_cell(name, path, Path(folder))
-        out.append((name, path, got, time.process_time() - begun))
+            out.append((name, path, got, spent() - begun))
     return out
 
 
-def pairs() -> dict[str, Any]:
-    """Return what became of the models that hold every pair of kinds."""
-    begun, asked = time.perf_counter(), kind_pairs.names()[::EACH]
-    if PROCESSES:
-        with ProcessPoolExecutor(PROCESSES, mp_context=get_context("spawn")) as pool:
-            found = [x for part in pool.map(model_of_pairs, asked, chunksize=4) for x in part]
-    else:
-        found = [x for name in asked for x in model_of_pairs(name)]
-    seconds = Counter[str]()
-    for _, path, _, taken in found:
+def pairs(found: Iterable[Any] | None = None) -> dict[str, Any]:
+    """Return what became of the models that hold every pair of kinds, in what `model_of_pairs` found of each."""
+    if found is None:
+        with shared() as each:
+            return pairs(each(model_of_pairs, kind_pairs.names()[::EACH]))
+    cells, seconds = [x for part in found for x in part], Counter[str]()
+    for _, path, _, taken in cells:
         seconds[path] += taken
-    return kind_pairs.summary([x[:3] for x in found]) | {
-        "cpu_s": round(seconds.total()),
-        "wall_s": round(time.perf_counter() - begun),
-        "seconds": {path: round(x, 1) for path, x in seconds.items()},
-    }
+    summary = kind_pairs.summary([x[:3] for x in cells])
+    return summary | {"cpu_s": round(seconds.total()), "seconds": {path: round(x, 1) for path, x in seconds.items()}}
 
 
 def told(data: dict[str, Any]) -> None:
@@ -141,19 +147,26 @@ def main() -> int:
     if asked := [x for x in sys.argv[1:] if x in made]:
         data = before | {x: made[x]() for x in asked}
     else:
-        found = rows()
+        with shared() as each:
+            # All calls are there at once, so that no process waits.
+            made_rows, of_pairs = (
+                each(row, KINDS, [PATHS] * len(KINDS)),
+                each(model_of_pairs, kind_pairs.names()[::EACH]),
+            )
+            found, together = list(made_rows), pairs(of_pairs)
         counts = Counter(c[0] for r in found for c in r["cells"].values())
         times = [r.pop("seconds") for r in found]
         seconds = {path: round(sum(x[path] for x in times), 1) for path in PATHS}
         data = stamp(__file__) | {
             "counts": dict(counts),
+            "cpu_s": round(sum(seconds.values())),
             "wall_s": round(time.perf_counter() - begun),
             "columns": [{"group": COLUMNS[p].group, "name": p, "close": COLUMNS[p].close} for p in PATHS],
             "seconds": seconds,
             "not_yet": NOT_YET,
             "without_column": sorted(set(registered()) - {g for c in COLUMNS.values() for g in c.gates}),
             "takes": takes(),
-            "pairs": pairs(),
+            "pairs": together,
             "mutations": before.get("mutations", {}),
             "rows": found,
         }

@@ -96,7 +96,9 @@ class ExpressionPrinter:
             ranks = sorted(self._rank(f) for f in factors if not f.is_Number)
             return (-degree, speeds, len(turned), turned, _signed(term)[0], len(ranks) > 1, ranks, str(term))
 
-        out = sorted(terms, key=key)
+        terms = list(terms)
+        # A key of many parts, which one term alone does not need.
+        out = sorted(terms, key=key) if len(terms) > 1 else terms
         # A sum does not begin with a minus where it need not.
         first = next((t for t in out if not _signed(t)[0]), None)
         if first is not None and _signed(out[0])[0]:
