@@ -205,11 +205,39 @@ def test_an_oscillation_is_followed_and_its_errors_do_not_add_up() -> None:
     k, times = 1e8, np.linspace(0, 1, 5)
     dyn = dynamics(slider(k, 0.0), "lagrangian", compile=True)
     run = simulate(dyn, [1.0], [0.0], 1.0, "auto", rtol=1e-8, save=times)
-    assert run.q[:, 0] == pytest.approx(np.cos(1e4 * times), abs=1e-7)
+    # With twice the sum that is allowed, 1.6e-8; with half of it, 43,400 steps.
+    assert run.q[:, 0] == pytest.approx(np.cos(1e4 * times), abs=1.2e-8)
+    assert run.stats.steps < 41_500
     assert run.stats.chosen.startswith("rk853, at rtol = ")
     plain = simulate(dyn, [1.0], [0.0], 1.0, "rk853", rtol=1e-8, save=times)
     assert np.abs(plain.q[:, 0] - np.cos(1e4 * times)).max() > 2e-7
     assert plain.stats.steps < run.stats.steps < 3 * plain.stats.steps
+
+
+@pytest.mark.parametrize(
+    ("model", "duration", "rtol", "evaluations", "trials"),
+    [
+        # Stability holds rk853's steps at h|λ| = 4.1: handed over at 6, it takes 2,400 evaluations.
+        ("damped", 0.5, 1e-6, 1500, (1, 20)),
+        # Accuracy holds them at 2: handed to trials from 1.5 on, it costs four of them.
+        ("rings a little", 0.2, 1e-6, 52_000, (0, 36)),
+        # 1,300 steps are to come: looked at from 2,600 on, 14,000 evaluations.
+        ("damped", 0.3, 1e-6, 1500, (1, 20)),
+        # An oscillation costs no trial with 2,600 steps to come, and some with 4,500.
+        ("rings", 0.35, 1e-3, 40_000, (0, 0)),
+        ("rings", 0.6, 1e-3, 60_000, (1, 47)),
+    ],
+)
+def test_what_is_tried_pays(
+    model: str, duration: float, rtol: float, evaluations: int, trials: tuple[int, int]
+) -> None:
+    if model == "rings":
+        dyn, start = dynamics(slider(1e8, 0.0), "lagrangian", compile=True), ([1.0], [0.0])
+    else:
+        dyn, start = COMPILED.at(k=1e8, c=1e3 if model == "damped" else 0.0), ([1.0, 0.0], [0.0, 0.0])
+    run = simulate(dyn, *start, duration, "auto", rtol=rtol, save=[0.0, duration], doubt=False)
+    assert run.stats.evaluations < evaluations
+    assert trials[0] <= run.stats.jacobians <= trials[1]
 
 
 def test_where_a_stiff_part_comes_to_its_end_rk853_comes_back() -> None:

@@ -40,14 +40,13 @@ _RECENT: Final = 8
 #: axis; steps that follow an oscillation at a tolerance of 1e-6 or less have 2 at most.
 _EDGE: Final = 3.0
 #: Errors of n steps, in a mean over 2 nv numbers, add up to n √(2 nv) tolerances at most: the limit, in the user's
-#: tolerances. Measured is a third to a three-hundredth of it for rk853, a tenth to a thirtieth for rodas5.
-_SUM: Final = {EXPLICIT: 300.0, IMPLICIT: 1000.0}
-#: Steps to come that count at most, for each step so far: the first ones may be short.
-_BELIEVED: Final = 64
+#: tolerances. Measured is a third to a three-hundredth of it.
+_SUM: Final = 300.0
 #: By how much a tolerance is loosened where rounding keeps steps short.
 _LOOSER: Final = 10.0
-#: Rounding of accelerations is the residual of a cubic through points within this part of a step.
-_NEAR: Final = 0.03
+#: Rounding of accelerations is the residual of a cubic through points within this part of a step: a smooth function
+#: has next to none there.
+_NEAR: Final = 0.003
 _AHEAD: Final = np.linspace(0.0, 1.0, 12)[:, None]
 _CUBIC: Final = np.linalg.qr(_AHEAD ** np.arange(4))[0]
 _RESIDUAL: Final = np.eye(len(_AHEAD)) - _CUBIC @ _CUBIC.T
@@ -304,10 +303,13 @@ class SwitchingController:
             return None
 
     def _factor(self, method: str, to_come: float) -> float:
-        """Return the factor of the tolerance with which the errors of all steps to come add up to the allowed sum."""
-        steps = max(1.0, min(to_come, _BELIEVED * self._tries))
+        """Return the factor of the tolerance with which the errors of the steps to come add up to the allowed sum.
+
+        Those until the next check count: then there is another one, and the first steps may be short.
+        """
+        steps = max(1.0, min(to_come, _LATER * self._tries))
         share = loosest(method, self._base).rtol / self._base.rtol
-        return min(share, _SUM[method] / (steps * math.sqrt(2 * self._context.space.nv)))
+        return min(share, _SUM / (steps * math.sqrt(2 * self._context.space.nv)))
 
     def _adapt_tolerance(self, attempts: StepAttempts, place: int, to_come: float) -> None:
         """Adapt the tolerance to the number of steps to come."""
@@ -326,9 +328,8 @@ class SwitchingController:
 
     def _rounding_limited(self, attempts: StepAttempts, place: int, step: float) -> bool:
         """Return whether rounding holds rk853's steps short, and loosen the tolerance there."""
-        share, noise = self._rounding_noise(attempts, place, step, _NEAR)
-        # A smooth function is far smoother within a tenth of the distance.
-        limited = share > _ROUNDED and self._rounding_noise(attempts, place, step, _NEAR / 10)[0] > _ROUNDED
+        share, noise = self._rounding_noise(attempts, place, step)
+        limited = share > _ROUNDED
         loosened = self._base.rtol > self._user.rtol or self._least == math.inf
         if limited:
             self._loosen(noise)
@@ -340,12 +341,12 @@ class SwitchingController:
         self._adapt_tolerance(attempts, place, 0.0)
         return limited
 
-    def _rounding_noise(self, attempts: StepAttempts, place: int, step: float, near: float) -> tuple[float, float]:
+    def _rounding_noise(self, attempts: StepAttempts, place: int, step: float) -> tuple[float, float]:
         """Return the part of rounding in a step's estimated error, beside the tolerance, and in accelerations."""
         (_, q, w), space = self._at, self._context.space
         try:
             k = attempts.rates(place, q[None], w[None])
-            ahead = near * step * _AHEAD
+            ahead = _NEAR * step * _AHEAD
             moved = space.retract(np.broadcast_to(q, (len(ahead), len(q))), ahead * w)
             rates = attempts.rates(place, moved, w + ahead * k)
         except FunctionError:
