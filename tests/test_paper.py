@@ -613,8 +613,6 @@ def test_models_of_bodies_and_of_energies_answer_the_same_questions():
     energies = lag.model
     for model, expected in ((energies, (False, "t", None, False)), (robot, (True, None, None, False))):
         assert (model.has_bodies, model.time_parameter, model.velocity_map, model.constrained) == expected
-        # Earlier names.
-        assert (model.clock, model.rates, model.written is None) == (*expected[1:3], expected[0])
     assert robot.energy_equations is None
     assert energies.energy_equations("literal").form is lag
 

@@ -111,11 +111,6 @@ class Model(Description):
         if self.constrained and len(q) and None not in self.parameters.values():
             _states_of(self).require_independent(q)
 
-    # Earlier names of the same, for scripts.
-    written = property(lambda self: self.energy_equations)
-    clock = property(lambda self: self.time_parameter)
-    rates = property(lambda self: self.velocity_map)
-
     # Configurations
 
     def neutral(self) -> Array:

@@ -37,15 +37,13 @@ def check_replaceable(folder: Path, *names: str, force: bool = False) -> None:
             raise OutputError(f"{path} is there and mbkit did not write it; {remedy}")
 
 
-#: At the beginning or the end of what mbkit writes. Pages of earlier versions have their title only.
+#: At the beginning or the end of what mbkit writes.
 _MARKS: Final = (
     b'content="mbkit"',
-    b"mbkit</title>",
     b"Software\0mbkit",
     b"ritten by mbkit",
     b"engine,method,setting,value,",
     b"case,parameter,unit,value,engine,method,",
-    b"robot,version,term,digits,moved,",
     b"t,q.",
 )
 _HEAD: Final = 4096
