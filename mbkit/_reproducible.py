@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
+from mbkit.errors import NumericalError
 
 #: Part of a row that is left of it, once the others are taken away, up to which it follows from them: rounding of J at
 #: a pose that is known to all digits, times the some thousand operations that lead to it.
@@ -109,14 +110,17 @@ def under_rows(M: Array, J: Array, force: Array, rate: Array, rounding: float = 
 
     Raises
     ------
-    numpy.linalg.LinAlgError
+    NumericalError
         M has no inverse on what the rows leave free.
     """
     masses = np.abs(np.diag(M))
     across = 1.0 / np.sqrt(np.where(masses > 0, masses, masses.max(initial=0.0) or 1.0))
     sizes = np.linalg.norm(J * across, axis=1)
     scaled, sizes = unit_rows(J * across), np.where(sizes > 0, sizes, 1.0)
-    L = np.linalg.cholesky(across[:, None] * M * across + scaled.T @ scaled)
+    try:
+        L = np.linalg.cholesky(across[:, None] * M * across + scaled.T @ scaled)
+    except np.linalg.LinAlgError:
+        raise NumericalError("the mass matrix is singular on what the constraints leave free") from None
     U, s, V = np.linalg.svd(np.linalg.solve(L, scaled.T), full_matrices=False)
     rank = int(np.count_nonzero(s > rounding * s.max(initial=0.0)))
     U, s, V = U[:, :rank], s[:rank], V[:rank].T

@@ -757,3 +757,9 @@ def test_a_disc_that_lies_nearly_flat_rolls_with_all_digits() -> None:
         # The directions of the contact have the rounding of an axis over its way from upright.
         close = 100 * np.finfo(float).eps / 7e-5
         assert mb.dynamics(model, engine).constraint_bias(q, v) == pytest.approx(exact, rel=0, abs=close)
+    # The condition of such a state belongs to its verdict; a wrong sign of J̇ v in one row would not pass.
+    result = mb.compare(model, ("lagrangian", "pinocchio"), terms_only=True)
+    assert result.passed, result.verdict
+    worst = next(row for row in result.rows if row.term == "J̇ v rows")
+    assert worst.max_abs < 1e-10
+    assert worst.relative < 1e-15

@@ -549,3 +549,13 @@ def test_rows_that_cannot_hold_are_refused_with_what_is_left() -> None:
     b.add_rolling("ground", "disc", body_a="wheel", radius=0.5, axis_a=(0, 1, 0))
     with pytest.raises(InputError, match=r"height: the ends never meet.*0\.1 is left"):
         mb.dynamics(b.build(), "pinocchio").constraint_jacobian(np.zeros(3))
+
+
+def test_a_bicycle_that_lies_flat_is_no_random_state_and_has_no_projection() -> None:
+    """Yaw and spins turn about one line there, so that M has no inverse; a raw error of NumPy ended 64 draws."""
+    model = mb.catalog.bicycle()
+    q, _ = model.random_state(0, 64)
+    assert np.isfinite(q).all()
+    flat = np.array([0, 0, 0, 0.3, np.pi / 2, 0, 0, 0, 0])
+    with pytest.raises(mb.errors.MbkitError, match="lies flat|singular on what the constraints leave free"):
+        mb.dynamics(model, "lagrangian").project(flat, np.ones(9))

@@ -145,7 +145,7 @@ def _solved(
     try:
         x, P, rank = under_rows(M, R, force, wanted)
         determined = rank == k + len(independent_rows(R[k:])[0])
-    except np.linalg.LinAlgError:
+    except NumericalError:
         determined = False
     if not determined:
         where = f" of sample {sample[0]}" if sample else ""

@@ -68,9 +68,9 @@ class ConsistentStates:
                 # Of many loops few configurations are near a closed one: nearer and nearer to one that is known.
                 model, known = dyn.model, dyn.model.neutral() if closed is None else closed
                 q = model.integrate(known, _NEARER ** (k - _ANYWHERE) * model.difference(known, q))
-            state = flowed(self.manifold, q, v, well)
-            # On some branches constraints depend on each other.
+            # On some branches constraints depend on each other, and where a disc lies flat M may have no inverse.
             with suppress(InputError, NumericalError):
+                state = flowed(self.manifold, q, v, well)
                 if state is not None:
                     require_independent(dyn, state[0])
                     return state

@@ -278,12 +278,7 @@ class PinConstraints:
         J, gamma = rows.J[which], rows.gamma[which]
         if not np.isfinite(J).all() or not np.isfinite(force).all():
             raise NumericalError(f"pinocchio: the terms of {self._model.name} are not finite at this state")
-        try:
-            a, forces, rank = under_rows(M, J, force, -gamma)
-        except np.linalg.LinAlgError:
-            raise NumericalError(
-                f"pinocchio: the mass matrix of {self._model.name} is singular on what its constraints leave free"
-            ) from None
+        a, forces, rank = under_rows(M, J, force, -gamma)
         if rank < len(J):
             raise singular_pose("pinocchio", self._model.name, self.choice.independent_names, J)
         lost = list(self.choice.redundant)

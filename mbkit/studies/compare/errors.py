@@ -125,10 +125,15 @@ def acceleration_errors(error: Array, reference: Array, scales: Scales) -> Error
     )
 
 
-def row_errors(error: Array, reference: Array, scales: Scales) -> Errors:  # noqa: ARG001  # as the others
-    """Measure errors of f, J and its bias by their largest numbers, or 1."""
+def row_errors(error: Array, reference: Array, scales: Scales, *, moving: bool = False) -> Errors:
+    """Measure errors of f, J and its bias by their largest numbers, or 1.
+
+    With `moving` they are of the bodies' velocities, whose rounding is one of the joints' by up to the root of the
+    equations' condition: a disc that lies nearly flat turns about one line by yaw and by spin.
+    """
     e = np.abs(error).reshape(len(error), -1)
     size = np.maximum(1.0, np.abs(reference).reshape(len(error), -1).max(axis=1, initial=0.0))
+    size = size * np.sqrt(scales.of_accelerations) if moving else size
     return Errors(e.max(axis=1, initial=0.0), ratio(e.max(axis=1, initial=0.0), size), np.empty(0))
 
 

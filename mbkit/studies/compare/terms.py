@@ -155,7 +155,7 @@ OF_CONSTRAINED_MOTION: Final = (FORWARD_DYNAMICS, JOINT_LOADS, "generalized_cons
 CONSTRAINT_TERMS: Final = (
     Term("f", "constraint_residual", ("q",), row_errors),
     Term("J", "constraint_jacobian", ("q",), row_errors),
-    Term("J̇ v rows", "constraint_bias", ("q", "v"), row_errors),
+    Term("J̇ v rows", "constraint_bias", ("q", "v"), partial(row_errors, moving=True)),
     Term("Jᵀ λ", "generalized_constraint_force", ("q", "v", "tau"), constraint_force_errors),
 )
 
