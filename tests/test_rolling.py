@@ -557,5 +557,5 @@ def test_a_bicycle_that_lies_flat_is_no_random_state_and_has_no_projection() -> 
     q, _ = model.random_state(0, 64)
     assert np.isfinite(q).all()
     flat = np.array([0, 0, 0, 0.3, np.pi / 2, 0, 0, 0, 0])
-    with pytest.raises(mb.errors.MbkitError, match="lies flat|singular on what the constraints leave free"):
+    with pytest.raises(mb.errors.MbkitError, match="singular on what the constraints leave free"):
         mb.dynamics(model, "lagrangian").project(flat, np.ones(9))

@@ -454,3 +454,21 @@ def test_a_pose_is_a_singular_one_where_that_keeps_more_digits(apart: float) -> 
     (here,), (a,), _ = at_singular_poses(dyn, 0.0, q[None], v[None], np.zeros(3))
     a = a if here else dyn.forward_dynamics(q, v, np.zeros(3))
     assert np.abs(a - exact).max() < 1e-9 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize(
+    ("n", "start", "rtol"),
+    [
+        # Without more slack for each refused step, below the least tolerance, and with a plan that is lost.
+        (2, (-1.3477537383115374, -4.80904859365445), 1e-13),
+        (1, (0.4929722163862067, 2.470643211201996), 1e-15),
+        (2, (2.0986100247969226, -3.9696366631616757), 1e-14),
+    ],
+)
+def test_steps_of_a_tight_tolerance_do_not_shrink_with_the_way_to_a_pose(n, start, rtol) -> None:
+    """Rounding of accelerations and projections grows there, and a shorter step only comes nearer."""
+    dyn = row(n)
+    run, _ = simulated(dyn, *parallel(dyn, *start), 1.0, "rk853", rtol=rtol, save=[0.0, 1.0])
+    assert run.stats.finished
+    assert run.stats.steps < 200
+    assert run.q[-1] == pytest.approx(parallel(dyn, motion(n, [1.0], *start)[0], 0.0)[0], abs=5e-12)

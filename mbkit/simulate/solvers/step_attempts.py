@@ -80,6 +80,10 @@ class StepAttempts(Protocol):
         """Return (q, w) at times, (m, nq) and (m, nv), each by one step from the state of the same row."""
 
 
+#: Tolerance of a step across a singular pose: what rounding lets a step of rk853 hold.
+_CROSSING: Final = 1e-13
+
+
 class RungeKuttaAttempts:
     """Attempts of rk853, one step of one trajectory at a time; `StepAttempts` says what its methods do."""
 
@@ -187,7 +191,7 @@ class RungeKuttaAttempts:
         if self._error >= 1 and not loose and self._field.near_singular:
             # Near a singular pose shorter steps are no better: their stages are nearer to it, and rounding grows.
             across = 0 < self._field.approach.ahead < step
-            self._slack, self._h, self._most = 10 * self._slack, step if across else 0.8 * step, 1.0
+            self._slack, self._h, self._most = 10 * self._slack, self._h if across else 0.8 * self._h, 1.0
             return
         self._slack = 1.0 if good else self._slack
         factors = self._factors(SCALARS, np.float64(self._error if self._error >= 0 else math.nan), self._last)
@@ -209,7 +213,8 @@ class RungeKuttaAttempts:
     def _attempt(self, step: float) -> tuple[Array, Array, float]:
         """Return q and w after a step, and its error in units of the tolerance."""
         q, w, u = self._step(self._t, self._q, self._w, step, fresh=self._fresh)
-        space, (rtol, atol) = self._space, self._tolerances
+        least = _CROSSING if self._field.near_singular else 0.0
+        space, (rtol, atol) = self._space, (max(x, least) for x in self._tolerances)
         sizes = np.maximum(space.magnitude(self._q, u), space.magnitude(q, u)), np.maximum(np.abs(self._w), np.abs(w))
         by_u, by_w = (self._slack * (atol + rtol * x) for x in sizes)
         error = embedded_error(SCALARS, self._tableau.errors, self._stages, (by_u, by_w), step, 2 * space.nv)
@@ -258,10 +263,6 @@ class RungeKuttaAttempts:
         return self._step(t, q, w, end - t)[:2]
 
 
-#: Tolerance of a step across a singular pose: what rounding lets a step of rk853 hold.
-_CROSSING: Final = 1e-13
-
-
 class AcrossPoses(RungeKuttaAttempts):
     """Steps of rk853 in place of another method's near a singular pose, from and to y = (q, v).
 
@@ -270,7 +271,6 @@ class AcrossPoses(RungeKuttaAttempts):
 
     def __init__(self, problem: IntegrationProblem) -> None:
         super().__init__(problem, Space(problem.dyn.model), problem.tolerances)
-        self.tighten(0, problem.tolerances)
         self._model = problem.dyn.model
         self._last_step: AcceptedSteps | None = None
 
@@ -278,9 +278,6 @@ class AcrossPoses(RungeKuttaAttempts):
     def of(cls, problem: IntegrationProblem) -> AcrossPoses | None:
         """Return those of a run; None where nothing is projected."""
         return cls(problem) if problem.dyn.projects else None
-
-    def tighten(self, place: int, tolerances: Tolerances) -> None:
-        super().tighten(place, Tolerances(*(max(x, _CROSSING) for x in tolerances)))
 
     def crosses(self, t: float, y: Array, h: float) -> bool:
         """Return whether a step of length h from a state would meet a pose; `cross` then starts there."""
