@@ -174,7 +174,7 @@ PAPER = Plan((Spot(kinds=frozenset({"force.of_time"})),), ("loop.distance", "no_
 
 def built(name: str, plan: Plan, seed: int) -> Example:
     """Return the example of a plan, in a state in which rows are apart from each other and dry friction slides on."""
-    tries = (_built(name, plan, np.random.default_rng([SEED, seed, k])) for k in range(20))
+    tries = (_built(name, plan, np.random.default_rng([SEED, seed, k])) for k in range(60))
     out = next(x for x in tries if x)
     return kind_examples.on_paper(out) if plan.paper else out
 
