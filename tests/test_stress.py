@@ -337,7 +337,7 @@ def test_a_cell_that_is_stopped_by_the_end_of_the_study_is_not_slow():
 # Truths
 
 
-def test_two_runs_that_agree_are_a_truth_and_where_none_do_there_is_none():
+def test_two_runs_that_agree_are_a_truth_and_where_none_do_there_is_none(monkeypatch):
     problem, times = own.sprung(100.0), np.linspace(0, 0.5, 11)
     truth, told = reference_motion(problem, times, 1e-7, 5.0)
     assert truth.floor < 1e-10
@@ -345,10 +345,14 @@ def test_two_runs_that_agree_are_a_truth_and_where_none_do_there_is_none():
     # At 50 µs its own error is 1e-13.
     other = mb.simulate(mb.dynamics(problem.model, "mujoco"), problem.q, problem.v, 0.5, "mujoco_rk4", 5e-5, save=times)
     assert np.abs(truth.q - other.q).max() < 1e-12
-    # 1e5 swings cannot be followed in the time.
+    # 1e5 swings cannot be followed in the time, and series would take longer to compile than is left.
+    series = []
+    search = import_module("mbkit.studies.work_precision.reference")
+    monkeypatch.setattr(search, "taylor_pair", lambda *x: series.append(x))
     truth, told = reference_motion(own.sprung(1e12), times, 1e-7, 0.5)
     assert truth is None
     assert told.startswith("no truth: ")
+    assert not series
 
 
 def test_a_stiff_motion_is_known_by_methods_for_it():
@@ -386,6 +390,19 @@ def test_a_force_of_the_problem_acts_along_its_runs(tau):
     assert np.abs(searched.q - known.truth.q).max() < 1e-12
     with pytest.raises(InputError, match="tau"):
         problem_of(replace(case, make=lambda value: replace(pushed(value), tau=np.ones(2))), 1.0)
+
+
+def test_an_engines_own_run_that_would_take_too_long_is_not_begun():
+    """It does not stop when it is asked to: 1e8 steps take a minute."""
+    case = replace(own.GLIDING, make=lambda value: own.gliding(value / 100), methods=("mujoco_rk4",))
+
+    def long(value):
+        return replace(own.gliding(value), duration=1e8 * value)
+
+    cell = measure(replace(case, make=long), 1e-7, "mujoco", "mujoco_rk4", Limits(0.5, 1e-3, 1e-8), None)
+    assert cell.end == "slow"
+    assert "100000000 steps would take" in cell.note
+    assert math.isnan(cell.seconds)
 
 
 def test_conditions_beyond_double_are_known():

@@ -6,6 +6,7 @@ precision, or two engines with a method each in double precision. Where they par
 
 from __future__ import annotations
 
+import time
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -390,7 +391,8 @@ def reference(
         (nv,), held all the time; (K - 1, nv), held over each interval of `save`, which then runs from 0 to `duration`;
         or a function of (t, q, v), for which only two engines make a reference, as for dry friction.
     seconds : float
-        Limit of the search, without derivation and compilation. The best reference by then is returned.
+        Limit of the search's processor time, without derivation and compilation. The best reference by then is
+        returned.
     wanted, agree : float
         How well two runs agree, relative to the size of the motion, where the search ends; and at the least, for beyond
         it the reference is cut. With less than 12 digits wanted, two engines are asked first, explicit methods and then
@@ -427,7 +429,7 @@ def reference(
     if not motion.duration or not model.nv:
         return _at_rest(motion)
     with Progress(progress, f"{model.name}: reference") as bar:
-        pairs, refused = _search(motion, Deadline(seconds, bar.update), seconds, wanted, agree)
+        pairs, refused = _search(motion, Deadline(seconds, bar.update, time.thread_time), seconds, wanted, agree)
         bar.update(1.0)
     if not pairs:
         raise UnsupportedError(f"reference: {'; '.join(refused)}")
