@@ -700,6 +700,7 @@ def test_a_renamed_link_moves_no_frame(tmp_path: Path) -> None:
     assert "tool most, by 0.1 m and 0 rad" in mb.baseline.check(mb.load(path), file).effect
 
 
+@pytest.mark.thorough
 def test_git_finds_the_commit_at_which_a_check_began_to_fail(tmp_path):
     """The command of the book; a commit whose file cannot be read is skipped."""
     env = {k: x for k, x in os.environ.items() if not k.startswith("GIT_")}

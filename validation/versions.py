@@ -43,7 +43,6 @@ from mbkit.studies.study_runs import free_of_mimic, start_state
 from tests.random_trees import random_tree
 from validation.arms import joint, link, urdf, written
 from validation.own_parser import OwnParser
-from validation.robots import FEW as TWO
 from validation.robots import chosen
 from validation.stamp import results, stamp
 
@@ -350,9 +349,9 @@ def smallest(engine: str) -> dict[str, Any]:
 #: See `validation.smoke`.
 SMOKE = {
     "VERSIONS": {"mujoco": ("4.0.0",)},
-    "ROBOTS": TWO[:1],
+    "ROBOTS": (),
     "WAYS": 1,
-    "TREES": {"rotors": TREES["rotors"]},
+    "TREES": {},
     "SMALLEST": {"weld_turned": SMALLEST["weld_turned"]},
 }
 
