@@ -659,9 +659,9 @@ def _from_zero(x: Example) -> Example:
 @column("studies", "stress")
 def _stress(x: Example, folder: Path) -> Told:
     """A case of the user's own, whose number is nothing; its exact motion is NumPy's."""
-    start = _from_zero(replace(x, tau=0 * x.tau))
+    start = _from_zero(x)
     truth = lambda times: start.motion(np.maximum(times, 1e-12))[0]  # noqa: E731
-    problem = Problem(x.model, start.q, start.v, duration=DURATION, exact=truth, dt=STEP)
+    problem = Problem(x.model, start.q, start.v, x.tau, DURATION, truth, dt=STEP)
     case = StressCase(x.name, "", "step", "nothing", "", (1.0,), (1.0,), lambda _: problem)
     known = prepare(case, 1.0, 1e-6, 60.0)
     if known.truth is None:
