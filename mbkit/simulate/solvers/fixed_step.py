@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,7 +55,12 @@ class GridRecord:
         return slice(*self.kept.searchsorted((first, last + 1)).tolist())
 
     def result(
-        self, why: Callable[[int], str], evaluations: int, jacobians: int = 0, error: FunctionError | None = None
+        self,
+        why: Callable[[int], str],
+        evaluations: int,
+        jacobians: int = 0,
+        error: FunctionError | None = None,
+        doubts: tuple[str, ...] = (),
     ) -> SolverResult:
         """Return the result, with NaN behind the good steps; why(i) is why trajectory i diverged, or empty."""
         grid, kept, steps, q, v = self._problem.grid, self.kept, self.steps, self.q, self.v
@@ -90,6 +94,7 @@ class GridRecord:
             message=message,
             jacobians=jacobians,
             error=error,
+            doubts=doubts,
         )
 
 
@@ -191,8 +196,7 @@ def run_fixed(
     stepper = _FieldStepper(problem)
     run = SteppedRun(problem, stepper, stepper.space.to_integrator_velocity(problem.q0, problem.v0), record, members)
     error = run.to_end()
-    result = run.record.result(lambda _: run.why, stepper.field.evaluations, error=error)
-    return replace(result, doubts=stepper.doubts)
+    return run.record.result(lambda _: run.why, stepper.field.evaluations, error=error, doubts=stepper.doubts)
 
 
 class SteppedRun:

@@ -7,7 +7,6 @@ converges linearly, at the rate of the step times the torque's derivative.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -76,13 +75,12 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
         _to_velocities(dyn, midpoint, problem, record)
     # Each iteration is an evaluation, and so is the end of each step.
     evaluations = iterations + int(record.steps.sum())
-    result = record.result(why, evaluations, iterations, error)
-    return replace(result, doubts=_poses(problem, record)) if dyn.projects else result
+    return record.result(why, evaluations, iterations, error, _poses(problem, record))
 
 
 def _poses(problem: IntegrationProblem, record: GridRecord) -> tuple[str, ...]:
     """Return the singular poses on the way, in a sentence; none where steps are left out of what is kept."""
-    if len(record.kept) <= problem.grid.steps:
+    if not problem.dyn.projects or len(record.kept) <= problem.grid.steps:
         return ()
     times = problem.grid.times_of(record.kept)
     poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
