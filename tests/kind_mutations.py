@@ -39,6 +39,8 @@ SEES: dict[str, frozenset[str]] = {
     # What its rows push at rest is nothing in examples without weight.
     "equilibrium": frozenset({"V", "force"}),
     "mobility": frozenset({"row", "speed"}),
+    # Joints beyond the first rest, and nothing accelerates.
+    "steady motion": frozenset({"V", "force"}),
     # What is linear in motion has none.
     "second derivatives": frozenset({"gravity", "body.rotor", "point.spring", "point.damper", "joint.stiction"})
     | {"force.joint", "force.frame", "force.bushing", "force.compensation", "force.compensation.partial"},

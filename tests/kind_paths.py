@@ -42,7 +42,7 @@ from tests.plain_mechanics import Part
 Told = float | tuple[float, tuple[str, ...]]
 #: Sums of a few hundred rounded terms, and second differences of rows.
 CLOSE = 1e-9
-DURATION, STEP = 0.02, 2.5e-3
+DURATION, STEP = 0.01, 1.25e-3
 STEP_OF_SLOPES = 0.01
 
 

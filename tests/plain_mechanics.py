@@ -264,7 +264,7 @@ class Case:
                 step = s + 1j * _STEP
                 return np.imag(self.rows(t + step, q + step * v)) / _STEP
 
-            d = 3e-4
+            d = 1e-4
             bias = (8 * (rate(d) - rate(-d)) - (rate(2 * d) - rate(-2 * d))) / (12 * d)
         for part in self.parts:
             if part.speeds is not None:

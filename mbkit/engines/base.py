@@ -452,8 +452,8 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         return ForwardDynamicsDerivatives(*self._derivatives("forward_dynamics_derivatives", q=q, v=v, tau=tau))
 
     def _derivatives(self, quantity: str, **arguments: ArrayLike) -> list[Array]:
-        if self.lacks_derivatives:
-            raise UnsupportedError(f"{self.engine} cannot give {quantity}: {self.lacks_derivatives}")
+        if reason := self.refuses.get(quantity, self.lacks_derivatives):
+            raise UnsupportedError(f"{self.engine} cannot give {quantity}: {reason}")
         out = self._evaluate(quantity, **arguments)
         return [out[..., k, :, :] for k in range(3)]
 
