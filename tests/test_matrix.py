@@ -695,6 +695,18 @@ def test_base_parameters_refuse_a_coupler_by_name() -> None:
             call()
 
 
+def test_derivatives_are_refused_with_every_part_at_once() -> None:
+    """Of forward dynamics also with what those of inverse dynamics carry."""
+    b = mb.ModelBuilder.of(example("point.spring"))
+    b.add_coupler("gear", "j0", "j1", ratio=0.5)
+    dyn = mb.dynamics(b.build(), "pinocchio")
+    zero = np.zeros(3)
+    with pytest.raises(UnsupportedError, match=r"spring 'x'.*coupler 'gear'"):
+        dyn.forward_dynamics_derivatives(zero, zero, zero)
+    with pytest.raises(UnsupportedError, match="spring 'x'"):
+        dyn.inverse_dynamics_derivatives(zero, zero, zero)
+
+
 @pytest.fixture
 def hook():
     yield register_kind("joints", "joint.hook", "joint {p.name!r} has a hook", at=lambda _, j: j.name == "j0")
