@@ -517,3 +517,22 @@ def test_the_truth_of_the_four_bar_has_the_accelerations_of_the_derivation():
         exact = np.array([a, second[0] * rate**2 + (first[0] - 1) * a, second[1] * rate**2 + first[1] * a], dtype=float)
         assert bare.opened(q[None])[0] < 1e-15
         assert np.abs(dyn.forward_dynamics(q, v, np.zeros(3)) - exact).max() < 1e-12 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize(
+    ("name", "q"),
+    [
+        ("four_bar", [-1.1, -2.1, -4.6]),
+        ("slider_crank", [1.6, 2.8, -0.2]),
+        ("five_bar", [-0.5, 1.9, 2.4, -1.7]),
+        ("planar_3rrr", [-0.1, 0.5, 0.7, -0.5, -4.2, 0.2, -0.1, -2.0, -1.7]),
+    ],
+)
+def test_a_projection_from_afar_is_a_foot_of_its_start(name: str, q: list[float]) -> None:
+    """M (x - q) stands on every motion at x; whole steps, and halves of them, go to and fro about it."""
+    dyn = mb.dynamics(getattr(mb.catalog, name)(), "lagrangian", compile=False)
+    x, _ = dyn.project(q, np.zeros(len(q)))
+    J = dyn.constraint_jacobian(x)
+    motions = np.linalg.svd(J)[2][len(J) :]
+    assert np.abs(dyn.constraint_residual(x)).max() < 1e-14
+    assert np.abs(motions @ dyn.mass_matrix(q) @ (x - q)).max() < 1e-11

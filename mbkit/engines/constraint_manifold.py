@@ -35,7 +35,8 @@ _ROUNDS: Final = 8
 #: Of the largest singular value of J, the smallest one at a singular pose: there v̇ from the equation of motion loses as
 #: many digits, eps/σ, as that of the pose itself is off, σ. So it is no `DEPENDENT`, where no digit is left.
 AT_POSE: Final = float(np.sqrt(_EPS))
-_MOST: Final = 60
+#: Steps of the search for a foot.
+_MOST: Final = 200
 _TWIN: Final = "_constrained_twin"
 
 
@@ -242,7 +243,7 @@ class Manifold:
         free, x, model = self._free(held), self.restored(q, held), self.dyn.model
         M = self._terms(q, v).M[np.ix_(free, free)]
         # Stationary: M (x - q) + Jᵀ μ = 0 with f(x) = 0.
-        last, step = np.inf, np.zeros(model.nv)
+        last, length, step = np.inf, 1.0, np.zeros(model.nv)
         for _ in range(_MOST):
             terms = self._terms(x, v)
             step[free] = under_rows(M, terms.held[:, free], M @ model.difference(x, q)[free], -terms.f)[0]
@@ -250,8 +251,9 @@ class Manifold:
             if size <= 1e-12 * (1 + float(np.linalg.norm(x))):
                 break
             # Where the constraints bend strongly, whole steps go to and fro about the foot.
-            x = self.restored(model.integrate(x, step if size < last else 0.5 * step), held)
-            last = min(last, size)
+            length = min(1.0, 1.1 * length) if size < last else 0.5 * length
+            x, last = model.integrate(x, length * step), size
+        x = self.restored(x, held)
         terms = self._terms(x, v)
         v = v + least_change(terms.M, terms.J, -terms.rate, held)
         if not held and (still := self.still_open(x, v)):
