@@ -63,12 +63,11 @@ def python_of(environment: Path) -> Path:
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
-def parsed(version: str) -> Version | None:
-    """Return a version that can be compared with others; None of a text that is no version."""
-    try:
-        return Version(version)
-    except InvalidVersion:
-        return None
+def is_version(text: str) -> bool:
+    """Return whether a text is a version."""
+    with contextlib.suppress(InvalidVersion):
+        return bool(Version(text))
+    return False
 
 
 def exists(distribution: str, version: str) -> bool:

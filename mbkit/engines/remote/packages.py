@@ -221,7 +221,7 @@ def engine(name: str, *, seconds: float | None = None) -> EngineVersion:
         )
     head, _, version = (part.strip() for part in name.partition("=="))
     require_known("engine with versions", PACKAGES, head)
-    if not (_VERSION.fullmatch(version) and environment.parsed(version)):
+    if not (_VERSION.fullmatch(version) and environment.is_version(version)):
         raise InputError(f"name: {form}, got {name!r}")
     limit = PACKAGES[head].limit if seconds is None else real("seconds", seconds, positive=True)
     return EngineVersion(head, version, limit)
