@@ -13,6 +13,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 import mbkit as mb
+from mbkit.errors import MbkitWarning
 from mbkit.model import Model
 
 ADAPTIVE = {"rtol": 1e-11, "atol": 1e-12}
@@ -310,6 +311,57 @@ def test_what_a_drive_lets_rest_goes_on_with_it() -> None:
         assert times["y stops"] == pytest.approx(2 + left / f, abs=1e-7)
         assert run.q[-1] == pytest.approx([1.0, back + on], abs=1e-7)
         assert (run.v[run.t > times["y stops"], 1] == 0).all()
+
+
+# Parallelograms, whose rows follow from each other, or are singular where all bars are in line
+
+
+def parallelogram(friction: tuple[float, ...], bar: float) -> Model:
+    """Return as many cranks as numbers of friction, of which that of the bar stands last."""
+    b = mb.ModelBuilder("parallelogram", gravity=(0, -9.81, 0))
+    b.add_body("bar", mass=1.0, com=(0.5, 0, 0), inertia=0.1 * np.ones(3))
+    for k, f in enumerate(friction):
+        x, name = 0.5 * k, f"crank{k}"
+        b.add_body(name, mass=1.0, com=(0.25, 0, 0), inertia=np.ones(3) / 48)
+        place = {"axis": (0, 0, 1), "translation": (x, 0, 0)}
+        b.add_joint(name, "continuous", parent="world", child=name, **place, friction=f)
+        if k:
+            ends = {"translation_a": (x, 0, 0), "translation_b": (0.5, 0, 0)}
+            b.add_loop(name, "point", body_a="bar", body_b=name, **ends)
+    place = {"axis": (0, 0, 1), "translation": (0.5, 0, 0)}
+    b.add_joint("bar", "continuous", parent="crank0", child="bar", **place, friction=bar)
+    return b.build()
+
+
+def turned(model: Model, angle: float) -> np.ndarray:
+    """Return the configuration in which all cranks are at an angle, as the bar does not turn."""
+    return np.array([-angle if j.name == "bar" else angle for j in model.joints])
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+@pytest.mark.parametrize(("method", "more"), [("dop853", ADAPTIVE), ("rk4", {"dt": 2e-3}), ("gauss4", {"dt": 5e-3})])
+def test_a_parallelogram_of_three_cranks_rests_where_next_to_no_force_is_needed(
+    engine: str, method: str, more: dict[str, float]
+) -> None:
+    model = parallelogram((0.5, 0.7, 0.9), 0.3)
+    dyn, crank = mb.dynamics(model, engine), model.velocity_names.index("crank0")
+    # The torque balances the weight on the way.
+    time = (0.5 + 0.7 + 0.9 + 0.3 + 9.81 * 1.25 * np.cos(1.5)) / 8
+    q, push = turned(model, 1.5), 8.0 * np.eye(4)[crank]
+    run = simulated(dyn, q, np.zeros(4), time + 0.02, method, torque=lambda t, *_: t * push, **more)
+    assert [e.t for e in run.events] == pytest.approx([time] * 4, rel=1e-11)
+    assert (run.q[run.t < time] == q).all()
+    hangs = simulated(dyn, turned(model, -np.pi / 2 + 1e-4), np.zeros(4), 0.05, method, **more)
+    assert (hangs.q == hangs.q[0]).all()
+
+
+@pytest.mark.parametrize("method", ["rk4", "gauss4"])
+def test_a_run_whose_first_step_fails_says_so(method: str) -> None:
+    dyn = mb.dynamics(parallelogram((0.5, 0.7, 0.9), 0.3), "lagrangian")
+    with pytest.warns(MbkitWarning, match="diverged"):
+        run = mb.simulate(dyn, turned(dyn.model, 0.3), np.zeros(4), 2e3, method, dt=1e3, torque=[30.0, 0, 0, 0])
+    assert run.stats.ended == "diverged"
+    assert run.t.tolist() == [0.0]
 
 
 # Two degrees of freedom

@@ -42,7 +42,7 @@ from mbkit.model.elements.references import called
 from mbkit.model.joint_types import cross3, dot3
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.manifold import closest_configuration, integrate, random_state
-from mbkit.model.parts import Coupler, Loop
+from mbkit.model.parts import RESTING, Coupler, Loop
 from mbkit.model.rolling import NO_SLIP_ROWS, Contact, contact, discs_of
 from mbkit.model.validation import sample_mass_matrix
 
@@ -258,7 +258,10 @@ def off_branch(J: Any, gamma: Any, a: Any, force: Any, M: Any) -> Any:
     """Return NaN where accelerations under a force break rows that are redundant where it moves, and else 0."""
     doubt, rest = 0.0, ca.mtimes(J, a) + gamma
     # What holds the mechanism still leaves the rounding of the free acceleration, in any direction.
-    size, rounding = ca.sumsqr(a), DEPENDENT**2 * ca.sumsqr(force) / ca.sumsqr(ca.diag(M))
+    # What rests accelerates by none of it.
+    masses = ca.diag(M) * (ca.diag(M) < RESTING)
+    masses = ca.fmax(ca.sumsqr(masses), float(np.finfo(float).tiny))
+    size, rounding = ca.sumsqr(a), DEPENDENT**2 * ca.sumsqr(force) / masses
     for i in range(J.shape[0]):
         slope = ca.sumsqr(J[i, :])
         most = OFF_BRANCH**2 * (slope * size + gamma[i] ** 2) + slope * rounding

@@ -403,7 +403,9 @@ class _Members:
 
 def _first(over: Any, limit: Indices) -> Indices:
     """Return before which place each row is over first, (m,), or its limit if that comes before."""
-    return np.asarray(np.where(over.any(axis=1), np.minimum(over.argmax(axis=1), limit), limit))
+    # A place behind the last, as a block whose first step fails has none.
+    ends = np.column_stack([over, np.full(len(over), True)])
+    return np.asarray(np.minimum(ends.argmax(axis=1), limit))
 
 
 def _of_each(force: Any) -> Callable[[float, Array, Array], Array]:
