@@ -12,10 +12,12 @@ from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
 import mbkit as mb
+from mbkit.engines.consistent.random_states import flowed, states_of
 from mbkit.engines.constraint_manifold import manifold_of, refuse_unreachable
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.lagrangian import from_model, systems
 from mbkit.model.loops import LOOP_KINDS
+from mbkit.model.manifold import random_state
 from mbkit.model.parts import Loop, Prescribed
 from tests.random_trees import off, random_tree
 from tests.scenes import chain
@@ -536,3 +538,27 @@ def test_a_projection_from_afar_is_a_foot_of_its_start(name: str, q: list[float]
     motions = np.linalg.svd(J)[2][len(J) :]
     assert np.abs(dyn.constraint_residual(x)).max() < 1e-14
     assert np.abs(motions @ dyn.mass_matrix(q) @ (x - q)).max() < 1e-11
+
+
+def test_a_random_state_hangs_little_on_its_draw(monkeypatch) -> None:
+    """So that rounding does not choose it; most draws are taken."""
+    model = mb.catalog.slider_crank()
+    manifold, rng, aside = (
+        states_of(model).manifold,
+        np.random.default_rng(0),
+        1e-8 * np.random.default_rng(1).standard_normal(3),
+    )
+    well, taken = 0.3 * manifold.apartness(manifold.equations.row_choice.closed), []
+    for _ in range(150):
+        q, v = random_state(model, rng)
+        if (state := flowed(manifold, q, v, well)) is not None:
+            taken.append((q, v, state[0]))
+    assert len(taken) > 120
+    monkeypatch.setattr("mbkit.engines.consistent.random_states._SLOPE", np.inf)
+    moved = [flowed(manifold, q + aside, v, 0.0)[0] - end for q, v, end in taken]
+    assert np.linalg.norm(moved, axis=1).max() < 1e3 * np.linalg.norm(aside)
+
+
+def test_random_states_of_many_loops_are_found_nearer_to_a_closed_one_and_are_not_all_there() -> None:
+    assert np.isfinite(mb.catalog.bricard().random_state(0, 2)[0]).all()
+    assert 0.2 < np.std(mb.catalog.four_bars(n=6).random_state(0, 12)[0], axis=0).mean() < 2.0

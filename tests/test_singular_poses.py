@@ -11,6 +11,7 @@ import warnings
 import mpmath as mp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import mbkit as mb
 from mbkit import catalog
@@ -472,3 +473,20 @@ def test_steps_of_a_tight_tolerance_do_not_shrink_with_the_way_to_a_pose(n, star
     assert run.stats.finished
     assert run.stats.steps < 200
     assert run.q[-1] == pytest.approx(parallel(dyn, motion(n, [1.0], *start)[0], 0.0)[0], abs=5e-12)
+
+
+def test_a_row_without_slope_at_the_pose_of_a_start_is_as_large_as_others() -> None:
+    """Its rate is rounding of π, and is none of its own slope: two bars of three, folded, swing as one of 2 kg."""
+    b = mb.ModelBuilder("in_line")
+    for k, parent in enumerate(("world", "bar0", "bar1")):
+        b.add_body(f"bar{k}", mass=1.0, com=(0.5, 0, 0), inertia=(0.01, 0.1, 0.1))
+        place = {"axis": (0, 1, 0), "translation": (float(k > 0), 0, 0)}
+        b.add_joint(f"hinge{k}", "revolute", parent=parent, child=f"bar{k}", **place)
+    b.add_loop("pin", "point", body_a="bar2", body_b="world", translation_a=(1, 0, 0), translation_b=(1, 0, 0))
+    dyn, v = mb.dynamics(b.build(), "lagrangian", compile=False), np.array([1.0, 0.0, -1.0])
+    q = np.array([0.0, math.pi, -math.pi])
+    run, _ = simulated(dyn, q, v, 0.02, "rk4", dt=1e-3)
+    # θ̈ = m g l / 2 cos θ / (I + m l²/4)
+    rate = 9.81 / 2 / 0.35
+    swung = solve_ivp(lambda _, y: [y[1], rate * math.cos(y[0])], (0, 0.02), [0.0, 1.0], rtol=1e-12, atol=1e-14)
+    assert run.q[-1] - q == pytest.approx(swung.y[0, -1] * v, abs=1e-9)
