@@ -242,6 +242,14 @@ def test_cranks_that_differ_by_little_do_not_move(engine: str, apart: float) -> 
     assert dyn.mobility(q).degrees_of_freedom == dyn.mobility().degrees_of_freedom == 0
 
 
+@pytest.mark.parametrize("apart", [1e-1, 1e-2])
+def test_an_iteration_whose_ends_do_not_agree_is_solved_otherwise(apart: float) -> None:
+    """Pivots of constraintDynamics are good here, and its answer lost as much as the square of the condition, 2e-11."""
+    dyn, q = mb.dynamics(cranks(apart), "pinocchio"), np.array([THETA, THETA, THETA + apart, -THETA])
+    assert dyn.constraint_solver == "constraintDynamics"
+    assert np.abs(dyn.forward_dynamics(q, np.zeros(4), [1.0, 0, 0, 0])).max() < 1e-14
+
+
 @pytest.mark.parametrize("apart", [1e-3, 1e-6, 1e-8])
 def test_forces_of_cranks_that_differ_by_little_lose_digits_with_the_condition(apart: float) -> None:
     model, q, still = cranks(apart), np.array([THETA, THETA, THETA + apart, -THETA]), np.zeros(4)
