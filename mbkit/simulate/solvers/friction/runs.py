@@ -107,6 +107,9 @@ def _adaptive(run: _Member) -> None:
         own, begun = phase, t
 
         def end(s: float, q: Array, v: Array, own: Phase = own, begun: float = begun, k: int = k) -> float:
+            if not np.isfinite([*q, *v]).all():
+                # The solver tells that there is no state.
+                return 1.0
             row = run.force(max(k, int(np.searchsorted(stops, s, side="left"))))
             out = float(run.friction.margins(own, s, q, v, row).min())
             return max(out, _EPS) if s == begun else out
