@@ -316,7 +316,8 @@ class Constrained:
         """Return the multipliers λ of all rows under the force τ, (m,) or (N, m).
 
         Where rows are redundant, λ is not unique: it is the one with the least norm, in N and N m. Jᵀ λ, which
-        `generalized_constraint_force` returns, is unique all the same.
+        `generalized_constraint_force` returns, is unique all the same. Joints that dry friction holds at rest beside
+        rows that let them move together alone share what they hold: neither is unique then, while the motion is.
 
         Examples
         --------
