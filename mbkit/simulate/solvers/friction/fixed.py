@@ -124,7 +124,7 @@ class _Members:
         rows = np.arange(len(self.k))
         self._sample(rows)
         self._phase = self.begin(rows, self.times(np.full(len(rows), grid.start)))
-        self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._compiled(self._phase.dyn) else 0)
+        self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._steps_compiled(self._phase.dyn) else 0)
         self._window, parts = self._shortest, len(self.problem.q) // len(self.k)
         while self.error is None and self._going.any():
             self._block()
@@ -266,8 +266,10 @@ class _Members:
     def _compiled(self, dyn: Dynamics) -> bool:
         """Return whether the margins of states are machine code with the steps."""
         # Beside constraints, forces at rest are shared by what rests together.
+        return self._steps_compiled(dyn) and not dyn.model.constrained
+
+    def _steps_compiled(self, dyn: Dynamics) -> bool:
         known = dyn.derived and method_of(self.problem.method).explicit and not self.problem.torque.callable
-        known = known and not dyn.model.constrained
         return known and getattr(dyn, "compiles_steps", False) and getattr(dyn, "device", None) is None
 
     @cached_property
