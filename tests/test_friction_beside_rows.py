@@ -583,3 +583,12 @@ def test_a_joint_that_turns_at_a_singular_pose_ends_a_run_by_name_or_passes_with
     with warnings.catch_warnings(action="ignore"):
         run = mb.simulate(dyn, q, v, 0.6, "rk853", rtol=1e-10)
     assert "singular pose" in "".join((run.stats.message, *run.stats.doubts))
+
+
+@pytest.mark.parametrize("method", ["rk853", "rk4"])
+def test_rods_that_only_shift_are_in_no_event(method: str) -> None:
+    """Two of these pins do not turn, but for rounding."""
+    dyn, q, v = rubbing("four_bars", 2)
+    more = ADAPTIVE if method == "rk853" else {"dt": 2e-3}
+    for run in (simulated(dyn, q, v, 1.0, method, **more), simulated(dyn, [q, q], [v, v], 1.0, "rk4", dt=2e-3)):
+        assert {e.name for e in run.events} == {f"{x} turns" for x in ("theta0", "theta1", "phi1")}

@@ -121,9 +121,11 @@ class _Members:
         self._record = record
         if not grid.steps or not len(self.k):
             return
-        rows = np.arange(len(self.k))
+        rows, start = np.arange(len(self.k)), self.times(np.full(len(self.k), grid.start))
         self._sample(rows)
-        self._phase = self.begin(rows, self.times(np.full(len(rows), grid.start)))
+        dyn = self.friction.dyn.of_samples(self.members) if self.side_by_side else self.friction.dyn
+        self.v = self.friction.stopped(dyn, start, self.q, self.v, self.v == 0)
+        self._phase = self.begin(rows, start)
         self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._steps_compiled(self._phase.dyn) else 0)
         self._window, parts = self._shortest, len(self.problem.q) // len(self.k)
         while self.error is None and self._going.any():

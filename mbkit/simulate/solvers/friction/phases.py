@@ -59,7 +59,7 @@ class Friction:
         self._bound = dyn.model.constrained
         if self._bound and dyn.soft_constraints:
             BESIDE_SOFT_ROWS.admit(dyn.model)
-        self._dyn, self._own, self._side_by_side = dyn, dyn._friction, side_by_side
+        self.dyn, self._own, self._side_by_side = dyn, dyn._friction, side_by_side
         self._names = dyn.model.velocity_names
         #: Velocities with friction.
         self.which = self._own.law.which
@@ -84,7 +84,7 @@ class Friction:
         `leaving` has the signs of velocities that are about to be.
         """
         tau = applied(force, t, q, v)
-        rubbed = self._dyn if members is None else self._dyn.of_samples(members)
+        rubbed = self.dyn if members is None else self.dyn.of_samples(members)
         resting, signs = self._own.law_of(rubbed).at_rest(v), np.sign(v)
         held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
         if resting.any():
@@ -127,14 +127,14 @@ class Friction:
 
     def places(self, still: Mask) -> Mask:
         """Return which coordinates keep their place, (..., nq)."""
-        rests = np.zeros((*still.shape[:-1], self._dyn.model.nq), dtype=bool)
+        rests = np.zeros((*still.shape[:-1], self.dyn.model.nq), dtype=bool)
         rests[..., self._places] = still[..., self.which]
         return rests
 
     def onto_rows(self, t: float, still: Mask, start: Array, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the consistent state beside one in which joints rest that were there at the `start`."""
-        locked = independent(self._directions(self._dyn, t, q), still)
-        rests = self._own.phase(self._dyn, np.zeros(v.shape), locked)
+        locked = independent(self._directions(self.dyn, t, q), still)
+        rests = self._own.phase(self.dyn, np.zeros(v.shape), locked)
         return self.held(still, start, *settled(rests, t, q, v))
 
     def margins(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
@@ -200,12 +200,18 @@ class Friction:
         lets_go = ended & phase.still
         out, leaving = np.where(phase.still | ended, 0.0, v), np.zeros(v.shape)
         if self._bound:
-            rests, rubs = phase.still | ended, np.isin(np.arange(v.shape[-1]), self.which)
-            states = _rows(self._directions(phase.rubbed, t, q), 2), _rows(v), _rows(rests)
-            out = np.array([stopped(*state, rubs) for state in zip(*states, strict=True)]).reshape(v.shape)
+            out = self.stopped(phase.rubbed, t, q, v, phase.still | ended)
         if lets_go.any():
             leaving = np.where(lets_go, -np.sign(self.holding(phase, t, q, v, force)), 0.0)
         return out, leaving
+
+    def stopped(self, dyn: Dynamics, t: float | Array, q: Array, v: Array, rests: Mask) -> Array:
+        """Return velocities of which some have come to rest, and with them those that constraints let rest too."""
+        if not self._bound:
+            return v
+        rubs = np.isin(np.arange(v.shape[-1]), self.which)
+        states = _rows(self._directions(dyn, t, q), 2), _rows(v), _rows(rests)
+        return np.array([stopped(*state, rubs) for state in zip(*states, strict=True)]).reshape(v.shape)
 
     def changes(self, before: Phase, after: Phase) -> list[tuple[int, str]]:
         """Return which trajectory's velocity stops, lets go or turns from one phase to the next, in words."""

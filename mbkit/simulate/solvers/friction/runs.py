@@ -102,6 +102,7 @@ def _adaptive(run: _Member) -> None:
     noise = max(1e-9, problem.tolerances.rtol)
     if rows is None or (len(rows) and rows[0] == t):
         record.keep(np.array([t]), run.q[None], run.v[None])
+    run.v = run.friction.stopped(run.friction.dyn, t, run.q, run.v, run.v == 0)
     phase: Phase | None = run.begin(0, t) if problem.duration else None
     while phase is not None and t < problem.end:
         own, begun = phase, t
