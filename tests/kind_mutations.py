@@ -24,6 +24,7 @@ from tests import kind_paths
 from tests.kind_examples import EXAMPLES, TYPES, Example
 from tests.kind_examples import example as known
 from tests.kind_paths import COLUMNS, told
+from tests.plain_mechanics import LOOPS
 
 ENGINES = ("lagrangian", "pinocchio", "mujoco", "drake", "oracle")
 #: Effects, or kinds, that a column's quantity depends on; all but limits, which are data, where it is not named.
@@ -36,9 +37,14 @@ SEES: dict[str, frozenset[str]] = {
     **dict.fromkeys(("impact", "operational space"), frozenset({"T", "row", "speed"})),
     # "without" takes the part out itself.
     **dict.fromkeys(("picture", "lint", "without"), frozenset()),
+    # A motion is found without forces, and losses and rotors are what is sought.
+    "excitation": frozenset(),
+    "identification": EVERY - {"loss", "jump", "T"},
     # What its rows push at rest is nothing in examples without weight.
     "equilibrium": frozenset({"V", "force"}),
     "mobility": frozenset({"row", "speed"}),
+    # Its motion is given: what acts at joints is in it already.
+    "load of the last joint": frozenset({"gravity", "point.spring", "point.damper"}.union(f"loop.{x}" for x in LOOPS)),
     # Joints beyond the first rest, and nothing accelerates.
     "steady motion": frozenset({"V", "force"}),
     # What is linear in motion has none.
