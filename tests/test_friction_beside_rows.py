@@ -15,7 +15,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 import mbkit as mb
-from mbkit.errors import MbkitWarning
+from mbkit.errors import DoubtfulRunWarning, MbkitWarning
 from mbkit.model import Model
 
 ADAPTIVE = {"rtol": 1e-11, "atol": 1e-12}
@@ -355,6 +355,24 @@ def test_a_parallelogram_of_three_cranks_rests_where_next_to_no_force_is_needed(
     assert (run.q[run.t < time] == q).all()
     hangs = simulated(dyn, turned(model, -np.pi / 2 + 1e-4), np.zeros(4), 0.05, method, **more)
     assert (hangs.q == hangs.q[0]).all()
+
+
+@pytest.mark.parametrize(("method", "friction"), [("rk853", 0.0), ("rk853", 0.3), ("auto", 0.3)])
+def test_states_within_a_step_across_a_singular_pose_are_those_of_the_motion(method: str, friction: float) -> None:
+    """As machine code, whose steps go across the pose."""
+    dyn = mb.dynamics(parallelogram((friction,) * 3, friction), "lagrangian", compile=True)
+    q, slope = turned(dyn.model, 0.5), turned(dyn.model, 1.0)
+    with pytest.warns(DoubtfulRunWarning, match="passed a singular pose"):
+        run = simulated(dyn, q, -2.0 * slope, 0.7, method, save=np.linspace(0, 0.7, 401), rtol=1e-9, atol=1e-11)
+
+    def speed(angle: Any) -> Any:
+        taken = 9.81 * 1.25 * (np.sin(0.5) - np.sin(angle)) - 4 * friction * (0.5 - angle)
+        return np.sqrt(4.0 + taken / 0.25)
+
+    crank = dyn.model.velocity_names.index("crank0")
+    assert len(run.t) == 401
+    assert run.v[:, crank] == pytest.approx(-speed(run.q[:, crank]), rel=1e-7)
+    assert quad(lambda x: 1 / speed(x), run.q[-1, crank], 0.5)[0] == pytest.approx(0.7, rel=1e-7)
 
 
 @pytest.mark.parametrize("method", ["rk4", "gauss4"])

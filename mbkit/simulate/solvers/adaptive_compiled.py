@@ -298,5 +298,15 @@ class CompiledAttempts:
         self._evaluations += self._stages * count
         after = done.transpose(0, 2, 1).reshape(len(pick), -1)[:count]
         # One that failed stayed at its start, and is no state at that time.
-        after[~(after[:, self._row["error"]] < 1)] = np.nan
-        return after[:, self._at["q"]], after[:, self._at["w"]]
+        failed = np.flatnonzero(~(after[:, self._row["error"]] < 1))
+        after[failed] = np.nan
+        q, w = after[:, self._at["q"]], after[:, self._at["w"]]
+        # A step across a singular pose is good, and yet a shorter one may have stages too near to it.
+        for i in failed if self._dyn.projects else ():
+            own = RungeKuttaAttempts(self._problem, self._space, self._of_place[place])
+            begin = start.rows(np.array([i]))
+            own.start([self._which[place]], begin.q, begin.w, float(begin.t[0]), _HUGE)
+            own.hold(self._k, self._stop)
+            q[i], w[i] = (x[0] for x in own.within(0, begin, times[i, None]))
+            self._taken.append(own)
+        return q, w
