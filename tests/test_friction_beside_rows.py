@@ -282,6 +282,30 @@ def test_a_block_on_a_shaken_table_sticks_and_slides(
         assert (run.v[rests, 1] == 0).all()
 
 
+@pytest.mark.parametrize("method", ["rk853", "rk4"])
+def test_a_drive_that_leaves_no_freedom_turns_the_pins_with_it(method: str) -> None:
+    """The pose and the speed are those of the crank's angle, 1.2 + ½ sin 3t, which turns at π/6 s."""
+    b = mb.ModelBuilder.of(slider_crank(0.0, 0.3, 3.0))
+    b.prescribe("crank", offset=1.2, amplitude=0.5, frequency=3.0)
+    dyn = mb.dynamics(b.build(), "lagrangian")
+
+    def at(t: float) -> tuple[np.ndarray, np.ndarray]:
+        q, slope = crank_pose(1.2 + 0.5 * np.sin(3 * t))
+        return q, 1.5 * np.cos(3 * t) * slope
+
+    more = {"dt": 0.01} if method == "rk4" else ADAPTIVE
+    for states in (at(0.0), tuple(np.tile(x, (2, 1)) for x in at(0.0))):
+        grid = {"save": np.array([0.0, 0.7])} if method == "rk853" and states[0].ndim == 2 else {}
+        run = simulated(dyn, *states, 0.7, method, **more, **grid)
+        assert {*names(run)} == {"rod turns", "slider turns"}
+        assert [e.t for e in run.events] == pytest.approx([np.pi / 6] * len(run.events), abs=1e-9)
+        for end, value in zip((run.q[..., -1, :], run.v[..., -1, :]), at(0.7), strict=True):
+            assert np.abs(end - value).max() < 1e-9
+    q, v = dyn.at(t=0.5).step(*at(0.5), np.zeros(3), 0.05, method="rk4", t=0.5)
+    assert np.abs(q - at(0.55)[0]).max() < 1e-9
+    assert np.abs(v - at(0.55)[1]).max() < 1e-9
+
+
 def test_what_has_no_friction_is_in_no_event() -> None:
     run = simulated(mb.dynamics(shaken(of_table=0.0), "lagrangian"), [0.0, 0.0], [1.5, 0.0], 2.0, "rk853", **ADAPTIVE)
     assert names(run) == ["y lets go", "y turns"]

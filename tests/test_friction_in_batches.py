@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import mbkit as mb
 from mbkit.errors import InputError, MbkitWarning, ModelError
@@ -228,3 +230,40 @@ def test_variants_of_friction_slide_as_in_the_closed_form() -> None:
     drawn = np.array(many.values["x.friction"])
     assert np.ptp(drawn) > 0.1
     np.testing.assert_allclose(run.q[:, -1, 0], 3.0 - drawn / 2, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(("method", "compiled", "most"), [
+    ("rk853", False, 1e-8), ("rk853", True, 1e-8), ("rk4", False, 1e-6), ("rk4", True, 1e-6), ("moreau", True, 2e-2),
+])  # fmt: skip
+def test_a_joint_whose_friction_is_zero_in_a_member_has_no_phases_there(
+    method: str, compiled: bool, most: float
+) -> None:
+    """A pendulum with a parameter as friction by SciPy's integrator, a block that slides 0.412 s, and one at rest."""
+    b = mb.ModelBuilder("beside", gravity=(0, -9.81, 0))
+    b.add_body("a", mass=1.0, com=(0.5, 0, 0), inertia=0.1 * np.ones(3))
+    b.add_joint("a", "continuous", parent="world", child="a", axis=(0, 0, 1), friction=mb.Parameter("f", 1.0))
+    for name in "xy":
+        b.add_body(name, mass=2.0)
+        b.add_joint(name, "prismatic", parent="world", child=name, axis=(1, 0, 0), friction=3.0)
+    dyn = mb.dynamics(b.build(), "lagrangian", compile=compiled)
+
+    def swung(t: float, f: float) -> np.ndarray:
+        """Return the pendulum's state before it turns."""
+        tight: Any = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}
+        run = solve_ivp(lambda _, y: [y[1], (f - 9.81 / 2 * np.cos(y[0])) / 0.35], (0, t), [0.3, 0.0], **tight)
+        return np.asarray(run.y[:, -1])
+
+    # Without friction it swings from 0.3 to -π - 0.3 and back.
+    period = 2 * brentq(lambda t: swung(t, 0.0)[1], 0.6, 1.6, xtol=1e-13)
+    more = {"dt": 5e-3} if method in ("rk4", "moreau") else {"save": np.array([0.0, 0.5, period])}
+    q, v = np.tile([0.3, 0.0, 0.0], (3, 1)), np.tile([0.0, 0.618, 0.0], (3, 1))
+    run = mb.simulate(dyn.at(f=np.array([0.0, 0.8, 0.0])), q, v, period, method, doubt=False, **more)
+    after = np.array([run.q[i, np.argmin(np.abs(run.t - 0.5)), 0] for i in range(3)])
+    assert after == pytest.approx([swung(0.5, f)[0] for f in (0.0, 0.8, 0.0)], abs=most)
+    alone = mb.simulate(dyn.at(f=0.0), q[0], v[0], period, method, doubt=False, **more)
+    for end in (run.q[0, -1], run.q[2, -1], alone.q[-1]):
+        assert end == pytest.approx([0.3, 0.618**2 / 3, 0.0], abs=most)
+    for events in (alone.events, *([e for e in run.events if e.member == i] for i in (0, 2))):
+        # Moreau's step has no events.
+        assert [e.name for e in events] == ["x stops"] * (method != "moreau")
+        assert [e.t for e in events] == pytest.approx([0.412] * len(events), abs=most)

@@ -24,9 +24,9 @@ def holding(equations: Equations, q: Any, v: Any, a: Any, force: Any, parameters
 def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str], locks: Sequence[str]) -> Part:
     """Return the part behind a step that tells how far its end is from that of its phase, ``margin1``.
 
-    It is the least of the velocities `which`: the speed of one that slides, and of one that rests the part of its bound
-    that is left; negative beyond. `sides` and `locks` are the parameters of their sides and of rotors at rest. The
-    part reads the largest forces at rest, ``bound``.
+    It is the least of the velocities `which`: the speed of one that slides, of one that rests the part of its bound
+    that is left, and 1 of one without a side; negative beyond. `sides` and `locks` are the parameters of their sides
+    and of rotors at rest. The part reads the largest forces at rest, ``bound``.
     """
     model, space, names = equations.model, SymbolicSpace(equations.model), list(equations.model.parameters)
     place, time = {name: i for i, name in enumerate(names)}, model.time_parameter
@@ -43,7 +43,8 @@ def phase_margin(equations: Equations, which: Sequence[int], sides: Sequence[str
         a = moves * equations.function("forward_dynamics")(q, v, tau, ca.vertcat(*values))
         loose = [0.0 if name in {*locks} else x for name, x in zip(names, values, strict=True)]
         needed = ca.mtimes(pick, holding(equations, q, v, a, tau, ca.vertcat(*loose)))
-        margins = choose(still, 1 + ROUNDING - ca.fabs(needed) / bound, side * ca.mtimes(pick, v))
+        slides = 1 - ca.fabs(side) + side * ca.mtimes(pick, v)
+        margins = choose(still, 1 + ROUNDING - ca.fabs(needed) / bound, slides)
         arguments = {"q1": q, "w1": w, "tau": tau, "dt": dt, "bound": bound, "parameters": given}
         return function_of("phase_margin", arguments, {"margin1": reduce(ca.fmin, ca.vertsplit(margins))})
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -85,7 +86,9 @@ class Friction:
         """
         tau = applied(force, t, q, v)
         rubbed = self.dyn if members is None else self.dyn.of_samples(members)
-        resting, signs = self._own.law_of(rubbed).at_rest(v), np.sign(v)
+        law = self._own.law_of(rubbed)
+        # A velocity whose friction is zero in these dynamics has no side, and so no phase.
+        resting, signs = law.at_rest(v), np.where(law.bound > 0, np.sign(v), 0.0)
         held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
         if resting.any():
             rows: Any = np.flatnonzero(resting.any(axis=1)) if self._side_by_side else ...
@@ -140,9 +143,10 @@ class Friction:
     def margins(self, phase: Phase, t: float | Array, q: Array, v: Array, force: Force) -> Array:
         """Return how far each velocity with friction is from the end of its phase, negative beyond; (k,) or (N, k).
 
-        Of one that slides it is the speed, of one that rests the part of its bound that is left.
+        Of one that slides it is the speed, of one that rests the part of its bound that is left, and 1 without a side.
         """
-        out, still = (phase.sides * v)[..., self.which], phase.still[..., self.which]
+        out = np.where(phase.sides == 0, 1.0, phase.sides * v)[..., self.which]
+        still = phase.still[..., self.which]
         if still.any():
             held = np.where(phase.still, 0.0, v)
             used = np.abs(self.holding(phase, t, q, held, force)[..., self.which]) / self.bounds(phase)
@@ -209,9 +213,9 @@ class Friction:
         """Return velocities of which some have come to rest, and with them those that constraints let rest too."""
         if not self._bound:
             return v
-        rubs = np.isin(np.arange(v.shape[-1]), self.which)
-        states = _rows(self._directions(dyn, t, q), 2), _rows(v), _rows(rests)
-        return np.array([stopped(*state, rubs) for state in zip(*states, strict=True)]).reshape(v.shape)
+        rubs = np.broadcast_to(self._own.law_of(dyn).bound > 0, v.shape)
+        states = _rows(self._directions(dyn, t, q), 2), *map(_rows, (v, rests, rubs))
+        return np.array([stopped(*state) for state in zip(*states, strict=True)]).reshape(v.shape)
 
     def changes(self, before: Phase, after: Phase) -> list[tuple[int, str]]:
         """Return which trajectory's velocity stops, lets go or turns from one phase to the next, in words."""
@@ -239,4 +243,6 @@ def applied(force: Force, t: float | Array, q: Array, v: Array) -> Array:
 
 def _rows(x: Any, axes: int = 1) -> Any:
     """Return numbers of one state or of several as those of several."""
-    return x.reshape(-1, *x.shape[x.ndim - axes :])
+    lead = x.ndim - axes
+    # Without freedom there are no directions, and their number tells nothing of the states'.
+    return x.reshape(math.prod(x.shape[:lead]), *x.shape[lead:])
