@@ -186,6 +186,24 @@ def test_batches_events_and_held_torques() -> None:
     assert ends[0] == pytest.approx(ends[1], abs=1e-10)
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_clock_s_start_changes_no_step(compiled: bool) -> None:
+    """A four-bar does not know the time: its steps are the same from every start, compiled or not."""
+    b = ModelBuilder("four_bar", gravity=(0, -9.81, 0))
+    for name, parent, x, length in (("a", "world", 0.0, 0.3), ("b", "a", 0.3, 0.9), ("c", "world", 1.0, 0.7)):
+        b.add_body(name, mass=2 * length, com=(length / 2, 0, 0), inertia=length**3 / 6 * np.ones(3))
+        b.add_joint(name, "continuous", parent=parent, child=name, axis=(0, 0, 1), translation=(x, 0, 0))
+    b.add_loop("pin", "point", body_a="b", body_b="c", translation_a=(0.9, 0, 0), translation_b=(0.7, 0, 0))
+    dyn = dynamics(b.build(), "lagrangian", compile=compiled)
+    q, v = dyn.project([1.2, -0.6, 1.5], [8.0, 0, 0])
+    first = simulate(dynamics(dyn.model, "lagrangian", compile=False), q, v, 0.1, "rodas5")
+    for start in (0.5, 0.8, 3.0, 64.0):
+        run = simulate(dyn, q, v, 0.1, "rodas5", t0=start)
+        assert run.stats.ended == "finished"
+        assert run.t - start == pytest.approx(first.t, rel=1e-5, abs=1e-12)
+        assert run.q[-1] == pytest.approx(first.q[-1], abs=1e-9)
+
+
 def test_what_overflows_is_told() -> None:
     box = catalog.free_body()
     for engine in ("lagrangian", "pinocchio"):

@@ -124,7 +124,9 @@ class CompiledAttempts:
         self._which = [*which, *[which[-1]] * (self.width - len(which))]
         self._places = len(which)
         pick = np.minimum(np.arange(self.width), self._places - 1)
-        self._outer.state[:] = self._state(self.width, q[pick], w[pick], t=t, most=MAX_GROWTH, last=FIRST_ROOT, h=h)
+        # Up to `hold` an attempt has no length.
+        known = {"t": t, "end": t, "most": MAX_GROWTH, "last": FIRST_ROOT, "h": h}
+        self._outer.state[:] = self._state(self.width, q[pick], w[pick], **known)
         self._set_parameters(self._outer, self._which)
         self._active = np.zeros(self.width, dtype=bool)
         self._dropped = np.zeros(self.width, dtype=bool)
