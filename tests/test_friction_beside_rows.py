@@ -413,19 +413,34 @@ def test_a_run_whose_first_step_fails_says_so(method: str) -> None:
 FIVE = np.array([1.0, 0.7, 0.4, 0.8, 0.5])
 
 
-def five_bar(stiction: float) -> Model:
-    b = mb.ModelBuilder("five_bar", gravity=(0, -3.0, 0))
+def five_bar(stiction: float, friction: np.ndarray = FIVE, gravity: float = 3.0) -> Model:
+    b = mb.ModelBuilder("five_bar", gravity=(0, -gravity, 0))
     for (name, parent, x, length), f in zip(
         (("a", "world", 0.0, 0.4), ("b", "a", 0.4, 0.6), ("c", "world", 0.5, 0.4), ("d", "c", 0.4, 0.6)),
-        FIVE,
+        friction,
         strict=False,
     ):
         rod(b, name, parent, x, length, friction=f, stiction=stiction * f)
     b.add_body("tip", mass=0.1, inertia=1e-3 * np.ones(3))
-    pin = {"axis": (0, 0, 1), "translation": (0.6, 0, 0), "friction": FIVE[4], "stiction": stiction * FIVE[4]}
+    pin = {"axis": (0, 0, 1), "translation": (0.6, 0, 0), "friction": friction[4], "stiction": stiction * friction[4]}
     b.add_joint("e", "continuous", parent="b", child="tip", **pin)
     b.add_loop("pin", "frame", body_a="tip", body_b="d", translation_b=(0.6, 0, 0))
     return b.build()
+
+
+def five_pins(q: np.ndarray) -> np.ndarray:
+    """Return velocities of the pins by two numbers, the freedoms that the loop leaves the absolute angles of rods."""
+    a, b, c, d = q[0], q[0] + q[1], q[2], q[2] + q[3]
+    ends = [[-0.4 * np.sin(a), -0.6 * np.sin(b), 0.4 * np.sin(c), 0.6 * np.sin(d)]]
+    ends += [[0.4 * np.cos(a), 0.6 * np.cos(b), -0.4 * np.cos(c), -0.6 * np.cos(d)]]
+    turns = np.linalg.svd(np.array(ends))[2][2:].T
+    return np.array([[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 1], [0, -1, 0, 1]]) @ turns
+
+
+def part_of_bounds(pins: np.ndarray, bounds: np.ndarray, needed: np.ndarray) -> float:
+    """Return the largest part of a bound that is used at least: forces within bounds fill a polygon of known edges."""
+    normals = [np.array([-row[1], row[0]]) for row in pins]
+    return max(abs(n @ needed) / (bounds @ np.abs(pins @ n)) for n in normals)
 
 
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
@@ -435,18 +450,12 @@ def test_a_five_bar_lets_go_where_no_share_of_its_pins_is_within_their_bounds(en
     dyn = mb.dynamics(five_bar(stiction), engine)
     bare = mb.dynamics(five_bar(stiction).without("friction"), "lagrangian")
     q, none = bare.project([1.9, -1.0, 1.1, 1.0, 0.0], np.zeros(5))
-    # Velocities of the pins by the absolute angles of the rods, of which the loop leaves two.
-    a, b, c, d = q[0], q[0] + q[1], q[2], q[2] + q[3]
-    ends = [[-0.4 * np.sin(a), -0.6 * np.sin(b), 0.4 * np.sin(c), 0.6 * np.sin(d)]]
-    ends += [[0.4 * np.cos(a), 0.6 * np.cos(b), -0.4 * np.cos(c), -0.6 * np.cos(d)]]
-    turns = np.linalg.svd(np.array(ends))[2][2:].T
-    pins = np.array([[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 1, 0], [0, 0, -1, 1], [0, -1, 0, 1]]) @ turns
+    pins = five_pins(q)
     weight, push = pins.T @ bare.nle(q, none), pins.T @ pull
     bounds = stiction * FIVE
 
     def used(t: float) -> float:
-        normals = [np.array([-row[1], row[0]]) for row in pins]
-        return max(abs(n @ (t * push - weight)) / (bounds @ np.abs(pins @ n)) for n in normals)
+        return part_of_bounds(pins, bounds, t * push - weight)
 
     assert used(0.0) < 1
     time = brentq(lambda t: used(t) - 1, 0.0, 60.0, xtol=1e-14)
@@ -459,6 +468,22 @@ def test_a_five_bar_lets_go_where_no_share_of_its_pins_is_within_their_bounds(en
         assert (run.v[rests] == 0).all()
         assert np.abs(run.v[-1]).max() > 1e-4
         assert np.abs(dyn.constraint_residual(run.q[-1])).max() < 1e-12
+
+
+@pytest.mark.parametrize("friction", [1e-10 * FIVE, np.array([1e-9, 1, 1, 1e-9, 1]), np.array([1, 1e-14, 1, 1, 1])])
+@pytest.mark.parametrize(("method", "more"), [("dop853", ADAPTIVE), ("rk4", {"dt": 0.01})])
+def test_a_five_bar_lets_go_as_its_bounds_say_whatever_their_sizes(
+    friction: np.ndarray, method: str, more: dict[str, float]
+) -> None:
+    dyn, scale = mb.dynamics(five_bar(1.0, friction, gravity=0.0), "lagrangian"), friction.max()
+    q, none = dyn.project([1.9, -1.0, 1.1, 1.0, 0.0], np.zeros(5))
+    pull = scale * np.array([1.0, 0.3, -0.5, 0.2, 0.0])
+    pins = five_pins(q)
+    time = 1 / part_of_bounds(pins, friction, pins.T @ pull)
+    run = simulated(dyn, q, none, time + 0.05, method, torque=lambda t, *_: t * pull, **more)
+    assert run.events[0].t == pytest.approx(time, rel=1e-11)
+    assert {(e.name.split(maxsplit=1)[1], e.t) for e in run.events} == {("lets go", run.events[0].t)}
+    assert np.abs(run.v[-1]).max() > 0
 
 
 # Stribeck's curve in the crank of a four-bar, to 34 digits

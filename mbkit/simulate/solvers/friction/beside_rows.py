@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from mbkit._check import Array
 from mbkit._reproducible import pivoted
 from mbkit.engines.elements.dry_friction import Mask
+from mbkit.errors import NumericalError
 
 #: Entries of N, and parts of them, that are rounding of a pose.
 _ROUNDED: Final = 1e-9
@@ -78,12 +79,19 @@ def shares(N: Array, needed: Array, bound: Array, still: Mask, locked: Mask) -> 
 def _least(G: Array, needed: Array) -> Array:
     """Return the x with Gᵀ x = needed whose largest entry is least, (n,)."""
     n, d = G.shape
-    size = float(np.abs(needed).max())
+    size, largest = float(np.abs(needed).max()), float(np.abs(G).max())
     if size == 0:
         return np.zeros(n)
     box = np.block([[np.eye(n), -np.ones((n, 1))], [-np.eye(n), -np.ones((n, 1))]])
     exact = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
-    rows = np.column_stack([G.T, np.zeros(d)])
-    found = linprog(np.eye(n + 1)[n], box, np.zeros(2 * n), rows, needed / size, (None, None), options=exact).x * size
-    x, most = found[:n], found[n]
+    rows = np.column_stack([G.T / largest, np.zeros(d)])
+    found = linprog(np.eye(n + 1)[n], box, np.zeros(2 * n), rows, needed / size, (None, None), options=exact)
+    if found.x is None:
+        raise NumericalError(f"dry friction: what holds {n} joints at rest, of bounds that differ much, is not known")
+    # The dual is the motion in which they let go. It tells how each of them moves, however small its bound is.
+    x, y = found.x[:n] * (size / largest), found.eqlin.marginals
+    moves = G @ y
+    turns = np.abs(moves) > _ROUNDED * np.linalg.norm(G, axis=1) * np.linalg.norm(y)
+    most = (needed @ y) / np.abs(moves).sum()
+    x = np.where(turns, np.copysign(most, moves), x)
     return np.asarray(np.where(np.abs(x) < (1 - _ROUNDED) * most, x, np.copysign(most, x)))
