@@ -44,6 +44,20 @@ def test_the_way_back_and_forth_counts_between_saved_states_too(save: Any) -> No
     assert np.abs(run.power_balance()).max() < 1e-8
 
 
+@pytest.mark.parametrize("batch", [False, True])
+def test_nothing_does_work_on_what_rests_before_it_lets_go(batch: bool) -> None:
+    """A ramp of 3 N/s lets go at 5/3 s; from there on the torque gives the kinetic energy and what friction takes."""
+    dyn = mb.dynamics(block(friction=3.0, stiction=5.0).build(), "lagrangian")
+    start = np.zeros((2, 1) if batch else 1)
+    # Times that are not even, with that of the change among them.
+    save = {"save": np.array([0.0, 0.1, 0.2, 1.2, 5 / 3, 5 / 3 + 1e-4, 1.8, 1.9, 2.0])} if batch else {}
+    run = mb.simulate(dyn, start, start, 2.0, "rk853", torque=lambda t, q, v: np.array([3 * t]), **save)  # noqa: ARG005
+    go, work = 5 / 3, run.work()
+    assert np.all(work[..., run.t < go + 1e-9] == pytest.approx(0.0, abs=1e-13))
+    speed = (1.5 * (4 - go**2) - 3 * (2 - go)) / 2
+    assert work[..., -1] == pytest.approx(speed**2, abs=1e-9 if batch else 1e-12)
+
+
 def conveyed(engine: str, h: float) -> Trajectory:
     b = mb.ModelBuilder("skate", gravity=(0, 0, 0))
     b.add_body("skate", mass=1.0, inertia=(0.1, 0.1, 0.1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -166,7 +167,7 @@ class RunData:
             if isinstance(force, SampledTorque):
                 whole = _generalized(dyn, q, force.values, self._acting)
                 lost = along(dyn, (), _lost_power, q, v, whole) + np.sum(whole * v, axis=-1)
-                steps = _by_cubics(t, lost)
+                steps = self._by_phases(dyn, lost)
             else:
                 held = np.zeros(self._numbers) if force is None else force.between(t)
                 steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
@@ -175,6 +176,21 @@ class RunData:
         out = np.zeros(q.shape[:-1])
         np.cumsum(steps, axis=-1, out=out[..., 1:])
         return out
+
+    def _by_phases(self, dyn: Dynamics, power: Array) -> Array:
+        """Return the integral of a power over each interval; no cubic goes across the end of a phase."""
+        if "jump" not in self.model.effects or dyn.soft_friction or not self.events:
+            return _by_cubics(self.t, power)
+        rows = power.reshape(-1, len(self.t))
+        out, which = np.zeros((len(rows), len(self.t) - 1)), dyn._friction.law.which
+        for i, row in enumerate(rows):
+            # Phases end where a velocity with friction is zero; other events part nothing.
+            ends = [x.t for x in self.events if x.member in (None, i) and (x.v[which] == 0).any()]
+            around = [np.searchsorted(self.t, ends), np.searchsorted(self.t, ends, side="right") - 1]
+            cuts = np.unique(np.clip([0, *around[0], *around[1], len(row) - 1], 0, len(row) - 1)).tolist()
+            for a, b in pairwise(cuts):
+                out[i, a:b] = _by_cubics(self.t[a : b + 1], row[a : b + 1])
+        return out.reshape(*power.shape[:-1], -1)
 
     def _rubbed(self, dyn: Dynamics) -> Array:
         """Return the energy that forces that jump take in each interval; states of events part them."""
