@@ -74,12 +74,14 @@ def crank_energies(theta: float) -> tuple[float, float]:
     return kinetic / 2, 9.81 * (crank * R / 2 * np.sin(theta) + coupler * (R * np.sin(theta) + L / 2 * np.sin(phi)))
 
 
-@pytest.mark.parametrize(("engine", "method", "most"), [
-    ("lagrangian", "rk853", 1e-9), ("lagrangian", "dop853", 1e-9), ("lagrangian", "rodas5", 1e-8),
-    ("lagrangian", "rk4", 2e-7), ("lagrangian", "gauss4", 2e-7), ("pinocchio", "dop853", 1e-9),
+@pytest.mark.parametrize(("engine", "method", "most", "t0"), [
+    ("lagrangian", "rk853", 1e-9, 0.0), ("lagrangian", "dop853", 1e-9, 0.0), ("lagrangian", "rodas5", 1e-8, 0.0),
+    ("lagrangian", "rk4", 2e-7, 0.0), ("lagrangian", "gauss4", 2e-7, 0.0), ("pinocchio", "dop853", 1e-9, 0.0),
+    # Late times are known to 1e-8 s: there the slider's speed is no sharper at its dead centre.
+    ("lagrangian", "rk853", 1e-6, 1e8),
 ])  # fmt: skip
 def test_a_slider_crank_comes_to_rest_where_friction_has_taken_its_energy(
-    engine: str, method: str, most: float
+    engine: str, method: str, most: float, t0: float
 ) -> None:
     friction = np.array([0.4, 0.3, 3.0])
     dyn, start, speed = mb.dynamics(slider_crank(*friction), engine), 2.6, 3.0
@@ -96,7 +98,7 @@ def test_a_slider_crank_comes_to_rest_where_friction_has_taken_its_energy(
     k = next(k for k, x in enumerate(grid) if left(x) < 0)
     end = brentq(left, grid[k - 1], grid[k], xtol=1e-13)
     more = {"dt": 2e-3} if method in ("rk4", "gauss4") else ADAPTIVE
-    run = simulated(dyn, q, speed * slope, 2.0, method, **more)
+    run = simulated(dyn, q, speed * slope, 2.0, method, t0=t0, **more)
     dead, *stops = run.events[:4]
     assert dead.name == "slider turns"
     assert abs(dead.q[0] - np.pi) < most

@@ -21,6 +21,8 @@ from mbkit.errors import NumericalError
 
 #: Entries of N, and parts of them, that are rounding of a pose.
 _ROUNDED: Final = 1e-9
+#: Part of a motion that is left where it stops, by the rounding of late times; at a dead centre all of it is.
+_LEFT: Final = 1e-3
 
 
 def slow(v: Array) -> Array:
@@ -39,9 +41,11 @@ def independent(N: Array, still: Mask) -> Mask:
 def stopped(N: Array, v: Array, rests: Mask, rubs: Mask) -> Array:
     """Return the velocity at which some joints have come to rest: so do those that can rest with them alone, (nv,)."""
     U, s, Vt = np.linalg.svd(N[rests], full_matrices=False)
-    known = s > _ROUNDED
+    speeds = (U.T @ v[rests]) / np.where(s > _ROUNDED, s, np.inf)
+    # A joint at its dead centre turns there, while the others go on.
+    known = (s > _ROUNDED) & (np.abs(speeds) <= _LEFT * max(1.0, float(np.abs(v).max())))
     along = N @ Vt[known].T
-    out: Array = v - along @ ((U[:, known].T @ v[rests]) / s[known])
+    out: Array = v - along @ speeds[known]
     held = np.linalg.norm(N, axis=1) ** 2 - np.linalg.norm(along, axis=1) ** 2 < _ROUNDED
     return np.where(rests | (held & rubs & (np.abs(out) <= slow(v))), 0.0, out)
 
