@@ -488,6 +488,18 @@ def test_a_five_bar_lets_go_as_its_bounds_say_whatever_their_sizes(
     assert np.abs(run.v[-1]).max() > 0
 
 
+@pytest.mark.parametrize(("method", "more"), [("rk853", {}), ("rk4", {"dt": 0.01})])
+def test_bounds_that_differ_by_14_decades_are_refused_by_name_where_the_large_one_does_not_hold(
+    method: str, more: dict[str, float]
+) -> None:
+    dyn = mb.dynamics(five_bar(1.0, np.array([1e-14, 1, 1e-14, 1e-14, 1e-14]), gravity=0.0), "lagrangian")
+    q, none = dyn.project([1.9, -1.0, 1.1, 1.0, 0.0], np.zeros(5))
+    pull = np.array([1e-14, 0.0, 0.0, 0.0, 0.0])
+    with pytest.warns(MbkitWarning, match="what holds 5 joints at rest"):
+        run = mb.simulate(dyn, q, none, 1.0, method, torque=lambda t, *_: t * pull, **more)
+    assert run.stats.ended == "diverged"
+
+
 # Stribeck's curve in the crank of a four-bar, to 34 digits
 
 CURVE = (1.0, 2.0, 0.8)

@@ -10,14 +10,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from mbkit._check import Array, real
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.errors import EventError, FunctionError, InputError, UnknownNameError
+from mbkit.errors import EventError, FunctionError, InputError, NumericalError, UnknownNameError
 from mbkit.model import Model
 
 #: state(t) -> (q, v) within a step
@@ -47,6 +47,7 @@ class Event:
     name: str = "event"
     direction: int = 0
     terminal: bool = True
+    _named: ClassVar[tuple[type[Exception], ...]] = (FunctionError,)
 
     def __post_init__(self) -> None:
         if not callable(self.function):
@@ -63,8 +64,8 @@ class Event:
         when = f"at t = {t:.9g} s"
         try:
             value = float(self.function(t, q.copy(), v.copy()))
-        except FunctionError:
-            # Of a torque that it asks, which has a name and a message of its own.
+        except self._named:
+            # Of a torque that it asks, or of an engine, which has a name and a message of its own.
             raise
         except Exception as error:
             raise EventError(
@@ -91,6 +92,7 @@ class Followed(Event):
     direction: int = -1
     parts: int = 1
     noise: float = 1e-9
+    _named = (FunctionError, NumericalError)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
