@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import mpmath
 import numpy as np
 import pytest
@@ -306,6 +307,33 @@ def test_a_drive_that_leaves_no_freedom_turns_the_pins_with_it(method: str) -> N
     q, v = dyn.at(t=0.5).step(*at(0.5), np.zeros(3), 0.05, method="rk4", t=0.5)
     assert np.abs(q - at(0.55)[0]).max() < 1e-9
     assert np.abs(v - at(0.55)[1]).max() < 1e-9
+
+
+@pytest.mark.parametrize(("method", "late"), [("rk853", 1e-8), ("dop853", 1e-8), ("rk4", 2e-3)])
+def test_a_drive_that_fades_out_stops_its_pins_where_it_ends(method: str, late: float) -> None:
+    """The crank's angle is 1.2 + t³ (1 - t)³ up to 1 s: speed and acceleration fade to zero there, and stay so."""
+    t = ca.SX.sym("t")
+    b = mb.ModelBuilder.of(slider_crank(0.4, 0.3, 3.0))
+    b.prescribe("crank", 1.2 + ca.if_else(t < 1, t**3 * (1 - t) ** 3, 0))
+    dyn = mb.dynamics(b.build(), "lagrangian")
+    run = simulated(dyn, crank_pose(1.2)[0], np.zeros(3), 2.0, method, **({"dt": 2e-3} if method == "rk4" else {}))
+    ends = [e for e in run.events if e.t > 0.7]
+    assert {e.name for e in ends} == {"crank stops", "rod stops", "slider stops"}
+    assert len(ends) == 3
+    assert all(-1e-8 < e.t - 1 < late * (1 + 1e-9) for e in ends)
+    assert [e.t for e in run.events if e.name.endswith("turns")] == pytest.approx([0.5] * 3, abs=1e-9)
+
+
+def test_a_drive_that_begins_slowly_lets_its_pins_go_once() -> None:
+    t = ca.SX.sym("t")
+    b = mb.ModelBuilder.of(slider_crank(0.4, 0.3, 3.0))
+    b.prescribe("crank", 1.2 + t**14)
+    run = simulated(mb.dynamics(b.build(), "lagrangian"), crank_pose(1.2)[0], np.zeros(3), 1.0, "rk853")
+    assert sorted(names(run)) == ["crank lets go", "rod lets go", "slider lets go"]
+    assert len({e.t for e in run.events}) == 1
+    q, slope = crank_pose(2.2)
+    assert run.q[-1] == pytest.approx(q, abs=1e-9)
+    assert run.v[-1] == pytest.approx(14 * slope, abs=1e-8)
 
 
 def test_what_has_no_friction_is_in_no_event() -> None:

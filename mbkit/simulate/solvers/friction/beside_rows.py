@@ -23,11 +23,20 @@ from mbkit.errors import NumericalError
 _ROUNDED: Final = 1e-9
 #: Part of a motion that is left where it stops, by the rounding of late times; at a dead centre all of it is.
 _LEFT: Final = 1e-3
+#: Acceleration, relative to speeds of 1 or more: a speed that fades as c s², s before its end, is zero by rounding from
+#: where its rate is 2 √(c eps).
+_FADED: Final = 8 * float(np.sqrt(np.finfo(float).eps))
 
 
 def slow(v: Array) -> Array:
     """Return the speed up to which a joint may be at rest by rounding, (1,) or (N, 1)."""
     return np.asarray(_ROUNDED * np.maximum(1.0, np.abs(v).max(axis=-1, keepdims=True, initial=0.0)))
+
+
+def fades(N: Array, v: Array, a: Array) -> Mask:
+    """Return which joints without velocity the rows alone move, and do not but by rounding of their end, (..., nv)."""
+    size = np.maximum(1.0, np.abs(v).max(axis=-1, keepdims=True, initial=0.0))
+    return np.asarray((np.linalg.norm(N, axis=-1) < _ROUNDED) & (np.abs(a) <= _FADED * size))
 
 
 def independent(N: Array, still: Mask) -> Mask:

@@ -16,7 +16,7 @@ from mbkit.engines.elements.dry_friction import Mask
 from mbkit.model.changes.dry_friction import ROUNDING
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.simulate.constraint_projection import settled
-from mbkit.simulate.solvers.friction.beside_rows import independent, shares, slow, stopped
+from mbkit.simulate.solvers.friction.beside_rows import fades, independent, shares, slow, stopped
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
 
@@ -101,6 +101,10 @@ class Friction:
                 *(q[rows], tau[rows], resting[rows], None if leaving is None else leaving[rows]),
                 law=self._own.law_of(own),
             )
+            if self._bound:
+                rate = sliding.forward_dynamics(q[rows], v[rows], tau[rows])
+                stays = resting[rows] & fades(self._directions(own, when, q[rows]), v[rows], rate)
+                still[rows] |= stays if leaving is None else stays & (leaving[rows] == 0)
         locked = still.copy()
         if self._bound and still.any():
             free = self._directions(rubbed, t, q)
@@ -207,6 +211,10 @@ class Friction:
             out = self.stopped(phase.rubbed, t, q, v, phase.still | ended)
         if lets_go.any():
             leaving = np.where(lets_go, -np.sign(self.holding(phase, t, q, v, force)), 0.0)
+            if self._bound:
+                # Without a share in what holds, rows alone move it.
+                rate = at_time(phase.dyn, t).forward_dynamics(q, v, applied(force, t, q, v))
+                leaving = np.where(lets_go & (leaving == 0), np.sign(rate), leaving)
         return out, leaving
 
     def stopped(self, dyn: Dynamics, t: float | Array, q: Array, v: Array, rests: Mask) -> Array:
