@@ -336,6 +336,17 @@ def test_a_drive_that_begins_slowly_lets_its_pins_go_once() -> None:
     assert run.v[-1] == pytest.approx(14 * slope, abs=1e-8)
 
 
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_phases_beside_a_drive_are_kept_for_their_time(engine: str) -> None:
+    """A step of Moreau's asks for the same one each time, which otherwise chooses its rows again."""
+    dyn, still = mb.dynamics(shaken(), engine), np.array([False, True])
+    law, later = dyn._friction, dyn.at(t=1.5)
+    phase = law.phase(dyn, np.zeros(2), still)
+    assert law.phase(dyn, np.zeros(2), still) is phase
+    assert law.phase(later, np.zeros(2), still).model.time == 1.5
+    assert phase.model.time == 0.0
+
+
 def test_what_has_no_friction_is_in_no_event() -> None:
     run = simulated(mb.dynamics(shaken(of_table=0.0), "lagrangian"), [0.0, 0.0], [1.5, 0.0], 2.0, "rk853", **ADAPTIVE)
     assert names(run) == ["y lets go", "y turns"]

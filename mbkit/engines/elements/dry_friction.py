@@ -311,8 +311,8 @@ class DryFriction(AddedForce):
         """Return the dynamics in which velocities have these signs, or stay at rest: smooth, and without friction."""
         sliding, bare = self.sliding, dyn._bare or dyn
         # Steps of a controller ask for the same few again and again.
-        held: dict[Any, Any] = vars(bare).setdefault("_phases", {}) if dyn.model.time_parameter is None else {}
-        key = np.where(still, 0.0, np.sign(sides)).tobytes(), still.tobytes()
+        held: dict[Any, Any] = vars(bare).setdefault("_phases", {})
+        key = np.where(still, 0.0, np.sign(sides)).tobytes(), still.tobytes(), dyn.model.time
         if key not in held:
             if len(held) >= _PHASES:
                 held.clear()
