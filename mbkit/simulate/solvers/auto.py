@@ -39,6 +39,9 @@ _RECENT: Final = 8
 #: h|λ| from which on stability holds rk853's steps: its region reaches to 6 on the negative and 5 on the imaginary
 #: axis; steps that follow an oscillation at a tolerance of 1e-6 or less have 2 at most.
 _EDGE: Final = 3.0
+#: h|λ| up to which steps follow every motion of the linearized system, so that rodas5 could not take longer ones for
+#: long: where steps are short in passing alone, a trial would get further as they grow.
+_FAST: Final = 0.2
 #: Errors of n steps, in a mean over 2 nv numbers, add up to n √(2 nv) tolerances at most: the limit, in the user's
 #: tolerances. Measured is a third to a three-hundredth of it.
 _SUM: Final = 300.0
@@ -250,7 +253,8 @@ class SwitchingController:
                 return
             held = rates is not None and step * rates.stable >= _EDGE
             # Compared with the steps as they are now, which may be short in passing only.
-            if (held or to_come >= _GUESS * check) and (trial := self._faster_trial(1 / step)):
+            fast = rates is None or step * rates.stable >= _FAST
+            if (held or (fast and to_come >= _GUESS * check)) and (trial := self._faster_trial(1 / step)):
                 why = "stability held its steps" if held else "rodas5 got further with a trial"
                 size = "" if rates is None else f" (h|λ| = {step * rates.stable:.1f}; {rates})"
                 self._switch(IMPLICIT, trial, why + size)
