@@ -207,17 +207,23 @@ def test_what_a_library_prints_is_no_answer():
     assert dyn.mass_matrix([0.0]).shape == (1, 1)
 
 
-def test_a_process_that_dies_is_an_error_and_the_next_call_starts_another():
+def test_a_process_that_dies_is_an_error_and_the_next_call_starts_another(monkeypatch):
     version = present("mujoco", "4.0.0")
     dyn = mb.dynamics(mb.catalog.pendulum(), version)
     before = dyn.mass_matrix([0.3])
     own = process.process_of(version)
     folder = own._folder
-    pid = own._process.pid
+    pid, send = own._process.pid, own._send
+
+    def sent(message):
+        send(message)
+        for one in (signal.SIGSEGV, signal.SIGCONT):
+            os.kill(pid, one)
+
     # As a library does it: in the middle of a call.
     os.kill(pid, signal.SIGSTOP)
-    threading.Timer(0.3, lambda: [os.kill(pid, s) for s in (signal.SIGSEGV, signal.SIGCONT)]).start()
-    with pytest.raises(EngineProcessError, match="SIGSEGV"):
+    with monkeypatch.context() as m, pytest.raises(EngineProcessError, match="SIGSEGV"):
+        m.setattr(own, "_send", sent)
         dyn.mass_matrix([0.3])
     assert not folder.exists()
     assert np.array_equal(dyn.mass_matrix([0.3]), before)
