@@ -561,7 +561,7 @@ def test_an_executor_that_is_shut_down_and_a_torque_that_cannot_be_sent_are_told
     executor.shutdown()
     result = study(["pinocchio"], ["rk4"], executor=executor)
     assert "takes no more calls" in result.refusals[0].reason
-    with spawning(1) as executor, pytest.raises(InputError, match="cannot be sent to the executor's processes"):
+    with spawning(1) as executor, pytest.raises(InputError, match="cannot be sent to other processes"):
         study(["pinocchio"], ["rk4"], torque=lambda *_: [0.0], executor=executor)
 
 

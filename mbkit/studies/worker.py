@@ -212,12 +212,17 @@ def check_executor(executor: object, **sent: object) -> None:
             "use a ProcessPoolExecutor, or the result of Dask's client.get_executor()"
         )
     for name, value in sent.items() if isinstance(executor, ProcessPoolExecutor) else ():
-        try:
-            pickle.dumps(value)
-        except Exception as error:  # pickle raises errors of several kinds
-            raise InputError(
-                f"{name}: cannot be sent to the executor's processes ({error}); define the function in a module"
-            ) from None
+        check_sendable(f"{name}:", value)
+
+
+def check_sendable(subject: str, value: object) -> None:
+    """Refuse what no other process can be given."""
+    try:
+        pickle.dumps(value)
+    except Exception as error:  # pickle raises errors of several kinds
+        raise InputError(
+            f"{subject} cannot be sent to other processes ({error}); define its functions in a module"
+        ) from None
 
 
 def run(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import pickle
 import tempfile
 import time
 from collections import deque
@@ -37,7 +36,7 @@ from mbkit.studies.stress.measure import TERMS, Limits, Prepared, measure, prepa
 from mbkit.studies.stress.measurements import CaseResult, Row
 from mbkit.studies.stress.result import StressResult
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
-from mbkit.studies.worker import CallError, Worker, WorkerPool, check_executor, describe, in_worker, run
+from mbkit.studies.worker import CallError, Worker, WorkerPool, check_executor, check_sendable, describe, in_worker, run
 
 #: Seconds that a run may take, and the whole study, quick and not.
 _SECONDS: Final = {True: 0.5, False: 2.0}
@@ -507,12 +506,7 @@ def _swept(cases: object, values: object, *, quick: bool) -> list[tuple[Case, tu
         if case.name in chosen:
             raise InputError(f"cases: {case.name!r} is there twice; a result finds a case by its name")
         chosen[case.name] = case
-        try:
-            pickle.dumps(case)
-        except Exception as error:  # pickle raises errors of several kinds
-            raise InputError(
-                f"cases: {case.name!r} cannot be sent to other processes ({error}); define its functions in a module"
-            ) from None
+        check_sendable(f"cases: {case.name!r}", case)
     if not chosen:
         raise InputError("cases: expected at least one, got none; leave it out for all")
     of_cases = values if isinstance(values, Mapping) else dict.fromkeys(chosen, values)
