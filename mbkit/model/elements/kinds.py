@@ -266,7 +266,7 @@ for _section, _name, _words in (
     register_kind(_section, f"{_name}.damper", "damper" + _words, "loss", "damping", "damping")
 register_kind("couplings", "coupling.armature", "armature" + _words, "T", "armature", "armature")
 for _name in LOOP_KINDS:
-    register_kind("loops", f"loop.{_name}", "loop {p.name!r} is {p.kind}", "row", "", "loops", _named(_name))
+    register_kind("loops", f"loop.{_name}", f"{_name} loop {{p.name!r}}", "row", "", "loops", _named(_name))
 _coupler = partial(register_kind, "couplers", does="row", features="loops couplers")
 _coupler("coupler", "coupler {p.name!r}")
 _coupler("coupler.curve", "coupler {p.name!r} is a curve", at=has("couplers", "curve"))
