@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 
+from mbkit._imports import hand_down
 from mbkit._version import __version__ as __version__
 
 # The module typing is no light one, and the command listens to Ctrl-C only after this.
@@ -29,10 +30,11 @@ if TYPE_CHECKING:
     from mbkit.engines import Dynamics as Dynamics
     from mbkit.engines import dynamics as dynamics
     from mbkit.engines import engine as engine
+    from mbkit.engines.applications.operational_space import OperationalSpace as OperationalSpace
+    from mbkit.engines.applications.operational_space import operational_space as operational_space
+    from mbkit.engines.applications.variants import variants as variants
     from mbkit.engines.consistent.impacts import Impact as Impact
     from mbkit.engines.consistent.impacts import impact as impact
-    from mbkit.engines.operational_space import OperationalSpace as OperationalSpace
-    from mbkit.engines.operational_space import operational_space as operational_space
     from mbkit.errors import MbkitError as MbkitError
     from mbkit.identify import excitation as excitation
     from mbkit.identify import identify as identify
@@ -47,7 +49,6 @@ if TYPE_CHECKING:
     from mbkit.model import Parameter as Parameter
     from mbkit.model.changes.freeing import scale as scale
     from mbkit.model.changes.joining import join as join
-    from mbkit.model.changes.variants import variants as variants
     from mbkit.show import show as show
     from mbkit.simulate import Trajectory as Trajectory
     from mbkit.simulate import sensitivities as sensitivities
@@ -66,7 +67,8 @@ if TYPE_CHECKING:
 _NAMES = {
     "engines": "Dynamics dynamics engine",
     "engines.consistent.impacts": "Impact impact",
-    "engines.operational_space": "OperationalSpace operational_space",
+    "engines.applications.operational_space": "OperationalSpace operational_space",
+    "engines.applications.variants": "variants",
     "errors": "MbkitError",
     "identify": "excitation identify",
     "lagrangian.statics.equilibrium": "equilibrium",
@@ -75,7 +77,6 @@ _NAMES = {
     "model": "Mimic Model ModelBuilder Parameter",
     "model.changes.freeing": "scale",
     "model.changes.joining": "join",
-    "model.changes.variants": "variants",
     "simulate": "Trajectory sensitivities",
     "studies": "compare stress work_precision",
     "studies.convert": "convert",
@@ -87,6 +88,20 @@ _HOME = {name: f"mbkit.{module}" for module, names in _NAMES.items() for name in
 # `show` and `simulate` are called too; methods and events are in the second.
 _OWN = "catalog engines errors lagrangian model show simulate spatial studies testing"
 _MODULES = {name: f"mbkit.{name}" for name in _OWN.split()} | {"baseline": "mbkit.studies.baseline"}
+
+#: Modules that rooms below use.
+_HANDED_DOWN = {
+    "consistent_states": "mbkit.engines.consistent.random_states",
+    "constraint_manifold": "mbkit.engines.constraint_manifold",
+    "fixed_step": "mbkit.simulate.solvers.fixed_step",
+    "formulas": "mbkit.lagrangian.formulas",
+    "freeing": "mbkit.model.changes.freeing",
+    "friction_step": "mbkit.simulate.solvers.friction.single_step",
+    "locking": "mbkit.model.changes.locking",
+    "sdf": "mbkit.engines.imported",
+    "segments": "mbkit.model.changes.segments",
+}
+hand_down(_HANDED_DOWN)
 
 __all__ = sorted([*_HOME, *_MODULES, "__version__"])
 

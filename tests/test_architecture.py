@@ -6,6 +6,7 @@ import ast
 import re
 from collections.abc import Iterable, Iterator
 from functools import cache
+from graphlib import TopologicalSorter
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -46,6 +47,24 @@ METHOD_NAMES = (
     "engines/",
     # The closed form of a method's error on a case, as for joint types.
     "studies/stress/cases/",
+)
+#: Files that may import what a text names.
+IMPORTS_BY_NAME = (
+    # Tables of what loads late.
+    "__init__.py",
+    "lagrangian/__init__.py",
+    "simulate/solvers/__init__.py",
+    # What users add: engines and importers.
+    "engines/registry.py",
+    "engines/imported.py",
+    # An adapter in a process without mbkit, named on its command line.
+    "engines/remote/served/serve.py",
+    # A user's target, ``package.module:function``.
+    "studies/_targets.py",
+    # Packages that unpickle as themselves, and what the table of ``__init__`` names.
+    "_imports.py",
+    # A module of robot_descriptions, which runs without its function that fetches.
+    "load/loader.py",
 )
 #: Names that are ordinary words too: a method with fixed steps, ``mimic="free"``, MJCF's ``autolimits="auto"``.
 WORDS = ("fixed", "free", "ball", "auto")
@@ -122,6 +141,38 @@ def test_no_joint_is_asked_for_the_name_of_its_type():
             if kinds and constants & {*KINDS} - {"fixed"}:
                 found.append(f"mbkit/{name}:{node.lineno}")
     assert found == []
+
+
+def names_imports(node: ast.AST) -> bool:
+    """Return whether a node may import what a text names."""
+    names = [getattr(node, "id", ""), getattr(node, "attr", "")]
+    names += [x.name for x in node.names] if isinstance(node, ast.ImportFrom) else []
+    return not {"import_module", "__import__"}.isdisjoint(names)
+
+
+def test_imports_by_name_stand_in_tables():
+    """What a lower room uses of an upper one stands in the table of `mbkit.__init__`, and contracts see the rest."""
+    found = {name for name, path in FILES.items() if any(map(names_imports, nodes(path)))}
+    assert found == set(IMPORTS_BY_NAME)
+
+
+def imported_by(name: str) -> set[str]:
+    """Return the files that a file imports, anywhere in it and for types too, without tables of packages."""
+    found = set()
+    for node in nodes(FILES[name]):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mbkit"):
+            module = node.module.replace(".", "/").removeprefix("mbkit").lstrip("/")
+            found |= {f"{module}.py", *(f"{module}/{x.name}.py".lstrip("/") for x in node.names)}
+    return found & FILES.keys()
+
+
+def test_no_file_imports_one_that_imports_it():
+    tuple(TopologicalSorter({name: imported_by(name) for name in FILES}).static_order())
+
+
+def test_modules_are_handed_down_to_those_that_use_them():
+    text = "".join(path.read_text(encoding="utf-8") for path in FILES.values())
+    assert set(re.findall(r'from_above\("(\w+)"\)', text)) == mbkit._HANDED_DOWN.keys()
 
 
 def test_files_are_no_longer_than_a_concept():

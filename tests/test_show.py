@@ -348,7 +348,7 @@ def test_a_page_loads_nothing_and_holds_the_scene(tmp_path: Path) -> None:
     q, _ = model.random_state(1, 4)
     shown = mb.show(model, q, tmp_path / "a.html")
     page = (tmp_path / "a.html").read_text()
-    assert page == shown.html == model.show(q, tmp_path / "b.html").html
+    assert page == shown.html == mb.show(model, q, tmp_path / "b.html").html
     assert not re.search(r"https?://|\bsrc=|\bhref=|@import|url\(", page)
     scene, block = unpacked(page)
     (script,) = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
@@ -542,4 +542,4 @@ def test_a_path_or_a_name_is_shown_as_its_model_is(tmp_path):
     file = mb.robots()[0].path
     by_path, by_name = (mb.show(x, path=tmp_path / "page.html").scene for x in (file, mb.robots()[0].name))
     model = mb.load(file, nonphysical="warn")
-    assert by_path.bodies == by_name.bodies == model.show(path=tmp_path / "page.html").scene.bodies
+    assert by_path.bodies == by_name.bodies == mb.show(model, path=tmp_path / "page.html").scene.bodies

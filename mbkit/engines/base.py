@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from functools import cached_property
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, TypeVar
 
 import numpy as np
@@ -49,6 +48,7 @@ from mbkit.model.elements.paths import Path
 from mbkit.model.rolling import discs_of
 
 if TYPE_CHECKING:
+    from mbkit.engines.elements.compiled_forces import CompiledForces
     from mbkit.show import Kind
 
 QUANTITIES: Final = (
@@ -539,7 +539,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
             reason = self.refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")
             raise UnsupportedError(f"{self.engine} cannot give {quantity}: {reason}")
         if self.model.forces and not self.has_elements:
-            return self._elements.beside(quantity, method, self)  # type: ignore[no-any-return]  # by name
+            return self._elements.beside(quantity, method, self)
         return method  # type: ignore[no-any-return]  # by name
 
     def _lost_force(self, q: Array, v: Array) -> Array:
@@ -552,9 +552,11 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         return np.asarray(self._elements.lost(self, q, v))
 
     @cached_property
-    def _elements(self) -> Any:
+    def _elements(self) -> CompiledForces:
         """Forces given by functions, compiled; CasADi is loaded for a model that has some."""
-        return import_module("mbkit.engines.elements.compiled_forces").CompiledForces(self.model)
+        from mbkit.engines.elements.compiled_forces import CompiledForces
+
+        return CompiledForces(self.model)
 
     def _evaluate(self, quantity: str, *more: Any, **arguments: ArrayLike) -> Array:
         """Return a quantity at states, checked; `more` are arguments that are the same for every state."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of
+from mbkit._imports import from_above
 from mbkit._reproducible import dependent, unit_rows
 from mbkit._warn import warn
 from mbkit.errors import InputError, MbkitWarning, NumericalError
@@ -114,8 +114,8 @@ class Constrained:
 
     @property
     def _states_held(self) -> Any:
-        # By name: the consistent states are those of the own derivation, an engine above this protocol.
-        return import_module("mbkit.engines.constraint_manifold")
+        # The consistent states are those of the own derivation, an engine above this protocol.
+        return from_above("constraint_manifold")
 
     @property
     def constraint_names(self) -> tuple[str, ...]:

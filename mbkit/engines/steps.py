@@ -8,13 +8,13 @@ solved for are differentiated by the implicit function theorem.
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, batch_of, real, real_array, require_finite
+from mbkit._imports import from_above
 from mbkit.engines.constrained import unwatched
 from mbkit.engines.frames_and_momenta import ALIGNED, axes_named
 from mbkit.engines.loads import Wrenches
@@ -177,9 +177,8 @@ class Steps:
         # An overflow is reported as an error.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             if "jump" in self.model.effects and not self.soft_friction:
-                # By name: the phases of friction are those of runs, a floor above.
-                one: Any = import_module("mbkit.simulate.solvers.friction.single_step")
-                q1, v1 = one.step(self, chosen, **states, dt=h)
+                # The phases of friction are those of runs, a floor above.
+                q1, v1 = from_above("friction_step").step(self, chosen, **states, dt=h)
             else:
                 with unwatched(self):
                     q1, v1 = self._step(chosen, **states, dt=h)
@@ -199,9 +198,9 @@ class Steps:
 
     def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
         """Return the state after a step, stage by stage; NaN where there is none."""
-        # By name: it is the step of runs, a floor above.
-        loop: Any = import_module("mbkit.simulate.solvers.fixed_step")
-        return loop.take_step(self, method.name, q, v, tau, dt)  # type: ignore[no-any-return]  # by name
+        # It is the step of runs, a floor above.
+        q1, v1 = from_above("fixed_step").take_step(self, method.name, q, v, tau, dt)
+        return q1, v1
 
 
 def _beside(tau: Array, wrenches: Array) -> Array:

@@ -1,6 +1,6 @@
 """Identification: inertial parameters from measured motions, and motions that show them."""
 
-from mbkit._callable import make_callable
+from mbkit._imports import make_callable
 from mbkit.identify.fourier_series import Excitation, excitation
 from mbkit.identify.motion_noise import FilteredMotion, filtered_motion
 from mbkit.identify.result import Identification, IdentifiedParameter, Residual, Undetermined

@@ -1,6 +1,6 @@
 """Expressions of CasADi and SymPy, and splines of SciPy, read as the plain data that a description holds.
 
-`mbkit.model` loads none of the three; its builder calls this module by name where it gets such an object.
+`mbkit.model` loads none of the three; its builder is handed this module where it gets such an object.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import NoneType, SimpleNamespace
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import shown
+from mbkit._imports import from_above
 from mbkit._warn import warn
 from mbkit.errors import InputError, LoadError, MbkitError, MbkitWarning, ModelError, UnknownNameError
 from mbkit.load import xml_reader
@@ -204,8 +204,7 @@ def load(
     elif root.tag == "sdf":
         if str(path) != _TEXT and path.suffix.lower() != ".sdf":
             raise LoadError(f"{path}: this is SDF; give its file a name that ends in .sdf")
-        # By name: files know no engine.
-        read = import_module("mbkit.engines.imported").model_of_sdf
+        read = from_above("sdf").model_of_sdf
         text = path.read_text("utf-8", "replace") if file else str(source)
         text = text.lstrip("\ufeff \t\r\n")
         model, file = read(root, text, str(path), floating_base, policy, gravity), ""
@@ -362,11 +361,12 @@ def described(name: str) -> Path:
     module = _key(name)
     if (file := _modules().get(module)) is None:
         raise unknown(name)
-    repositories = import_module(f"{_DESCRIPTIONS}._repositories").REPOSITORIES
+    from robot_descriptions._repositories import REPOSITORIES
+
     cache = os.path.expanduser(os.environ.get("ROBOT_DESCRIPTIONS_CACHE", "~/.cache/robot_descriptions"))
 
     def cached(repository: str, commit: str | None = None) -> str:
-        place = repositories[repository].cache_path
+        place = REPOSITORIES[repository].cache_path
         return os.path.join(cache, f"{place}-{commit}/{place}" if commit else place)
 
     def importing(what: str, *others: Any) -> Any:

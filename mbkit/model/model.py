@@ -8,9 +8,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import cached_property
-from importlib import import_module
 from math import hypot
-from os import PathLike
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from mbkit._check import TWO_TURNS, Array, batch_of, count, generator, hint_at_degrees, real, rows
 from mbkit._escape import html
+from mbkit._imports import from_above
 from mbkit._warn import warn
 from mbkit.errors import MbkitWarning, ModelError, UnknownNameError, UnsupportedError, require_known
 from mbkit.model import manifold
@@ -109,7 +108,7 @@ class Model(Description):
     def require_independent(self, q: Array) -> None:
         """Refuse constraints that depend on each other at q, (nq,) or the first of (N, nq), with the rows."""
         if self.constrained and len(q) and None not in self.parameters.values():
-            _states_of(self).require_independent(q)
+            from_above("consistent_states").states_of(self).require_independent(q)
 
     # Configurations
 
@@ -144,7 +143,10 @@ class Model(Description):
                 MbkitWarning,
             )
         rng = generator("rng", rng)
-        return _states_of(self).random(rng, size) if self.constrained else manifold.random_state(self, rng, size)
+        if not self.constrained:
+            return manifold.random_state(self, rng, size)
+        state: tuple[Array, Array] = from_above("consistent_states").states_of(self).random(rng, size)
+        return state
 
     def check_q(self, q: ArrayLike, name: str = "q") -> Array:
         """Return `q` as float64, checked for shape, finite numbers and unit quaternions."""
@@ -290,19 +292,6 @@ class Model(Description):
 
     # Variants
 
-    def show(
-        self,
-        q: ArrayLike | None = None,
-        path: str | PathLike[str] | None = None,
-        *,
-        shapes: str = "visual",
-        triangles: int = 250_000,
-    ) -> Any:
-        """Show the model at a configuration, as `mbkit.show` does, which has the parameters."""
-        # By name: a description knows nothing that draws it, and loads it for this call alone.
-        view: Any = import_module("mbkit.show.view").show(self, q, path, shapes=shapes, triangles=triangles)
-        return view
-
     def without(self, *features: str) -> Model:
         """Return the same description less some features.
 
@@ -361,7 +350,7 @@ class Model(Description):
         >>> arm.nv, float(arm.full_state(arm.neutral())[0][-1])
         (7, 0.02)
         """
-        locked: Model = _changes("locking").lock(self, joints, q)
+        locked: Model = from_above("locking").lock(self, joints, q)
         return locked
 
     def full_state(self, q: ArrayLike, v: ArrayLike | None = None) -> tuple[Array, Array]:
@@ -373,7 +362,7 @@ class Model(Description):
         v : (nv,) or (N, nv) array_like, optional
             Or an acceleration; zero without.
         """
-        full: tuple[Array, Array] = _changes("locking").full_state(self, q, v)
+        full: tuple[Array, Array] = from_above("locking").full_state(self, q, v)
         return full
 
     def reduced_state(self, q: ArrayLike, v: ArrayLike | None = None) -> tuple[Array, Array]:
@@ -384,7 +373,7 @@ class Model(Description):
         q, v : arrays
             Of the model before `lock`, one state or a batch. Numbers of locked joints are left out.
         """
-        reduced: tuple[Array, Array] = _changes("locking").reduced_state(self, q, v)
+        reduced: tuple[Array, Array] = from_above("locking").reduced_state(self, q, v)
         return reduced
 
     def segmented(self, segments: int) -> Model:
@@ -413,7 +402,7 @@ class Model(Description):
         >>> mb.dynamics(b.build().segmented(10), "pinocchio").model.nv
         10
         """
-        made: Model = _changes("segments").segmented(self, segments)
+        made: Model = from_above("segments").segmented(self, segments)
         return made
 
     def with_free(self, *paths: Any) -> Model:
@@ -451,7 +440,7 @@ class Model(Description):
         >>> dyn.gravity([0.0] * 6).shape
         (3, 6)
         """
-        free: Model = _changes("freeing").with_free(self, paths)
+        free: Model = from_above("freeing").with_free(self, paths)
         return free
 
     def with_parameters(self, /, **values: float) -> Model:
@@ -482,7 +471,7 @@ class Model(Description):
             _ = self.effects
             if self.constrained:
                 # Before the copy, so that all times share one derivation and one choice of rows.
-                _states_of(self)
+                from_above("consistent_states").states_of(self)
             out = object.__new__(type(self))
             out.__dict__.update({k: x for k, x in self.__dict__.items() if k != "parameters"}, time=time)
             return out
@@ -522,14 +511,3 @@ class Model(Description):
             f"{self._mass_text()}{self._servos_text()}; {self.needs}</p>"
             f"<table><tr>{head}</tr>{cells}</table>" + (f"<ul>{notes}</ul>" if notes else "")
         )
-
-
-def _changes(name: str) -> Any:
-    # By name: what changes a model makes one, and stands a floor above.
-    return import_module(f"mbkit.model.changes.{name}")
-
-
-def _states_of(model: Model) -> Any:
-    """Return the consistent states of a model under constraints."""
-    # By name: a description knows no derivation, and asks for it only here.
-    return import_module("mbkit.engines.consistent.random_states").states_of(model)

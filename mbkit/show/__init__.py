@@ -1,6 +1,6 @@
 """Models and motions to look at: pages with a viewer in them, pictures and films."""
 
-from mbkit._callable import make_callable
+from mbkit._imports import make_callable
 from mbkit.show.scene import Kind as Kind
 from mbkit.show.scene import Scene, shapes_of
 from mbkit.show.view import View, show

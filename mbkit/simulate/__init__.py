@@ -11,7 +11,7 @@ In: an engine's `Dynamics`, start states, torques (`torque`), events. Out: times
 Callers: users, every study, `mbkit simulate`.
 """
 
-from mbkit._callable import make_callable
+from mbkit._imports import make_callable
 from mbkit.methods.registry import METHODS, Method, register_method
 from mbkit.methods.tableaus import RK4, ImplicitTableau, Tableau
 from mbkit.simulate.diagnostics.stiffness import Stiffness, stiffness

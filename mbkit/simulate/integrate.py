@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from importlib import import_module
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
@@ -20,6 +19,7 @@ from mbkit.errors import FunctionError, InputError, MbkitWarning, UnsupportedErr
 from mbkit.methods.registry import ADAPTIVE_METHOD, DEFAULT_METHOD, EULER_METHOD, METHODS, Method, Tolerances, method_of
 from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
+from mbkit.simulate import solvers
 from mbkit.simulate.constraint_projection import along_constraints, from_consistent
 from mbkit.simulate.diagnostics.checks import diagnostics, massless_joints
 from mbkit.simulate.events import as_events
@@ -226,7 +226,7 @@ def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Callable[[Integrat
     as_data = not torque.callable or (torque.feedback is not None and method.explicit)
     if compiles and as_data and _compiles(dyn):
         module, function = "compiled_fixed_step", "run_rollout"
-    run: Callable[..., SolverResult] = getattr(import_module(f"mbkit.simulate.solvers.{module}"), function)
+    run: Callable[[IntegrationProblem], SolverResult] = solvers.load(module, function)
     return run
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import io
 import json
 import os
@@ -256,9 +255,9 @@ class Trajectory(RunData):
             pandas is not installed.
         """
         with _check.needed("pandas", "to_dataframe"):
-            frames: Any = importlib.import_module("pandas")
+            import pandas
         header, rows = self._table()
-        out = frames.DataFrame(rows, columns=header)
+        out = pandas.DataFrame(rows, columns=header)
         return out.astype({"trajectory": int}) if self.q.ndim == 3 else out
 
     def save(self, path: str | os.PathLike[str]) -> None:

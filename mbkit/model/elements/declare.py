@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from importlib import import_module
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array, shown
+from mbkit._imports import from_above
 from mbkit.errors import MbkitError
 from mbkit.model.elements.beams import LONGEST, SHORTEST, beam_types, modes_of
 from mbkit.model.elements.forces import (
@@ -39,11 +39,6 @@ _Vector = ArrayLike | Sequence[Number]
 _DEFLECTION: Final = 0.1
 #: Values by the names that stand for them in expressions.
 Constants = Mapping[str, Number]
-
-
-def _door() -> Any:
-    # By name: a description loads neither CasADi nor SymPy unless somebody brings an expression.
-    return import_module("mbkit.lagrangian.formulas")
 
 
 def _is_zero(x: Any) -> bool:
@@ -120,7 +115,7 @@ class ElementBuilder:
         if not isinstance(spline, str) or spline not in _ENDS:
             self._read.faults.append(f"{item}: spline: expected one of {', '.join(_ENDS)}, got {shown(spline)}")
             return
-        good, pieces = self._asked(item, law, lambda: _door().read_spline(law, spline))
+        good, pieces = self._asked(item, law, lambda: from_above("formulas").read_spline(law, spline))
         if not good:
             return
         if pieces is not None:
@@ -538,7 +533,7 @@ class ElementBuilder:
         things: list[Expression] = []
 
         def read(what: str, parts: Any) -> None:
-            formulas[what] = _door().read_formula(parts, given[what], things)
+            formulas[what] = from_above("formulas").read_formula(parts, given[what], things)
 
         for what, parts in wanted.items():
             if all(x is None for x, _ in parts):

@@ -1,6 +1,6 @@
 """Where engines and methods break: sweeps of one number over decades, each run in a process of its own."""
 
-from mbkit._callable import make_callable
+from mbkit._imports import make_callable
 from mbkit.studies.measurement import Measurement, Problem, Truth
 from mbkit.studies.stress.case import Case
 from mbkit.studies.stress.measurements import Breaking, CaseResult, Row

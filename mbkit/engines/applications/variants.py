@@ -14,7 +14,6 @@ import os
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, overload
 
@@ -23,6 +22,8 @@ import numpy as np
 from mbkit._check import Array, by_key, count, finite_array, real, shown
 from mbkit._escape import csv_text, html
 from mbkit._warn import warn
+from mbkit.engines.base import Dynamics
+from mbkit.engines.registry import DERIVED, dynamics, find_engine
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError, writing
 from mbkit.model.builder import expect_model, shape_of
 from mbkit.model.changes.freeing import (
@@ -85,7 +86,7 @@ class Variants:
     def __iter__(self) -> Iterator[Model]:
         return (self[k] for k in range(len(self)))
 
-    def dynamics(self, engine: str | None = None, **options: Any) -> Any:
+    def dynamics(self, engine: str | None = None, **options: Any) -> Dynamics:
         """Return the own derivation's dynamics of all variants, one a member of each batch; derived once.
 
         Parameters
@@ -95,12 +96,10 @@ class Variants:
         **options
             Those of ``mbkit.dynamics(model, "lagrangian", ...)``.
         """
-        # By name: a description knows no engine.
-        registry = import_module("mbkit.engines.registry")
-        if engine not in (None, registry.DERIVED):
-            name = registry.find_engine(engine).name
+        if engine not in (None, DERIVED):
+            name = find_engine(engine).name
             raise UnsupportedError(f"variants: {name} takes them one by one, as mbkit.dynamics(many[k], {name!r})")
-        return registry.dynamics(self.model, registry.DERIVED, **options).at(**self.values)
+        return dynamics(self.model, DERIVED, **options).at(**self.values)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the seed and the values by name, as JSON takes them."""
