@@ -17,7 +17,8 @@ from mbkit.errors import InputError
 if TYPE_CHECKING:
     from mbkit.model import Model
     from mbkit.studies.baseline import BaselineResult
-    from mbkit.studies.compare.result import Comparison, Row
+    from mbkit.studies.compare.result import Comparison
+    from mbkit.studies.compare.rows import Row
     from mbkit.studies.explain import Explanation
     from mbkit.studies.lint import LintFinding, LintResult
 

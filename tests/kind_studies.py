@@ -38,10 +38,10 @@ from mbkit.model import Model
 from mbkit.model.elements.kinds import PART_KINDS
 from mbkit.model.elements.paths import PATHS as GATES
 from mbkit.pytest_plugin import MbkitBaseline
-from mbkit.report import compare_view
 from mbkit.report.page import render
 from mbkit.studies._targets import with_values
 from mbkit.studies.baseline.file import Rollout
+from mbkit.studies.compare import figure
 from mbkit.studies.compare.study import Judge
 from mbkit.studies.compare.terms import TERMS, states
 from mbkit.studies.importers.loops import Written, between_joints
@@ -611,12 +611,12 @@ def _diff(x: Example, folder: Path) -> Told:
 def _check(x: Example, folder: Path) -> Told:
     """Two engines agree with 34 digits; one that lacks the part does not, and the page has each refusal."""
     untimed = patch("mbkit.studies.compare.study.interleaved", lambda calls: dict.fromkeys(calls, (1.0, 0.0)))
-    undrawn = patch.multiple("mbkit.report.figures", svg=lambda *_, **__: "", term_costs=lambda *_: None)
+    undrawn = patch.multiple(figure, digits=lambda *_: "", term_costs=lambda *_: "")
     with untimed, undrawn:
         result = mb.compare(x.model, ("lagrangian", "pinocchio"), 1, terms_only=True)
         if bad := [r.reason for r in result.rows if not r.passed and "known defect" not in r.reason]:
             raise AssertionError(str(bad))
-        page = html.unescape(render(compare_view.view(result)))
+        page = html.unescape(render(result.document()))
         if missing := [r.reason for r in result.refusals if not r.term and r.reason[:60] not in page]:
             raise AssertionError(f"not on the page: {missing}")
         if (less := without_part(x)) is None or PART_KINDS[x.name].does == {"bound"}:

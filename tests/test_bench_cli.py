@@ -12,7 +12,6 @@ from click.testing import CliRunner, Result
 import mbkit as mb
 from mbkit.cli import cli
 from mbkit.errors import OutputError
-from mbkit.report import work_precision_view
 from mbkit.studies._checkpoint import InterruptedSweepError
 from mbkit.studies.study_runs import OUT_OF_TIME
 
@@ -214,5 +213,5 @@ def test_little_time_is_shared_by_all_engines_and_names_no_winner_without_them()
         refusals=(*lost, *(replace(lost[0], engine=e, term="rk4") for e in ("lagrangian", "mujoco"))),
     )
     assert less.untimed == ("lagrangian", "mujoco")
-    assert work_precision_view.headline(less).startswith("no time was left for lagrangian and mujoco, so none is")
-    assert "fastest of" not in work_precision_view.headline(less)
+    assert less.headline.startswith("no time was left for lagrangian and mujoco, so none is")
+    assert "fastest of" not in less.headline

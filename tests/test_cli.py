@@ -18,6 +18,7 @@ from mbkit.cli import cli
 from mbkit.errors import OutputError, UnknownNameError
 from mbkit.load.loader import find
 from mbkit.studies.compare import all_robots as sweeps
+from mbkit.studies.compare import figure
 from mbkit.studies.compare.all_robots import RobotOutcome, all_robots
 from mbkit.studies.worker import run
 
@@ -27,7 +28,7 @@ QUICK = ("--no-rollouts", "--samples", "4")
 @pytest.fixture(autouse=True)
 def without_panels(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the panels of a page, which take most of a small check's time and are tested with the figures."""
-    monkeypatch.setattr("mbkit.report.figures.term_costs", lambda _: "")
+    monkeypatch.setattr(figure, "term_costs", lambda *_: "")
 
 
 @pytest.fixture

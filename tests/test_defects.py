@@ -15,7 +15,6 @@ import mbkit as mb
 from mbkit.engines import known_defects
 from mbkit.errors import KnownDefectWarning
 from mbkit.model.joint_types import KINDS
-from mbkit.report.compare_view import headline, view
 from mbkit.report.page import render
 from tests.random_trees import off, random_tree, states
 
@@ -145,7 +144,13 @@ def test_a_comparison_names_the_engine_and_its_defect_where_nothing_else_differs
     assert [(r.term, r.engine) for r in failed] == [(term, "pinocchio") for term in terms]
     assert all("known defect of pinocchio" in r.reason and "odd" in r.reason for r in failed)
     assert failed == [r for r in result.rows if r.defect]
-    for text in (result.verdict, headline(result), result.to_markdown(), result._repr_html_(), render(view(result))):
+    for text in (
+        result.verdict,
+        result.headline,
+        result.to_markdown(),
+        result._repr_html_(),
+        render(result.document()),
+    ):
         first = next(line for line in text.splitlines() if "differs in" in line)
         assert word in first
         assert "mujoco" not in first.split("differs in")[0].rpartition(">")[2]
@@ -156,7 +161,7 @@ def test_a_comparison_names_the_engine_and_its_defect_where_nothing_else_differs
     assert not worse.only_known_defects
     assert word in worse.verdict
     assert f"mujoco differs in {row.term}" in worse.verdict
-    assert headline(worse).startswith("pinocchio, mujoco differ")
+    assert worse.headline.startswith("pinocchio, mujoco differ")
 
 
 @in_this_version

@@ -13,9 +13,10 @@ from xml.etree import ElementTree
 
 import pytest
 
-from mbkit.report import compare_view, explain_view, figures, work_precision_view
 from mbkit.report import page as pages
+from mbkit.studies.compare.all_robots import drawn_robots
 from mbkit.studies.importers.result import Parsed, ParserComparison, Stage
+from mbkit.studies.work_precision.result import error_against_time
 from tests import test_report as examples
 from tests import test_stress_report as stress
 
@@ -41,7 +42,7 @@ PAGES = {
     "hostile": cache(lambda: examples.check_page(examples.NASTY)),
     "all": cache(lambda: examples.sweep_page(examples.ALL)),
     "bench": cache(lambda: examples.bench_page(examples.STUDY)),
-    "importers": cache(lambda: pages.render(explain_view.importers_view(IMPORTERS))),
+    "importers": cache(lambda: pages.render(IMPORTERS.document())),
     "stress": cache(lambda: stress.stress_page(stress.RESULT)),
 }
 SENTENCES = {
@@ -67,11 +68,11 @@ def test_a_page_begins_with_one_sentence_of_what_was_compared_on_how_many_states
 def test_a_long_list_of_what_is_missing_is_a_number_in_the_sentence() -> None:
     (refusal,) = examples.STUDY.refusals
     many = [examples.replace(refusal, term=f"method_number_{k}") for k in range(9)]
-    shown = work_precision_view.view(examples.replace(examples.STUDY, refusals=tuple(many)))
+    shown = examples.replace(examples.STUDY, refusals=tuple(many)).document()
     assert "; 9 curves left out; horizon" in shown.sentence
     assert "method_number_8" in shown.verdict
     whole = examples.replace(examples.AGREEING, precision=shown.result)
-    assert "; error against run time: 9 curves left out; " in compare_view.view(whole).sentence
+    assert "; error against run time: 9 curves left out; " in whole.document().sentence
 
 
 @pytest.mark.thorough("hostile")
@@ -109,14 +110,14 @@ def test_points_of_figures_say_what_they_are() -> None:
     def titles(svg: str) -> list[str]:
         return [str(e.text) for e in ElementTree.fromstring(svg).iter() if e.tag.endswith("title")]
 
-    assert "M, mujoco: worst error 3.0e-14" in titles(figures.digits(examples.AGREEING))
-    assert "M, mujoco: worst error 3.0e-14 in 1.23 µs" in titles(figures.term_costs(examples.AGREEING))
-    assert "a/one: 3.0e-14, M of mujoco" in titles(figures.robots(examples.ALL))
-    curves = titles(work_precision_view.error_against_time(examples.STUDY))
+    assert "M, mujoco: worst error 3.0e-14" in titles(examples.digits(examples.AGREEING))
+    assert "M, mujoco: worst error 3.0e-14 in 1.23 µs" in titles(examples.term_costs(examples.AGREEING))
+    assert "a/one: 3.0e-14, M of mujoco" in titles(drawn_robots(examples.ALL))
+    curves = titles(error_against_time(examples.STUDY))
     assert "lagrangian rk4: 1.0e-03 in 0.01 s" in curves
     assert "mujoco mujoco_rk4" in curves
     for result in (examples.NASTY, examples.DIFFERING):
-        ElementTree.fromstring(figures.digits(result))
+        ElementTree.fromstring(examples.digits(result))
 
 
 def test_a_table_reads_without_its_script() -> None:

@@ -14,20 +14,21 @@ from rich.console import Console
 
 from mbkit._escape import one_line, terminal
 from mbkit.errors import OutputError
-from mbkit.report import compare_view, figures, work_precision_view
 from mbkit.report import page as pages
 from mbkit.report import terminal as tables
-from mbkit.report.compare_view import failures, headline, omission_state
-from mbkit.report.figures import term_costs
-from mbkit.report.formatting import count_text, error_text, refusals, time_text
 from mbkit.report.output_folder import check_writable, file_stem, write
 from mbkit.simulate.progress import Bar
+from mbkit.studies.compare import figure
 from mbkit.studies.compare.all_robots import RobotOutcome, Sweep
 from mbkit.studies.compare.body_terms import BODY_TERMS, MECHANISM_TERMS
-from mbkit.studies.compare.result import Comparison, Finding, Omission, RolloutRow, Row
+from mbkit.studies.compare.result import Comparison
+from mbkit.studies.compare.rows import Finding, Omission, RolloutRow, Row
+from mbkit.studies.compare.tables import MEANINGS, failures, omission_state
 from mbkit.studies.compare.terms import CONSTRAINT_TERMS, TERMS
+from mbkit.studies.formatting import count_text, error_text, refusals, time_text
 from mbkit.studies.measurement import Measurement
 from mbkit.studies.results import Refusal
+from mbkit.studies.work_precision import result as curves
 from mbkit.studies.work_precision.curve import Curve
 from mbkit.studies.work_precision.result import WorkPrecision
 
@@ -196,23 +197,31 @@ ALL = Sweep(
 
 
 def check_page(result: Comparison, asked: str = "", data: str = "") -> str:
-    return pages.render(compare_view.view(result, asked), data=data)
+    return pages.render(result.document(asked), data=data)
 
 
 def bench_page(result: WorkPrecision, asked: str = "", data: str = "", table: str = "") -> str:
-    return pages.render(work_precision_view.view(result, asked), data=data, table=table)
+    return pages.render(result.document(asked), data=data, table=table)
 
 
 def sweep_page(result: Sweep, data: str = "") -> str:
-    return pages.render(compare_view.robots_view(result), data=data)
+    return pages.render(result.document(), data=data)
+
+
+def digits(result: Comparison) -> str:
+    return figure.digits(result.rows, result.engines, result.reference, result.tolerance)
+
+
+def term_costs(result: Comparison) -> str:
+    return figure.term_costs(result.rows, result.engines, result.tolerance)
 
 
 def check_table(result: Comparison, asked: str = "", *, full: bool = True) -> object:
-    return tables.render(compare_view.view(result, asked, full=full))
+    return tables.render(result.document(asked, full=full))
 
 
 def bench_table(result: WorkPrecision, asked: str = "") -> object:
-    return tables.render(work_precision_view.view(result, asked))
+    return tables.render(result.document(asked))
 
 
 def printed(what: object, width: int = 100) -> str:
@@ -254,10 +263,10 @@ def test_text_from_files_cannot_command_a_terminal():
 def test_headline_names_the_engines_and_who_is_left_out():
     # No row gives nle here: what nobody compared is not called agreement.
     told = "pinocchio, lagrangian, mujoco agree to 13.5 digits; not compared: nle; drake left out"
-    assert headline(AGREEING).startswith(told)
-    assert "1 of 6 comparisons of terms" in headline(DIFFERING)
-    assert "1 of 1 rollouts" in headline(DIFFERING)
-    assert "nothing compared" in headline(EMPTY)
+    assert AGREEING.headline.startswith(told)
+    assert "1 of 6 comparisons of terms" in DIFFERING.headline
+    assert "1 of 1 rollouts" in DIFFERING.headline
+    assert "nothing compared" in EMPTY.headline
 
 
 def test_what_a_study_left_out_is_said_first():
@@ -270,11 +279,11 @@ def test_what_a_study_left_out_is_said_first():
     for head in heads:
         assert "1 curve left out: pinocchio taylor" in head
         assert "horizon cut from 1 s to 0.5 s" in head
-    assert "1 of 1 rollouts cut, to 0.25 s" in headline(cut)
+    assert "1 of 1 rollouts cut, to 0.25 s" in cut.headline
     unjudged = replace(AGREEING, rollouts=(replace(rollout(1e-13, 1e-12), judged=False, passed=None),))
     assert unjudged.passed
-    assert "; the rollout not judged" in headline(unjudged)
-    assert "no rollouts" in headline(replace(AGREEING, rollouts=(), refusals=(Refusal("", "rollouts", "it fell"),)))
+    assert "; the rollout not judged" in unjudged.headline
+    assert "no rollouts" in replace(AGREEING, rollouts=(), refusals=(Refusal("", "rollouts", "it fell"),)).headline
     early = replace(STUDY, curves=(replace(STUDY.curves[0], ended="time"),), refusals=(), asked=0.5)
     assert early.shortened == ("1 curve ended by time: pinocchio rk4",)
     assert replace(early, curves=STUDY.curves).shortened == ()
@@ -315,7 +324,7 @@ def test_many_stiff_joints_do_not_fill_the_first_screen():
 
 def test_every_term_of_the_table_has_a_line_on_the_page():
     every = {t.name for t in (*TERMS, *CONSTRAINT_TERMS, *BODY_TERMS, *MECHANISM_TERMS)} | {"power balance"}
-    assert every == set(compare_view.MEANINGS)
+    assert every == set(MEANINGS)
     words = Tags(check_page(replace(AGREEING, rows=(*AGREEING.rows, row("A_G", "mujoco", 0.0))))).text
     assert "A_G v is the momentum of all bodies" in words
     assert "as if every joint were locked" not in words
@@ -339,32 +348,32 @@ def test_a_method_of_which_no_run_came_to_an_end_is_named_with_its_reason():
 def test_an_engine_that_comes_next_stands_once_whatever_lies_between():
     first, pin, mujoco = (Curve(e, "rk4", (), NAN, 0, 4.0, 0.1) for e in ("lagrangian", "pinocchio", "mujoco"))
     behind = [(c, point(0.1, 1e-9, s)) for c, s in ((pin, 1.3), (mujoco, 4.0), (pin, 5.0))]
-    lead = work_precision_view.Lead(first, point(0.1, 1e-9, 1.0), [1.0, 0.1, 0.01], behind)
-    assert work_precision_view.next_engines(lead) == "pinocchio × 1.3 to 5, mujoco × 4"
+    lead = curves.Lead(first, point(0.1, 1e-9, 1.0), [1.0, 0.1, 0.01], behind)
+    assert curves.next_engines(lead) == "pinocchio × 1.3 to 5, mujoco × 4"
 
 
 def test_a_run_that_is_the_fastest_for_several_errors_is_one_row():
     # lagrangian rk4 at 0.1 / 2^k has errors of 1e-3 / 16^k, and nobody is faster.
-    found = work_precision_view.leads(STUDY)
+    found = curves.leads(STUDY)
     assert [x.errors for x in found] == [[1e-2], [1e-4], [1e-6]]
     far = replace(
         STUDY, curves=tuple(replace(c, points=(point(0.1, 1e-9, c.points[0].seconds),)) for c in STUDY.curves)
     )
-    (one,) = work_precision_view.leads(far)
+    (one,) = curves.leads(far)
     assert one.errors == pytest.approx([1e-2, 1e-4, 1e-6, 1e-8])
-    assert work_precision_view.next_engines(one) == "mujoco × 2"
+    assert curves.next_engines(one) == "mujoco × 2"
     rows = [line for line in printed(bench_table(far), 120).splitlines() if line.startswith("1e-")]
     assert [" ".join(r.split()[:3]) for r in rows] == ["1e-02 to 1e-08"]
     assert Tags(check_page(replace(AGREEING, precision=far))).text.count("1e-02 to 1e-08") == 1
-    assert far.to_markdown().count("lagrangian rk4 | dt") == 1
+    assert far.to_markdown().count("lagrangian | rk4 | dt") == 1
 
 
 def test_failures_refusals_and_omissions_are_told_with_reasons():
-    found = {f.head: f.text for f in failures(DIFFERING)}
+    found = {f.head: f.text for f in failures(DIFFERING.rows, DIFFERING.rollouts, DIFFERING.omissions)}
     assert found["kinetic energy, pinocchio"] == "differs by 3.0e-01; pinocchio#2053"
     assert "1e-12 expected" in found["rollout rk4, pinocchio"]
     assert "leaving out limits" in found
-    assert not failures(AGREEING)
+    assert not failures(AGREEING.rows, AGREEING.rollouts, AGREEING.omissions)
     # Refusals of one reason are one notice, and what is left out by choice is not called unchanged.
     assert [b.head for b in refusals(AGREEING.refusals)] == ["mujoco (g, nle)", "drake"]
     assert [omission_state(o) for o in AGREEING.omissions] == ["same", "same", "on", "chosen"]
@@ -389,7 +398,7 @@ def test_the_verdict_comes_first_and_nothing_is_wider_than_the_terminal(width):
         assert "3.0e-14" in text
         assert "1.23 µs" in text
         assert "semi" not in text
-    lines = printed(tables.render(compare_view.robots_view(ALL)), width).splitlines()
+    lines = printed(tables.render(ALL.document()), width).splitlines()
     assert max(map(len, lines)) <= width
 
 
@@ -485,21 +494,21 @@ def test_a_page_holds_what_an_expert_asks_for():
 
 
 def test_figures_are_the_same_every_time_and_scale():
-    for draw in (figures.digits, term_costs, lambda r: work_precision_view.error_against_time(r.precision)):
+    for draw in (digits, term_costs, lambda r: curves.error_against_time(r.precision)):
         one, two = draw(AGREEING), draw(AGREEING)
         assert one == two
         assert "viewBox" in one
         assert not re.match(r"<svg[^>]* width=", one)
         assert "var(--series1)" in one
-    assert "mujoco against oracle" in figures.digits(AGREEING)
-    assert "var(--bad)" in figures.digits(DIFFERING)
-    assert "var(--bad)" not in figures.digits(AGREEING)
+    assert "mujoco against oracle" in digits(AGREEING)
+    assert "var(--bad)" in digits(DIFFERING)
+    assert "var(--bad)" not in digits(AGREEING)
 
 
 @pytest.mark.thorough("result1", "result2")
 @pytest.mark.parametrize("result", [STUDY, NASTY_STUDY, replace(STUDY, curves=STUDY.curves[:1], floor=0.0)])
 def test_the_figure_is_valid_svg_with_every_panel_named(result):
-    drawn = work_precision_view.error_against_time(result)
+    drawn = curves.error_against_time(result)
     root = ElementTree.fromstring(drawn)
     assert root.tag.endswith("svg")
     # What names parts inside is local, so nothing is loaded.
@@ -508,7 +517,7 @@ def test_the_figure_is_valid_svg_with_every_panel_named(result):
 
 
 def test_the_figure_names_the_front_and_puts_same_formulas_together():
-    drawn = work_precision_view.error_against_time(STUDY)
+    drawn = curves.error_against_time(STUDY)
     for told in ("best of lagrangian", "reference known to 1e-13", "run time of 0.5 s", "energy drift", "dashed"):
         assert told in drawn, told
     # MuJoCo's own RK4 stands in the panel of rk4, and has none of its own.
@@ -518,52 +527,52 @@ def test_the_figure_names_the_front_and_puts_same_formulas_together():
     damped = tuple(
         replace(c, points=tuple(replace(p, energy=NAN, note="has dampers") for p in c.points)) for c in STUDY.curves
     )
-    assert "energy drift" not in work_precision_view.error_against_time(replace(STUDY, curves=damped))
+    assert "energy drift" not in curves.error_against_time(replace(STUDY, curves=damped))
 
 
 def test_a_colour_and_marker_belong_to_an_engine_and_a_picture_is_the_same_every_time():
     for fig in (replace(STUDY, curves=STUDY.curves[2:]).plot(), STUDY.plot()):
         handle = next(h for h in fig.legends[0].legend_handles if "mujoco" in str(h.get_label()))
         assert (handle.get_color(), handle.get_marker()) == ("#00805e", "D")
-    made = work_precision_view.picture(STUDY)
+    made = curves.picture(STUDY)
     assert made.startswith(b"\x89PNG")
-    assert made == work_precision_view.picture(STUDY)
+    assert made == curves.picture(STUDY)
 
 
 def test_leads_end_where_no_run_or_the_reference_ends():
-    found = work_precision_view.leads(STUDY)
+    found = curves.leads(STUDY)
     assert [f"{e:.0e}" for x in found for e in x.errors] == ["1e-02", "1e-04", "1e-06"]
     assert {x.curve.engine for x in found} == {"lagrangian"}
     assert found[0].nexts[0][0].method == "mujoco_rk4"
-    assert work_precision_view.next_engines(found[0]) == "mujoco × 2"
+    assert curves.next_engines(found[0]) == "mujoco × 2"
     # An error that the reference itself may have is not told of.
-    assert len(work_precision_view.leads(replace(STUDY, floor=1e-5))) == 2
-    only = work_precision_view.leads(replace(STUDY, curves=STUDY.curves[:1]))
+    assert len(curves.leads(replace(STUDY, floor=1e-5))) == 2
+    only = curves.leads(replace(STUDY, curves=STUDY.curves[:1]))
     assert only[0].nexts == [None]
-    assert work_precision_view.next_engines(only[0]) == "none"
+    assert curves.next_engines(only[0]) == "none"
 
 
 def test_a_run_that_is_no_answer_is_on_no_front_and_the_headline_tells_where_the_lead_changes():
     wild = Curve("pinocchio", "semi_implicit_euler", (point(0.5, 8.0, 1e-4),), NAN, 0, 1.0, 0.1)
     result = replace(STUDY, curves=(wild, *STUDY.curves))
     assert result.front[0][0] is wild
-    assert work_precision_view.front_names(result) == ["lagrangian rk4"]
-    assert not work_precision_view.curve_lines(result)[0].on_front
+    assert curves.front_names(result) == ["lagrangian rk4"]
+    assert not curves.curve_lines(result)[0].on_front
     late = Curve("mujoco", "rk853", (point(0.1, 1e-9, 0.012),), NAN, 0, NAN, 0.1)
-    told = work_precision_view.headline(replace(STUDY, curves=(*STUDY.curves, late)))
+    told = replace(STUDY, curves=(*STUDY.curves, late)).headline
     leads = "lagrangian rk4 for an error of 1e-02, mujoco rk853 for an error of 1e-04 to 1e-08"
     assert told.startswith(f"fastest of 5 curves: {leads}")
 
 
 def test_an_order_that_is_off_is_flagged_and_one_that_was_not_seen_is_not():
-    assert [line.off for line in work_precision_view.curve_lines(STUDY)] == [False, True, False, False]
+    assert [line.off for line in curves.curve_lines(STUDY)] == [False, True, False, False]
     page, text = bench_page(STUDY), printed(bench_table(STUDY))
     assert "! 3.55" in page
     assert "! 4.02" not in page
     assert "! 3.55" in text
     assert "not the method's own" in text
     # The least error is the fastest of those that the reference can tell.
-    line = work_precision_view.curve_lines(replace(STUDY, floor=1e-5))[0]
+    line = curves.curve_lines(replace(STUDY, floor=1e-5))[0]
     assert line.best is STUDY.curves[0].points[2]
 
 
@@ -644,7 +653,7 @@ def test_a_sweep_counts_and_passes_only_when_all_agree_or_are_refused():
     assert not replace(good, expected=3).passed
     data = json.loads(ALL.to_json())
     assert [r["status"] for r in data["robots"]] == ["agree", "differ", "refused", "failed"]
-    assert "no joints" in printed(tables.render(compare_view.robots_view(ALL)))
+    assert "no joints" in printed(tables.render(ALL.document()))
     assert "no joints" in Tags(sweep_page(ALL)).text
 
 

@@ -14,11 +14,12 @@ from mbkit.errors import InputError, OutputError
 from mbkit.studies.baseline.description import Change
 from mbkit.studies.baseline.result import BaselineResult, ChangedNumber, VersionChange
 from mbkit.studies.compare.result import Comparison
+from mbkit.studies.document import Column, Table, block_html, block_markdown
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import Gap
 from mbkit.studies.importers.result import Parsed, ParserComparison, Stage
-from mbkit.studies.results import Column, Refusal, Table, block_html, block_markdown, from_plain, to_plain
+from mbkit.studies.results import Refusal, from_plain, to_plain
 from tests.test_report import AGREEING, DIFFERING, EMPTY, STUDY
 from tests.test_stress_report import RESULT
 
@@ -137,7 +138,7 @@ def test_nothing_is_lost_where_a_file_cannot_be_written(tmp_path):
 
 
 def test_markdown_and_html_escape_texts_and_write_numbers_as_asked():
-    table = Table((Column("a|b", lambda r: r[0]), Column("x", lambda r: r[1], ".1e", right=True)), [("<b>|", 0.5)])
+    table = Table((Column("a|b", lambda r: r[0]), Column("x", lambda r: f"{r[1]:.1e}", right=True)), [("<b>|", 0.5)])
     assert block_markdown(table) == "| a\\|b | x |\n|---|---:|\n| &lt;b&gt;\\| | 5.0e-01 |"
     assert (
         block_html(table)

@@ -17,7 +17,7 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.identify import filtered_motion
 from mbkit.model import Model
-from mbkit.studies.compare.result import OWN_LAW
+from mbkit.studies.compare.rows import OWN_LAW
 from mbkit.studies.work_precision.reference import reference
 from tests.random_trees import IN_MUJOCO, random_tree
 

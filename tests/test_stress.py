@@ -25,7 +25,6 @@ import mbkit as mb
 from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
 from mbkit.cli import cli
 from mbkit.errors import InputError, UnknownNameError
-from mbkit.report.stress_view import headline
 from mbkit.studies import InterruptedSweepError, StressResult
 from mbkit.studies.stress import Case, CaseResult, Measurement, Problem, Row, stress
 from mbkit.studies.stress.case import problem_of
@@ -203,7 +202,7 @@ def test_nothing_is_lost_on_the_way_to_json_and_back(study):
     rows = list(csv.DictReader(io.StringIO(study.to_csv())))
     assert len(rows) == sum(len(row.cells) for _, row in study.rows())
     assert {r["outcome"] for r in rows} >= {"held", "died", "slow", "silent", "nan", "refused", "unjudged"}
-    assert "| pinocchio | rk4 | dt 0.001 s | 3 |  |  |" in study.to_markdown()
+    assert "| pinocchio | rk4 | dt 0.001 s | 3 | | |" in study.to_markdown()
     assert "<td>died</td>" in study._repr_html_()
     assert "4 cases" in repr(study)
     # A study that left something out says so first.
@@ -212,9 +211,9 @@ def test_nothing_is_lost_on_the_way_to_json_and_back(study):
     row = replace(study.case("gliding").rows[0], cells=(late,))
     partial = replace(study, cases=(replace(study.case("gliding"), rows=(row,)),))
     assert partial.left_out == "the time allowed was used up: 1 of 1 cells were not run"
-    assert partial.to_markdown().startswith(f"**Incomplete**: {partial.left_out}.")
-    assert headline(partial).endswith("nothing was run")
-    assert headline(replace(partial, complete=False)).startswith("interrupted")
+    assert partial.to_markdown().startswith(f"**stress**: {partial.left_out}; ")
+    assert partial.headline.endswith("nothing was run")
+    assert replace(partial, complete=False).headline.startswith("interrupted")
     for text in ("{}", "no JSON", '{"cases": [1]}', "[" * 100_000):
         with pytest.raises(InputError, match="StressResult"):
             StressResult.from_json(text)

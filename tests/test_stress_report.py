@@ -11,14 +11,13 @@ import pytest
 from rich.console import Console
 
 from mbkit.errors import UnknownNameError
-from mbkit.report import stress_view, terminal
-from mbkit.report.figures import stable_steps
+from mbkit.report import terminal
 from mbkit.report.page import render
-from mbkit.report.stress_view import against_theory, avoid, content, map_cells, methods, rules, steps, view
 from mbkit.studies.measurement import Measurement
-from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade
-from mbkit.studies.stress.measurements import CaseResult, Overview, Row, name_of, place
+from mbkit.studies.stress.figure import SHADES, cell_text, figure, number_text, shade, stable_steps
+from mbkit.studies.stress.measurements import CaseResult, Overview, Row, name_of, overviews, place
 from mbkit.studies.stress.result import StressResult
+from mbkit.studies.stress.view import against_theory, avoid, content, map_cells, methods, rules, steps
 
 NAN, INF = math.nan, math.inf
 HOSTILE = '<script>alert("x")</script>[red]x[/red]\x1b[31m\u202e$x$</style>'
@@ -172,11 +171,11 @@ def printed(what: object, width: int = 100) -> str:
 
 
 def stress_page(result: StressResult, **files: str) -> str:
-    return render(view(result), **files)
+    return render(result.document(), **files)
 
 
 def summary(result: StressResult) -> object:
-    return terminal.render(view(result))
+    return terminal.render(result.document(full=False))
 
 
 @pytest.fixture(scope="module")
@@ -284,29 +283,27 @@ def test_dark_text_reads_on_every_shade_of_paper():
 def test_the_headline_says_who_held_furthest_and_how_much_was_silent():
     # Neither terms nor stable steps make a method the best.
     told = "lagrangian auto held furthest, or as far as any, in 1 of 1 case; 7 silent failures in 3 cases"
-    assert stress_view.headline(RESULT) == told
+    assert RESULT.headline == told
     twice = replace(RESULT, cases=(SPRING, replace(SPRING, rows=SPRING.rows[2:3])))
-    assert stress_view.headline(twice).startswith(
-        "lagrangian auto and pinocchio radau held furthest, or as far as any, in 1 of 2"
-    )
+    assert twice.headline.startswith("lagrangian auto and pinocchio radau held furthest, or as far as any, in 1 of 2")
     quiet = replace(RESULT, cases=(replace(SPRING, rows=SPRING.rows[1:3]),))
-    assert stress_view.headline(quiet).endswith("in 1 of 1 case; no silent failures")
-    assert stress_view.headline(NOTHING) == "interrupted; what was finished: nothing was run"
+    assert quiet.headline.endswith("in 1 of 1 case; no silent failures")
+    assert NOTHING.headline == "interrupted; what was finished: nothing was run"
     lost = replace(RESULT, cases=(replace(SPRING, rows=SPRING.rows[4:]),))
-    assert stress_view.headline(lost) == "nothing held in 1 case; no silent failures"
+    assert lost.headline == "nothing held in 1 case; no silent failures"
     # Without a run, terms are told of by engine.
-    assert stress_view.headline(replace(RESULT, cases=(TERMS,))).startswith("pinocchio held furthest")
+    assert replace(RESULT, cases=(TERMS,)).headline.startswith("pinocchio held furthest")
 
 
 def test_what_to_avoid_is_told_by_method_with_where_it_begins():
-    found = {a.method: a.places for a in avoid(stress_view.overview(RESULT))}
+    found = {a.method: a.places for a in avoid(overviews(RESULT.cases))}
     assert list(found) == ["rk4", "semi_implicit_euler", "pinocchio forward_dynamics"]
     assert [(o.case.name, *rest) for o, *rest in found["rk4"]] == [("joint_spring", "1e6 N m/rad", ["mujoco"])]
     assert found["semi_implicit_euler"][0][2] == []
 
 
 def test_where_another_holds_further_than_auto_is_told():
-    assert not any(o.behind for o in stress_view.overview(RESULT))
+    assert not any(o.behind for o in overviews(RESULT.cases))
     worse = Row("lagrangian", "auto", cells(STIFF, 1e-9, 1e-9, "slow", "slow"))
     result = replace(RESULT, cases=(replace(SPRING, rows=(worse, *SPRING.rows[2:])),))
     page = " ".join(Tags(stress_page(result)).text.split())
@@ -316,7 +313,7 @@ def test_where_another_holds_further_than_auto_is_told():
 
 
 def test_methods_are_counted_by_family_with_their_price():
-    first, *_ = found = methods(RESULT)
+    first, *_ = found = methods(overviews(RESULT.cases))
     assert (name_of(first.row), first.families) == ("lagrangian auto", {"stiffness": (1, 1)})
     assert (first.ahead, first.factor) == (1, 1.0)
     assert {name_of(m.row): m.silent for m in found}["mujoco rk4"] == 1
@@ -326,7 +323,7 @@ def test_methods_are_counted_by_family_with_their_price():
 
 
 def test_steps_are_set_against_linear_theory_and_make_a_rule():
-    found = steps(stress_view.overview(RESULT))
+    found = steps(overviews(RESULT.cases))
     assert [(x.row.method, against_theory(x)) for x in found[0].ran] == [
         ("gauss4", "as theory says"),
         ("rk4", "as theory says"),
@@ -339,19 +336,19 @@ def test_steps_are_set_against_linear_theory_and_make_a_rule():
         "semi_implicit_euler": (0.0, "none tried held, the least 1 / ω"),
     }
     further = replace(STEP.rows[0], theory=1.2e-3)
-    (case,) = steps(stress_view.overview(replace(RESULT, cases=(replace(STEP, rows=(further,), facts=()),))))
+    (case,) = steps(overviews(replace(RESULT, cases=(replace(STEP, rows=(further,), facts=()),)).cases))
     assert against_theory(case.ran[0]) == "holds 1.7 × further"
     # Without a frequency there is no rule, and a step all the same.
     assert rules([case]) == []
     # What was too slow tells nothing of stability.
     slow = replace(STEP, rows=(replace(STEP.rows[0], cells=cells(STEPS, 1e-5, "slow")),))
-    (case,) = steps(stress_view.overview(replace(RESULT, cases=(slow,))))
+    (case,) = steps(overviews(replace(RESULT, cases=(slow,)).cases))
     assert (against_theory(case.ran[0]), rules([case])) == ("", [])
 
 
 def test_a_damper_has_a_rule_of_its_own():
     damped = replace(STEP, name="damped", facts=({"fastest rate": 100.0},) * 4)
-    page = content(replace(RESULT, cases=(STEP, damped)))
+    page = content(overviews(replace(RESULT, cases=(STEP, damped)).cases))
     assert page["kinds"] == ["fastest frequency", "fastest rate"]
     told = {r.method: r.words for r in page["rules"]}
     assert told["rk4"] == "dt ≤ 2 / ω (fastest frequency); dt ≤ 0.2 / ω (fastest rate)"
@@ -485,7 +482,7 @@ def test_figures_draw_a_case_or_all_and_refuse_what_there_is_not():
 
 def test_the_figure_of_steps_is_valid_svg_and_the_same_every_time():
     for result in (RESULT, NASTY):
-        found = [(o.case, o.ran) for o in steps(stress_view.overview(result))]
+        found = [(o.case, o.ran) for o in steps(overviews(result.cases))]
         drawn = stable_steps(found)
         assert drawn == stable_steps(found)
         assert ElementTree.fromstring(drawn).tag.endswith("svg")

@@ -23,7 +23,7 @@ from mbkit.errors import InputError, MbkitError, MbkitWarning, OutputError, Unkn
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
-    from mbkit.report.document import Document
+    from mbkit.studies.document import Document
 
 # Exit status. "Differ" is a verdict, so a fault of mbkit's own has another.
 AGREE: Final = 0

@@ -121,7 +121,6 @@ def _check_one(
     file: Path, target: str | None, options: dict[str, Any], strict: bool, rebaseline: bool, *, table: bool
 ) -> tuple[BaselineResult, bool]:
     """Return the result, and whether it was recorded again."""
-    from mbkit.report.explain_view import baseline_view
     from mbkit.simulate.progress import Bar
     from mbkit.studies import baseline as baselines
     from mbkit.studies._targets import kept_options
@@ -132,7 +131,7 @@ def _check_one(
         result = baselines.check(model, file, strict=strict, target=new_target, progress=bar)
     if table:
         again = f"mbkit baseline check {file}{f' --target {target}' if target else ''} --rebaseline"
-        shared.show(baseline_view(result, again), as_json=False)
+        shared.show(result.document(again), as_json=False)
     if result.status in ("same", "skipped"):
         return result, False
     if not rebaseline and not (table and result.status == "versions" and _confirmed(file)):
@@ -173,11 +172,10 @@ def diff(path_a: Path, path_b: Path, as_json: bool) -> None:
     Exit status: 0 the same robot with the same numbers, 1 something differs, 2 misuse or a file
     that cannot be read.
     """
-    from mbkit.report.explain_view import baseline_view
     from mbkit.studies import baseline as baselines
 
     result = baselines.diff(path_a, path_b)
-    shared.show(baseline_view(result), as_json=as_json)
+    shared.show(result.document(), as_json=as_json)
     shared.leave(AGREE if result.passed else DIFFER)
 
 

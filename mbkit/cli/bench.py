@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any
 
 import click
@@ -48,11 +49,11 @@ def bench(
     Ctrl-C ends the study early and writes the finished part.
     """
     from mbkit.methods.registry import METHODS, QUICK_METHODS
-    from mbkit.report import work_precision_view
     from mbkit.simulate.progress import Bar
     from mbkit.studies import work_precision
     from mbkit.studies._checkpoint import InterruptedSweepError
     from mbkit.studies._targets import model_of
+    from mbkit.studies.work_precision.result import picture
     from mbkit.studies.worker import WorkerPool
 
     if full and quick:
@@ -73,8 +74,8 @@ def bench(
             result = work_precision(model, engines, methods or None, executor=executor, progress=bar, **settings)
     except InterruptedSweepError as stopped:
         result = stopped.result
-    figure = (lambda: work_precision_view.picture(result)) if result.front else None
-    written = report.write(work_precision_view.view(result, target), stem, table=result.to_csv, figure=figure)
+    figure = partial(picture, result) if result.front else None
+    written = report.write(result.document(target), stem, table=result.to_csv, figure=figure)
     if not result.complete:
         count, curves = sum(len(c.points) for c in result.curves), len(result.curves)
         shared.say("interrupted", f"{count} settings of {curves} curve{'s' * (curves != 1)} were finished")

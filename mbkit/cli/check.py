@@ -91,7 +91,6 @@ def check(
 
 
 def _check_one(report: Report, target: str, options: dict[str, Any], *, full: bool, **settings: Any) -> None:
-    from mbkit.report import compare_view
     from mbkit.simulate.progress import Bar
     from mbkit.studies import compare
     from mbkit.studies._targets import model_of
@@ -102,7 +101,7 @@ def _check_one(report: Report, target: str, options: dict[str, Any], *, full: bo
     with Bar(f"check {model.name}") as bar:
         result = compare(model, **settings, progress=bar, checkpoint=_tell_terms)
     result = replace(result, findings=(*result.findings, *_of_file(model, target)))
-    written = report.write(compare_view.view(result, target, full=full), stem)
+    written = report.write(result.document(target, full=full), stem)
     if result.nothing:
         needed = "" if result.rows else "; two engines that hold the model are needed"
         shared.say("error", f"{result.verdict}{needed}")
@@ -111,9 +110,7 @@ def _check_one(report: Report, target: str, options: dict[str, Any], *, full: bo
 
 def _tell_terms(result: Comparison) -> None:
     """Print the verdict on terms at once; what follows takes longer."""
-    from mbkit.report.compare_view import headline
-
-    shared.say("terms", f"{'✓' if result.passed else '✗'} {headline(result)}; rollouts and run times follow")
+    shared.say("terms", f"{'✓' if result.passed else '✗'} {result.headline}; rollouts and run times follow")
 
 
 def _of_file(model: Model, target: str) -> Iterator[Finding]:
@@ -134,13 +131,12 @@ def _of_file(model: Model, target: str) -> Iterator[Finding]:
 
 
 def _check_parsers(report: Report, target: str, **settings: Any) -> None:
-    from mbkit.report import explain_view
     from mbkit.studies.importers import compare_parsers
 
     stem = f"{shared.stem_of(target, Path(target).stem)}.importers"
     report.prepare(stem, "json", "html")
     result = compare_parsers(target, **settings)
-    written = report.write(explain_view.importers_view(result), stem)
+    written = report.write(result.document(), stem)
     read = any(not p.refused for p in result.importers)
     if not read:
         shared.say("error", f"no importer reads {target}")
@@ -149,7 +145,6 @@ def _check_parsers(report: Report, target: str, **settings: Any) -> None:
 
 def _check_all(report: Report, jobs: int | None, settings: dict[str, Any]) -> None:
     from mbkit.load import robots
-    from mbkit.report import compare_view
     from mbkit.simulate.progress import Bar
     from mbkit.studies.compare.all_robots import RobotOutcome, Sweep, all_robots
 
@@ -171,7 +166,7 @@ def _check_all(report: Report, jobs: int | None, settings: dict[str, Any]) -> No
         **{name: settings[name] for name in ("engines", "samples", "seed")},
         seconds=time.perf_counter() - start,
     )
-    written = report.write(compare_view.robots_view(result), "all")
+    written = report.write(result.document(), "all")
     if interrupted:
         shared.say("interrupted", f"{len(outcomes)} of {expected} robots were finished")
     shared.leave(INTERRUPTED if interrupted else MISUSE if not written else AGREE if result.passed else DIFFER)

@@ -49,7 +49,6 @@ def diff(
     elif second is None:
         raise click.UsageError("give two descriptions, or one and --engines A,B")
     from mbkit.engines import dynamics
-    from mbkit.report.explain_view import explanation_view
     from mbkit.studies.explain import explain
 
     targets = [first] if second is None else [first, second]
@@ -65,7 +64,7 @@ def diff(
         unlike = not beside[0].startswith("not compared")
         head = "beside the terms: " if unlike else ""
         result = replace(result, beside=(f"{head}{beside[0]}", *beside[1:]), agree=result.agree and not unlike)
-    shared.show(explanation_view(result), as_json=as_json)
+    shared.show(result.document(), as_json=as_json)
     shared.leave(shared.AGREE if result.agree else shared.DIFFER)
 
 

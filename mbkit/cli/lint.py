@@ -27,9 +27,8 @@ def lint(target: str, control_period: float, no_shapes: bool, options: dict[str,
     TARGET is what `mbkit check` takes. Links that no matter has are judged, not refused. Status 1 says that something
     is wrong for sure or likely; what to look at leaves it 0.
     """
-    from mbkit.report.lint_view import lint_view
     from mbkit.studies.lint import lint as study
 
     result = study(target, control_period=control_period, shapes=not no_shapes, **options)
-    shared.show(lint_view(result), as_json=as_json)
+    shared.show(result.document(), as_json=as_json)
     shared.leave(shared.AGREE if result.passed else shared.DIFFER)

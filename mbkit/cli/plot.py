@@ -31,8 +31,8 @@ def plot(files: tuple[Path, ...], case: str | None, ending: str, out: Path | Non
     FILE is the CSV of mbkit simulate, or the JSON of mbkit check, mbkit bench or mbkit stress. The figure has the
     file's name. Exit status: 0 done, 2 misuse or bad input.
     """
-    from mbkit.report.figures import image
     from mbkit.report.output_folder import check_replaceable, check_writable, write
+    from mbkit.studies.svg import image
 
     stems = [(f"{file.stem}-{case}" if case else file.stem) for file in files]
     folders = [out or file.parent for file in files]

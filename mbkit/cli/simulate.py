@@ -91,8 +91,8 @@ def _state(option: str, text: str, model: Model, which: int) -> Any:
 
 
 def _write(run: Trajectory, report: Report, stem: str) -> list[str]:
-    from mbkit.report.figures import image
     from mbkit.report.output_folder import write
+    from mbkit.studies.svg import image
 
     contents: dict[str, Any] = {"trajectory.csv": run.to_csv, "plot.png": lambda: image(run.plot())}
     if run.model.has_bodies:

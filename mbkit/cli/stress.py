@@ -48,7 +48,6 @@ def stress(
     if listing:
         _list(as_json=report.as_json)
         return
-    from mbkit.report.stress_view import view
     from mbkit.simulate.progress import Bar
     from mbkit.studies._checkpoint import InterruptedSweepError
     from mbkit.studies.stress.study import stress as study
@@ -63,7 +62,7 @@ def stress(
             result = study(cases or None, engines, methods or None, quick=quick, jobs=jobs, progress=bar, **limits)
     except InterruptedSweepError as stopped:
         result = stopped.result
-    written = report.write(view(result), stem, table=result.to_csv)
+    written = report.write(result.document(full=False), stem, table=result.to_csv)
     finished = sum(cell.end == "finished" for _, row in result.rows() for cell in row.cells)
     if not result.complete:
         shared.say("interrupted", f"{finished} runs were finished")
@@ -74,8 +73,8 @@ def stress(
 
 
 def _list(*, as_json: bool) -> None:
-    from mbkit.report.document import Column, Table
     from mbkit.report.terminal import table
+    from mbkit.studies.document import Column, Table
     from mbkit.studies.stress.cases import CASES
 
     if as_json:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
-from operator import attrgetter
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -14,7 +12,8 @@ from mbkit.errors import InputError, ModelError
 from mbkit.model import Joint, Model
 from mbkit.model.base_parameters import OF_JOINTS, STANDARD, body_of, length_of, standard_names
 from mbkit.model.validation import check_substituted, suspects
-from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
+from mbkit.studies.document import Block, Bullet, Column, Document, Items, Section, Table
+from mbkit.studies.results import ResultTable, columns_of
 
 _SIZE: Final = len(STANDARD)
 #: Velocities whose residuals are printed.
@@ -85,17 +84,17 @@ class Residual:
 
 
 _COLUMNS: Final = (
-    Column("parameter", attrgetter("name")),
-    Column("before", attrgetter("before"), ".6g", right=True),
-    Column("identified", attrgetter("value"), ".6g", right=True),
-    Column("standard deviation", attrgetter("deviation"), ".2g", right=True),
-    Column("is", attrgetter("combination")),
+    Column("parameter", lambda x: x.name),
+    Column("before", lambda x: f"{x.before:.6g}", right=True),
+    Column("identified", lambda x: f"{x.value:.6g}", right=True),
+    Column("standard deviation", lambda x: f"{x.deviation:.2g}", right=True),
+    Column("is", lambda x: x.combination),
 )
 _RESIDUALS: Final = (
-    Column("torque of", attrgetter("velocity")),
-    Column("samples", attrgetter("samples"), "d", right=True),
-    Column("root mean square", attrgetter("torque"), ".4g", right=True),
-    Column("noise", attrgetter("noise"), ".2g", right=True),
+    Column("torque of", lambda x: x.velocity),
+    Column("samples", lambda x: f"{x.samples:d}", right=True),
+    Column("root mean square", lambda x: f"{x.torque:.4g}", right=True),
+    Column("noise", lambda x: f"{x.noise:.2g}", right=True),
 )
 
 
@@ -146,7 +145,7 @@ class Identification(ResultTable):
     cutoff: float | None = None
 
     _listed: ClassVar = "parameters"
-    _csv_columns: ClassVar = (*columns_of(IdentifiedParameter), Column("determined", attrgetter("determined")))
+    _csv_columns: ClassVar = {**columns_of(IdentifiedParameter), "determined": lambda x: x.determined}
 
     @property
     def model(self) -> Model:
@@ -229,10 +228,10 @@ class Identification(ResultTable):
         more = len(self.residuals) - _SHOWN
         return "\n".join(lines + ([f"    and {more} more; .residuals has all"] if more > 0 else []))
 
-    def _blocks(self) -> Iterator[Block]:
+    def document(self) -> Document:
+        """Return the document of the identification: parameters, residuals, and what the data cannot tell."""
         how = f", physically consistent, {self.prior} prior" if self.physical else ""
-        text = f": {len(self.parameters)} parameters of {self.samples} samples, condition {self.condition:.3g}{how}"
-        yield Title(self.model_name, text)
-        yield Table(_COLUMNS, self.parameters)
-        yield Table(_RESIDUALS, self.residuals)
-        yield Items(f"the data cannot tell {x.text}" for x in self.undetermined)
+        text = f"{len(self.parameters)} parameters of {self.samples} samples, condition {self.condition:.3g}{how}"
+        unknown = Items([Bullet("", f"the data cannot tell {x.text}") for x in self.undetermined])
+        blocks: list[Block] = [Table(_COLUMNS, self.parameters), Table(_RESIDUALS, self.residuals), unknown]
+        return Document(self.model_name, text, True, [Section("", blocks)], self, marked=False)

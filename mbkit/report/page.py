@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from mbkit._escape import terminal
-from mbkit.report.document import Document, Span, spans
-from mbkit.report.formatting import count_text, error_text, time_text
-from mbkit.report.stress_view import FILTERS
+from mbkit.studies.document import Document, Span, spans
+from mbkit.studies.formatting import count_text, error_text, time_text
+from mbkit.studies.stress.view import FILTERS
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -12,8 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from mbkit._escape import one_line, terminal
-from mbkit.report import document
-from mbkit.report.document import Bullet, Column, Document, Items, Paragraph, Span, Style
+from mbkit.studies import document
+from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Span, Style
 
 _STYLES: Final[dict[Style, str]] = {
     "good": "green",

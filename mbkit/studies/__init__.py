@@ -2,7 +2,8 @@
 
 from mbkit.studies import stress
 from mbkit.studies._checkpoint import InterruptedSweepError
-from mbkit.studies.compare.result import Comparison, Finding, Omission, RolloutRow, Row
+from mbkit.studies.compare.result import Comparison
+from mbkit.studies.compare.rows import Finding, Omission, RolloutRow, Row
 from mbkit.studies.compare.study import compare
 from mbkit.studies.results import Refusal
 from mbkit.studies.stress.result import StressResult

@@ -15,7 +15,7 @@ import tempfile
 import time
 import types
 import typing
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, reduce
 from importlib import metadata
@@ -25,11 +25,12 @@ from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 
-from mbkit._escape import csv_text, html, markdown, one_line
+from mbkit._escape import csv_text, one_line
 from mbkit._version import __version__
 from mbkit.engines.registry import ENGINES
 from mbkit.errors import InputError, writing
 from mbkit.model import Model
+from mbkit.studies.document import Document, to_html, to_markdown
 
 #: What JSON has for an infinite limit, where null stands for an unknown one.
 NO_LIMIT: Final = "no limit"
@@ -108,37 +109,23 @@ def from_plain(kind: Any, value: Any) -> Any:
     return value
 
 
-# Tables, as Markdown and HTML.
+# Columns of CSV files: head -> value of a row.
+
+Columns = Mapping[str, Callable[[Any], Any]]
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column: its head, its value in a row, how a number is written, and whether it is set to the right."""
-
-    head: str
-    value: Callable[[Any], Any]
-    form: str = ""
-    right: bool = False
-
-    def text(self, row: Any, escape: Callable[[str], str]) -> str:
-        """Return the cell of a row."""
-        value = self.value(row)
-        return escape(value) if isinstance(value, str) else format(value, self.form)
-
-
-def columns_of(kind: type) -> tuple[Column, ...]:
+def columns_of(kind: type) -> Columns:
     """Return a column for each field of a dataclass that is a text, a number or a truth value."""
-    plain = ("str", "int", "float", "bool")
-    return tuple(Column(f.name, attrgetter(f.name)) for f in fields(kind) if f.type in plain)
+    return {f.name: attrgetter(f.name) for f in fields(kind) if f.type in ("str", "int", "float", "bool")}
 
 
-def columns(part: int, *names: str) -> list[Column]:
+def columns(part: int, *names: str) -> Columns:
     """Return a column for each attribute of one part of a row."""
 
-    def column(name: str) -> Column:
-        return Column(name, lambda row: getattr(row[part], name))
+    def value(name: str) -> Callable[[Any], Any]:
+        return lambda row: getattr(row[part], name)
 
-    return [column(name) for name in names]
+    return {name: value(name) for name in names}
 
 
 def counted(n: int, noun: str) -> str:
@@ -146,68 +133,18 @@ def counted(n: int, noun: str) -> str:
     return f"{n} {noun}{'s' * (n != 1)}"
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows of any kind, and the columns to read from each."""
-
-    columns: Sequence[Column]
-    rows: Iterable[Any]
-
-
-@dataclass(frozen=True)
-class Title:
-    """A name in bold, and what follows it."""
-
-    name: str
-    text: str
-
-
-@dataclass(frozen=True)
-class Items:
-    """A list of texts."""
-
-    texts: Iterable[str]
-
-
-Block = Title | Table | Items
-
-
-def block_markdown(block: Block) -> str:
-    """Return a block in Markdown."""
-    if isinstance(block, Title):
-        return f"**{markdown(block.name)}**{markdown(block.text)}"
-    if isinstance(block, Items):
-        return "\n".join(f"- {markdown(text)}" for text in block.texts)
-    head = "".join(f"| {markdown(c.head)} ".replace("  ", " ") for c in block.columns)
-    rule = "".join("|---:" if c.right else "|---" for c in block.columns)
-    rows = ("".join(f"| {c.text(row, markdown)} " for c in block.columns) for row in block.rows)
-    return "\n".join(f"{line}|" for line in (head, rule, *rows))
-
-
-def block_html(block: Block) -> str:
-    """Return a block in HTML."""
-    if isinstance(block, Title):
-        return f"<p><b>{html(block.name)}</b>{html(block.text)}</p>"
-    if isinstance(block, Items):
-        items = "".join(f"<li>{html(text)}</li>" for text in block.texts)
-        return f"<ul>{items}</ul>" if items else ""
-    head = "".join(f"<th>{html(c.head)}</th>" for c in block.columns)
-    rows = ("".join(f"<td>{c.text(row, html)}</td>" for c in block.columns) for row in block.rows)
-    return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
-
-
 class ResultTable:
-    """Base of the results of studies: `_blocks` for people, `_csv_columns` of `_csv_rows` for programs."""
+    """Base of the results of studies: a `document` for people, `_csv_columns` of `_csv_rows` for programs."""
 
     #: The attribute by which a repr calls the result, and the one with a row for each line of CSV.
     _called: ClassVar[str] = "model"
     _listed: ClassVar[str] = "rows"
     #: Properties that stand in the plain data beside the fields.
     _derived: ClassVar[Sequence[str]] = ()
-    _csv_columns: ClassVar[Sequence[Column]] = ()
+    _csv_columns: ClassVar[Columns] = {}
 
-    def _blocks(self) -> Iterator[Block]:
-        """Yield titles, tables and lists, in order."""
+    def document(self) -> Document:
+        """Return all that a terminal, a page, Markdown and a notebook show of the result."""
         raise NotImplementedError
 
     def _csv_rows(self) -> Iterable[Any]:
@@ -260,19 +197,19 @@ class ResultTable:
         """Return one line a row, with all digits; with `path`, write it there too."""
         stream = io.StringIO()
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(c.head for c in self._csv_columns)
+        writer.writerow(self._csv_columns)
         for row in self._csv_rows():
-            writer.writerow(_csv_cell(c.value(row)) for c in self._csv_columns)
+            writer.writerow(_csv_cell(value(row)) for value in self._csv_columns.values())
         if path is not None:
             write(path, stream.getvalue())
         return stream.getvalue()
 
     def to_markdown(self) -> str:
         """Return the result for people, in Markdown."""
-        return "\n\n".join(text for block in self._blocks() if (text := block_markdown(block))) + "\n"
+        return to_markdown(self.document())
 
     def _repr_html_(self) -> str:
-        return "".join(map(block_html, self._blocks()))
+        return to_html(self.document())
 
 
 def _csv_cell(value: Any) -> Any:

@@ -9,12 +9,21 @@ from typing import Final, Literal
 import numpy as np
 
 from mbkit.studies.baseline.description import Change
-from mbkit.studies.results import Block, Items, Refusal, ResultTable, Title, columns_of, counted
+from mbkit.studies.document import Bullet, Document, Items, Style
+from mbkit.studies.results import Refusal, ResultTable, columns_of, counted
 
 Status = Literal["same", "versions", "numbers", "description", "skipped"]
 # A person acts on the first few; the rest is in the data.
 _MOST: Final = 5
 _MOST_CHANGES: Final = 20
+_MARKS: Final[dict[str, tuple[str, Style]]] = {
+    "note": ("·", "muted"),
+    "version": ("·", "muted"),
+    "processor": ("·", "muted"),
+    "effect": ("→", "bold"),
+}
+_FAULT: Final[tuple[str, Style]] = ("✗", "bad")
+_SKIPPED: Final[tuple[str, Style]] = ("–", "allowed")
 
 
 @dataclass(frozen=True)
@@ -167,6 +176,21 @@ class BaselineResult(ResultTable):
     _listed = "moved"
     _csv_columns = columns_of(ChangedNumber)
 
-    def _blocks(self) -> Iterator[Block]:
-        yield Title(self.model, f": {self.verdict}")
-        yield Items(f"{what}: {text}" for what, text in self.lines(everything=True))
+    def document(self, again: str = "") -> Document:
+        """Return the document of a check or a diff; `again` is the command that records again."""
+        skipped = {r.engine for r in self.skipped}
+        bullets = []
+        for what, line in self.lines():
+            mark, style = _SKIPPED if what in skipped else _MARKS.get(what, _FAULT)
+            bullets.append(Bullet(what, line, mark, style))
+        if again and self.question == "check" and self.status in ("description", "numbers", "versions"):
+            bullets.append(Bullet("if this is meant" if self.status != "versions" else "to record again", again))
+        path = self.path if self.question == "check" else f"{self.path} → {self.against}"
+        return Document(
+            name=f"{self.model} ({path})",
+            verdict=self.verdict,
+            good=self.passed,
+            opening=[Items(bullets)],
+            sections=[],
+            result=self,
+        )

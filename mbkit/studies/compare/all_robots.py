@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,13 +15,26 @@ from mbkit.engines.registry import STANDARD
 from mbkit.errors import MbkitError, MbkitWarning, UnknownNameError
 from mbkit.load import load, robots
 from mbkit.load.loader import find
+from mbkit.simulate.plotting.style import log_ticks, name_points
+from mbkit.studies import document as doc
 from mbkit.studies import results
-from mbkit.studies.compare.result import Comparison
+from mbkit.studies.compare.figure import shown_error
+from mbkit.studies.compare.result import Comparison, states_text
 from mbkit.studies.compare.study import compare
+from mbkit.studies.formatting import error_text
+from mbkit.studies.svg import PAGE, canvas, svg
 from mbkit.studies.worker import run
 
 Status = Literal["agree", "differ", "refused", "failed"]
 STATUSES: Final[tuple[Status, ...]] = ("agree", "differ", "refused", "failed")
+
+
+_STATUS: Final = {
+    "agree": doc.Span("✓ agree", "good"),
+    "refused": doc.Span("– refused", "allowed"),
+    "differ": doc.Span("✗ differ", "bad"),
+    "failed": doc.Span("✗ failed", "bad"),
+}
 
 
 @dataclass(frozen=True)
@@ -73,6 +86,50 @@ class Sweep:
         parts += [f"{missing} not reached"] if missing else []
         return f"{self.expected} robots: " + ("; ".join(parts) or "nothing compared")
 
+    def document(self) -> doc.Document:
+        """Return the document of many robots."""
+        reasons = [
+            doc.Bullet(o.robot, o.reason, _STATUS[o.status].text[0], _STATUS[o.status].style)
+            for o in self.outcomes
+            if o.reason
+        ]
+        compared = any(o.comparison and o.comparison.rows for o in self.outcomes)
+        about = "Worst relative error of any term and state, one marker per robot; the dotted line is the tolerance."
+        columns = (
+            doc.Column("result", lambda o: _STATUS[o.status], width=9),
+            doc.Column("robot", lambda o: o.robot, width=20),
+            doc.Column("nv", _of(lambda c: str(c.facts["nv"])), right=True, width=3),
+            doc.Column("engines", _of(lambda c: str(len(c.engines))), right=True, width=7, on="terminal"),
+            doc.Column("engines", _of(lambda c: ", ".join(c.engines)), on="page"),
+            doc.Column("digits", _of(lambda c: f"{c.digits:.1f}" if c.worst else ""), right=True, width=6),
+            doc.Column("worst", _of(lambda c: error_text(c.worst.relative) if c.worst else ""), right=True, width=7),
+            doc.Column("where", _of(lambda c: f"{c.worst.term}, {c.worst.engine}" if c.worst else ""), on="page"),
+        )
+        return doc.Document(
+            name="",
+            heading="All robots of example-robot-data",
+            title=f"all robots: {'agree' if self.passed else 'differ'}",
+            verdict=self.verdict,
+            sentence=self._sentence(),
+            good=self.passed,
+            opening=[doc.Figure(lambda: drawn_robots(self), about)] if compared else [],
+            sections=[
+                doc.Section("Robot by robot", [doc.Table(columns, self.outcomes, dense=True)]),
+                doc.Section("Reasons", [doc.Items(reasons)]),
+            ],
+            result=self,
+            basis=states_text(self.samples, self.seed),
+            last=True,
+        )
+
+    def _sentence(self) -> str:
+        states = [c.rows[0].samples for o in self.outcomes if (c := o.comparison) and c.rows]
+        if not states:
+            return self.verdict
+        least, most = min(states), max(states)
+        span = f"{least} to {most}" if least != most else f"{least}"
+        return f"{self.verdict}; each against its own derivation evaluated with 34 digits, at {span} states"
+
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain data; NaN is None."""
         names = ("passed", "verdict", "counts", "expected", "engines", "samples", "seed", "seconds", "versions")
@@ -86,6 +143,37 @@ class Sweep:
     def to_json(self) -> str:
         """Return the sweep as JSON. NaN becomes null."""
         return json.dumps(self.to_dict(), indent=1, allow_nan=False)
+
+
+def _of(text: Callable[[Any], str]) -> Callable[[RobotOutcome], str]:
+    return lambda o: text(o.comparison) if o.comparison else ""
+
+
+_GROUP_MARKS: Final = "osD^vP"
+
+
+def drawn_robots(result: Sweep) -> str:
+    """Draw the worst error of each robot against its size."""
+    groups: dict[tuple[str, ...], list[tuple[int, float, str]]] = {}
+    compared = [(o.robot, o.comparison) for o in result.outcomes if o.comparison is not None]
+    for robot, c in compared:
+        if (worst := c.worst) is not None:
+            text = f"{robot}: {error_text(worst.relative)}, {worst.term} of {worst.engine}"
+            groups.setdefault(c.engines, []).append((int(c.facts["nv"]), shown_error(worst.relative, 1e-17), text))
+    with canvas("robots", 7.2, 3.4) as (fig, (ax,)):
+        for k, (engines, points) in enumerate(groups.items()):
+            nv, errors, texts = zip(*points, strict=True)
+            look: dict[str, Any] = {"color": PAGE.series[k % 6], "label": ", ".join(engines)}
+            name_points(ax.plot(nv, errors, _GROUP_MARKS[k % 6], **look), texts)
+        ax.set_yscale("log")
+        ax.set_xlabel("velocities, nv")
+        ax.set_ylabel("worst relative error")
+        ax.grid()
+        for tolerance in {c.tolerance for _, c in compared}:
+            ax.axhline(tolerance, color=PAGE.muted, linestyle=(0, (2, 2)), linewidth=1.0)
+        log_ticks(ax)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+        return svg(fig, "Worst relative error of each robot against its size")
 
 
 def all_robots(

@@ -26,7 +26,7 @@ from mbkit.model.elements.kinds import EFFECTS
 from mbkit.simulate import Trajectory
 from mbkit.studies.compare.errors import EPS, ROUNDINGS, interleaved
 from mbkit.studies.compare.findings import STEP, stiff_joints
-from mbkit.studies.compare.result import Omission, RolloutRow
+from mbkit.studies.compare.rows import Omission, RolloutRow
 from mbkit.studies.study_runs import quiet_simulate, start_state, state_within_limits
 
 DURATION: Final = 1.0

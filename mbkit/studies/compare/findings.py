@@ -11,7 +11,7 @@ from mbkit.model import Model
 from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.parts import Joint, rules_of
-from mbkit.studies.compare.result import ACTUATORS, LIMITS, STIFF, Finding
+from mbkit.studies.compare.rows import ACTUATORS, LIMITS, STIFF, Finding
 from mbkit.studies.results import counted
 
 #: The step of the rollouts, s.

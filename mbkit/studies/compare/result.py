@@ -1,202 +1,48 @@
-"""What a comparison returns: frozen rows, and ways to read them."""
+"""What a comparison returns: frozen rows, their judgement, and the document that shows them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from operator import attrgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._check import by_key
-from mbkit._escape import one_line
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.constrained import off_by
 from mbkit.model.elements.kinds import EFFECTS
-from mbkit.simulate.plotting.style import (
-    CROSS,
-    PLAIN,
-    Palette,
-    drawing,
-    engine_mark,
-    error_words,
-    figure_of,
-    legend,
-    name_points,
-)
-from mbkit.studies.compare.errors import digits_of, named_precision
-from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, columns_of
-from mbkit.studies.work_precision.result import WorkPrecision
+from mbkit.simulate.plotting.style import drawing
+from mbkit.studies import document as doc
+from mbkit.studies.compare import figure, tables
+from mbkit.studies.compare.errors import named_precision
+from mbkit.studies.compare.rows import OWN_LAW, STIFF, Finding, Omission, RolloutRow, Row, by_term
+from mbkit.studies.formatting import brief, model_facts, refusals, time_text
+from mbkit.studies.results import Refusal, ResultTable, columns_of
+from mbkit.studies.work_precision.result import WorkPrecision, curve_sections, failed_curves
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: The reference of terms of an engine whose constraints are soft.
-OWN_LAW: Final = "own law"
-#: Kinds of findings.
-ACTUATORS: Final = "actuators"
-LIMITS: Final = "limits"
-STIFF: Final = "stiff joint"
-#: Where an error of exactly zero stands on an axis of digits.
-_SAME: Final = 17.0
-
-
-@dataclass(frozen=True)
-class Row:
-    """One term of one engine against the reference, worst over all samples.
-
-    `reference` is ``"oracle"``, an engine where the oracle has no value, or ``"own law"`` where an engine's constraints
-    are soft. `max_abs` is the largest absolute difference of any entry, in the term's own unit; `relative` the worst
-    normwise error of a sample, and `median` the median, see `mbkit.studies.compare.errors`; `per_joint` the worst error
-    of a joint relative to its own scale, and `joint` that joint, empty for energies. `worst_kind` (random, neutral, at
-    limits, near singular), `worst_q` and `worst_v` are the state of the worst sample. `ns` is the median of nanoseconds
-    per evaluation of a single state, `ns_spread` half their interquartile range. `reason` says why the row failed,
-    naming joints and a known defect where there is one; or why more than the comparison's tolerance was allowed.
-    `allowed` is the error that passes: that tolerance, or more where the engine's own formula cannot do better.
-    `defect` is the engine's known defect, where the row failed with one announced. `zero` says whether the reference is
-    zero in every entry at every state, so that the row is no evidence. `bits` are those of the significand with which
-    the engine computes: 53, or 24 in single precision, where `allowed` is what that precision costs the term.
-    """
-
-    term: str
-    engine: str
-    reference: str
-    joint: str
-    max_abs: float
-    relative: float
-    per_joint: float
-    median: float
-    samples: int
-    worst_kind: str
-    worst_q: tuple[float, ...]
-    worst_v: tuple[float, ...]
-    ns: float
-    ns_spread: float
-    passed: bool
-    reason: str = ""
-    allowed: float = math.nan
-    defect: str = ""
-    zero: bool = False
-    bits: int = DOUBLE_BITS
-
-    @property
-    def digits(self) -> str:
-        """Digits of a row of an engine in another precision than double, as in ``6.4 of 7.2 digits``."""
-        return f"{-math.log10(max(self.relative, 1e-16)):.1f} of {digits_of(self.bits):.1f} digits"
-
-
-@dataclass(frozen=True)
-class RolloutRow:
-    """A trajectory of mbkit's integrator on one engine against MuJoCo's own, by the same formula.
-
-    `dt` is the step, `duration` the compared horizon and `asked` the wanted one, s. `error` is the largest difference
-    of q over the horizon, on the manifold. `condition` says how far q moves per relative disturbance of the forces,
-    see `mbkit.studies.compare.beyond_terms`; `tolerance` is 1e-12, or a multiple of eps times the condition if that
-    is more, as where an engine's formula for M loses digits. `off` is MuJoCo where the other engines' runs all differ
-    from its own and not from each other: then its own is the one that is off. `seconds` and `seconds_against` are the
-    run times of the two. `judged` is False where too few steps are well conditioned to say anything, and of a row for
-    information, whose tolerance is infinite; `passed` is None there.
-    """
-
-    method: str
-    engine: str
-    against: str
-    dt: float
-    duration: float
-    error: float
-    condition: float
-    tolerance: float
-    steps: int
-    seconds: float
-    seconds_against: float
-    passed: bool | None
-    note: str = ""
-    judged: bool = True
-    asked: float = math.nan
-    off: str = ""
-
-    @property
-    def cut(self) -> bool:
-        """Whether the compared horizon is shorter than the one wanted."""
-        return self.duration < self.asked * (1 - 1e-9)
-
-    @property
-    def informs(self) -> bool:
-        """Whether the row is for information, since it compares another formula and cannot fail."""
-        return math.isinf(self.tolerance)
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What the description has that bears on runs: what no engine uses, forces that jump, joints for other methods.
-
-    `kind` is ``"actuators"``, ``"left out of the motion"``, ``"dry friction"``, ``"limits"`` or ``"stiff joint"``;
-    `says` tells it in words, and `joints` has its joints. `mbkit check` adds ``"the file itself"``, with the links and
-    joints that `mbkit.lint` names.
-    `size` of dry friction is its ratio to the other forces at that joint and the median state, the largest of all
-    joints; of a stiff joint its time constant, s; of the file the number of findings; of limits NaN.
-    """
-
-    kind: str
-    says: str
-    joints: tuple[str, ...]
-    size: float = math.nan
-
-
-@dataclass(frozen=True)
-class Omission:
-    """One thing that was left out, need by need.
-
-    `present` says whether the description has it, and `what` what was off. `saved_ns` are the nanoseconds saved per
-    evaluation, the difference of two medians, NaN where nothing was timed; `saved_spread` is half the interquartile
-    range of that difference; `saved_setup` are the seconds of set-up saved, NaN where none. `change` is the largest
-    relative change of the accelerations with the thing on, and `unchanged` says whether it is within rounding. What
-    the description has and no engine uses may change them; what it has not may not, so that is a `fault`.
-    """
-
-    need: str
-    present: bool
-    what: str
-    saved_ns: float
-    saved_spread: float
-    saved_setup: float
-    change: float
-    unchanged: bool
-    note: str = ""
-
-    _derived: ClassVar = ("measurable", "fault")
-
-    @property
-    def fault(self) -> bool:
-        """Whether leaving out what the description has not changes the accelerations."""
-        return not self.unchanged and not self.present
-
-    @property
-    def measurable(self) -> bool:
-        """Whether the time saved stands out from the spread of the timings, by twice that."""
-        return abs(self.saved_ns) > 2 * self.saved_spread
-
-
-def _outcome(row: Row) -> str:
-    if not row.passed:
-        return row.reason
-    if row.zero:
-        return "zero in all states"
-    single = row.bits < DOUBLE_BITS and row.relative > 0
-    return f"agrees to {named_precision(row.bits)} ({row.digits})" if single else "agree"
-
-
-_COLUMNS: Final = (
-    Column("term", attrgetter("term")),
-    Column("engine", attrgetter("engine")),
-    Column("worst", attrgetter("relative"), ".1e"),
-    Column("median", attrgetter("median"), ".1e"),
-    Column("per joint", attrgetter("per_joint"), ".1e"),
-    Column("joint", attrgetter("joint")),
-    Column("ns", attrgetter("ns"), ".0f"),
-    Column("", _outcome),
+_MAX_FAILURES: Final = 12
+#: Stiff joints that have a line of their own on the first screen.
+_MAX_STIFF: Final = 3
+_ROLLOUTS: Final = "Rollouts against MuJoCo's own, step {}: largest difference of q (rad or m)"
+_MEASURED: Final = (
+    "At each state a vector x of the reference and its error e give ‖e‖ / max(‖x‖, ‖M‖‖v‖²): a term that happens to be "
+    "small is measured by the forces at play. “Worst” is the largest over all states.",
+    (
+        "M: the largest |eᵢⱼ| / √(Mᵢᵢ Mⱼⱼ), which no choice of units changes.",
+        "Forward dynamics: accelerations weighted by √Mⱼⱼ, and divided by cond(M) of M scaled to a unit diagonal, "
+        "which any arithmetic loses.",
+        "Energies: |e| / max(|x|, ‖M‖‖v‖²).",
+        "Per joint: |eⱼ| by that joint's own scale, which shows a small joint beside a large one.",
+        "Power balance: dE/dt against (τ + damping)·v, each engine by itself.",
+    ),
 )
+
+
+_MORE: Final = "All terms, rollouts, run times and notes: with --full, and on the page."
 
 
 @dataclass(frozen=True, repr=False)
@@ -351,10 +197,179 @@ class Comparison(ResultTable):
 
     def by_term(self) -> dict[str, dict[str, Row]]:
         """Return the rows by term and engine, terms in their order."""
-        out: dict[str, dict[str, Row]] = {}
-        for row in self.rows:
-            out.setdefault(row.term, {})[row.engine] = row
+        return by_term(self.rows)
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence that stays short however much differs."""
+        if self.nothing or self.passed or self.only_known_defects:
+            return self.verdict
+        # Rows are measured by the oracle: the engine that differs fails. Rollouts are measured by MuJoCo's own.
+        rows = [r for r in self.rows if not r.passed]
+        runs = [r for r in self.rollouts if r.passed is False]
+        omissions = [o for o in self.omissions if o.fault]
+        counts = (
+            (rows, self.rows, "comparisons of terms"),
+            (runs, [r for r in self.rollouts if r.judged], "rollouts"),
+            (omissions, self.omissions, "omissions"),
+        )
+        parts = [f"{len(failed)} of {len(every)} {what}" for failed, every, what in counts if failed]
+        engines = dict.fromkeys([*(r.engine for r in rows), *(r.off or r.engine for r in runs)])
+        known = [r.engine for r in rows if r.defect]
+        by_defect = f" ({len(known)} by a known defect of {', '.join(dict.fromkeys(known))})" if known else ""
+        subject = f"{', '.join(engines)} differ{'s' * (len(engines) == 1)}: " if engines else ""
+        return f"{subject}{', '.join(parts)}{by_defect}{brief(self.shortened)}"
+
+    def _sentence(self) -> str:
+        """Return the headline, with what was compared with what on how many states."""
+        if self.nothing:
+            return self.headline
+        instead = self.reference in self.engines
+        what = "which stands in for the oracle" if instead else "the own derivation evaluated with 34 digits"
+        reference = f"{'' if instead else 'the '}{self.reference}, {what}"
+        terms = len({r.term for r in self.rows})
+        measured = f"{terms} term{'s' * (terms != 1)} at {self.rows[0].samples} states"
+        if not self.passed:
+            return f"{self.headline}; measured against {reference}, in {measured}"
+        return f"{self.agreement(f' with {reference}')}, in {measured}{brief(self.shortened)}"
+
+    def document(self, target: str = "", *, full: bool = True) -> doc.Document:
+        """Return the document of the comparison; `target` is the name by which a person called the model.
+
+        Without `full` a terminal shows what the page begins with: verdict, what the file has that no engine used,
+        faults, and each engine's worst row.
+        """
+        target = target if target != self.model else ""
+        facts = self.facts
+        mass = facts.get("mass")
+        samples = self.rows[0].samples if self.rows else self.samples
+        size = f"nq {facts.get('nq', '?')}, nv {facts.get('nv', '?')}" + (
+            f", {mass:.4g} kg" if mass is not None else ""
+        )
+        outcome = "agree" if self.passed else "not compared" if self.nothing else "differ"
+        precision = self.precision
+        steps = " or ".join(dict.fromkeys(time_text(r.dt) for r in self.rollouts if not r.informs))
+        on: doc.On = "both" if full else "page"
+        terms = dict.fromkeys(r.term for r in self.rows)
+        return doc.Document(
+            name=f"{self.model} ({target})" if target else self.model,
+            heading=self.model,
+            title=f"{self.model}: {outcome}",
+            verdict=self.headline,
+            sentence=self._sentence(),
+            good=self.passed,
+            summary=f"{size} · {samples} states (seed {self.seed}) · tolerance {self.tolerance:.0e}"
+            f" · {self.seconds:.1f} s",
+            opening=self._first_screen(full=full),
+            sections=[
+                doc.Section("The model", [doc.Facts(list(model_facts(facts, target, self.setup)))], on="page"),
+                doc.Section("Terms: worst relative error, time per call", self._terms() if self.rows else [], on),
+                doc.Section(_ROLLOUTS.format(steps), tables.rollout_blocks(self.rollouts), on),
+                *(curve_sections(precision, whole=False, on=on) if precision is not None else []),
+                doc.Section(
+                    "What a call leaves out, and the time that this saves; change is that of the accelerations",
+                    tables.omission_blocks(self.omissions),
+                    on,
+                ),
+                doc.Section("Notes", self._notes(), on),
+                doc.Section(
+                    "What the terms are", [doc.Facts([(t, x) for t in terms if (x := tables.MEANINGS.get(t))])], "page"
+                ),
+                doc.Section(
+                    "How errors are measured",
+                    [doc.Paragraph(_MEASURED[0]), doc.Items([doc.Bullet("", text) for text in _MEASURED[1]])],
+                    on="page",
+                ),
+            ],
+            result=self,
+            basis=states_text(self.samples, self.seed),
+        )
+
+    def _first_screen(self, *, full: bool) -> list[doc.Block]:
+        """Return what a reader needs to know before any table."""
+        stiff = [x for x in self.findings if x.kind == STIFF]
+        beside = [doc.Bullet(x.kind, x.says, "!", "allowed") for x in self.findings if x not in stiff[_MAX_STIFF:]]
+        if len(stiff) > _MAX_STIFF:
+            rest = ", ".join(name for x in stiff[_MAX_STIFF:] for name in x.joints)
+            beside.append(
+                doc.Bullet("stiff joints", f"{len(stiff) - _MAX_STIFF} more, less stiff: {rest}", "!", "allowed")
+            )
+        beside += [
+            doc.Bullet(r.engine or f"no {r.term}", r.reason, "!", "allowed")
+            for r in self.refusals
+            if not r.engine or (not r.term and r.engine not in self.engines)
+        ]
+        notes = dict.fromkeys(r.note for r in self.rollouts if r.passed is None and not r.informs)
+        beside += [doc.Bullet("rollouts", note, "!", "allowed") for note in notes]
+        if self.precision is not None:
+            failed = self.precision.failed
+            beside += [doc.Bullet(f"no curve of {b.head}", b.text, "!", "allowed") for b in failed_curves(failed)]
+        return [
+            doc.Items(tables.failures(self.rows, self.rollouts, self.omissions), most=_MAX_FAILURES),
+            doc.Items(beside, most=_MAX_FAILURES),
+            doc.Table(tables.WORST, self._worst_rows()),
+            *([] if full else [doc.Paragraph(doc.Span(_MORE, "muted"), on="terminal")]),
+        ]
+
+    def _worst_rows(self) -> list[Row]:
+        """Return each engine's worst row; one that failed comes first."""
+        rows = [[r for r in self.rows if r.engine == engine and r.reference != engine] for engine in self.engines]
+        return [max(some, key=lambda r: (not r.passed, r.relative)) for some in rows if some]
+
+    def _terms(self) -> list[doc.Block]:
+        terms = self.by_term()
+        short = [doc.Column("term", lambda rows: next(iter(rows.values())).term)]
+        short += [tables.engine_column(engine, self.reference) for engine in self.engines]
+        entries = [(term, engine, rows.get(engine)) for term, rows in terms.items() for engine in self.engines]
+        allowed = [r for r in self.rows if r.passed and r.reason]
+        but = ", but where an engine's own formula cannot do better (marked !)" if allowed else ""
+        return [
+            doc.Table(short, [*terms.values()], on="terminal"),
+            *self._soft(),
+            doc.Paragraph(
+                f"Every engine against the {self.reference}, the own derivation evaluated with 34 digits, at "
+                f"{self.rows[0].samples} states; an error above {self.tolerance:g} fails{but}.",
+                on="page",
+            ),
+            doc.Figure(
+                lambda: figure.digits(self.rows, self.engines, self.reference, self.tolerance),
+                "A marker is the worst state, crossed out where it fails; the thin bar's other end is the median. "
+                "Double precision ends near 16 digits; “same” is the same number in every state.",
+            ),
+            doc.Figure(
+                lambda: figure.term_costs(self.rows, self.engines, self.tolerance),
+                "The same worst errors over the time of one call through mbkit: lower left is better. Errors below "
+                "what double precision can tell stand at the bottom.",
+                wide=True,
+            ),
+            doc.Table(tables.TERM_COLUMNS, entries, on="page"),
+            doc.Items([doc.Bullet(f"{r.term}, {r.engine}", r.reason, "!", "allowed") for r in allowed]),
+            doc.Paragraph(
+                "Times are medians of single calls through mbkit, interleaved between engines; ± is half the "
+                "interquartile range. The joint named has the largest error on its own scale.",
+                on="page",
+                note=True,
+            ),
+        ]
+
+    def _soft(self) -> list[doc.Block]:
+        """Return a sentence on each engine with soft constraints."""
+        out: list[doc.Block] = []
+        for engine in self.softness:
+            terms = [r.term for r in self.rows if r.engine == engine and r.reference == OWN_LAW]
+            out.append(
+                doc.Paragraph(
+                    f"{', '.join(terms)} of {engine} are measured by its own law of soft constraints instead of the "
+                    f"{self.reference}."
+                )
+            )
         return out
+
+    def _notes(self) -> list[doc.Block]:
+        notes = [doc.Bullet("", note) for note in self.facts.get("notes", ())]
+        bodies = "; ".join(self.facts.get("nonphysical", ()))
+        inconsistent = [doc.Bullet("bodies with inconsistent inertia", bodies)] if bodies else []
+        return [doc.Items([*refusals(self.refusals), *notes, *inconsistent])]
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Draw the digits of each engine and term with Matplotlib: the worst state, and the median behind it.
@@ -362,66 +377,12 @@ class Comparison(ResultTable):
         What failed is crossed out. `ax` is where to draw; by default in a figure of its own.
         """
         with drawing():
-            return figure(self, PLAIN, ax)
+            return figure.figure(self.rows, self.engines, self.reference, self.tolerance, ax=ax)
 
     _derived = ("passed", "verdict", "digits", "shortened")
     _csv_columns = columns_of(Row)
 
-    def _blocks(self) -> Iterator[Block]:
-        yield Title(self.model, f": {self.verdict}")
-        yield Items(f"{x.kind}: {x.says}" for x in self.findings)
-        yield Table(_COLUMNS, self.rows)
-        yield Items(f"{r.engine}{' ' + r.term if r.term else ''}: {r.reason}" for r in self.refusals)
 
-
-def figure(result: Comparison, palette: Palette, ax: Axes | None = None) -> Figure:
-    """Draw the digits of agreement of each term and engine, in the style that is set."""
-    from matplotlib.figure import Figure
-
-    terms, engines = result.by_term(), result.engines
-    own = ax is None
-    if ax is None:
-        ax = Figure(figsize=(7.2, 1.3 + 0.36 * len(terms)), layout="constrained").add_subplot()
-    step = 0.8 / max(len(engines), 3)
-    for k, engine in enumerate(engines):
-        colour, label = palette.engine(engine), f"{one_line(engine, 30)} against {result.reference}"
-        ax.plot([], [], engine_mark(engine), color=colour, label=label)
-        shown = [(place, by[engine]) for place, by in enumerate(terms.values()) if engine in by]
-        if not shown:
-            continue
-        y = [place + (k - (len(engines) - 1) / 2) * step for place, _ in shown]
-        errors = {"median": [r.median for _, r in shown], "worst": [r.relative for _, r in shown]}
-        ends = {kind: [_shown_digits(x) for x in some] for kind, some in errors.items()}
-        ax.hlines(y, ends["median"], ends["worst"], color=colour, linewidth=1.2)
-        # One line for all terms: Matplotlib's time goes by the lines.
-        for kind, look in (("median", {"marker": "|", "markersize": 8}), ("worst", {"marker": engine_mark(engine)})):
-            texts = [
-                f"{r.term}, {engine}: {kind} error {error_words(x)}"
-                for (_, r), x in zip(shown, errors[kind], strict=True)
-            ]
-            name_points(ax.plot(ends[kind], y, ls="none", color=colour, **look), texts)
-        if failed := [(x, h) for (_, r), x, h in zip(shown, ends["worst"], y, strict=True) if not r.passed]:
-            ax.plot(*zip(*failed, strict=True), "x", color=palette.bad, **CROSS)
-    ax.set_yticks(range(len(terms)), [one_line(t, 40) for t in terms])
-    ax.set_ylim(len(terms) - 0.4, -1.1)
-    # The digits that all have say nothing; the tolerance's stay in sight.
-    least = min((_shown_digits(row.relative) for row in result.rows), default=0.0)
-    begin = max(0, min(10, 2 * (math.floor(least) // 2) - 2))
-    ticks = range(begin, 17, 2)
-    limit = -math.log10(result.tolerance)
-    ax.axvline(limit, color=palette.muted, linestyle=(0, (2, 2)), linewidth=1.0)
-    side = "left" if limit < (begin + _SAME) / 2 else "right"
-    text = f" tolerance {result.tolerance:g} "
-    ax.text(limit, -0.75, text, color=palette.muted, ha=side, va="center", fontsize=9)
-    ax.set_xlim(begin - 0.1, _SAME + 0.3)
-    ax.set_xticks([*ticks, _SAME], [*map(str, ticks), "same"])
-    ax.set_xlabel("digits of agreement, −log₁₀ of the relative error")
-    ax.grid(axis="x")
-    ax.tick_params(axis="y", length=0)
-    handles = ax.get_legend_handles_labels()[0]
-    legend(ax, handles, "upper", own=own, columns=3 if own and len(max(engines, key=len, default="")) < 12 else 2)
-    return figure_of(ax)
-
-
-def _shown_digits(error: float) -> float:
-    return 0.0 if math.isnan(error) else _SAME if error == 0 else min(max(-math.log10(error), 0.0), 16.5)
+def states_text(samples: int, seed: int) -> Mapping[str, doc.Text]:
+    """Return the states of a comparison, for the foot of a page."""
+    return {"states": f"{samples} random ones, seed {seed}; beside them neutral, at-limit and near-singular ones"}

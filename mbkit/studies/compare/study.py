@@ -37,7 +37,8 @@ from mbkit.studies.compare.errors import (
 )
 from mbkit.studies.compare.findings import findings
 from mbkit.studies.compare.precision import Precision
-from mbkit.studies.compare.result import OWN_LAW, Comparison, Row
+from mbkit.studies.compare.result import Comparison
+from mbkit.studies.compare.rows import OWN_LAW, Row
 from mbkit.studies.compare.terms import (
     CONSTRAINT_TERMS,
     FORWARD_DYNAMICS,

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+import tomllib
+from collections.abc import Iterable
 from dataclasses import dataclass
-from operator import itemgetter
-from typing import Any, Final
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar, Final
 
 from mbkit._check import by_key
 from mbkit._escape import one_line
+from mbkit.studies.document import Block, Bullet, Column, Document, Items, Section, Span, Style, Table
 from mbkit.studies.explain.joint_matching import Match
 from mbkit.studies.explain.terms import WHOLE, Gap
-from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns_of
+from mbkit.studies.formatting import error_text
+from mbkit.studies.results import ResultTable, columns_of
 
 #: More causes of one kind than this are one line.
 _MAX_LINES: Final = 3
@@ -131,14 +135,34 @@ class Explanation(ResultTable):
 
     _derived = ("verdict",)
     _listed = "causes"
-    _csv_columns = (*columns_of(Cause), Column("effect", lambda cause: effect(cause)))
+    _csv_columns: ClassVar = {**columns_of(Cause), "effect": lambda cause: effect(cause)}
 
-    def _blocks(self) -> Iterator[Block]:
-        yield Title(f"{self.a} and {self.b}", f": {self.verdict}")
-        if self.causes:
-            columns = [Column(head, itemgetter(k)) for k, head in enumerate(("cause", "what", "effect"))]
-            yield Table(columns, grouped(self.causes))
-        yield Items(self.notes)
+    def document(self) -> Document:
+        """Return the document of the explanation: verdict, terms, causes and notes."""
+        gaps = (
+            Column("term", lambda g: g.term),
+            Column("relative difference", self._difference, right=True),
+            Column("joint", lambda g: g.joint),
+        )
+        joints = [f"{m.a} is {m.b}" for m in self.matches if m.how == "structure"]
+        for names, side in ((self.only_a, self.a), (self.only_b, self.b)):
+            joints += [f"{name} is only in {side}" for name in names]
+        by_name = sum(m.how == "name" for m in self.matches)
+        return Document(
+            name=f"{self.a} and {self.b}",
+            verdict=self.verdict,
+            good=self.agree,
+            sections=[
+                Section("Terms, by joint name", [Table(gaps, self.gaps)]),
+                Section("Causes", cause_blocks(self.causes)),
+                Section(f"Joints: {by_name} matched by name, and", [Items([Bullet("", text) for text in joints])]),
+                Section("Notes", [Items([Bullet("", note) for note in self.notes])]),
+            ],
+            result=self,
+        )
+
+    def _difference(self, gap: Gap) -> Span:
+        return Span(error_text(gap.relative), "good" if gap.relative <= self.tolerance else "bad")
 
     def __repr__(self) -> str:
         reasons = [f"{c.says} ({effect(c)})" for c in self.acting]
@@ -172,3 +196,28 @@ def grouped(causes: Iterable[Cause]) -> list[tuple[str, str, str]]:
         most = f"up to {effect(largest)}" if largest.acts and largest.effects else effect(largest)
         out.append((kind, f"{len(some)} times, first {some[0].says}; in all: {names}", most))
     return out
+
+
+def cause_blocks(causes: Iterable[Cause], apart: tuple[str, ...] = ()) -> list[Block]:
+    """Return the causes, those that move something first; kinds that stand `apart` decide nothing."""
+    bullets: list[Bullet] = []
+    known = list(causes)
+    for acts in (True, False):
+        for kind, says, what in grouped(c for c in known if c.acts == acts):
+            # What a kind means is said once.
+            again = any(b.head == kind for b in bullets)
+            decides = acts and kind not in apart
+            look: tuple[str, Style] = ("✗", "bad") if decides else ("!", "allowed")
+            bullets.append(Bullet(kind, f"{says} ({what})", *look, "" if again else meaning(kind)))
+    return [Items(bullets)]
+
+
+@cache
+def meanings() -> dict[str, dict[str, str]]:
+    """Return sentences on kinds of causes and on stages of importers."""
+    return tomllib.loads((Path(__file__).parent / "meanings.toml").read_text(encoding="utf-8"))
+
+
+def meaning(kind: str) -> str:
+    """Return a sentence on a kind of cause; empty where its name says it all."""
+    return meanings()["causes"].get(kind, "")

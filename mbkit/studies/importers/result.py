@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from operator import itemgetter
+from pathlib import PurePath
 from typing import ClassVar, Final
 
-from mbkit.studies.explain.result import Explanation, grouped
-from mbkit.studies.results import Block, Column, Items, ResultTable, Table, Title, columns
+from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Section, Span, Table
+from mbkit.studies.explain.result import Explanation, cause_blocks, meanings
+from mbkit.studies.formatting import error_text
+from mbkit.studies.results import ResultTable, columns
 
 #: The terms that each engine computes by itself, on its own model.
 TERMS: Final = ("M", "g", "nle", "passive")
@@ -18,7 +21,10 @@ MISSING: Final = "not installed"
 DECIDING: Final = ("joints", *TERMS)
 #: Stages that no term shows: an agreement leaves them out.
 _APART: Final = {"mimic": "mimic joints", "limits": "limits", "loops": "loops", "couplers": "couplers"}
-_MARK: Final = {True: "same", False: "differs", None: "not comparable"}
+_LEGEND: Final = (
+    "✓ the same. ✗ another motion, which decides whether an importer agrees. ! in no term, so it decides nothing. "
+    "– cannot be compared."
+)
 
 
 @dataclass(frozen=True)
@@ -128,39 +134,123 @@ class ParserComparison(ResultTable):
 
     _derived = ("agree", "verdict")
     _called = "source"
-    _csv_columns = (
-        *columns(0, "engine", "version"),
-        Column("stage", lambda row: row[1].name),
-        *columns(1, "same", "worst", "where", "says"),
-    )
+    _csv_columns: ClassVar = {
+        **columns(0, "engine", "version"),
+        "stage": lambda row: row[1].name,
+        **columns(1, "same", "worst", "where", "says"),
+    }
 
     def _csv_rows(self) -> list[tuple[Parsed, Stage]]:
         return [(p, stage) for p in self.importers for stage in p.stages]
 
-    def _blocks(self) -> Iterator[Block]:
-        yield Title(self.source, f": {self.verdict}")
+    def document(self) -> Document:
+        """Return the document of several importers of one file: their own terms, and why they differ."""
+        name = PurePath(self.source).name
         read = [p for p in self.importers if p.stages]
-        if read:
-            rows = [(stages[0].name, *map(_cell, stages)) for stages in zip(*(p.stages for p in read), strict=True)]
-            heads = ("stage", *(p.engine for p in read))
-            yield Table([Column(head, itemgetter(k)) for k, head in enumerate(heads)], rows)
-        yield Items(self._notes())
+        alone = [p for p in self.importers if not p.stages and not p.refused]
+        outcome = "agree" if self.agree else "differ" if read else "are not compared" if alone else "refuse"
+        rows = [p.stages for p in read]
+        columns = [
+            Column("stage", lambda k: Span(rows[0][k].name, "bold")),
+            Column("", lambda k: Span(meanings()["stages"].get(rows[0][k].name, ""), "muted"), on="page"),
+            *(_importer(p) for p in read),
+        ]
+        plural = "s" * (self.samples != 1)
+        refused = [Bullet(p.label, p.refused, "✗", "bad") for p in self.importers if p.refused]
+        notes = [Bullet("the file", note) for note in (*([self.faults] if self.faults else []), *self.notes)]
+        notes += [Bullet(p.engine, note) for p in (*read, *alone) for note in p.notes]
+        fused = (
+            "What an importer fuses is fused on the other side too; mimic joints are left free in M, g, nle and "
+            f"passive, whose differences are relative to the forces at play and count above {self.tolerance:g}."
+        )
+        return Document(
+            name=name,
+            title=f"{name}: importers {outcome}",
+            verdict=self.verdict,
+            sentence=_importers_sentence(self, read),
+            good=self.agree,
+            opening=[Paragraph(_setting(self, read, alone), on="page")],
+            sections=[
+                Section(
+                    "Terms of each engine" + (f", against the {self.against}" if self.against else ""),
+                    [
+                        Table(columns, range(len(rows[0])), style="stages"),
+                        Paragraph(_LEGEND, on="page", note=True),
+                        Paragraph(fused, on="page", note=True),
+                    ]
+                    if read
+                    else [],
+                ),
+                *_differences(read),
+                Section("Refused", [Items(refused)]),
+                Section("Notes", [Items(notes)]),
+            ],
+            result=self,
+            basis={
+                "file": Span(self.source, "mono"),
+                "states": f"{self.samples} random one{plural}, seed {self.seed}; M, g, nle and passive are each "
+                "engine's own, on its own model",
+            },
+        )
 
-    def _notes(self) -> Iterator[str]:
-        for p in self.importers:
-            if p.refused:
-                yield f"{p.engine}: {p.refused}"
-            elif not p.stages:
-                yield f"{p.engine} reads it{', and is the reference' if p.engine == self.reference else ''}"
-            for kind, says, what in grouped(p.explanation.causes) if p.explanation else ():
-                yield f"{kind}: {says} ({what})"
-            yield from (f"{p.engine}: {note}" for note in p.notes)
-        yield from (*self.notes, *([self.faults] if self.faults else []))
+
+def _importers_sentence(result: ParserComparison, read: list[Parsed]) -> str:
+    """Return the verdict with the digits on which terms agree, and at how many states."""
+    terms = [s for p in read if p.agrees for s in p.stages if s.name in TERMS and s.same]
+    worst = max((s.worst for s in terms if math.isfinite(s.worst)), default=0.0)
+    if not worst:
+        return result.verdict
+    names = ", ".join(dict.fromkeys(s.name for s in terms))
+    states = f"{result.samples} state{'s' * (result.samples != 1)}"
+    return f"{result.verdict}; where they agree, {names} to {-math.log10(worst):.1f} digits or more at {states}"
 
 
-def _cell(stage: Stage) -> str:
-    """Return a stage as a cell of a table."""
-    return stage.says if stage.same is False and stage.says else _MARK[stage.same]
+def _importer(p: Parsed) -> Column:
+    return Column(p.label, lambda k: _stage(p.stages[k]))
+
+
+def _setting(result: ParserComparison, read: list[Parsed], alone: list[Parsed]) -> str:
+    """Return what was done with the file, in words."""
+    head = f"The same {'URDF' if result.format == 'urdf' else 'MJCF'} was read by each engine's own importer"
+    because = ", because mbkit itself does not read the file"
+    if not read:
+        why = because if not result.reference else ""
+        return f"{head}. Nothing is compared{why}." if alone else f"{head}, and none reads it."
+    still = "stands still" if result.format == "urdf" else "is as the file has it"
+    why = because if result.reference != "file" else ""
+    base = "floats" if result.floating_base else still
+    return f"{head}. What came out is compared with the {result.against}{why}; the base {base}."
+
+
+def _differences(read: list[Parsed]) -> Iterator[Section]:
+    about = Paragraph(
+        "Each cause was applied to the other side, to see whether the difference vanishes. ✗ moves something, by so "
+        "much; ! moves nothing.",
+        on="page",
+    )
+    for p in read:
+        why = p.explanation
+        if why is None or not why.causes:
+            continue
+        title = p.engine
+        if not why.explained:
+            where = f"; the smallest part that still differs: {', '.join(why.subtree)}" if why.subtree else ""
+            title += f": not all is explained{where}"
+        elif not why.acting:
+            title += " moves the same; what differs is data"
+        yield Section(f"Why they differ: {title}", [about, *cause_blocks(why.causes, ("mimic",))])
+
+
+def _stage(stage: Stage) -> Span:
+    """Return a stage as mark, word and what differs."""
+    if stage.same is None:
+        return Span("– not comparable" + (f": {stage.says}" if stage.says else ""), "muted", "none")
+    number = error_text(stage.worst) if stage.name in TERMS and math.isfinite(stage.worst) else ""
+    if stage.same:
+        return Span(f"✓ same to {number}" if number else "✓ same", "good", "same")
+    joint = f", most at {stage.where}" if stage.where else ""
+    says = f" by {number}{joint}" if number else f": {stage.says}"
+    return Span(f"✗ differs{says}", "bad", "differs") if stage.name in DECIDING else Span(f"! differs{says}", "allowed")
 
 
 def _s(names: list[str]) -> str:

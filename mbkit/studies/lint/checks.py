@@ -22,7 +22,7 @@ from mbkit.model import Body, Model
 from mbkit.model.validation import body_fault, listing
 from mbkit.spatial import skew
 from mbkit.studies.compare.findings import stiff_joints
-from mbkit.studies.compare.result import Finding
+from mbkit.studies.compare.rows import Finding
 from mbkit.studies.lint.geometry import Geometry
 from mbkit.studies.lint.result import LIKELY, LOOK, SURE, LintFinding
 

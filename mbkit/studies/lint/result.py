@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
-from mbkit.studies.results import Block, Items, ResultTable, Table, Title, columns_of, counted
+from mbkit._check import by_key
+from mbkit.model.validation import listing
+from mbkit.studies.document import Bullet, Column, Document, Items, Section, Span, Style, Table
+from mbkit.studies.results import ResultTable, columns_of, counted
 
 #: How sure a finding is. Only the first two make `LintResult.passed` False.
 SURE: Final = "sure"
 LIKELY: Final = "likely"
 LOOK: Final = "look"
 SURENESS: Final = (SURE, LIKELY, LOOK)
+_STYLES: Final[dict[str, Style]] = {SURE: "bad", LIKELY: "allowed", LOOK: "muted"}
+#: Parts of one finding that are named.
+_NAMED: Final = 3
 #: What is never judged, since nothing in the file contradicts it.
 UNSEEN: Final = "what one file cannot show: the sign of an axis, the mass of the whole, where a joint's zero is"
 
@@ -75,8 +80,23 @@ class LintResult(ResultTable):
             f": {how}" if how else ""
         )
 
-    def _blocks(self) -> Iterator[Block]:
-        yield Title(self.model, f": {self.verdict}")
-        if self.rows:
-            yield Table([c for c in columns_of(LintFinding) if c.head != "value"], self.rows)
-        yield Items((*self.skipped, UNSEEN))
+    def document(self) -> Document:
+        """Return the document of the findings; parts with the same finding share a line."""
+        groups = by_key(((row.check, row.confidence, row.message, row.expected), row) for row in self.rows)
+        columns = (
+            Column("link or joint", lambda rows: Span(listing([row.part for row in rows], _NAMED), "mono")),
+            Column("check", lambda rows: rows[0].check),
+            Column("", lambda rows: Span(rows[0].confidence, _STYLES[rows[0].confidence])),
+            Column("found", lambda rows: rows[0].message, fill=True),
+            Column("expected", lambda rows: rows[0].expected),
+        )
+        return Document(
+            name=self.model,
+            verdict=self.verdict,
+            good=self.passed,
+            sections=[
+                Section("", [Table(columns, [*groups.values()])]),
+                Section("Not judged", [Items([Bullet("", text) for text in (*self.skipped, UNSEEN)])]),
+            ],
+            result=self,
+        )

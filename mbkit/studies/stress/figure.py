@@ -11,13 +11,24 @@ import math
 import re
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from mbkit._escape import one_line
 from mbkit.errors import UnknownNameError
-from mbkit.simulate.plotting.style import PLAIN, Palette, drawing, engine_mark, figure_of, legend
+from mbkit.simulate.plotting.style import (
+    PLAIN,
+    Palette,
+    drawing,
+    engine_index,
+    engine_mark,
+    figure_of,
+    legend,
+    log_ticks,
+    name_points,
+)
 from mbkit.studies.measurement import Measurement, Outcome
-from mbkit.studies.stress.measurements import CaseResult, Overview, engines_of, name_of, place
+from mbkit.studies.stress.measurements import CaseResult, Line, Overview, engines_of, name_of, place
+from mbkit.studies.svg import PAGE, PAGE_WIDTH, canvas, page_legend, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +71,6 @@ WORDS: Final[dict[Outcome, tuple[str, str]]] = {
 _MARKS: Final[dict[Outcome, str]] = {"silent": "✗ ", "warned": "! ", "unjudged": "? "}
 #: More columns than these have no room for words.
 ROOMY: Final = 14
-_WIDTH: Final = 10.4
 _DASHED: Final = (0, (1.5, 1))
 
 
@@ -120,7 +130,7 @@ def _axes(ax: Axes | None, rows: int, height: float) -> Axes:
     # Figure without pyplot: no window system, nothing to close.
     from matplotlib.figure import Figure
 
-    return ax or Figure(figsize=(_WIDTH, 1.5 + height * max(rows, 1)), layout="constrained").add_subplot()
+    return ax or Figure(figsize=(PAGE_WIDTH, 1.5 + height * max(rows, 1)), layout="constrained").add_subplot()
 
 
 def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
@@ -217,3 +227,60 @@ def _overview(cases: Sequence[CaseResult], palette: Palette, given: Axes | None)
     if handles:
         legend(ax, handles, "upper", own=given is None, columns=4 if given is None else 2)
     return figure_of(ax)
+
+
+# The largest stable steps: measured as a bar between held and not, linear theory as a mark.
+
+_STEP_COLUMNS: Final = 3
+_THEORY: Final[dict[str, Any]] = {"color": PAGE.ink, "linewidth": 1.6, "linestyle": (0, (1.2, 0.8))}
+
+
+def stable_steps(cases: Sequence[tuple[CaseResult, Sequence[Line]]]) -> str:
+    """Draw each case's steps, a panel a case: from the largest that held to the least that failed, or an arrow."""
+    # The rows of all panels: methods together, engine by engine.
+    rows = [line.row for _, lines in cases for line in lines]
+    methods = list(dict.fromkeys(row.method for row in rows))
+    rows.sort(key=lambda row: (methods.index(row.method), engine_index(row.engine)))
+    names = list(dict.fromkeys(map(name_of, rows)))
+    columns = min(_STEP_COLUMNS, len(cases))
+    count = math.ceil(len(cases) / columns)
+    panel = 0.2 * len(names)
+    height = 0.4 + (panel + 0.75) * count
+    margins = {"left": 0.2, "right": 0.99, "top": 1 - 0.75 / height, "bottom": 0.5 / height}
+    grid = {**margins, "wspace": 0.06, "hspace": 0.75 / panel}
+    with canvas("stable steps", PAGE_WIDTH, height, count, columns, sharey=True, gridspec_kw=grid) as (fig, panels):
+        for ax, (case, lines) in zip(panels, cases, strict=False):
+            _step_panel(ax, case, lines, names)
+        for ax in panels[len(cases) :]:
+            ax.remove()
+        engines = sorted({row.engine for row in rows}, key=engine_index)
+        page_legend(fig, engines, [{**_THEORY, "label": "linear theory"}], 0.0, 6.0)
+        return svg(fig, "Largest stable step of each method")
+
+
+def _step_panel(ax: Axes, case: CaseResult, lines: Sequence[Line], names: list[str]) -> None:
+    ax.set_xscale("log")
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    if steps := [s for s in case.values if s > 0]:
+        ax.set_xlim(min(steps) / 2, max(steps) * 2)
+    for line in lines:
+        y, held, failed, theory = names.index(name_of(line.row)), line.broken.held, line.broken.failed, line.row.theory
+        colour, mark = PAGE.engine(line.row.engine), engine_mark(line.row.engine)
+        name = name_of(line.row)
+        if held is not None and failed is not None:
+            ax.plot([held, failed], [y, y], color=colour, linewidth=1.4)
+        if failed is not None:
+            end = ax.plot([failed], [y], "|", color=colour, markersize=7, markeredgewidth=1.4)
+            name_points(end, [f"{name}: did not hold at {failed:g} s"])
+        if held is not None:
+            point = ax.plot([held], [y], mark if failed is not None else ">", color=colour, markersize=5.5)
+            name_points(point, [f"{name}: held to {held:g} s"])
+        if theory is not None and 0 < theory < math.inf:
+            ax.plot([theory] * 2, [y - 0.45, y + 0.45], **_THEORY)
+    ax.set_yticks(range(len(names)), [one_line(n, 34) for n in names], fontsize=8.5)
+    ax.set_title(one_line(case.name, 34), loc="left", fontsize=9.5, pad=3)
+    ax.grid(axis="x", which="major")
+    log_ticks(ax, 6)
+    ax.tick_params(axis="y", length=0)
+    ax.tick_params(axis="x", labelsize=8.5)
+    ax.set_xlabel("step, s", fontsize=9)

@@ -240,6 +240,11 @@ class Overview:
         return [name_of(line.row) for line in self.lines if line.reach == most > 0]
 
 
+def overviews(cases: Iterable[CaseResult]) -> list[Overview]:
+    """Return every case with its rows, each with a place on a page."""
+    return [Overview(case, f"case-{k}") for k, case in enumerate(cases, 1)]
+
+
 def engines_of(cases: Iterable[CaseResult]) -> list[str]:
     """Return the engines that are in any row, in the order of every figure."""
     return sorted(dict.fromkeys(row.engine for case in cases for row in case.rows), key=engine_index)

@@ -7,19 +7,34 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 from mbkit._check import real
 from mbkit.errors import require_known
+from mbkit.studies.document import Bullet, Column, Document, Items, Paragraph, Section, Span, Table
+from mbkit.studies.formatting import choice, time_text
 from mbkit.studies.measurement import Measurement, Outcome
-from mbkit.studies.results import NO_LIMIT, Block, Column, ResultTable, Table, Title, columns, counted
+from mbkit.studies.results import NO_LIMIT, ResultTable, columns, counted
 from mbkit.studies.stress.figure import figure
-from mbkit.studies.stress.measurements import Breaking, CaseResult, Row
+from mbkit.studies.stress.measurements import Breaking, CaseResult, Row, name_of, overviews
+from mbkit.studies.stress.view import (
+    avoid,
+    content,
+    first_failure,
+    held_text,
+    leader_text,
+    leaders,
+    places_text,
+    reached_text,
+)
 from mbkit.studies.study_runs import OUT_OF_TIME
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+#: On a terminal: methods that were wrong in silence.
+_METHODS: Final = 6
 
 
 @dataclass(frozen=True)
@@ -59,16 +74,16 @@ class StressResult(ResultTable):
     seconds: float
     settings: dict[str, Any] = field(default_factory=dict)
 
-    _csv_columns: ClassVar = (
-        Column("case", attrgetter("case.name")),
-        *columns(0, "parameter", "unit"),
-        *columns(2, "value"),
-        *columns(1, "engine", "method", "setting"),
-        Column("outcome", attrgetter("outcome")),
-        *columns(2, "end", "error", "floor", "energy", "seconds", "steps"),
-        Column("warnings", lambda item: "; ".join(item.cell.warnings)),
-        *columns(2, "note"),
-    )
+    _csv_columns: ClassVar = {
+        "case": attrgetter("case.name"),
+        **columns(0, "parameter", "unit"),
+        **columns(2, "value"),
+        **columns(1, "engine", "method", "setting"),
+        "outcome": attrgetter("outcome"),
+        **columns(2, "end", "error", "floor", "energy", "seconds", "steps"),
+        "warnings": lambda item: "; ".join(item.cell.warnings),
+        **columns(2, "note"),
+    }
 
     @property
     def left_out(self) -> str:
@@ -126,20 +141,66 @@ class StressResult(ResultTable):
     def _csv_rows(self) -> Iterator[_Item]:
         return (_Item(case, row, cell) for case, row in self.rows() for cell in row.cells)
 
-    def _blocks(self) -> Iterator[Block]:
-        """Yield a table per case of how far each engine and method held, the furthest first."""
-        if self.left_out:
-            yield Title("Incomplete", f": {self.left_out}.")
-        for case in self.cases:
-            yield Title(case.name, f": {case.about} Held: error ≤ {case.bar:g}.")
-            rows = sorted(case.rows, key=lambda row: -row.reach(case.bar))
-            held = Column(
-                f"held to {case.unit}".rstrip(), lambda b: "none" if b.held is None else f"{b.held:g}", right=True
+    @property
+    def headline(self) -> str:
+        """What held furthest and how much was wrong in silence, in one sentence."""
+        stopped = "interrupted; what was finished: "
+        if self.complete:
+            stopped = f"{self.left_out}; " if self.left_out else ""
+        if all(cell.end == "not run" for _, row in self.rows() for cell in row.cells):
+            return f"{stopped}nothing was run"
+        counts = [[c.outcome(case.bar) for row in case.rows for c in row.cells].count("silent") for case in self.cases]
+        silent = f"{sum(counts)} silent failure{'s' * (sum(counts) != 1)} in {counted(sum(map(bool, counts)), 'case')}"
+        return f"{stopped}{leaders(overviews(self.cases))}; {silent if sum(counts) else 'no silent failures'}"
+
+    def document(self, *, full: bool = True) -> Document:
+        """Return the document of the study; `full` has how far each engine and method held in every case."""
+        cases = overviews(self.cases)
+        runs = sum(cell.end != "not run" for _, row in self.rows() for cell in row.cells)
+        behind_or_not = {True: Span("behind", "allowed"), False: Span("✓", "good")}
+        auto = [Column("auto", lambda o: behind_or_not[o.behind] if o.choice else Span("", "good"), fill=True)]
+        columns = (
+            Column("case", lambda o: o.case.name, most=22, fill=True),
+            Column("furthest", leader_text, most=24, fill=True),
+            Column("held to", lambda o: reached_text(o.leader) if o.leader else "", fill=True),
+            *(auto if any(o.choice for o in cases) else []),
+            Column("✗", lambda o: Span(str(sum(x.outcomes.count("silent") for x in o.lines) or ""), "bad"), right=True),
+            Column("first to break", lambda o: Span(first_failure(o), "muted"), fill=True),
+        )
+        behind = [
+            Bullet(
+                o.case.name,
+                f"auto {held_text(o.choice)}, {name_of(o.lines[0].row)} {held_text(o.lines[0])}",
+                "!",
+                "allowed",
             )
-            then = Column("then", lambda b: "" if b.failed is None else f"{b.failed:g}", right=True)
-            names = (Column(name, attrgetter(name)) for name in ("engine", "method", "setting"))
-            columns = (*names, held, then, Column("how", attrgetter("how")))
-            yield Table(columns, [row.breaking(case.bar, case.name) for row in rows])
+            for o in cases
+            if o.behind and o.choice is not None
+        ]
+        silent = [Bullet(a.method, places_text(a), "✗", "bad") for a in avoid(cases)]
+        return Document(
+            name="stress",
+            heading="Stiff and extreme: where each engine and method breaks",
+            title="Stiff and extreme",
+            verdict=self.headline,
+            sentence=f"{self.headline}; {runs} runs of {counted(len(cases), 'case')}, each against a known truth",
+            good=bool(self.complete and self.cases and not silent),
+            marked=False,
+            summary=f"{len(cases)} cases · {runs} runs · {time_text(self.seconds)}",
+            sections=[
+                Section("Who holds furthest, and what breaks first", [Table(columns, cases)]),
+                Section("Where another held further than auto", [Items(behind)]),
+                Section("Wrong in silence, and the mildest value where", [Items(silent, most=_METHODS)]),
+                *(map(_rows_of, self.cases) if full else ()),
+            ],
+            result=self,
+            basis={
+                name: f"{value / 2**30:g} GiB" if name == "memory" and value else choice(value)
+                for name, value in self.settings.items()
+            },
+            template="stress.html",
+            content=lambda: content(cases),
+        )
 
     def plot(self, case: str | None = None, ax: Axes | None = None) -> Figure:
         """Draw the map of one case, or how far each engine held in all of them, with Matplotlib.
@@ -156,3 +217,16 @@ class StressResult(ResultTable):
 
 def _bar(case: CaseResult, other: float | None) -> float:
     return case.bar if other is None else real("bar", other, positive=True)
+
+
+def _rows_of(case: CaseResult) -> Section:
+    """Return how far each engine and method held in a case, the furthest first."""
+    ranked = sorted(case.rows, key=lambda row: -row.reach(case.bar))
+    columns = (
+        *(Column(name, attrgetter(name)) for name in ("engine", "method", "setting")),
+        Column(f"held to {case.unit}".rstrip(), lambda b: "none" if b.held is None else f"{b.held:g}", right=True),
+        Column("then", lambda b: "" if b.failed is None else f"{b.failed:g}", right=True),
+        Column("how", attrgetter("how")),
+    )
+    about = Paragraph(f"{case.about} Held: error ≤ {case.bar:g}.")
+    return Section(case.name, [about, Table(columns, [row.breaking(case.bar, case.name) for row in ranked])])

@@ -1,22 +1,65 @@
-"""The result of `work_precision`: curves of error against run time, as tables, text and a figure."""
+"""The result of `work_precision`: curves of error against run time, and the document and figure that show them."""
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter, itemgetter
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
+from mbkit._check import by_key
+from mbkit.studies import document as doc
+from mbkit.studies.formatting import brief, choice, count_text, error_text, model_facts, time_text
 from mbkit.studies.measurement import Measurement
-from mbkit.studies.results import Block, Column, Items, Refusal, ResultTable, Table, Title, block_html, columns, counted
+from mbkit.studies.results import Refusal, ResultTable, columns, counted
 from mbkit.studies.study_runs import OUT_OF_TIME
+from mbkit.studies.svg import PAGE, image, page_style, svg
 from mbkit.studies.work_precision.curve import Curve, pareto_front
-from mbkit.studies.work_precision.figure import figure
+from mbkit.studies.work_precision.figure import USEFUL, figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+#: An observed order farther than this from the method's own is flagged.
+ORDER_TOLERANCE: Final = 0.2
+_EXPONENTS: Final = range(-2, -15, -2)
+
+
+class Lead(NamedTuple):
+    """A run, the errors for which it is the fastest, and for each the fastest of another engine that reaches it."""
+
+    curve: Curve
+    point: Measurement
+    errors: list[float]
+    nexts: list[tuple[Curve, Measurement] | None]
+
+
+def _range(errors: Sequence[float]) -> str:
+    """Return the largest and the least of some errors."""
+    return " to ".join(dict.fromkeys(f"{x:.0e}" for x in (errors[0], errors[-1])))
+
+
+def next_engines(lead: Lead) -> str:
+    """Return the engines that are next, which may change with the error, and how many times as long they take."""
+    texts = []
+    for engine, alike in by_key((x[0].engine if x else "", x) for x in lead.nexts).items():
+        factors = [x[1].seconds / lead.point.seconds for x in alike if x]
+        ends = dict.fromkeys(count_text(x) for x in (min(factors), max(factors))) if factors else ()
+        texts.append(f"{engine} × {' to '.join(ends)}" if factors else "none")
+    return ", ".join(texts)
+
+
+class CurveLine(NamedTuple):
+    """One engine and method in one line."""
+
+    curve: Curve
+    best: Measurement | None  # the fastest of those with the least error that the reference can resolve
+    off: bool  # the observed order is not the method's own
+    on_front: bool
 
 
 @dataclass(frozen=True)
@@ -50,16 +93,16 @@ class WorkPrecision(ResultTable):
     seconds: float
     settings: dict[str, Any] = field(default_factory=dict)
 
-    _csv_columns: ClassVar = (
-        *columns(0, "engine", "method"),
-        *columns(1, "setting", "value", "error", "energy", "seconds", "spread"),
-        Column("first_run", lambda row: row[0].compile + row[1].seconds),
-        *columns(1, "steps", "evaluations"),
-        *columns(0, "order"),
-        Column("expected_order", lambda row: row[0].expected),
-        Column("front", itemgetter(2)),
-        *columns(1, "note"),
-    )
+    _csv_columns: ClassVar = {
+        **columns(0, "engine", "method"),
+        **columns(1, "setting", "value", "error", "energy", "seconds", "spread"),
+        "first_run": lambda row: row[0].compile + row[1].seconds,
+        **columns(1, "steps", "evaluations"),
+        **columns(0, "order"),
+        "expected_order": lambda row: row[0].expected,
+        "front": itemgetter(2),
+        **columns(1, "note"),
+    }
 
     def rows(self) -> Iterator[tuple[Curve, Measurement]]:
         """Yield every point with its curve."""
@@ -146,19 +189,52 @@ class WorkPrecision(ResultTable):
         front = {(id(c), id(p)) for c, p in self.front}
         return ((c, p, (id(c), id(p)) in front) for c, p in self.rows())
 
-    def _title(self) -> Title:
-        missing = f" ({'; '.join(self.shortened)})" if self.shortened else ""
-        return Title(self.model, f", {self.duration:g} s{missing}: {self.reference}")
+    @property
+    def headline(self) -> str:
+        """The fastest curve for each error, in one sentence."""
+        return self._fastest() + "".join(f"; {x}" for x in self.shortened if x != "interrupted")
 
-    def _blocks(self) -> Iterator[Block]:
-        yield self._title()
-        fastest = {exponent: self.fastest(10.0**exponent) for exponent in range(-2, -14, -2)}
-        # One row for each run, with the least error that it is fastest for.
-        last = {id(x[1]): (f"1e{exponent}", *x) for exponent, x in fastest.items() if x}
-        yield Table((Column("error ≤", itemgetter(0), right=True), *_run_columns("fastest", 1)), last.values())
-        yield Table(_CURVE_COLUMNS, self.curves)
-        notes = [f"{r.engine} {r.term}: {r.reason}" for r in self.failed] + [*self.turns]
-        yield Items([*notes, *([] if self.complete else ["Interrupted: this is what was finished."])])
+    def _sentence(self) -> str:
+        """Return the headline with what the errors are measured against; long lists stand below it."""
+        known = f"known to {error_text(self.floor)} rad or m" if math.isfinite(self.floor) else "of unknown error"
+        measured = f"errors of q over {self.duration:g} s, against a reference {known}"
+        return f"{self._fastest()}; {measured}{brief(x for x in self.shortened if x != 'interrupted')}"
+
+    def _fastest(self) -> str:
+        stopped = "" if self.complete else "interrupted; what was finished: "
+        groups = itertools.groupby(leads(self), key=lambda lead: lead.curve.name)
+        parts = [f"{name} for an error of {_range([e for lead in some for e in lead.errors])}" for name, some in groups]
+        if not parts:
+            return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m"
+        count = f"{len(self.curves)} curve{'s' * (len(self.curves) != 1)}"
+        if self.untimed:
+            stopped += f"no time was left for {' and '.join(self.untimed)}, so none is the fastest; "
+            return f"{stopped}of {count}, least time: {', '.join(parts)}"
+        return f"{stopped}fastest of {count}: {', '.join(parts)}"
+
+    def document(self, target: str = "") -> doc.Document:
+        """Return the document of the study; `target` is the name by which a person called the model."""
+        target = target if target != self.model else ""
+        facts = self.facts
+        count = sum(len(c.points) for c in self.curves)
+        notes = [doc.Bullet("", note) for note in facts.get("notes", ())]
+        return doc.Document(
+            name=f"{self.model} ({target})" if target else self.model,
+            heading=f"{self.model}: error against run time",
+            verdict=self.headline,
+            sentence=self._sentence(),
+            good=bool(self.complete and self.front),
+            marked=False,
+            summary=f"nq {facts.get('nq', '?')}, nv {facts.get('nv', '?')} · {count} settings · {self.seconds:.1f} s",
+            sections=[
+                *curve_sections(self, whole=True),
+                doc.Section(
+                    "The model", [doc.Facts(list(model_facts(facts, target, {}))), doc.Items(notes)], on="page"
+                ),
+            ],
+            result=self,
+            basis={name: choice(value) for name, value in self.settings.items()},
+        )
 
     def plot(self, ax: Axes | None = None) -> Figure:
         """Draw error and energy drift against run time with Matplotlib, and a panel for each method.
@@ -173,37 +249,199 @@ class WorkPrecision(ResultTable):
         curves = counted(len(self.curves), "curve")
         return f"<WorkPrecision of {self.model!r}: {curves}, {count} points, {self.duration:g} s{missing}>"
 
-    def _repr_html_(self) -> str:
-        error = Column("error", lambda row: row[1].error, ".1e", right=True)
-        name, setting, *times = _run_columns("on the front", 0)
-        return block_html(self._title()) + block_html(Table((name, setting, error, *times), self.front))
+
+def leads(result: WorkPrecision) -> list[Lead]:
+    """Return the fastest run for each error that anyone reaches, as far as the reference can tell, each run once."""
+    out: dict[int, Lead] = {}
+    for error in (10.0**exponent for exponent in _EXPONENTS):
+        first = result.fastest(error)
+        if first is None or error < result.floor:
+            break
+        beside = [(c, p) for c, p in result.rows() if p.error <= error and c.engine != first[0].engine]
+        lead = out.setdefault(id(first[1]), Lead(*first, [], []))
+        lead.errors.append(error)
+        lead.nexts.append(min(beside, key=lambda item: item[1].seconds, default=None))
+    return list(out.values())
 
 
-def _run_columns(head: str, at: int) -> tuple[Column, ...]:
-    """Return columns of rows that hold a curve and its point from some place on."""
-    return (
-        Column(head, lambda row: row[at].name),
-        Column("setting", lambda row: f"{row[at + 1].setting} {row[at + 1].value:g}"),
-        Column("run time", lambda row: f"{row[at + 1].seconds:.3g} s", right=True),
-        Column("first run", lambda row: f"{row[at].compile + row[at + 1].seconds:.3g} s", right=True),
+def curve_lines(result: WorkPrecision) -> list[CurveLine]:
+    """Return every curve in one line, in the order of the curves."""
+    front = {id(c) for c, p in result.front if p.error <= USEFUL}
+    floor = result.floor if math.isfinite(result.floor) else 0.0
+    out = []
+    for curve in result.curves:
+        known = [p for p in curve.points if math.isfinite(p.error)]
+        best = min(known, key=lambda p: (max(p.error, floor), p.seconds), default=None)
+        out.append(CurveLine(curve, best, abs(curve.order - curve.expected) > ORDER_TOLERANCE, id(curve) in front))
+    return out
+
+
+def front_names(result: WorkPrecision) -> list[str]:
+    """Return the names of the curves on the front, the fastest first; no answers are left out."""
+    return list(dict.fromkeys(c.name for c, p in result.front if p.error <= USEFUL))
+
+
+def error_against_time(result: WorkPrecision) -> str:
+    """Draw the figure of error against run time, for the page."""
+    with page_style("precision"):
+        return svg(
+            figure(result.curves, result.duration, result.floor, PAGE), "Error against run time, by engine and method"
+        )
+
+
+def picture(result: WorkPrecision) -> bytes:
+    """Return the same figure as PNG on white."""
+    return image(figure(result.curves, result.duration, result.floor))
+
+
+def failed_curves(failed: Sequence[Refusal]) -> list[doc.Bullet]:
+    """Return the methods that gave no curve, those of one reason together."""
+    of = by_key((r.reason, f"{r.engine} {r.term}".strip()) for r in failed)
+    return [doc.Bullet(", ".join(dict.fromkeys(names)), reason) for reason, names in of.items()]
+
+
+def curve_sections(result: WorkPrecision, whole: bool, on: doc.On = "both") -> list[doc.Section]:
+    """Return the sections of a study, shown on `on`; unless `whole`, a terminal shows the fastest only."""
+    missing = brief(result.shortened).removeprefix("; ") if not whole else ""
+    cut = f", cut from {result.asked:g} s where the reference stops holding" if result.duration < result.asked else ""
+    of = "rad or m (a smaller error of a run cannot be told)"
+    known = (
+        f"its own error is at most {error_text(result.floor)} {of}"
+        if math.isfinite(result.floor)
+        else "its own error is unknown"
     )
+    front = "Lower left is better. On the front, fastest first: {}. Names beside the grey band are the methods that "
+    front += (
+        "join it there, in their engine’s colour. Run times are without deriving and compiling, first runs with both."
+    )
+    drawn = doc.Figure(lambda: error_against_time(result), front.format(", ".join(front_names(result))), wide=True)
+    fastest = leads(result)
+    about = f"Error against run time, {result.duration:g} s of motion: errors of q in rad or m"
+    start = [(n, f"{n} = [{choice(getattr(result, n))}]") for n in ("q0", "v0")]
+    lists: doc.On = on if whole else "page"
+    return [
+        doc.Section(
+            about,
+            [
+                *([doc.Paragraph(doc.Span(f"! {missing}", "allowed"))] if missing else []),
+                doc.Paragraph(
+                    f"Errors are the largest difference of q on the manifold over the saved times{cut}.", "page"
+                ),
+                doc.Paragraph(f"Reference: {result.reference}; {known}."),
+                *([drawn] if result.front else []),
+            ],
+            on,
+        ),
+        doc.Section(
+            "Who reaches an error first",
+            [doc.Table(_LEADS, fastest) if fastest else doc.Paragraph(doc.Span("no run reached 1e-02", "muted"))],
+            on,
+            level=3,
+        ),
+        doc.Section(
+            "Engine by engine, method by method; the run time is that of the least error",
+            _curve_blocks(result),
+            lists,
+            level=3,
+        ),
+        doc.Section("What could not be measured", [doc.Items(failed_curves(result.failed))], on, level=3),
+        doc.Section("Where rounding grows", [doc.Items([doc.Bullet("", x) for x in result.turns])], on, level=3),
+        doc.Section("", [doc.Details("the motion", [doc.Facts(start)])], on="page", level=3),
+    ]
 
 
-def _least(curve: Curve, text: Callable[[Measurement], str], otherwise: str) -> str:
-    """Return a text about the point with the least error."""
-    best = min((p for p in curve.points if math.isfinite(p.error)), key=lambda p: p.error, default=None)
-    return text(best) if best else otherwise
+def setting_text(point: Measurement) -> str:
+    """Return the step with its unit, or the tolerance."""
+    return f"dt {time_text(point.value)}" if point.setting == "dt" else f"rtol {point.value:.0e}"
 
 
-def _order(x: float) -> str:
-    return "" if math.isnan(x) else f"{x:.2f}"
+def _known(x: float) -> str:
+    return "" if math.isnan(x) else error_text(x)
 
 
-_CURVE_COLUMNS: Final = (
-    Column("engine and method", attrgetter("name")),
-    Column("order", lambda c: _order(c.order), right=True),
-    Column("expected", lambda c: _order(c.expected), right=True),
-    Column("least error", lambda c: _least(c, lambda p: f"{p.error:.1e}", "none"), right=True),
-    Column("its run time", lambda c: _least(c, lambda p: f"{p.seconds:.3g} s", ""), right=True),
-    Column("compile", lambda c: f"{c.compile:.3g} s", right=True),
+_LEADS: Final = (
+    doc.Column("error ≤", lambda x: _range(x.errors), right=True),
+    doc.Column("engine", lambda x: x.curve.engine),
+    doc.Column("method", lambda x: x.curve.method),
+    doc.Column("setting", lambda x: setting_text(x.point), right=True),
+    doc.Column("run time", lambda x: time_text(x.point.seconds), right=True),
+    doc.Column("±", lambda x: doc.Span(time_text(x.point.spread), "muted"), right=True, on="page"),
+    doc.Column("first run", lambda x: time_text(x.curve.compile + x.point.seconds) or "–", right=True),
+    doc.Column("next engine", lambda x: doc.Span(next_engines(x), "muted")),
+    doc.Column("its method", lambda x: ", ".join(dict.fromkeys(n[0].method for n in x.nexts if n)), on="page"),
 )
+
+
+def _order(line: CurveLine) -> doc.Text:
+    order = "" if math.isnan(line.curve.order) else f"{line.curve.order:.2f}"
+    return doc.Span(f"! {order}", "allowed") if line.off else order
+
+
+_CURVES: Final = (
+    doc.Column("", lambda x: doc.Span("●" if x.on_front else "", "good")),
+    doc.Column("engine", lambda x: x.curve.engine),
+    doc.Column("method", lambda x: x.curve.method),
+    doc.Column("order", _order, right=True),
+    doc.Column("of", lambda x: "" if math.isnan(x.curve.expected) else f"{x.curve.expected:g}", right=True),
+    doc.Column("from\npoints", lambda x: doc.Span(str(x.curve.order_points or ""), "muted"), right=True, on="page"),
+    doc.Column("least error", lambda x: error_text(x.best.error) if x.best else "none", right=True),
+    doc.Column("at", lambda x: setting_text(x.best) if x.best else "", right=True, on="page"),
+    doc.Column("run time", lambda x: time_text(x.best.seconds) if x.best else "", right=True),
+    doc.Column("±", lambda x: doc.Span(time_text(x.best.spread) if x.best else "", "muted"), right=True, on="page"),
+    doc.Column("energy\ndrift", lambda x: _known(x.best.energy) if x.best else "", right=True, on="page"),
+    doc.Column("compile", lambda x: time_text(x.curve.compile) or "–", right=True),
+    doc.Column(
+        "first run",
+        lambda x: (time_text(x.curve.compile + x.best.seconds) or "–") if x.best else "",
+        right=True,
+        on="page",
+    ),
+    doc.Column("note", lambda x: doc.Span(_why_none(x), "muted"), on="page"),
+)
+
+
+def _why_none(line: CurveLine) -> str:
+    """Return why a curve has no error at all."""
+    return "" if line.best else next((p.note for p in line.curve.points if p.note), "no run came to an end")
+
+
+_POINTS: Final = (
+    doc.Column("engine", lambda x: x[0].engine),
+    doc.Column("method", lambda x: x[0].method),
+    doc.Column("setting", lambda x: setting_text(x[1]), right=True),
+    doc.Column("error of q,\nrad or m", lambda x: _known(x[1].error) or "–", right=True),
+    doc.Column("energy\ndrift", lambda x: _known(x[1].energy), right=True),
+    doc.Column("run time", lambda x: time_text(x[1].seconds), right=True),
+    doc.Column("±", lambda x: doc.Span(time_text(x[1].spread), "muted"), right=True),
+    doc.Column("first run", lambda x: time_text(x[0].compile + x[1].seconds), right=True),
+    doc.Column("steps", lambda x: str(x[1].steps or ""), right=True),
+    doc.Column("evaluations", lambda x: str(x[1].evaluations or ""), right=True),
+    doc.Column("note", lambda x: doc.Span(x[1].note, "muted")),
+)
+
+
+def _curve_blocks(result: WorkPrecision) -> list[doc.Block]:
+    lines = curve_lines(result)
+    if not lines:
+        return []
+    counts = [p.repeats for _, p in result.rows() if p.repeats]
+    repeats = " to ".join(dict.fromkeys(str(x) for x in (min(counts, default=0), max(counts, default=0))))
+    work, timing = result.settings.get("work"), result.settings.get("timing")
+    most = f" ({work:.0f} evaluations of the dynamics; one that is called from Python counts eight)" if work else ""
+    legend = [doc.Bullet("", "on the front: nothing beats it in both error and run time", "●", "good")]
+    if any(line.off for line in lines):
+        off = f"the observed order is not the method's own: it is more than {ORDER_TOLERANCE} off"
+        legend.append(doc.Bullet("", off, "!", "allowed"))
+    return [
+        doc.Table(_CURVES, lines),
+        doc.Items(legend),
+        doc.Paragraph(
+            "The order is the slope of log error over log step, where neither coarse steps nor rounding hide it. A "
+            f"curve ends where finer settings bring nothing, or a run would take too much work{most}. Run times are "
+            f"medians of {repeats} timings{f', {timing}' if timing else ''}, the longest runs timed least; ± is half "
+            "the interquartile range. Compiling is timed from nothing, whatever the caches hold.",
+            on="page",
+            note=True,
+        ),
+        doc.Details("every setting", [doc.Table(_POINTS, list(result.rows()))]),
+    ]

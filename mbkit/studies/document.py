@@ -1,7 +1,7 @@
 """The document of a result: sections of paragraphs, tables, lists, facts and figures.
 
-A view makes one document of a result; `terminal` and `page` render it. A terminal has room for the verdict and what
-leads to it, a page for everything: `on` says where a part is shown.
+A result has one, `ResultTable.document`; a terminal, a page, Markdown and a notebook show it. A page has room for
+everything, the others for the verdict and what leads to it: `on` says where a part is shown.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
+
+from mbkit._escape import html, markdown
 
 On = Literal["both", "terminal", "page"]
 Style = Literal["", "good", "bad", "allowed", "muted", "bold", "mono"]
@@ -30,6 +32,11 @@ def spans(text: Text) -> list[Span]:
     """Return a text as pieces."""
     pieces = [text] if isinstance(text, (str, Span)) else text
     return [piece if isinstance(piece, Span) else Span(piece) for piece in pieces]
+
+
+def plain(text: Text) -> str:
+    """Return a text without its styles, and without the spaces that align it."""
+    return " ".join("".join(piece.text for piece in spans(text)).split())
 
 
 @dataclass(frozen=True)
@@ -102,6 +109,12 @@ class Bullet:
     style: Style = "muted"
     aside: str = ""
     folded: tuple[str, str] | None = None
+
+    @property
+    def line(self) -> str:
+        """Mark, head and text without styles; a plain entry has no mark."""
+        mark = "" if self.mark in ("·", "i") else f"{self.mark} "
+        return f"{mark}{self.head}{': ' if self.head else ''}{self.text}"
 
 
 @dataclass(frozen=True)
@@ -192,3 +205,59 @@ class Document:
         for section in (Section("", self.opening), *self.sections):
             if blocks := section.shown(where):
                 yield section, blocks
+
+
+# A notebook shows what a terminal shows, Markdown what a page shows but for figures and what is folded away.
+
+
+def to_markdown(shown: Document) -> str:
+    """Return a document in Markdown."""
+    parts = [f"**{markdown(shown.name)}**: {markdown(shown.verdict)}"]
+    for section, blocks in shown.shown("page"):
+        parts += [f"**{markdown(section.title)}**"] if section.title else []
+        parts += filter(None, map(block_markdown, blocks))
+    return "\n\n".join(parts) + "\n"
+
+
+def to_html(shown: Document) -> str:
+    """Return a document as a notebook shows it."""
+    parts = [f"<p><b>{html(shown.name)}</b>: {html(shown.verdict)}</p>"]
+    for section, blocks in shown.shown("terminal"):
+        parts += [f"<p><b>{html(section.title)}</b></p>"] if section.title else []
+        parts += map(block_html, blocks)
+    return "".join(parts)
+
+
+def block_markdown(block: Block) -> str:
+    """Return a block in Markdown; empty for what Markdown does not show."""
+    if isinstance(block, Paragraph):
+        return markdown(plain(block.text))
+    if isinstance(block, Items):
+        return "\n".join(f"- {markdown(bullet.line)}" for bullet in block.bullets)
+    if isinstance(block, Facts):
+        return "\n".join(f"- {markdown(f'{name}: {plain(text)}')}" for name, text in block.facts)
+    if not isinstance(block, Table):
+        return ""
+    rule = "".join("|---:" if c.right else "|---" for c in block.shown("page"))
+    head, *rows = ("".join(f"| {markdown(x)} ".replace("  ", " ") for x in row) for row in _texts(block, "page"))
+    return "\n".join(f"{line}|" for line in (head, rule, *rows))
+
+
+def block_html(block: Block) -> str:
+    """Return a block as a notebook shows it; empty for what it does not show."""
+    if isinstance(block, Paragraph):
+        return f"<p>{html(plain(block.text))}</p>"
+    if isinstance(block, Items):
+        return f"<ul>{''.join(f'<li>{html(bullet.line)}</li>' for bullet in block.bullets)}</ul>"
+    if not isinstance(block, Table):
+        return ""
+    head, *rows = _texts(block, "terminal")
+    lines = [[f"<th>{html(x)}</th>" for x in head], *([f"<td>{html(x)}</td>" for x in row] for row in rows)]
+    return "".join(("<table>", *(f"<tr>{''.join(line)}</tr>" for line in lines), "</table>"))
+
+
+def _texts(table: Table, where: On) -> Iterator[list[str]]:
+    """Yield the heads and then the cells of each row, as plain text."""
+    yield [plain(c.head) for c in table.shown(where)]
+    for group in table.groups(where):
+        yield from ([plain(cell) for cell in row] for row in group)

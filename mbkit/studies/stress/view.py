@@ -1,4 +1,4 @@
-"""Where engines and methods break, as a document: a line a case on a terminal, maps of coloured cells on a page."""
+"""Words and tables for where engines and methods break: a line a case on a terminal, coloured maps on a page."""
 
 from __future__ import annotations
 
@@ -11,16 +11,13 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple, get_args
 
 from mbkit._check import by_key
-from mbkit.report.document import Bullet, Column, Document, Items, Section, Span, Table
-from mbkit.report.figures import stable_steps
-from mbkit.report.formatting import choice, error_text, time_text
 from mbkit.simulate.plotting.style import engine_index
+from mbkit.studies.formatting import error_text, time_text
 from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.results import counted
 from mbkit.studies.stress.case import Family
-from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade
+from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade, stable_steps
 from mbkit.studies.stress.measurements import CaseResult, Line, Overview, Row, engines_of, name_of, place
-from mbkit.studies.stress.result import StressResult
 
 #: Outcomes in words that follow "then".
 HOW: Final[dict[Outcome, str]] = {
@@ -50,14 +47,8 @@ _MEASURES: Final = {
 _KNOWN: Final = "; known to "
 #: Names in one sentence; the tables have all.
 _NAMED: Final = 3
-#: On a terminal: methods that were wrong in silence, and the cases of each.
-_METHODS: Final = 6
+#: On a terminal: cases in which a method was wrong in silence.
 _PLACES: Final = 2
-
-
-def overview(result: StressResult) -> list[Overview]:
-    """Return every case with its rows."""
-    return [Overview(case, f"case-{k}") for k, case in enumerate(result.cases, 1)]
 
 
 def _left_out(o: Overview) -> list[tuple[str, str]]:
@@ -88,10 +79,11 @@ def value_text(x: float | None, case: CaseResult, unit: bool = True) -> str:
 
 def held_text(line: Line) -> str:
     """Return how far a row held, in words."""
-    return f"held {'' if line.whole or line.broken.held is None else 'to '}{_reached(line)}"
+    return f"held {'' if line.whole or line.broken.held is None else 'to '}{reached_text(line)}"
 
 
-def _reached(line: Line) -> str:
+def reached_text(line: Line) -> str:
+    """Return the value up to which a row held."""
     if line.whole:
         return "all"
     return "nothing" if line.broken.held is None else value_text(line.broken.held, line.case)
@@ -102,20 +94,9 @@ def remarks(cell: Measurement | None) -> str:
     return "" if cell is None else "; ".join(dict.fromkeys(x for x in (cell.note, *cell.warnings) if x))
 
 
-def headline(result: StressResult) -> str:
-    """Return what held furthest and how much was wrong in silence, in one sentence."""
-    stopped = "interrupted; what was finished: "
-    if result.complete:
-        stopped = f"{result.left_out}; " if result.left_out else ""
-    if all(cell.end == "not run" for _, row in result.rows() for cell in row.cells):
-        return f"{stopped}nothing was run"
-    counts = [[c.outcome(case.bar) for row in case.rows for c in row.cells].count("silent") for case in result.cases]
-    silent = f"{sum(counts)} silent failure{'s' * (sum(counts) != 1)} in {counted(sum(map(bool, counts)), 'case')}"
-    return f"{stopped}{_leaders(result)}; {silent if sum(counts) else 'no silent failures'}"
-
-
-def _leaders(result: StressResult) -> str:
-    ran = [o for o in overview(result) if o.case.rows]
+def leaders(cases: Iterable[Overview]) -> str:
+    """Return what held furthest in most cases."""
+    ran = [o for o in cases if o.case.rows]
     ranked = [o for o in ran if o.ranks] or ran
     counts = Counter(name for o in ranked for name in o.unbeaten)
     if not counts:
@@ -145,11 +126,11 @@ class MethodLine:
     factor: float  # median run time over the least of those that held as far; NaN: never ahead
 
 
-def methods(result: StressResult) -> list[MethodLine]:
+def methods(cases: Iterable[Overview]) -> list[MethodLine]:
     """Return every engine and method that ran, the one that was most often unbeaten first."""
     # Family, line, whether it held furthest, its time over the least of those that did.
     scores: list[tuple[tuple[str, str], tuple[str, Line, bool, float]]] = []
-    for o in (o for o in overview(result) if o.ranks):
+    for o in (o for o in cases if o.ranks):
         most, family = o.furthest, o.case.family
         least = min((x.seconds for x in o.lines if x.reach == most and x.seconds > 0), default=math.nan)
         scores += [((x.row.engine, x.row.method), (family, x, x.reach == most > 0, x.seconds / least)) for x in o.lines]
@@ -387,9 +368,8 @@ def _facts(case: CaseResult) -> list[tuple[str, list[float]]]:
     return [(name, [facts.get(name, math.nan) for facts in padded]) for name in names]
 
 
-def content(result: StressResult) -> dict[str, Any]:
+def content(cases: Sequence[Overview]) -> dict[str, Any]:
     """Return what the template of the page is filled with."""
-    cases = overview(result)
     swept = steps(cases)
     step_rules = rules(swept)
     return {
@@ -397,15 +377,15 @@ def content(result: StressResult) -> dict[str, Any]:
         "silences": silences(cases),
         "asked": [o for o in cases if o.choice is not None],
         "behind": [o for o in cases if o.behind],
-        "methods": methods(result),
+        "methods": methods(cases),
         "run_families": families(o for o in cases if o.ranks),
         "families": families(cases),
-        "engines": engines_of(result.cases),
+        "engines": engines_of(o.case for o in cases),
         "steps": swept,
         "rules": step_rules,
         "kinds": list(dict.fromkeys(kind for rule in step_rules for kind in rule.bounds)),
         "step_figure": stable_steps([(o.case, o.ran) for o in swept]) if swept else None,
-        "bars": by_key(((case.bar, case.why), case.name) for case in result.cases),
+        "bars": by_key(((case.bar, case.why), case.name) for case in (o.case for o in cases)),
     }
 
 
@@ -443,65 +423,14 @@ FILTERS: Final[Mapping[str, Any]] = {
 }
 
 
-# The document.
-
-
-def view(result: StressResult) -> Document:
-    """Return the document of a stress study."""
-    cases = overview(result)
-    runs = sum(cell.end != "not run" for _, row in result.rows() for cell in row.cells)
-    behind_or_not = {True: Span("behind", "allowed"), False: Span("✓", "good")}
-    auto = [Column("auto", lambda o: behind_or_not[o.behind] if o.choice else Span("", "good"), fill=True)]
-    columns = (
-        Column("case", lambda o: o.case.name, most=22, fill=True),
-        Column("furthest", _leader, most=24, fill=True),
-        Column("held to", lambda o: _reached(o.leader) if o.leader else "", fill=True),
-        *(auto if any(o.choice for o in cases) else []),
-        Column("✗", lambda o: Span(str(sum(x.outcomes.count("silent") for x in o.lines) or ""), "bad"), right=True),
-        Column("first to break", lambda o: Span(_first(o), "muted"), fill=True),
-    )
-    behind = [
-        Bullet(
-            o.case.name,
-            f"auto {held_text(o.choice)}, {name_of(o.lines[0].row)} {held_text(o.lines[0])}",
-            "!",
-            "allowed",
-        )
-        for o in cases
-        if o.behind and o.choice is not None
-    ]
-    silent = [Bullet(a.method, _places(a), "✗", "bad") for a in avoid(cases)]
-    return Document(
-        name="stress",
-        heading="Stiff and extreme: where each engine and method breaks",
-        title="Stiff and extreme",
-        verdict=headline(result),
-        sentence=f"{headline(result)}; {runs} runs of {counted(len(cases), 'case')}, each against a known truth",
-        good=bool(result.complete and result.cases and not silent),
-        marked=False,
-        summary=f"{len(cases)} cases · {runs} runs · {time_text(result.seconds)}",
-        sections=[
-            Section("Who holds furthest, and what breaks first", [Table(columns, cases)]),
-            Section("Where another held further than auto", [Items(behind)]),
-            Section("Wrong in silence, and the mildest value where", [Items(silent, most=_METHODS)]),
-        ],
-        result=result,
-        basis={
-            name: f"{value / 2**30:g} GiB" if name == "memory" and value else choice(value)
-            for name, value in result.settings.items()
-        },
-        template="stress.html",
-        content=lambda: content(result),
-    )
-
-
-def _leader(o: Overview) -> str:
+def leader_text(o: Overview) -> str:
+    """Return what held furthest in a case."""
     if o.leader is None:
         return "none ran"
     return f"{o.leader.row.engine} (terms)" if o.case.measure == "terms" else name_of(o.leader.row)
 
 
-def _first(o: Overview) -> str:
+def first_failure(o: Overview) -> str:
     """Return which row is the first that is of no use, and how."""
     line = min((x for x in o.ran if x.ended), key=lambda x: x.usable, default=None)
     if line is None or line.ended is None:
@@ -510,6 +439,7 @@ def _first(o: Overview) -> str:
     return f"{value_text(cell.value, o.case, unit=False)} {how}: {name_of(line.row)}"
 
 
-def _places(a: Avoid) -> str:
+def places_text(a: Avoid) -> str:
+    """Return where a method was wrong in silence, the first few places."""
     places = [f"{o.case.name} at {o.case.parameter} = {text}" for o, text, _ in a.places[:_PLACES]]
     return ", ".join(places + ([f"{len(a.places) - _PLACES} more"] if len(a.places) > _PLACES else []))

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from mbkit._check import by_key
-from mbkit.report.document import Bullet, Span, Text
+from mbkit.studies.document import Bullet, Span, Text
 from mbkit.studies.results import Refusal
 
 #: Letters of a list that has a place in a sentence.
