@@ -107,7 +107,7 @@ def test_text_is_written_once_however_often_elements_interrupt_it(monkeypatch):
 
 
 def test_more_elements_than_any_robot_has_are_refused(monkeypatch, tmp_path):
-    monkeypatch.setattr(xml_reader, "MOST_ELEMENTS", 100)
+    monkeypatch.setattr(xml_reader, "MAX_ELEMENTS", 100)
     error = raised(tmp_path, b'<robot name="r">' + b"<a/>" * 100 + b"</robot>")
     assert isinstance(error, LoadError)
     assert "100 elements" in str(error)

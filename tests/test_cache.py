@@ -161,7 +161,7 @@ def test_a_changed_number_is_another_entry():
 
 
 def test_the_oldest_entries_go_when_the_folder_is_full(folder, monkeypatch):
-    monkeypatch.setattr(disk_cache, "_MAX_BYTES", 3000)
+    monkeypatch.setattr(disk_cache, "_MAX_CACHE_BYTES", 3000)
     for k in range(6):
         disk_cache.write(f"{k:064x}", {"k": k}, b"x" * 900)
         os.utime(folder / f"{k:064x}", (k, k))

@@ -169,8 +169,8 @@ def test_a_program_in_pieces_gives_the_same_numbers_as_a_whole(monkeypatch):
     function = mb.dynamics(model, "lagrangian", compile=False).function("forward_dynamics")
     q, v, _, tau = states(model, 17)
     whole = built(function)(q, v, tau)[0]
-    monkeypatch.setattr(simd_kernel, "_WHOLE", 100)
-    monkeypatch.setattr(simd_kernel, "_PIECE", 150)
+    monkeypatch.setattr(simd_kernel, "_MAX_WHOLE_OPERATIONS", 100)
+    monkeypatch.setattr(simd_kernel, "_PIECE_OPERATIONS", 150)
     pieces = built(function)(q, v, tau)[0]
     np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e3 * EPS * np.abs(whole).max())
 
@@ -507,7 +507,7 @@ def test_a_child_forked_during_another_threads_work_computes(work):
 
 def test_a_folder_of_other_files_is_neither_closed_nor_cleared(tmp_path, monkeypatch):
     monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(disk_cache, "_MAX_BYTES", 1000)
+    monkeypatch.setattr(disk_cache, "_MAX_CACHE_BYTES", 1000)
     mine = tmp_path / "thesis.dat"
     mine.write_bytes(b"x" * 3000)
     os.utime(mine, (1, 1))

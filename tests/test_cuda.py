@@ -116,8 +116,8 @@ def test_a_program_in_pieces_has_the_same_bits(monkeypatch: pytest.MonkeyPatch) 
     cpu, gpu = both(model)
     q, v, a = study.states(model, 9).values()
     want = cpu.forward_dynamics(q, v, a)
-    monkeypatch.setattr(simd_kernel, "_WHOLE", 300)
-    monkeypatch.setattr(simd_kernel, "_PIECE", 200)
+    monkeypatch.setattr(simd_kernel, "_MAX_WHOLE_OPERATIONS", 300)
+    monkeypatch.setattr(simd_kernel, "_PIECE_OPERATIONS", 200)
     assert np.array_equal(gpu.forward_dynamics(q, v, a), want)
 
 
@@ -169,7 +169,7 @@ def test_runs_have_the_bits_of_the_cpu(name: str, method: str, torque: str, monk
 
 def test_a_step_in_stages_is_the_same_to_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
     """The forward dynamics is then a function, which is called for each stage."""
-    monkeypatch.setattr(runs, "WHOLE", 0)
+    monkeypatch.setattr(runs, "MAX_STEP_OPERATIONS", 0)
     # A model of its own: steps are kept with the equations.
     model = random_tree(21, 2, ("free", "revolute"))
     cpu, gpu = both(model)
@@ -445,7 +445,7 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_function_too_large_to_compile_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(backend, "_MAX_OPERATIONS", 20)
+    monkeypatch.setattr(backend, "_MAX_COMPILED_OPERATIONS", 20)
     model = random_tree(19, 3, ("revolute",))
     _, gpu = both(model)
     q, v, a = study.states(model, 3).values()

@@ -351,8 +351,8 @@ def test_every_width_of_register_gives_the_same_bits(monkeypatch: pytest.MonkeyP
 def test_pieces_give_the_same_bits_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     points = columns(np.random.default_rng(6).uniform(0.05, 0.95, (21, 2)))
     expected = built(everything())(*points)[0]
-    monkeypatch.setattr(simd_kernel, "_WHOLE", 10)
-    monkeypatch.setattr(simd_kernel, "_PIECE", 12)
+    monkeypatch.setattr(simd_kernel, "_MAX_WHOLE_OPERATIONS", 10)
+    monkeypatch.setattr(simd_kernel, "_PIECE_OPERATIONS", 12)
     assert len(simd_kernel.pieces_of(program(everything()))) > 5
     np.testing.assert_array_equal(built(everything())(*points)[0], expected)
 

@@ -237,7 +237,7 @@ def test_a_part_that_is_too_large_to_compile_leaves_the_run_to_python(monkeypatc
     model, start = catalog.furuta_pendulum(), ([0.3, 0.4], [1.0, 2.0])
     dyn = mb.dynamics(model, "lagrangian", compile=True)
     dyn.forward_dynamics(*start, [0.0, 0.0])
-    monkeypatch.setattr(backend, "_MAX_OPERATIONS", 20)
+    monkeypatch.setattr(backend, "_MAX_COMPILED_OPERATIONS", 20)
     run = simulate(dyn, *start, 0.1, "gauss4", dt=0.01)
     expected = simulate(mb.dynamics(model, "lagrangian", compile=False), *start, 0.1, "gauss4", dt=0.01)
     assert np.abs(run.q - expected.q).max() < 1e-14

@@ -337,7 +337,7 @@ def test_large_data_are_read_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     tau = torques(model, q, v, a)
     whole = mb.identify(model, q, v, a, tau, friction=True)
     reports: list[float] = []
-    monkeypatch.setattr("mbkit.identify.measurements._BLOCK", 1)
+    monkeypatch.setattr("mbkit.identify.measurements._MAX_BLOCK_NUMBERS", 1)
     parts = mb.identify(model, q, v, a, tau, friction=True, progress=reports.append)
     assert np.allclose(values(whole), values(parts), rtol=0, atol=1e-12)
     assert reports[-1] == 1.0

@@ -182,6 +182,6 @@ def test_levels_and_bytes_are_bounded_over_all_files(tmp_path: Path, monkeypatch
     with pytest.raises(LoadError, match="nested more than 250 deep"):
         mb.load(files(tmp_path, main=world(include("c0.xml")), **chain))
     path = files(tmp_path, main=world(include("f0.xml")))
-    monkeypatch.setattr("mbkit.load.xml_reader.MOST_BYTES", 3000)
+    monkeypatch.setattr("mbkit.load.xml_reader.MAX_FILE_BYTES", 3000)
     with pytest.raises(MbkitError, match="up to 3000 bytes of included files"):
         mb.load(path)

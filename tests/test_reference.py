@@ -50,7 +50,7 @@ def summed(high: Any, low: Any) -> Any:
 @pytest.fixture(autouse=True)
 def quick_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops for all but the smallest systems: what is run once is not worth more."""
-    monkeypatch.setattr("mbkit.codegen.taylor._UNROLLED", 2000)
+    monkeypatch.setattr("mbkit.codegen.taylor._MAX_UNROLLED_OPERATIONS", 2000)
 
 
 def ample() -> Deadline:

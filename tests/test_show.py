@@ -242,8 +242,8 @@ TWICE = "".join(f'<node id="n{k}">{2 * f"""<instance_node url="#n{k - 1}"/>"""}<
 @pytest.mark.parametrize(
     ("was", "now", "why"),
     [
-        ("<node>", f'{TWICE}<node id="n0"/><node>', "more than 200000 elements in them"),
-        ("<node>", '<node id="n"><instance_node url="#n"/>', "nested more than 50 deep"),
+        ("<node>", f'{TWICE}<node id="n0"/><node>', "more than 500000 elements in them"),
+        ("<node>", '<node id="n"><instance_node url="#n"/>', "nested more than 250 deep"),
         ("<node>", 100_000 * "<node>", "nested more than 250 deep"),
         ("<p>0", "<p>1000000000", "vertices that are not there"),
         ("<p>0", "<p>99999999999999999999", "vertices that are not there"),
@@ -289,7 +289,7 @@ def test_colours_are_numbers_from_pictures_that_fit(tmp_path: Path, monkeypatch)
     os.close(pipe)
     (tmp_path / "b.dae").write_text(DAE.replace("<color>1", "<color>inf"))
     assert read_surfaces(tmp_path / "b.dae")[0].color is None
-    monkeypatch.setattr(mesh_files, "_MOST_PIXELS", 15)
+    monkeypatch.setattr(mesh_files, "_MAX_TEXTURE_PIXELS", 15)
     (tmp_path / "a.dae").write_text(text.replace("pipe.png", "a.png"))
     assert read_surfaces(tmp_path / "a.dae")[0].color is None
     (tmp_path / "a.obj").write_text(OBJ + "".join(f"usemtl {k}\nf 1 2 3\n" for k in range(5000)))

@@ -67,7 +67,7 @@ def double() -> Any:
 @pytest.fixture(autouse=True)
 def quick_to_compile(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops for all but the smallest systems: what is run once is not worth more."""
-    monkeypatch.setattr("mbkit.codegen.taylor._UNROLLED", 2000)
+    monkeypatch.setattr("mbkit.codegen.taylor._MAX_UNROLLED_OPERATIONS", 2000)
 
 
 # Exact motions
@@ -354,7 +354,7 @@ def test_what_has_no_series_is_refused(swing: Any) -> None:
 
 
 def test_too_large_a_model_is_refused_before_it_is_derived(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbkit.codegen.taylor._MAX_OPERATIONS", 3)
+    monkeypatch.setattr("mbkit.codegen.taylor._MAX_TAYLOR_OPERATIONS", 3)
     with pytest.raises(UnsupportedError, match=r"double_pendulum takes \d+ operations.*'rk853' or 'dop853'"):
         TaylorSystem(Equations(catalog.double_pendulum()))
 

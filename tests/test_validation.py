@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mbkit.codegen import jit
-from validation import smoke, stamp
+from validation import smoke, stamp, thresholds
 from validation.__main__ import PARTS
 from validation.pages import LEVELS, SIMD, lanes, origin
 
@@ -73,3 +73,22 @@ def test_ratios_of_batches_stand_with_the_level_of_simd() -> None:
     for part in SIMD:
         assert lanes(told) in origin(told, part).data
         assert "the level of SIMD was not kept" in origin({"date": "2026-01-01"}, part).data
+
+
+def test_thresholds_are_told_from_constants_and_found_in_tests(tmp_path: Path) -> None:
+    package, tests = tmp_path / "mbkit", tmp_path / "tests"
+    package.mkdir()
+    tests.mkdir()
+    (package / "a.py").write_text(
+        "EPS = 2.0**-52\n_MAX_STEPS = 20\nG: float = 9.81\nON, NAME = True, 'a'\n"
+        "def f(x):\n    return G * x if x < 8 * _MAX_STEPS else scipy.rank(x, rcond=EPS)\n"
+    )
+    (package / "b.py").write_text("from mbkit.a import EPS\n_ERROR_RATIO = 8 * EPS\ny = min(x, z[:_ERROR_RATIO])\n")
+    (tests / "test_a.py").write_text("monkeypatch.setattr(a, '_MAX_STEPS', 2)\n")
+    found = {c.name: (c.value, c.threshold, c.tests) for c in thresholds.constants(package, tests)}
+    assert found == {
+        "EPS": (2.0**-52, True, ()),
+        "_MAX_STEPS": (20, True, ("test_a.py",)),
+        "G": (9.81, False, ()),
+        "_ERROR_RATIO": (2.0**-49, True, ()),
+    }

@@ -31,7 +31,7 @@ from mbkit._child_process import cores
 from mbkit.codegen.cuda.arrays import DeviceArray
 from mbkit.codegen.cuda.driver import device_of
 from mbkit.codegen.cuda.kernels import kernel_code, ptx, steps_code
-from mbkit.codegen.cuda.runs import WHOLE
+from mbkit.codegen.cuda.runs import MAX_STEP_OPERATIONS
 from mbkit.codegen.program import program
 from mbkit.derivation.steps.fixed import STATE, Part, parts_of
 from mbkit.errors import InputError
@@ -281,7 +281,7 @@ def assembled(ptxas: str) -> dict[str, Any]:
         model = loaded(name)
         dyn = mb.dynamics(model, "lagrangian", compile=True)
         forward = program(dyn.equations.function("forward_dynamics")).fused
-        parts = parts_of(dyn.equations, "rk4", partial(operations, dyn), most=WHOLE)
+        parts = parts_of(dyn.equations, "rk4", partial(operations, dyn), most=MAX_STEP_OPERATIONS)
         texts = {"forward_dynamics": kernel_code(forward, [s for s, _ in model.quaternions])[0]}
         texts["rk4"] = steps_code(parts, STATE)[0]
         for kernel, text in texts.items():

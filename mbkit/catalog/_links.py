@@ -20,7 +20,7 @@ ORIGIN: Final[Pair] = (0.0, 0.0)
 #: Cosine and sine of three directions in a plane, 120° apart.
 THIRDS: Final = ((1.0, 0.0), (-0.5, 0.75**0.5), (-0.5, -(0.75**0.5)))
 #: Height of a triangle over one of its sides, squared, below which rounding alone keeps its corners apart.
-_FLAT: Final = 1e-12
+_FLAT_TRIANGLE_RATIO: Final = 1e-12
 
 
 def at(point: Pair) -> Point:
@@ -42,7 +42,7 @@ def add_rod(b: ModelBuilder, name: str, mass: Number, along: Point, radius: Numb
     """Add a uniform rod from the body's origin along a vector; it is thin, or a solid cylinder of a radius."""
     square = [_product(x, x) for x in along]
     length = square[0] + square[1] + square[2]
-    # Of a cylinder m/12 (|e|² 1 - e eᵀ) + m r²/4 (1 + e eᵀ/|e|²).
+    # Inertia of a cylinder: m/12 (|e|² 1 - e eᵀ) + m r²/4 (1 + e eᵀ/|e|²).
     mixed = -mass / 12 if radius == 0.0 else mass * (radius**2 / (4 * length) - 1 / 12)
     equal = mass / 12 * length if radius == 0.0 else mass * (length / 12 + radius**2 / 4)
     inertia = [[_product(mixed, _product(along[min(i, j)], along[max(i, j)])) for j in range(3)] for i in range(3)]
@@ -67,7 +67,7 @@ def add_pin(b: ModelBuilder, name: str, body_a: str, end_a: Pair, body_b: str, e
 def leg(names: str, side: Number, other: Number) -> Number:
     """Return the second leg of a right triangle with a hypotenuse and a leg; `names` are for the message."""
     square = side**2 - other**2
-    if known(square) and nominal(square) <= _FLAT * nominal(side) ** 2:
+    if known(square) and nominal(square) <= _FLAT_TRIANGLE_RATIO * nominal(side) ** 2:
         a, b = (abs(nominal(x)) for x in (side, other))
         raise InputError(
             f"{names}: expected links that meet at an angle, got a reach of {a:g} m for {b:g} m; change one"

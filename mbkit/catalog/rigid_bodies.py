@@ -114,10 +114,10 @@ def gyroscope(
 # a = 1/√6 by 1.4e-4.
 
 #: Length of the stub in lengths of a segment.
-_STUB: Final = 6**-0.5
+_STUB_LENGTH_RATIO: Final = 6**-0.5
 
 #: Limit of a segment's turn, rad: lumping is valid below; random states stay there.
-_BEND: Final = 0.2
+_MAX_SEGMENT_TURN: Final = 0.2
 
 _Z: Final = (0.0, 0.0, 1.0)
 #: Half a turn about +z.
@@ -133,13 +133,13 @@ def _add_beam(
 ) -> None:
     """Add a beam's segments in the x-y plane, hinged about +z, from `root` along ±x of the parent; the stub is its."""
     segments, length, mass, bending_stiffness = beam
-    h = length / (segments + _STUB)
-    share = mass / (segments + _STUB)
+    h = length / (segments + _STUB_LENGTH_RATIO)
+    share = mass / (segments + _STUB_LENGTH_RATIO)
     across = share * h**2 / 12
     for i in range(1, segments + 1):
         b.add_body(f"{name} segment{i}", mass=share, com=(h / 2, 0.0, 0.0), inertia=(0.0, across, across))
         first, turned = i == 1, i == 1 and backwards
-        reach = root + _STUB * h if first else h
+        reach = root + _STUB_LENGTH_RATIO * h if first else h
         b.add_joint(
             f"{name}{i}",
             "revolute",
@@ -148,9 +148,9 @@ def _add_beam(
             axis=_Z,
             translation=(-reach if turned else reach, 0.0, 0.0),
             rotation=_BACKWARDS if turned else None,
-            stiffness=bending_stiffness / ((_STUB + 0.5) * h if first else h),
-            lower=-_BEND,
-            upper=_BEND,
+            stiffness=bending_stiffness / ((_STUB_LENGTH_RATIO + 0.5) * h if first else h),
+            lower=-_MAX_SEGMENT_TURN,
+            upper=_MAX_SEGMENT_TURN,
         )
     b.add_frame(f"{name} tip", body=f"{name} segment{segments}", translation=(h, 0.0, 0.0))
 
@@ -273,7 +273,10 @@ def flexible_spacecraft(
     default values are those of no particular craft; the beams' first frequency, clamped, is 0.96 rad/s.
     """
     along, across, about = point("hub_inertia", hub_inertia)
-    stub, share = _STUB / (segments + _STUB) * length, _STUB / (segments + _STUB) * mass
+    stub, share = (
+        _STUB_LENGTH_RATIO / (segments + _STUB_LENGTH_RATIO) * length,
+        _STUB_LENGTH_RATIO / (segments + _STUB_LENGTH_RATIO) * mass,
+    )
     # Two thin rods of length `stub` from the radius outwards.
     added = 2 * share * ((hub_radius + stub / 2) ** 2 + stub**2 / 12)
     b = ModelBuilder("flexible_spacecraft", gravity=(0.0, 0.0, 0.0))

@@ -153,7 +153,7 @@ def bicycle(
     """
     b = ModelBuilder("bicycle", gravity=down(gravity))
     c, s = cos(tilt), sin(tilt)
-    # Of the front frame: the point of the steering axis at the height of the front hub.
+    # Origin of the front frame: the point of the steering axis at the height of the front hub.
     ahead = wheelbase + trail - front_radius * (s / c)
     for name, mass, com, inertia, product, at in (
         ("rear frame", rear_mass, rear_com, rear_inertia, rear_product, (0.0, rear_radius)),

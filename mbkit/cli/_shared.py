@@ -210,7 +210,7 @@ class CommandGroup(Group):
             say("error", in_options(str(error)))
             ctx.exit(MISUSE)
         except KeyboardInterrupt:
-            # Where the entry point listens, it has said so by now, and nothing else is printed.
+            # An entry point that listens has said so by now, and nothing else is printed.
             say("interrupted", "the command did not finish")
             ctx.exit(INTERRUPTED)
         except click.ClickException as error:

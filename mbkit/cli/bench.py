@@ -14,7 +14,7 @@ from mbkit.cli import _shared as shared
 from mbkit.cli._shared import Report
 
 #: Limits of evaluations in a run, of all methods and of a few.
-_WORK, _QUICK_WORK = 3_000, 12_000
+_MAX_EVALUATIONS, _MAX_QUICK_EVALUATIONS = 3_000, 12_000
 
 
 @shared.command("mbkit bench double_pendulum --quick", "mbkit bench ur5 --methods rk4,rk853 --duration 2 --out results")
@@ -67,7 +67,7 @@ def bench(
         # A method that none of the engines has would be refused.
         methods = tuple(m for m in QUICK_METHODS if any(map(METHODS[m].on, engines)))
     settings["repeats"] = repeats or (5 if full else 3)
-    settings["work"] = None if full else _QUICK_WORK if quick else _WORK
+    settings["work"] = None if full else _MAX_QUICK_EVALUATIONS if quick else _MAX_EVALUATIONS
     workers: AbstractContextManager[Executor | None] = nullcontext() if jobs is None else WorkerPool(jobs)
     try:
         with _interrupt.keeping, Bar(f"bench {model.name}") as bar, workers as executor:

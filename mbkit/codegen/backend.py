@@ -26,7 +26,7 @@ DERIVING: Final = fork_safe(threading.RLock())
 
 #: Operations, repeated ones included, above which LLVM's time, some 10 s per 100k, is not spent unasked: a Coriolis
 #: matrix of a hundred joints has twice as many, and is interpreted in 0.5 ms.
-_MAX_OPERATIONS: Final = 200_000
+_MAX_COMPILED_OPERATIONS: Final = 200_000
 T = TypeVar("T")
 
 
@@ -87,7 +87,7 @@ def executable(
 
     def checked() -> ca.Function:
         function = make()
-        if function.n_instructions() > _MAX_OPERATIONS:
+        if function.n_instructions() > _MAX_COMPILED_OPERATIONS:
             raise _TooLargeError(function)
         return function
 
@@ -100,7 +100,7 @@ def executable(
                 return checked()
             except _TooLargeError as error:
                 raise UnsupportedError(
-                    f"device: expected at most {_MAX_OPERATIONS:,} operations, {name[1]} of this model has "
+                    f"device: expected at most {_MAX_COMPILED_OPERATIONS:,} operations, {name[1]} of this model has "
                     f"{error.args[0].n_instructions():,}; use the CPU"
                 ) from None
 

@@ -23,7 +23,7 @@ from mbkit.codegen.simd_kernel import BODY
 
 RUN: Final = "mbkit_run"
 #: Inputs, and outputs, of one function at most.
-MOST_ARRAYS: Final = 16
+MAX_ARRAYS: Final = 16
 
 _I64: Final = ir.IntType(64)
 _DOUBLE: Final = ir.DoubleType()
@@ -176,7 +176,7 @@ def batch_code(width: int) -> str:
     W = _I64(width)
     kinds = {"p": _POINTER, "s": _I64}
     # In the order of the body's arguments.
-    held = {(name, i): b.room(kinds[name], MOST_ARRAYS) for i in (True, False) for name in kinds}
+    held = {(name, i): b.room(kinds[name], MAX_ARRAYS) for i in (True, False) for name in kinds}
     n_in, n_out, share = (b.get(table, _I64(i), _I64) for i in range(3))
     used = b.room(_I64, 1)
 

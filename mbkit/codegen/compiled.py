@@ -25,12 +25,12 @@ from mbkit.codegen.python_call import Kernel, python_call
 from mbkit.derivation.fingerprint import SOURCES
 
 #: Operations on which a second thread is worth its start: about 100 µs.
-_SHARE: Final = 2_000_000
+_MIN_THREAD_OPERATIONS: Final = 2_000_000
 #: Coordinate-major arrays with more rows than this are read in blocks: so many places
 #: of a large array at once are more than the processor's tables of pages hold.
-_ROWS: Final = 48
+_MAX_STREAMED_ROWS: Final = 48
 #: Samples in such a block. No power of two: rows would meet in the same cache sets.
-_BLOCK: Final = 1032
+_BLOCK_SAMPLES: Final = 1032
 
 
 def aligned(size: int) -> Array:
@@ -111,7 +111,7 @@ class Compiled:
         if n == 0:
             return True
         width = jit.host().width
-        parts = min(threads or cores(), max(1, n * self.operations // _SHARE))
+        parts = min(threads or cores(), max(1, n * self.operations // _MIN_THREAD_OPERATIONS))
         if parts == 1:
             return self._part(inputs, outputs, 0, n)
         # A few more parts than threads: one that is held up is helped out by the others.
@@ -120,13 +120,13 @@ class Compiled:
         return all(list(_pool(parts).map(lambda s: self._part(inputs, outputs, s, min(s + size, n)), starts)))
 
     def _part(self, inputs: Sequence[Array], outputs: Sequence[Array], first: int, last: int) -> bool:
-        many = [sum(x.shape[1] for x in xs if x.strides[0] == 8) > _ROWS for xs in (inputs, outputs)]
-        if not any(many) or last - first <= _BLOCK:
+        many = [sum(x.shape[1] for x in xs if x.strides[0] == 8) > _MAX_STREAMED_ROWS for xs in (inputs, outputs)]
+        if not any(many) or last - first <= _BLOCK_SAMPLES:
             return self._run_range(inputs, outputs, first, last)
-        near = [[np.empty((x.shape[1], _BLOCK)).T for x in xs] for xs in (inputs, outputs)]
+        near = [[np.empty((x.shape[1], _BLOCK_SAMPLES)).T for x in xs] for xs in (inputs, outputs)]
         finite = True
-        for start in range(first, last, _BLOCK):
-            n = min(_BLOCK, last - start)
+        for start in range(first, last, _BLOCK_SAMPLES):
+            n = min(_BLOCK_SAMPLES, last - start)
             for x, y in zip(inputs, near[0], strict=True):
                 y[:n] = x[start : start + n]
             finite &= self._run_range(near[0], near[1], 0, n)

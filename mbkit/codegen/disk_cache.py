@@ -25,7 +25,7 @@ from platformdirs import user_cache_path
 T = TypeVar("T")
 _MAGIC: Final = b"mbkit machine code 1\n"
 #: The oldest entries go when the folder holds more than this, bytes.
-_MAX_BYTES: Final = 512 * 2**20
+_MAX_CACHE_BYTES: Final = 512 * 2**20
 #: By folder what this process may write before it looks through it again, bytes.
 _left: Final[dict[Path, int]] = {}
 #: Names of entries, and of those being written.
@@ -167,10 +167,10 @@ def _make_room(at: Path, written: int) -> None:
                     entries.append((status.st_mtime, status.st_size, entry.path))
     size = sum(entry[1] for entry in entries)
     for _, bytes_, path in sorted(entries):
-        if size <= _MAX_BYTES:
+        if size <= _MAX_CACHE_BYTES:
             break
         with suppress(OSError):
             os.unlink(path)
             size -= bytes_
     # Others write too.
-    _left[at] = (_MAX_BYTES - size) // 4
+    _left[at] = (_MAX_CACHE_BYTES - size) // 4

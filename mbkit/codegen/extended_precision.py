@@ -18,7 +18,7 @@ from mbkit.codegen.program import Program
 from mbkit.errors import InputError, UnsupportedError
 
 Backend = Literal["real128", "mpmath"]
-BITS: Final = 113
+BINARY128_BITS: Final = 113
 
 #: Functions' names in C -> in NumPy.
 _FUNCTIONS: Final = {
@@ -27,7 +27,7 @@ _FUNCTIONS: Final = {
     "pow": "power",
 }
 #: Beyond it binary128 has no numbers, nor anything between 0 and its inverse.
-_LARGEST: Final = 16384
+_MAX_EXPONENT: Final = 16384
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Arithmetic:
 
     name: Backend
     dtype: Any
-    #: From a float to one number, exactly.
+    #: Converts a float to one number, exactly.
     number: Callable[[float], Any]
     divide: Callable[[Any, Any], Any]
     #: By their names in C; NaN outside of the domain.
@@ -96,7 +96,7 @@ def mpmath_context() -> Any:
         import mpmath
 
     context = mpmath.MPContext()
-    context.prec = BITS
+    context.prec = BINARY128_BITS
     return context
 
 
@@ -121,7 +121,7 @@ def _mpmath() -> Arithmetic:
 
     def bounded(growing: Callable[[Any], Any]) -> Callable[[Any], Any]:
         """Return a function that grows like exp, within the range of binary128: mpmath has no bounds but memory."""
-        most = context.mpf(_LARGEST) * context.ln2
+        most = context.mpf(_MAX_EXPONENT) * context.ln2
         return lambda x: growing(x if abs(x) < most else context.sign(x) * context.inf)
 
     def power(a: Any, b: Any) -> Any:
@@ -130,7 +130,7 @@ def _mpmath() -> Arithmetic:
         if a == 0:
             return context.inf if b < 0 else context.zero if b > 0 else context.nan
         size = b * context.log(abs(a), 2)
-        if abs(size) < _LARGEST:
+        if abs(size) < _MAX_EXPONENT:
             return context.power(a, b)
         return context.nan if a < 0 or context.isnan(size) else context.inf if size > 0 else context.zero
 
@@ -160,7 +160,7 @@ def digits(x: Any, own: Arithmetic) -> Any:
 # NumPy's broadcasting does the rest.
 
 # States per pass: enough to share the interpreter's work, few enough for memory.
-_LANES: Final = 128
+_MAX_PASS_STATES: Final = 128
 
 
 class Extended:
@@ -199,8 +199,8 @@ class Extended:
         outputs = [np.empty((n, *shape), dtype=own.dtype) for shape in self.program.shapes]
         with np.errstate(all="ignore"):
             columns = [np.ascontiguousarray(own.array(x).T) for x in arguments]
-            for start in range(0, n, _LANES):
-                part = slice(start, start + _LANES)
+            for start in range(0, n, _MAX_PASS_STATES):
+                part = slice(start, start + _MAX_PASS_STATES)
                 self._run([c if c.shape[1] == 1 else c[:, part] for c in columns], [out[part] for out in outputs])
         return outputs
 

@@ -14,7 +14,7 @@ from llvmlite import binding as llvm
 
 from mbkit._fork import fork_safe
 from mbkit.codegen import disk_cache as disk
-from mbkit.codegen.batch_loop import MOST_ARRAYS, RUN, batch_code
+from mbkit.codegen.batch_loop import MAX_ARRAYS, RUN, batch_code
 from mbkit.codegen.program import Program
 from mbkit.codegen.simd_kernel import vector_code
 from mbkit.derivation.fingerprint import SOURCES
@@ -24,7 +24,7 @@ _SIGNATURE: Final = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, cty
 
 
 class Host(NamedTuple):
-    """What machine code depends on; `width` is the number of doubles in a register, `fma` says whether it fuses."""
+    """A processor, as machine code depends on it; `width` counts doubles in a register, `fma` says whether it fuses."""
 
     triple: str
     cpu: str
@@ -123,8 +123,8 @@ def object_code(text: str, *, optimize: bool = False) -> bytes:
 
 def program_object(program: Program) -> tuple[bytes, int]:
     """Return a program's object file, and how many doubles of work space its body needs."""
-    if max(len(program.inputs), len(program.outputs)) > MOST_ARRAYS:
-        raise ValueError(f"expected at most {MOST_ARRAYS} arguments and as many results")
+    if max(len(program.inputs), len(program.outputs)) > MAX_ARRAYS:
+        raise ValueError(f"expected at most {MAX_ARRAYS} arguments and as many results")
     width = host().width
     text, vectors = vector_code(program, width)
     return object_code(text), vectors * width

@@ -82,7 +82,8 @@ class Text:
 # Sine and cosine of a whole vector.
 #
 # Reduction by Cody and Waite with π/2 in three parts: the first difference is exact in a fused multiply-add, the second
-# by Knuth's exact sum, so that the reduced angle has twice the working precision. Beyond `LIMIT` a lane is reduced by
+# by Knuth's exact sum, so that the reduced angle has twice the working precision. Beyond
+# `MAX_REDUCED_ANGLE` a lane is reduced by
 # Payne and Hanek's method (1983), with as many bits of 2/π as its exponent asks for. On [-π/4, π/4] the minimax
 # polynomials of Ng's ``__kernel_sin`` and ``__kernel_cos`` (Sun's fdlibm, 1993) take the tail into account. Measured
 # against 70 digits: at most 0.76 ulp, next to multiples of π/2 too. No library is called, so that every processor gives
@@ -92,7 +93,7 @@ class Text:
 # and a cosine of one angle, and which it would take ours for.
 
 #: Angles above this in absolute value are reduced with more bits of 2/π, rad.
-LIMIT: Final = 1e8
+MAX_REDUCED_ANGLE: Final = 1e8
 
 #: π/2 = the sum of these to 161 bits.
 _HALF_PI: Final = (1.5707963267948966, 6.123233995736766e-17, -1.4973849048591833e-33)
@@ -188,7 +189,7 @@ declare i1 @llvm.vector.reduce.or.v{width}i1({B})
 define internal {pair} @mbkit_sincos({V} %x) {attributes} nounwind willreturn memory(none) {{
 entry:
   %size = call {V} @llvm.fabs.v{width}f64({V} %x)
-  %far = fcmp ugt {V} %size, {number(LIMIT)}
+  %far = fcmp ugt {V} %size, {number(MAX_REDUCED_ANGLE)}
   %any = call i1 @llvm.vector.reduce.or.v{width}i1({B} %far)
 {reduction}
   br i1 %any, label %distant, label %done
@@ -204,15 +205,15 @@ done:
 
 _FAR: Final = "{ double, double, i64 }"
 #: Words of 64 bits of 2/π that the largest double asks for, behind one of zeros.
-_WORDS: Final = 20
+_TWO_OVER_PI_WORDS: Final = 20
 _ZERO_BITS: Final = 64
 
 
 def _two_over_pi() -> list[int]:
-    bits = 64 * _WORDS
+    bits = 64 * _TWO_OVER_PI_WORDS
     with mpmath.workprec(bits + 64):
         digits = int(mpmath.floor(mpmath.ldexp(2 / mpmath.pi, bits)))
-    return [0, *(digits >> (bits - 64 * (i + 1)) & (2**64 - 1) for i in range(_WORDS))]
+    return [0, *(digits >> (bits - 64 * (i + 1)) & (2**64 - 1) for i in range(_TWO_OVER_PI_WORDS))]
 
 
 def _far() -> str:

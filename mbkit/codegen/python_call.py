@@ -32,7 +32,7 @@ import numpy as np
 from llvmlite import ir
 
 from mbkit.codegen import jit
-from mbkit.codegen.batch_loop import MOST_ARRAYS, RUN, Builder
+from mbkit.codegen.batch_loop import MAX_ARRAYS, RUN, Builder
 from mbkit.model.manifold import NEAR_UNIT
 
 
@@ -53,11 +53,11 @@ _HEAD: Final = object.__basicsize__ // 8
 _DATA, _RANK, _SHAPE, _STRIDES, _DTYPE = _HEAD, _HEAD + 1, _HEAD + 2, _HEAD + 3, _HEAD + 5
 #: Letters, byte order, flags and number of a type, in eight bytes.
 _KIND: Final = _HEAD + 1
-_TABLE: Final = 3 + 4 * 2 * MOST_ARRAYS
+_TABLE: Final = 3 + 4 * 2 * MAX_ARRAYS
 # Places in the array of numbers: what holds of every function in this process, then what is its own.
 (_ARRAY, _FLOAT, _DOUBLE_KIND, _TAKE, _GIVE, _NONE, _KEEP, _DROP, _NEW_ARRAY, _NEW_FLOAT, _NEW_TUPLE, _SET) = range(12)
 (_INPUTS, _RESULTS, _BYTES, _TABLE_AT, _QUATERNIONS, _CALLS, _LISTS) = range(12, 19)
-_MOST_AXES: Final = 4
+_MAX_AXES: Final = 4
 #: Entries of a Python float, and of one that must be positive.
 FLOAT, POSITIVE = -1, -2
 _METH_FASTCALL: Final = 0x80
@@ -127,9 +127,9 @@ def python_call(
     given = [x for name, n in inputs.items() for x in (n, places[name])]
     made = []
     for name, shape in results.items():
-        if prod(shape) != rows[name] or len(shape) > _MOST_AXES:
+        if prod(shape) != rows[name] or len(shape) > _MAX_AXES:
             raise ValueError(f"{name}: {rows[name]} numbers have no shape {tuple(shape)}")
-        made += [rows[name], places[name], len(shape), *shape, *[1] * (_MOST_AXES - len(shape))]
+        made += [rows[name], places[name], len(shape), *shape, *[1] * (_MAX_AXES - len(shape))]
     turns = [places[next(iter(inputs))] + start * width for start in quaternions]
     lists = [*given, *made, *turns, *calls]
     numbers = np.array([*_process(), *counts, *lists], dtype=np.int64).view(_Numbers)
@@ -222,7 +222,7 @@ def _code() -> str:
     lanes = ir.VectorType(_F64, width)
     entries = b.at(numbers, _I64(_LISTS), _I64)
     made = b.at(entries, b.mul(number(_INPUTS), _I64(2)), _I64)
-    starts = b.at(made, b.mul(number(_RESULTS), _I64(3 + _MOST_AXES)), _I64)
+    starts = b.at(made, b.mul(number(_RESULTS), _I64(3 + _MAX_AXES)), _I64)
     calls = b.at(starts, number(_QUATERNIONS), _I64)
     refused, refused_late, no_memory = (f.append_basic_block(n) for n in ("refused", "refused_late", "no_memory"))
     nothing = ir.Constant(_PTR, None)
@@ -317,7 +317,7 @@ def _code() -> str:
         require(is_there(b.load(out, typ=_PTR)), no_memory)
 
     def one_result(i: Any) -> None:
-        result = b.at(made, b.mul(i, _I64(3 + _MOST_AXES)), _I64)
+        result = b.at(made, b.mul(i, _I64(3 + _MAX_AXES)), _I64)
         size, place, axes = (b.get(result, _I64(k), _I64) for k in range(3))
         values = b.at(work, place)
         with b.if_else(b.icmp_signed("==", axes, _I64(0))) as (is_float, is_array):

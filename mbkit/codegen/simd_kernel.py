@@ -24,10 +24,10 @@ from mbkit.codegen.program import Program
 
 BODY: Final = "mbkit_body"
 #: LLVM's time to compile one block grows faster than its length, most of all with
-#: what it stores. A program heavier than _WHOLE is compiled in pieces of _PIECE.
-_WHOLE: Final = 20000
-_PIECE: Final = 1000
-_STORE: Final = 4  # weight of a store, in operations
+#: what it stores. A program heavier than _MAX_WHOLE_OPERATIONS is compiled in pieces of _PIECE_OPERATIONS.
+_MAX_WHOLE_OPERATIONS: Final = 20000
+_PIECE_OPERATIONS: Final = 1000
+_STORE_OPERATIONS: Final = 4  # weight of a store, in operations
 _ARGUMENTS: Final = "ptr noalias %in, ptr noalias %is, ptr noalias %out, ptr noalias %os, ptr noalias %work"
 #: Operations that can be finite where an argument is not: 1/inf, exp(-inf), atan(inf), NaN to the power of 0.
 _HIDING: Final = frozenset(
@@ -63,10 +63,10 @@ def pieces_of(program: Program) -> list[list[int]]:
         for k in out.ravel().tolist():
             stored[k] = stored.get(k, 0) + 1
     order = [k for k, o in enumerate(program.operations) if o.name not in ("input", "const")]
-    ends = np.cumsum([1 + _STORE * stored.get(k, 0) for k in order])
-    if not order or ends[-1] <= _WHOLE:
+    ends = np.cumsum([1 + _STORE_OPERATIONS * stored.get(k, 0) for k in order])
+    if not order or ends[-1] <= _MAX_WHOLE_OPERATIONS:
         return [order]
-    cuts = np.searchsorted(ends, np.arange(_PIECE, ends[-1], _PIECE)).tolist()
+    cuts = np.searchsorted(ends, np.arange(_PIECE_OPERATIONS, ends[-1], _PIECE_OPERATIONS)).tolist()
     return [order[a:b] for a, b in zip([0, *cuts], [*cuts, len(order)], strict=True) if a < b]
 
 

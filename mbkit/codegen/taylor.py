@@ -30,10 +30,10 @@ from mbkit.errors import UnsupportedError
 from mbkit.model.rolling import discs_of
 
 # A compiler's time for more is no longer spent unasked: 34,000 operations take 9 s.
-_MAX_OPERATIONS: Final = 100_000
+_MAX_TAYLOR_OPERATIONS: Final = 100_000
 # Up to this many operations times order², the recurrences are written out: 2 to 3
 # times as fast to run as loops over them, compiled in about a second.
-_UNROLLED: Final = 25_000
+_MAX_UNROLLED_OPERATIONS: Final = 25_000
 _KINKS: Final = frozenset(
     {"fabs", "sign", "fmin", "fmax", "lt", "le", "eq", "ne", "not", "and", "or", "if_else_zero"}
     # A series follows the branch that it began on.
@@ -46,8 +46,8 @@ _SAME: Final = (
 )
 #: heyoka's default limit of the machine code that it keeps in memory, bytes, and the one that replaces it:
 #: enough for some hundred systems.
-_HEYOKAS_MEMORY: Final = 2**31
-_MEMORY: Final = 2**26
+_HEYOKA_CODE_BYTES: Final = 2**31
+_MAX_CODE_BYTES: Final = 2**26
 #: heyoka's compiler has locks of its own, which a forked child must not find held.
 _COMPILING: Final = fork_safe(threading.RLock())
 _REMEDY: Final = "method='rk853' and method='dop853' go without it"
@@ -101,8 +101,8 @@ def _heyoka() -> Any:
             "taylor: heyoka is not installed; pip install heyoka (Linux), or conda install -c conda-forge heyoka.py; "
             + _REMEDY
         ) from None
-    if heyoka.llvm_state.get_memcache_limit() == _HEYOKAS_MEMORY:
-        heyoka.llvm_state.set_memcache_limit(_MEMORY)
+    if heyoka.llvm_state.get_memcache_limit() == _HEYOKA_CODE_BYTES:
+        heyoka.llvm_state.set_memcache_limit(_MAX_CODE_BYTES)
     return heyoka
 
 
@@ -137,11 +137,11 @@ class TaylorSystem:
         heyoka = _heyoka()
         # Written out from M, the size is known before the derivation, which would take long.
         size = 0 if equations.elimination == "links" else elimination_size(equations.model)
-        if size <= _MAX_OPERATIONS:
+        if size <= _MAX_TAYLOR_OPERATIONS:
             self.rates = rates(equations)
             graph = program(self.rates)
             size = graph.arithmetic
-        if size > _MAX_OPERATIONS:
+        if size > _MAX_TAYLOR_OPERATIONS:
             name = equations.model.name
             raise UnsupportedError(
                 f"taylor: {name} takes {size} operations, too many for a Taylor series; method='rk853' or 'dop853'"
@@ -199,7 +199,7 @@ class TaylorSystem:
     def _compiled(self, kind: Precision, tolerance: float) -> Any:
         n = self._nq + self._nv
         # Beyond double the arithmetic itself takes so long that loops cost nothing.
-        compact = kind.bits > 53 or self.operations * order_of(tolerance) ** 2 > _UNROLLED
+        compact = kind.bits > 53 or self.operations * order_of(tolerance) ** 2 > _MAX_UNROLLED_OPERATIONS
         with _COMPILING:
             return _heyoka().taylor_adaptive(
                 self._system,

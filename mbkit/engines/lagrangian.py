@@ -523,7 +523,7 @@ class LagrangianDynamics(Dynamics):
     def device_steps(self, method: str, *, thorough: bool = False, fed: bool = False) -> CudaSteps:
         """Return the same steps on the GPU of these dynamics."""
         from mbkit.codegen.cuda.driver import device_of
-        from mbkit.codegen.cuda.runs import WHOLE, steps_on_device
+        from mbkit.codegen.cuda.runs import MAX_STEP_OPERATIONS, steps_on_device
         from mbkit.derivation.steps.fixed import STATE, parts_of
 
         assert self.device is not None
@@ -535,7 +535,9 @@ class LagrangianDynamics(Dynamics):
                 def operations(part: Part) -> int:
                     return int(self._part(part).operations)
 
-                return parts_of(self.equations, method, operations, thorough=thorough, fed=fed, most=WHOLE)
+                return parts_of(
+                    self.equations, method, operations, thorough=thorough, fed=fed, most=MAX_STEP_OPERATIONS
+                )
 
             held[key] = steps_on_device((self.form, *name), parts, STATE, device_of(self.device))
         return held[key]

@@ -28,9 +28,9 @@ from mbkit.model.base_parameters import STANDARD, BaseParameters, parameters_of,
 ENTROPIC, EUCLIDEAN = "entropic", "euclidean"
 PRIORS: Final = (ENTROPIC, EUCLIDEAN)
 #: Least eigenvalue of X, so that what is written down is matter after rounding too.
-_LEAST: Final = 1e-6
-#: What a body without extent gets of its size, so that L exists.
-_EXTENT: Final = 1e-6
+_MIN_EIGENVALUE: Final = 1e-6
+#: Least extent of a body, relative to its largest, so that L exists.
+_POINT_EXTENT_RATIO: Final = 1e-6
 #: Noise below this part of the torque is rounding to the solver.
 NEGLIGIBLE: Final = 1e-6
 _SIZE: Final = len(STANDARD)
@@ -70,11 +70,11 @@ def consistent(system: Array, unknowns: Unknowns, length: float, prior: str, wei
     for k, X in shapes.items():
         predicted = predicted + inertial[:, _SIZE * k : _SIZE * (k + 1)] @ columns[k] @ cp.vec(X, order="C")
         total += cp.trace(X) - cp.log_det(X) if prior == ENTROPIC else 0.5 * cp.sum_squares(X - np.eye(4))
-    # Of the order of one, as the solver likes it.
+    # The solver likes numbers of the order of one.
     objective = (0.5 * cp.sum_squares(predicted - b) + weight * total) / (len(b) + weight)
-    problem = cp.Problem(cp.Minimize(objective), [X >> _LEAST * np.eye(4) for X in shapes.values()])
+    problem = cp.Problem(cp.Minimize(objective), [X >> _MIN_EIGENVALUE * np.eye(4) for X in shapes.values()])
     with warnings.catch_warnings():
-        # Of an accuracy of fewer digits than it aims at, which data without noise do not allow.
+        # Its accuracy has fewer digits than it aims at, which data without noise do not allow.
         warnings.filterwarnings("ignore", "Solution may be inaccurate")
         try:
             problem.solve(solver=cp.CLARABEL)
@@ -131,5 +131,5 @@ def _root(J: Array, length: float) -> Array:
     """Return L with L Lᵀ = J, of a body without extent with a little of it."""
     lengths = np.array([length, length, length, 1.0])
     values, axes = np.linalg.eigh(J / np.outer(lengths, lengths))
-    values = np.maximum(values, _EXTENT * values.max())
+    values = np.maximum(values, _POINT_EXTENT_RATIO * values.max())
     return np.asarray(lengths[:, None] * axes * np.sqrt(values))

@@ -23,7 +23,7 @@ import numpy as np
 from mbkit._check import Array, count, generator, real
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError
-from mbkit.identify.measurements import REST, moving
+from mbkit.identify.measurements import REST_SPEED_RATIO, moving
 from mbkit.model import Model
 from mbkit.model.base_parameters import BASE_PARAMETERS, PARAMETER_SETS, regressor_columns
 from mbkit.model.builder import expect_model
@@ -41,11 +41,11 @@ _BASE: Final = PARAMETER_SETS[1]
 _RANGE: Final = {True: np.pi, False: 1.0}
 _SPEED: Final = {True: 2.0, False: 0.5}
 #: Samples of the search for each period of the highest harmonic, and step of differences of coefficients of order one.
-_PER_PERIOD: Final = 8
-_STEP: Final = 1e-6
-_TRIALS: Final = 8
+_SAMPLES_PER_PERIOD: Final = 8
+_COEFFICIENT_STEP: Final = 1e-6
+_RANDOM_TRIALS: Final = 8
 #: Numbers of regressors that are held at once.
-_BLOCK: Final = 4_000_000
+_MAX_BLOCK_NUMBERS: Final = 4_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,8 +186,8 @@ class _Search:
             raise InputError(f"model: expected one whose motion depends on inertial parameters, got {model.name}")
         self._frequency = 2 * np.pi / period
         self._shape = (model.nv, 2 * harmonics + 1)
-        self._t = np.linspace(0.0, period, _PER_PERIOD * harmonics, endpoint=False)
-        self._fine = np.linspace(0.0, period, 8 * _PER_PERIOD * harmonics, endpoint=False)
+        self._t = np.linspace(0.0, period, _SAMPLES_PER_PERIOD * harmonics, endpoint=False)
+        self._fine = np.linspace(0.0, period, 8 * _SAMPLES_PER_PERIOD * harmonics, endpoint=False)
         self._low, self._high, self._speed = _limits(model, margin)
 
     def bounded(self, x: Array) -> Array:
@@ -208,7 +208,7 @@ class _Search:
         Y: Array = self._dyn._evaluate("regressor", self._columns, q=at, v=rates, a=second)
         if self._columns.along:
             # As `identify` leaves them out.
-            Y = Y * moving(v, REST).reshape(*Y.shape[:2], 1)
+            Y = Y * moving(v, REST_SPEED_RATIO).reshape(*Y.shape[:2], 1)
         return Y.reshape(*v.shape[:-2], -1, Y.shape[-1])
 
     def _equations(self, x: Array) -> Array:
@@ -231,17 +231,17 @@ class _Search:
         centre = self._equations(x[None])[0]
         value, vectors = self.value(centre)
         start = _stretches(centre[None], vectors)[0]
-        steps = x + _STEP * np.eye(x.size).reshape(-1, *self._shape)
-        size = max(1, _BLOCK // centre.size)
+        steps = x + _COEFFICIENT_STEP * np.eye(x.size).reshape(-1, *self._shape)
+        size = max(1, _MAX_BLOCK_NUMBERS // centre.size)
         blocks = [_stretches(self._equations(steps[i : i + size]), vectors) for i in range(0, len(steps), size)]
-        least, largest = ((np.concatenate(blocks) - start) / start / _STEP / 2).T
+        least, largest = ((np.concatenate(blocks) - start) / start / _COEFFICIENT_STEP / 2).T
         return value, largest - least
 
     def run(self, rng: np.random.Generator, iterations: int, progress: Progress) -> Array:
         """Return the best free numbers found."""
         from scipy.optimize import minimize
 
-        trials = rng.standard_normal((_TRIALS, *self._shape))
+        trials = rng.standard_normal((_RANDOM_TRIALS, *self._shape))
         values = [self.value(self._equations(x[None])[0])[0] for x in trials]
         best = trials[int(np.argmin(values))]
         done = 0

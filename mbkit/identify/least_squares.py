@@ -20,14 +20,14 @@ from mbkit.model.base_parameters import eliminated
 
 #: Singular values below this part of the largest one are directions that the data cannot tell. The rest of
 #: geometry that counts as parallel is 1e-7 for base parameters; noise would be blown up as much.
-TOLERANCE: Final = 1e-8
-#: What is smaller than this part of a direction is rounding.
-_ROUNDING: Final = 1e-6
-_ROUNDS: Final = 10
+SINGULAR_VALUE_RATIO: Final = 1e-8
+#: Entries below this part of a direction's largest one are rounding.
+_DIRECTION_ENTRY_RATIO: Final = 1e-6
+_MAX_REWEIGHTINGS: Final = 10
 #: Part of the largest noise that the others are weighed with at least; a torque may be exact, or always zero.
 _LEAST: Final = 1e-6
 #: Change of variances between two rounds at which they are taken as settled.
-_SETTLED: Final = 1e-3
+_VARIANCE_CHANGE: Final = 1e-3
 _EPS: Final = float(np.finfo(float).eps)
 
 
@@ -71,13 +71,13 @@ def fit(given: Sequence[Equations], start: Array, units: Array, *, weighted: boo
         Whether the equations have their weights already; else those of their noise are found.
     """
     noise = np.ones(len(given))
-    for _ in range(_ROUNDS):
+    for _ in range(_MAX_REWEIGHTINGS):
         solution = _Solution(given, noise, start, units)
         found = solution.residual_noise()
         if weighted:
             break
         before, noise = noise, _weighing(found, given)
-        if np.abs(noise / before - 1).max(initial=0.0) < _SETTLED:
+        if np.abs(noise / before - 1).max(initial=0.0) < _VARIANCE_CHANGE:
             break
     null = solution.null
     # Rounding of a sum of equations moves the estimates together, unlike noise of each.
@@ -107,10 +107,10 @@ class _Solution:
         A, b = system[:, :-1], system[:, -1]
         lengths = np.linalg.norm(A, axis=0)
         natural = lengths / units
-        seen = natural > TOLERANCE * natural.max(initial=0.0)
+        seen = natural > SINGULAR_VALUE_RATIO * natural.max(initial=0.0)
         scale = np.where(seen, lengths, 1.0)
         U, sizes, axes = np.linalg.svd(np.where(seen, A / scale, 0.0))
-        rank = int(np.sum(sizes > TOLERANCE * sizes.max(initial=0.0)))
+        rank = int(np.sum(sizes > SINGULAR_VALUE_RATIO * sizes.max(initial=0.0)))
         self.condition = float(sizes[0] / sizes[rank - 1]) if rank else np.nan
         #: Parameters of each unit of the directions that the data can tell.
         self._back = axes[:rank].T / sizes[:rank] / scale[:, None]
@@ -122,7 +122,7 @@ class _Solution:
         given, noise = self._given, self._noise
         squares = np.array([np.sum((x.factor[:, :-1] @ self.values - x.factor[:, -1]) ** 2) for x in given])
         left = np.array([x.count - np.sum(part**2) for x, part in zip(given, self._parts(), strict=True)])
-        # Where a velocity has next to no freedom left, all of them say how large the noise is.
+        # A velocity with next to no freedom left takes the noise of all of them.
         shared = np.sum(squares / noise**2) / max(float(left.sum()), 1.0)
         return np.asarray(np.sqrt(np.where(left >= 1.0, squares / np.maximum(left, 1.0), shared * noise**2)))
 
@@ -141,5 +141,5 @@ def _directions(null: Array, scale: Array) -> Array:
     if not len(null):
         return null
     gone, unit = eliminated(null)
-    unit[np.abs(unit) < _ROUNDING * np.abs(unit).max(axis=1, keepdims=True)] = 0.0
+    unit[np.abs(unit) < _DIRECTION_ENTRY_RATIO * np.abs(unit).max(axis=1, keepdims=True)] = 0.0
     return np.asarray(unit * scale[gone, None] / scale)

@@ -26,11 +26,11 @@ _BASE: Final = PARAMETER_SETS[1]
 #: Effects of what acts beside bodies and gravity.
 _KNOWN: Final = {"T", "V", "loss", "jump", "force"}
 #: Part of a joint's greatest speed below which it counts as at rest.
-REST: Final = 0.05
+REST_SPEED_RATIO: Final = 0.05
 #: Numbers of a regressor that are held at once.
-_BLOCK: Final = 250_000
+_MAX_BLOCK_NUMBERS: Final = 250_000
 #: Columns that no state moves are found at so many.
-_PROBES: Final = 4
+_PROBE_STATES: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,14 +166,14 @@ def _blocks(dyn: Dynamics, unknowns: Unknowns, data: Measurements) -> Iterator[t
     """Yield samples with their regressor and the torque that it has to explain."""
     model = dyn.model
     known = any(kind(name).effects & _KNOWN for name in model.acts if name != "gravity")
-    size = max(64, _BLOCK // max(model.nv * len(unknowns.names), 1))
+    size = max(64, _MAX_BLOCK_NUMBERS // max(model.nv * len(unknowns.names), 1))
     for start in range(0, len(data), size):
         part = slice(start, min(start + size, len(data)))
         q, v, a = data.q[part], data.v[part], data.a[part]
         Y = dyn._evaluate("regressor", unknowns.columns, q=q, v=v, a=a)
         tau = data.tau[part]
         if known:
-            # What is not to be found, as the model has it.
+            # Parameters that are not sought are those of the model.
             tau = tau - (dyn.inverse_dynamics(q, v, a) - Y @ unknowns.nominal)
         yield part, Y, tau
 
@@ -181,6 +181,6 @@ def _blocks(dyn: Dynamics, unknowns: Unknowns, data: Measurements) -> Iterator[t
 def _used(dyn: Dynamics, unknowns: Unknowns) -> list[NDArray[np.intp]]:
     """Return the columns that each velocity's torque depends on: those of bodies that it carries."""
     model, rng = dyn.model, np.random.default_rng(0)
-    q, v = model.random_state(rng, _PROBES)
-    Y = dyn._evaluate("regressor", unknowns.columns, q=q, v=v, a=rng.standard_normal((_PROBES, model.nv)))
+    q, v = model.random_state(rng, _PROBE_STATES)
+    Y = dyn._evaluate("regressor", unknowns.columns, q=q, v=v, a=rng.standard_normal((_PROBE_STATES, model.nv)))
     return [np.flatnonzero(Y[:, j].any(axis=0)) for j in range(model.nv)]

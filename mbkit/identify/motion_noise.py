@@ -23,14 +23,14 @@ from mbkit.identify.measurements import Measurements
 from mbkit.model import Model
 
 #: Samples of a polynomial, beside the middle one on each side, and its coefficients.
-_SIDE: Final = 4
-_COEFFICIENTS: Final = 6
+_SIDE_SAMPLES: Final = 4
+_POLYNOMIAL_COEFFICIENTS: Final = 6
 #: Samples that are looked at: more make it no surer.
-_MOST: Final = 4000
+_MAX_SAMPLES: Final = 4000
 #: Part of the spread of positions that a polynomial leaves of samples in the order of time, at the most.
-_IN_ORDER: Final = 0.1
+_ORDERED_RESIDUAL_RATIO: Final = 0.1
 #: Draws of noise that are averaged.
-_DRAWS: Final = 2
+_NOISE_DRAWS: Final = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +128,7 @@ def filtered_motion(
     forces = None
     if tau is not None:
         forces = sosfiltfilt(sections, finite_array("tau", tau, (len(raw), model.nv)), axis=0)
-    # What the filter passes has two independent samples a period of its cut-off: more would count one error often.
+    # A filtered signal has two independent samples a period of its cut-off: more would count one error often.
     kept = slice(edge, len(raw) - edge, max(1, int(0.5 / (cutoff * dt))))
     return FilteredMotion(smooth[kept], v[kept], a[kept], None if forces is None else forces[kept], kept, cutoff, dt)
 
@@ -155,12 +155,12 @@ def bias(
     solve : callable
         Returns the estimates and the residuals' deviations of other measurements.
     """
-    if len(data) > _MOST:
-        data = _first(data, _MOST)
+    if len(data) > _MAX_SAMPLES:
+        data = _first(data, _MAX_SAMPLES)
         values, noise = solve(data)
-    if len(data) <= 2 * _SIDE:
+    if len(data) <= 2 * _SIDE_SAMPLES:
         return np.zeros(len(values))
-    if not (np.std(_beside_neighbours(data.q), axis=0) < _IN_ORDER * np.std(data.q, axis=0)).all():
+    if not (np.std(_beside_neighbours(data.q), axis=0) < _ORDERED_RESIDUAL_RATIO * np.std(data.q, axis=0)).all():
         # Neighbours far apart say nothing of noise.
         return np.zeros(len(values))
     errors = np.hstack([_beside_neighbours(x) for x in (data.v, data.a)])
@@ -168,7 +168,7 @@ def bias(
     L = _root(errors.T @ errors / len(errors))
 
     # Each with its opposite: what is odd in the noise is chance, and the bias is even.
-    halves = [rng.standard_normal((len(data), 2 * nv)) @ L.T for _ in range(_DRAWS)]
+    halves = [rng.standard_normal((len(data), 2 * nv)) @ L.T for _ in range(_NOISE_DRAWS)]
     draws = [sign * x for x in halves for sign in (1.0, -1.0)]
 
     def noisy(times: float) -> tuple[Array, Array]:
@@ -193,11 +193,11 @@ def _first(data: Measurements, count: int) -> Measurements:
 
 def _beside_neighbours(x: Array) -> Array:
     """Return what is left of each sample beside a polynomial through it and its neighbours, as large as its noise."""
-    k = np.arange(-_SIDE, _SIDE + 1.0)
-    A = np.vander(k / _SIDE, _COEFFICIENTS)
+    k = np.arange(-_SIDE_SAMPLES, _SIDE_SAMPLES + 1.0)
+    A = np.vander(k / _SIDE_SAMPLES, _POLYNOMIAL_COEFFICIENTS)
     H = np.eye(len(k)) - A @ np.linalg.pinv(A)
-    row = H[_SIDE]
-    out = sum(c * x[i : len(x) - 2 * _SIDE + i] for i, c in enumerate(row))
+    row = H[_SIDE_SAMPLES]
+    out = sum(c * x[i : len(x) - 2 * _SIDE_SAMPLES + i] for i, c in enumerate(row))
     return np.asarray(out / np.sqrt(row @ row))
 
 

@@ -17,7 +17,7 @@ from mbkit.studies.results import ResultTable, columns_of
 
 _SIZE: Final = len(STANDARD)
 #: Velocities whose residuals are printed.
-_SHOWN: Final = 8
+_MAX_PRINTED_RESIDUALS: Final = 8
 #: Standard deviations below a bound within which an estimate is the bound.
 _UNSURE: Final = 3.0
 
@@ -43,7 +43,7 @@ class IdentifiedParameter:
 
     @property
     def determined(self) -> bool:
-        """Whether the data tell it."""
+        """Whether the data determine it."""
         return bool(np.isfinite(self.deviation))
 
     @property
@@ -72,7 +72,7 @@ class Undetermined:
 
 @dataclass(frozen=True)
 class Residual:
-    """What is left of a velocity's torque: `noise` is its standard deviation, `torque` the torque's root mean square.
+    """Residual of a velocity's torque: `noise` is its standard deviation, `torque` the torque's root mean square.
 
     N m or N.
     """
@@ -224,8 +224,8 @@ class Identification(ResultTable):
         if self.undetermined:
             lines += [f"  {len(self.undetermined)} directions that the data cannot tell"]
         lines += ["  residual / torque, root mean squares"]
-        lines += [f"    {r.velocity}: {r.noise:.3g} / {r.torque:.3g}" for r in self.residuals[:_SHOWN]]
-        more = len(self.residuals) - _SHOWN
+        lines += [f"    {r.velocity}: {r.noise:.3g} / {r.torque:.3g}" for r in self.residuals[:_MAX_PRINTED_RESIDUALS]]
+        more = len(self.residuals) - _MAX_PRINTED_RESIDUALS
         return "\n".join(lines + ([f"    and {more} more; .residuals has all"] if more > 0 else []))
 
     def document(self) -> Document:

@@ -15,7 +15,7 @@ from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, MbkitWarning
 from mbkit.identify.consistency import ENTROPIC, NEGLIGIBLE, PRIORS, consistent, nearest
 from mbkit.identify.least_squares import Fit, fit, stacked
-from mbkit.identify.measurements import REST, Equations, Measurements, Unknowns, equations
+from mbkit.identify.measurements import REST_SPEED_RATIO, Equations, Measurements, Unknowns, equations
 from mbkit.identify.motion_noise import bias, motion_noise
 from mbkit.identify.result import Identification, IdentifiedParameter, Residual, Undetermined
 from mbkit.model import Model
@@ -54,7 +54,7 @@ def identify(
     prior_weight: float = 1.0,
     progress: bool | ProgressFunction | None = None,
     cutoff: float | None = None,
-    rest: float = REST,
+    rest: float = REST_SPEED_RATIO,
 ) -> Identification:
     """Identify the base parameters of a model from measured motions and torques, by weighted least squares.
 

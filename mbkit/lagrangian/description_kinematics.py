@@ -35,7 +35,7 @@ Vector = list[Any]
 #: The joints from a body down to one that carries it.
 _Way = list[Joint]
 #: Relative size of a zero term that rounded rotations leave.
-_DUST: Final = Fraction(1, 10**15)
+_ROUNDED_ANGLE_ERROR: Final = Fraction(1, 10**15)
 
 
 #: The advice of a message for a model that is too large to be written out.
@@ -255,7 +255,7 @@ class SymbolicKinematics(Kinematics):
             for (_, _, powers), value in x.terms.items():
                 largest[powers] = max(largest.get(powers, Fraction(0)), abs(value))
         for x in sums:
-            for key in [k for k, value in x.terms.items() if abs(value) < _DUST * largest[k[2]]]:
+            for key in [k for k, value in x.terms.items() if abs(value) < _ROUNDED_ANGLE_ERROR * largest[k[2]]]:
                 del x.terms[key]
 
 
@@ -384,7 +384,7 @@ def rolling(kin: SymbolicKinematics, part: NoSlip) -> tuple[list[sp.Expr], list[
     speeds = [material(way, point, at) for way, point in zip(ways, (centre, ground), strict=True)]
     gap, velocity = ([c - d for c, d in zip(*two, strict=True)] for two in ((centre, ground), speeds))
     held, moving = ([tidy(row) for row in rows] for rows in place.rows(gap, velocity, x.speed))
-    held, moving = ([x for x in rows if not (x.is_number and abs(x) < _MEETS)] for rows in (held, moving))
+    held, moving = ([x for x in rows if not (x.is_number and abs(x) < _CLOSING_GAP_RATIO)] for rows in (held, moving))
     still = [row for row in (*held, *moving) if not row.free_symbols & {*kin.symbols, *kin.rates}]
     if still or not (held or moving):
         raise InputError(
@@ -406,8 +406,8 @@ def written_rows(kin: SymbolicKinematics, part: Any) -> tuple[list[sp.Expr], lis
 # Both ends are written in the axes of the last body that their ways to the ground share. So the rows hold the joints of
 # the loop only, and a plane mechanism has no row across its plane. Dependent rows are left out.
 
-#: Of the largest number, or rad: what a few typed digits leave where ends can meet.
-_MEETS: Final = 1e-9
+#: Ends meet up to this part of the largest number, or angle in rad, as numbers are typed with few digits.
+_CLOSING_GAP_RATIO: Final = 1e-9
 
 
 def closure(kin: SymbolicKinematics, loop: Loop) -> list[sp.Expr]:
@@ -464,7 +464,9 @@ def _in_plane(
     about = float(turn @ axis)
     start = atan2(about, (np.trace(E) - 1) / 2)
     # Whatever turns about the axis leaves the rest as it is.
-    if np.abs(E @ axis - axis).max() > _MEETS or (not axis.any() and np.abs(E - np.eye(3)).max() > _MEETS):
+    if np.abs(E @ axis - axis).max() > _CLOSING_GAP_RATIO or (
+        not axis.any() and np.abs(E - np.eye(3)).max() > _CLOSING_GAP_RATIO
+    ):
         raise InputError(f"{kin.model.name}: {message}, whatever the joints do; turn one of them by rotation_a")
     total = angle(start)
     for sign, way in zip((1, -1), ends, strict=True):
@@ -474,7 +476,7 @@ def _in_plane(
         total += sp.Add(*(sign * s * x for s, x in zip(signs, angles, strict=True)))
     total = sp.expand(total)
     if not total.free_symbols & set(kin.symbols):
-        if abs(sp.sin(total / 2).evalf()) < _MEETS:
+        if abs(sp.sin(total / 2).evalf()) < _CLOSING_GAP_RATIO:
             return []
         raise InputError(f"{kin.model.name}: {message}: between them stays an angle of {total}")
     return [2 * sp.sin(total / 2)]
@@ -513,7 +515,7 @@ def _independent(kin: SymbolicKinematics, sums: list[TrigPolynomial], messages: 
     for i in sorted({*range(len(sums))} - {*kept}):
         weights = np.linalg.lstsq(A[kept][:, moving].T, A[i, moving], rcond=None)[0]
         left = A[i] - weights @ A[kept]
-        if np.abs(left[~moving]).max(initial=0.0) > _MEETS * largest:
+        if np.abs(left[~moving]).max(initial=0.0) > _CLOSING_GAP_RATIO * largest:
             rest = kin.shown(TrigPolynomial(kin.formulas, {k: x for k, x in sums[i].terms.items() if not kin.moves(k)}))
             why = f": {f'{float(rest):.6g}' if rest.is_number else rest} is left between them"
             raise InputError(f"{kin.model.name}: {messages[i]}, whatever the joints do{'' if weights.any() else why}")

@@ -20,7 +20,7 @@ from mbkit.errors import InputError, MbkitError
 from mbkit.model.elements.formula import Formula, Operation
 from mbkit.model.parameters import Expression
 
-#: How a table is interpolated.
+#: Ways to interpolate a table.
 Ends = Literal["natural", "clamped", "quintic"]
 ENDS: Final[tuple[Ends, ...]] = ("natural", "clamped", "quintic")
 _KNOWN: Final = "a number, a Parameter, a casadi.SX, a SymPy expression, or a function of symbols that returns such"

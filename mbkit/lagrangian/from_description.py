@@ -27,11 +27,11 @@ from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.elements.references import _OF_BODIES, KINDS_OF_PARTS, names_in
 
 #: Velocities up to which equations are written out.
-_MOST: Final = 24
+_MAX_TREE_VELOCITIES: Final = 24
 #: The same with loops or motions in time. A row of 40 four-bars has 81 coordinates.
-_MOST_BOUND: Final = 100
+_MAX_LOOP_VELOCITIES: Final = 100
 #: The same with what rolls. A bicycle's nine coordinates take half a minute and rows that nobody reads.
-_MOST_ROLLING: Final = 7
+_MAX_ROLLING_VELOCITIES: Final = 7
 
 
 def from_model(
@@ -166,7 +166,7 @@ def from_model(
         "dissipation": R,
         "constraints": constraints,
         "velocity_constraints": moving,
-        # What only a frame needs is no part of the equation; a name of the user's own is kept all the same.
+        # A number that only a frame needs is no part of the equation; a name of the user's own stays all the same.
         "parameters": {s: source.parameters[n] for n, s in parameters.items() if named is None or s in used} | g,
         "name": model.name,
     }
@@ -224,7 +224,9 @@ def _too_much(model: Model) -> Iterator[str]:
     if not model.nv:
         yield "no joint of it moves, so there is no equation"
     bound = model.loops or motions_of(model)
-    most = _MOST_ROLLING if model.holds_velocities else _MOST_BOUND if bound else _MOST
+    most = (
+        _MAX_ROLLING_VELOCITIES if model.holds_velocities else _MAX_LOOP_VELOCITIES if bound else _MAX_TREE_VELOCITIES
+    )
     if model.nv > most:
         yield f"expected at most {most} coordinates to be written out, got {model.nv} coordinates"
 

@@ -38,21 +38,21 @@ EMBEDDED: Final = Path(
     asks=ASKED,
     instead="mbkit.simulate(lag.dynamics(), ...) holds them by multipliers, and maggi() has equations without these",
 )
-_MOST: Final = 25
+_MAX_NEWTON_ITERATIONS: Final = 25
 #: Places from which the next one is searched: more than a step has stages.
-_PLACES: Final = 32
+_MAX_STARTS: Final = 32
 # Beyond such a change of J, relative to its size, Newton's iteration may end on another
 # branch; a link that turns by half a radian changes it by half.
-_BENT: Final = 0.5
-# Of a last step of Newton's, relative to the coordinates.
-_SOLVED: Final = 1e-9
+_MAX_JACOBIAN_CHANGE: Final = 0.5
+# Size of Newton's last step, relative to the coordinates.
+_NEWTON_STEP_RATIO: Final = 1e-9
 _TINY: Final = float(np.finfo(float).tiny)
 
 #: A pose is near a singular one where the smallest singular value of J, or of the
 #: dependent block, is below this part of the largest of J.
-SINGULAR: Final = 1e-3
-# Of the best that any choice can give: below, another one is due.
-_WORN: Final = 0.25
+SINGULAR_VALUE_RATIO: Final = 1e-3
+# A chart is changed below this part of the best quality that any choice can give.
+_CHART_QUALITY_RATIO: Final = 0.25
 
 Indices = NDArray[np.intp]
 
@@ -71,7 +71,7 @@ class ReducedModel(Model):
 
 
 class Chart(NamedTuple):
-    """Which coordinates are independent, by index."""
+    """A choice of independent coordinates, by index."""
 
     independent: Indices
     dependent: Indices
@@ -94,8 +94,8 @@ class EmbeddedDynamics(Dynamics):
         super().__init__(model)
         self._whole, self._chart, self._begin = whole, chart, begin
         self._manifold = Manifold(whole).at(begin)
-        # Where Newton's iteration last ended: q, J, and the sign of the dependent block's determinant.
-        self._places: deque[tuple[Array, Array, float]] = deque(maxlen=_PLACES)
+        # Ends of Newton's last iterations: q, J, and the sign of the dependent block's determinant.
+        self._places: deque[tuple[Array, Array, float]] = deque(maxlen=_MAX_STARTS)
 
     def at(self, /, **values: float) -> EmbeddedDynamics:
         """Return the same dynamics at a time of the run."""
@@ -121,7 +121,7 @@ class EmbeddedDynamics(Dynamics):
     def _sign(self, J: Array) -> float:
         return float(np.linalg.slogdet(J[:, self._chart.dependent])[0])
 
-    # From independent coordinates to all
+    # All coordinates from the independent ones
 
     def configuration(self, u: Array) -> Array:
         """Return q, (n,)."""
@@ -132,7 +132,7 @@ class EmbeddedDynamics(Dynamics):
         q, before = q.copy(), J
         q[chart.dependent] -= self._solved(J, J[:, chart.independent] @ (u - q[chart.independent]), q)
         q[chart.independent] = u
-        for _ in range(_MOST):
+        for _ in range(_MAX_NEWTON_ITERATIONS):
             f, J = self._manifold.call("constraint_rows", q)
             step = self._solved(J, f[:, 0], q)
             q[chart.dependent] -= step
@@ -140,11 +140,11 @@ class EmbeddedDynamics(Dynamics):
             if not np.isfinite(size):
                 break
             # The iteration squares the error.
-            if size <= _SOLVED * (1 + float(np.abs(q).max())):
+            if size <= _NEWTON_STEP_RATIO * (1 + float(np.abs(q).max())):
                 if self._sign(J) != sign:
                     # On the other side of a singular pose another branch begins.
                     raise NumericalError(f"{name}: beyond a singular pose at {self._at(u)}")
-                if np.linalg.norm(J - before) > _BENT * np.linalg.norm(before):
+                if np.linalg.norm(J - before) > _MAX_JACOBIAN_CHANGE * np.linalg.norm(before):
                     raise NumericalError(f"{name}: too long a step to {self._at(u)} to tell the dependent coordinates")
                 self._places.append((q.copy(), J, sign))
                 return q
@@ -236,7 +236,7 @@ class Embedded:
         if self.degrees < 1:
             raise InputError(f"{self.model.name}: {rows} constraints leave none of {self.model.nv} coordinates free")
         # However chosen, the best block of a matrix is no worse than this (Gu and Eisenstat 1996).
-        self.least = _WORN / float(np.sqrt(1 + rows * self.degrees))
+        self.least = _CHART_QUALITY_RATIO / float(np.sqrt(1 + rows * self.degrees))
         known = self.model.coordinate_names
         require_known("coordinate", known, *(independent or ()))
         if independent is not None and len(set(independent)) != self.degrees:

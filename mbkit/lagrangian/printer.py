@@ -22,7 +22,7 @@ _FRACTIONS: Final = {(1, 2): "½", (1, 3): "⅓", (1, 4): "¼", (1, 6): "⅙", (
 _HIGH: Final = str.maketrans("0123456789-/", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ")
 _MASS: Final = re.compile(r"[mM](\d*|_\w+)")
 #: Denominators that are read as such; longer fractions are decimals.
-_READ: Final = 10_000
+_MAX_DENOMINATOR: Final = 10_000
 _INERTIA: Final = re.compile(r"[A-CIJ](\d*|_\w+)|EI")
 
 
@@ -330,7 +330,7 @@ def _compared(x: Any, board: ExpressionPrinter) -> str:
 
 
 def _number(x: sp.Expr) -> str:
-    if x.is_Rational and 1 < x.q <= _READ:
+    if x.is_Rational and 1 < x.q <= _MAX_DENOMINATOR:
         return _FRACTIONS.get((int(x.p), int(x.q)), str(x))
     return str(x) if x.is_Integer or not x.is_Number else f"{float(x):.15g}"
 
@@ -396,8 +396,8 @@ def folded(text: str, width: int) -> list[str]:
 # Letters for roots that an equation holds in many places: ρ = √(l² - r² sin² θ).
 
 #: A root gets a letter from this many operations and occurrences on.
-_LONG: Final = 4
-_OFTEN: Final = 3
+_MIN_ROOT_OPERATIONS: Final = 4
+_MIN_ROOT_OCCURRENCES: Final = 3
 
 
 class Abbreviations:
@@ -408,12 +408,12 @@ class Abbreviations:
         roots: set[sp.Expr] = set()
         for x in expressions:
             for part in sp.preorder_traversal(x):
-                if part.is_Pow and part.base.is_Add and part.base.count_ops() >= _LONG:
+                if part.is_Pow and part.base.is_Add and part.base.count_ops() >= _MIN_ROOT_OPERATIONS:
                     counts[part.base] += 1
                     if part.exp.is_Rational and part.exp.q == 2:
                         roots.add(part.base)
         # In the order in which they were met.
-        bases = [base for base, n in counts.items() if base in roots and n >= _OFTEN]
+        bases = [base for base, n in counts.items() if base in roots and n >= _MIN_ROOT_OCCURRENCES]
         names = {s.name for s in used}
         letter = next(name for name in ("rho", "varrho", "rho_") if name not in names)
         letters = [letter] if len(bases) == 1 else [f"{letter}{k + 1}" for k in range(len(bases))]

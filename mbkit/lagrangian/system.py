@@ -412,7 +412,7 @@ class QuasiLagrangian(Lagrangian):
         self.time = self.time or self.quasi.time
 
     quasi: QuasiVelocities
-    #: Whether its energies were written in w, and not in the coordinates' rates.
+    #: True if its energies were written in w, and not in the coordinates' rates.
     _native = False
 
     @classmethod
@@ -490,7 +490,7 @@ class QuasiLagrangian(Lagrangian):
             return self.system._ignorable
         p, rates = self.momenta, self.D * sp.Matrix(self.velocities)
         forces = self.W.T * sp.Matrix(acting_forces(self))
-        # Of L where the coordinates' rates are held.
+        # The derivative of L at constant rates of the coordinates.
         slopes = (sp.diff(self.L, q) + (p.T * sp.diff(self.W, q) * rates)[0] for q in self.coordinates)
         found = zip(self.coordinates, slopes, forces, strict=True)
         return {q: tidy(force) for q, slope, force in found if vanish([slope])}

@@ -20,12 +20,12 @@ from mbkit.model.builder import with_loops
 from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop
 
-#: What `loads(..., loops=)` takes beside True and False.
+#: Values of `load(..., loops=)` beside True and False.
 Loops = str | os.PathLike[str] | Sequence[Loop | Mapping[str, Any]]
-#: Of a TOML file: its tables, one for each loop.
+#: Name of a TOML file's tables, one for each loop.
 _TABLE: Final = "loop"
 #: Largest file that is read, bytes.
-_LARGEST: Final = 1_000_000
+_MAX_TOML_BYTES: Final = 1_000_000
 _PARAMETERS: Final = {
     name: parameter.default is inspect.Parameter.empty
     for name, parameter in inspect.signature(ModelBuilder.add_loop).parameters.items()
@@ -67,7 +67,7 @@ def read_loops(path: str | os.PathLike[str]) -> list[Mapping[str, Any]]:
     """Return the tables ``[[loop]]`` of a TOML file, whose keys are arguments of `ModelBuilder.add_loop`."""
     file = Path(os.fspath(path))
     try:
-        if file.stat().st_size > _LARGEST:
+        if file.stat().st_size > _MAX_TOML_BYTES:
             raise LoadError(f"{file}: expected a TOML file of loops, got {file.stat().st_size} bytes")
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except OSError as error:

@@ -35,10 +35,10 @@ _URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/[^\\]")
 _PACKAGE: Final = "example-robot-data"
 #: A package of modules, one a robot, that clone its repository into a cache.
 _DESCRIPTIONS: Final = "robot_descriptions"
-#: What stands for a path in messages on a text.
+#: The path of a text, in messages.
 _TEXT: Final = "the text given"
 _USD: Final = "this is OpenUSD; export it as one of them"
-#: What is said of files of other formats.
+#: Messages about files of other formats.
 _OTHERS: Final = {
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), _USD),
     ".mjb": "this is a compiled MuJoCo model; save it as XML (mujoco.mj_saveLastXML)",
@@ -181,7 +181,7 @@ def load(
     else:
         path, by_name = _locate(source)
         expands = path.suffix.lower() == ".xacro"
-        # What xacro makes is no file that others could read again.
+        # xacro's result is no file that others could read again.
         file = "" if expands else str(path.absolute())
         root = xml_reader.expanded(path, {} if xacro is None else xacro) if expands else xml_reader.read(path)
     if xacro is not None and path.suffix.lower() != ".xacro":

@@ -3,6 +3,10 @@
 Pinocchio's MJCF parser (4.1.0) loses bodies, masses and springs without a message. A body's frame is its last joint's;
 a frame of the body's name keeps the body's origin. A body with several joints becomes a chain of massless bodies.
 Coordinates are MuJoCo's: a hinge is at its ``ref`` in the pose of the file, a free joint's are its pose in the world.
+
+MuJoCo's uncompiled ``MjSpec`` (4.0.0) holds every decimal, but resolves no defaults, copies and attached files here. Of
+92 descriptions refused here by name and line it takes 40, three (such as 300³ copies) exhaust its memory, it
+reads ``0x10`` and ``inf`` as numbers, and elements of included files have line 0.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit._reproducible import length, product
 from mbkit.errors import did_you_mean
-from mbkit.load.xml_reader import MOST_BYTES, Element, Reader
+from mbkit.load.xml_reader import MAX_FILE_BYTES, Element, Reader
 from mbkit.model.validation import listing
 
 ORIENTATIONS: Final = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
@@ -110,14 +110,14 @@ def mesh_name(mesh: Element) -> str:
     return mesh.attributes.get("name") or stem
 
 
-def read_mesh(path: Path, most: int = MOST_BYTES) -> tuple[bytes, str]:
+def read_mesh(path: Path, most: int = MAX_FILE_BYTES) -> tuple[bytes, str]:
     """Return a file's content, and why it cannot be read, if so."""
     try:
         # A pipe or a device would be read for ever.
         if not path.is_file():
             return b"", f"no such file: {path}"
         if path.stat().st_size > most:
-            return b"", f"up to {MOST_BYTES} bytes of meshes are read"
+            return b"", f"up to {MAX_FILE_BYTES} bytes of meshes are read"
         return path.read_bytes(), ""
     except (OSError, ValueError) as error:
         return b"", f"cannot be read ({error})"
@@ -247,7 +247,7 @@ _UNREAD: Final = frozenset({"attach", "composite", "flexcomp", "plugin"})
 
 @dataclass(frozen=True)
 class Rule:
-    """What an element may hold; `once` says that its parent has one at most."""
+    """Attributes and children of an element; its parent has one at most if `once`."""
 
     attributes: frozenset[str] = frozenset()
     children: dict[str, Rule] = field(default_factory=dict)

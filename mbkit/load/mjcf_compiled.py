@@ -157,7 +157,7 @@ class _Text:
             if "mesh" in full or full.get("type") in ("mesh", "sdf", "hfield"):
                 return ""
         if id(element) in self.counted:
-            # What does not collide needs no convex hull.
+            # A geom that does not collide needs no convex hull.
             own |= {"contype": "0", "conaffinity": "0"}
         childclass = own.get("childclass", own.get("class", childclass) if tag == "frame" else childclass)
         own |= self.needed.get(id(element), {})

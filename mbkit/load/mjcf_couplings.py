@@ -20,7 +20,7 @@ import numpy as np
 from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
-from mbkit.load.xml_reader import LARGEST, Element, Reader, reserved
+from mbkit.load.xml_reader import MAX_MAGNITUDE, Element, Reader, reserved
 from mbkit.model import Joint, JointCoupling, Model, ModelBuilder, PointSpring
 from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.forces import RATE
@@ -157,7 +157,7 @@ class _Acting:
 
     @property
     def acts(self) -> bool:
-        """Whether a part is a linear spring or damper, or a rotor."""
+        """Whether it has a linear spring or damper, or a rotor."""
         return bool(self.stiffness or self.damping or self.armature or self.dampratio)
 
     @property
@@ -353,7 +353,7 @@ class Transmissions:
 
     @property
     def functions(self) -> list[_Acting]:
-        """What acts by functions, or has a rest length to be measured."""
+        """Tendons and actuators that act by functions, or have a rest length to be measured."""
         return [x for x in (*self._tendons, *self._actuators) if x.band or x.damper or x.measured]
 
     def add_functions(self, b: ModelBuilder, model: Model) -> None:
@@ -514,9 +514,9 @@ def _add_bias(settings: _Actuator, out: _Acting) -> None:
         return
     b0, b1, b2 = settings.bias
     rest = -b0 / b1 if b1 else 0.0
-    if abs(rest) <= LARGEST:
+    if abs(rest) <= MAX_MAGNITUDE:
         out.stiffness, out.rest_length = -b1, rest
-    if b0 and (b1 >= 0 or abs(rest) > LARGEST):
+    if b0 and (b1 >= 0 or abs(rest) > MAX_MAGNITUDE):
         out.left_out.append(f"the constant force {b0:g}")
     if b2 > 0 and settings.gain == -b1 and settings.gaintype in ("fixed", "pid"):
         out.dampratio = b2

@@ -26,7 +26,7 @@ from mbkit.model.description import LEFT_OUT
 from mbkit.model.validation import listing
 
 _KINDS: Final = {"connect": "point", "weld": "frame"}
-#: How soft MuJoCo holds an element: nothing of it is left in an exact loop.
+#: Attributes by which MuJoCo softens an element; an exact loop has none of it.
 _SOFT: Final = ("solref", "solimp", "torquescale")
 _JOINT: Final = "joint"
 _COUPLED: Final = (_JOINT, "tendon")
@@ -185,7 +185,7 @@ class Equalities:
             if body not in self._poses:
                 self._read.fault(f"{item}: {key} {body!r} is no body of the file", element)
                 return None
-        # Of the second body in the first one's axes, in the reference configuration.
+        # Pose of the second body in the first one's axes, in the reference configuration.
         between = _inverse(self._poses[body1]) @ self._poses[body2]
         if element.tag == "connect":
             point = np.array(self._read.numbers(element, "anchor", item, count=3))

@@ -36,14 +36,14 @@ from mbkit.load.mjcf_attributes import (
 )
 from mbkit.load.shapes import NOTHING, SIZES, MassProperties, solid, together
 from mbkit.load.urdf_reader import BASE_JOINT
-from mbkit.load.xml_reader import MOST_ELEMENTS, Element, Reader, reserved, unused
+from mbkit.load.xml_reader import MAX_ELEMENTS, Element, Reader, reserved, unused
 from mbkit.model.validation import listing
 
 KINDS: Final = {"hinge": "revolute", "slide": "prismatic", "ball": "ball", "free": "free"}
 _JOINTS: Final = ("joint", "freejoint")
 _NAMED: Final = {"body": "body", "joint": "joint", "freejoint": "joint", "site": "site"}
 # MuJoCo 4.0.0 counts geoms above this mass, in kg.
-_LEAST_MASS: Final = 1e-14
+_MIN_GEOM_MASS: Final = 1e-14
 
 
 @dataclass
@@ -131,11 +131,11 @@ class Scene:
 
 # Copies
 
-_OF_COPIES: Final = frozenset({"name", "count", "sep", "offset", "euler", "class", "childclass"})
+_REPLICATE_ATTRIBUTES: Final = frozenset({"name", "count", "sep", "offset", "euler", "class", "childclass"})
 #: Sections whose elements are copied where they name something that is copied.
-_NAMING: Final = ("tendon", "actuator", "equality")
-#: What an attribute names; a final 1 or 2 is left out.
-_NAMES: Final = {
+_SECTIONS_WITH_REFERENCES: Final = ("tendon", "actuator", "equality")
+#: Kind of element that an attribute names; a final 1 or 2 is left out.
+_REFERENCES: Final = {
     **{kind: kind for kind in ("body", "joint", "site", "geom", "tendon")},
     **dict.fromkeys(("refsite", "sidesite", "cranksite", "slidersite"), "site"),
     "jointinparent": "joint",
@@ -151,7 +151,7 @@ def write_out_copies(mujoco: Element, compiler: Compiler, read: Reader) -> str:
     copier = _Copier(mujoco, compiler, read)
     for world in mujoco.all("worldbody"):
         copier.size(world)
-        # What is inside is written out first: its numbers stand before those around it.
+        # Inner copies are written out first: their numbers stand before the outer ones.
         _replace_all(world, "replicate", copier.copies)
     return f"<replicate> written out: {listing(copier.told, 6)}" if copier.told else ""
 
@@ -164,7 +164,7 @@ class _Copier:
     compiler: Compiler
     read: Reader
     told: list[str] = field(default_factory=list)
-    left: int = MOST_ELEMENTS
+    left: int = MAX_ELEMENTS
 
     def size(self, element: Element) -> int:
         """Return the number of elements once all is written out; after a fault a <replicate> stands for one copy."""
@@ -176,7 +176,7 @@ class _Copier:
             self.left -= int(count) * inside
             return int(count) * inside
         got = element.attributes.get("count", "")[:40]
-        more = f"expected a whole number up to {most}, as all copies may have {MOST_ELEMENTS:,} elements"
+        more = f"expected a whole number up to {most}, as all copies may have {MAX_ELEMENTS:,} elements"
         self.read.fault(f"<replicate>: count {got!r}; {more}", element)
         for one in (e for e in element.walk() if e.tag == "replicate"):
             one.tag, one.attributes = "frame", {}
@@ -185,8 +185,10 @@ class _Copier:
     def copies(self, element: Element) -> Iterable[Element]:
         """Return a <frame> for each copy, and copy what names something in it."""
         item, own, read = "<replicate>", element.attributes, self.read
-        for name in own.keys() - _OF_COPIES:
-            read.fault(f"{item}: unknown attribute {name!r}; there are: {', '.join(sorted(_OF_COPIES))}", element)
+        for name in own.keys() - _REPLICATE_ATTRIBUTES:
+            read.fault(
+                f"{item}: unknown attribute {name!r}; there are: {', '.join(sorted(_REPLICATE_ATTRIBUTES))}", element
+            )
         for child in element.children:
             if child.tag in (*_JOINTS, "inertial"):
                 read.fault(f"{item}: <{child.tag}> is not copied; put it into a <body>", child)
@@ -224,7 +226,7 @@ def _quat(R: Array) -> str:
 def _suffixed(element: Element, suffix: str, names: Mapping[str, Container[str]] = MappingProxyType({})) -> Element:
     """Return a copy with a suffix behind all names, and behind the names of those to which it refers."""
     own = {
-        key: x + suffix if key == "name" or x in names.get(_NAMES.get(key.rstrip("12"), ""), ()) else x
+        key: x + suffix if key == "name" or x in names.get(_REFERENCES.get(key.rstrip("12"), ""), ()) else x
         for key, x in element.attributes.items()
     }
     return replace(element, attributes=own, children=[_suffixed(e, suffix, names) for e in element.children])
@@ -233,7 +235,15 @@ def _suffixed(element: Element, suffix: str, names: Mapping[str, Container[str]]
 # Attached models
 
 #: Settings of <compiler> that what is attached must share; orientations and angles are converted.
-_SHARED: Final = ["autolimits", "inertiafromgeom", "groups", "balanceinertia", "boundmass", "boundinertia", "alignfree"]
+_SHARED_SETTINGS: Final = [
+    "autolimits",
+    "inertiafromgeom",
+    "groups",
+    "balanceinertia",
+    "boundmass",
+    "boundinertia",
+    "alignfree",
+]
 
 
 def write_out_attached(mujoco: Element, path: Path, compiler: Compiler, read: Reader) -> str:
@@ -261,7 +271,7 @@ def _set_main_apart(mujoco: Element) -> None:
         for e in section.walk():
             e.attributes |= {k: name for k in ("class", "childclass") if e.attributes.get(k) == "main"}
         for e in section.children:
-            if section.tag in _NAMING or e.tag in ("mesh", "material"):
+            if section.tag in _SECTIONS_WITH_REFERENCES or e.tag in ("mesh", "material"):
                 e.attributes.setdefault("class", name)
         if section.tag == "worldbody":
             section.children = [Element("frame", {"childclass": name}, section.line, section.children)]
@@ -293,7 +303,7 @@ class _Attacher:
     told: list[str] = field(default_factory=list)
     others: dict[str, _Other | None] = field(default_factory=dict)
     added: set[tuple[str, str]] = field(default_factory=set)
-    left: int = MOST_ELEMENTS
+    left: int = MAX_ELEMENTS
 
     def attached(self, element: Element) -> list[Element]:
         """Return what is attached; nothing after a fault."""
@@ -312,7 +322,7 @@ class _Attacher:
         parts = found[:1] or [(x, None) for world in worlds for x in world.children]
         self.left -= sum(1 for part, _ in parts for _ in part.walk())
         if self.left < 0:
-            read.fault(f"<attach>: more than {MOST_ELEMENTS} elements; attach less", element)
+            read.fault(f"<attach>: more than {MAX_ELEMENTS} elements; attach less", element)
             return []
         self.told.append(f"{model!r} as {prefix!r} ({element.place})")
         if (model, prefix) not in self.added:
@@ -349,7 +359,7 @@ class _Attacher:
             self.read.fault(f"model {model!r}: expected an MJCF without <attach> and <replicate> of its own", asset)
             return None
         compiler = Compiler.of(root, self.read)
-        for name in _SHARED:
+        for name in _SHARED_SETTINGS:
             ours, theirs = getattr(self.compiler, name), getattr(compiler, name)
             if ours != theirs:
                 self.read.fault(
@@ -387,7 +397,7 @@ class _Attacher:
     def _add_naming(self, parts: list[Element], prefix: str, other: _Other) -> None:
         """Add the tendons, actuators and equalities that name nothing but what is attached."""
         names = _names(parts)
-        for tag in _NAMING:
+        for tag in _SECTIONS_WITH_REFERENCES:
             for section in other.root.all(tag):
                 kept = []
                 for e in section.children:
@@ -413,7 +423,7 @@ class _Prefixed:
         own = dict(element.attributes)
         self._turn(element, own, childclass)
         for key, x in own.items():
-            named = key in ("name", "class", "childclass", "mesh") or key.rstrip("12") in _NAMES
+            named = key in ("name", "class", "childclass", "mesh") or key.rstrip("12") in _REFERENCES
             if named and x not in ("", "world"):
                 own[key] = self.prefix + x
         inner = class_inside(element, childclass)
@@ -455,21 +465,21 @@ def _names(elements: Iterable[Element]) -> dict[str, set[str]]:
     """Return all names below elements, by tag."""
     names: dict[str, set[str]] = {}
     for inner in (x for element in elements for x in element.walk()):
-        if inner.tag in _NAMES and "name" in inner.attributes:
+        if inner.tag in _REFERENCES and "name" in inner.attributes:
             names.setdefault(inner.tag, set()).add(inner.attributes["name"])
     return names
 
 
 def _inside(element: Element, names: Mapping[str, Container[str]]) -> list[bool]:
     """Return of each part that an element names whether it is among some names."""
-    ends = [(_NAMES.get(k.rstrip("12"), ""), x) for y in element.walk() for k, x in y.attributes.items()]
+    ends = [(_REFERENCES.get(k.rstrip("12"), ""), x) for y in element.walk() for k, x in y.attributes.items()]
     return [x in names.get(kind, ()) for kind, x in ends if kind]
 
 
 def _copy_naming(mujoco: Element, element: Element, suffixes: Iterable[str]) -> Iterator[str]:
     """Copy the elements that name something in a <replicate>, and yield those that MuJoCo leaves out."""
     names = _names(element.children)
-    for tag in _NAMING:
+    for tag in _SECTIONS_WITH_REFERENCES:
         for section in mujoco.all(tag):
             kept, copied = list[Element](), list[Element]()
             for e in section.children:
@@ -658,7 +668,7 @@ def _body_mass_properties(
         masses = [_geom(e, X, compiler, read, item) for e, X in geoms]
         if any(x is None for x in masses):
             return None, []
-        heavy = [x for x in masses if x and x.mass > _LEAST_MASS]
+        heavy = [x for x in masses if x and x.mass > _MIN_GEOM_MASS]
         if heavy:
             # A flat body's A + B and C differ by rounding.
             return _bounded(together(heavy), compiler, slack=1e-14)

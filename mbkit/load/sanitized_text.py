@@ -17,7 +17,7 @@ from mbkit.errors import LoadError, ModelError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import Compiler, Defaults, mesh_assets, mesh_name, read_mesh
 from mbkit.load.mjcf_reader import add_free_base, class_inside, counts
-from mbkit.load.xml_reader import MOST_BYTES, Element, Reader, element_text, unused, with_includes
+from mbkit.load.xml_reader import MAX_FILE_BYTES, Element, Reader, element_text, unused, with_includes
 
 _FORMATS: Final = {"robot": "urdf", "mujoco": "mjcf"}
 #: Elements that name other files, or mean nothing without one that does.
@@ -155,7 +155,7 @@ class _Meshes:
         if relative.is_absolute() or PureWindowsPath(str(relative)).drive:
             content, why = b"", "an absolute path is not followed"
         else:
-            content, why = read_mesh(self._folder / relative, MOST_BYTES - sum(map(len, self.files.values())))
+            content, why = read_mesh(self._folder / relative, MAX_FILE_BYTES - sum(map(len, self.files.values())))
         if why:
             file = asset.attributes["file"].replace("\\", "/")
             self.unread.append(f"mesh {file[:200]!r} ({asset.place}): {why}")

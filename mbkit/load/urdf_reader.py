@@ -499,7 +499,7 @@ def _element_hint(owner: str, tag: str, known: frozenset[str]) -> str:
 
 
 # A rotation matrix from a quaternion is off by up to about 5 eps.
-_REACH: Final = 8 * float(np.finfo(float).eps)
+_ROTATION_ERROR: Final = 8 * float(np.finfo(float).eps)
 
 
 class Snapper:
@@ -509,7 +509,7 @@ class Snapper:
     derived. Entries farther off, such as -3.67e-6 of the angle 1.5708, stay as written.
     """
 
-    def __init__(self, reach: float = _REACH) -> None:
+    def __init__(self, reach: float = _ROTATION_ERROR) -> None:
         self._reach = reach
         self.count = 0
         self.largest = 0.0

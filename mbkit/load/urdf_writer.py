@@ -35,7 +35,7 @@ URDF: Final = Path(
     beside=_notes,
 )
 # Stands for no limit: the largest number that every reader reads.
-_OPEN: Final = 1e308
+_UNLIMITED: Final = 1e308
 
 
 def urdf_text(model: Model, comment: str) -> str:
@@ -92,7 +92,7 @@ def _joint(joint: Joint) -> str:
         if bounded:
             limits = {"lower": joint.lower, "upper": joint.upper} | limits
         if bounded or np.isfinite(list(limits.values())).any():
-            out.append(_element("limit", {k: np.clip(x, -_OPEN, _OPEN) for k, x in limits.items()}))
+            out.append(_element("limit", {k: np.clip(x, -_UNLIMITED, _UNLIMITED) for k, x in limits.items()}))
         dynamics = {k: x for k in DYNAMICS if (x := getattr(joint, k)).any()}
         out += [_element("dynamics", dynamics)] if dynamics else []
     if joint.mimic is not None:

@@ -20,20 +20,20 @@ from mbkit._check import shown
 from mbkit.errors import InputError, LoadError
 
 #: Far above any robot, far below what would exhaust memory or the stack.
-MOST_BYTES: Final = 64 * 2**20
-MOST_ELEMENTS: Final = 500_000
-MOST_LEVELS: Final = 250
+MAX_FILE_BYTES: Final = 64 * 2**20
+MAX_ELEMENTS: Final = 500_000
+MAX_DEPTH: Final = 250
 
 _ENDINGS: Final = (".urdf", ".xml", ".mjcf")
-_MAX_LISTED: Final = 10
+_MAX_LISTED_FILES: Final = 10
 # An XML declaration starts in the first so many bytes, and is no longer.
-_HEAD: Final = 4096
+_MAX_DECLARATION_BYTES: Final = 4096
 _COMMENT: Final = re.compile(rb"<!--.*?-->", re.DOTALL)
 _ENCODING: Final = re.compile(rb"encoding\s*=\s*[\"']([A-Za-z0-9._-]+)[\"']")
 _BLANK: Final = b" \t\r\n\xef\xbb\xbf"
 
 #: expat's "syntax error" and "not well-formed (invalid token)" do not name the character.
-_VAGUE: Final = (2, 4)
+_VAGUE_ERRORS: Final = (2, 4)
 #: First elements of descriptions.
 _ROOTS: Final = ("robot", "mujoco", "mujocoinclude", "sdf")
 _FIRST: Final = re.compile(rb"<([A-Za-z]\w*)")
@@ -79,7 +79,7 @@ def read(path: Path) -> Element:
     try:
         exists, is_file = path.exists(), path.is_file()
         size = path.stat().st_size if exists else 0
-        content = path.read_bytes() if is_file and size <= MOST_BYTES else b""
+        content = path.read_bytes() if is_file and size <= MAX_FILE_BYTES else b""
     except (OSError, ValueError) as error:
         # ValueError: a null character in the name.
         raise LoadError(f"{path!s}: cannot be read ({error})") from None
@@ -88,8 +88,8 @@ def read(path: Path) -> Element:
     if not is_file:
         what = f"a folder{_descriptions(path)}" if path.is_dir() else "not a regular file"
         raise LoadError(f"{path}: expected a URDF or MJCF file, this is {what}")
-    if size > MOST_BYTES:
-        raise LoadError(f"{path}: expected a description of up to {MOST_BYTES} bytes, got {size} bytes")
+    if size > MAX_FILE_BYTES:
+        raise LoadError(f"{path}: expected a description of up to {MAX_FILE_BYTES} bytes, got {size} bytes")
     return parse(content, str(path))
 
 
@@ -99,7 +99,7 @@ def expanded(path: Path, arguments: Mapping[str, str]) -> Element:
         raise InputError(
             f"xacro: expected a mapping of names to text, as {{'prefix': 'left_'}}, got {shown(arguments)}"
         )
-    # What is missing or too large is said as of every file.
+    # A file that is missing or too large is refused as every file is.
     read(path)
     try:
         # Only such a file needs it.
@@ -129,7 +129,7 @@ def _descriptions(folder: Path) -> str:
     names = sorted(str(p.relative_to(folder)) for p in files if p.suffix in _ENDINGS)
     if not names:
         return ", and no .urdf or .xml file is in it or right below"
-    return f"; it holds {', '.join(names[:_MAX_LISTED])}{' and more' * (len(names) > _MAX_LISTED)}"
+    return f"; it holds {', '.join(names[:_MAX_LISTED_FILES])}{' and more' * (len(names) > _MAX_LISTED_FILES)}"
 
 
 def parse(content: bytes, name: str) -> Element:
@@ -151,10 +151,10 @@ def parse(content: bytes, name: str) -> Element:
         (stack[-1].children if stack else roots).append(element)
         stack.append(element)
         texts.append([])
-        if len(stack) > MOST_LEVELS:
-            raise LoadError(f"{name}: line {element.line}: elements are nested more than {MOST_LEVELS} deep")
-        if count > MOST_ELEMENTS:
-            raise LoadError(f"{name}: line {element.line}: more than {MOST_ELEMENTS} elements; a robot has far fewer")
+        if len(stack) > MAX_DEPTH:
+            raise LoadError(f"{name}: line {element.line}: elements are nested more than {MAX_DEPTH} deep")
+        if count > MAX_ELEMENTS:
+            raise LoadError(f"{name}: line {element.line}: more than {MAX_ELEMENTS} elements; a robot has far fewer")
 
     def end(_: str) -> None:
         stack.pop().text = "".join(texts.pop())
@@ -180,7 +180,7 @@ def parse(content: bytes, name: str) -> Element:
         first = _FIRST.search(_COMMENT.sub(b"", content))
         known = first is not None and first[1].decode() in _ROOTS
         why = _unexpected(content, parser.ErrorByteIndex) if known else "its first element is no <robot> or <mujoco>"
-        if error.code not in _VAGUE or not why:
+        if error.code not in _VAGUE_ERRORS or not why:
             why = expat.errors.messages.get(error.code, str(error))
         raise LoadError(f"{name}: line {error.lineno}, column {error.offset + 1}: not well-formed XML: {why}") from None
     except LoadError:
@@ -204,8 +204,8 @@ def _readable(content: bytes) -> tuple[bytes, str | None, tuple[str, ...]]:
     if b"\0" in content[len(stripped) :]:
         content = stripped
         notes.append("null characters after the last element were ignored")
-    start = content.find(b"<?xml", 0, _HEAD)
-    stop = content.find(b"?>", start, start + _HEAD) + 2
+    start = content.find(b"<?xml", 0, _MAX_DECLARATION_BYTES)
+    stop = content.find(b"?>", start, start + _MAX_DECLARATION_BYTES) + 2
     before = content[: max(start, 0)]
     if not before.strip(b"\xef\xbb\xbf") or stop < 2 or b"<" in _COMMENT.sub(b"", before):
         return content, None, tuple(notes)
@@ -245,8 +245,8 @@ def element_text(tag: str, attributes: Mapping[str, str], inside: str = "") -> s
 
 _NUMBER: Final = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 #: Larger than anything that moves, and the products of several still fit a double.
-LARGEST: Final = 1e30
-_LONGEST_NAME: Final = 1000
+MAX_MAGNITUDE: Final = 1e30
+_MAX_NAME_LENGTH: Final = 1000
 
 
 class Reader:
@@ -265,10 +265,10 @@ class Reader:
         value = element.attributes.get(attribute, "")
         if not value.strip():
             self.fault(f"{item}: <{element.tag}> has no {attribute}; give it one", element)
-        if len(value) > _LONGEST_NAME:
-            expected = f"expected a name of up to {_LONGEST_NAME} characters, got {len(value)}: {_short(value)}"
+        if len(value) > _MAX_NAME_LENGTH:
+            expected = f"expected a name of up to {_MAX_NAME_LENGTH} characters, got {len(value)}: {_short(value)}"
             self.fault(f"{item}: {element.tag} {attribute}: {expected}", element)
-        return value[:_LONGEST_NAME]
+        return value[:_MAX_NAME_LENGTH]
 
     def numbers(
         self,
@@ -300,7 +300,7 @@ class Reader:
             if not math.isfinite(value):
                 why = f"{_short(word)} is not a finite number{_hint(word)}"
                 break
-            if bounded and abs(value) > LARGEST:
+            if bounded and abs(value) > MAX_MAGNITUDE:
                 why = f"{_short(word)} is too large to compute with"
                 break
         if not why:
@@ -383,12 +383,12 @@ def reserved(name: str, names: set[str]) -> str:
 # main file or else of the file with the <include>, and no file is included twice. Unlike in MuJoCo, absolute
 # names are not followed, so that a description means the same wherever its folder is.
 
-_TAG: Final = "include"
+_INCLUDE: Final = "include"
 
 
 def with_includes(mujoco: Element, path: Path) -> Element:
     """Return the <mujoco> element of a file with the files that it includes, or raise `LoadError`."""
-    if all(e.tag != _TAG for e in mujoco.walk()):
+    if all(e.tag != _INCLUDE for e in mujoco.walk()):
         return mujoco
     return replace(mujoco, children=_Includes(path).inside(mujoco, path.parent, 1))
 
@@ -403,11 +403,11 @@ class _Includes:
 
     def inside(self, element: Element, folder: Path, level: int) -> list[Element]:
         """Return the children of an element of a file in `folder`, `level` deep in the whole."""
-        if level > MOST_LEVELS:
-            self._refuse(element, f"elements are nested more than {MOST_LEVELS} deep, included files counted")
+        if level > MAX_DEPTH:
+            self._refuse(element, f"elements are nested more than {MAX_DEPTH} deep, included files counted")
         out: list[Element] = []
         for child in element.children:
-            if child.tag != _TAG:
+            if child.tag != _INCLUDE:
                 out.append(replace(child, children=self.inside(child, folder, level + 1)))
                 continue
             path = self._path(child, folder)
@@ -445,8 +445,8 @@ class _Includes:
             self.bytes += path.stat().st_size
         except (LoadError, OSError) as error:
             self._refuse(include, str(error))
-        if self.bytes > MOST_BYTES:
-            self._refuse(include, f"expected up to {MOST_BYTES} bytes of included files")
+        if self.bytes > MAX_FILE_BYTES:
+            self._refuse(include, f"expected up to {MAX_FILE_BYTES} bytes of included files")
         if not root.children:
             self._refuse(include, "its root element is empty; expected elements inside")
         folder = self.path.parent

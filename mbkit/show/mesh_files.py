@@ -3,8 +3,8 @@
 coal makes one surface of a file and drops its materials, so the two formats that have any are read here. coal 3.0.3
 also gives the triangles of a node's second mesh the vertices of the first one, and each material is a mesh there. Files
 are those of strangers: whatever is wrong with one is a ValueError. That is why pycollada 0.9.3 and trimesh 5.2.0 do not
-read them: nodes in nodes and texts in archives keep them busy for ever, NaN becomes zero, a mesh without one of its
-materials gets lost (a foot of ANYmal is one), and trimesh rounds colours to bytes.
+read them: a mesh without one of its materials gets lost (of 343 public meshes the foot of ANYmal, with all its 4,604
+triangles), NaN becomes zero, a wrong index an empty mesh, and trimesh rounds colours to bytes.
 """
 
 from __future__ import annotations
@@ -24,16 +24,13 @@ from mbkit._check import Array, by_key
 from mbkit.errors import LoadError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import about, read_mesh
-from mbkit.load.xml_reader import Element
+from mbkit.load.xml_reader import MAX_DEPTH, MAX_ELEMENTS, Element
 from mbkit.show.surfaces import Color, Indices, Surface, cleaned
 
-#: Nodes in nodes, and elements in nodes, each time that a node is used: a short file can use one for ever.
-_DEEPEST: Final = 50
-_MOST_ELEMENTS: Final = 200_000
-_MOST_TRIANGLES: Final = 10_000_000
-_MOST_MATERIALS: Final = 5000
-#: Of a texture, 8192 by 8192: decoded it has 256 MiB.
-_MOST_PIXELS: Final = 2**26
+_MAX_TRIANGLES: Final = 10_000_000
+_MAX_MATERIALS: Final = 5000
+#: Pixels of a texture, 8192 by 8192: decoded it has 256 MiB.
+_MAX_TEXTURE_PIXELS: Final = 2**26
 
 MeanColor = Callable[[Path], Color | None]
 
@@ -48,7 +45,7 @@ def read_surfaces(path: Path) -> tuple[Surface, ...]:
     mean_color = cache(_mean_color)
     try:
         if suffix == ".dae":
-            # What is not finite is told of the whole.
+            # Numbers that are not finite are refused once all is read.
             with np.errstate(invalid="ignore"):
                 surfaces = list(_Collada(content, path, mean_color).surfaces())
         elif suffix == ".obj":
@@ -109,8 +106,8 @@ def _wavefront(text: str, folder: Path, mean_color: MeanColor) -> list[Surface]:
             libraries.append(Path(rest.strip()).name)
     if any(len(p) != 3 for p in points):
         raise ValueError("a vertex without three coordinates")
-    if max(len(faces), len(libraries)) > _MOST_MATERIALS:
-        raise ValueError(f"more than {_MOST_MATERIALS} materials")
+    if max(len(faces), len(libraries)) > _MAX_MATERIALS:
+        raise ValueError(f"more than {_MAX_MATERIALS} materials")
     colors: dict[str, Color | None] = {}
     for library in dict.fromkeys(libraries):
         colors |= _materials(folder / library, mean_color)
@@ -147,7 +144,7 @@ def _mean_color(image: Path) -> Color | None:
 
         # A pipe is not opened, and a picture is decoded only if it fits.
         with Image.open(io.BytesIO(content)) as picture:
-            if math.prod(picture.size) > _MOST_PIXELS:
+            if math.prod(picture.size) > _MAX_TEXTURE_PIXELS:
                 return None
             r, g, b = np.asarray(picture.convert("RGB").resize((16, 16))).reshape(-1, 3).mean(axis=0) / 255
     except Exception:
@@ -182,8 +179,9 @@ class _Collada:
 
     def _below(self, node: Element, above: Array, depth: int) -> Iterator[Surface]:
         self.elements += sum(1 for _ in node.walk())
-        if depth > _DEEPEST or self.elements > _MOST_ELEMENTS:
-            raise ValueError(f"nodes nested more than {_DEEPEST} deep, or more than {_MOST_ELEMENTS} elements in them")
+        # A short file can use a node in itself, or one node for ever.
+        if depth > MAX_DEPTH or self.elements > MAX_ELEMENTS:
+            raise ValueError(f"nodes nested more than {MAX_DEPTH} deep, or more than {MAX_ELEMENTS} elements in them")
         X = above
         for child in node.children:
             if child.tag in ("matrix", "translate", "rotate", "scale"):
@@ -199,8 +197,8 @@ class _Collada:
                 bound = {m.get("symbol", ""): m.get("target", "") for m in materials}
                 for symbol, s in self.geometry(target):
                     self.count += len(s.triangles)
-                    if self.count > _MOST_TRIANGLES:
-                        raise ValueError(f"more than {_MOST_TRIANGLES} triangles")
+                    if self.count > _MAX_TRIANGLES:
+                        raise ValueError(f"more than {_MAX_TRIANGLES} triangles")
                     V = s.vertices @ X[:3, :3].T + X[:3, 3]
                     yield Surface(V, s.triangles, self._color(bound.get(symbol, symbol)))
 
@@ -251,7 +249,7 @@ class _Collada:
 
 def _numbers(text: str, kind: type) -> np.ndarray:
     try:
-        # Of a blank text it would make a number.
+        # A blank text would become a number.
         return np.fromstring(text.strip(), dtype=kind, sep=" ")
     except ValueError:
         # Slower, but its error names the word.

@@ -14,13 +14,13 @@ import numpy as np
 
 from mbkit._check import Array, needed
 from mbkit.errors import OutputError, UnsupportedError
-from mbkit.show.scene import HALF_ANGLE, Scene, camera_axes
+from mbkit.show.scene import HALF_ANGLE_DEGREES, Scene, camera_axes
 
 #: Suffix -> Matplotlib's writer, and what to install where it is missing.
 FILMS: Final = {".gif": ("pillow", "pip install pillow"), ".mp4": ("ffmpeg", "install ffmpeg")}
 PICTURES: Final = (".png",)
 #: Triangles of a frame, which Matplotlib draws in about a tenth of a second.
-TRIANGLES: Final = 6_000
+MAX_FILM_TRIANGLES: Final = 6_000
 _INCHES: Final = (6.4, 4.8)
 _DPI: Final = 100
 _KEY: Final = np.array([0.35, -0.45, 0.82]) / np.linalg.norm([0.35, -0.45, 0.82])
@@ -75,7 +75,7 @@ class _Drawing:
         self.which = np.concatenate(self.owner)
         self.local = np.concatenate(self.corners)
         axis.set_axis_off()
-        reach, wide = np.tan(np.deg2rad(HALF_ANGLE)), _INCHES[0] / _INCHES[1]
+        reach, wide = np.tan(np.deg2rad(HALF_ANGLE_DEGREES)), _INCHES[0] / _INCHES[1]
         axis.set_xlim(-reach * wide, reach * wide)
         axis.set_ylim(-reach, reach)
         self._grid(axis, float(camera["reach"]))

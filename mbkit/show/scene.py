@@ -39,13 +39,13 @@ _BODIES: Final[tuple[Color, ...]] = (
 )
 _JOINT: Final[Color] = (0.30, 0.32, 0.35, 1.0)
 #: Radius of a stick as part of the mean distance of joints.
-_THICK: Final = 0.06
+_STICK_RADIUS_RATIO: Final = 0.06
 #: Frames at which the extent is measured.
-_MEASURED: Final = 40
-#: Of the camera: half its angle in degrees, its elevation in rad, and the width of a picture by its height.
-HALF_ANGLE: Final = 17.5
-_ELEVATION: Final = 0.3
-_ASPECT: Final = 1.2
+_EXTENT_FRAMES: Final = 40
+#: The camera's half angle in degrees, its elevation in rad, and a picture's width over its height.
+HALF_ANGLE_DEGREES: Final = 17.5
+_CAMERA_ELEVATION: Final = 0.3
+_PICTURE_ASPECT: Final = 1.2
 
 
 def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
@@ -88,7 +88,7 @@ def shapes_of(model: Model, kind: Kind = "visual") -> list[Shape]:
         warn(f"{model.name}: its shapes are not read, and it is drawn as capsules and boxes: {error}", MbkitWarning)
     bodies = {model.frame(name).body for name in found.missing if name != "world"}
     if found.shapes and model.drawn_from:
-        # Of what was added to the robot there is no file.
+        # Bodies that were added to the robot have no file.
         bodies |= {body.name for body in model.bodies if body.mass} - {s.body for s in found.shapes}
     if found.missing:
         several = listing([f"{name} ({why})" for name, why in found.missing.items()], 3)
@@ -112,7 +112,7 @@ def stand_ins(model: Model, bodies: set[str]) -> list[Shape]:
     boxes = {body.name: inertia_box(body) for body in model.bodies}
     lengths = [float(np.linalg.norm(p)) for places in ends.values() for p in places if has_length(p)]
     lengths = lengths or [2 * float(np.linalg.norm(half)) for _, half in boxes.values() if half.any()] or [1.0]
-    radius, longest = _THICK * float(np.mean(lengths)), 1.5 * max(lengths)
+    radius, longest = _STICK_RADIUS_RATIO * float(np.mean(lengths)), 1.5 * max(lengths)
     out: list[Shape] = []
     moving = {joint.child: joint for joint in model.joints if joint.type.nv}
     for k, body in enumerate(model.bodies):
@@ -193,7 +193,7 @@ class Scene:
             V = np.concatenate([s.vertices for s in shape.surfaces])
             corners.append(list(product(*zip(V.min(axis=0), V.max(axis=0), strict=True))))
         points = [self.translations[:, 0]] if not corners else []
-        for frame in np.unique(np.linspace(0, len(self.t) - 1, _MEASURED).astype(int)) if corners else ():
+        for frame in np.unique(np.linspace(0, len(self.t) - 1, _EXTENT_FRAMES).astype(int)) if corners else ():
             R, p = self.placements(frame)
             points.append((np.einsum("nij,ncj->nci", R, np.array(corners)) + p[:, None]).reshape(-1, 3))
         every = np.concatenate(points)
@@ -207,19 +207,21 @@ class Scene:
 
     @cached_property
     def camera(self) -> dict[str, Any]:
-        """Where a camera of 35° sees everything, by target and distance in m, azimuth and elevation in rad."""
+        """Return a camera of 35° that sees everything: target and distance in m, azimuth and elevation in rad."""
         low, high = self.bounds
         wide, deep = (high - low)[:2]
         # A motion in a plane is seen from its side, and a robot that looks along x from the front.
         azimuth = -np.pi / 2 + 0.5 if wide >= deep else 0.5
-        right, up, back = camera_axes(azimuth, _ELEVATION)
+        right, up, back = camera_axes(azimuth, _CAMERA_ELEVATION)
         corners = np.array(list(product(*zip(low, high, strict=True)))) - (low + high) / 2
-        needed = np.maximum(np.abs(corners @ up), np.abs(corners @ right) / _ASPECT) / np.tan(np.deg2rad(HALF_ANGLE))
+        needed = np.maximum(np.abs(corners @ up), np.abs(corners @ right) / _PICTURE_ASPECT) / np.tan(
+            np.deg2rad(HALF_ANGLE_DEGREES)
+        )
         return {
             "target": ((low + high) / 2).tolist(),
             "distance": 1.12 * max(float((corners @ back + needed).max()), 1e-6),
             "azimuth": azimuth,
-            "elevation": _ELEVATION,
+            "elevation": _CAMERA_ELEVATION,
             "reach": max(float(np.linalg.norm(high - low)) / 2, 1e-6),
         }
 

@@ -15,10 +15,10 @@ from mbkit._check import Array
 Indices = NDArray[np.int64]
 Color = tuple[float, float, float, float]
 #: Sides of what is round.
-_SIDES: Final = 32
+_ROUND_SIDES: Final = 32
 #: A mesh of fewer triangles stays as it is, and one of more is at least so many cells long.
-_FEW: Final = 150
-_CELLS: Final = 5
+_MIN_CLUSTERED_TRIANGLES: Final = 150
+_MIN_CELLS_ALONG: Final = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +42,12 @@ def solid(kind: str, size: tuple[float, ...]) -> Surface:
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * size
         quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
         return Surface(corners, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]))
-    turns = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1)
+    turns = np.linspace(-np.pi / 2, np.pi / 2, _ROUND_SIDES // 2 + 1)
     r, z = np.cos(turns), np.sin(turns)
     if kind == "cylinder":
         return _revolved(np.array([0, size[0], size[0], 0]), np.array([-size[1], -size[1], size[1], size[1]]))
     if kind == "capsule":
-        upper, half = z[_SIDES // 4 :], _SIDES // 4
+        upper, half = z[_ROUND_SIDES // 4 :], _ROUND_SIDES // 4
         ends = np.concatenate([size[0] * z[: half + 1] - size[1], size[0] * upper + size[1]])
         return _revolved(size[0] * np.concatenate([r[: half + 1], r[half:]]), ends)
     ball = _revolved(r, z)
@@ -56,20 +56,20 @@ def solid(kind: str, size: tuple[float, ...]) -> Surface:
 
 def _revolved(r: Array, z: Array) -> Surface:
     """Return a profile turned about z, whose first and last radius are zero."""
-    angles = np.arange(_SIDES) * (2 * np.pi / _SIDES)
+    angles = np.arange(_ROUND_SIDES) * (2 * np.pi / _ROUND_SIDES)
     rings = np.stack([np.outer(r[1:-1], np.cos(angles)), np.outer(r[1:-1], np.sin(angles))], axis=-1)
     heights = np.broadcast_to(z[1:-1, None, None], (*rings.shape[:2], 1))
     ends = np.array([[0, 0, z[0]], [0, 0, z[-1]]])
     vertices = np.concatenate([np.concatenate([rings, heights], axis=-1).reshape(-1, 3), ends])
-    own = np.arange(_SIDES)
-    after, count = (own + 1) % _SIDES, len(r) - 2
-    bottom, top = count * _SIDES, count * _SIDES + 1
-    parts = [np.stack([np.full(_SIDES, bottom), after, own], axis=1)]
+    own = np.arange(_ROUND_SIDES)
+    after, count = (own + 1) % _ROUND_SIDES, len(r) - 2
+    bottom, top = count * _ROUND_SIDES, count * _ROUND_SIDES + 1
+    parts = [np.stack([np.full(_ROUND_SIDES, bottom), after, own], axis=1)]
     for k in range(count - 1):
-        a, b = k * _SIDES, (k + 1) * _SIDES
+        a, b = k * _ROUND_SIDES, (k + 1) * _ROUND_SIDES
         parts += [np.stack([a + own, a + after, b + after], axis=1), np.stack([a + own, b + after, b + own], axis=1)]
-    last = (count - 1) * _SIDES
-    parts.append(np.stack([last + own, last + after, np.full(_SIDES, top)], axis=1))
+    last = (count - 1) * _ROUND_SIDES
+    parts.append(np.stack([last + own, last + after, np.full(_ROUND_SIDES, top)], axis=1))
     return Surface(vertices, np.concatenate(parts).astype(np.int64))
 
 
@@ -87,7 +87,7 @@ def thinned(surfaces: Sequence[Surface], most: int) -> list[Surface]:
     largest = max(float(np.ptp(s.vertices, axis=0).max()) for s in surfaces)
     out = list(surfaces)
     while total > most and cell < largest:
-        out = [s if len(s.triangles) < _FEW else _clustered(s, cell) for s in surfaces]
+        out = [s if len(s.triangles) < _MIN_CLUSTERED_TRIANGLES else _clustered(s, cell) for s in surfaces]
         total = sum(len(s.triangles) for s in out)
         cell *= 1.25
     return out
@@ -96,7 +96,7 @@ def thinned(surfaces: Sequence[Surface], most: int) -> list[Surface]:
 def _clustered(surface: Surface, cell: float) -> Surface:
     low, extent = surface.vertices.min(axis=0), np.ptp(surface.vertices, axis=0)
     # A small part stays a solid.
-    cell = min(cell, float(extent.max()) / _CELLS)
+    cell = min(cell, float(extent.max()) / _MIN_CELLS_ALONG)
     cells = np.floor((surface.vertices - low) / cell).astype(np.int64)
     sizes = cells.max(axis=0) + 1
     keys = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]

@@ -26,9 +26,9 @@ from mbkit.show import movie, page
 from mbkit.show.scene import PICTURE, Kind, Scene
 
 #: Frames that a page and a film hold at most.
-_FRAMES: Final = 2000
-_FILM_FRAMES: Final = 20_000
-_PAGE_RATE: Final = 60.0
+_MAX_PAGE_FRAMES: Final = 2000
+_MAX_FILM_FRAMES: Final = 20_000
+_PAGE_FRAMES_PER_SECOND: Final = 60.0
 _SUFFIXES: Final = (".html", *movie.PICTURES, *movie.FILMS)
 
 
@@ -137,8 +137,8 @@ def show(
         raise InputError(f"model: expected a Model or a path, got {shown(model)}; a trajectory has animate()")
     PICTURE.admit(model)
     configurations = np.atleast_2d(model.neutral() if q is None else model.check_q(q))
-    if len(configurations) > _FRAMES:
-        raise InputError(f"q: expected at most {_FRAMES} configurations, got {len(configurations)}")
+    if len(configurations) > _MAX_PAGE_FRAMES:
+        raise InputError(f"q: expected at most {_MAX_PAGE_FRAMES} configurations, got {len(configurations)}")
     return view_of(model, configurations, np.arange(float(len(configurations))), path, shapes, triangles)
 
 
@@ -154,8 +154,8 @@ def animate(
         raise InputError(f"{model.name}: the trajectory has no state with finite numbers, so nothing can be shown")
     t, q = t[good], model.check_q(_with_motions(model, q[good], t[good]))
     filmed = path is not None and Path(path).suffix.lower() in movie.FILMS
-    rate = real("fps", fps, positive=True) if filmed else _PAGE_RATE
-    most = _FILM_FRAMES if filmed else _FRAMES
+    rate = real("fps", fps, positive=True) if filmed else _PAGE_FRAMES_PER_SECOND
+    most = _MAX_FILM_FRAMES if filmed else _MAX_PAGE_FRAMES
     frames = int(min((t[-1] - t[0]) * rate, most)) + 1
     if filmed and frames > most:
         raise InputError(f"fps: expected a film of at most {most} frames, got {rate:g} a second for {t[-1] - t[0]:g} s")
@@ -196,7 +196,7 @@ def view_of(
     if file is not None and file.suffix.lower() not in _SUFFIXES:
         raise InputError(f"path: expected a name that ends in {', '.join(_SUFFIXES)}, got {shown(str(path))}")
     drawn = file is not None and file.suffix.lower() != ".html"
-    scene = Scene.of(model, q, t, shapes, min(most, movie.TRIANGLES) if drawn else most)
+    scene = Scene.of(model, q, t, shapes, min(most, movie.MAX_FILM_TRIANGLES) if drawn else most)
     if file is not None and drawn:
         movie.write(scene, file, fps)
         return View(scene, file)

@@ -67,7 +67,7 @@ class Shape:
 
 @dataclass
 class Visuals:
-    """What a file has to draw."""
+    """The shapes that a file draws."""
 
     shapes: list[Shape] = field(default_factory=list)
     #: Bodies whose mesh is missing or unreadable, with the first reason of each.
@@ -233,7 +233,7 @@ def _mjcf(model: _Bodies, source: Path, mujoco: Element, kind: str) -> Visuals:
     text = "".join(_written(e, lost, out) for e in mujoco.children if e.tag in ("default", "asset", "worldbody"))
     kept = {"angle", "eulerseq", "autolimits", "inertiafromgeom", "fitaabb", "boundmass", "boundinertia"}
     merged = {k: x for e in mujoco.all("compiler") for k, x in e.attributes.items() if k in kept}
-    # What has no mass only for want of its mesh compiles, too.
+    # A body without mass for want of its mesh compiles, too.
     merged |= {"boundmass": "1e-9", "boundinertia": "1e-9", "balanceinertia": "true"}
     compiled = _compiled(f"<mujoco>{element_text('compiler', merged)}{text}</mujoco>", assets, source)
     out.shapes += _geoms(model, compiled, kind)

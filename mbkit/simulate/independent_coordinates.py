@@ -19,7 +19,7 @@ from mbkit._warn import warn
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.errors import FunctionError, MbkitWarning, NumericalError, UnsupportedError
-from mbkit.lagrangian.independent_coordinates import SINGULAR, Chart, Embedded, EmbeddedDynamics
+from mbkit.lagrangian.independent_coordinates import SINGULAR_VALUE_RATIO, Chart, Embedded, EmbeddedDynamics
 from mbkit.methods.registry import METHODS, Method, method_of
 from mbkit.simulate.events import Event, Hit
 from mbkit.simulate.integrate import integrate
@@ -132,7 +132,7 @@ class _Run:
             self._hold(k, t, q, v)
             new, chart = chart is None, chart or system.chart(q, t)
             near = system.nearness(chart, q, t)
-            if near < SINGULAR:
+            if near < SINGULAR_VALUE_RATIO:
                 across = across or self.passes
                 if not (self._near and self._near[-1][0] == t):
                     self._near.append((t, near))
@@ -173,7 +173,7 @@ class _Run:
             return np.inf
         near = self.system.nearness(chart, q, t)
         rate = abs(self.system.nearness(chart, q + step / size * v, t) - near) * size / step
-        return _FAR * max(near, SINGULAR) / rate if rate else np.inf
+        return _FAR * max(near, SINGULAR_VALUE_RATIO) / rate if rate else np.inf
 
     def _take(self, part: RunData, way: _Way, chart: Chart, left: list[float] | None) -> str:
         """Add a part; return why the run goes on from its end on another chart, or nothing."""
@@ -241,13 +241,13 @@ class _Run:
                 if k in kept:
                     self._keep(t, q, v)
                 near = system.nearness(chart, q, t)
-                if near < SINGULAR and not was_near:
+                if near < SINGULAR_VALUE_RATIO and not was_near:
                     self._near.append((t, near))
                     record.events.append(Hit(_NEAR, t, q, v))
                     if stays:
                         self._undetermined()
                         return
-                was_near = near < SINGULAR
+                was_near = near < SINGULAR_VALUE_RATIO
                 worn = not stays and system.quality(chart, q, t) < system.least
                 if worn:
                     break
@@ -331,7 +331,7 @@ class _Way:
 
     def _watch(self, chart: Chart, what: str) -> Event:
         system = self._run.system
-        measure, limit = (system.quality, system.least) if what == _WORN else (system.nearness, SINGULAR)
+        measure, limit = (system.quality, system.least) if what == _WORN else (system.nearness, SINGULAR_VALUE_RATIO)
 
         def function(t: float, u: Array, _w: Array) -> float:
             # Its logarithm is nearly straight where the value itself bends to zero.

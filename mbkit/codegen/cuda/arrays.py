@@ -21,7 +21,7 @@ from mbkit.codegen.cuda.runs import OnDevice, Place
 from mbkit.errors import InputError
 
 #: The stream on which `Device` works, as both protocols number it: the one that waits for all others.
-_STREAM: Final = 1
+_LEGACY_STREAM: Final = 1
 
 
 class _Tensor(ctypes.Structure):
@@ -43,7 +43,7 @@ class _Managed(ctypes.Structure):
     _fields_ = (("tensor", _Tensor), ("context", ctypes.c_void_p), ("deleter", ctypes.c_void_p))
 
 
-_FLOAT: Final = 2  # kDLFloat
+_DL_FLOAT: Final = 2  # kDLFloat
 _NAME: Final = b"dltensor"
 _DELETER: Final = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)
 _API: Final = ctypes.pythonapi
@@ -54,7 +54,7 @@ _API.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
 # A capsule that is dying may not be counted again.
 _IS_VALID: Final = ctypes.PYFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_char_p)(("PyCapsule_IsValid", _API))
 _POINTER: Final = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)(("PyCapsule_GetPointer", _API))
-#: What has been handed over and not given back, by its address.
+#: Arrays that were handed over and not given back, by address.
 _SHARED: Final[dict[int, Any]] = {}
 
 
@@ -95,14 +95,14 @@ def viewed(name: str, x: Any, device: Device) -> _View:
         strides = facts.get("strides") or _contiguous(shape, 8)
         _require(name, kind == "<f8", kind)
         _require(name, all(s % 8 == 0 for s in strides), f"strides {strides}")
-        if (stream := facts.get("stream")) not in (None, _STREAM):
+        if (stream := facts.get("stream")) not in (None, _LEGACY_STREAM):
             device.wait(int(stream))
         return _View(int(facts["data"][0] or 0), shape, tuple(s // 8 for s in strides), x)
     kind, ordinal = map(int, x.__dlpack_device__())
     _require(name, (kind, ordinal) == (GPU, device.ordinal), f"device {(kind, ordinal)}")
-    capsule = x.__dlpack__(stream=_STREAM)
+    capsule = x.__dlpack__(stream=_LEGACY_STREAM)
     tensor = _Managed.from_address(_API.PyCapsule_GetPointer(capsule, _NAME)).tensor
-    _require(name, (tensor.code, tensor.bits, tensor.lanes) == (_FLOAT, 64, 1), f"{tensor.bits} bits")
+    _require(name, (tensor.code, tensor.bits, tensor.lanes) == (_DL_FLOAT, 64, 1), f"{tensor.bits} bits")
     shape = tuple(tensor.shape[i] for i in range(tensor.ndim))
     strides = tuple(tensor.strides[i] for i in range(tensor.ndim)) if tensor.strides else _contiguous(shape, 1)
     return _View((tensor.data or 0) + tensor.byte_offset, shape, strides, (x, capsule))
@@ -190,7 +190,7 @@ class DeviceArray:
         """The description by Numba's protocol."""
         strides = tuple(8 * s for s in self._strides)
         facts = {"shape": self.shape, "typestr": "<f8", "data": (self._address, False), "strides": strides}
-        return facts | {"version": 3, "stream": _STREAM}
+        return facts | {"version": 3, "stream": _LEGACY_STREAM}
 
     def __dlpack_device__(self) -> tuple[int, int]:
         return GPU, self._device.ordinal
@@ -199,7 +199,7 @@ class DeviceArray:
         """Return a capsule; all work on the array is done already, whatever the stream."""
         n = len(self.shape)
         shape, strides = (ctypes.c_int64 * n)(*self.shape), (ctypes.c_int64 * n)(*self._strides)
-        tensor = _Tensor(self._address, GPU, self._device.ordinal, n, _FLOAT, 64, 1, shape, strides, 0)
+        tensor = _Tensor(self._address, GPU, self._device.ordinal, n, _DL_FLOAT, 64, 1, shape, strides, 0)
         managed = _Managed(tensor, None, ctypes.cast(_returned, ctypes.c_void_p))
         address = ctypes.addressof(managed)
         _SHARED[address] = managed, shape, strides, self

@@ -12,10 +12,10 @@ from weakref import finalize
 import numpy as np
 from numpy.typing import NDArray
 
-from mbkit.codegen.cuda.kernels import BLOCK, TARGETS, ptx
+from mbkit.codegen.cuda.kernels import BLOCK_THREADS, TARGETS, ptx
 from mbkit.errors import DeviceError, UnknownNameError, UnsupportedError
 
-#: What `device=` may be, but for the number of a GPU behind it, as in "cuda:1".
+#: Values of `device=`, but for the number of a GPU behind it, as in "cuda:1".
 CUDA: Final = "cuda"
 _CAPABILITY: Final = "CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY"
 _OUT_OF_MEMORY: Final = 2  # CUDA_ERROR_OUT_OF_MEMORY
@@ -59,7 +59,7 @@ class Device:
             raise UnsupportedError(f"device: expected one of {count} NVIDIA GPUs, numbered from 0; got {ordinal}")
         self.ordinal, self._handle = ordinal, _ask("cuDeviceGet", ordinal)
         self._context = _ask("cuDevicePrimaryCtxRetain", self._handle)
-        #: What NVIDIA calls it.
+        #: NVIDIA's name of it.
         self.title = _ask("cuDeviceGetName", 100, self._handle).decode().strip("\0 ")
         kinds = driver().CUdevice_attribute
         major, minor = (
@@ -71,7 +71,7 @@ class Device:
             raise UnsupportedError(
                 f"device: expected compute capability {TARGETS[0] / 10} or later, this GPU has {major}.{minor}"
             )
-        #: What machine code depends on.
+        #: Compute capability, on which machine code depends.
         self.target = f"sm_{known[-1]}"
         self.code_name = (f"sm_{major}{minor}", self.target, str(_ask("cuDriverGetVersion")))
         with self.current(), suppress(DeviceError):
@@ -149,8 +149,8 @@ class Device:
         """Start one thread for each of so many states; arguments are of eight bytes."""
         values = np.array(arguments, dtype=np.int64)
         places = values.ctypes.data + 8 * np.arange(len(values), dtype=np.uint64)
-        blocks = -(-threads // BLOCK)
-        _ask("cuLaunchKernel", function, blocks, 1, 1, BLOCK, 1, 1, 0, 0, places.ctypes.data, 0)
+        blocks = -(-threads // BLOCK_THREADS)
+        _ask("cuLaunchKernel", function, blocks, 1, 1, BLOCK_THREADS, 1, 1, 0, 0, places.ctypes.data, 0)
 
     @property
     def name(self) -> str:

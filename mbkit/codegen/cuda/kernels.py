@@ -32,9 +32,9 @@ _LAYOUT: Final = "e-p6:32:32-i64:64-i128:128-i256:256-v16:16-v32:32-n16:32:64"
 TARGETS: Final = (75, 80, 86, 89, 90)
 _PTX: Final = "+ptx80"
 #: Threads of a block. A kernel's registers leave room for two such blocks on a multiprocessor.
-BLOCK: Final = 128
+BLOCK_THREADS: Final = 128
 _REGISTERS: Final = ("tid", "ntid", "ctaid")
-#: What a batch's kernel found: a number that is not finite, a quaternion that is not of unit length.
+#: Marks of a batch's kernel: a number that is not finite, a quaternion that is not of unit length.
 _NOT_FINITE, _NOT_UNIT = 1, 2
 
 
@@ -89,7 +89,7 @@ def _entry(name: str, parameters: str, body: str) -> str:
         f"  %{r}32 = call i32 @llvm.nvvm.read.ptx.sreg.{r}.x()\n  %{r} = zext i32 %{r}32 to i64" for r in _REGISTERS
     )
     return f"""
-define ptx_kernel void @{name}({parameters}) "nvvm.maxntid"="{BLOCK}" "nvvm.minctasm"="1" {{
+define ptx_kernel void @{name}({parameters}) "nvvm.maxntid"="{BLOCK_THREADS}" "nvvm.minctasm"="1" {{
 entry:
 {registers}
   %before = mul i64 %ctaid, %ntid
@@ -159,7 +159,7 @@ class _Entry(Piece):
                 x = self._load(self._place("in", "is", 0, start + j))
                 error = t.fma(x, x, error)
             worst = t.select(t.compare("ugt", t.call("fabs", error), worst), t.call("fabs", error), worst)
-        # Of NaN too.
+        # NaN counts as larger too.
         self._mark(t.compare("uge", worst, number(NEAR_UNIT)), _NOT_UNIT)
 
     def function(self, name: str, linkage: str = "internal") -> str:
@@ -182,7 +182,7 @@ class _Values(Piece):
     def _load(self, pointer: Any) -> str:
         i, j = pointer
         given = self._given[i]
-        # What all threads share is read where it is used: there is no room for it in registers.
+        # Numbers that all threads share are read where they are used: registers have no room for them.
         return _read(self._text, given, str(j)) if isinstance(given, str) else given[j]
 
     def _store(self, value: str, pointer: Any) -> None:

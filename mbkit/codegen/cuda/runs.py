@@ -28,7 +28,7 @@ from mbkit.derivation.steps.fixed import Part
 
 
 class Place(NamedTuple):
-    """Where an array of (N, n) is on the GPU: its address, and the strides between rows and samples, in doubles."""
+    """An array of (N, n) on the GPU: its address, and the strides between rows and samples, in doubles."""
 
     address: int
     across: int
@@ -241,7 +241,7 @@ class Arena:
 
 #: Operations of a step that is one function: Talos' 19,000, or 27,000 under a feedback, kept the driver's compiler busy
 #: for more than two minutes.
-WHOLE: Final = 10_000
+MAX_STEP_OPERATIONS: Final = 10_000
 _STEPS: Final[WeakValueDictionary[str, CudaSteps]] = WeakValueDictionary()
 
 

@@ -32,7 +32,7 @@ from mbkit.model.joint_types import kind_of
 from mbkit.model.validation import listing
 
 _KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
-#: What changes no smooth term, and may take long or leave a part of the tree out.
+#: Flags that change no smooth term, and may take long or leave a part of the tree out.
 _OFF: Final = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _ASLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 #: Names that a note lists.

@@ -20,8 +20,8 @@ from mbkit.lagrangian.continua.reduction import Reduction
 from mbkit.lagrangian.continua.ritz import NormalModes
 from mbkit.lagrangian.energies.symbols import listed, name_of, plain, velocity_of
 
-#: What a shape may move of what is fixed, of its largest value.
-_MOVES: Final = 1e-12
+#: A fixed place may move by this part of a shape's largest value.
+_FIXED_DISPLACEMENT_RATIO: Final = 1e-12
 
 
 @dataclass(frozen=True, repr=False)
@@ -119,7 +119,7 @@ def _require_fixed(system: Densities, what: str, mode: tuple[Shape, ...]) -> Non
             k, (along, _) = system.jets.order(s)
             shape = mode[k].slope(along)
             size = max((abs(shape(x / 8)) for x in range(9)), default=0)
-            if abs(shape(place)) > _MOVES * size:
+            if abs(shape(place)) > _FIXED_DISPLACEMENT_RATIO * size:
                 raise InputError(
                     f"{what}: {s} = {mpmath.nstr(shape(place), 6)} at {system.jets.x} = {end}, where it is fixed; a "
                     "shape must keep what `fixed` says"

@@ -15,9 +15,9 @@ from mbkit.lagrangian.energies.energy_form import vanish
 from mbkit.lagrangian.energies.symbols import PlainSymbols, expression, listed
 from mbkit.lagrangian.trig.simplify import tidy
 
-_DIGITS: Final = 40
-#: Modes of which cosh λ is no number that sines could be added to in 40 digits.
-_MOST: Final = 20
+_ROOT_DIGITS: Final = 40
+#: Beyond so many modes, sines added to cosh λ are lost in 40 digits.
+_MAX_MODES: Final = 20
 
 
 def clamped_free(count: int, x: sp.Symbol, length: Any) -> tuple[sp.Expr, ...]:
@@ -38,16 +38,16 @@ def clamped_free(count: int, x: sp.Symbol, length: Any) -> tuple[sp.Expr, ...]:
     Young, Felgar 1949, Tables of characteristic functions representing normal modes of vibration of a beam.
     """
     count = counted("count", count, least=1)
-    if count > _MOST:
-        raise UnsupportedError(f"count: expected at most {_MOST} modes, got {count}; take Continuum.normal_modes")
+    if count > _MAX_MODES:
+        raise UnsupportedError(f"count: expected at most {_MAX_MODES} modes, got {count}; take Continuum.normal_modes")
     if not isinstance(x, sp.Symbol):
         raise InputError(f"x: expected a SymPy symbol, got {x!r}")
     place, out = x / _above_zero(expression("length", length)), []
-    with mpmath.workdps(_DIGITS):
+    with mpmath.workdps(_ROOT_DIGITS):
         for k in range(count):
             root = mpmath.findroot(lambda y: mpmath.cos(y) + 1 / mpmath.cosh(y), (k + mpmath.mpf(1) / 2) * mpmath.pi)
             sigma = (mpmath.sinh(root) - mpmath.sin(root)) / (mpmath.cosh(root) + mpmath.cos(root))
-            b, s = sp.Float(root, _DIGITS), sp.Float(sigma, _DIGITS)
+            b, s = sp.Float(root, _ROOT_DIGITS), sp.Float(sigma, _ROOT_DIGITS)
             out.append(sp.cosh(b * place) - sp.cos(b * place) - s * (sp.sinh(b * place) - sp.sin(b * place)))
     return tuple(out)
 
@@ -151,7 +151,7 @@ def beam(
     T, T_end = rho * speed.dot(speed) / 2, m * speed.dot(speed) / 2
     V = read("tension", tension) * square / 2 + _bending(stiffness, read, bent.diff(s, 2))
     V_end: Any = 0
-    # What u moves lies beyond s: ∫ ρ u f ds = -½ ∫ v′² (∫ ρ f ds beyond s) ds.
+    # u moves the part beyond s: ∫ ρ u f ds = -½ ∫ v′² (∫ ρ f ds beyond s) ds.
     mass, moment = (sp.integrate(sp.expand(f), (s, s, L)) + end for f, end in ((rho, m), (rho * s, m * L)))
     if stiffening:
         T -= square * (mass * u0.dot(turn[:, 0]) + moment * turn[:, 0].dot(turn[:, 0])) / 2

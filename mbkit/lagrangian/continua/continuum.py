@@ -129,13 +129,13 @@ class Continuum(Densities):
                         at_ends.append((end, sp.Eq(free, 0, evaluate=False)))
                         continue
                     passed = ((-1) ** (i - j - 1) * jets.along(G[i], i - j - 1) for i in range(j + 1, most + 1))
-                    # What is fixed stays zero, with all its rates.
+                    # A fixed function stays zero, with all its rates.
                     balance = sign * sp.Add(*passed) + self._forces(own, k, j)
                     # A function of x stays one: the place stands beside the equation.
                     balance = balance if balance.atoms(AppliedUndef) else balance.subs(jets.x, end)
                     still = {s: 0 for s in jets.among(balance) if self._held(s, end)}
                     at_ends.append((end, sp.Eq(_short(-balance.subs(still), jets), 0, evaluate=False)))
-        # Where nothing is passed on, as at the free end of a turning string, every motion that stays finite will do.
+        # An end that passes nothing on, as the free end of a turning string, takes every motion that stays finite.
         kept = [pair for pair in at_ends if pair[1].lhs != 0]
         return FieldEquations(tuple(inside), tuple(sorted(kept, key=lambda x: self.ends.index(x[0]))), jets)
 

@@ -14,15 +14,15 @@ from mpmath.calculus.quadrature import GaussLegendre
 from mbkit.errors import InputError, NumericalError
 from mbkit.lagrangian.energies.symbols import expression, plain
 
-#: Of all shapes the place between 0 and 1, from end to end.
+#: The place on a continuum, from 0 at one end to 1 at the other; all shapes depend on it.
 XI: Final = sp.Symbol("xi", real=True)
-DIGITS: Final = 50
+INTEGRAL_DIGITS: Final = 50
 #: Orders of two rules of Gauss and Legendre, of 48 and 96 nodes, whose results are compared.
 _ORDERS: Final = (5, 6)
-#: What two rules may differ by, and what is zero, of the integral of the absolute value.
-_SAME: Final = 1e-22
-#: Denominators of numbers that are written as quotients.
-_READ: Final = 10_000
+#: Two rules agree, and an integral is zero, up to this part of the integral of the absolute value.
+_INTEGRAL_ERROR_RATIO: Final = 1e-22
+#: Largest denominator of a number that is written as a quotient.
+_MAX_DENOMINATOR: Final = 10_000
 
 
 @lru_cache(8)
@@ -57,7 +57,7 @@ class Shape:
         x = self.expression
         return sp.lambdify(XI, sp.horner(x, XI) if x.is_polynomial(XI) else x, "mpmath")
 
-    def __call__(self, xi: Any, digits: int = DIGITS) -> Any:
+    def __call__(self, xi: Any, digits: int = INTEGRAL_DIGITS) -> Any:
         """Return the value at a place; InputError where there is none."""
         with mpmath.workdps(digits):
             try:
@@ -66,7 +66,7 @@ class Shape:
                 at = mpmath.nstr(xi, 6)
                 raise InputError(f"shapes: {self.expression} has no real value at {XI} = {at}, of 0 to 1") from error
 
-    def at_nodes(self, order: int, digits: int = DIGITS) -> list[Any]:
+    def at_nodes(self, order: int, digits: int = INTEGRAL_DIGITS) -> list[Any]:
         """Return the values at the nodes of a rule."""
         key = order, digits
         if key not in self._nodes:
@@ -124,15 +124,15 @@ def _of_polynomials(parts: Sequence[sp.Poly]) -> sp.Expr:
 
 def _by_quadrature(parts: Sequence[Shape]) -> sp.Expr:
     totals = []
-    with mpmath.workdps(DIGITS):
+    with mpmath.workdps(INTEGRAL_DIGITS):
         for order in _ORDERS:
             products = [mpmath.fprod(x) for x in zip(*(p.at_nodes(order) for p in parts), strict=True)]
-            weights = [w for _, w in _rule(order, DIGITS)]
+            weights = [w for _, w in _rule(order, INTEGRAL_DIGITS)]
             total = mpmath.fdot(weights, products)
             size = mpmath.fdot(weights, map(abs, products))
             totals.append(total)
-        _settled(parts, totals, _SAME, size)
-        if abs(totals[1]) < _SAME * size:
+        _settled(parts, totals, _INTEGRAL_ERROR_RATIO, size)
+        if abs(totals[1]) < _INTEGRAL_ERROR_RATIO * size:
             return sp.Integer(0)
         return number(sp.Float(totals[1], 40))
 
@@ -150,10 +150,10 @@ def _settled(parts: Sequence[Shape], totals: Sequence[Any], same: Any, size: Any
 def number(x: sp.Expr) -> sp.Expr:
     """Return a number as a short quotient where it is one, else with 20 digits."""
     x = sp.sympify(x)
-    if x.is_Rational and x.q <= _READ:
+    if x.is_Rational and x.q <= _MAX_DENOMINATOR:
         return x
     near = sp.Rational(str(x.n(30))).limit_denominator(24)
-    if near != 0 and abs(x - near) < _SAME * abs(near):
+    if near != 0 and abs(x - near) < _INTEGRAL_ERROR_RATIO * abs(near):
         return near
     return sp.Float(x, 20)
 

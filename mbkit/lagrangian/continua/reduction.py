@@ -9,7 +9,7 @@ import sympy as sp
 
 from mbkit.errors import UnsupportedError
 from mbkit.lagrangian.continua.densities import Densities
-from mbkit.lagrangian.continua.integrals import DIGITS, Integrals, Shape, number, weights_of
+from mbkit.lagrangian.continua.integrals import INTEGRAL_DIGITS, Integrals, Shape, number, weights_of
 from mbkit.lagrangian.energies.symbols import velocity_of
 
 #: Shapes by their number, each with its derivative.
@@ -57,7 +57,7 @@ class Reduction:
         place = self._system.ends.index(end)
 
         def measured(c: sp.Expr, factors: Factors) -> sp.Expr:
-            with mpmath.workdps(DIGITS):
+            with mpmath.workdps(INTEGRAL_DIGITS):
                 value = mpmath.fprod(self._shapes[k].slope(along)(place) for k, along in factors)
             return c.subs(self._system.jets.x, end) * number(value)
 

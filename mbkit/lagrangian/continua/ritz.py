@@ -44,24 +44,24 @@ class NormalModes:
         return f"<NormalModes: {', '.join(f'{x:.6g}' for x in self.frequencies)} rad/s>"
 
 
-#: Modes up to which the digits below are enough.
-_COUNT: Final = 20
-#: Digits of Ritz's matrices: n powers cost 1.2 n of them.
-_DIGITS: Final = 200
-_WRITTEN: Final = 60
-#: Monomials for n modes, and how many more have to give the same frequencies.
-_FIRST, _MORE, _ROUNDS = 12, 6, 4
-_SETTLED: Final = 1e-11
-#: Of a diagonal entry, what rounding leaves of a pivot that is zero; of the slowest motion, that of one that is rigid.
-_ZERO: Final = 1e-100
-_RIGID: Final = 1e-12
+#: The digits below are enough for so many modes.
+_MAX_MODES: Final = 20
+#: Digits of Ritz's matrices: n powers cost 1.2 n of them. Shapes are written with fewer.
+_MATRIX_DIGITS: Final = 200
+_SHAPE_DIGITS: Final = 60
+#: Monomials beside 2 n for n modes; so many more have to give the same frequencies, in so many refinements.
+_EXTRA_MONOMIALS, _ADDED_MONOMIALS, _MAX_REFINEMENTS = 12, 6, 4
+_EIGENVALUE_CHANGE: Final = 1e-11
+#: A pivot is zero below this part of its diagonal entry, and a motion rigid below this part of the slowest square.
+_ZERO_PIVOT_RATIO: Final = 1e-100
+_RIGID_EIGENVALUE_RATIO: Final = 1e-12
 
 
 def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> NormalModes:
     """Return what `Continuum.normal_modes` does."""
     count = counted("count", count, least=1)
-    if count > _COUNT:
-        raise UnsupportedError(f"count: expected at most {_COUNT} modes, got {count}")
+    if count > _MAX_MODES:
+        raise UnsupportedError(f"count: expected at most {_MAX_MODES} modes, got {count}")
     if not isinstance(values, Mapping):
         raise InputError(f"values: expected a mapping of parameters to numbers, got {values!r}")
     moved = _moved(system)
@@ -74,14 +74,15 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
         raise InputError(f"values: no value for {plain(missing)}; a mode of free vibration takes one of each parameter")
     ritz = _Ritz(system, {s: given[s.name] for s in own})
     before: Any = None
-    for step in range(_ROUNDS):
-        squares, vectors, shift = ritz.eigenpairs(2 * count + _FIRST + _MORE * step, count)
-        if before is not None and (np.abs(before - squares) <= _SETTLED * max(squares.max(), shift)).all():
+    for step in range(_MAX_REFINEMENTS):
+        squares, vectors, shift = ritz.eigenpairs(2 * count + _EXTRA_MONOMIALS + _ADDED_MONOMIALS * step, count)
+        if before is not None and (np.abs(before - squares) <= _EIGENVALUE_CHANGE * max(squares.max(), shift)).all():
             break
         before = squares
     else:
+        powers = 2 * count + _EXTRA_MONOMIALS + _ADDED_MONOMIALS * step
         raise NumericalError(
-            f"values: the frequencies do not settle to ten digits with {2 * count + _FIRST + _MORE * step} powers of "
+            f"values: the frequencies do not settle to ten digits with {powers} powers of "
             "x; T and V need coefficients that are smooth between the ends, and not too many modes at once"
         )
     lower, upper = system.ends
@@ -89,7 +90,7 @@ def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> 
     names = [f.func.__name__ for f in system.jets.fields]
     shapes: list[Any] = []
     for mode in vectors:
-        own_shapes = [sp.Add(*(sp.Float(c, _WRITTEN) * place**p for p, c in enumerate(rows))) for rows in mode]
+        own_shapes = [sp.Add(*(sp.Float(c, _SHAPE_DIGITS) * place**p for p, c in enumerate(rows))) for rows in mode]
         shapes.append(dict(zip(names, own_shapes, strict=True)) if len(names) > 1 else own_shapes[0])
     return NormalModes(np.sqrt(squares), tuple(shapes))
 
@@ -195,7 +196,7 @@ class _Ritz:
                     if rates in (0, 2):
                         forms[rates][j, i] += x
         G = forms[1]
-        if mpmath.mnorm(G - G.T, mpmath.inf) > _ZERO * mpmath.mnorm(G, mpmath.inf):
+        if mpmath.mnorm(G - G.T, mpmath.inf) > _ZERO_PIVOT_RATIO * mpmath.mnorm(G, mpmath.inf):
             raise UnsupportedError(
                 "T: a term of a deflection and another one's rate couples the modes like a gyroscope, and they have no "
                 "shapes of real numbers; take shapes of the system at rest, and mbkit.simulate"
@@ -204,10 +205,10 @@ class _Ritz:
 
     def eigenpairs(self, powers: int, count: int) -> tuple[Array, list[list[list[Any]]], float]:
         """Return the least ω², for each the coefficients of the powers, field by field, and how much was added."""
-        with mpmath.workdps(_DIGITS):
+        with mpmath.workdps(_MATRIX_DIGITS):
             B = self._basis(powers)
             M, K = (B.T * A * B for A in self._matrices(powers))
-            if mpmath.mnorm(K - K.T, mpmath.inf) > _ZERO * mpmath.mnorm(K, mpmath.inf):
+            if mpmath.mnorm(K - K.T, mpmath.inf) > _ZERO_PIVOT_RATIO * mpmath.mnorm(K, mpmath.inf):
                 raise UnsupportedError(f"forces: they have no potential, {_NOT_REAL}")
             if _cholesky(M) is None:
                 raise NumericalError("T: some shape of a field has no kinetic energy, or a negative one")
@@ -215,7 +216,7 @@ class _Ritz:
             if L is None:
                 # Motions as a rigid body: what is left of them is small beside the slowest other one.
                 ratios = [K[i, i] / M[i, i] for i in range(K.rows)]
-                shift = min((x for x in ratios if x > _ZERO * max(ratios)), default=mpmath.mpf(1))
+                shift = min((x for x in ratios if x > _ZERO_PIVOT_RATIO * max(ratios)), default=mpmath.mpf(1))
                 L = _cholesky(K + shift * M)
             unstable = "values: the state of rest is not stable: some shape lowers the potential energy"
             if L is None:
@@ -225,7 +226,7 @@ class _Ritz:
             # The largest flexibilities are the slowest modes, and exact to rounding.
             sizes, ways = np.linalg.eigh((flexibility + flexibility.T) / 2)
             squares = 1 / sizes[::-1][:count] - float(shift)
-            squares[np.abs(squares) < _RIGID * float(shift)] = 0.0
+            squares[np.abs(squares) < _RIGID_EIGENVALUE_RATIO * float(shift)] = 0.0
             if (squares < 0).any():
                 raise NumericalError(unstable)
             columns = inverse.T * mpmath.matrix(ways[:, ::-1][:, :count].tolist())
@@ -240,8 +241,8 @@ class _Ritz:
 
 def _digits(x: sp.Expr) -> Any:
     """Return a number of mpmath."""
-    with mpmath.workdps(_DIGITS):
-        return mpmath.mpf(int(x.p)) / int(x.q) if x.is_Rational else mpmath.mpf(sp.Float(x, _DIGITS))
+    with mpmath.workdps(_MATRIX_DIGITS):
+        return mpmath.mpf(int(x.p)) / int(x.q) if x.is_Rational else mpmath.mpf(sp.Float(x, _MATRIX_DIGITS))
 
 
 def _cholesky(A: Any) -> Any:
@@ -250,4 +251,4 @@ def _cholesky(A: Any) -> Any:
         L = mpmath.cholesky(A)
     except ValueError:
         return None
-    return None if any(L[i, i] ** 2 <= _ZERO * A[i, i] for i in range(A.rows)) else L
+    return None if any(L[i, i] ** 2 <= _ZERO_PIVOT_RATIO * A[i, i] for i in range(A.rows)) else L

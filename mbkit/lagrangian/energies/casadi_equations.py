@@ -21,15 +21,15 @@ from mbkit.lagrangian.energies.energy_form import EnergyForm, QuasiVelocities
 from mbkit.lagrangian.energies.sympy_to_casadi import Conversion
 from mbkit.model import Model
 
-#: Characters of a constraint in a message: of a loop in space it has thousands.
-_SHOWN: Final = 100
-#: |D⁻¹| |D| from which on rates have less than four digits.
-_SINGULAR: Final = 1e12
+#: Characters of a constraint that a message shows: a loop in space has thousands.
+_MAX_MESSAGE_LENGTH: Final = 100
+#: Largest |D⁻¹| |D|: beyond it rates have less than four digits.
+_SINGULAR_CONDITION: Final = 1e12
 
 
 def _short(x: Any) -> str:
     text = str(x)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]} ..."
+    return text if len(text) <= _MAX_MESSAGE_LENGTH else f"{text[:_MAX_MESSAGE_LENGTH]} ..."
 
 
 class EnergyEquations(ConstraintQuantities, Equations):
@@ -50,7 +50,7 @@ class EnergyEquations(ConstraintQuantities, Equations):
         read = Conversion(names, values.number)
         self._T, self._V, self._R = ca.SX(read(form.T)), ca.SX(read(form.V)), ca.SX(read(form.dissipation))
         self._Q = read.matrix(form.forces)
-        #: Of each momentum k, (γ^k v)_i = Σ_j γ^k_ij v_j; none where velocities are rates.
+        #: (γ^k v)_i = Σ_j γ^k_ij v_j of each momentum k; none where velocities are rates.
         self._turns: list[Any] = []
         qdot, pullback = self.v, lambda x: x
         if form.quasi is not None:
@@ -205,7 +205,7 @@ class VelocityMap:
         _, D, W = self.linear(q, v)
         # cos π/2 is 6e-17, and the inverse of zero is none.
         with np.errstate(invalid="ignore"):
-            bad = ~(np.abs(W) @ np.abs(D) < _SINGULAR).all(axis=(1, 2))
+            bad = ~(np.abs(W) @ np.abs(D) < _SINGULAR_CONDITION).all(axis=(1, 2))
         if bad.any():
             raise InputError(
                 f"q0: D(q) of q̇ = D v is singular at {q[int(np.argmax(bad))].tolist()}; start elsewhere, "

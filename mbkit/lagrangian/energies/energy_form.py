@@ -200,7 +200,7 @@ class EnergyForm:
                 slopes = [(w, sp.diff(a.args[0], w)) for w in held]
                 solved = [(w, w - a.args[0] / slope) for w, slope in slopes if slope != 0 and not slope.has(w)]
                 size = sp.Dummy()
-                # What it multiplies, at the velocity where it jumps: v² sign(v) does not.
+                # Its factor at the velocity where it jumps: v² sign(v) does not jump.
                 factor = sp.diff(x.xreplace({a: size}), size).subs(size, at_zero).subs(solved[:1])
                 if held and not is_zero(factor):
                     out.append(f"{name} by {a}")
@@ -236,7 +236,7 @@ class EnergyForm:
                 raise InputError(f"values: {key} is no parameter or function; the parameters are {parameters}")
 
         def replaced(x: Any) -> Any:
-            # Of a function that is now known, the derivatives are too.
+            # The derivatives of a function that is now known are known too.
             x = x.subs([*made.items()]).subs(numbers).doit()
             return by_name(x, {s.name: s for s in (*self.coordinates, *self.parameters)})
 
@@ -390,7 +390,7 @@ def _rows(into: PlainSymbols, what: str, source: Any) -> tuple[sp.Expr, ...]:
         source = [source]
     if isinstance(source, (Mapping, set, frozenset)) or not isinstance(source, Iterable):
         raise InputError(f"{what}: expected a list of expressions, got {source!r}")
-    # Of an equation the left side less the right side.
+    # An equation stands for its left side less its right side.
     sides = [(c.lhs, c.rhs) if isinstance(c, sp.Equality) else (c, 0) for c in source]
     return tuple(into(f"{what}[{k}]", a) - into(f"{what}[{k}]", b) for k, (a, b) in enumerate(sides))
 

@@ -178,7 +178,7 @@ def _by_speeds(x: sp.Expr, velocities: tuple[sp.Symbol, ...]) -> sp.Expr:
     if len(moving) < 2 or not x.has(sp.sin, sp.cos):
         return x
     pairs = combinations_with_replacement(moving, 2)
-    # Of a square the second derivative is twice its factor.
+    # The second derivative of a square is twice its factor.
     terms = ((tidy(sp.diff(x, v, w) / (2 if v == w else 1)), v * w) for v, w in pairs)
     grouped = sp.Add(*(factor * pair for factor, pair in terms))
     brackets = (a for f in sp.preorder_traversal(x) if f.is_Mul for a in f.args if a.is_Add)

@@ -13,13 +13,13 @@ import sympy as sp
 
 from mbkit._warn import warn
 from mbkit.errors import InputError, MbkitWarning
-from mbkit.lagrangian.trig.simplify import DIGITS, LARGE, RandomEvaluation, settled, tidy
+from mbkit.lagrangian.trig.simplify import MAX_SIMPLIFIED_OPERATIONS, PROBE_DIGITS, RandomEvaluation, settled, tidy
 
 #: Lines through the velocities, and places on each.
-_LINES: Final = 4
+_PROBE_LINES: Final = 4
 _STEPS: Final = (3, 1, -1, -3)
-#: Of 30 digits, what a third difference that is zero has left.
-_ROUNDED: Final = 1e-20
+#: A number computed with 30 digits is zero below this part of those that it is computed from.
+_ZERO_AT_30_DIGITS: Final = 1e-20
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def _check(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> None:
     """Refuse T that is not of second degree, with the first term that is not."""
     if _quadratic(T, velocities):
         return
-    terms = sp.Add.make_args(sp.expand_mul(T) if T.count_ops() <= LARGE else T)
+    terms = sp.Add.make_args(sp.expand_mul(T) if T.count_ops() <= MAX_SIMPLIFIED_OPERATIONS else T)
     term = next((x for x in terms if not _quadratic(x, velocities)), T)
     raise InputError(
         f"T: expected at most the second degree in the velocities {', '.join(map(str, velocities))}, "
@@ -74,8 +74,8 @@ def _check(T: sp.Expr, velocities: Sequence[sp.Symbol]) -> None:
 def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
     """Return whether an expression is of second degree at most: along random lines its third differences are zero."""
     probe = RandomEvaluation([x], velocities)
-    with mpmath.workdps(DIGITS):
-        for seed in range(_LINES):
+    with mpmath.workdps(PROBE_DIGITS):
+        for seed in range(_PROBE_LINES):
             start, way = probe.place(2 * seed), probe.place(2 * seed + 1)
             # Through velocities of both signs, where what has a kink shows it.
             places = ({c: y / 3 + s * way[c] if c in velocities else y for c, y in start.items()} for s in _STEPS)
@@ -83,20 +83,20 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
             if len(values) < len(_STEPS):
                 continue
             third = sum(k * value for k, value in zip((1, -3, 3, -1), values, strict=True))
-            if abs(third) > _ROUNDED * max(abs(value) for value in values):
+            if abs(third) > _ZERO_AT_30_DIGITS * max(abs(value) for value in values):
                 return False
     return True
 
 
-# Whether every motion has kinetic energy, or is bound by a constraint.
+# The test that every motion has kinetic energy, or is bound by a constraint.
 
-_PLACES: Final = 3
-#: Of its largest eigenvalue, what rounding leaves of one that is zero.
-_NEGATIVE: Final = 1e-12
-#: How much nearer to zero coordinates are at every other place.
-_NEAR: Final = 1e-3
-#: Letters of a matrix that a message shows.
-_SHOWN: Final = 200
+_PROBE_PLACES: Final = 3
+#: An eigenvalue is zero, and not negative, within this part of the largest one.
+_ZERO_EIGENVALUE_RATIO: Final = 1e-12
+#: Coordinates at every other place are nearer to zero by this factor.
+_NEAR_ZERO_FACTOR: Final = 1e-3
+#: Characters of a matrix that a message shows.
+_MAX_MESSAGE_LENGTH: Final = 200
 
 
 def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: sp.ImmutableMatrix) -> None:
@@ -111,12 +111,12 @@ def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: s
         names = ", ".join(w.name for w in idle)
         raise InputError(f"T: the mass matrix is singular everywhere: no kinetic energy has {names}{bound}")
     probe = RandomEvaluation([*M, *J])
-    for seed in range(_PLACES):
+    for seed in range(_PROBE_PLACES):
         values = probe(probe.place(seed))
         if values is None:
             # No judgement where it has no value.
             return
-        with mpmath.workdps(DIGITS):
+        with mpmath.workdps(PROBE_DIGITS):
             A = mpmath.matrix(n, n)
             for i, j in product(range(n), repeat=2):
                 pulls = (mpmath.conj(values[k + i]) * values[k + j] for k in range(n * n, len(values), n))
@@ -127,9 +127,9 @@ def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: s
                 scale = mpmath.diag([1 / mpmath.sqrt(x) for x in rows])
                 scaled = scale * A * scale
                 sizes = (mpmath.norm(scaled[i, :]) for i in range(n))
-                if abs(mpmath.det(scaled)) > _ROUNDED * mpmath.fprod(sizes):
+                if abs(mpmath.det(scaled)) > _ZERO_AT_30_DIGITS * mpmath.fprod(sizes):
                     return
-    matrix = f" {M.tolist()}" if len(str(M)) <= _SHOWN else ""
+    matrix = f" {M.tolist()}" if len(str(M)) <= _MAX_MESSAGE_LENGTH else ""
     raise InputError(
         f"T: its mass matrix{matrix} is singular everywhere: {_unmoved(A, velocities)} can change without kinetic "
         "energy; a velocity is missing, or there is a coordinate too many"
@@ -154,14 +154,14 @@ def warn_of_negative(
     if None in held.values():
         return
     probe, n, way = RandomEvaluation([*M]), len(velocities), None
-    for seed in range(2 * _PLACES):
+    for seed in range(2 * _PROBE_PLACES):
         # Small deflections too: what holds for these alone, as of beams, may be negative far away.
-        near = {s: x * _NEAR ** (seed % 2) for s, x in probe.place(seed).items()}
+        near = {s: x * _NEAR_ZERO_FACTOR ** (seed % 2) for s, x in probe.place(seed).items()}
         found = probe({**near, **{s: mpmath.mpf(x) for s, x in held.items()}})
         if found is None or any(mpmath.im(x) for x in found):
             return
         sizes, ways = np.linalg.eigh(np.array(found, dtype=float).reshape(n, n))
-        if sizes[0] >= -_NEGATIVE * abs(sizes[-1]):
+        if sizes[0] >= -_ZERO_EIGENVALUE_RATIO * abs(sizes[-1]):
             return
         way = ways[:, 0]
     names = [w.name for w, x in zip(velocities, way, strict=True) if abs(x) > 1e-6]  # type: ignore[arg-type]
@@ -171,7 +171,7 @@ def warn_of_negative(
 # The inverse of a matrix in symbols, block by block.
 
 # Above this size cofactors grow faster than elimination does.
-_BY_COFACTORS: Final = 4
+_MAX_COFACTOR_ROWS: Final = 4
 
 
 def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
@@ -183,7 +183,7 @@ def inverse(A: Any, what: str) -> sp.ImmutableMatrix:
         det = settled(part.det(method="berkowitz"))
         if det == 0:
             raise InputError(f"{what}: {part.tolist()} is singular everywhere")
-        if len(block) <= _BY_COFACTORS:
+        if len(block) <= _MAX_COFACTOR_ROWS:
             turned = part.adjugate(method="berkowitz") / det
         else:
             turned = part.LUsolve(sp.eye(len(block)))
@@ -211,7 +211,7 @@ def blocks(A: sp.Matrix) -> list[list[int]]:
 # where entries of M⁻¹ would be long. A pivot that is a product leaves the shortest quotients.
 
 #: Operations up to which a step of an elimination is tidied.
-_LONG: Final = 250
+_MAX_TIDIED_OPERATIONS: Final = 250
 
 
 def completed_squares(M: sp.ImmutableMatrix, what: str) -> _Eliminated | _Inverted:
@@ -224,7 +224,7 @@ def completed_squares(M: sp.ImmutableMatrix, what: str) -> _Eliminated | _Invert
 
 def _shorter(x: sp.Expr) -> sp.Expr:
     """Return an expression tidied; a long one as it is."""
-    return tidy(x) if x.count_ops() <= _LONG else x
+    return tidy(x) if x.count_ops() <= _MAX_TIDIED_OPERATIONS else x
 
 
 class _NoPivotError(Exception):
@@ -237,7 +237,7 @@ class _Eliminated:
     def __init__(self, M: sp.ImmutableMatrix) -> None:
         left = list(range(M.shape[0]))
         entries = {(i, j): M[i, j] for i in left for j in left}
-        #: Of each pivot: its index, its D, and how much of its row goes off each later one.
+        #: Each pivot's index, its D, and the multiple of its row that is subtracted from each later one.
         self._steps: list[tuple[int, sp.Expr, dict[int, sp.Expr]]] = []
         while left:
             pivots = {i: entries[i, i] for i in left if entries[i, i] != 0}

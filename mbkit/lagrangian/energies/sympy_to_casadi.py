@@ -32,7 +32,7 @@ _COMPARED: Final[dict[Any, Callable[[Any, Any], Any]]] = {
 
 
 class Conversion:
-    """From SymPy to CasADi, each subexpression once; `number` returns what stands for a float, maybe a symbol."""
+    """Translates SymPy to CasADi, each subexpression once; `number` returns the number or symbol for a float."""
 
     def __init__(self, symbols: Mapping[sp.Symbol, Any], number: Callable[[float], Any]) -> None:
         self._done: dict[Any, Any] = dict(symbols)

@@ -32,7 +32,7 @@ _SYMBOLS: Final = {
     "inner_inertia=A_i,B_i,C_i outer_inertia=J_o",
     "slider_crank": "crank=L1 rod=L2 crank_mass=m1 rod_mass=m2 piston_mass=m3",
 }
-#: Of coordinates that the catalog calls by a word.
+#: Symbols of coordinates that the catalog calls by a word.
 _LETTERS: Final = {
     "elastic_pendulum": ("theta", "s"),
     "furuta_pendulum": ("alpha", "theta"),
@@ -41,7 +41,7 @@ _LETTERS: Final = {
 _LETTER: Final = re.compile(r"([A-Za-z]|alpha|beta|gamma|delta|theta|phi|psi)(_?\d+)?")
 _USUAL: Final = {"gravity": "g", "mass": "m", "length": "l", "stiffness": "k", "damping": "d", "inertia": "J"}
 #: Two descriptions are the same where their numbers differ by rounding only.
-_SAME: Final = 1e-13
+_EQUAL_NUMBERS_RATIO: Final = 1e-13
 
 
 def in_symbols(model: Model) -> Model | None:
@@ -62,10 +62,15 @@ def in_symbols(model: Model) -> Model | None:
             values = _solved(symbolic, model)
             moved = symbolic.with_nominal(values)
             pairs = zip(_content(moved)[1], numbers, strict=True)
-            if all(np.allclose(x, y, rtol=_SAME, atol=_SAME * float(np.abs(y).max(initial=0.0))) for x, y in pairs):
+            if all(
+                np.allclose(
+                    x, y, rtol=_EQUAL_NUMBERS_RATIO, atol=_EQUAL_NUMBERS_RATIO * float(np.abs(y).max(initial=0.0))
+                )
+                for x, y in pairs
+            ):
                 zeros = {name: 0.0 for name, x in values.items() if x == 0.0}
                 named = moved.with_parameters(**zeros) if zeros else moved
-                # What the catalog's system does not have, such as forces, is the model's own.
+                # Parts that the catalog's system lacks, such as forces, are the model's own.
                 return replace(model, bindings=tuple(b for b in named.bindings if b.where != "frames"))
             return None
     return None
@@ -78,7 +83,7 @@ def letters(model: Model) -> list[str] | None:
         return None
     if model.name in _LETTERS and len(_LETTERS[model.name]) == len(own):
         return list(_LETTERS[model.name])
-    # Of a joint with several coordinates, such as hub.x, the last part may be one.
+    # The last part of a name such as hub.x, of a joint with several coordinates, may be a symbol.
     tails = [n.rpartition(".")[2] for n in own]
     known = {t for t in tails if _LETTER.fullmatch(t) and tails.count(t) == 1 and not t.startswith("q")}
     numbers = count(1)
@@ -162,7 +167,7 @@ def _solved(symbolic: Model, model: Model) -> dict[str, float]:
 def _rounded(x: float) -> float:
     """Return the shorter decimal where a number is one to rounding."""
     short = float(f"{x:.12g}")
-    return short if abs(short - x) <= _SAME * abs(x) else x
+    return short if abs(short - x) <= _EQUAL_NUMBERS_RATIO * abs(x) else x
 
 
 def _evaluated(expression: Expression, values: Mapping[str, float]) -> float:

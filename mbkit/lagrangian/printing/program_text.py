@@ -30,9 +30,9 @@ from mbkit.model.elements.kinds import that_do
 
 PROGRAM: Final = replace(C_CODE, name="program", words="program: not known of")
 #: Operations of a term from which on it gets a name of its own: a line of text has some 100 letters.
-_LONG: Final = 10
-_WIDTH: Final = 100
-_DIGITS: Final = 6
+_MIN_NAMED_OPERATIONS: Final = 10
+TEXT_WIDTH: Final = 100
+_PRINTED_DIGITS: Final = 6
 #: Keywords of C, and functions that its lines call.
 _C_WORDS: Final = {*C99CodePrinter().reserved_words, *(SYMPY.operations.keys() & dir(math)), "fmin", "fmax"}
 
@@ -80,10 +80,10 @@ class ProgramText(Printable):
     def __str__(self) -> str:
         board, lines = ExpressionPrinter(), []
         for left, right in self._pairs():
-            lines += folded(f"{left} = {board.text(_rounded(right))}", _WIDTH)
+            lines += folded(f"{left} = {board.text(_rounded(right))}", TEXT_WIDTH)
         head = f"{self.quantity} of {self.model}: {self.operations} operations, {len(self.terms)} named terms"
         notes = [f"note: {one_line(self.note)}"] if self.note else []
-        return terminal("\n".join([f"{one_line(head)}; numbers to {_DIGITS} digits", *notes, *lines]))
+        return terminal("\n".join([f"{one_line(head)}; numbers to {_PRINTED_DIGITS} digits", *notes, *lines]))
 
     def latex(self) -> str:
         """Return an aligned LaTeX block, numbers to 6 digits."""
@@ -123,7 +123,7 @@ class ProgramText(Printable):
 
 
 def _rounded(x: sp.Expr) -> sp.Expr:
-    short = {f: float(f"{float(f):.{_DIGITS}g}") for f in x.atoms(sp.Float)}
+    short = {f: float(f"{float(f):.{_PRINTED_DIGITS}g}") for f in x.atoms(sp.Float)}
     # A product keeps a factor 1.0, and drops 1.
     return x.xreplace({f: sp.Integer(int(y)) if abs(y) == 1 else sp.Float(y) for f, y in short.items()})
 
@@ -182,7 +182,7 @@ def program(model: Model, quantity: str = "inverse_dynamics") -> ProgramText:
         turned = isinstance(x, (sp.sin, sp.cos)) and x.args[0] in named.get("q", ())
         if turned:
             x = called(x, f"{'s' if isinstance(x, sp.sin) else 'c'}{named['q'].index(x.args[0]) + 1}")
-        elif not x.is_Atom and not (-x).is_Atom and (uses[k] > 1 or x.count_ops() >= _LONG):
+        elif not x.is_Atom and not (-x).is_Atom and (uses[k] > 1 or x.count_ops() >= _MIN_NAMED_OPERATIONS):
             x = called(x, f"x{next(numbered)}")
         known.append(x)
     (shape,), (out,) = operations.shapes, operations.outputs

@@ -19,11 +19,11 @@ from mbkit.lagrangian.system import Lagrangian
 from mbkit.model.elements.paths import ALL, Path
 
 #: Operations of T above which C and the equations are left out of a page.
-_READABLE: Final = 1500
+_MAX_FULL_PAGE_OPERATIONS: Final = 1500
 #: And above which M is.
-_WRITTEN: Final = 6000
+_MAX_MATRIX_OPERATIONS: Final = 6000
 #: Letters above which a conserved quantity is only named.
-_LONG: Final = 800
+_MAX_CONSERVED_LENGTH: Final = 800
 
 
 class SystemSummary:
@@ -42,7 +42,7 @@ class SystemSummary:
     ) -> None:
         self.system, self._names, self._progress, self._note = system, dict(names or {}), progress, one_line(note)
         self._size = int(system.T.count_ops())
-        self.long = self._size > _READABLE
+        self.long = self._size > _MAX_FULL_PAGE_OPERATIONS
 
     @cached_property
     def equations(self) -> EquationsOfMotion:
@@ -119,7 +119,7 @@ class SystemSummary:
         for letter, root in self._short.roots.items():
             out.append(f"with {board.text(letter)} = {board.text(root)}")
         for name, (A, meaning) in self._matrices.items():
-            if name == "M" and self._size > _WRITTEN:
+            if name == "M" and self._size > _MAX_MATRIX_OPERATIONS:
                 out += ["", f"M is too long for a page as well; its size is {A.rows} by {A.cols}."]
                 continue
             out += ["", f"{name}, {meaning}:", *matrix(name, A.applyfunc(self._short), board.text, width)]
@@ -153,7 +153,7 @@ class SystemSummary:
             # T and V stand above.
             text = "T + V" if x == self.system.T + self.system.V else self._board.text(self._short(x))
             note = f" ({meaning})" if name == "h" else ""
-            if len(text) > _LONG:
+            if len(text) > _MAX_CONSERVED_LENGTH:
                 text, note = "∂T/∂v" if name != "h" else "T2 - T0 + V", ", too long for a page"
             out += folded(f"Conserved: {written(name)} = {text}{note}", width)
         return out

@@ -39,7 +39,7 @@ from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.trig.simplify import is_zero, slope, tidy
 
 # Operations up to which a bracket is tidied.
-_SHORT: Final = 100
+_MAX_TIDIED_OPERATIONS: Final = 100
 #: Meaning of h where it is not the energy.
 _JACOBI: Final = "Jacobi's integral T2 - T0 + V, not the energy T + V"
 
@@ -151,7 +151,7 @@ def shorter(x: sp.Expr) -> sp.Expr:
     """Return a short bracket tidied, and a long one as it is unless it is zero: nested ones grow fast."""
     if is_zero(x):
         return sp.Integer(0)
-    return tidy(x) if x.count_ops() <= _SHORT else x
+    return tidy(x) if x.count_ops() <= _MAX_TIDIED_OPERATIONS else x
 
 
 @dataclass(frozen=True, repr=False)

@@ -48,12 +48,20 @@ from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
 from mbkit.lagrangian.reduction.hamilton import ConservedQuantity, numbers_at
 from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
-from mbkit.lagrangian.trig.simplify import DIGITS, RandomEvaluation, is_zero, settled, settled_matrix, tidy, tidy_matrix
+from mbkit.lagrangian.trig.simplify import (
+    PROBE_DIGITS,
+    RandomEvaluation,
+    is_zero,
+    settled,
+    settled_matrix,
+    tidy,
+    tidy_matrix,
+)
 
 #: Choices of dependent velocities that are looked at.
-_CHOICES: Final = 200
-#: Of 30 digits, what is left of a singular value that is zero.
-_ROUNDED: Final = 1e-15
+_MAX_CHOICES: Final = 200
+#: A singular value computed with 30 digits is zero below this part of the largest one.
+_ZERO_SINGULAR_VALUE_RATIO: Final = 1e-15
 
 
 @dataclass(frozen=True, repr=False)
@@ -248,7 +256,7 @@ def _simplest(system: EnergyForm, A: sp.ImmutableMatrix) -> list[int]:
         det = tidy(A[:, list(dependent)].det(method="berkowitz"))
         return is_zero(det), bool(det.free_symbols & moving), det.count_ops(), dependent
 
-    best = min((_dependent(system, A), *islice(combinations(range(n), A.rows), _CHOICES)), key=price)
+    best = min((_dependent(system, A), *islice(combinations(range(n), A.rows), _MAX_CHOICES)), key=price)
     return [i for i in range(n) if i not in best]
 
 
@@ -326,7 +334,7 @@ def _maggi(system: EnergyForm, frame: _Frame, motion: _Motion) -> dict[str, Any]
     N, w = frame.N, frame.velocities
     M = motion.equations.mass_matrix
     slow = dict(zip(system.velocities, N * sp.Matrix(w), strict=True))
-    # Of what N w alone does: the rest, of drifts and of the time, is d.
+    # The part of N w alone; the rest, of drifts and of the time, is d.
     turning = sum((sp.diff(N, q) * slow[v] for q, v in zip(system.coordinates, system.velocities, strict=True)), 0 * N)
     C = settled_matrix(N.T * (M * turning + motion.equations.coriolis_matrix.subs(slow, simultaneous=True) * N), w)
     rest = sp.zeros(len(w), 1)
@@ -344,7 +352,7 @@ def _appell(system: EnergyForm, frame: _Frame, motion: _Motion) -> dict[str, Any
     M = settled_matrix(slopes.jacobian(motion.accelerations))
     at_rest = settled_matrix(slopes.subs(dict.fromkeys(motion.accelerations, 0)), w)
     d = settled_matrix(at_rest - C * sp.Matrix(w), w)
-    # Of the shortest parts.
+    # Built from the shortest parts.
     S = tidy((wdot.T * M * wdot)[0] / 2) + tidy((wdot.T * at_rest)[0])
     return {"form": "Gibbs and Appell", "mass_matrix": M, "coriolis_matrix": C, "drift": d, "S": S}
 
@@ -370,12 +378,12 @@ def _hamel(system: EnergyForm, frame: _Frame, _: _Motion) -> dict[str, Any]:
     return {"form": "Boltzmann and Hamel", "mass_matrix": M, "coriolis_matrix": C, "drift": d}
 
 
-# Which rows are integrable
+# Integrable rows
 
 
 @dataclass(frozen=True, repr=False)
 class Integrability(Printable):
-    """Which velocity constraints follow from functions of the coordinates, by Frobenius' theorem.
+    """The velocity constraints that follow from functions of the coordinates, by Frobenius' theorem.
 
     Attributes
     ----------
@@ -452,7 +460,7 @@ def integrability(system: EnergyForm) -> Integrability:
 
 def _kernel(A: sp.ImmutableMatrix) -> list[sp.Matrix]:
     n = A.cols
-    choices = dict.fromkeys((_places(A), *islice(combinations(range(n), A.rows), _CHOICES)))
+    choices = dict.fromkeys((_places(A), *islice(combinations(range(n), A.rows), _MAX_CHOICES)))
     priced = ((tidy(A[:, list(c)].det(method="berkowitz")), c) for c in choices)
     det, dependent = min(((d, c) for d, c in priced if not is_zero(d)), key=lambda x: (x[0].count_ops(), x[1]))
     block, out = A[:, list(dependent)], []
@@ -490,13 +498,13 @@ def _rank(columns: Sequence[sp.Matrix]) -> int:
         values = probe(probe.place(seed))
         if values is None:
             continue
-        with mpmath.workdps(DIGITS):
+        with mpmath.workdps(PROBE_DIGITS):
             B = mpmath.matrix(whole.rows, whole.cols)
             for i in range(whole.rows):
                 for j in range(whole.cols):
                     B[i, j] = values[i * whole.cols + j]
             sizes = [abs(x) for x in mpmath.svd_c(B, compute_uv=False)]
-            best = max(best, sum(x > _ROUNDED * max(sizes) for x in sizes))
+            best = max(best, sum(x > _ZERO_SINGULAR_VALUE_RATIO * max(sizes) for x in sizes))
     return best
 
 

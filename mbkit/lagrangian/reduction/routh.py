@@ -96,7 +96,7 @@ class Routhian(Printable, Generic[FormT]):
 
     @cached_property
     def _places(self) -> tuple[list[int], list[int]]:
-        """Where the remaining and the ignored coordinates stand in the whole system."""
+        """Indices of the remaining and the ignored coordinates in the whole system."""
         whole = self.system.coordinates
         return [whole.index(q) for q in self.lagrangian.coordinates], [whole.index(q) for q in self.cyclic]
 
@@ -259,9 +259,9 @@ def _need_not(ignored: list[sp.Symbol], x: sp.Expr, what: str) -> None:
 # ignored coordinates as further states. What each adds is then summed.
 
 # SciPy's limit is 100 eps; the norm is a mean over all intervals.
-_TOLERANCE: Final = 1e-13
+_QUADRATURE_TOLERANCE: Final = 1e-13
 # The two starts are the same number, rounded apart.
-_SAME: Final = 1e-9
+_START_DIFFERENCE_RATIO: Final = 1e-9
 
 
 def _read(
@@ -308,7 +308,7 @@ def _start(routhian: Routhian[Any], q0: ArrayLike, q: Array) -> Array:
     if len(start) < whole:
         return start
     off = float(np.abs(start[kept] - q[0]).max())
-    if off > _SAME * (1 + float(np.abs(q[0]).max())):
+    if off > _START_DIFFERENCE_RATIO * (1 + float(np.abs(q[0]).max())):
         names = ", ".join(x.name for x in routhian.lagrangian.coordinates)
         raise InputError(f"q0: its {names} differ from the run's first state by {off:.3g}")
     return start[ignored]
@@ -331,7 +331,7 @@ def _increments(routhian: Routhian[Any], t: Array, q: Array, v: Array, numbers: 
 
     start = np.concatenate([q[:-1], v[:-1], np.zeros((len(spans), m))], axis=1).ravel()
     # A mean over N numbers hides one that is √N times as wrong.
-    tight = max(_TOLERANCE / np.sqrt(len(spans)), 3e-14)
+    tight = max(_QUADRATURE_TOLERANCE / np.sqrt(len(spans)), 3e-14)
     solution = solve_ivp(field, (0.0, 1.0), start, "DOP853", t_eval=[1.0], rtol=tight, atol=tight)
     if not solution.success or not np.isfinite(solution.y).all():
         name = routhian.lagrangian.name

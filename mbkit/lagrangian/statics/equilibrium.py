@@ -30,29 +30,29 @@ from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.parts import read_only
 
-#: Of the forces that balance: what rounding leaves of them.
-_BALANCED: Final = 1e-11
-#: Of the largest force, what rounding leaves of one that cancels, over the part above.
-_CANCELS: Final = 1e-3
+#: Forces balance when their sum is below this part of them.
+_BALANCE_RATIO: Final = 1e-11
+#: Forces of a row count as at least this part of the largest row's, whose rounding reaches it.
+_CANCELLED_FORCE_RATIO: Final = 1e-3
 # Random starts, and steps from each.
-_STARTS: Final = 30
-_MOST: Final = 200
-#: Halvings of a start from which a search ends nowhere.
-_NEARER: Final = 12
+_RANDOM_STARTS: Final = 30
+_MAX_NEWTON_ITERATIONS: Final = 200
+#: Halvings of a start from which the search finds nothing.
+_START_HALVINGS: Final = 12
 # rad or m: a neighbourhood, in which stiffness that vanishes at a threshold does not.
-_ASIDE: Final = 0.1
+_NEIGHBOUR_DISTANCE: Final = 0.1
 #: Step of differences of fourth order, whose error is far below half of the digits.
-_STEP: Final = float(np.finfo(float).eps) ** 0.2
+_DIFFERENCE_STEP: Final = float(np.finfo(float).eps) ** 0.2
 #: s: when a system that depends on the time is looked at again, and what may differ then.
 _LATER: Final = (0.7310585786300049, 2.0178)
-_SAME: Final = 1e-9
-#: Part of the terms of an exact derivative, and of differences, that rounding leaves.
-_EXACT: Final = 8 * float(np.finfo(float).eps)
-_DIFFERENCES: Final = 8 * float(np.finfo(float).eps) ** 0.8
+_EQUAL_STATES_RATIO: Final = 1e-9
+#: Rounding of an exact derivative, and of differences, relative to their terms.
+_EXACT_ERROR_RATIO: Final = 8 * float(np.finfo(float).eps)
+_DIFFERENCE_ERROR_RATIO: Final = 8 * float(np.finfo(float).eps) ** 0.8
 
 
 def _driven(model: Model) -> Iterator[str]:
-    # What depends on the time may still leave a system at rest, which the search finds out.
+    # Forces of the time may still leave a system at rest, which the search finds out.
     if model.constraints_do_work and model.time_parameter is None:
         yield "its constraints prescribe a speed, at which nothing rests"
 
@@ -207,11 +207,13 @@ def equilibrium(
         if q0 is not None:
             starts = [balance.allowed(model.check_q(finite_array("q0", q0, (model.nq,)), "q0"))]
             # Far out a force fades, and the search runs away from where it balances.
-            starts += [] if model.has_bodies or model.constrained else [starts[0] / 2**k for k in range(1, _NEARER)]
+            starts += (
+                [] if model.has_bodies or model.constrained else [starts[0] / 2**k for k in range(1, _START_HALVINGS)]
+            )
         else:
             rng = generator("seed", seed)
-            starts = [model.random_state(rng)[0] for _ in range(_STARTS)]
-            # From the neutral configuration there need be no way to the constraints.
+            starts = [model.random_state(rng)[0] for _ in range(_RANDOM_STARTS)]
+            # Newton's iteration may not reach the constraints from the neutral configuration.
             starts[:0] = [] if model.constrained else [model.neutral()]
         q, multipliers = balance.at_rest(starts, acting)
     motion = balance.small_motion(q, acting, multipliers)
@@ -243,7 +245,7 @@ class _Balance:
         self._manifold: Any = manifold_of(dyn).at(t) if self.model.constrained else None
         self._zero, self._unit = np.zeros(self.model.nv), np.eye(self.model.nv)
 
-    # What balances
+    # Balance
 
     def load(self, q: Array) -> Array:
         """Return nle - τ_passive - Σ J_Fᵀ F at rest: the force to be held, (nv,)."""
@@ -305,7 +307,7 @@ class _Balance:
     def _stiffness(self, q: Array) -> Array:
         """Return ∂load/∂q along the manifold, (nv, nv)."""
         if not isinstance(self.dyn, LagrangianDynamics):
-            return self._slopes(lambda u: self.load(self.model.integrate(q, u)), _STEP)
+            return self._slopes(lambda u: self.load(self.model.integrate(q, u)), _DIFFERENCE_STEP)
         K = np.asarray(self.dyn.inverse_dynamics_derivatives(q, self._zero, self._zero).q)
         if self._wrenches:
 
@@ -313,14 +315,14 @@ class _Balance:
                 there = self.model.integrate(q, u)
                 return np.asarray(-sum(self.dyn.jacobian(there, n).T @ w for n, w in self._wrenches.items()))
 
-            K = K + self._slopes(loads, _STEP)
+            K = K + self._slopes(loads, _DIFFERENCE_STEP)
         return K
 
     def _damping(self, q: Array) -> Array:
         """Return ∂(inverse dynamics)/∂v at rest."""
         if isinstance(self.dyn, LagrangianDynamics):
             return np.asarray(self.dyn.inverse_dynamics_derivatives(q, self._zero, self._zero).v)
-        # Of a quadratic differences are exact, and those of two speeds leave out what jumps.
+        # Differences of a quadratic are exact, and those of two speeds leave jumps out.
         change = (
             np.array([self.dyn.inverse_dynamics(q, s * e, self._zero) for s in (2, -2, 1, -1)]) for e in self._unit
         )
@@ -364,11 +366,11 @@ class _Balance:
         nv, multipliers = self.model.nv, self.multipliers(q, tau)
         r = self.residual(q, multipliers, tau)
         damping, size = 0.0, float(np.linalg.norm(r))
-        for _ in range(_MOST):
+        for _ in range(_MAX_NEWTON_ITERATIONS):
             own, left = self._left(r, q, tau)
             if own <= 1e-3 or size == 0.0:
                 break
-            # What is little beside a stiff direction may be much of a soft one: on, as long as it gets less.
+            # A remainder that is small beside a stiff direction may be large in a soft one: on, while it gets less.
             K = self._whole_stiffness(q, multipliers)
             if self._manifold is not None:
                 J = self._manifold.jacobian(q)
@@ -393,8 +395,8 @@ class _Balance:
     def _left(self, r: Array, q: Array, tau: Array) -> tuple[float, float]:
         """Return the residual relative to its rounding: of the forces of each row, and beside those of all rows."""
         rows = self.scale(q, tau)[: len(r)]
-        beside = np.maximum(rows, _CANCELS * rows.max(initial=0.0))
-        own, left = (float((np.abs(r) / (_BALANCED * x)).max(initial=0.0)) for x in (rows, beside))
+        beside = np.maximum(rows, _CANCELLED_FORCE_RATIO * rows.max(initial=0.0))
+        own, left = (float((np.abs(r) / (_BALANCE_RATIO * x)).max(initial=0.0)) for x in (rows, beside))
         return own, left
 
     # Small motions
@@ -418,17 +420,25 @@ class _Balance:
 
     def _errors(self, q: Array, multipliers: Array, M: Array, D: Array, K: Array) -> tuple[Array, Array, Array]:
         """Return bounds of the errors of M, D and K, entry by entry."""
-        places = [self.model.integrate(q, s * np.ones(self.model.nv)) for s in (-_ASIDE, _ASIDE)]
+        places = [
+            self.model.integrate(q, s * np.ones(self.model.nv)) for s in (-_NEIGHBOUR_DISTANCE, _NEIGHBOUR_DISTANCE)
+        ]
         # Terms that cancel here do not beside it: their size is the curvature of their sum.
-        terms = np.abs([K, *((self._whole_stiffness(p, multipliers) - K) / _ASIDE**2 for p in places)]).sum(axis=0)
+        terms = np.abs(
+            [K, *((self._whole_stiffness(p, multipliers) - K) / _NEIGHBOUR_DISTANCE**2 for p in places)]
+        ).sum(axis=0)
         M, D = np.abs(M), np.abs(D)
         if self.model.has_bodies:
             # Sums over bodies round by what they add in other rows and columns too.
             terms += np.where(self._unit, 0.0, np.maximum(terms.max(axis=0), terms.max(axis=1)[:, None]))
         if isinstance(self.dyn, LagrangianDynamics):
-            return _EXACT * M, _EXACT * D, _EXACT * terms
-        loads = np.max([np.abs(self.load(p)) for p in (q, *places)], axis=0)[:, None] / _ASIDE
-        return _EXACT * M, _EXACT * (D + loads + M.max(axis=1, keepdims=True)), _DIFFERENCES * (terms + loads)
+            return _EXACT_ERROR_RATIO * M, _EXACT_ERROR_RATIO * D, _EXACT_ERROR_RATIO * terms
+        loads = np.max([np.abs(self.load(p)) for p in (q, *places)], axis=0)[:, None] / _NEIGHBOUR_DISTANCE
+        return (
+            _EXACT_ERROR_RATIO * M,
+            _EXACT_ERROR_RATIO * (D + loads + M.max(axis=1, keepdims=True)),
+            _DIFFERENCE_ERROR_RATIO * (terms + loads),
+        )
 
     def _linear(self, q: Array, multipliers: Array) -> list[Array]:
         """Return M, D and K of what the constraints leave free."""
@@ -451,13 +461,15 @@ class _Balance:
             later = _Balance(self._whole, self._wrenches, t)
             theirs = later.multipliers(q, tau)
             left = np.abs(later.residual(q, theirs, tau))
-            if (left > _SAME * (1 + later.scale(q, tau)[: len(left)])).any():
+            if (left > _EQUAL_STATES_RATIO * (1 + later.scale(q, tau)[: len(left)])).any():
                 raise InputError(
                     f"dynamics: {self.model.name} depends on the time {self.model.time_parameter}, which moves it; "
                     "there is no equilibrium of such a system"
                 )
             pairs = zip(now, later._linear(q, theirs), strict=True)
-            differs = differs or any(np.abs(a - b).max(initial=0.0) > _SAME * (1 + np.abs(a).max()) for a, b in pairs)
+            differs = differs or any(
+                np.abs(a - b).max(initial=0.0) > _EQUAL_STATES_RATIO * (1 + np.abs(a).max()) for a, b in pairs
+            )
         return differs
 
 

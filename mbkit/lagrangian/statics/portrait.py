@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_POINTS: Final = 241
-_CURVES: Final = 14
-_DENSITY: Final = 1.4
+_GRID_POINTS: Final = 241
+_ENERGY_LEVELS: Final = 14
+_STREAM_DENSITY: Final = 1.4
 
 
 def portrait(
@@ -63,7 +63,7 @@ def portrait(
     for name, (low, high) in zip("qv", bounds, strict=True):
         if low >= high:
             raise InputError(f"{name}: expected bounds that increase, got {low:g} and {high:g}")
-    Q, W = np.meshgrid(*(np.linspace(low, high, _POINTS) for low, high in bounds))
+    Q, W = np.meshgrid(*(np.linspace(low, high, _GRID_POINTS) for low, high in bounds))
     numbers = parameter_values(form, values, "portrait")
 
     def on(x: sp.Expr, at: Array, speed: Array) -> Array:
@@ -74,7 +74,7 @@ def portrait(
 
     e = form.equations()
     rate = e.applied[0].subs(dict.fromkeys(form.inputs.values(), 0)) / e.mass_matrix[0]
-    rests = _rests(Q[0], on(rate, Q[0], np.zeros(_POINTS)))
+    rests = _rests(Q[0], on(rate, Q[0], np.zeros(_GRID_POINTS)))
     slopes = on(sp.diff(rate, form.coordinates[0]), rests, np.zeros(len(rests)))
     conserved = not any(x.free_symbols - set(form.inputs.values()) for x in acting_forces(form))
     if ax is not None and not hasattr(ax, "contour"):
@@ -86,13 +86,13 @@ def portrait(
     ax = ax or _axes()
     if conserved:
         h = drawn
-        levels = np.unique(np.quantile(h[np.isfinite(h)], np.linspace(0.0, 0.97, _CURVES)))
+        levels = np.unique(np.quantile(h[np.isfinite(h)], np.linspace(0.0, 0.97, _ENERGY_LEVELS)))
         ax.contour(Q, W, h, levels, colors="C0", linewidths=0.9, linestyles="solid")
         saddles = np.unique(on(form.energy_function, rests[slopes > 0], np.zeros(int((slopes > 0).sum()))))
         if len(saddles):
             ax.contour(Q, W, h, saddles, colors="C3", linewidths=1.2, linestyles="dashed")
     else:
-        ax.streamplot(Q[0], W[:, 0], W, drawn, density=_DENSITY, color="C0", linewidth=0.9, arrowsize=0.8)
+        ax.streamplot(Q[0], W[:, 0], W, drawn, density=_STREAM_DENSITY, color="C0", linewidth=0.9, arrowsize=0.8)
     for stable, filled in ((True, "C0"), (False, "none")):
         there = rests[(slopes < 0) == stable]
         ax.plot(there, 0 * there, "o", markerfacecolor=filled, markeredgecolor="C0" if stable else "C3")

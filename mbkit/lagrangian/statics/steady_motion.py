@@ -25,9 +25,9 @@ from mbkit.lagrangian.statics.equilibrium import Equilibrium, equilibrium
 from mbkit.lagrangian.system import Lagrangian
 
 #: Condition of the scaled mass matrix of cyclic coordinates; its square times eps is the error of the stiffness.
-_POLE: Final = 1e5
-#: From a place to those beside it, of a coordinate's size.
-_BESIDE: Final = 1e-3
+_SINGULAR_CONDITION: Final = 1e5
+#: Distance to neighbouring places, relative to a coordinate's size.
+_NEIGHBOUR_RATIO: Final = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ def steady_motion(
     q, v = np.zeros(len(system.coordinates)), np.zeros(len(system.coordinates))
     q[kept], v[cyclic] = rest.q, turning
     if turning.any():
-        steps = _BESIDE * np.diag(np.maximum(1.0, abs(q)))[kept]
+        steps = _NEIGHBOUR_RATIO * np.diag(np.maximum(1.0, abs(q)))[kept]
         beside = np.concatenate([[q], q + steps, q - steps])
         _refuse_pole(_at(system, values).mass_matrix(beside)[:, cyclic][:, :, cyclic], reduced, rest.q)
     told = {s.name: float(x) for s, x in zip(reduced.cyclic, turning, strict=True)}
@@ -155,14 +155,18 @@ def _refuse_pole(beside: Array, reduced: Routhian[Any], q: Array) -> None:
     `beside` are the mass matrices of cyclic coordinates there, first, and at places beside it.
     """
     M, around = beside[0], np.diagonal(beside, axis1=1, axis2=2).max(axis=0)
-    still = [x.name for x, own, most in zip(reduced.cyclic, np.diag(M), around, strict=True) if own * _POLE**2 < most]
+    still = [
+        x.name
+        for x, own, most in zip(reduced.cyclic, np.diag(M), around, strict=True)
+        if own * _SINGULAR_CONDITION**2 < most
+    ]
     if still:
         raise NumericalError(
             f"{reduced.system.name}: {', '.join(still)} turns nothing at {np.array2string(q, precision=4)}, where the "
             "coordinates are singular and a rate says nothing; take other coordinates, or another q0"
         )
     scale = 1 / np.sqrt(np.diag(M))
-    if np.linalg.cond(scale[:, None] * M * scale) > _POLE:
+    if np.linalg.cond(scale[:, None] * M * scale) > _SINGULAR_CONDITION:
         names = ", ".join(x.name for x in reduced.cyclic)
         raise NumericalError(
             f"{reduced.system.name}: {names} turn about one axis at {np.array2string(q, precision=4)}, where terms of "

@@ -15,7 +15,7 @@ import sympy as sp
 from mbkit.errors import UnsupportedError
 
 #: Products of terms that one system may cost. A robot with six joints costs 10,000, a planar chain of 19 twice that.
-MOST: Final = 200_000
+MAX_TERM_PRODUCTS: Final = 200_000
 
 #: 0 for a cosine and 1 for a sine, whole multiples of the angles, exponents of the generators.
 Key = tuple[int, tuple[int, ...], tuple[int, ...]]
@@ -32,7 +32,7 @@ class TrigRing:
         name: str,
         angles: Sequence[sp.Expr],
         generators: Sequence[sp.Expr],
-        most: int = MOST,
+        most: int = MAX_TERM_PRODUCTS,
         instead: str = "shorten it",
     ) -> None:
         self.name, self.angles, self.generators = name, tuple(angles), tuple(generators)
@@ -206,7 +206,7 @@ def _put(
 # computed term by term, modulo sin² + cos² = 1 and without a search.
 
 #: Terms of a quotient that is useful.
-_MOST: Final = 400
+_MAX_QUOTIENT_TERMS: Final = 400
 
 #: Exponents of the z's and the generators -> a complex number of fractions.
 _Exponential = dict[tuple[int, ...], Any]
@@ -217,7 +217,7 @@ def quotient(above: TrigPolynomial, below: TrigPolynomial) -> TrigPolynomial | N
     if not above.terms or not below.terms:
         return None
     a, b = _exponential(above), _exponential(below)
-    # Of a product the least and the largest exponents add, of each variable by itself.
+    # The least and the largest exponents of each variable add in a product.
     spans = list(zip(zip(*a, strict=True), zip(*b, strict=True), strict=True))
     low, high = [min(x) - min(y) for x, y in spans], [max(x) - max(y) for x, y in spans]
     lead = max(b)
@@ -225,7 +225,7 @@ def quotient(above: TrigPolynomial, below: TrigPolynomial) -> TrigPolynomial | N
     while a:
         first = max(a)
         step = tuple(p - q for p, q in zip(first, lead, strict=True))
-        if any(not i <= e <= j for i, e, j in zip(low, step, high, strict=True)) or len(out) == _MOST:
+        if any(not i <= e <= j for i, e, j in zip(low, step, high, strict=True)) or len(out) == _MAX_QUOTIENT_TERMS:
             return None
         out[step] = factor = a[first] / b[lead]
         for exponents, value in b.items():

@@ -18,10 +18,10 @@ import sympy as sp
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing, gather
 
 #: Terms and angles up to which products of cosines and sines are looked for.
-_SMALL: Final = 60
-_ANGLES: Final = 4
+_MAX_PRODUCT_TERMS: Final = 60
+_MAX_PRODUCT_ANGLES: Final = 4
 #: Terms up to which a sum is tried to be a product of sums.
-_FACTORED: Final = 10
+_MAX_FACTORED_TERMS: Final = 10
 
 
 def complexity(x: sp.Expr) -> int:
@@ -71,7 +71,7 @@ def _joined(forms: Iterable[Form]) -> Form:
 def _split_off(x: TrigPolynomial) -> list[int]:
     """Return the angles that powers are tried of; none of a large sum."""
     angles = [i for i in range(len(x.space.angles)) if any(key[1][i] for key in x.terms)]
-    return angles if len(angles) <= _ANGLES and len(x.terms) <= _SMALL else []
+    return angles if len(angles) <= _MAX_PRODUCT_ANGLES and len(x.terms) <= _MAX_PRODUCT_TERMS else []
 
 
 def _fewest_terms(x: TrigPolynomial) -> Form:
@@ -99,7 +99,7 @@ class _Writer:
         for atoms, value in poly.items():
             turned = tuple(a for a in atoms if isinstance(a[0], (sp.sin, sp.cos)))
             by_angle.setdefault(turned, {})[atoms] = value
-        # Of equal forms the one whose cosines and sines stand by themselves.
+        # Among equally complex forms the one whose cosines and sines stand by themselves wins.
         tried = [sp.Add(*map(self._written, by_angle.values())), *([self._written(poly)] if self._whole else [])]
         return min(tried, key=complexity)
 
@@ -130,12 +130,12 @@ class _Writer:
         counts = Counter(a for atoms in poly for a, e in atoms if e > 0)
         most = max(counts.values(), default=0)
         shared = [a for a, n in counts.items() if n == most > 1]
-        if len(poly) > _FACTORED:
+        if len(poly) > _MAX_FACTORED_TERMS:
             shared = shared[:1]
         tried = [self._by_atom(poly, a) for a in shared] or [self._plain(poly)]
-        if 2 < len(poly) <= _FACTORED:
+        if 2 < len(poly) <= _MAX_FACTORED_TERMS:
             tried += product(poly, tried[0])
-        # Of equal forms the one that was combined most.
+        # Among equally complex forms the most combined one wins.
         return min(reversed(tried), key=complexity)
 
     def _plain(self, poly: Poly) -> sp.Expr:
@@ -216,8 +216,8 @@ def _power(k: int, kept: int) -> dict[tuple[int, int], int]:
 # Sums of products of atoms: what their terms share, and whether they are products of sums.
 
 #: Possible terms up to which a product of sums is looked for, and places at which it is ruled out first.
-_DENSE: Final = 50_000
-_PROBES: Final = 4
+_MAX_DENSE_TERMS: Final = 50_000
+_PROBE_PLACES: Final = 4
 
 #: A product of powers of atoms -> its coefficient.
 Poly = dict[tuple[tuple[sp.Expr, int], ...], Fraction]
@@ -229,7 +229,7 @@ def product(poly: Poly, x: sp.Expr) -> list[sp.Expr]:
     for a, e in (pair for atoms in poly for pair in atoms):
         highest[a] = max(highest.get(a, 0), e)
     # SymPy's polynomials are as large as all powers together.
-    large = prod(e + 1 for e in highest.values()) > _DENSE
+    large = prod(e + 1 for e in highest.values()) > _MAX_DENSE_TERMS
     # The factors of a sum with decimals would have others.
     if large or x.has(sp.Float) or any(e < 0 for atoms in poly for _, e in atoms) or _irreducible(poly):
         return []
@@ -255,7 +255,7 @@ def _irreducible(poly: Poly) -> bool:
     numbers = [int(v * scale) for v in poly.values()]
     shared, rng = gcd(*numbers), Random(0)
     for i, highest in enumerate(max(es) for es in zip(*rows, strict=True)):
-        for _ in range(_PROBES if highest == 1 else 0):
+        for _ in range(_PROBE_PLACES if highest == 1 else 0):
             at = [rng.randrange(1_000, 1_000_000) for _ in atoms]
             parts = [0, 0]
             for row, x in zip(rows, numbers, strict=True):

@@ -25,9 +25,9 @@ from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing, quot
 from mbkit.lagrangian.trig.shortest_form import complexity, shortest_form
 
 #: Operations up to which an expression is simplified.
-LARGE: Final = 2000
+MAX_SIMPLIFIED_OPERATIONS: Final = 2000
 # Roots of cosines: their factors often read better as they were.
-_WORTH: Final = 0.7
+_ROOT_COMPLEXITY_RATIO: Final = 0.7
 
 
 @lru_cache(1024)
@@ -36,11 +36,13 @@ def tidy(x: sp.Expr) -> sp.Expr:
 
     `sympy.simplify` and `trigsimp` search with no bound on their time.
     """
-    if not x.free_symbols or x.count_ops() > LARGE:
+    if not x.free_symbols or x.count_ops() > MAX_SIMPLIFIED_OPERATIONS:
         return x
     rooted = any(p.has(TrigonometricFunction) for p in x.atoms(sp.Pow) if not p.exp.is_Integer)
-    # Of equal forms one that was combined.
-    tried = [(complexity(form), form) for form in forms(x)] + [(complexity(x) * (_WORTH if rooted else 1.0), x)]
+    # Among equally complex forms a combined one wins.
+    tried = [(complexity(form), form) for form in forms(x)] + [
+        (complexity(x) * (_ROOT_COMPLEXITY_RATIO if rooted else 1.0), x)
+    ]
     return min(tried, key=lambda pair: pair[0])[1]
 
 
@@ -83,7 +85,7 @@ def tidy_matrix(x: Any) -> sp.ImmutableMatrix:
 
 
 #: Operations up to which the contents of brackets are tidied.
-_LONG: Final = 150
+_MAX_TIDIED_OPERATIONS: Final = 150
 
 
 def slope(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
@@ -123,18 +125,18 @@ def _product(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
         rate = _product(b, q) if b.is_Add else sp.diff(b, q)
         inside += e * rate * sp.Mul(*(other for i, (other, _) in enumerate(moving) if i != k))
     # A number would be multiplied into the sum.
-    number, rest = (tidy(inside) if inside.count_ops() <= _LONG else inside).primitive()
+    number, rest = (tidy(inside) if inside.count_ops() <= _MAX_TIDIED_OPERATIONS else inside).primitive()
     return shared * number * rest
 
 
 # Expressions as exact sums, and back
 
 #: Products of terms that one expression may cost: about half a second.
-_MOST: Final = 40_000
-_HIGHEST: Final = 12
+_MAX_TERM_PRODUCTS: Final = 40_000
+_MAX_EXPONENT: Final = 12
 #: Terms of a readable sum, and up to which quotients are put over one denominator.
-_MOST_TERMS: Final = 300
-_SHORT: Final = 60
+_MAX_QUOTIENT_TERMS: Final = 300
+_MAX_SUBSTITUTED_TERMS: Final = 60
 
 #: Functions that are quotients of cosines and sines.
 _QUOTIENTS: Final[dict[Any, Callable[[sp.Expr], sp.Expr]]] = {
@@ -185,7 +187,7 @@ class _Reading:
         self._powers: dict[sp.Expr, sp.Dummy] = {}
         self._gather(x)
         generators = [*self._symbols, *self._powers.values()]
-        self._space = TrigRing("expression", list(self._angles), generators, _MOST)
+        self._space = TrigRing("expression", list(self._angles), generators, _MAX_TERM_PRODUCTS)
         self._known: dict[sp.Dummy, _Power] = {}
         self._decimals = x.has(sp.Float)
         self.sum = self._read(x)
@@ -201,7 +203,7 @@ class _Reading:
         elif x.is_Add or x.is_Mul:
             for e in x.args:
                 self._gather(e)
-        elif x.is_Pow and x.exp.is_Integer and 0 < x.exp <= _HIGHEST:
+        elif x.is_Pow and x.exp.is_Integer and 0 < x.exp <= _MAX_EXPONENT:
             self._gather(x.base)
         elif not _is_power(x):
             self._symbols[x] = None
@@ -225,7 +227,7 @@ class _Reading:
             for part in parts[1:]:
                 out = out + part if x.is_Add else out * part
             return out
-        if x.is_Pow and x.exp.is_Integer and 0 < x.exp <= _HIGHEST:
+        if x.is_Pow and x.exp.is_Integer and 0 < x.exp <= _MAX_EXPONENT:
             out = base = self._read(x.base)
             for _ in range(int(x.exp) - 1):
                 out = out * base
@@ -248,7 +250,7 @@ class _Reading:
     # Writing
 
     def _written(self, x: TrigPolynomial) -> sp.Expr:
-        if len(x.terms) > _MOST_TERMS:
+        if len(x.terms) > _MAX_QUOTIENT_TERMS:
             raise UnsupportedError(f"expression: {len(x.terms)} terms are more than anybody reads")
         return self._back(shortest_form(x, decimals=self._decimals))
 
@@ -265,9 +267,9 @@ class _Reading:
 
     def over_one_denominator(self) -> list[sp.Expr]:
         """Return the sum with terms of the same roots over one denominator each; none if it is long or has neither."""
-        if not self._known or len(self.sum.terms) > _SHORT:
+        if not self._known or len(self.sum.terms) > _MAX_SUBSTITUTED_TERMS:
             return []
-        # What was read last may stand on what was read before.
+        # A symbol read later may depend on earlier ones.
         return [self._over_one(self.sum, list(reversed(self._known)))]
 
     def _over_one(self, x: TrigPolynomial, left: list[sp.Dummy]) -> sp.Expr:
@@ -317,7 +319,7 @@ def _shared(x: TrigPolynomial, i: int, least: int, power: _Power, step: int) -> 
 
 def _is_power(x: sp.Expr) -> bool:
     """Return whether an expression is a square root, or one over something; other roots are generators themselves."""
-    if not (x.is_Pow and x.exp.is_Rational and abs(x.exp) <= _HIGHEST):
+    if not (x.is_Pow and x.exp.is_Rational and abs(x.exp) <= _MAX_EXPONENT):
         return False
     return bool(x.exp.q == 2 or (x.exp.is_Integer and x.exp.is_negative))
 
@@ -341,15 +343,15 @@ def _turns(angle: sp.Expr) -> dict[sp.Expr, int]:
 # Zero tests by values at random places: with more digits only the value of a zero gets smaller.
 
 #: Digits of values, and of the second evaluation of a zero test.
-DIGITS: Final = 30
-_MORE: Final = 60
+PROBE_DIGITS: Final = 30
+_FINE_DIGITS: Final = 60
 #: Remainder of zero at the second evaluation, relative to the first.
-_LESS: Final = 1e-15
+_ZERO_REMAINDER_RATIO: Final = 1e-15
 #: Negligible beside terms of the order of 1.
-_NOTHING: Final = 1e-50
+_ZERO_VALUE: Final = 1e-50
 #: Places that must agree; more of them where signs decide.
-_PLACES: Final = 2
-_SIGNED: Final = 8
+_AGREEING_PLACES: Final = 2
+_AGREEING_SIGNED_PLACES: Final = 8
 
 
 class RandomEvaluation:
@@ -376,7 +378,7 @@ class RandomEvaluation:
             out[s] = mpmath.mpf(size if seed % 2 == 0 or s.is_nonnegative else sign * size)
         return out
 
-    def __call__(self, place: dict[sp.Symbol, Any], digits: int = DIGITS) -> list[Any] | None:
+    def __call__(self, place: dict[sp.Symbol, Any], digits: int = PROBE_DIGITS) -> list[Any] | None:
         """Return the values at a place, complex where a root is negative; None where one is not defined."""
         with mpmath.workdps(digits):
             try:
@@ -391,13 +393,13 @@ def is_zero(x: sp.Expr) -> bool:
     if not x.free_symbols or x.is_zero is not None or x.has(sp.Piecewise, sp.Max, sp.Min):
         return bool(x == 0 or x.is_zero)
     broken = x.has(sp.Abs, sp.sign) or any(not p.exp.is_Integer for p in x.atoms(sp.Pow))
-    probe, needed = RandomEvaluation([x]), _SIGNED if broken else _PLACES
+    probe, needed = RandomEvaluation([x]), _AGREEING_SIGNED_PLACES if broken else _AGREEING_PLACES
     for seed in range(2 * needed):
         place = probe.place(seed)
-        rough, fine = (probe(place, digits) for digits in (DIGITS, _MORE))
+        rough, fine = (probe(place, digits) for digits in (PROBE_DIGITS, _FINE_DIGITS))
         if rough is None or fine is None:
             continue
-        if abs(fine[0]) > max(_LESS * abs(rough[0]), _NOTHING):
+        if abs(fine[0]) > max(_ZERO_REMAINDER_RATIO * abs(rough[0]), _ZERO_VALUE):
             return False
         needed -= 1
         if not needed:
