@@ -539,6 +539,35 @@ def test_bounds_that_differ_by_14_decades_are_refused_by_name_where_the_large_on
     assert run.stats.ended == "diverged"
 
 
+@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
+def test_moreau_s_steps_pass_dead_centres(engine: str) -> None:
+    """The rocker turns while the others go on; a rate of the rows that is not zero would let all three never rest."""
+    b = mb.ModelBuilder("free", gravity=(0, 0, 0))
+    b.add_body("base", mass=5.0, inertia=0.3 * np.ones(3))
+    b.add_joint("base", "free", parent="world", child="base")
+    for name, parent, x, length in (
+        ("crank", "base", 0, 0.3),
+        ("coupler", "crank", 0.3, 0.9),
+        ("rocker", "base", 1, 0.7),
+    ):
+        rod(b, name, parent, x, length, friction=0.1, stiction=0.2)
+    b.add_loop("pin", "point", body_a="coupler", body_b="rocker", translation_a=(0.9, 0, 0), translation_b=(0.7, 0, 0))
+    model = b.build()
+    truth = mb.dynamics(model, "lagrangian")
+    q, v = truth.project([*model.neutral()[:7], 1.2, -0.6, 1.5], [0, 0, 0, 0, 0, 0.5, 4, 0, 0], hold=["crank"])
+    dead = simulated(truth, q, v, 1.01, "rk853", **ADAPTIVE).events[-1]
+    assert dead.name == "rocker turns"
+    h, steps = 5e-4, 3
+    times = dead.t - h * np.linspace(0.4, 2.4, 41)
+    run = simulated(
+        truth, q, v, 1.02, "rk853", save=np.concatenate([[0], times[::-1], times[::-1] + h * steps]), **ADAPTIVE
+    )
+    starts, ends = slice(1, 42), slice(42, 83)
+    few = simulated(mb.dynamics(model, engine), run.q[starts], run.v[starts], steps * h, "moreau", dt=h)
+    assert np.abs(few.q[:, -1] - run.q[ends]).max() < 1e-5
+    assert np.abs(few.v[:, -1] - run.v[ends]).max() < 1e-3
+
+
 # Stribeck's curve in the crank of a four-bar, to 34 digits
 
 CURVE = (1.0, 2.0, 0.8)

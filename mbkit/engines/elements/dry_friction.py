@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbkit._check import Array
+from mbkit._reproducible import unit_rows
 from mbkit._warn import warn
 from mbkit.engines.elements.added_force import LOADS, UNDER_FORCE, AddedForce
 from mbkit.errors import MbkitWarning, NumericalError, UnsupportedError
@@ -279,7 +280,7 @@ class DryFriction(AddedForce):
         b = np.asarray(accelerate(tau), dtype=np.float64)
         # Where there are no accelerations nothing is held, and the engine says why there are none.
         none = np.asarray(~np.isfinite(b).all(axis=-1, keepdims=True))
-        A = np.where(none[..., None], 0.0, self.responses(dyn, accelerate, q, tau, b))
+        A = np.where(none[..., None], 0.0, self.responses(dyn, q))
         resting, b, n = resting & ~none, np.where(none, 0.0, b), shape[-1]
         A, b, on = A.reshape(-1, n, n), b.reshape(-1, n), resting.reshape(-1, n)
         bound, less = (np.broadcast_to(x, on.shape) for x in (law.bound, law.just_moving))
@@ -292,18 +293,21 @@ class DryFriction(AddedForce):
         forces = forces - _restricted(A, left, holds, definite=definite)
         return forces.reshape(shape), holds.reshape(shape)
 
-    def responses(self, dyn: Any, accelerate: Callable[[Array], Array], q: Array, tau: Array, a: Array) -> Array:
+    def directions(self, dyn: Any, q: Array) -> Array:
+        """Return a basis of the velocities that constraints allow at configurations, (nv, k) or (N, nv, k)."""
+        J = dyn.constraint_jacobian(q)[..., list(dyn._row_choice.independent), :]
+        return np.asarray(np.linalg.svd(unit_rows(J))[2][..., J.shape[-2] :, :].mT)
+
+    def responses(self, dyn: Any, q: Array) -> Array:
         """Return the accelerations of joints per force on each of them, (nv, nv) or (N, nv, nv)."""
+        M = np.asarray((dyn._bare or dyn).mass_matrix(q))
         if not self._constrained:
-            return np.asarray(np.linalg.inv(np.asarray((dyn._bare or dyn).mass_matrix(q))))
-        # Accelerations are linear in the force; a large one loses fewest digits of the difference.
-        law = self.law_of(dyn)
-        out, size = np.zeros((*a.shape, a.shape[-1])), max(1.0, float(np.abs(tau).max()), float(law.bound.max()))
-        for j in law.which:
-            unit = np.broadcast_to(size * np.eye(a.shape[-1])[j], a.shape)
-            out[..., j] = (np.asarray(accelerate(tau + padded(unit, tau)), dtype=np.float64) - a) / size
+            return np.asarray(np.linalg.inv(M))
+        # Differences of accelerations have the rounding of the largest, by which a joint at its dead centre loses all.
+        N = self.directions(dyn, q)
+        out = N @ np.linalg.solve(N.mT @ M @ N, N.mT)
         # A joint that loops hold responds by rounding alone, of either sign; the least response keeps A definite.
-        masses, own = (np.einsum("...ii->...i", np.asarray(x)) for x in ((dyn._bare or dyn).mass_matrix(q), out))
+        masses, own = (np.einsum("...ii->...i", x) for x in (M, out))
         own[...] = np.maximum(own, _PROXIMAL / np.where(masses > 0, masses, np.inf))
         return np.asarray(0.5 * (out + out.mT))
 

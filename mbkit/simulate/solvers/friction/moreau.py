@@ -13,9 +13,10 @@ import numpy as np
 from mbkit._check import Array
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
-from mbkit.engines.elements.dry_friction import friction_forces, padded
+from mbkit.engines.elements.dry_friction import friction_forces
 from mbkit.errors import FunctionError, NumericalError
 from mbkit.model.integration_space import Space
+from mbkit.model.manifold import least_change
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.solvers.fixed_step import GridRecord
@@ -86,25 +87,26 @@ class _InPython:
         return grid.steps, grid.steps, ""
 
     def _step(self, t: float, h: float, q: Array, v: Array, force: Any) -> tuple[Array, Array]:
-        dyn, tau, which, space = at_time(self._smooth, t), applied(force, t, q, v), self._which, self._space
-
-        def accelerate(force: Array) -> Array:
-            return np.asarray(dyn.forward_dynamics(q, v, force))
-
-        a = accelerate(tau)
-        free, holds, bound = v + h * a, v != v, dyn.model.constrained
+        dyn, which, space, bound = at_time(self._smooth, t), self._which, self._space, self._dyn.model.constrained
+        smooth = v + h * dyn.forward_dynamics(q, v, applied(force, t, q, v))
+        inverse = self._dyn._friction.responses(dyn, q)
+        if bound:
+            # Rows hold velocities, not their rates: else no velocities of what rests together may be zero.
+            own, M = at_time(dyn, t + h), (dyn._bare or dyn).mass_matrix(q)
+            chosen = list(own._row_choice.independent)
+            J, rate = own.constraint_jacobian(q)[chosen], own.constraint_rate(q, smooth)[chosen]
+            smooth = smooth + least_change(M, J, -rate)
+        free, holds = smooth, v != v
         if len(which):
-            inverse = self._dyn._friction.responses(dyn, accelerate, q, tau, a)
             rubs = self._law.bound > 0
             slides = np.abs(self._law.force_at(v))
-            less, none, rests, smooth = h * slides[None], np.zeros((1, len(v))), v == 0, free
+            less, none, rests = h * slides[None], np.zeros((1, len(v))), v == 0
             # What stops or turns may be held by its stiction.
             while True:
                 most = h * np.where(rests, self._law.bound, slides)[None]
                 problem = inverse[None], smooth[None], most, less, rubs[None], none
                 (impulse,), (holds,) = friction_forces(*problem, definite=not bound)
-                pushed = v + h * accelerate(tau + padded(impulse, tau) / h) if bound else smooth + inverse @ impulse
-                free = np.where(holds, 0.0, pushed)
+                free = np.where(holds, 0.0, smooth + inverse @ impulse)
                 if not (turns := rubs & ~rests & (v * free <= 0) & (slides < self._law.bound)).any():
                     break
                 rests = rests | turns

@@ -9,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit._reproducible import unit_rows
 from mbkit.engines import Dynamics
 from mbkit.engines.base import at_time
 from mbkit.engines.elements.dry_friction import Mask
@@ -122,9 +121,7 @@ class Friction:
         return one
 
     def _directions(self, dyn: Dynamics, t: float | Array, q: Array) -> Array:
-        """Return a basis of the velocities that constraints allow at configurations, (nv, k) or (N, nv, k)."""
-        J = at_time(dyn, t).constraint_jacobian(q)[..., list(dyn._row_choice.independent), :]
-        return np.asarray(np.linalg.svd(unit_rows(J))[2][..., J.shape[-2] :, :].mT)
+        return self._own.directions(at_time(dyn, t), q)
 
     def held(self, still: Mask, start: Array, q: Array, v: Array) -> tuple[Array, Array]:
         """Return states of a phase from `start` on in which what rests keeps its place and no velocity, to the bit."""
