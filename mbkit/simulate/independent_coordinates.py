@@ -98,8 +98,8 @@ class _Run:
 
     def saw(self, t: float, q: Array) -> None:
         """Look for singular poses at the end of a step."""
-        if self.record.poses is not None:
-            self.record.poses.saw(t, q)
+        if self.record.passed is not None:
+            self.record.passed.saw(t, q)
 
     def _hold(self, k: int, t: float, q: Array, v: Array) -> None:
         """Take the force from interval or step k on."""

@@ -301,22 +301,14 @@ class SingularPosesOfBatch:
     """The singular poses that trajectories pass which step together, by their numbers."""
 
     def __init__(self, dyn: Dynamics, t: float, q: Array) -> None:
-        self._members = {i: SingularPoses(dyn.of_samples([i])) for i in range(len(q))}
-        for poses, start in zip(self._members.values(), q, strict=True):
+        self.members = {i: SingularPoses(dyn.of_samples([i])) for i in range(len(q))}
+        for poses, start in zip(self.members.values(), q, strict=True):
             poses.began(t, start)
 
     def saw(self, dyn: Dynamics, t: float, q: Array, members: Iterable[int]) -> None:
         """Take in the ends of the steps of these members, whose dynamics are `dyn`."""
         for i, depends, at in zip(members, manifold_at(dyn, t).dependence(q).tolist(), q, strict=True):
-            self._members[int(i)].take(t, depends, at)
-
-    def saw_run(self, member: int, t: Array, q: Array) -> None:
-        """Take in the ends of all steps of one member, (n,) and (n, nq)."""
-        self._members[member].saw_all(t, q)
-
-    def describe(self, batch: int | None) -> str:
-        """Return the poses in a sentence; empty where there are none."""
-        return describe_poses(self._members, batch)
+            self.members[int(i)].take(t, depends, at)
 
 
 def describe_poses(members: Mapping[int, SingularPoses], batch: int | None) -> str:

@@ -13,7 +13,8 @@ from mbkit.codegen.cuda.runs import Arena
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.solvers.fixed_step import GridRecord, to_body_velocity
+from mbkit.simulate.solvers.fixed_step import to_body_velocity
+from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Indices
 
 #: Steps of the first launch; later ones take longer until one lasts so many seconds, so that Ctrl-C is heard.
@@ -82,4 +83,4 @@ def _run(
             q, w = (np.ascontiguousarray(arena.get(name).T) for name in ("q", "w"))
             record.q[rows, kept.start] = q
             record.v[rows, kept.start] = to_body_velocity(space, q, w)
-    record.steps[members] = grid.steps
+    record.good[members] = grid.steps

@@ -20,13 +20,13 @@ from mbkit.codegen.compiled import Call, KernelSequence
 from mbkit.derivation.steps.fixed import LAW, Part
 from mbkit.engines.compiled_calls import Plan
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import FunctionError, NumericalError, TorqueError
+from mbkit.errors import NumericalError, TorqueError
 from mbkit.methods.registry import method_of
 from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import GridRecord, divergence_reason, run_fixed, to_body_velocity
+from mbkit.simulate.solvers.fixed_step import divergence_reason, run_fixed, to_body_velocity
 from mbkit.simulate.solvers.machine_code.blocks import (
     CACHE,
     LANES,
@@ -37,6 +37,7 @@ from mbkit.simulate.solvers.machine_code.blocks import (
     run_members,
 )
 from mbkit.simulate.solvers.machine_code.implicit_steps import run_collocation
+from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import BOUND, are_bounded
 from mbkit.simulate.time_grid import Indices
 
@@ -186,16 +187,16 @@ def run_rollout(
         def velocity(t: float, q: Array, w: Array, members: Indices) -> Array:  # noqa: ARG001
             return to_body_velocity(space, q, w)
 
-        error = run_members(problem, record, members, parts, workers, new_loop, velocity, read_margins, after_part)
-        if error is not None:
-            failures.append(error)
+        record.error = run_members(
+            problem, record, members, parts, workers, new_loop, velocity, read_margins, after_part
+        )
         # A NaN is not below anything.
         return members[~(squares < BOUND**2)]
 
-    lost, failures = dict[int, list[Array]](), list[FunctionError]()
+    lost = dict[int, list[Array]]()
     suspects = suspects_of(np.arange(len(problem.q)), thorough=False)
-    if failures:
-        return record.result(lambda _: "", method_of(method).stages * int(record.steps.sum()), error=failures[0])
+    if record.error is not None:
+        suspects = suspects[:0]
     if len(suspects) and dyn.model.constrained:
         if problem.torque.samples is None:
             suspects = suspects_of(suspects, thorough=True)
@@ -211,13 +212,14 @@ def run_rollout(
                 lost |= last
 
     def why(i: int) -> str:
-        k, (q, w) = int(record.steps[i]), lost[i]
+        k, (q, w) = int(record.good[i]), lost[i]
         force = problem.torque.columns(np.array([i]), k, k + 1)[0, :, 0]
         if law is not None:
             force = law(grid.time(k), q, to_body_velocity(space, q, w))
         return divergence_reason(dyn.of_samples([i]), method, grid.time(k), grid.step(k), q[None], w[None], force[None])
 
-    return record.result(why, method_of(method).stages * (int(record.steps.sum()) + len(lost)))
+    record.evaluations = method_of(method).stages * (int(record.good.sum()) + len(lost))
+    return record.result(why)
 
 
 def _split(n: int, widest: int, workers: int) -> list[slice]:
@@ -247,7 +249,7 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
     q, v, start, dt, steps, force = problem.q0, problem.v0, grid.start, grid.dt, grid.steps, forces[0]
     row = int(record.kept[0] == 0)
     kept = iter(record.kept[row:].tolist())
-    all_q, all_v, following, error = record.q[0], record.v[0], next(kept, -1), None
+    all_q, all_v, following = record.q[0], record.v[0], next(kept, -1)
     k = s = sample = 0
     new, shorter = False, steps - 1 if grid.last != dt else steps
     try:
@@ -276,7 +278,7 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
         k = steps
         problem.bar.update(1.0)
     except TorqueError as failed:
-        error = failed
+        record.error = failed
     except Exception as failed:
         # A sample at which the answer is known is behind.
         if isinstance(failed, NumericalError) and k != sample:
@@ -285,7 +287,7 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
             # The reason is found in Python, with the same answers.
             samples.asked[0] = s
             return run_fixed(problem)
-        error = controller.failure(failed, start + k * dt)
+        record.error = controller.failure(failed, start + k * dt)
     samples.asked[0] = s
-    record.steps[0] = k
-    return record.result(lambda _: "", method_of(method).stages * k, error=error)
+    record.good[0], record.evaluations = k, method_of(method).stages * k
+    return record.result()

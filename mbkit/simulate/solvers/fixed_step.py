@@ -1,8 +1,7 @@
-"""Fixed steps in Python, on any engine and under any torque; and the record of any run with a fixed step."""
+"""Fixed steps in Python, on any engine and under any torque."""
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable
 from typing import Any
 
@@ -20,6 +19,7 @@ from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.singular_poses import SingularPosesOfBatch
 from mbkit.simulate.solvers.gauss import CollocationStep
+from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import ALL, DIVERGED, DivergenceError, Field, are_bounded
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
@@ -36,66 +36,6 @@ def to_body_velocity(space: Space, q: Array, w: Array) -> Array:
     # What a lost state has become is nobody's concern here.
     with np.errstate(over="ignore", invalid="ignore"):
         return np.asarray(space.to_body_velocity(*flat).reshape(w.shape))
-
-
-class GridRecord:
-    """Kept states of each trajectory of a run with a fixed step, (n, K, ...), and its good steps, (n,)."""
-
-    def __init__(self, problem: IntegrationProblem) -> None:
-        self._problem, self.kept = problem, problem.kept
-        n, rows = len(problem.q), len(problem.kept)
-        # Written by the threads, so that each of them pays for its own pages.
-        self.q, self.v = np.empty((n, rows, problem.q.shape[1])), np.empty((n, rows, problem.v.shape[1]))
-        self.steps: Indices = np.zeros(n, dtype=np.intp)
-        if self.kept[0] == 0:
-            self.q[:, 0], self.v[:, 0] = problem.q, problem.v
-
-    def rows(self, first: int, last: int) -> slice:
-        """Return the saved rows of the states from the first to the last."""
-        return slice(*self.kept.searchsorted((first, last + 1)).tolist())
-
-    def result(
-        self,
-        why: Callable[[int], str],
-        evaluations: int,
-        jacobians: int = 0,
-        error: FunctionError | None = None,
-        doubts: tuple[str, ...] = (),
-    ) -> SolverResult:
-        """Return the result, with NaN behind the good steps; why(i) is why trajectory i diverged, or empty."""
-        grid, kept, steps, q, v = self._problem.grid, self.kept, self.steps, self.q, self.v
-        single = self._problem.batch is None
-        lost = np.flatnonzero(steps < grid.steps)
-        for i in lost:
-            after = bisect_right(kept, steps[i])
-            q[i, after:], v[i, after:] = np.nan, np.nan
-        message = "" if error is None else str(error)
-        if error is None and len(lost):
-            first = int(lost[np.argmin(steps[lost])])
-            k, reason = int(steps[first]), why(first)
-            message = f"diverged after t = {grid.time(k):.6g} s (step {k + 1})" + (f": {reason}" if reason else "")
-            message += f"; dt = {grid.dt:g} s may be too long"
-            if not single:
-                message += f"; {len(lost)} of {len(steps)} trajectories diverged, see reached"
-        rows = int(np.count_nonzero(kept <= steps.max())) if len(steps) else len(kept)
-        q, v = (x if rows == len(kept) else x[:, :rows].copy() for x in (q, v))
-        # Read-only, so that nobody needs a copy.
-        q.setflags(write=False)
-        v.setflags(write=False)
-        reached = grid.times_of(steps).tolist()
-        return SolverResult(
-            t=grid.times_of(kept[:rows]),
-            q=q[0] if single else q,
-            v=v[0] if single else v,
-            steps=int(steps.sum()),
-            evaluations=evaluations,
-            ended="function_failed" if error is not None else "diverged" if message else "finished",
-            reached=reached[0] if single else tuple(reached),
-            message=message,
-            jacobians=jacobians,
-            error=error,
-            doubts=doubts,
-        )
 
 
 class Stepper:
@@ -129,11 +69,10 @@ class _FieldStepper(Stepper):
     """Steps of a method that only evaluates ẇ; it looks for singular poses of constraints on the way."""
 
     def __init__(self, problem: IntegrationProblem) -> None:
-        self._poses: SingularPosesOfBatch | None = None
+        self.poses: SingularPosesOfBatch | None = None
         if problem.dyn.projects:
-            self._poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
+            self.poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
         self._members: Indices = np.arange(len(problem.q))
-        self._batch = problem.batch
         self.space = Space(problem.dyn.model)
         self.field = Field(problem.dyn, self.space)
         self._step = make_step(problem.method, self.field, self.space)
@@ -147,17 +86,12 @@ class _FieldStepper(Stepper):
 
     def settled(self, t: float, q: Array, w: Array) -> tuple[Array, Array]:
         q, w = self.field.settled(t, q, w)
-        if self._poses is not None:
-            self._poses.saw(self.field.dyn, t, np.atleast_2d(q), self._members)
+        if self.poses is not None:
+            self.poses.saw(self.field.dyn, t, np.atleast_2d(q), self._members)
         return q, w
 
     def reason(self, q: Array, w: Array) -> str:
         return self.field.undetermined or super().reason(q, w)
-
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """The singular poses on the way, in a sentence."""
-        return (text,) if self._poses is not None and (text := self._poses.describe(self._batch)) else ()
 
     def to_body_velocity(self, q: Array, w: Array) -> Array:
         return np.asarray(self.space.to_body_velocity(q, w))
@@ -195,8 +129,11 @@ def run_fixed(
     """
     stepper = _FieldStepper(problem)
     run = SteppedRun(problem, stepper, stepper.space.to_integrator_velocity(problem.q0, problem.v0), record, members)
-    error = run.to_end()
-    return run.record.result(lambda _: run.why, stepper.field.evaluations, error=error, doubts=stepper.doubts)
+    run.to_end()
+    run.record.evaluations = stepper.field.evaluations
+    if stepper.poses is not None:
+        run.record.poses = stepper.poses.members
+    return run.record.result(lambda _: run.why)
 
 
 class SteppedRun:
@@ -217,13 +154,13 @@ class SteppedRun:
         self._row = self.record.rows(0, 0).stop
         self._q, self._w = problem.q0.copy(), w0
         if members is not None:
-            self.record.steps[members] = 0
+            self.record.good[members] = 0
         if members is not None and self._members is not None:
             self._members, self._q, self._w = members, self._q[members], self._w[members]
             stepper.only(members)
 
-    def to_end(self) -> FunctionError | None:
-        """Step over the grid; return the error of a torque function that ended it."""
+    def to_end(self) -> None:
+        """Step over the grid, or up to where a torque function fails."""
         steps = self._problem.grid.steps
         # An overflow is a divergence, and reported as one.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -232,9 +169,9 @@ class SteppedRun:
                     if not self._advance(k):
                         break
                 except FunctionError as error:
-                    return error
+                    self.record.error = error
+                    break
                 self._problem.bar.update((k + 1) / steps)
-        return None
 
     def _advance(self, k: int) -> bool:
         """Take step k; return whether any trajectory goes on."""
@@ -260,7 +197,7 @@ class SteppedRun:
             step.only(self._members, good)
         self._q, self._w = step.settled(grid.time(k + 1), q, w)
         which: Any = slice(None) if self._members is None else self._members
-        record.steps[which] = k + 1
+        record.good[which] = k + 1
         if self._row < len(record.kept) and k + 1 == record.kept[self._row]:
             record.q[which, self._row], record.v[which, self._row] = self._q, step.to_body_velocity(self._q, self._w)
             self._row += 1

@@ -19,14 +19,14 @@ from mbkit.derivation.steps.constrained_midpoint import ConstrainedMidpoint
 from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import GUESS, LEAST, MOST, SMALL, Midpoint
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import FunctionError
 from mbkit.methods.registry import IMPLICIT_METHODS
 from mbkit.model.elements.paths import ALL, Path
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
 from mbkit.simulate.singular_poses import SingularPosesOfBatch
-from mbkit.simulate.solvers.fixed_step import GridRecord, SteppedRun, Stepper
+from mbkit.simulate.solvers.fixed_step import SteppedRun, Stepper
+from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import BOUND, DIVERGED
 from mbkit.simulate.time_grid import Indices
 from mbkit.simulate.torque import Force
@@ -46,7 +46,6 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
     dyn = problem.dyn
     assert isinstance(dyn, LagrangianDynamics)
     midpoint, q0 = midpoint_of(dyn), problem.q
-    error: FunctionError | None = None
     w0 = np.zeros((len(q0), midpoint.unknowns))
     w0[:, : dyn.model.nv] = Space(dyn.model).to_integrator_velocity(q0, problem.v)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -58,7 +57,7 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
             def velocity(t: float, q: Array, pi: Array, members: Indices) -> Array:
                 return _velocities(dyn, midpoint, members, t, q, pi)
 
-            record, iterations, lost, error = run_implicit(problem, midpoint, pi0, w0, velocity)
+            record, iterations, lost = run_implicit(problem, midpoint, pi0, w0, velocity)
 
             def why(i: int) -> str:
                 return _reason(*lost[i])
@@ -66,7 +65,7 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
         else:
             stepper = MidpointStepper(dyn, problem, w0)
             run = SteppedRun(problem, stepper, pi0[0] if problem.batch is None else pi0)
-            error = run.to_end()
+            run.to_end()
             record, iterations = run.record, stepper.iterations
 
             def why(i: int) -> str:  # noqa: ARG001  # of a batch the first one's
@@ -74,20 +73,13 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
 
         _to_velocities(dyn, midpoint, problem, record)
     # Each iteration is an evaluation, and so is the end of each step.
-    evaluations = iterations + int(record.steps.sum())
-    return record.result(why, evaluations, iterations, error, _poses(problem, record))
-
-
-def _poses(problem: IntegrationProblem, record: GridRecord) -> tuple[str, ...]:
-    """Return the singular poses on the way, in a sentence; none where steps are left out of what is kept."""
-    if not problem.dyn.projects or len(record.kept) <= problem.grid.steps:
-        return ()
-    times = problem.grid.times_of(record.kept)
-    poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
-    for i, last in enumerate(record.steps.tolist()):
-        poses.saw_run(i, times[1 : last + 1], record.q[i, 1 : last + 1])
-    text = poses.describe(problem.batch)
-    return (text,) if text else ()
+    record.evaluations, record.jacobians = iterations + int(record.good.sum()), iterations
+    if dyn.projects and len(record.kept) > problem.grid.steps:
+        # Only where all steps are kept.
+        times, record.poses = problem.grid.times, SingularPosesOfBatch(dyn, problem.start, problem.q).members
+        for i, last in enumerate(record.good.tolist()):
+            record.poses[i].saw_all(times[1 : last + 1], record.q[i, 1 : last + 1])
+    return record.result(why)
 
 
 def midpoint_of(dyn: LagrangianDynamics) -> Midpoint:
@@ -231,7 +223,7 @@ def _to_velocities(
     for start in range(0, rows, size):
         q, v = (x[:, start : start + size] for x in (record.q, record.v))
         at_k = kept[start : start + size]
-        who, at = np.nonzero((at_k > 0) & (at_k <= record.steps[:, None]))
+        who, at = np.nonzero((at_k > 0) & (at_k <= record.good[:, None]))
         if not len(who):
             continue
         v[who, at] = _velocities(dyn, midpoint, who, times[start + at], q[who, at], v[who, at])

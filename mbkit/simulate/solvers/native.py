@@ -15,8 +15,15 @@ from mbkit.errors import FunctionError
 from mbkit.methods.registry import method_of
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import GridRecord, SteppedRun, Stepper
-from mbkit.simulate.solvers.trajectory_record import StoppedError, TrajectoryRecord, assemble_result, diverged, run_each
+from mbkit.simulate.solvers.fixed_step import SteppedRun, Stepper
+from mbkit.simulate.solvers.trajectory_record import (
+    GridRecord,
+    StoppedError,
+    TrajectoryRecord,
+    assemble_result,
+    diverged,
+    run_each,
+)
 from mbkit.simulate.solvers.vector_field import DivergenceError, are_bounded, is_bounded
 from mbkit.simulate.time_grid import check_room
 from mbkit.simulate.torque import Force
@@ -28,7 +35,7 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
     dyn, q0, v0 = problem.dyn, problem.q0, problem.v0
     rollout = _in_its_process(dyn) if isinstance(dyn, VersionDynamics) else _in_mujoco(dyn)
     check_room((grid.steps + 1) * len(problem.q), q0.shape[-1] + v0.shape[-1])
-    parts, error, now = [(q0[..., None, :], v0[..., None, :])], None, (q0, v0)
+    record, parts, now = GridRecord(problem), [(q0[..., None, :], v0[..., None, :])], (q0, v0)
     # MuJoCo's step is fixed for a rollout, so a shortened last step is a rollout of its own.
     whole = grid.steps if grid.last == grid.dt else grid.steps - 1
     for k, end in pairwise(sorted({0, *torque.changes(grid.steps), whole, grid.steps})):
@@ -41,7 +48,7 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
             who = np.flatnonzero(good)
             torque.sample(k, grid.time(k), np.atleast_2d(q)[who], np.atleast_2d(v)[who], who)
         except FunctionError as failed:
-            error = failed
+            record.error = failed
             break
         tau = torque.rows(range(k, end)) if torque.held or torque.table.any() else None
         if tau is not None and torque.samples is not None:
@@ -61,12 +68,12 @@ def run_native(problem: IntegrationProblem) -> SolverResult:
     q, v = (x[None] if problem.batch is None else x for x in (q, v))
     good = are_bounded(q, v)
     good[:, 0] = True  # the start is the caller's
-    record = GridRecord(problem)
     # After the first bad state everything is void, even what looks like numbers.
-    record.steps[:] = np.logical_and.accumulate(good, axis=1).sum(1) - 1
+    record.good[:] = np.logical_and.accumulate(good, axis=1).sum(1) - 1
     record.q, record.v = q[:, record.kept], v[:, record.kept]
     problem.bar.update(1.0)
-    return record.result(lambda _: "", int(record.steps.sum()) * method.stages, error=error)
+    record.evaluations = int(record.good.sum()) * method.stages
+    return record.result()
 
 
 _Rollout = Callable[..., tuple[Array, Array]]
@@ -159,5 +166,6 @@ def run_drake_discrete(problem: IntegrationProblem) -> SolverResult:
     """Step one state, or each of a batch by itself, on Drake's discrete plant."""
     stepper = _DiscreteStepper(problem.dyn)
     run = SteppedRun(problem, stepper, problem.v0.copy())
-    error = run.to_end()
-    return run.record.result(lambda _: run.why, int(run.record.steps.sum()), error=error)
+    run.to_end()
+    run.record.evaluations = int(run.record.good.sum())
+    return run.record.result(lambda _: run.why)

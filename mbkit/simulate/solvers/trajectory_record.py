@@ -1,8 +1,9 @@
-"""The record of each trajectory while an adaptive solver runs, and all of them as one result."""
+"""The record of a run while a solver goes on, on a grid or with steps of each trajectory's own, and its result."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -26,6 +27,104 @@ _ATTEMPTS: Final = 20_000
 _COVERED: Final = 1e-6
 #: Attempts of a trajectory between two looks at them, at most.
 ROUNDS: Final = 256
+#: Of several ends a run tells the first in this order.
+_ENDS: Final[tuple[Ended, ...]] = ("function_failed", "diverged", "step_too_small", "event")
+
+
+class RunRecord:
+    """All that is known of a run but its states; `assembled` is the only place that makes a result.
+
+    `early` has how each trajectory ended that did not reach the end, and why; `last` and `error` are as in
+    `SolverResult`.
+    """
+
+    def __init__(self, problem: IntegrationProblem) -> None:
+        self.problem = problem
+        self.steps = self.rejected = self.evaluations = self.jacobians = 0
+        self.chosen = ""
+        self.doubts: list[str] = []
+        self.events: list[Hit] = []
+        self.last: Array | None = None
+        self.error: FunctionError | None = None
+        self.early: dict[int, tuple[Ended, str]] = {}
+        self.poses: Mapping[int, SingularPoses] = {}
+
+    def count(self, part: RunRecord | Stats) -> None:
+        """Add the cost of a part of the run."""
+        for name in ("steps", "rejected", "evaluations", "jacobians"):
+            setattr(self, name, getattr(self, name) + getattr(part, name))
+        self.chosen = self.chosen or part.chosen
+
+    def assembled(self, t: Array, q: Array, v: Array, reached: list[float]) -> SolverResult:
+        """Return the result with states (N, K, ·) at common times, and the time that each trajectory reached."""
+        batch = self.problem.batch
+        ended, message = self._end(reached)
+        return SolverResult(
+            t=np.array(t, dtype=np.float64),
+            q=q[0] if batch is None else q,
+            v=v[0] if batch is None else v,
+            steps=self.steps,
+            evaluations=self.evaluations,
+            ended=ended,
+            reached=reached[0] if batch is None else tuple(reached),
+            message=message,
+            rejected=self.rejected,
+            jacobians=self.jacobians,
+            events=tuple(self.events),
+            error=self.error,
+            last=self.last,
+            chosen=self.chosen,
+            doubts=tuple(dict.fromkeys(filter(None, (describe_poses(self.poses, batch), *self.doubts)))),
+        )
+
+    def _end(self, reached: list[float]) -> tuple[Ended, str]:
+        if self.error is not None:
+            return "function_failed", str(self.error)
+        if not self.early:
+            return "finished", ""
+        ended, message = self.early[min(self.early, key=lambda i: (_ENDS.index(self.early[i][0]), reached[i], i))]
+        if self.problem.batch is not None:
+            how = "diverged" if {end for end, _ in self.early.values()} == {"diverged"} else "ended early"
+            message += f"; {len(self.early)} of {self.problem.batch} trajectories {how}, see reached"
+        return ended, message
+
+
+class GridRecord(RunRecord):
+    """Record of a run with a fixed step: kept states of each trajectory, (n, K, ...), and its good steps, (n,)."""
+
+    def __init__(self, problem: IntegrationProblem) -> None:
+        super().__init__(problem)
+        self.kept = problem.kept
+        n, rows = len(problem.q), len(problem.kept)
+        # Written by the threads, so that each of them pays for its own pages.
+        self.q, self.v = np.empty((n, rows, problem.q.shape[1])), np.empty((n, rows, problem.v.shape[1]))
+        self.good: Indices = np.zeros(n, dtype=np.intp)
+        if self.kept[0] == 0:
+            self.q[:, 0], self.v[:, 0] = problem.q, problem.v
+
+    def rows(self, first: int, last: int) -> slice:
+        """Return the saved rows of the states from the first to the last."""
+        return slice(*self.kept.searchsorted((first, last + 1)).tolist())
+
+    def result(self, why: Callable[[int], str] = lambda _: "") -> SolverResult:
+        """Return the result, with NaN behind the good steps; why(i) is why trajectory i diverged, or empty."""
+        grid, kept, good, q, v = self.problem.grid, self.kept, self.good, self.q, self.v
+        self.steps = self.steps or int(good.sum())
+        lost = np.flatnonzero(good < grid.steps)
+        for i in lost:
+            after = bisect_right(kept, good[i])
+            q[i, after:], v[i, after:] = np.nan, np.nan
+        if len(lost) and self.error is None and not self.early:
+            first = int(lost[np.argmin(good[lost])])
+            k, reason = int(good[first]), why(first)
+            message = f"diverged after t = {grid.time(k):.6g} s (step {k + 1})" + (f": {reason}" if reason else "")
+            self.early = dict.fromkeys(lost.tolist(), ("diverged", f"{message}; dt = {grid.dt:g} s may be too long"))
+        rows = int(np.count_nonzero(kept <= good.max())) if len(good) else len(kept)
+        q, v = (x if rows == len(kept) else x[:, :rows].copy() for x in (q, v))
+        # Read-only, so that nobody needs a copy.
+        q.setflags(write=False)
+        v.setflags(write=False)
+        return self.assembled(grid.times_of(kept[:rows]), q, v, grid.times_of(good).tolist())
 
 
 class StoppedError(Exception):
@@ -68,28 +167,24 @@ class AcceptedSteps:
 Within = Callable[[AcceptedSteps, Array], tuple[Array, Array]]
 
 
-class TrajectoryRecord:
-    """One trajectory of an adaptive solver: kept states, counts, events, and how it ended.
+class TrajectoryRecord(RunRecord):
+    """Record of one trajectory of an adaptive solver, with its kept states.
 
-    `reached` is the time and `last` the configuration of the last good state; `ended` is as in `Stats`. Without a
-    space, velocities are mbkit's and quaternions of any length.
+    `reached` is the time of the last good state; `ended` is as in `Stats`. Without a space, velocities are mbkit's and
+    quaternions of any length.
     """
 
     def __init__(self, problem: IntegrationProblem, i: int, space: Space | None = None) -> None:
+        super().__init__(problem)
         dyn, member, self.index = problem.dyn, problem.member(i), i
-        self._problem, self._model, self._space, self._save = problem, dyn.model, space, problem.save
+        self._model, self._space, self._save = dyn.model, space, problem.save
         self._watch = Watch(problem.events, member) if problem.events else None
         own = dyn if member is None or not dyn.model.constrained else dyn.of_samples([member])
-        self.poses = SingularPoses(own) if dyn.projects else None
-        self.steps = self.rejected = self.evaluations = self.jacobians = 0
-        self.chosen = ""
-        self.doubts: list[str] = []
+        self.passed = SingularPoses(own) if dyn.projects else None
         self.reached = problem.start
-        self.last: Array | None = None
+        self._q: Array | None = None
         self.ended: Ended = "finished"
         self.message = ""
-        self.events: list[Hit] = []
-        self.error: FunctionError | None = None
         self._look = 0, problem.start
         self._kept: list[tuple[Array, Array, Array]] = []
 
@@ -99,8 +194,8 @@ class TrajectoryRecord:
             self.keep(np.array([self.reached]), q[None], v[None])
         if self._watch is not None:
             self._watch.start(self.reached, q, v)
-        if self.poses is not None:
-            self.poses.began(self.reached, q)
+        if self.passed is not None:
+            self.passed.began(self.reached, q)
 
     def take(self, accepted: AcceptedSteps, within: Within) -> bool:
         """Add steps; return whether to go on."""
@@ -122,9 +217,9 @@ class TrajectoryRecord:
         self.steps += steps
         self.reached = until
         if steps:
-            self.last = accepted.q[steps]
-        if self.poses is not None:
-            self.poses.saw_all(accepted.t[1 : steps + 1], accepted.q[1 : steps + 1])
+            self._q = accepted.q[steps]
+        if self.passed is not None:
+            self.passed.saw_all(accepted.t[1 : steps + 1], accepted.q[1 : steps + 1])
         if hit is not None:
             self.stop_at(hit)
         elif lost:
@@ -133,10 +228,9 @@ class TrajectoryRecord:
 
     def add(self, run: Stats, begin: float = 0.0) -> None:
         """Add the cost of a part that was a run of its own and began at a time, s."""
-        for name in ("steps", "rejected", "evaluations", "jacobians"):
-            setattr(self, name, getattr(self, name) + getattr(run, name))
+        self.count(run)
         assert isinstance(run.reached, float)
-        self.reached, self.chosen = begin + run.reached, run.chosen
+        self.reached = begin + run.reached
 
     def keep(self, t: Array, q: Array, v: Array) -> None:
         """Keep states, (n,), (n, nq) and (n, nv), in mbkit's velocities."""
@@ -146,8 +240,8 @@ class TrajectoryRecord:
     def reach(self, t: float, y: Array) -> None:
         """Go on to a state (q, v), of a solver that does not tell its steps."""
         self.reached, nq = t, self._model.nq
-        if self.poses is not None:
-            self.poses.saw(t, y[:nq])
+        if self.passed is not None:
+            self.passed.saw(t, y[:nq])
         if self._save is not None and t in self._save:
             self.keep(np.array([t]), *self._state(y[None, :nq], y[None, nq:]))
 
@@ -215,7 +309,7 @@ class TrajectoryRecord:
             return False
         covered = self.reached - since
         self._look = attempts, self.reached
-        if covered < _COVERED * self._problem.duration:
+        if covered < _COVERED * self.problem.duration:
             why = f"stopped, as {attempts - before} steps covered {covered:.2g} s alone: stiff, singular or diverging"
             self.stop(StoppedError("step_too_small", why))
             return True
@@ -223,6 +317,7 @@ class TrajectoryRecord:
 
     def stop(self, reason: StoppedError) -> None:
         """End early, after `reached`."""
+        self.last = self._q
         self.ended, self.message = reason.ended, f"{reason} after t = {self.reached:.6g} s"
 
     def stop_at(self, hit: Hit) -> None:
@@ -285,10 +380,22 @@ def assemble_result(
 
     `evaluations` and `jacobians` are those of all together that no record has.
     """
-    batch, model = problem.batch, problem.dyn.model
+    batch, model, run = problem.batch, problem.dyn.model, RunRecord(problem)
+    run.evaluations, run.jacobians = evaluations, jacobians
+    reached = [problem.start] * len(problem.q)
+    for record in records:
+        run.count(record)
+        run.doubts += record.doubts
+        run.events += record.events
+        run.error = run.error or record.error
+        run.last = record.last if run.last is None else run.last
+        reached[record.index] = float(record.reached)
+        if record.ended != "finished":
+            run.early[record.index] = record.ended, record.message
+    run.poses = {record.index: record.passed for record in records if record.passed}
     states = [record.states for record in records]
     if batch is None:
-        t, q, v = states[0]
+        t, q, v = states[0][0], *(x[None] for x in states[0][1:])
     else:
         assert problem.save is not None
         # A batch of none has all its times.
@@ -297,35 +404,4 @@ def assemble_result(
         q, v = (np.full((batch, count, n), np.nan) for n in (model.nq, model.nv))
         for i, (own, *state) in enumerate(states):
             q[i, : len(own)], v[i, : len(own)] = state
-    reached = [float(record.reached) for record in records] + [problem.start] * (len(problem.q) - len(records))
-    ended, message = _end(records, batch)
-    poses = describe_poses({i: record.poses for i, record in enumerate(records) if record.poses}, batch)
-    return SolverResult(
-        t=np.array(t, dtype=np.float64),
-        q=q,
-        v=v,
-        steps=sum(record.steps for record in records),
-        evaluations=evaluations + sum(record.evaluations for record in records),
-        ended=ended,
-        reached=reached[0] if batch is None else tuple(reached),
-        message=message,
-        rejected=sum(record.rejected for record in records),
-        jacobians=jacobians + sum(record.jacobians for record in records),
-        events=tuple(hit for record in records for hit in record.events),
-        error=next((record.error for record in records if record.error), None),
-        last=next((record.last for record in records if record.ended in ("diverged", "step_too_small")), None),
-        chosen=next((record.chosen for record in records if record.chosen), ""),
-        doubts=tuple(dict.fromkeys(filter(None, (poses, *(x for record in records for x in record.doubts))))),
-    )
-
-
-def _end(records: Sequence[TrajectoryRecord], batch: int | None) -> tuple[Ended, str]:
-    # Failures come before events.
-    early = [record for record in records if record.ended != "finished"]
-    early.sort(key=lambda record: ("function_failed", "diverged", "step_too_small", "event").index(record.ended))
-    if not early:
-        return "finished", ""
-    first = early[0]
-    if batch is None or first.error is not None:
-        return first.ended, first.message
-    return first.ended, f"{first.message}; {len(early)} of {batch} trajectories ended early, see reached"
+    return run.assembled(t, q, v, reached)

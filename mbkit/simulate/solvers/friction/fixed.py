@@ -8,7 +8,6 @@ ends in parts, to the end of the phase and on from there; the parts are steps of
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -25,8 +24,8 @@ from mbkit.simulate.events import Hit
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.result import Ended, SolverResult
-from mbkit.simulate.solvers.fixed_step import GridRecord
 from mbkit.simulate.solvers.friction.phases import Friction, Phase
+from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
 
 #: problem -> result, of a smooth problem.
@@ -61,31 +60,25 @@ def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics]
 
 
 def _together(problem: IntegrationProblem, parts: list[_Members]) -> SolverResult:
-    record, early, error = GridRecord(problem), dict[int, tuple[Ended, str]](), None
+    record = GridRecord(problem)
     for part in parts:
         try:
             part.to_end(record)
         except FunctionError as failed:
-            error = failed
+            record.error = failed
         except NumericalError as failed:
             if part.side_by_side:
                 raise
             reached = problem.grid.time(int(part.k[0]))
             part.early[int(part.members[0])] = "diverged", f"diverged after t = {reached:.6g} s: {failed}"
-        record.steps[part.members] = part.k
-        early |= part.early
-        error = error or part.error
-        if error is not None:
+        record.good[part.members] = part.k
+        record.early |= part.early
+        record.error = record.error or part.error
+        record.events += part.hits
+        if record.error is not None:
             break
-    out = record.result(lambda _: "", sum(x.evaluations for x in parts), sum(x.jacobians for x in parts), error)
-    if early and error is None:
-        ended, message = early[min(early)]
-        if problem.batch is not None:
-            message += f"; {len(early)} of {len(problem.q)} trajectories ended early, see reached"
-        out = replace(out, ended=ended, message=message)
-    hits = sorted((x for part in parts for x in part.hits), key=lambda x: (x.member or 0, x.t))
-    doubts = dict.fromkeys(x for part in parts for x in part.doubts)
-    return replace(out, steps=sum(x.steps for x in parts), events=tuple(hits), doubts=tuple(doubts))
+    record.events.sort(key=lambda x: (x.member or 0, x.t))
+    return record.result()
 
 
 class _Members:
@@ -111,8 +104,6 @@ class _Members:
         self.early: dict[int, tuple[Ended, str]] = {}
         self.error: FunctionError | None = None
         self.hits: list[Hit] = []
-        self.doubts: list[str] = []
-        self.steps = self.evaluations = self.jacobians = 0
         self._phase: Phase
 
     def to_end(self, record: GridRecord) -> None:
@@ -309,10 +300,8 @@ class _Members:
 
             bound = self.friction.bounds(phase)
             out = run_rollout(own, behind=[self.margin_part], margins=margins, bound=bound)
-        self.steps += out.steps
-        self.evaluations += out.evaluations
-        self.jacobians += out.jacobians
-        self.doubts += out.doubts
+        self._record.count(out)
+        self._record.doubts += out.doubts
         return out
 
     def _good(self, rows: Indices, phase: Phase, q: Array, v: Array, limit: Indices, start: float, h: float) -> Indices:
@@ -361,7 +350,7 @@ class _Members:
                 break
             s = part.ends(every, left, margins[over])
             q, v, _ = part.ahead(every, s)
-            self.steps += len(rows)
+            self._record.steps += len(rows)
             moved = s >= _FROM * left
             start, left = start + s, left - s
             phase, decided = self._following(rows, phase.take(every), start, (q, v), moved, s > 0)

@@ -19,8 +19,8 @@ from mbkit.model.integration_space import Space
 from mbkit.model.manifold import least_change
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import GridRecord
 from mbkit.simulate.solvers.friction.phases import Friction, applied
+from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import DIVERGED
 
 #: Attempts at once, and the most for one step for each velocity with friction.
@@ -33,7 +33,7 @@ _UNDECIDED: Final = "which joints rest cannot be decided"
 def run_moreau(problem: IntegrationProblem) -> SolverResult:
     """Step one state or a batch over the grid."""
     dyn = problem.dyn
-    record, reasons, evaluations = GridRecord(problem), dict[int, str](), 0
+    record, reasons = GridRecord(problem), dict[int, str]()
     compiled = dyn.derived and not problem.torque.callable and "jump" in dyn.model.effects
     compiled = compiled and getattr(dyn, "compiles_steps", False) and not dyn.model.constrained
     for i in range(len(problem.q)):
@@ -41,13 +41,13 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
         own = dyn if member is None else dyn._of_sample(i)
         run = (_Compiled if compiled else _InPython)(problem, own, member, record, i)
         steps, attempts, reasons[i] = run.run()
-        record.steps[i] = steps
-        evaluations += attempts
+        record.good[i], record.error = steps, run.error
+        record.evaluations += attempts
         if run.error is not None:
-            return record.result(lambda i: reasons[i], evaluations, error=run.error)
+            break
         if problem.grid.steps:
             problem.report(i)(problem.end)
-    return record.result(lambda i: reasons[i], evaluations)
+    return record.result(lambda i: reasons[i])
 
 
 class _InPython:

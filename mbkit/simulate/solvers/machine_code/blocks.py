@@ -19,7 +19,7 @@ from mbkit.codegen.jit import host
 from mbkit.derivation.steps.fixed import Part
 from mbkit.errors import FunctionError
 from mbkit.simulate.problem import IntegrationProblem
-from mbkit.simulate.solvers.fixed_step import GridRecord
+from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
 
 #: Half of what a core has in its second cache, bytes.
@@ -249,9 +249,9 @@ def run_blocks(
                 q, w = (loop.states(name, kept[rows] - k) for name in loop.carried)
                 record.q[which, rows], record.v[which, rows] = q, loop.to_body_velocity(q, w)
             if good is None:
-                record.steps[which] = k + n
+                record.good[which] = k + n
             else:
-                record.steps[members[alive]] = k + good[alive]
+                record.good[members[alive]] = k + good[alive]
                 for m in np.flatnonzero(alive & (good < n)).tolist():
                     last[int(members[m])] = [loop.states(name, [good[m]])[m, 0] for name in loop.carried]
                 alive &= good == n

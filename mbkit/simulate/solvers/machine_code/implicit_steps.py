@@ -19,13 +19,13 @@ from mbkit.derivation.steps.fixed import Part
 from mbkit.derivation.steps.midpoint import MOST
 from mbkit.engines.base import at_time
 from mbkit.engines.lagrangian import LagrangianDynamics
-from mbkit.errors import FunctionError
 from mbkit.methods.tableaus import ImplicitTableau
 from mbkit.model.integration_space import Space
 from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.result import SolverResult
-from mbkit.simulate.solvers.fixed_step import GridRecord, run_fixed, to_body_velocity
+from mbkit.simulate.solvers.fixed_step import run_fixed, to_body_velocity
 from mbkit.simulate.solvers.machine_code.blocks import CACHE, SHORTEST, BlockLoop, padded, run_members
+from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Indices
 
 #: Multiplications of an implicit step's system beyond which compiling it takes longer than tens of thousands of steps
@@ -165,12 +165,12 @@ def run_implicit(
     other: Array,
     guess: Array,
     velocity: Callable[[float, Array, Array, Indices], Array],
-) -> tuple[GridRecord, int, dict[int, list[Array]], FunctionError | None]:
+) -> tuple[GridRecord, int, dict[int, list[Array]]]:
     """Run every trajectory, some side by side, and such chunks at once on several cores.
 
     `other` is what goes with q, (n, nv), and `guess` the first unknown; velocity(t, q, other, members) is mbkit's.
-    Returns also Newton's iterations, the last state of each trajectory that was lost, by its index, and the error of a
-    torque function that ended the run. The record holds `other` in the place of v.
+    Returns also Newton's iterations, and the last state of each trajectory that was lost, by its index. The record
+    holds `other` in the place of v.
     """
     dyn, record, grid = problem.dyn, GridRecord(problem), problem.grid
     assert isinstance(dyn, LagrangianDynamics)
@@ -189,12 +189,12 @@ def run_implicit(
         chunk.begin(*(x[members] for x in own), *([] if values.ndim == 2 else [values]))
         return chunk
 
-    error = run_members(
+    record.error = run_members(
         *(problem, record, np.arange(n), [slice(a, b) for a, b in pairwise(ends)], workers, lambda: begin, velocity),
         after_block=lambda _chunk, _members, _k, last: lost.update(last),
         after_part=lambda chunk, _part: iterations.append(chunk.iterations),
     )
-    return record, sum(iterations), lost, error
+    return record, sum(iterations), lost
 
 
 def run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> SolverResult:
@@ -214,12 +214,13 @@ def run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> So
         def velocity(t: float, q: Array, w: Array, members: Indices) -> Array:  # noqa: ARG001
             return to_body_velocity(space, q, w)
 
-        record, iterations, lost, error = run_implicit(problem, parts, w0, guess, velocity)
+        record, iterations, lost = run_implicit(problem, parts, w0, guess, velocity)
         if not space.flat:
             # The start is there already, as it was given.
             q, w = (x[:, record.kept > 0] for x in (record.q, record.v))
             flat = space.to_body_velocity(*(x.reshape(-1, x.shape[-1]) for x in (q, w)))
             record.v[:, record.kept > 0] = flat.reshape(w.shape)
-    if lost and error is None:
+    if lost and record.error is None:
         return run_fixed(problem, record, np.array(sorted(lost)))
-    return record.result(lambda _: "", tableau.stages * iterations, iterations, error)
+    record.evaluations, record.jacobians = tableau.stages * iterations, iterations
+    return record.result()
