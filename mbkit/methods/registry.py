@@ -218,22 +218,9 @@ def _scipy(name: str, scheme: str, order: int | None, **more: Any) -> Method:
     return _adaptive(name, order, "scipy:run_scipy", scheme=scheme, least=100 * _EPS, **more)
 
 
-#: The programs that have MuJoCo's integrators, and which of these they all have.
-_OF_MUJOCO: Final = ("mujoco", "mujoco-warp", "mjx", "mjx-single", "newton")
-_ANYWHERE: Final = ("euler", "implicitfast", "rk4")
-
-
-def _mujoco(scheme: str, stability: Stability, own: str = "") -> Method:
-    order, name = 4 if isinstance(stability, TableauStability) else 1, f"mujoco_{scheme}"
-    more: dict[str, Any] = {"solver": "native:run_native", "scheme": scheme, "stability": stability, "own": own}
-    engines = _OF_MUJOCO if scheme in _ANYWHERE else _OF_MUJOCO[:1]
-    return Method(name, "native", order, order, _ABOUT[name], engines=engines, callables=False, wrenches=False, **more)
-
-
-def _newton(scheme: str) -> Method:
-    more: dict[str, Any] = {"solver": "native:run_native", "scheme": scheme, "stability": SYMPLECTIC_EULER}
-    name = f"newton_{scheme}"
-    return Method(name, "native", 1, 1, _ABOUT[name], engines=("newton",), callables=False, wrenches=False, **more)
+def _native(name: str, order: int, stability: Stability, *engines: str, **more: Any) -> Method:
+    more = {"solver": "native:run_native", "stability": stability, "callables": False, "wrenches": False, **more}
+    return Method(name, "native", order, order, _ABOUT[name], engines=engines, **more)
 
 
 def _drake(scheme: str, order: int) -> Method:
@@ -241,12 +228,8 @@ def _drake(scheme: str, order: int) -> Method:
     return _adaptive(f"drake_{scheme}", order, "native:run_drake", scheme=scheme, least=1e-15, **more)
 
 
-def _drake_discrete() -> Method:
-    more: dict[str, Any] = {"solver": "native:run_drake_discrete", "stability": IMPLICIT_IN_VELOCITY}
-    name = "drake_sap"
-    return Method(name, "native", 1, 1, _ABOUT[name], engines=("drake",), callables=False, wrenches=False, **more)
-
-
+#: The programs that have MuJoCo's integrators.
+_OF_MUJOCO: Final = ("mujoco", "mujoco-warp", "mjx", "mjx-single", "newton")
 _STIFF: Final[dict[str, Any]] = {"jacobian": True, "fills_tolerance": True}
 _STIFF_OWN: Final[dict[str, Any]] = {**_STIFF, "compiled": True}
 _MOMENTA: Final[dict[str, Any]] = {
@@ -299,18 +282,18 @@ METHODS: Final[dict[str, Method]] = {
         _scipy(SCIPY_STIFF_METHOD, "Radau", 5, **_STIFF),
         _scipy("bdf", "BDF", None, multistep=True, **_STIFF),
         _scipy("lsoda", "LSODA", None, multistep=True, **_STIFF),
-        _mujoco("euler", SYMPLECTIC_EULER, EULER_METHOD),
-        _mujoco("rk4", _RK4_STABILITY, DEFAULT_METHOD),
-        _mujoco("implicit", IMPLICIT_IN_VELOCITY),
-        _mujoco("implicitfast", IMPLICIT_IN_VELOCITY),
-        _mujoco("discrete", IMPLICIT_EULER),
-        _newton("featherstone"),
+        _native("mujoco_euler", 1, SYMPLECTIC_EULER, *_OF_MUJOCO, scheme="euler", own=EULER_METHOD),
+        _native("mujoco_rk4", 4, _RK4_STABILITY, *_OF_MUJOCO, scheme="rk4", own=DEFAULT_METHOD),
+        _native("mujoco_implicit", 1, IMPLICIT_IN_VELOCITY, "mujoco", scheme="implicit"),
+        _native("mujoco_implicitfast", 1, IMPLICIT_IN_VELOCITY, *_OF_MUJOCO, scheme="implicitfast"),
+        _native("mujoco_discrete", 1, IMPLICIT_EULER, "mujoco", scheme="discrete"),
+        _native("newton_featherstone", 1, SYMPLECTIC_EULER, "newton", scheme="featherstone"),
         _drake("runge_kutta3", 3),
         _drake("runge_kutta5", 5),
         _drake("bogacki_shampine3", 3),
         _drake("radau3", 3),
         _drake("implicit_euler", 1),
-        _drake_discrete(),
+        _native("drake_sap", 1, IMPLICIT_IN_VELOCITY, "drake", solver="native:run_drake_discrete"),
     )
 }
 _BUILT_IN: Final = frozenset(METHODS)

@@ -11,7 +11,7 @@ whether a step is near a singular pose (`nears_singular`). Such a step is lost h
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
 from itertools import groupby
@@ -25,11 +25,9 @@ from mbkit._check import Array
 from mbkit.derivation.equations import Equations
 from mbkit.derivation.steps.onto_constraints import dependence, nears_singular, quick_projection, thorough_projection
 from mbkit.derivation.steps.symbols import SymbolicSpace
-from mbkit.errors import InputError
 from mbkit.methods.one_step import SemiImplicitEuler
-from mbkit.methods.registry import METHODS, method_of
+from mbkit.methods.registry import method_of
 from mbkit.methods.tableaus import Tableau
-from mbkit.model.integration_space import Space
 
 _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
@@ -109,36 +107,17 @@ class Part:
         return cls(name, tuple(arguments), tuple(results), lambda: function_of(name, arguments, results))
 
 
-def step(equations: Equations, method: str) -> ca.Function:
-    """Return (q, v, tau, dt) -> (q1, v1), with the equations' extra arguments behind.
-
-    The state after dt seconds under the torque tau, by an explicit method with a fixed step; q1 has unit quaternions
-    and v1 is mbkit's velocity, body axes on a free joint. An `InputError` where the method has no explicit step.
-    """
-    s, space = _symbols(equations), SymbolicSpace(equations.model)
-    names = {n: s[n] for n in ("q", "v", "tau", "dt", *equations.extra_arguments)}
-    q1, w1, _ = _stepped(
-        equations, method, s, space.to_integrator_velocity(s["q"], s["v"]), _acceleration(equations, space, s)
-    )
-    return function_of(f"{method}_step", names, {"q1": q1, "v1": space.to_body_velocity(q1, w1)})
-
-
 def march(equations: Equations, method: str, *, thorough: bool = False, fed: bool = False) -> tuple[Part, ...]:
-    """Return one part: the whole step in the integrators' own velocity, for many steps in a row.
-
-    It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum of the squares of all states so
-    far: a number that once was not finite, or beyond all bounds, shows in it for ever; so does a step that is lost to
-    its constraints. `thorough` projections lose fewer steps. `fed`: it reads the numbers of a state feedback too, whose
-    torque is added to tau.
-    """
+    """Return the step of `march_in_stages` as one part."""
     name = f"{_prefix(method, thorough, fed)}_march"
     reads = (*_MARCH, *equations.extra_arguments, *([LAW] if fed else []))
 
     def make() -> ca.Function:
-        s, space = _symbols(equations), SymbolicSpace(equations.model)
-        law = s[LAW] if fed else None
-        ends = _stepped(equations, method, s, s["w"], _acceleration(equations, space, s, law), thorough=thorough)
-        return function_of(name, {n: s[n] for n in reads}, _with_squares(s, *ends))
+        known = _symbols(equations)
+        given = {name: known[name] for name in reads}
+        for part in march_in_stages(equations, method, thorough=thorough, fed=fed):
+            known |= zip(part.writes, part.make().call([known[name] for name in part.reads]), strict=True)
+        return function_of(name, given, {name: known[name] for name in _MARCHED})
 
     return (Part(name, reads, _MARCHED, make),)
 
@@ -167,25 +146,27 @@ def _fed(law: Any, q: Any, v: Any) -> Any:
 def march_in_stages(
     equations: Equations, method: str, *, thorough: bool = False, fed: bool = False
 ) -> tuple[Part, ...]:
-    """Return the same step cut at each evaluation of the forward dynamics.
+    """Return a step in the integrators' own velocity, for many in a row, cut at each evaluation of forward dynamics.
 
-    The forward dynamics, most of the step, is then compiled once instead of once a stage. Between the parts go the
-    stages' states (q_i, v_i) and accelerations a_i.
+    It reads q, w, tau, dt, squares and writes q1, w1, squares1. The last is the sum of the squares of all states so
+    far: a number that once was not finite, or beyond all bounds, shows in it for ever; so does a step that is lost to
+    its constraints, as it is near a singular pose, or so long that its projection is not done. `thorough` projections
+    lose fewer steps. `fed`: it reads the numbers of a state feedback too, whose torque is added to tau.
+
+    The forward dynamics, most of the step, is compiled once and not for each stage. Between the parts go the stages'
+    states (q_i, v_i) and accelerations a_i.
     """
-    s, space = _symbols(equations), SymbolicSpace(equations.model)
-    known = {n: s[n] for n in ("q", "w", "dt")}
-    parts: list[Part] = []
-    prefix = _prefix(method, thorough, fed)
-
-    timed = equations.model.time_parameter is not None
-    held = equations.model.constrained
-    known |= equations.extra_arguments if held else {}
+    s, space, formula = _symbols(equations), SymbolicSpace(equations.model), method_of(method).formula
+    assert isinstance(formula, (Tableau, SemiImplicitEuler))
+    timed, held = equations.model.time_parameter is not None, equations.model.constrained
+    known = {n: s[n] for n in ("q", "w", "dt")} | (equations.extra_arguments if held else {})
     own = {n: s[n] for n in ("tau", LAW)} if fed else {}
-    dependences: list[Any] = []
+    parts, dependences, prefix = list[Part](), list[Any](), _prefix(method, thorough, fed)
+    last = s["q"]
 
-    def acceleration(t: Any, q: Any, w: Any) -> Any:
-        i = sum(part.name in DYNAMICS for part in parts)
-        v = space.to_body_velocity(q, w)
+    def rates(t: Any, q: Any, u: Any, w: Any) -> tuple[Any, Any]:
+        nonlocal last
+        i, v, last = sum(part.name in DYNAMICS for part in parts), space.to_body_velocity(q, w), q
         at, force, more = ("q", "w"), "tau", (*equations.extra_arguments,)
         stage = dict[str, Any]()
         if i or not space.flat:
@@ -208,11 +189,22 @@ def march_in_stages(
         else:
             parts.append(Part("forward_dynamics", reads, (f"a_{i}",), lambda: equations.function("forward_dynamics")))
         a = known[f"a_{i}"] = ca.SX.sym(f"a_{i}", equations.model.nv)
-        return space.acceleration(q, v, a)
+        return w if u is None else space.rate(u, w), space.acceleration(q, v, a)
 
-    ends = _stepped(equations, method, s, s["w"], acceleration, thorough=thorough, dependences=dependences)
-    known["squares"] = s["squares"]
-    return (*parts, Part.of(f"{prefix}_end", known, _with_squares(s, *ends)))
+    q1, w1, _ = formula.step(space, rates, SymbolicStages(space.nv), 0.0, s["dt"], s["q"], s["w"])
+    lost: Any = 0.0
+    if held:
+        behind, v1 = at_time(equations, s["dt"]).values(), space.to_body_velocity(q1, w1)
+        end = dependences[-1] if formula.ends_at_a_stage else dependence(equations)(q1, *behind)
+        if thorough or not formula.ends_at_a_stage:
+            q1, v1, far = thorough_projection(equations)(q1, v1, *behind)
+        else:
+            q1, v1, far = quick_projection(equations)(q1, v1, last, *behind)
+        w1, lost = space.to_integrator_velocity(q1, v1), ca.logic_or(far, nears_singular(dependences[0], end))
+    # Infinite where it is lost.
+    squares = s["squares"] + (ca.sumsqr(q1) + ca.sumsqr(w1)) + lost / (1 - lost)
+    results = dict(zip(_MARCHED, (q1, w1, squares), strict=True))
+    return (*parts, Part.of(f"{prefix}_end", known | {"squares": s["squares"]}, results))
 
 
 def parts_of(
@@ -241,67 +233,10 @@ def _held_dynamics(equations: Equations) -> ca.Function:
     return function_of("held_dynamics", dict(zip(forward.name_in(), (q, v, tau, *more), strict=True)), outs)
 
 
-def _stepped(
-    equations: Equations,
-    method: str,
-    s: dict[str, Any],
-    w: Any,
-    acceleration: Callable[[Any, Any, Any], Any],
-    *,
-    thorough: bool = True,
-    dependences: Sequence[Any] = (),
-) -> tuple[Any, Any, Any]:
-    """Return q and w after a step from q and this w, and 1 where it is lost to its constraints, else 0.
-
-    That is near a singular pose, and where a step is so long that its projection is not done.
-
-    acceleration(t, q, w) is ẇ at a time after the step's start; it may add the `dependence` at each stage to those.
-    """
-    formula, space = method_of(method).formula, SymbolicSpace(equations.model)
-    if not isinstance(formula, (Tableau, SemiImplicitEuler)) or not formula.explicit:
-        explicit = ", ".join(m.name for m in METHODS.values() if m.explicit)
-        raise InputError(f"method: expected one with an explicit step, got {method!r}; there are: {explicit}")
-    last: list[Any] = [s["q"]]
-
-    def rates(t: Any, q: Any, u: Any, w: Any) -> tuple[Any, Any]:
-        last[:] = [q]
-        return w if u is None else space.rate(u, w), acceleration(t, q, w)
-
-    q1, w1, _ = formula.step(space, rates, SymbolicStages(space.nv), 0.0, s["dt"], s["q"], w)
-    if not equations.model.constrained:
-        return q1, w1, 0.0
-    before, behind = equations.extra_arguments.values(), at_time(equations, s["dt"]).values()
-    v1, depends = space.to_body_velocity(q1, w1), dependence(equations)
-    first = dependences[0] if dependences else depends(s["q"], *before)
-    if formula.ends_at_a_stage:
-        end = dependences[-1] if dependences else depends(*last, *behind)
-    else:
-        end = depends(q1, *behind)
-    if thorough or not formula.ends_at_a_stage:
-        q1, v1, far = thorough_projection(equations)(q1, v1, *behind)
-    else:
-        q1, v1, far = quick_projection(equations)(q1, v1, *last, *behind)
-    lost = ca.logic_or(far, nears_singular(first, end))
-    return q1, space.to_integrator_velocity(q1, v1), lost
-
-
 def _symbols(equations: Equations) -> dict[str, Any]:
     nq, nv = equations.model.nq, equations.model.nv
     sizes = {"q": nq, "v": nv, "w": nv, "tau": equations.force.numel(), "dt": 1, "squares": 1, LAW: nv * (1 + nq + nv)}
     return {**{name: ca.SX.sym(name, n) for name, n in sizes.items()}, **equations.extra_arguments}
-
-
-def _acceleration(
-    equations: Equations, space: Space, s: dict[str, Any], law: Any = None
-) -> Callable[[Any, Any, Any], Any]:
-    forward = equations.function("forward_dynamics")
-
-    def acceleration(t: Any, q: Any, w: Any) -> Any:
-        v = space.to_body_velocity(q, w)
-        tau = s["tau"] if law is None else s["tau"] + _fed(law, q, v)
-        return space.acceleration(q, v, forward(q, v, tau, *at_time(equations, t).values()))
-
-    return acceleration
 
 
 def at_time(equations: Equations, t: Any) -> dict[str, Any]:
@@ -312,12 +247,6 @@ def at_time(equations: Equations, t: Any) -> dict[str, Any]:
         *others, time = ca.vertsplit(parameters)
         given["parameters"] = ca.vertcat(*others, time + t)
     return given
-
-
-def _with_squares(s: dict[str, Any], q1: Any, w1: Any, lost: Any) -> dict[str, Any]:
-    # Infinite where it is lost.
-    squares = s["squares"] + (ca.sumsqr(q1) + ca.sumsqr(w1)) + lost / (1 - lost)
-    return dict(zip(_MARCHED, (q1, w1, squares), strict=True))
 
 
 def function_of(name: str, arguments: dict[str, Any], results: dict[str, Any]) -> ca.Function:
