@@ -385,6 +385,11 @@ def test_a_force_of_time_acts_at_the_times_of_a_loop(engine: str, options: dict[
     np.testing.assert_allclose(q, 6e-4 * (1 - np.cos(50 * end)), atol=1e-11)
 
 
+def test_a_step_in_parts_has_the_time_of_each_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
+    test_a_force_of_time_acts_at_the_times_of_a_loop("lagrangian", {"compile": True})
+
+
 @pytest.mark.parametrize("model", [_shaken, lambda: _shaken(friction=0.4), _carried])
 @pytest.mark.parametrize("compiled", [True, False])
 def test_each_state_of_a_batch_has_its_time(model: Any, compiled: bool) -> None:

@@ -159,7 +159,7 @@ def march_in_stages(
     s, space, formula = _symbols(equations), SymbolicSpace(equations.model), method_of(method).formula
     assert isinstance(formula, (Tableau, SemiImplicitEuler))
     timed, held = equations.model.time_parameter is not None, equations.model.constrained
-    known = {n: s[n] for n in ("q", "w", "dt")} | (equations.extra_arguments if held else {})
+    known = {n: s[n] for n in ("q", "w", "dt")} | (equations.extra_arguments if held or timed else {})
     own = {n: s[n] for n in ("tau", LAW)} if fed else {}
     parts, dependences, prefix = list[Part](), list[Any](), _prefix(method, thorough, fed)
     last = s["q"]
