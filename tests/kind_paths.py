@@ -204,7 +204,7 @@ def _forward(x: Example, folder: Path, which: str) -> Told:
     dyn = engine(x.name, which)
     a = dyn.forward_dynamics(x.q, x.v, x.tau)
     wanted = x.accelerated()
-    if dyn.soft_constraints and x.rows:
+    if dyn._soft_constraints and x.rows:
         # MuJoCo's constraints are soft; its law, which its solver reaches, becomes the rigid one.
         law = dyn.constraint_law(x.q, x.v, x.tau)
         return max(off(a, law.acceleration), off(law.rigid, wanted))
@@ -536,7 +536,7 @@ def _ended(run: mb.Trajectory) -> None:
 def _run(x: Example, folder: Path, which: str, method: str) -> Told:
     """The end of a run; of a fixed step that which steps of half the length lead to, by the method's order."""
     dyn, told = engine(x.name, which), METHODS[method]
-    if dyn.soft_constraints and x.rows:
+    if dyn._soft_constraints and x.rows:
         raise NotAskedError("its constraints are soft")
     q, v = _truth(x.name)
 

@@ -299,7 +299,7 @@ def test_one_wrong_entry_of_a_derivative_is_found_at_its_joint(monkeypatch, meth
 )
 def test_the_rounding_of_the_mass_matrix_excuses_no_other_term(monkeypatch, method, term, passed):
     planted(monkeypatch, MujocoDynamics, method, lambda x: x * (1 + 1e-9))
-    monkeypatch.setattr(MujocoDynamics, "mass_matrix_rounding", lambda self, q, quantity: 1e10)  # noqa: ARG005
+    monkeypatch.setattr(MujocoDynamics, "_mass_matrix_rounding", lambda self, q, quantity: 1e10)  # noqa: ARG005
     rows = {(r.term, r.engine): r for r in terms(mb.load("ur5"), engines=("pinocchio", "mujoco")).rows}
     row = rows[term, "mujoco"]
     assert row.passed == passed
@@ -688,10 +688,10 @@ def test_what_an_engine_may_lose_is_small_on_a_robot_and_grows_with_the_distance
     robot = mb.load("ur5")
     q = robot.neutral()
     for name in ("pinocchio", "lagrangian", "mujoco"):
-        assert 1 <= mb.dynamics(robot, name).mass_matrix_rounding(q) < 1e3
+        assert 1 <= mb.dynamics(robot, name)._mass_matrix_rounding(q) < 1e3
     # Where the link stands along the first axis, M_11 is small, and the inertia about it grows with the distance.
     q = [0.0, np.pi / 2, 0.0]
-    near, far = (mb.dynamics(far_from_its_joint(x)).mass_matrix_rounding(q) for x in (4.0, 40.0))
+    near, far = (mb.dynamics(far_from_its_joint(x))._mass_matrix_rounding(q) for x in (4.0, 40.0))
     assert 50 < far / near < 200
 
 

@@ -381,7 +381,7 @@ def test_without_a_compiler_the_same_numbers_come_and_one_warning(monkeypatch):
             mb.dynamics(model, "lagrangian", compile=True).nle(q, v)
     finally:
         backend.has_compiler.cache_clear()
-    assert isinstance(dyn.code("inverse_dynamics"), Machine)
+    assert isinstance(dyn._code("inverse_dynamics"), Machine)
     np.testing.assert_allclose(got, expected, rtol=0, atol=50 * EPS * np.abs(expected).max())
 
 

@@ -557,7 +557,7 @@ def test_moreau_s_step_in_machine_code_is_that_in_python(monkeypatch: pytest.Mon
     model = rubbed(3, 4, ("revolute", "universal", "prismatic", "spherical_zyx"), mimic=True)
     q, v, tau = mostly_at_rest(model, 2)
     dyn = mb.dynamics(model, "lagrangian", compile=True)
-    assert dyn.compiles_steps
+    assert dyn._compiles_steps
     pulls = np.repeat(tau[:, None], 100, axis=1)
     fast = mb.simulate(dyn, q, v, 0.1, "moreau", dt=1e-3, torque=pulls)
     monkeypatch.setattr(moreau, "_Compiled", moreau._InPython)

@@ -36,7 +36,7 @@ def together_and_alone(dyn: Any, q: Any, v: Any, method: str, each: dict[str, An
     alone = []
     for i in range(len(q)):
         own = {name: x[i] if not isinstance(x, dict) else {f: w[i] for f, w in x.items()} for name, x in each.items()}
-        one = dyn if dyn.samples is None else dyn._of_sample(i)
+        one = dyn if dyn._samples is None else dyn._of_sample(i)
         alone.append(mb.simulate(one, q[i], v[i], DURATION, method, **own, **settings))
     return batch, alone
 

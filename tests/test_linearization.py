@@ -145,7 +145,7 @@ def test_a_large_batch_is_computed_in_slices():
     own = dyn.at(m=np.linspace(1.0, 2.0, n))
     many = own.discretize(q, v, tau, 0.01)
     for k in (0, n // 2, n - 1):
-        one = own.of_samples([k]).discretize(q[k : k + 1], v[k : k + 1], tau[k : k + 1], 0.01)
+        one = own._of_samples([k]).discretize(q[k : k + 1], v[k : k + 1], tau[k : k + 1], 0.01)
         for x, y in zip(many, one, strict=True):
             close(x[k], y[0], 1e-13)
 

@@ -19,13 +19,13 @@ FAST = np.array([10.0, 0.0, 0.0])
 def plans(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Return the list of plans that are asked for: whether each is the thorough one."""
     asked: list[bool] = []
-    plan = LagrangianDynamics.step_plan
+    plan = LagrangianDynamics._step_plan
 
     def step_plan(self: LagrangianDynamics, method: str, *, thorough: bool = False, **how: bool) -> object:
         asked.append(thorough)
         return plan(self, method, thorough=thorough, **how)
 
-    monkeypatch.setattr(LagrangianDynamics, "step_plan", step_plan)
+    monkeypatch.setattr(LagrangianDynamics, "_step_plan", step_plan)
     return asked
 
 

@@ -151,7 +151,7 @@ def test_runs_keep_mujoco_s_drift() -> None:
     """Its own steps are those of `mj_step` to the bit, and mbkit's methods converge to the same motion."""
     model, q, v = four_bar()
     dyn = mb.dynamics(model, "mujoco", **stiffest(1e-3))
-    assert not dyn.projects
+    assert not dyn._projects
     run = mb.simulate(dyn, q, v, 0.2, "mujoco_rk4", 1e-3)
     m = dyn.mj_model
     d = mujoco.MjData(m)

@@ -73,7 +73,7 @@ def on_engine(engine: str) -> Callable[[Case, Path], None]:
     def check(case: Case, folder: Path) -> None:
         dyn = dynamics(case, engine=engine)
         a = dyn.forward_dynamics(case.q, case.v, case.tau)
-        if dyn.soft_constraints and any(p.rows for p in case.parts):
+        if dyn._soft_constraints and any(p.rows for p in case.parts):
             # MuJoCo's constraints are soft; its law, which its solver reaches, becomes the rigid one.
             law = dyn.constraint_law(case.q, case.v, case.tau)
             assert_close(a, law.acceleration)
@@ -406,7 +406,7 @@ def as_in_numpy(model: mb.Model, *others: mb.Dynamics) -> None:
     x = truth(model)
     for dyn in others:
         dyn = dyn.at(**{model.time_parameter: x.t}) if model.time_parameter else dyn
-        if not (model.constrained and dyn.soft_constraints):
+        if not (model.constrained and dyn._soft_constraints):
             assert_close(dyn.forward_dynamics(x.q, x.v, x.tau), x.accelerated())
         elif hasattr(dyn, "constraint_law"):
             assert_close(dyn.constraint_law(x.q, x.v, x.tau).rigid, x.accelerated())

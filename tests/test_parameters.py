@@ -181,11 +181,11 @@ def test_some_samples_of_a_batch(open_machine):
     many = dyn.at(**draw(1)).at(mass=[0.6, 1.0, 1.5])
     q = states(model, 3)[0]
     some = [2, 0, 2, 1]
-    assert off(many.of_samples(some).mass_matrix(q[some]), many.mass_matrix(q)[some]) == 0
-    assert many.samples == 3
+    assert off(many._of_samples(some).mass_matrix(q[some]), many.mass_matrix(q)[some]) == 0
+    assert many._samples == 3
     for single in (dyn, mb.dynamics(dyn.at(**draw(1)).model, "pinocchio")):
-        assert single.of_samples(some) is single
-        assert single.samples is None
+        assert single._of_samples(some) is single
+        assert single._samples is None
 
 
 def test_nothing_is_derived_again(open_machine):
@@ -599,6 +599,6 @@ def test_unknown_kinds_of_constants_are_refused():
 @pytest.mark.parametrize("which", [[False, True], 1, [0.5], [[0]], "a"])
 def test_samples_are_chosen_by_whole_numbers_alone(which):
     dyn = mb.dynamics(mb.catalog.pendulum(mass=mb.Parameter("m")), "lagrangian").at(m=[1.0, 2.0])
-    assert dyn.of_samples([]).mass_matrix([0.0]).shape == (0, 1, 1)
+    assert dyn._of_samples([]).mass_matrix([0.0]).shape == (0, 1, 1)
     with pytest.raises(InputError, match="expected a list of indices"):
-        dyn.of_samples(which)
+        dyn._of_samples(which)

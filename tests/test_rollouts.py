@@ -78,7 +78,7 @@ def in_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
     monkeypatch.setattr(
         LagrangianDynamics,
-        "step_plan",
+        "_step_plan",
         lambda dyn, method, **how: compiled_calls.Plan(dyn.equations, method, dyn._part, **how),
     )
 
@@ -212,7 +212,7 @@ def test_rollouts_in_stages_are_the_stepwise_runs(method: str, floating: Lagrang
     tau = np.random.default_rng(1).standard_normal((11, 50, floating.model.nv))
     run = simulate(floating, q, v, 0.05, method, torque=tau)
     assert_same(run, stepwise(floating, q, v, 0.05, method, torque=tau))
-    assert len(floating.step_plan(method).parts) > 1
+    assert len(floating._step_plan(method).parts) > 1
 
 
 def test_robots_are_mujocos_rollouts() -> None:
@@ -294,7 +294,7 @@ def test_a_block_stops_anywhere_for_another_torque(n: int, floating: LagrangianD
     tau = np.random.default_rng(1).normal(size=(n, len(stops) - 1, floating.model.nv))
     table = np.repeat(tau, np.diff(stops), axis=1)
     run = simulate(floating, q, v, steps * 1e-3, dt=1e-3, torque=table)
-    chunk = compiled_fixed_step.Chunk(floating.step_plan("rk4"), space, n, steps, torques=False, all_kept=False)
+    chunk = compiled_fixed_step.Chunk(floating._step_plan("rk4"), space, n, steps, torques=False, all_kept=False)
     chunk.begin(q, space.to_integrator_velocity(q, v), np.empty(0))
     chunk.set_times(Grid.of(0.0, 1.0, 1e-3), 0, steps)
     done = 0

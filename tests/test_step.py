@@ -91,7 +91,7 @@ def test_a_step_in_parts_too(kinds: tuple[str, ...], monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
     dyn = own(random_tree(3, n=3, kinds=kinds))
     assert_simulated(dyn, "rk4", rounding="free" in kinds)
-    assert len(dyn.step_plan("rk4").parts) > 1
+    assert len(dyn._step_plan("rk4").parts) > 1
 
 
 @pytest.mark.thorough("rk4-lagrangian", "rk4-oracle")

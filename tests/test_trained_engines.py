@@ -56,7 +56,7 @@ def test_an_unknown_engine_is_answered_with_these_too():
 
 class Single(PinocchioDynamics):
     engine = "single"
-    bits = 24
+    _significand_bits = 24
     wrong = 1.0
 
     def _value(self, method, states, more, size):
@@ -102,7 +102,7 @@ def test_what_single_precision_does_not_explain_is_an_error(monkeypatch, wrong):
 
 @pytest.mark.usefixtures("single")
 def test_an_engine_in_double_precision_is_judged_as_before(monkeypatch):
-    monkeypatch.setattr(Single, "bits", 53)
+    monkeypatch.setattr(Single, "_significand_bits", 53)
     assert not compared().passed
 
 
@@ -338,7 +338,7 @@ def test_a_stack_gives_what_single_states_give(real):
         each = np.array([getattr(dyn, term)(*state) for state in zip(*arguments, strict=True)])
         # Sums may come in another order.
         lost = np.linalg.cond(dyn.mass_matrix(q)).max() if term == "forward_dynamics" else 4.0
-        assert np.abs(whole - each).max() <= lost * epsilon(dyn.bits) * np.abs(whole).max(), term
+        assert np.abs(whole - each).max() <= lost * epsilon(dyn._significand_bits) * np.abs(whole).max(), term
 
 
 def test_own_integrators_have_their_order(real):
@@ -412,7 +412,7 @@ def test_own_runs_take_torques_that_a_controller_samples(real, method, twin):
     own = mb.simulate(dyn, q0, v0, 0.2, method, **setting)
     same = mb.simulate(mujoco, q0, v0, 0.2, twin, **setting)
     free = mb.simulate(mujoco, q0, v0, 0.2, twin, dt=2e-3)
-    limit = 1e3 * epsilon(dyn.bits) if method == twin else 5e-3
+    limit = 1e3 * epsilon(dyn._significand_bits) if method == twin else 5e-3
     if sums := real.engine.startswith("mjx"):
         assert np.abs(model.difference(same.q, own.q)).max() < 1e-5
     expected = run_of_sums(mujoco, q0, v0, 2e-3, 100, law, hold=2) if sums else same.q
@@ -426,7 +426,7 @@ def test_own_runs_take_torques_that_a_controller_samples(real, method, twin):
     expected = run_of_sums(mujoco, q0, v0, 2e-3, 50, lambda k, *_: rows[k]) if sums else same.q
     assert np.abs(model.difference(expected, whole.q)).max() < limit
     batch = mb.simulate(dyn, [q0, q0], v0, 0.1, method, dt=2e-3, torque=np.stack([rows, 0 * rows]))
-    assert np.abs(batch.q[0] - whole.q).max() < 1e3 * epsilon(dyn.bits)
+    assert np.abs(batch.q[0] - whole.q).max() < 1e3 * epsilon(dyn._significand_bits)
     assert np.abs(batch.q[1] - whole.q).max() > 1e-3
     with pytest.raises(UnsupportedError, match="in the world's axes"):
         mb.simulate(dyn, q0, v0, 0.1, method, dt=2e-3, torque=np.ones(model.nv))

@@ -241,8 +241,8 @@ def measure(scene):
 def fixed(label, model):
     """Return the processor's time of a step of RK4 in runs of one state, µs."""
     dyn, (q, v), space = mb.dynamics(model, "lagrangian", threads=1, compile=True), start(model), Space(model)
-    chunk = Chunk(dyn.step_plan("rk4"), space, 1, STEPS[0], torques=False, all_kept=False)
-    chunk.begin(q[None], space.to_integrator_velocity(q, v)[None], dyn.parameter_values)
+    chunk = Chunk(dyn._step_plan("rk4"), space, 1, STEPS[0], torques=False, all_kept=False)
+    chunk.begin(q[None], space.to_integrator_velocity(q, v)[None], dyn._parameter_values)
     chunk.set_times(Grid.of(0.0, 1.0, DT), 0, chunk.block)
     zero = np.zeros((1, model.nv, 1))
 

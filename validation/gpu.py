@@ -171,7 +171,7 @@ def steps(model: mb.Model) -> dict[str, Any]:
         began = time.perf_counter()
         run(gpu, n, count)
         out[f"a second, {name}"] = n * count / (time.perf_counter() - began)
-    made = gpu.device_steps("rk4")
+    made = gpu._device_steps("rk4")
     with made.arena(n) as arena:
         arena.put("q", given["q"].T)
         arena.put("w", v.T)
@@ -271,7 +271,7 @@ def varied() -> dict[str, Any]:
 
 def operations(dyn: Any, part: Part) -> int:
     """Return how many operations a part of a step has."""
-    return int(dyn.code(part.name, make=part.make).operations)
+    return int(dyn._code(part.name, make=part.make).operations)
 
 
 def assembled(ptxas: str) -> dict[str, Any]:

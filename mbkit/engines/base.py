@@ -135,21 +135,21 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     """
 
     engine: ClassVar[str]
-    #: Quantities this engine cannot give, each with the reason.
-    refuses: ClassVar[dict[str, str]] = {}
+    #: Reason for each quantity that this engine cannot give.
+    _refuses: ClassVar[dict[str, str]] = {}
     #: Whether parameters may still be without values when the adapter is built.
-    takes_parameters: ClassVar[bool] = False
+    _takes_parameters: ClassVar[bool] = False
     #: The kinds of parts that it carries.
-    path: Path = OWN_ENGINE
+    _path: Path = OWN_ENGINE
     #: The point about which it writes composite inertias, by quantity, or for all others by the empty name; of each
     #: joint its own origin by default. `mbkit.engines.frames_and_momenta` has the choices.
-    inertias_about: ClassVar[dict[str, str]] = {}
+    _inertias_about: ClassVar[dict[str, str]] = {}
     #: Whether it has `mbkit.derivation.Equations` and compiles whole steps of them.
-    derived: ClassVar[bool] = False
-    #: Of the significand with which it computes.
-    bits: ClassVar[int] = DOUBLE_BITS
+    _derived: ClassVar[bool] = False
+    #: Significand bits of its arithmetic.
+    _significand_bits: ClassVar[int] = DOUBLE_BITS
     #: Whether the adapter's own terms hold the forces that are given by functions; else they are added to them.
-    has_elements: ClassVar[bool] = False
+    _has_force_elements: ClassVar[bool] = False
     #: Whether an evaluation uses memory of the object, so that one thread at a time may evaluate.
     _one_at_a_time: ClassVar[bool] = True
     #: Whether the adapter's methods take batches too, all of one size, and not single states alone.
@@ -165,14 +165,14 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 
     def __init__(self, model: Model) -> None:
         self._take(model)
-        self.path.admit(model, f"{self.engine}:")
+        self._path.admit(model, f"{self.engine}:")
 
     def _take(self, model: Model) -> None:
         """Take a model, whatever its parts."""
-        if not self.takes_parameters:
+        if not self._takes_parameters:
             model.require_values(self.engine)
-        #: Whether the first accelerations, and the first step, look whether their state satisfies the constraints.
-        self.looks = self.unstepped = model.constrained and not self.soft_constraints
+        #: Whether no acceleration, and no step, has yet checked that its state satisfies the constraints.
+        self._state_unchecked = self._step_unchecked = model.constrained and not self._soft_constraints
         self._lock: Any = fork_safe(threading.RLock()) if self._one_at_a_time else nullcontext()
         # Also where a copy begins again.
         vars(self)["model"] = model
@@ -182,7 +182,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         """Names of the quantities that this engine can give."""
         following = loads.FOLLOWING | closed_loops.FOLLOWING
         needed = {x: following.get(x, x) for x in QUANTITIES}
-        given = {x for x, y in needed.items() if y not in self.refuses and hasattr(self, f"_{y}")}
+        given = {x for x, y in needed.items() if y not in self._refuses and hasattr(self, f"_{y}")}
         closed = {path for path in _GATES.values() if path.refuses(self.model)}
         given = {x for x in given if not {_GATES.get(x), _GATES.get(needed[x])} & closed}
         return frozenset(given if self.model.has_bodies else given - _OF_BODIES)
@@ -233,7 +233,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         vars(out).update(vars(self), model=self.model.with_nominal(values))
         return out
 
-    def of_samples(self, which: ArrayLike) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
+    def _of_samples(self, which: ArrayLike) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
         """Return the dynamics of these samples of a batch, by index: itself, unless parameters differ between them.
 
         Examples
@@ -241,7 +241,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         >>> import mbkit as mb
         >>> model = mb.catalog.pendulum(mass=mb.Parameter("m", 2.0))
         >>> dyn = mb.dynamics(model, "lagrangian").at(m=[1.0, 2.0, 3.0])
-        >>> dyn.of_samples([0, 2]).samples
+        >>> dyn._of_samples([0, 2])._samples
         2
         """
         return self
@@ -365,7 +365,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         >>> print(dyn.forward_dynamics([0.1, 0.2], [1.0, -2.0], [0.0, 0.0]).round(4))
         [ 1.2275 -5.5282]
         """
-        self._look(q, v)
+        self._warn_if_inconsistent(q, v)
         if wrenches:
             frames, w = self._stacked_wrenches(wrenches)
             acting = frames, axes_named(axes)
@@ -416,7 +416,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     # Derivatives
 
     @property
-    def lacks_derivatives(self) -> str:
+    def _why_no_derivatives(self) -> str:
         """Why there are no derivatives of this model; empty where there are."""
         return "it has none; mbkit.dynamics(model, 'lagrangian') has"
 
@@ -452,12 +452,12 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         return ForwardDynamicsDerivatives(*self._derivatives("forward_dynamics_derivatives", q=q, v=v, tau=tau))
 
     def _derivatives(self, quantity: str, **arguments: ArrayLike) -> list[Array]:
-        if reason := self.refuses.get(quantity, self.lacks_derivatives):
+        if reason := self._refuses.get(quantity, self._why_no_derivatives):
             raise UnsupportedError(f"{self.engine} cannot give {quantity}: {reason}")
         out = self._evaluate(quantity, **arguments)
         return [out[..., k, :, :] for k in range(3)]
 
-    def mass_matrix_rounding(self, q: ArrayLike, quantity: str = "mass_matrix") -> float:
+    def _mass_matrix_rounding(self, q: ArrayLike, quantity: str = "mass_matrix") -> float:
         """Return how far the engine's own formula amplifies rounding in M at one configuration.
 
         ``Σ |terms| / M_jj`` of the sum that makes the worst diagonal entry, at least 1. `quantity` is M or what is
@@ -467,12 +467,12 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         --------
         >>> import mbkit as mb
         >>> dyn = mb.dynamics(mb.catalog.double_pendulum())
-        >>> round(dyn.mass_matrix_rounding([0.1, 0.2]), 1)
+        >>> round(dyn._mass_matrix_rounding([0.1, 0.2]), 1)
         1.0
         """
         if not self.model.has_bodies:
             return 1.0
-        about = self.inertias_about.get(quantity, self.inertias_about.get("", JOINT))
+        about = self._inertias_about.get(quantity, self._inertias_about.get("", JOINT))
         return composite_rounding(self, self.model.check_q(q), about)
 
     # Wrenches behind the force
@@ -503,7 +503,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if quantity in frames_and_momenta.OF_THE_WHOLE and self.model.rotors:
             return self._matter._without_friction(quantity)
         method = self._without_friction(quantity)
-        exact = "jump" in self.model.effects and not (self.soft_friction and quantity in UNDER_FORCE)
+        exact = "jump" in self.model.effects and not (self._soft_friction and quantity in UNDER_FORCE)
         return self._friction.beside(quantity, method, self) if exact else method
 
     def _of_sample(self, i: int) -> Dynamics:  # noqa: ARG002  # for the engine whose samples differ
@@ -535,10 +535,10 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         if quantity in _GATES:
             _GATES[quantity].admit(self.model, f"{quantity}: not known of")
         method = getattr(self, f"_{quantity}", None)
-        if method is None or quantity in self.refuses:
-            reason = self.refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")
+        if method is None or quantity in self._refuses:
+            reason = self._refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")
             raise UnsupportedError(f"{self.engine} cannot give {quantity}: {reason}")
-        if self.model.forces and not self.has_elements:
+        if self.model.forces and not self._has_force_elements:
             return self._elements.beside(quantity, method, self)
         return method  # type: ignore[no-any-return]  # by name
 
@@ -608,7 +608,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
         model, index = self.model, tuple(np.argwhere(~np.isfinite(out))[0].tolist())
         sample = f" in sample {index[0]}" if next(iter(states.values())).ndim == 2 else ""
         if model.has_bodies:
-            if model.constrained and not self.soft_constraints and "tau" in states:
+            if model.constrained and not self._soft_constraints and "tau" in states:
                 i = index[0] if sample else 0
                 self._of_sample(i)._require_regular(*(np.atleast_2d(states[k])[i] for k in "qv"))
             where, why = f"index {index}{sample}", self._suspects()
@@ -644,12 +644,12 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 class WrenchedDynamics(Dynamics):
     """`Dynamics._under` of an engine, by its own Jacobians."""
 
-    takes_parameters = has_elements = True
+    _takes_parameters = _has_force_elements = True
     _bare: Dynamics
 
     def __init__(self, dyn: Dynamics, frames: tuple[Frame, ...], axes: str) -> None:
-        self._bare, self._acting, self.path = dyn, (frames, axes), dyn.path
-        self.soft_constraints, self.soft_friction = dyn.soft_constraints, dyn.soft_friction
+        self._bare, self._acting, self._path = dyn, (frames, axes), dyn._path
+        self._soft_constraints, self._soft_friction = dyn._soft_constraints, dyn._soft_friction
         super().__init__(dyn.model)
         self._forward_dynamics = dyn._method("forward_dynamics")
         dyn._method("jacobian")
@@ -756,9 +756,9 @@ def at_times(dyn: _Dynamics, t: Array, trajectories: int | None = None) -> _Dyna
     clock = dyn.model.time_parameter
     if clock is None:
         return dyn
-    if not dyn.takes_parameters:
+    if not dyn._takes_parameters:
         raise UnsupportedError(f"{dyn.engine}: holds one time; evaluate along a run with the lagrangian engine")
     own = dyn
-    if trajectories is not None and dyn.samples is not None:
-        own = dyn.of_samples(np.repeat(np.arange(trajectories), len(t)))  # type: ignore[assignment]
+    if trajectories is not None and dyn._samples is not None:
+        own = dyn._of_samples(np.repeat(np.arange(trajectories), len(t)))  # type: ignore[assignment]
     return own.at(**{clock: np.tile(t, trajectories or 1)})  # type: ignore[return-value]

@@ -58,14 +58,14 @@ def singular_pose(who: str, name: str, rows: Sequence[str], J: Array) -> Numeric
 @contextmanager
 def unwatched(*all_dynamics: Any) -> Iterator[None]:
     """Let no acceleration warn of an open state, as stages of a run are open by the order of a method's error."""
-    before = [dyn.looks for dyn in all_dynamics]
+    before = [dyn._state_unchecked for dyn in all_dynamics]
     try:
         for dyn in all_dynamics:
-            dyn.looks = False
+            dyn._state_unchecked = False
         yield
     finally:
-        for dyn, looks in zip(all_dynamics, before, strict=True):
-            dyn.looks = looks
+        for dyn, unchecked in zip(all_dynamics, before, strict=True):
+            dyn._state_unchecked = unchecked
 
 
 class Constrained:
@@ -92,12 +92,12 @@ class Constrained:
 
     model: Model
     #: Whether the engine lets constraints give way: its states are those of its own equations, and none is projected.
-    soft_constraints: bool = False
+    _soft_constraints: bool = False
     #: Options with which the engine holds dry friction by its own soft law, and whether it does.
-    own_friction: ClassVar[Mapping[str, Any]] = {}
-    soft_friction: bool = False
+    _soft_friction_options: ClassVar[Mapping[str, Any]] = {}
+    _soft_friction: bool = False
     engine: ClassVar[str]
-    looks: bool
+    _state_unchecked: bool
     _row_choice: Any
     _evaluate: Callable[..., Array]
     _without_friction: Callable[[str], Callable[..., Any]]
@@ -108,9 +108,9 @@ class Constrained:
         return np.zeros_like(v)
 
     @property
-    def projects(self) -> bool:
+    def _projects(self) -> bool:
         """Whether runs project their states onto constraints."""
-        return self.model.constrained and not self.soft_constraints
+        return self.model.constrained and not self._soft_constraints
 
     @property
     def _states_held(self) -> Any:
@@ -159,17 +159,17 @@ class Constrained:
                 f"v: {self.model.name}: no velocity satisfies all constraints: open stay {', '.join(still)}"
             )
 
-    def _look(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
-        if self.looks:
+    def _warn_if_inconsistent(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
+        if self._state_unchecked:
             self._warn_of_open_states(q)
             if v is not None and self._row_choice.redundant and np.isfinite(q).all() and np.isfinite(v).all():
                 self._refuse_contradictory_rates(q, v)
-            self.looks = False
+            self._state_unchecked = False
 
     def _require_motion(self, q: ArrayLike, v: ArrayLike | None = None, tau: ArrayLike | None = None) -> None:
         """Refuse a pose on another branch by its accelerations, under unit forces without τ (NumericalError)."""
-        self._look(q, v)
-        if self.soft_constraints or not self._row_choice.redundant:
+        self._warn_if_inconsistent(q, v)
+        if self._soft_constraints or not self._row_choice.redundant:
             return
         still = np.zeros(self.model.nv)
         with unwatched(self):
@@ -327,7 +327,7 @@ class Constrained:
         >>> dyn.constraint_forces(q, v, [0.0] * 3).shape, len(dyn.constraint_names)
         ((2,), 2)
         """
-        self._look(q, v)
+        self._warn_if_inconsistent(q, v)
         return self._evaluate("constraint_forces", q=q, v=v, tau=tau)
 
     def generalized_constraint_force(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
@@ -341,7 +341,7 @@ class Constrained:
         >>> dyn.generalized_constraint_force(q, v, [0.0] * 3).shape
         (3,)
         """
-        self._look(q, v)
+        self._warn_if_inconsistent(q, v)
         return self._evaluate("generalized_constraint_force", q=q, v=v, tau=tau)
 
     def _generalized_constraint_force(self, q: Array, v: Array, tau: Array) -> Any:

@@ -127,9 +127,9 @@ class Manifold:
 
     def call(self, name: str, *arguments: Array) -> list[Array]:
         """Return the outputs of a compiled function, with its parameters behind."""
-        code = self.dyn.code(name, make=lambda: _function(self.equations, name))
+        code = self.dyn._code(name, make=lambda: _function(self.equations, name))
         if self.dyn.model.parameters:
-            p, lead = self.dyn.parameter_values, arguments[0].shape[:-1]
+            p, lead = self.dyn._parameter_values, arguments[0].shape[:-1]
             if p.ndim > 1 and not lead:
                 # One of a batch is a batch of one.
                 (p,) = p
@@ -202,10 +202,10 @@ class Manifold:
 
     def member(self, k: int) -> Manifold:
         """Return the states of one sample of a batch of parameters; the same where there is none."""
-        if self.dyn.samples is None:
+        if self.dyn._samples is None:
             return self
-        one = self.dyn.of_samples([k])
-        return Manifold(one.at(**dict(zip(one.model.parameters, one.parameter_values[0].tolist(), strict=True))))
+        one = self.dyn._of_samples([k])
+        return Manifold(one.at(**dict(zip(one.model.parameters, one._parameter_values[0].tolist(), strict=True))))
 
     def pulled(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return the consistent state beside one that has drifted a little, or of each of a batch.

@@ -101,7 +101,7 @@ def _quick(checked: _Function) -> _Function:
     loads = "".join(f", {x.name}={x.default!r}" for x in given if x.default is not x.empty)
     rest = "".join(f", {x.name}" for x in given if x.default is not x.empty)
     # Accelerations look first whether their state is open.
-    looking = " and not self.looks" if name == "forward_dynamics" else ""
+    looking = " and not self._state_unchecked" if name == "forward_dynamics" else ""
     text = f"""
 def {name}(self, {arguments}{loads}):
     call = self._direct.get("{name}"){f" if wrenches is None{looking} else None" if loads else ""}
@@ -173,11 +173,11 @@ class LagrangianDynamics(Dynamics):
     """
 
     engine = "lagrangian"
-    derived = has_elements = True
+    _derived = _has_force_elements = True
     _one_at_a_time = False
-    takes_parameters = True
-    path = DERIVATION
-    lacks_derivatives = ""
+    _takes_parameters = True
+    _path = DERIVATION
+    _why_no_derivatives = ""
 
     def __init__(
         self,
@@ -222,13 +222,13 @@ class LagrangianDynamics(Dynamics):
         return self._chosen or elimination_of(self.model)
 
     @cached_property
-    def form(self) -> str:
+    def _form(self) -> str:
         """The digest of the derivation: of the description without parameters' values, and of what these decide."""
         digest = self.model.form_digest
         chosen = self._chosen or self.model.parameters
         return f"{digest} by {self.elimination}" if chosen else digest
 
-    def code(self, name: str, *extra: Any, make: Callable[[], Any] | None = None) -> Any:
+    def _code(self, name: str, *extra: Any, make: Callable[[], Any] | None = None) -> Any:
         """Return a `Compiled` or `Machine` of a quantity, or of what `make` derives from this model.
 
         Its arguments are not checked.
@@ -247,7 +247,7 @@ class LagrangianDynamics(Dynamics):
 
             with DERIVING:
                 starts = [start for start, _ in self.model.quaternions] if name in _TRIM else None
-                named = self.form, *map(str, key)
+                named = self._form, *map(str, key)
                 code = executable(named, derive, compile=self.compile, device=self.device, quaternions=starts)
             # At rest, a force that jumps is decided outside of machine code, and has no derivative.
             undecided = "jump" in self.model.effects and {name, *extra} & {*UNDER_FORCE, _DERIVATIVES[1]}
@@ -264,20 +264,20 @@ class LagrangianDynamics(Dynamics):
         return self._machines[key]
 
     def _machine(self, name: str, *extra: Any) -> Callable[..., list[Array]]:
-        code = self.code(name, *extra)
+        code = self._code(name, *extra)
         return lambda *arguments: code(*arguments, *self._trailing(arguments[0]), threads=self.threads)
 
     def _trailing(self, first: Any) -> tuple[Array, ...]:
         """Return the argument of parameters that a compiled function takes behind its own, if it takes one."""
         if not self.model.parameters:
             return ()
-        values = self.parameter_values
+        values = self._parameter_values
         if values.ndim == 1 and np.ndim(first) == 2:
             return (np.broadcast_to(values, (len(first), len(values))),)
         return (values,)
 
     @cached_property
-    def parameter_values(self) -> Array:
+    def _parameter_values(self) -> Array:
         """Values of the model's parameters in their order, (p,) or one row per sample."""
         parameters = self.model.parameters
         missing = [name for name, x in parameters.items() if x is None and name not in self._batched]
@@ -305,11 +305,11 @@ class LagrangianDynamics(Dynamics):
         return self._with(self.model.with_nominal(single) if single else self.model, batched)
 
     @property
-    def samples(self) -> int | None:
+    def _samples(self) -> int | None:
         """Size of the batch that the parameters' values make, None where every sample has the same."""
         return next((len(x) for x in self._batched.values()), None)
 
-    def of_samples(self, which: ArrayLike) -> LagrangianDynamics:
+    def _of_samples(self, which: ArrayLike) -> LagrangianDynamics:
         """Return the dynamics of these samples of a batch, by index, which may repeat."""
         if not self._batched:
             return self
@@ -320,12 +320,12 @@ class LagrangianDynamics(Dynamics):
                 f"samples: expected a list of indices, got {which!r}; numpy.flatnonzero makes one of a mask"
             )
         index = index.astype(int)
-        if "parameter_values" not in vars(self):
+        if "_parameter_values" not in vars(self):
             return self._with(self.model, {name: x[index] for name, x in self._batched.items()})
-        values = self.parameter_values[index]
+        values = self._parameter_values[index]
         columns = dict(zip(self.model.parameters, values.T, strict=True))
         out = self._with(self.model, {name: columns[name] for name in self._batched})
-        vars(out)["parameter_values"] = values
+        vars(out)["_parameter_values"] = values
         return out
 
     def _of_sample(self, i: int) -> LagrangianDynamics:
@@ -342,8 +342,8 @@ class LagrangianDynamics(Dynamics):
     def _with(self, model: Model, batched: dict[str, Array]) -> LagrangianDynamics:
         out = object.__new__(type(self))
         # Both share derived and compiled functions, now and later.
-        out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, form=self.form)
-        for name in ("parameter_values", "_phases", "_matter", "_law"):
+        out.__dict__.update(self.__dict__, equations=self.equations, elimination=self.elimination, _form=self._form)
+        for name in ("_parameter_values", "_phases", "_matter", "_law"):
             out.__dict__.pop(name, None)
         bare: Any = self._bare
         vars(out).update(model=model, _batched=batched, _wrenched={}, _bare=bare and bare._with(model, batched))
@@ -354,7 +354,7 @@ class LagrangianDynamics(Dynamics):
         return _restore, (self.model, self._batched, options)
 
     def _states(self, arguments: dict[str, ArrayLike]) -> tuple[dict[str, Array], int | None]:
-        n = self.samples
+        n = self._samples
         if n is not None:
             for name, x in arguments.items():
                 if np.ndim(x) == 2 and len(np.asarray(x)) != n:
@@ -394,7 +394,7 @@ class LagrangianDynamics(Dynamics):
             raise UnsupportedError(f"{quantity} takes arrays of the host, not of a GPU; copy them with numpy first")
         trailing = self._trailing(np.empty(0))
         arguments = {**given, **({"parameters": trailing[0]} if trailing else {})}
-        out = batch_on_device(self.code(*key), _TRIM[key[0]], arguments)
+        out = batch_on_device(self._code(*key), _TRIM[key[0]], arguments)
         if out is None:
             # The host's checks say what is wrong.
             near = {k: on_host(x) for k, x in given.items()}
@@ -427,12 +427,12 @@ class LagrangianDynamics(Dynamics):
     _mechanism = forwarded("equations", "The equations, of those with constraints.")
 
     def _every_jacobian(self, q: Array) -> Array:
-        code = self.code("every_jacobian", make=lambda: self.equations.function("every_jacobian"))
+        code = self._code("every_jacobian", make=lambda: self.equations.function("every_jacobian"))
         return np.asarray(code(q, *self._trailing(q), threads=self.threads)[0])
 
     def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Array:
         which = self._moved_by(actuators)
-        code = self.code("actuator_forces", which, make=lambda: self._mechanism.actuator_forces(which))
+        code = self._code("actuator_forces", which, make=lambda: self._mechanism.actuator_forces(which))
         out = code(q, v, a, *self._trailing(q), threads=self.threads)[0][..., 0]
         return self._judged(out, q, a, which)
 
@@ -445,7 +445,7 @@ class LagrangianDynamics(Dynamics):
     def _loads(self, moved: bool, *given: Any) -> Array:
         *states, joints, frames, axes = given
         names = _names(joints), _names(frames), axes
-        code = self.code("loads", moved, *names, make=lambda: self._mechanism.loads(*names, moved))
+        code = self._code("loads", moved, *names, make=lambda: self._mechanism.loads(*names, moved))
         return np.asarray(code(*states, *self._trailing(states[0]), threads=self.threads)[0])
 
     def energy_rate(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Any:
@@ -463,11 +463,11 @@ class LagrangianDynamics(Dynamics):
 
     def _inverse_dynamics_second_derivatives(self, q: Array, v: Array, a: Array) -> Array:
         name = "inverse_dynamics_second_derivatives"
-        code = self.code(name, make=lambda: self.equations.inverse_dynamics_second_derivatives())
+        code = self._code(name, make=lambda: self.equations.inverse_dynamics_second_derivatives())
         return np.asarray(of_second_order(code(q, v, a, *self._trailing(q), threads=self.threads)[0]))
 
     def _parameter_derivatives(self, quantity: str, *states: Array) -> Array:
-        code = self.code(f"{quantity}_by_parameters", make=lambda: self.equations.parameter_derivatives(quantity))
+        code = self._code(f"{quantity}_by_parameters", make=lambda: self.equations.parameter_derivatives(quantity))
         out = code(*states, *self._trailing(states[0]), threads=self.threads)[0]
         return np.asarray(of_parameters(self.model, quantity, out))
 
@@ -482,7 +482,7 @@ class LagrangianDynamics(Dynamics):
         kept: dict[Any, LagrangianDynamics] = self.equations.kept.setdefault("under", {})
         if key not in kept:
             own = LagrangianDynamics(self.model, compile=self.compile, threads=self.threads, device=self.device)
-            own.elimination, own.form, own._acting = self.elimination, f"{self.form} under {key}", (frames, axes)
+            own.elimination, own._form, own._acting = self.elimination, f"{self._form} under {key}", (frames, axes)
             own.equations = equations_of(self.model, elimination=self.elimination, acting=key)
             kept[key] = own
         out = self._wrenched[key] = kept[key]._with(self.model, self._batched)
@@ -490,14 +490,16 @@ class LagrangianDynamics(Dynamics):
         return out
 
     @property
-    def compiles_steps(self) -> bool:
+    def _compiles_steps(self) -> bool:
         """Whether whole steps are machine code: with a compiler, for a model that moves."""
         if not self.model.nv:
             return False
-        return not isinstance(self.code("forward_dynamics"), Machine)
+        return not isinstance(self._code("forward_dynamics"), Machine)
 
-    def step_plan(self, method: str, *, thorough: bool = False, fed: bool = False, behind: Sequence[Part] = ()) -> Plan:
-        """Return the compiled parts of an explicit method's step; `compiles_steps` says whether there are some.
+    def _step_plan(
+        self, method: str, *, thorough: bool = False, fed: bool = False, behind: Sequence[Part] = ()
+    ) -> Plan:
+        """Return the compiled parts of an explicit method's step; `_compiles_steps` says whether there are some.
 
         `thorough`: with the projection for steps that the usual one loses to their constraints; `fed`: under a state
         feedback; `behind`: with these parts at its end.
@@ -510,17 +512,17 @@ class LagrangianDynamics(Dynamics):
             plans[key] = Plan(self.equations, method, self._part, thorough=thorough, fed=fed, behind=behind)
         return plans[key]
 
-    def step_with(self, method: str, part: Part) -> CompiledStep:
+    def _step_with(self, method: str, part: Part) -> CompiledStep:
         """Return an explicit method's step with a part at its end."""
         from mbkit.engines.compiled_calls import CompiledStep
 
         steps: dict[Any, CompiledStep] = self.equations.kept.setdefault("steps", {})
         key = METHODS[method].code_name, part.name
         if key not in steps:
-            steps[key] = CompiledStep(self.model, self.equations, self.step_plan(method, behind=[part]), self._part)
+            steps[key] = CompiledStep(self.model, self.equations, self._step_plan(method, behind=[part]), self._part)
         return steps[key]
 
-    def device_steps(self, method: str, *, thorough: bool = False, fed: bool = False) -> CudaSteps:
+    def _device_steps(self, method: str, *, thorough: bool = False, fed: bool = False) -> CudaSteps:
         """Return the same steps on the GPU of these dynamics."""
         from mbkit.codegen.cuda.driver import device_of
         from mbkit.codegen.cuda.runs import MAX_STEP_OPERATIONS, steps_on_device
@@ -539,11 +541,11 @@ class LagrangianDynamics(Dynamics):
                     self.equations, method, operations, thorough=thorough, fed=fed, most=MAX_STEP_OPERATIONS
                 )
 
-            held[key] = steps_on_device((self.form, *name), parts, STATE, device_of(self.device))
+            held[key] = steps_on_device((self._form, *name), parts, STATE, device_of(self.device))
         return held[key]
 
     def _part(self, part: Part) -> Any:
-        return self.code(part.name, make=part.make)
+        return self._code(part.name, make=part.make)
 
     def step(
         self,
@@ -581,7 +583,7 @@ class LagrangianDynamics(Dynamics):
                 return out
         return super().step(q, v, tau, dt, method, wrenches, axes, t)
 
-    def single_step(self, method: str) -> Callable[..., tuple[Array, Array] | None]:
+    def _single_step(self, method: str) -> Callable[..., tuple[Array, Array] | None]:
         """Return the machine code of a step as a function of q, v, tau, dt and 0.0; None where it refuses them."""
         return self._compiled_step(METHODS[method]).single
 
@@ -591,12 +593,12 @@ class LagrangianDynamics(Dynamics):
         if held is None or held[0] is not method:
             from mbkit.engines.compiled_calls import CompiledStep
 
-            plan = self.step_plan(method.name, thorough=thorough)
+            plan = self._step_plan(method.name, thorough=thorough)
             held = steps[method.name] = method, CompiledStep(self.model, self.equations, plan, self._part)
         return held[1]
 
     def _step(self, method: Method, q: Array, v: Array, tau: Array, dt: float) -> tuple[Array, Array]:
-        if not self.compiles_steps:
+        if not self._compiles_steps:
             return super()._step(method, q, v, tau, dt)
         for thorough in (False, True) if self.model.constrained else (False,):
             step = self._compiled_step(method, thorough=thorough)
@@ -612,7 +614,7 @@ class LagrangianDynamics(Dynamics):
         from mbkit.derivation.steps.midpoint import Midpoint
 
         part = Midpoint(self.equations).slopes
-        code = self.code(part.name, make=part.make)
+        code = self._code(part.name, make=part.make)
 
         def equations(q: Array, w: Array, v1: Array) -> list[Array]:
             h = np.full((*q.shape[:-1], 1), dt)

@@ -225,8 +225,8 @@ class LinearizationQuantities:
     # Of `Dynamics`.
     engine: ClassVar[str]
     model: Model
-    samples: Any
-    of_samples: Callable[..., Any]
+    _samples: Any
+    _of_samples: Callable[..., Any]
     _states: Callable[..., Any]
     _value: Callable[..., Any]
     _require_finite: Callable[..., None]
@@ -327,7 +327,7 @@ class LinearizationQuantities:
         return DiscreteLinearization(slopes[..., : 2 * n], slopes[..., 2 * n :], move)
 
     def _forward_slopes(self, q: Array, v: Array, tau: Array, *, parameters: bool = False) -> Slopes:
-        if q.ndim == 2 and len(q) == 1 and self.samples is None:
+        if q.ndim == 2 and len(q) == 1 and self._samples is None:
             # Calls for one state are several times quicker than those for a batch of one.
             one = self._forward_slopes(q[0], v[0], tau[0], parameters=parameters)
             return Slopes(*(x[None] for x in one))
@@ -347,7 +347,7 @@ class LinearizationQuantities:
         if q.ndim == 2 and len(q) > size:
             slices = [np.arange(k, min(k + size, len(q))) for k in range(0, len(q), size)]
             each = [
-                self.of_samples(at)._step_slopes(method, dt, q[at], v[at], tau[at], parameters=parameters)
+                self._of_samples(at)._step_slopes(method, dt, q[at], v[at], tau[at], parameters=parameters)
                 for at in slices
             ]
             q1, v1, slopes = (np.concatenate(x) for x in zip(*each, strict=True))

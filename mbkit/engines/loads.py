@@ -69,7 +69,7 @@ class Loads:
     _loads_under: Callable[..., Array]
 
     @property
-    def samples(self) -> int | None:
+    def _samples(self) -> int | None:
         """Size of the batch that the parameters' values make, None where every sample has the same."""
         return None
 
@@ -278,7 +278,7 @@ class Loads:
         states = {"q": model.check_q(q), "v": model.check_v(v), "a": model.check_v(a, "a")}
         states["tau"] = model.check_v(tau, "tau")
         pushes = {name: np.asarray(w, dtype=float) for name, w in (wrenches or {}).items()}
-        size = self.samples or batch_of(**states, **pushes)
+        size = self._samples or batch_of(**states, **pushes)
         q, v, a, tau = (np.broadcast_to(x, (size or 1, x.shape[-1])) for x in states.values())
         names = [joint.name for joint in model.tree]
         loads = self.joint_wrenches(q, v, None, wrenches, axes, names, tau)

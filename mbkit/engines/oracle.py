@@ -110,12 +110,12 @@ class OracleDynamics(Dynamics):
     """
 
     engine = "oracle"
-    bits = 113
-    has_elements = True
+    _significand_bits = 113
+    _has_force_elements = True
     _one_at_a_time = False
-    path = DERIVATION
-    lacks_derivatives = ""
-    refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}
+    _path = DERIVATION
+    _why_no_derivatives = ""
+    _refuses: ClassVar = {"function": "a casadi.Function computes in double; the lagrangian engine gives it"}
 
     def __init__(
         self,
@@ -187,7 +187,7 @@ class OracleDynamics(Dynamics):
         if self._given is not None:
             raise InputError("at: this oracle already has its constants; put the parameters' values among them")
         out = type(self)(self.model.with_nominal(values), backend=self._arithmetic.name)
-        out.looks, out.unstepped = self.looks, self.unstepped
+        out._state_unchecked, out._step_unchecked = self._state_unchecked, self._step_unchecked
         return out
 
     def _of_model(self, model: Model, form: str) -> OracleDynamics:

@@ -52,9 +52,9 @@ class Steps:
     # Of `Dynamics`.
     engine: ClassVar[str]
     model: Model
-    unstepped: bool
+    _step_unchecked: bool
     _states_held: Any
-    soft_friction: bool
+    _soft_friction: bool
     at: Callable[..., Any]
     forward_dynamics: Callable[..., Array]
     _stacked_wrenches: Callable[..., Any]
@@ -147,14 +147,14 @@ class Steps:
         if times is None or not times.ndim:
             own: Steps = self if times is None else self.at(**{clock: float(times)})
             out = own._checked_step(chosen, h, states)
-            self.unstepped = False
+            self._step_unchecked = False
             return out
         rows = zip(*(np.broadcast_to(x, (len(times), x.shape[-1])) for x in states.values()), strict=True)
         each = [
             self._of_sample(i).at(**{clock: time})._checked_step(chosen, h, dict(zip(states, row, strict=True)))
             for i, (time, row) in enumerate(zip(times.tolist(), rows, strict=True))
         ]
-        self.unstepped, n = False, (self.model.nq, self.model.nv)
+        self._step_unchecked, n = False, (self.model.nq, self.model.nv)
         return tuple(np.array([x[k] for x in each]).reshape(-1, n[k]) for k in (0, 1))  # type: ignore[return-value]
 
     def _start_of_step(self, t: ArrayLike | None, h: float, size: int | None = None) -> Array | None:
@@ -172,11 +172,11 @@ class Steps:
 
     def _checked_step(self, chosen: Method, h: float, states: dict[str, Array]) -> tuple[Array, Array]:
         """Return the state after a step from checked states, or the error of a state that is not finite."""
-        if self.unstepped and states["q"].size:
+        if self._step_unchecked and states["q"].size:
             self._states_held.manifold_of(self).at(self.model.time).check(states["q"], states["v"])
         # An overflow is reported as an error.
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            if "jump" in self.model.effects and not self.soft_friction:
+            if "jump" in self.model.effects and not self._soft_friction:
                 # The phases of friction are those of runs, a floor above.
                 q1, v1 = from_above("friction_step").step(self, chosen, **states, dt=h)
             else:

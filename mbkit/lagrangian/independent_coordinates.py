@@ -82,7 +82,7 @@ class EmbeddedDynamics(Dynamics):
 
     engine = "embedded"
     _batches = False
-    refuses: ClassVar = dict.fromkeys(
+    _refuses: ClassVar = dict.fromkeys(
         sorted(
             set(QUANTITIES)
             - {"mass_matrix", "forward_dynamics", "inverse_dynamics", "kinetic_energy", "potential_energy"}

@@ -30,7 +30,7 @@ def from_consistent(dyn: Dynamics, q: Array, v: Array, t: float) -> tuple[Array,
 
     manifold = manifold_at(dyn, t)
     manifold.check(q, v)
-    if not dyn.projects:
+    if not dyn._projects:
         # Soft ones need no independence.
         return q, v
     poses, rates, why = np.atleast_2d(q), np.atleast_2d(v), ""
@@ -57,7 +57,7 @@ def beside(dyn: Dynamics, t: float, q: Array, v: Array) -> tuple[Array, Array]:
 
 def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:
     """Return a run with its kept states projected onto the constraints; an engine's soft ones keep their drift."""
-    if not dyn.projects or not outcome.q.size:
+    if not dyn._projects or not outcome.q.size:
         return outcome
     from mbkit.engines.constraint_manifold import manifold_of
 
@@ -70,6 +70,6 @@ def along_constraints(dyn: Dynamics, outcome: SolverResult) -> SolverResult:
     if own.model.time_parameter is not None:
         own = at_times(own, outcome.t, trajectories)
     elif trajectories is not None:
-        own = own.of_samples(np.repeat(np.arange(trajectories), shape[1]))
-    flat_q[good], flat_v[good] = manifold_of(own.of_samples(good)).pulled(flat_q[good], flat_v[good])
+        own = own._of_samples(np.repeat(np.arange(trajectories), shape[1]))
+    flat_q[good], flat_v[good] = manifold_of(own._of_samples(good)).pulled(flat_q[good], flat_v[good])
     return replace(outcome, q=q, v=v)

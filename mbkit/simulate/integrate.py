@@ -193,18 +193,18 @@ def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
         # Without jumps its step is that of this method.
         method = METHODS[EULER_METHOD]
         problem = replace(problem, method=method.name)
-    if dyn.soft_friction and method.dry_friction:
+    if dyn._soft_friction and method.dry_friction:
         raise UnsupportedError(
             f"{method.name}: solves exact dry friction, and {dyn.engine} was asked for its own; leave soft_friction out"
         )
     native = method.kind == "native"
-    if not dyn.soft_friction and (native or not (method.events or problem.equal_steps)):
-        own = ", ".join(f"{name}={value}" for name, value in dyn.own_friction.items() if native)
+    if not dyn._soft_friction and (native or not (method.events or problem.equal_steps)):
+        own = ", ".join(f"{name}={value}" for name, value in dyn._soft_friction_options.items() if native)
         soft = (
             f" (mbkit.dynamics(model, {dyn.engine!r}, {own}) has dry friction of its own, which is soft)" if own else ""
         )
         SMOOTH_RUNS.admit(dyn.model, f"{method.name}{soft}: not known of")
-    elif not dyn.soft_friction:
+    elif not dyn._soft_friction:
         RUNS.admit(dyn.model)
     if method.dry_friction:
         return _solver(dyn, method, read)(problem)
@@ -212,7 +212,7 @@ def _outcome(problem: IntegrationProblem, method: Method) -> SolverResult:
     def solver(smooth: Dynamics) -> Callable[[IntegrationProblem], SolverResult]:
         return lambda part: along_constraints(smooth, _solver(smooth, method, read)(part))
 
-    if "jump" not in dyn.model.effects or dyn.soft_friction:
+    if "jump" not in dyn.model.effects or dyn._soft_friction:
         return solver(dyn)(problem)
     from mbkit.simulate.solvers.friction.runs import run_in_phases
 
@@ -232,12 +232,12 @@ def _solver(dyn: Dynamics, method: Method, torque: Torque) -> Callable[[Integrat
 
 def _compiles(dyn: Dynamics) -> bool:
     """Return whether whole steps can be compiled: own derivation, written out, and a compiler."""
-    if not dyn.derived:
+    if not dyn._derived:
         return False
     # Other engines need no CasADi.
     from mbkit.engines.lagrangian import LagrangianDynamics
 
-    return isinstance(dyn, LagrangianDynamics) and dyn.compiles_steps
+    return isinstance(dyn, LagrangianDynamics) and dyn._compiles_steps
 
 
 @runtime_checkable
@@ -245,7 +245,7 @@ class TakesParameters(Protocol):
     """An engine whose parameters may have a value for each sample."""
 
     @property
-    def parameter_values(self) -> Array:
+    def _parameter_values(self) -> Array:
         """Values of the model's parameters, (p,) or one row per sample."""
 
 
@@ -292,7 +292,7 @@ def _held_time(dyn: Dynamics) -> float:
     if clock is None:
         return 0.0
     if isinstance(dyn, TakesParameters):
-        held = np.unique(np.atleast_2d(dyn.parameter_values)[:, list(dyn.model.parameters).index(clock)])
+        held = np.unique(np.atleast_2d(dyn._parameter_values)[:, list(dyn.model.parameters).index(clock)])
     else:
         held = np.array([dyn.model.parameters[clock]])
     if len(held) != 1:
@@ -315,7 +315,7 @@ def _refuse(what: str, method: Method, others: Sequence[str]) -> None:
 
 
 def _batch(dyn: Dynamics, states: int | None) -> int | None:
-    samples = states if dyn.samples is None else dyn.samples
+    samples = states if dyn._samples is None else dyn._samples
     if states not in (None, samples):
         raise InputError(f"q0, v0: a batch of {states}, but the parameters' values are {samples}")
     return samples
@@ -323,7 +323,7 @@ def _batch(dyn: Dynamics, states: int | None) -> int | None:
 
 def _tolerances(dyn: Dynamics, method: Method, rtol: float | None, atol: float | None) -> Tolerances:
     rtol = 1e-10 if rtol is None else real("rtol", rtol, positive=True)
-    least = _LEAST_EXTENDED if dyn.bits > DOUBLE_BITS and method.extended else method.least
+    least = _LEAST_EXTENDED if dyn._significand_bits > DOUBLE_BITS and method.extended else method.least
     if rtol < least:
         raise InputError(f"rtol: expected at least {least:.3g} for {method.name} on {dyn.engine}, got {rtol:g}")
     return Tolerances(rtol, rtol if atol is None else real("atol", atol, positive=True))

@@ -76,7 +76,7 @@ class RunData:
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
         # A process pool would derive an engine that is sent along for every trajectory.
-        known = self.engine in ENGINES and (self._dyn is None or self._dyn.samples is None)
+        known = self.engine in ENGINES and (self._dyn is None or self._dyn._samples is None)
         applied = self._applied
         if isinstance(applied, ForceFunctions):
             # Functions can seldom be pickled; their values can.
@@ -171,7 +171,7 @@ class RunData:
             else:
                 held = np.zeros(self._numbers) if force is None else force.between(t)
                 steps = _of_held(dyn, np.diff(t), q, v, held, self._acting)
-        if "jump" in self.model.effects and not dyn.soft_friction:
+        if "jump" in self.model.effects and not dyn._soft_friction:
             steps = steps - self._rubbed(dyn)
         out = np.zeros(q.shape[:-1])
         np.cumsum(steps, axis=-1, out=out[..., 1:])
@@ -179,7 +179,7 @@ class RunData:
 
     def _by_phases(self, dyn: Dynamics, power: Array) -> Array:
         """Return the integral of a power over each interval; no cubic goes across the end of a phase."""
-        if "jump" not in self.model.effects or dyn.soft_friction or not self.events:
+        if "jump" not in self.model.effects or dyn._soft_friction or not self.events:
             return _by_cubics(self.t, power)
         rows = power.reshape(-1, len(self.t))
         out, which = np.zeros((len(rows), len(self.t) - 1)), dyn._friction.law.which
@@ -226,7 +226,7 @@ class RunData:
         dyn, q, v = self._by(engine), self.q, self.v
         if not self.model.has_bodies:
             raise UnsupportedError(f"momentum: {self.model.name} was written as energies and has no bodies")
-        if dyn.samples is None:
+        if dyn._samples is None:
             return along(dyn, (6,), _momentum, q, v)
         # Of a batch with values of its own, each trajectory is a system of its own.
         each = [along(dynamics_of_trajectory(dyn, i), (6,), _momentum, q[i], v[i]) for i in range(len(q))]
@@ -243,7 +243,7 @@ class RunData:
             if engine.model.coordinate_names != self.model.coordinate_names:
                 raise InputError(f"engine: expected a Dynamics of {self.model.name}, got one of {engine.model.name}")
             dyn = engine
-        elif self._dyn is not None and self._dyn.samples is not None:
+        elif self._dyn is not None and self._dyn._samples is not None:
             raise UnsupportedError(
                 f"{engine}: the trajectories have parameters of their own, which only the {self.engine} engine holds"
             )
@@ -278,9 +278,9 @@ def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array],
         own = dyn
         if dyn.model.time_parameter is not None:
             # One sample for each state (`mbkit.engines.base.at_times`).
-            own = dyn.of_samples(which)
+            own = dyn._of_samples(which)
         elif len(lead) == 2:
-            own = dyn.of_samples(which // lead[1])
+            own = dyn._of_samples(which // lead[1])
         out[which] = evaluate(own, *(x[which] for x in flat))
     return out.reshape(*lead, *shape)
 
@@ -309,9 +309,9 @@ def _of_held(dyn: Dynamics, h: Array, q: Array, v: Array, held: Array, acting: A
     pushed, wrenches = held[..., :nv], held[..., nv:]
     coordinates, plain = np.array(_plain(dyn.model), dtype=int).reshape(-1, 2).T
     model = dyn.model
-    lossy = dyn.soft_friction or model.needs.damping or model.forces or not model.has_bodies or _driven(dyn)
+    lossy = dyn._soft_friction or model.needs.damping or model.forces or not model.has_bodies or _driven(dyn)
     losing, turned = bool(lossy or wrenches.any()), len(plain) < nv and bool(pushed.any())
-    moved, jumps = np.diff(q, axis=-2)[..., coordinates], "jump" in model.effects and not dyn.soft_friction
+    moved, jumps = np.diff(q, axis=-2)[..., coordinates], "jump" in model.effects and not dyn._soft_friction
     # Forces that jump keep their sides up to the states in which they change them, and what rests is held up to there.
     sides, keeps = np.zeros(pushed.shape), np.zeros(pushed.shape, dtype=bool)
     sides[..., plain], keeps[..., plain] = np.sign(moved), jumps
@@ -352,7 +352,7 @@ def _at_end(dyn: Dynamics, lead: tuple[int, ...], end: int) -> Dynamics:
     if dyn.model.time_parameter is None:
         return dyn
     samples = np.arange(int(np.prod(lead))).reshape(lead)
-    return dyn.of_samples(samples[..., end : lead[-1] - 1 + end].ravel())
+    return dyn._of_samples(samples[..., end : lead[-1] - 1 + end].ravel())
 
 
 def _corrected(h: Array, start: tuple[Array, Array], end: tuple[Array, Array]) -> Array:
@@ -381,7 +381,7 @@ def _with_rate(
     up = down = np.broadcast_to(_NEAR * h, (*q.shape[:-1], 1))
     if clock is not None:
         # The time is the last parameter; beyond its ends a table is not known.
-        times = of_samples.parameter_values[:, -1].reshape(up.shape)
+        times = of_samples._parameter_values[:, -1].reshape(up.shape)
         up, down = np.minimum(up, model.interval[1] - times), np.minimum(up, times - model.interval[0])
 
     def after(s: Array) -> Array:
@@ -398,7 +398,7 @@ def _with_rate(
 
 def _driven(dyn: Dynamics) -> bool:
     """Return whether constraints do work."""
-    return dyn.model.constrained and (dyn.soft_constraints or dyn.model.constraints_do_work)
+    return dyn.model.constrained and (dyn._soft_constraints or dyn.model.constraints_do_work)
 
 
 def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
@@ -411,7 +411,7 @@ def _lost_power(dyn: Dynamics, q: Array, v: Array, tau: Array) -> Array:
     if model.needs.damping:
         # At rest the passive force is that of springs; forces by functions are counted above.
         force = force + _dampers(dyn, q, v) - _dampers(dyn, q, np.zeros_like(v))
-    if dyn.soft_friction:
+    if dyn._soft_friction:
         force = force + dyn._friction.law_of(dyn).force(v) + dyn._friction_beside_passive(q, v, tau)
     if _driven(dyn):
         force = force + dyn.generalized_constraint_force(q, v, tau)
@@ -468,13 +468,13 @@ def _canonical(dyn: Dynamics, q: Array, v: Array) -> Array:
 
 def dynamics_of_trajectory(dyn: Dynamics, i: int) -> Dynamics:
     """Return the dynamics of one trajectory of a batch, with plain values of the parameters."""
-    if dyn.samples is None:
+    if dyn._samples is None:
         return dyn
     # Other engines need no CasADi.
     from mbkit.engines.lagrangian import LagrangianDynamics
 
     assert isinstance(dyn, LagrangianDynamics)  # the others have no samples
-    values = dyn.of_samples([i]).parameter_values[0].tolist()
+    values = dyn._of_samples([i])._parameter_values[0].tolist()
     return dyn.at(**dict(zip(dyn.model.parameters, values, strict=True)))
 
 

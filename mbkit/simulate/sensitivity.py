@@ -182,7 +182,7 @@ def sensitivities(
         many = at.stop - at.start
         rows = [x[:, at].reshape(members * many, x.shape[-1]) for x in (q, v, tau)]
         if many and members:
-            own = dyn.of_samples(np.repeat(np.arange(members), many))
+            own = dyn._of_samples(np.repeat(np.arange(members), many))
             out = own._step_slopes(chosen, grid.step(at.start), *rows, parameters=by_parameters)[2]
             slopes[:, at] = out.reshape(members, many, 2 * n, columns)
     change = np.zeros((members, steps + 1, 2 * n, columns))

@@ -301,7 +301,7 @@ class SingularPosesOfBatch:
     """The singular poses that trajectories pass which step together, by their numbers."""
 
     def __init__(self, dyn: Dynamics, t: float, q: Array) -> None:
-        self.members = {i: SingularPoses(dyn.of_samples([i])) for i in range(len(q))}
+        self.members = {i: SingularPoses(dyn._of_samples([i])) for i in range(len(q))}
         for poses, start in zip(self.members.values(), q, strict=True):
             poses.began(t, start)
 

@@ -276,7 +276,7 @@ class Trajectory(RunData):
         >>> bool((again.q == run.q).all()), again.method
         (True, 'rk4')
         """
-        if self._dyn is not None and self._dyn.samples is not None:
+        if self._dyn is not None and self._dyn._samples is not None:
             which = f"save: trajectories of {self.model.name} have parameters of their own, which no file keeps"
             raise UnsupportedError(f"{which}; save runs of one set of numbers, or pickle the batch")
         about = {"format": 2, "digest": self.model.digest, "model": self.model.name, "method": self.method}
@@ -373,7 +373,7 @@ def _step_doubling(
         return
     both = both[np.unique(np.linspace(0, len(both) - 1, CHECKED_TIMES).astype(int))]
     times = states[0][both]
-    own, q0, v0 = (dyn, q[0], v[0]) if dyn.samples is None else (dyn.of_samples([0]), q[:1], v[:1])
+    own, q0, v0 = (dyn, q[0], v[0]) if dyn._samples is None else (dyn._of_samples([0]), q[:1], v[:1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MbkitWarning)
         length = float(times[-1] - settings.t0)

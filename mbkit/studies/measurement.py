@@ -209,6 +209,6 @@ def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
         return math.nan
     gained, change = ((high - high[0]) + (low - low[0]) for high, low in (T, V))
     drift, size = float(np.abs(gained + change).max()), max(float(T[0].max()), float(np.ptp(V[0])))
-    rounding = 0.0 if dyn.bits > DOUBLE_BITS else _ROUNDING * float(np.abs([T[0], V[0]]).max())
+    rounding = 0.0 if dyn._significand_bits > DOUBLE_BITS else _ROUNDING * float(np.abs([T[0], V[0]]).max())
     hidden = rounding > _HIDDEN * size and drift <= rounding
     return min(drift / size, MAX_ERROR) if size > 0 and not hidden else math.nan

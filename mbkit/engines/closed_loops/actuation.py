@@ -56,7 +56,7 @@ class Actuation(Constrained):
     """The part of `Dynamics` for forces of actuators under constraints."""
 
     # Of the other parts of `Dynamics`.
-    of_samples: Callable[..., Any]
+    _of_samples: Callable[..., Any]
     _method: Callable[[str], Callable[..., Any]]
     _inverse_dynamics: Callable[..., Array]
     _constraint_jacobian: Callable[[Array], Array]
@@ -176,7 +176,7 @@ class Actuation(Constrained):
         broken = ~(np.abs(rates) <= _CONSISTENT * np.maximum(sizes, 1.0) * fast).all(axis=1)
         flat = ~(sizes.min(axis=1) > DEPENDENT * sizes.max(axis=1))
         for k in np.flatnonzero(~(left > DEPENDENT**2) | flat | broken).tolist():
-            own = self.of_samples([k])
+            own = self._of_samples([k])
             J = own._evaluate("constraint_jacobian", q=states[k]).reshape(kept, n)
             self._require_determined(J[list(self._row_choice.independent)], which)
             self._require_consistent(rates[k], sizes[k], accelerations[k])

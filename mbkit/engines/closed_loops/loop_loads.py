@@ -239,8 +239,8 @@ class LoopLoads(Actuation, Loads):
         model = self.model
         LOOP_LOADS.admit(model, "undetermined_loads: not known of")
         q = model.check_q(q)
-        if q.ndim > 1 or self.samples is not None:
-            got = f"shape {q.shape}" if q.ndim > 1 else f"parameters of {self.samples} samples"
+        if q.ndim > 1 or self._samples is not None:
+            got = f"shape {q.shape}" if q.ndim > 1 else f"parameters of {self._samples} samples"
             raise InputError(f"undetermined_loads: expected one configuration, got {got}")
         held = sum(len(LOOP_ROWS[loop.kind][0]) for loop in model.loops)
         # Drives are single, and take no strain from each other.

@@ -56,11 +56,11 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
     """
 
     engine = "drake"
-    path = DRAKE
-    lacks_derivatives = ""
-    soft_constraints = True
+    _path = DRAKE
+    _why_no_derivatives = ""
+    _soft_constraints = True
     _takes_wrenches = ("inverse_dynamics", "forward_dynamics")
-    refuses: ClassVar[dict[str, str]] = {
+    _refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "Drake forms C v without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no CasADi form; mbkit.dynamics(model, 'lagrangian') has",
         **dict.fromkeys(regressors.QUANTITIES, "Drake has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
@@ -70,7 +70,7 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
         super().__init__(model)
         if model.constrained:
             parts = {"model": model.name, "parts": model.constraint_parts}
-            vars(self)["refuses"] = self.refuses | {k: why.format(**parts) for k, why in _WITHOUT_LOOPS.items()}
+            vars(self)["_refuses"] = self._refuses | {k: why.format(**parts) for k, why in _WITHOUT_LOOPS.items()}
         self._hold(build(model))
 
     def _hold(self, compiled: DrakeModel) -> None:

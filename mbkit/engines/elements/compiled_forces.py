@@ -52,8 +52,8 @@ class CompiledForces(AddedForce):
         trailing: list[Array] = []
         if self._model.parameters:
             # The own derivation's may differ from sample to sample.
-            own = hasattr(type(dyn), "parameter_values")
-            values = dyn.parameter_values if own else np.array([*dyn.model.parameters.values()], dtype=np.float64)
+            own = hasattr(type(dyn), "_parameter_values")
+            values = dyn._parameter_values if own else np.array([*dyn.model.parameters.values()], dtype=np.float64)
             trailing = [np.broadcast_to(values, (*states[0].shape[:-1], values.shape[-1]))]
         given = [np.ascontiguousarray(x, dtype=np.float64) for x in (*states, *trailing)]
         return np.asarray(self._codes[name](*given)[0])

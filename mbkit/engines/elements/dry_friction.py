@@ -181,26 +181,26 @@ class DryFriction(AddedForce):
 
     def law_of(self, dyn: Any) -> DryFrictionLaw:
         """Return the law at the values of parameters of some dynamics of this model, or of each of their samples."""
-        if not (self._varies and dyn.derived):
+        if not (self._varies and dyn._derived):
             return self.law
         held = vars(dyn)
         if "_law" not in held:
             held["_law"] = DryFrictionLaw(
-                self._model, dict(zip(dyn.model.parameters, dyn.parameter_values.T, strict=True))
+                self._model, dict(zip(dyn.model.parameters, dyn._parameter_values.T, strict=True))
             )
         out: DryFrictionLaw = held["_law"]
         return out
 
     def beside(self, quantity: str, method: Callable[..., Any], dyn: Any) -> Callable[..., Any]:
         """Return an engine's method for a quantity with friction; terms of one with elements hold it at speed."""
-        law, moving = self.law_of(dyn), method if dyn.has_elements else super().beside(quantity, method, dyn)
+        law, moving = self.law_of(dyn), method if dyn._has_force_elements else super().beside(quantity, method, dyn)
         if quantity in UNDER_FORCE:
 
             def pushed(q: Array, v: Array, tau: Array, *rest: Any) -> Any:
                 resting = law.at_rest(v)
                 if not resting.any():
                     return moving(q, v, tau, *rest)
-                if dyn.bits > _DOUBLE:
+                if dyn._significand_bits > _DOUBLE:
                     return self._in_phase(quantity, dyn, q, v, tau, rest, resting)
                 held, still = self._each(dyn, quantity, moving, q, v, tau, rest, resting)
                 out = moving(q, v, tau + padded(held, tau), *rest)
@@ -247,13 +247,13 @@ class DryFriction(AddedForce):
         """Return `decided` of a state or of each of a batch, of which only those with joints at rest are looked at."""
         single = v.ndim == 1
         rows: Any = ... if single else np.flatnonzero(resting.any(axis=1))
-        own = dyn if single else dyn.of_samples(rows)
+        own = dyn if single else dyn._of_samples(rows)
         forward = quantity.startswith(_FORWARD)
         accelerate = method
         if own is not dyn or not forward:
             name = quantity if forward else _FORWARD
             accelerate = own._without_friction(name)
-            accelerate = accelerate if own.has_elements else super().beside(name, accelerate, own)
+            accelerate = accelerate if own._has_force_elements else super().beside(name, accelerate, own)
         more = [x[rows] if isinstance(x, np.ndarray) else x for x in rest] if forward else []
         held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
         held[rows], still[rows] = self.decided(
@@ -322,7 +322,7 @@ class DryFriction(AddedForce):
                 held.clear()
             held[key] = bare._of_model(sliding.at(sides, still, dyn.model), sliding.form)
             # The dynamics with friction have looked at the state, and what a phase goes through is open by rounding.
-            held[key].looks = False
+            held[key]._state_unchecked = False
         return held[key]._under(*dyn._acting) if dyn._acting[0] else held[key]
 
     def phases(self, dyn: Any, sides: Array, still: Mask) -> Any:
@@ -335,7 +335,7 @@ class DryFriction(AddedForce):
         values = {name: np.where(still, 0.0, sides)[:, i] for i, name in sliding.sides.items()}
         values |= {name: RESTING * still[:, i] for i, name in sliding.locks.items()}
         own = own._with(own.model, {**own._batched, **values})
-        own.looks = False
+        own._state_unchecked = False
         return own._under(*dyn._acting) if dyn._acting[0] else own
 
     @cached_property

@@ -93,7 +93,7 @@ def _floating(text: str) -> Any:
 class _Read(MujocoDynamics):
     """MuJoCo on its own model, with all that acts in it at zero control and activation."""
 
-    has_elements = True
+    _has_force_elements = True
 
     @classmethod
     def of(cls, model: Model, m: Any, numbers: dict[str, int], removals: dict[str, _Removal]) -> _Read:

@@ -135,14 +135,14 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
     """
 
     engine = "pinocchio"
-    refuses: ClassVar[dict[str, str]] = {
+    _refuses: ClassVar[dict[str, str]] = {
         "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
         "constraint_rate_gradient": "its derivatives are of trees; mbkit.dynamics(model, 'lagrangian') has this one",
     }
-    path = PINOCCHIO
+    _path = PINOCCHIO
     _takes_wrenches = ("inverse_dynamics", "forward_dynamics")
     # computeMinverse
-    inertias_about: ClassVar[dict[str, str]] = {"mass_matrix_inverse": WORLD}
+    _inertias_about: ClassVar[dict[str, str]] = {"mass_matrix_inverse": WORLD}
     _batches = False
 
     def __init__(self, model: Model) -> None:
@@ -152,7 +152,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
             "forward_dynamics_derivatives": FORWARD_DERIVATIVES,
         }
         # Of this model alone, in the place of the class's.
-        vars(self)["refuses"] = self.refuses | {
+        vars(self)["_refuses"] = self._refuses | {
             name: why for name, path in given.items() if (why := path.refuses(model))
         }
         self._pin: PinModel = build(model)
@@ -311,9 +311,9 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         return self._force(self._full_passive(self._full_q(q), self._full_v(v)))
 
     @cached_property
-    def lacks_derivatives(self) -> str:
+    def _why_no_derivatives(self) -> str:
         """Why there are no derivatives of this model; empty where there are."""
-        return self.refuses.get("inverse_dynamics_derivatives", "")
+        return self._refuses.get("inverse_dynamics_derivatives", "")
 
     def _inverse_dynamics_derivatives(self, q: Array, v: Array, a: Array) -> Array:
         passive = self._joint_passive

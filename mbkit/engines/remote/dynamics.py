@@ -71,7 +71,7 @@ class VersionDynamics(MappedDynamics):
     """
 
     def __init__(self, model: Model, version: EngineVersion) -> None:
-        self.version, self.path = version, version.package.path
+        self.version, self._path = version, version.package.path
         super().__init__(model)
         self._convention = version.package.convention
         self._data, self._names = self._travelling()
@@ -97,13 +97,13 @@ class VersionDynamics(MappedDynamics):
         for needed, quantities in (("frame", ("pose", "jacobian")), ("matter", ("potential_energy",))):
             if needed not in gives and quantities[0] not in gives:
                 lacks |= dict.fromkeys(quantities, f"its file here has no function {needed}")
-        vars(self)["refuses"] = lacks
+        vars(self)["_refuses"] = lacks
 
     engine = forwarded("version.name", "Name of the engine with its version.")
-    bits = forwarded(
-        "version.package.bits", "Of the significand with which it computes: 53, or 24 in single precision."
+    _significand_bits = forwarded(
+        "version.package.bits", "Significand bits of its arithmetic: 53, or 24 in single precision."
     )
-    inertias_about = forwarded(
+    _inertias_about = forwarded(
         "version.package.inertias_about", "The point about which it writes composite inertias, by quantity."
     )
 

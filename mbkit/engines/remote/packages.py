@@ -34,9 +34,9 @@ class Package(NamedTuple):
     path : paths.Path
         The kinds of parts that it carries; by default all that travels.
     bits : int
-        Of the significand with which it computes: 53, or 24 in single precision.
+        Significand bits of its arithmetic: 53, or 24 in single precision.
     inertias_about : mapping
-        The point about which it writes composite inertias, as `Dynamics.inertias_about`.
+        The point about which it writes composite inertias, as `Dynamics._inertias_about`.
     tested : tuple of str
         Versions that were judged, the newest last: that one is meant where none is named. Empty where the name alone
         is an engine that needs no environment.

@@ -193,7 +193,7 @@ def equilibrium(
         raise InputError(
             f"dynamics: expected a Dynamics or a Lagrangian, got {type(dyn).__name__}; mbkit.dynamics makes one"
         )
-    if dyn.samples is not None:
+    if dyn._samples is not None:
         raise InputError("dynamics: its parameters have a value per sample; expected one value of each")
     if holding is not None and not (tau is None and q0 is None):
         raise InputError("holding: expected without q0 and tau, which are for finding a configuration")

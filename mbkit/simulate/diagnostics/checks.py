@@ -74,7 +74,7 @@ def diagnostics(
     """
     t, model, quick = states[0], dyn.model, work is not None
     # The oracle's digits are not in doubt, and its terms take long.
-    if len(t) < 2 or not model.nv or not states[2].size or dyn.bits > DOUBLE_BITS:
+    if len(t) < 2 or not model.nv or not states[2].size or dyn._significand_bits > DOUBLE_BITS:
         return []
     q, v = (x.reshape(-1, *x.shape[-2:]) for x in states[1:])
     most = _MEMBERS * CHECKED_TIMES if work is None else work // _WORK_A_STATE
@@ -101,11 +101,11 @@ def diagnostics(
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
         fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
         limit = _ENERGY if method.order in _LOW else _ENERGY_HIGH
-        damped = model.loses_energy or (model.constrained and dyn.soft_constraints)
+        damped = model.loses_energy or (model.constrained and dyn._soft_constraints)
         checks.append(energy_drift([samples[i] for i in whole], fast, damped, limit))
     # Neither the engine nor the method may solve with the mass matrix.
     matrices = [one.M for member in samples for one in member]
-    if matrices and (method.mass_matrix or not dyn.derived or getattr(dyn, "elimination", "") != "least constraint"):
+    if matrices and (method.mass_matrix or not dyn._derived or getattr(dyn, "elimination", "") != "least constraint"):
         checks.append(condition(matrices[-1:] if quick else matrices))
     if not quick:
         checks.append(softness(dyn, at_q[0, 0], at_v[0, 0]))
@@ -130,7 +130,7 @@ def _rushes(dyn: Dynamics, method: Method, h: float, q: Array, v: Array) -> bool
     What has no such step is checked, unless the terms of a check would have to be compiled.
     """
     if not (method.explicit and method.order):
-        return not dyn.derived
+        return not dyn._derived
     i, k = np.unravel_index(np.nan_to_num(np.abs(v).max(axis=-1)).argmax(), v.shape[:-1])
     own, q, v, tau = dyn._of_sample(int(i)), q[i, k], v[i, k], np.zeros(v.shape[-1])
     try:
@@ -147,7 +147,7 @@ def _rushes(dyn: Dynamics, method: Method, h: float, q: Array, v: Array) -> bool
 def softness(dyn: Dynamics, q: Array, v: Array) -> Iterator[str]:
     """Yield how far MuJoCo's soft loops, or its soft friction, take accelerations off those of exact ones."""
     law: Any = getattr(dyn, "constraint_law", None)
-    if law and (dyn.soft_friction or (dyn.model.needs.loops and dyn.soft_constraints)):
+    if law and (dyn._soft_friction or (dyn.model.needs.loops and dyn._soft_constraints)):
         error = law(q, v, np.zeros(len(v))).error
         if error > ROUNDING:
             yield f"soft constraints: accelerations at the start are {off_by(error, 'those of exact ones')}"
@@ -169,7 +169,7 @@ class _Sample:
     def _term(self, name: str, *state: Array) -> Array:
         # Calls for single states take far less time than one for a few.
         term = getattr(self._dyn, name)
-        return np.asarray(term(*state) if self._dyn.samples is None else term(*(x[None] for x in state))[0])
+        return np.asarray(term(*state) if self._dyn._samples is None else term(*(x[None] for x in state))[0])
 
     def kinetic(self, v: Array) -> float:
         """Return vᵀ M v / 2: of a system on paper T2."""
@@ -185,7 +185,7 @@ class _Sample:
 
 def _samples(dyn: Dynamics, member: int, t: Array, q: Array, v: Array) -> Iterator[_Sample]:
     """Yield the finite ones of a trajectory's states."""
-    own = dyn if dyn.samples is None else dyn.of_samples([member])
+    own = dyn if dyn._samples is None else dyn._of_samples([member])
     for k in range(len(t)):
         if math.isfinite(q[k].sum()):
             yield _Sample(at_time(own, float(t[k])), q[k], v[k])
@@ -249,7 +249,7 @@ def condition(matrices: list[Array]) -> Iterator[str]:
 def step_size(dyn: Dynamics, method: Method, h: float, duration: float, q: Array, v: Array) -> Iterator[str]:
     """Compare the step with the modes of the linearized motion at a trajectory's first, fastest and last state."""
     model, name = dyn.model, method.name
-    if dyn.samples is not None or model.time_parameter is not None or model.constrained or method.stability is None:
+    if dyn._samples is not None or model.time_parameter is not None or model.constrained or method.stability is None:
         return
     space = Space(model)
 
@@ -370,7 +370,7 @@ def accumulated_error(method: str, tolerances: Tolerances, numbers: int, steps: 
 def massless_joints(dyn: Dynamics, q: Array) -> str:
     """Return the end of a message that names the joints which move next to no mass at q, or nothing."""
     model = dyn.model
-    if not model.has_bodies or dyn.samples is not None or not model.nv:
+    if not model.has_bodies or dyn._samples is not None or not model.nv:
         return ""
     try:
         there = dyn.mass_matrix(model.random_state(np.random.default_rng(0))[0])

@@ -59,7 +59,7 @@ class RateJacobian:
 
     def only(self, member: int) -> None:
         """Go on with this member of a batch."""
-        self._own = self._twin.of_samples([member])
+        self._own = self._twin._of_samples([member])
 
     def __call__(self, t: float, y: Array, force: Force) -> Array:
         """Return the Jacobian, (nq + nv, nq + nv); the last one where the state is not finite or singular."""
@@ -140,7 +140,7 @@ def _differences(
 
 
 def _twin(dyn: Dynamics) -> Dynamics:
-    if not dyn.lacks_derivatives:
+    if not dyn._why_no_derivatives:
         return dyn
     # Deriving and compiling costs more than most runs: once for each engine's object.
     if _TWIN not in vars(dyn):
@@ -270,7 +270,7 @@ def stiffness(
     model = dyn.model
     q, v, t, enough = model.check_q(q), model.check_v(v), real("t", t), real("enough", enough, nonnegative=True)
     torque = tau if callable(tau) else finite_array("tau", np.zeros(model.nv) if tau is None else tau, (model.nv,))
-    states, count = batch_of(q=q, v=v), dyn.samples
+    states, count = batch_of(q=q, v=v), dyn._samples
     if states is not None and count is not None and states != count:
         raise InputError(f"q, v: a batch of {states}, but the parameters' values are {count}")
     count = states if count is None else count
@@ -279,7 +279,7 @@ def stiffness(
     if not count:
         raise InputError("q: expected at least one state, got an empty batch")
     q, v = np.broadcast_to(q, (count, model.nq)), np.broadcast_to(v, (count, model.nv))
-    each = [_of_one(dyn.of_samples([i]), q[i], v[i], torque, t, enough, i) for i in range(count)]
+    each = [_of_one(dyn._of_samples([i]), q[i], v[i], torque, t, enough, i) for i in range(count)]
     return max(each, key=lambda one: one.rate)
 
 
@@ -290,7 +290,7 @@ def _of_one(
     force: Force = TorqueCallback(tau, model.nv).one if callable(tau) else tau
     if not model.nv:
         return Stiffness(np.zeros(0, dtype=complex), 0.0, member=member)
-    if dyn.derived:
+    if dyn._derived:
         exact = RateJacobian(dyn)
         J = exact(t, np.concatenate([q, v]), force)
         if not exact.evaluations:

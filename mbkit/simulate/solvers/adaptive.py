@@ -87,7 +87,7 @@ def _compiles(problem: IntegrationProblem, method: str) -> bool:
     dyn, stiff = problem.dyn, isinstance(method_of(method).formula, RosenbrockTableau)
     # A compiled step has one value of the time.
     plain = not problem.torque.callable and not dyn.model.time_parameter
-    if not (dyn.derived and plain and dyn.model.nv):
+    if not (dyn._derived and plain and dyn.model.nv):
         return False
     # Other engines need no CasADi.
     from mbkit.codegen.backend import has_compiler

@@ -38,7 +38,7 @@ def _code(dyn: LagrangianDynamics, own: EmbeddedTableau | RosenbrockTableau) -> 
     codes: dict[str, CompiledStepLoop] = dyn.equations.kept.setdefault("lanes", {})
     if own.name not in codes:
         parts: Any = rosenbrock_parts if isinstance(own, RosenbrockTableau) else embedded_parts
-        name = (dyn.form, own.name, own.digest)
+        name = (dyn._form, own.name, own.digest)
         codes[own.name] = compiled_step_loop(name, lambda: parts(dyn.equations, own), STATE)
     return codes[own.name]
 
@@ -79,7 +79,7 @@ class CompiledAttempts:
     ) -> None:
         assert isinstance(problem.dyn, LagrangianDynamics)
         self._dyn, self._torque, self._batch = problem.dyn, problem.torque, problem.batch
-        self._space, self._parameters, self._wanted = space, problem.dyn.parameter_values, problem.tolerances
+        self._space, self._parameters, self._wanted = space, problem.dyn._parameter_values, problem.tolerances
         self._problem, self._in_python = problem, in_python
         own = in_python.formula()
         self._stiff = isinstance(own, RosenbrockTableau)
@@ -251,7 +251,7 @@ class CompiledAttempts:
         if not np.isnan(error):
             return below_rounding(self._wanted)
         member = self._which[place]
-        field = Field(self._dyn.of_samples([member]), self._space)
+        field = Field(self._dyn._of_samples([member]), self._space)
         try:
             field(0.0, state[None, self._at["q"]], state[None, self._at["w"]], self._force(self._k, member)[None])
         except DivergenceError as reason:
@@ -304,7 +304,7 @@ class CompiledAttempts:
         after[failed] = np.nan
         q, w = after[:, self._at["q"]], after[:, self._at["w"]]
         # A step across a singular pose is good, and yet a shorter one may have stages too near to it.
-        for i in failed if self._dyn.projects else ():
+        for i in failed if self._dyn._projects else ():
             own = RungeKuttaAttempts(self._problem, self._space, self._of_place[place])
             begin = start.rows(np.array([i]))
             own.start([self._which[place]], begin.q, begin.w, float(begin.t[0]), _HUGE)

@@ -33,7 +33,7 @@ def step_on_device(
     """
     dyn = problem.dyn
     assert isinstance(dyn, LagrangianDynamics)
-    steps = dyn.device_steps(problem.method, thorough=thorough, fed=problem.torque.feedback is not None)
+    steps = dyn._device_steps(problem.method, thorough=thorough, fed=problem.torque.feedback is not None)
     squares = np.zeros(len(members))
 
     def run(part: slice) -> None:
@@ -54,7 +54,7 @@ def _run(
     # Of a batch that is whole or in parts; a list of indices would copy the rows of an array of torques.
     which = slice(int(members[0]), int(members[-1]) + 1)
     rows: slice | Indices = which if which.stop - which.start == len(members) else members
-    values = dyn.parameter_values
+    values = dyn._parameter_values
     arena.put("q", problem.q[members].T)
     arena.put("w", w0[members].T)
     arena.put("squares", np.zeros((1, 1)))

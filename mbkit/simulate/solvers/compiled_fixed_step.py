@@ -145,7 +145,7 @@ def run_rollout(
         return _run_step_by_step(problem)
     record = GridRecord(problem)
     space = Space(dyn.model)
-    w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn.parameter_values
+    w0, values = space.to_integrator_velocity(problem.q, problem.v), dyn._parameter_values
     clock = None if dyn.model.time_parameter is None else list(dyn.model.parameters).index(dyn.model.time_parameter)
     law = problem.torque.feedback
     workers = workers or dyn.threads or cores()
@@ -173,7 +173,7 @@ def run_rollout(
 
             squares = step_on_device(problem, record, w0, members, thorough=thorough)
             return members[~(squares < BOUND**2)]
-        plan = dyn.step_plan(method, thorough=thorough, fed=law is not None, behind=behind)
+        plan = dyn._step_plan(method, thorough=thorough, fed=law is not None, behind=behind)
         # Parts that wait for one another have a thread each.
         parts = _split(n, _widest(plan) if problem.torque.samples is None else max(-(-n // workers), 1), workers)
 
@@ -204,7 +204,7 @@ def run_rollout(
             # Near a singular pose stages are projected too, and the pose is named. The others of a batch are done.
             return run_fixed(problem, record, suspects)
     if len(suspects):
-        plan = dyn.step_plan(method, fed=law is not None)
+        plan = dyn._step_plan(method, fed=law is not None)
         for first in range(0, len(suspects), _widest(plan)):
             members = suspects[first : first + _widest(plan)]
             chunk = begin(new_chunk(plan, len(members), all_kept=True, watched=True), members)
@@ -216,7 +216,9 @@ def run_rollout(
         force = problem.torque.columns(np.array([i]), k, k + 1)[0, :, 0]
         if law is not None:
             force = law(grid.time(k), q, to_body_velocity(space, q, w))
-        return divergence_reason(dyn.of_samples([i]), method, grid.time(k), grid.step(k), q[None], w[None], force[None])
+        return divergence_reason(
+            dyn._of_samples([i]), method, grid.time(k), grid.step(k), q[None], w[None], force[None]
+        )
 
     record.evaluations = method_of(method).stages * (int(record.good.sum()) + len(lost))
     return record.result(why)
@@ -245,7 +247,7 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
     controller, begins = samples.controller, [*torque.changes(grid.steps), grid.steps]
     ask, nv, timed = controller.function, dyn.model.nv, dyn.model.time_parameter is not None
     # A step whose force is the answer alone.
-    step: Any = dyn.single_step(method) if forces.shape[1] == nv and not dyn.model.parameters else None
+    step: Any = dyn._single_step(method) if forces.shape[1] == nv and not dyn.model.parameters else None
     q, v, start, dt, steps, force = problem.q0, problem.v0, grid.start, grid.dt, grid.steps, forces[0]
     row = int(record.kept[0] == 0)
     kept = iter(record.kept[row:].tolist())

@@ -70,7 +70,7 @@ class _FieldStepper(Stepper):
 
     def __init__(self, problem: IntegrationProblem) -> None:
         self.poses: SingularPosesOfBatch | None = None
-        if problem.dyn.projects:
+        if problem.dyn._projects:
             self.poses = SingularPosesOfBatch(problem.dyn, problem.start, problem.q)
         self._members: Indices = np.arange(len(problem.q))
         self.space = Space(problem.dyn.model)
@@ -111,7 +111,7 @@ def take_step(dyn: Dynamics, method: str, q: Array, v: Array, force: Array, h: f
             return np.full(q.shape, np.nan), np.full(v.shape, np.nan)
         # One must not stop the others.
         rows = (np.array([i]) for i in range(len(q)))
-        each = [take_step(dyn.of_samples(i), method, q[i], v[i], force[i], h) for i in rows]
+        each = [take_step(dyn._of_samples(i), method, q[i], v[i], force[i], h) for i in rows]
         return np.concatenate([x for x, _ in each]), np.concatenate([x for _, x in each])
     if not are_bounded(q1, w1).all():
         return q1, w1

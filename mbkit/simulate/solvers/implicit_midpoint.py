@@ -74,7 +74,7 @@ def run_midpoint(problem: IntegrationProblem) -> SolverResult:
         _to_velocities(dyn, midpoint, problem, record)
     # Each iteration is an evaluation, and so is the end of each step.
     record.evaluations, record.jacobians = iterations + int(record.good.sum()), iterations
-    if dyn.projects and len(record.kept) > problem.grid.steps:
+    if dyn._projects and len(record.kept) > problem.grid.steps:
         # Only where all steps are kept.
         times, record.poses = problem.grid.times, SingularPosesOfBatch(dyn, problem.start, problem.q).members
         for i, last in enumerate(record.good.tolist()):
@@ -98,7 +98,7 @@ def called(
     n = len(arguments[0])
     args = [np.broadcast_to(x, (n, x.shape[-1])) for x in arguments]
     if dyn.model.parameters:
-        values = dyn.parameter_values
+        values = dyn._parameter_values
         if values.ndim == 2 and members is not None:
             values = values[members]
         own = np.broadcast_to(values, (n, values.shape[-1]))
@@ -106,7 +106,7 @@ def called(
             own = own.copy()
             own[:, list(dyn.model.parameters).index(dyn.model.time_parameter)] = t
         args.append(own)
-    results = dyn.code(part.name, make=part.make)(*args, threads=dyn.threads)
+    results = dyn._code(part.name, make=part.make)(*args, threads=dyn.threads)
     return [
         x[..., 0] if x.shape[-1] == 1 and name not in ("M", "jacobian") else x
         for name, x in zip(part.writes, results, strict=True)
@@ -116,7 +116,7 @@ def called(
 def _machine_code(dyn: LagrangianDynamics, midpoint: Midpoint, problem: IntegrationProblem) -> bool:
     if problem.torque.callable or not dyn.model.nv or not dyn.compile or not _written_out(dyn):
         return False
-    return not any(isinstance(dyn.code(p.name, make=p.make), Machine) for p in (midpoint.newton, midpoint.end))
+    return not any(isinstance(dyn._code(p.name, make=p.make), Machine) for p in (midpoint.newton, midpoint.end))
 
 
 def _written_out(dyn: LagrangianDynamics) -> bool:

@@ -143,7 +143,7 @@ class _Solve:
         # Radau and DOP853 go on from the rate at the end of a step.
         if not is_bounded(solver.y) or not np.isfinite(getattr(solver, "f", 0.0)).all():
             raise diverged(self.rates.why)
-        if self._problem.dyn.projects and not self._method.multistep:
+        if self._problem.dyn._projects and not self._method.multistep:
             solver.y = self.rates.settled(float(solver.t), solver.y)
             solver.f = self.rates(float(solver.t), solver.y, force)
         return solver

@@ -277,7 +277,7 @@ class AcrossPoses(RungeKuttaAttempts):
     @classmethod
     def of(cls, problem: IntegrationProblem) -> AcrossPoses | None:
         """Return those of a run; None where nothing is projected."""
-        return cls(problem) if problem.dyn.projects else None
+        return cls(problem) if problem.dyn._projects else None
 
     def crosses(self, t: float, y: Array, h: float) -> bool:
         """Return whether a step of length h from a state would meet a pose; `cross` then starts there."""

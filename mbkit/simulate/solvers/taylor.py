@@ -43,7 +43,7 @@ def run_taylor(problem: IntegrationProblem) -> SolverResult:
     """
     dyn, torque = problem.dyn, problem.torque
     assert isinstance(dyn, (LagrangianDynamics, OracleDynamics))
-    kind, stops = precision(dyn.bits), problem.stops
+    kind, stops = precision(dyn._significand_bits), problem.stops
     system, tolerance = taylor_system(dyn.equations), max(min(problem.tolerances) / magnitude(problem.y), kind.eps)
     # With 34 digits the drift is far below what a double tells.
     across = AcrossPoses.of(problem) if kind.bits == 53 else None
@@ -51,9 +51,11 @@ def run_taylor(problem: IntegrationProblem) -> SolverResult:
 
         def walk(i: int, y: Array, record: TrajectoryRecord) -> Iterator[tuple[float, Array, Any]]:  # noqa: ARG001
             member = problem.member(i)
-            own: Any = dyn if member is None else dyn.of_samples([member])
+            own: Any = dyn if member is None else dyn._of_samples([member])
             settled = None if across is None else Rates(own).settled
-            behind = kind.array(*own.constant_values) if dyn.bits > 53 else own.parameter_values.reshape(-1)
+            behind = (
+                kind.array(*own.constant_values) if dyn._significand_bits > 53 else own._parameter_values.reshape(-1)
+            )
             if across is not None:
                 across.follow(i)
             steps, held = TaylorSteps(system, integrator, kind, behind, settled, across), torque.of_member(member)

@@ -179,8 +179,8 @@ class TrajectoryRecord(RunRecord):
         dyn, member, self.index = problem.dyn, problem.member(i), i
         self._model, self._space, self._save = dyn.model, space, problem.save
         self._watch = Watch(problem.events, member) if problem.events else None
-        own = dyn if member is None or not dyn.model.constrained else dyn.of_samples([member])
-        self.passed = SingularPoses(own) if dyn.projects else None
+        own = dyn if member is None or not dyn.model.constrained else dyn._of_samples([member])
+        self.passed = SingularPoses(own) if dyn._projects else None
         self.reached = problem.start
         self._q: Array | None = None
         self.ended: Ended = "finished"

@@ -64,12 +64,12 @@ class Field:
 
     def only(self, members: Indices) -> None:
         """Go on with these members of the whole batch."""
-        self._use(self._dyn.of_samples(members))
+        self._use(self._dyn._of_samples(members))
         self.undetermined = ""
 
     def _use(self, own: Dynamics) -> None:
         self._own, self._forward, self._timed = own, own.forward_dynamics, own.model.time_parameter is not None
-        self._approach, self._constrained = Approach(), own.projects
+        self._approach, self._constrained = Approach(), own._projects
 
     dyn: Dynamics = forwarded("_own", "The dynamics of the members of the batch that go on.")
     projects: bool = forwarded("_constrained", "Whether states are projected onto constraints.")
@@ -141,7 +141,7 @@ class Field:
         if self._timed:
             forward = at_time(own, t).forward_dynamics
         if which is not None:
-            own = own.of_samples(np.flatnonzero(which))
+            own = own._of_samples(np.flatnonzero(which))
             forward = (at_time(own, t) if self._timed else own).forward_dynamics
             q, v, force = q[which], v[which], force if force.ndim == 1 else force[which]
         try:

@@ -66,7 +66,7 @@ def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str
             ours = quiet_simulate(engines[name], q0, v0, STEP * last, method, STEP)
             # How far their formulas for M amplify rounding along the run.
             places = [(engines[x], theirs.q[k]) for x in (MUJOCO, name) for k in (0, (last + 1) // 2, last)]
-            amplified = max(dyn.mass_matrix_rounding(q) for dyn, q in places)
+            amplified = max(dyn._mass_matrix_rounding(q) for dyn, q in places)
             grown = condition[: last + 1], last + 1 < len(condition)
             own.append((_row(engines[name], ours, theirs, *grown, amplified, note), ours))
         rows += _blamed(model, own)

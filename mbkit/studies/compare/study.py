@@ -99,9 +99,9 @@ class Judge:
         self.joint_of = model.velocity_joints
         #: Tolerances of engines that are not double, by their bits.
         self._lower = {
-            dyn.bits: Precision(model, at, dyn.bits, self.scales, oracle)
+            dyn._significand_bits: Precision(model, at, dyn._significand_bits, self.scales, oracle)
             for dyn in self.engines.values()
-            if dyn.bits < DOUBLE_BITS
+            if dyn._significand_bits < DOUBLE_BITS
         }
 
     def rows(self, tell: Progress) -> tuple[list[Row], list[Refusal]]:
@@ -118,7 +118,7 @@ class Judge:
             except MbkitError as error:
                 self._refuse(name, POWER, error)
             else:
-                lower = self._lower.get(self.engines[name].bits)
+                lower = self._lower.get(self.engines[name]._significand_bits)
                 allowed = lower.allowed(POWER) if lower else None
                 rows.append(self._row(POWER, name, errors, self.defects.get(name, ""), allowed))
         return rows, self.refusals
@@ -153,7 +153,7 @@ class Judge:
         for name, value in values.items():
             against, exact, rest = reference, high, low
             dyn = self.engines[name]
-            soft = dyn.soft_friction or (self.model.constrained and dyn.soft_constraints)
+            soft = dyn._soft_friction or (self.model.constrained and dyn._soft_constraints)
             if soft and term.quantity in (OF_CONSTRAINED_MOTION if self.model.constrained else (FORWARD_DYNAMICS,)):
                 against, exact, rest = OWN_LAW, self._own_law(term, name), np.zeros_like(value)
             errors = term.errors((value - exact) - rest, exact, self.scales)
@@ -193,14 +193,14 @@ class Judge:
     def _allowed(self, term: Term, engine: str, errors: Errors) -> float:
         """Return the tolerance, or the engine's own bound where its formula cannot do better."""
         dyn, allowed = self.engines[engine], self.tolerance
-        if lower := self._lower.get(dyn.bits):
+        if lower := self._lower.get(dyn._significand_bits):
             allowed = max(allowed, lower.allowed(term))
         # Accelerations are M's solution: they cannot be better than M.
         of_mass = term.quantity in ("mass_matrix", "mass_matrix_inverse", "forward_dynamics")
         if not of_mass or errors.relative.max() <= allowed:
             return allowed
-        amplified = dyn.mass_matrix_rounding(self.at.q[errors.worst], term.quantity)
-        return max(allowed, ROUNDINGS * epsilon(dyn.bits) * amplified)
+        amplified = dyn._mass_matrix_rounding(self.at.q[errors.worst], term.quantity)
+        return max(allowed, ROUNDINGS * epsilon(dyn._significand_bits) * amplified)
 
     def _row(self, term: str, engine: str, errors: Errors, defect: str, allowed: float | None = None) -> Row:
         """Return a row against the oracle, not timed."""
@@ -214,7 +214,7 @@ class Judge:
             bad = [n for n, e in zip(self.joint_of, per, strict=False) if e > self.tolerance]
             named = f" at {', '.join(dict.fromkeys(bad)) or 'no single joint'}" if per.size else ""
             reason = f"differs by {relative:.1e}{named}" + (f"; {defect}" if defect else "")
-        elif relative > self.tolerance and self.engines[engine].bits == DOUBLE_BITS:
+        elif relative > self.tolerance and self.engines[engine]._significand_bits == DOUBLE_BITS:
             reason = (
                 f"{relative:.1e} at {joint} is above {self.tolerance:.0e}, and within the rounding of {engine}'s own "
                 f"formula ({allowed:.0e}): its terms are {allowed / (ROUNDINGS * EPS):.0e} times the result"
@@ -237,7 +237,7 @@ class Judge:
             passed=passed,
             reason=reason,
             allowed=allowed,
-            bits=self.engines[engine].bits,
+            bits=self.engines[engine]._significand_bits,
             defect="" if passed else defect.split(_AS_IT_IS)[0],
         )
 
@@ -380,7 +380,7 @@ def _build(
             try:
                 # A few dozen states are no reason to compile; run times are.
                 options = {} if compile else find_engine(name).brief
-                own = find_engine(name).load().own_friction if "jump" in model.effects else {}
+                own = find_engine(name).load()._soft_friction_options if "jump" in model.effects else {}
                 try:
                     engines[name] = dynamics(model, name, **options, **own)
                 except UnsupportedError as error:

@@ -282,7 +282,7 @@ def _road(motion: Motion, choices: tuple[tuple[str, str], ...]) -> tuple[Dynamic
 
 def _require_rigid(dyn: Dynamics) -> None:
     """Refuse an engine whose loops give way: its motion is another one."""
-    if dyn.model.constrained and dyn.soft_constraints:
+    if dyn.model.constrained and dyn._soft_constraints:
         raise UnsupportedError(f"{dyn.engine} holds loops softly")
 
 

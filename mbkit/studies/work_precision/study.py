@@ -184,7 +184,7 @@ def work_precision(
     sweep = Sweep(problem, truth, settings, repeats, seed, budget, executor)
     facts = results.model_info(integrated)
     facts["notes"] = [*facts["notes"], *changed]
-    soft = [name for name in methods_of if model.constrained and find_engine(name).load().soft_constraints]
+    soft = [name for name in methods_of if model.constrained and find_engine(name).load()._soft_constraints]
     if soft:
         which = " and ".join(soft)
         facts["notes"] = [*facts["notes"], f"{which}: holds loops by its own law; the curves end at that law's motion"]

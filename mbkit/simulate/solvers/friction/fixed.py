@@ -50,7 +50,7 @@ def run_fixed_in_phases(problem: IntegrationProblem, solver: Callable[[Dynamics]
     Torque functions, and engines whose parameters are not numbers, take the members of a batch one by one.
     """
     torque, every = problem.torque, np.arange(len(problem.q))
-    if problem.batch is not None and problem.dyn.derived and (not torque.callable or torque.feedback is not None):
+    if problem.batch is not None and problem.dyn._derived and (not torque.callable or torque.feedback is not None):
         try:
             return _together(problem, [_Members(problem, every, solver, side_by_side=True)])
         except NumericalError:
@@ -114,7 +114,7 @@ class _Members:
             return
         rows, start = np.arange(len(self.k)), self.times(np.full(len(self.k), grid.start))
         self._sample(rows)
-        dyn = self.friction.dyn.of_samples(self.members) if self.side_by_side else self.friction.dyn
+        dyn = self.friction.dyn._of_samples(self.members) if self.side_by_side else self.friction.dyn
         self.v = self.friction.stopped(dyn, start, self.q, self.v, self.v == 0)
         self._phase = self.begin(rows, start)
         self._shortest = max(_BLOCK, _SET_UP // len(rows) if self._steps_compiled(self._phase.dyn) else 0)
@@ -162,7 +162,7 @@ class _Members:
         first = int(self.k[0])
         torque = self.problem.torque
         forces = None if torque.callable else torque.rows(first + step, self._alone)
-        if forces is not None and (not self._timed or phase.dyn.takes_parameters):
+        if forces is not None and (not self._timed or phase.dyn._takes_parameters):
             return friction.margins(phase, t, q, v, forces)
         each = []
         for i, (j, when) in enumerate(zip(step.tolist(), t.tolist(), strict=True)):
@@ -262,8 +262,8 @@ class _Members:
         return self._steps_compiled(dyn) and not dyn.model.constrained
 
     def _steps_compiled(self, dyn: Dynamics) -> bool:
-        known = dyn.derived and method_of(self.problem.method).explicit and not self.problem.torque.callable
-        return known and getattr(dyn, "compiles_steps", False) and getattr(dyn, "device", None) is None
+        known = dyn._derived and method_of(self.problem.method).explicit and not self.problem.torque.callable
+        return known and getattr(dyn, "_compiles_steps", False) and getattr(dyn, "device", None) is None
 
     @cached_property
     def margin_part(self) -> Any:
@@ -280,7 +280,7 @@ class _Members:
             np.broadcast_to(x, (len(q), np.shape(x)[1]))
             for x in (*states, self.friction.bounds(phase), with_time(dyn, t))
         )
-        return np.asarray(dyn.code(part.name, make=part.make)(*given, threads=dyn.threads)[0][:, 0, 0][None])
+        return np.asarray(dyn._code(part.name, make=part.make)(*given, threads=dyn.threads)[0][:, 0, 0][None])
 
     def _solved(self, rows: Indices, phase: Phase, n: int, grid: Grid, margins: Array | None = None) -> SolverResult:
         """Return the run of a block, whose margins are put into an array where one is given, (m, n)."""
@@ -408,7 +408,7 @@ def _of_each(force: Any) -> Callable[[float, Array, Array], Array]:
 
 def with_time(dyn: Any, t: Array) -> Array:
     """Return values of parameters, (1, p) or (m, p), at a time of each sample."""
-    values, clock = np.atleast_2d(dyn.parameter_values), dyn.model.time_parameter
+    values, clock = np.atleast_2d(dyn._parameter_values), dyn.model.time_parameter
     if clock is None:
         return values
     return np.where(np.arange(values.shape[1]) == list(dyn.model.parameters).index(clock), t[:, None], values)
@@ -426,7 +426,7 @@ class _PartOfStep:
         dyn: Any = phase.dyn
         timed = dyn.model.time_parameter
         if run._compiled(dyn):
-            self._code, self._threads = dyn.step_with(run.problem.method, run.margin_part), dyn.threads
+            self._code, self._threads = dyn._step_with(run.problem.method, run.margin_part), dyn.threads
             self._values, self._bound = with_time(dyn, t), run.friction.bounds(phase)
         self._stepped = self._method.explicit and timed is None and not callable(self._force)
 

@@ -34,8 +34,8 @@ def run_moreau(problem: IntegrationProblem) -> SolverResult:
     """Step one state or a batch over the grid."""
     dyn = problem.dyn
     record, reasons = GridRecord(problem), dict[int, str]()
-    compiled = dyn.derived and not problem.torque.callable and "jump" in dyn.model.effects
-    compiled = compiled and getattr(dyn, "compiles_steps", False) and not dyn.model.constrained
+    compiled = dyn._derived and not problem.torque.callable and "jump" in dyn.model.effects
+    compiled = compiled and getattr(dyn, "_compiles_steps", False) and not dyn.model.constrained
     for i in range(len(problem.q)):
         member = problem.member(i)
         own = dyn if member is None else dyn._of_sample(i)
@@ -136,7 +136,7 @@ class _Compiled:
         kept: dict[str, Any] = own.equations.kept
         if problem.method not in kept:
             kept[problem.method] = compiled_step_loop(
-                (own.form, problem.method), lambda: moreau_parts(own.equations, which, sides, locks), STATE
+                (own._form, problem.method), lambda: moreau_parts(own.equations, which, sides, locks), STATE
             )
         self._code = kept[problem.method]
         self._room = aligned(self._code.size * width()).reshape(self._code.size, width())

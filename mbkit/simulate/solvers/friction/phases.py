@@ -47,7 +47,7 @@ class Phase:
 
     def take(self, which: Indices) -> Phase:
         """Return the phases of these trajectories, by index, which may repeat."""
-        dyn, rubbed = self.dyn.of_samples(which), self.rubbed.of_samples(which)
+        dyn, rubbed = self.dyn._of_samples(which), self.rubbed._of_samples(which)
         return Phase(dyn, self.sides[which], self.still[which], self.locked[which], rubbed)
 
 
@@ -57,7 +57,7 @@ class Friction:
     def __init__(self, dyn: Dynamics, *, side_by_side: bool = False) -> None:
         #: Whether constraints may hold with friction what rests.
         self._bound = dyn.model.constrained
-        if self._bound and dyn.soft_constraints:
+        if self._bound and dyn._soft_constraints:
             BESIDE_SOFT_ROWS.admit(dyn.model)
         self.dyn, self._own, self._side_by_side = dyn, dyn._friction, side_by_side
         self._names = dyn.model.velocity_names
@@ -84,14 +84,14 @@ class Friction:
         `leaving` has the signs of velocities that are about to be.
         """
         tau = applied(force, t, q, v)
-        rubbed = self.dyn if members is None else self.dyn.of_samples(members)
+        rubbed = self.dyn if members is None else self.dyn._of_samples(members)
         law = self._own.law_of(rubbed)
         # A velocity whose friction is zero in these dynamics has no side, and so no phase.
         resting, signs = law.at_rest(v), np.where(law.bound > 0, np.sign(v), 0.0)
         held, still = np.zeros(v.shape), np.zeros(v.shape, dtype=bool)
         if resting.any():
             rows: Any = np.flatnonzero(resting.any(axis=1)) if self._side_by_side else ...
-            own = rubbed.of_samples(rows) if self._side_by_side else rubbed
+            own = rubbed._of_samples(rows) if self._side_by_side else rubbed
             when: Any = t[rows] if isinstance(t, np.ndarray) else t
             sliding = at_time(self._dynamics(own, signs[rows], still[rows]), when)
             held[rows], still[rows] = self._own.decided(

@@ -23,7 +23,7 @@ def step(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: floa
 
     States whose phase does not change take one step of their method; the others run it in parts.
     """
-    together = q.ndim == 2 and dyn.derived
+    together = q.ndim == 2 and dyn._derived
     if q.ndim == 2 and not together:
         each = [step(dyn._of_sample(i), method, *state, dt) for i, state in enumerate(zip(q, v, tau, strict=True))]
         return np.array([x for x, _ in each]).reshape(q.shape), np.array([x for _, x in each]).reshape(v.shape)
@@ -35,7 +35,7 @@ def step(dyn: Dynamics, method: Method, q: Array, v: Array, tau: Array, dt: floa
     over = (friction.margins(phase, start + dt, q1, v1, tau) < 0).any(axis=-1)
     if over.any():
         which: Any = np.flatnonzero(over) if together else ...
-        own = dyn.of_samples(which) if together else dyn
+        own = dyn._of_samples(which) if together else dyn
         grid, kept, silent = Grid(start, start + dt, dt, 1, dt), np.arange(2), Progress(None, "")
         # Without wrenches: they stand behind the force already, and the dynamics know where they act.
         torque = Torque.of_force(tau[which], dyn.model)

@@ -68,7 +68,7 @@ class ImplicitChunk(BlockLoop):
     def __init__(self, dyn: LagrangianDynamics, parts: ImplicitParts, count: int, steps: int, *, torques: bool) -> None:
         self._parts, self.carried, self.evaluated, self.each_step = parts, parts.carried, parts.clock, torques
         every = (*parts.iteration, parts.end)
-        self._codes = {part.name: dyn.code(part.name, make=part.make) for part in every}
+        self._codes = {part.name: dyn._code(part.name, make=part.make) for part in every}
         rows = dict[str, int]()
         for part in every:
             code = self._codes[part.name]
@@ -174,7 +174,7 @@ def run_implicit(
     """
     dyn, record, grid = problem.dyn, GridRecord(problem), problem.grid
     assert isinstance(dyn, LagrangianDynamics)
-    values, n = dyn.parameter_values, len(other)
+    values, n = dyn._parameter_values, len(other)
     count, workers = -(-n // WIDEST), dyn.threads or cores()
     if problem.torque.samples is not None:
         # Parts that wait for one another have a thread each.
@@ -203,13 +203,13 @@ def run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> So
     assert isinstance(dyn, LagrangianDynamics)
     parts, space, q0, v0 = Collocation(dyn.equations, tableau), Space(dyn.model), problem.q, problem.v
     every = (parts.start, *parts.iteration, parts.end)
-    if parts.size > _WORTH_COMPILING or any(isinstance(dyn.code(x.name, make=x.make), Machine) for x in every):
+    if parts.size > _WORTH_COMPILING or any(isinstance(dyn._code(x.name, make=x.make), Machine) for x in every):
         return run_fixed(problem)
     w0, first = space.to_integrator_velocity(q0, v0), problem.torque.columns(np.arange(len(q0)), 0, 1)[0].T
     more = at_time(dyn, problem.start)._trailing(q0)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         tau = np.broadcast_to(first, (len(q0), first.shape[-1]))
-        guess = dyn.code(parts.start.name, make=parts.start.make)(q0, v0, w0, tau, *more)[0][..., 0]
+        guess = dyn._code(parts.start.name, make=parts.start.make)(q0, v0, w0, tau, *more)[0][..., 0]
 
         def velocity(t: float, q: Array, w: Array, members: Indices) -> Array:  # noqa: ARG001
             return to_body_velocity(space, q, w)
