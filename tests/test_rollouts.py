@@ -75,7 +75,7 @@ def planar() -> LagrangianDynamics:
 
 @pytest.fixture
 def in_stages(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
+    monkeypatch.setattr(fixed, "_MAX_OPERATIONS_IN_ONE_PIECE", 0)
     monkeypatch.setattr(
         LagrangianDynamics,
         "_step_plan",

@@ -43,7 +43,7 @@ def test_a_compiled_run_is_that_of_a_function(
     from mbkit.derivation.steps import fixed
 
     if in_pieces:
-        monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
+        monkeypatch.setattr(fixed, "_MAX_OPERATIONS_IN_ONE_PIECE", 0)
     model = TREES[name]()
     dyn = mb.dynamics(model, "lagrangian", compile=True)
     q, v, *_ = states(model, 5)

@@ -88,7 +88,7 @@ def test_with_a_free_joint_it_is_simulate_to_rounding(method: str) -> None:
 @pytest.mark.thorough("kinds1")
 @pytest.mark.parametrize("kinds", [SAME_VELOCITY[:3], ("free", "ball", "revolute")])
 def test_a_step_in_parts_too(kinds: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
+    monkeypatch.setattr(fixed, "_MAX_OPERATIONS_IN_ONE_PIECE", 0)
     dyn = own(random_tree(3, n=3, kinds=kinds))
     assert_simulated(dyn, "rk4", rounding="free" in kinds)
     assert len(dyn._step_plan("rk4").parts) > 1
@@ -386,7 +386,7 @@ def test_a_force_of_time_acts_at_the_times_of_a_loop(engine: str, options: dict[
 
 
 def test_a_step_in_parts_has_the_time_of_each_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fixed, "_ONE_PIECE", 0)
+    monkeypatch.setattr(fixed, "_MAX_OPERATIONS_IN_ONE_PIECE", 0)
     test_a_force_of_time_acts_at_the_times_of_a_loop("lagrangian", {"compile": True})
 
 

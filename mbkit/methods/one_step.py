@@ -94,17 +94,19 @@ class SemiImplicitEuler:
 
 # Errors and lengths of adaptive steps
 
-#: A step grows at most by this, and shrinks at most to SHRINK of its length.
+#: Largest growth of a step.
 MAX_GROWTH: Final = 10.0
-_SHRINK: Final = 0.2
+#: Smallest length of a step after a rejection, relative to the rejected one.
+_MIN_SHRINK: Final = 0.2
 _SAFETY: Final = 0.8
 #: The 32nd root of the smallest error that is remembered, 1e-4.
 FIRST_ROOT: Final = 1e-4 ** (1 / 32)
-#: A Rosenbrock method sees a force only through the Jacobian at the step's start: what was stiff there and has gone by
-#: its end leaves no error behind. So the rate at the end is compared with that of the step's polynomial; for smooth
-#: motions, however stiff, they differ by 20 times the tolerance at most, by a tenth of it as a rule.
-_DEFECT: Final = 100.0
-#: Of numpy.float64, whose quotients by zero are infinite.
+#: Largest defect of a Rosenbrock step, in tolerances. The method sees a force only through the Jacobian at the step's
+#: start: what was stiff there and has gone by its end leaves no error behind. So the rate at the end is compared with
+#: that of the step's polynomial; for smooth motions, however stiff, they differ by 20 times the tolerance at most, by a
+#: tenth of it as a rule.
+_MAX_DEFECT: Final = 100.0
+#: Arithmetic of numpy.float64, whose quotients by zero are infinite.
 SCALARS: Final = Arithmetic(np.sqrt, np.sin, np.cos, FLOATS.choose)
 
 #: Growth after an accepted step, reduction after a rejected one, and the error's 32nd root to remember.
@@ -133,7 +135,7 @@ def embedded_error(
 
 def with_defect(m: Arithmetic, error: Any, defect: Any) -> Any:
     """Return the error of a Rosenbrock step, with the defect of its polynomial's slope at the end."""
-    defect = defect / _DEFECT
+    defect = defect / _MAX_DEFECT
     # NaN is chosen where it is one of the two.
     return larger(m, error, defect) + 0 * defect
 
@@ -181,7 +183,7 @@ def next_step(
     # A step that was short only because the end was near says little.
     grown = m.choose((2 * step < h) * (grown < h), h, grown)
     # NaN shrinks as much as anything does.
-    shrunk = step * m.choose(reduction > _SHRINK, reduction, _SHRINK)
+    shrunk = step * m.choose(reduction > _MIN_SHRINK, reduction, _MIN_SHRINK)
     idle = 1 - (step > 0)
     h1 = m.choose(accepted, grown, m.choose(idle, h, shrunk))
     remembered = m.choose(accepted, larger(m, root, FIRST_ROOT), last)

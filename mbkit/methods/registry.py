@@ -30,7 +30,7 @@ from mbkit.methods.tableaus import (
 _EPS: Final = 2.0**-52
 #: With a step, when nothing else is said.
 DEFAULT_METHOD: Final = "rk4"
-#: Of first order, as MuJoCo does it.
+#: The method of first order, as MuJoCo does it.
 EULER_METHOD: Final = "semi_implicit_euler"
 #: With a tolerance, for motions that are not stiff.
 ADAPTIVE_METHOD: Final = "rk853"

@@ -16,8 +16,8 @@ import numpy as np
 from mbkit._check import Array
 
 _EPS: Final = float(np.finfo(float).eps)
-#: Rounds of refinement; each squares the error.
-_ROUNDS: Final = 5
+#: Number of refinements; each squares the error.
+_REFINEMENTS: Final = 5
 
 
 class SmallMotion(NamedTuple):
@@ -77,7 +77,7 @@ def eigenvalues(pencil: Sequence[Array], errors: Sequence[Array]) -> tuple[Any, 
     values, x, y = values[half], x.T[half] * scale, y.T[half] * scale
     pair, apart = values.imag > 0, 2 * values.imag
     error, due, at = np.full(len(values), np.inf), np.arange(len(values)), values
-    for turn in range(_ROUNDS):
+    for turn in range(_REFINEMENTS):
         powers, slopes = np.array([at**2, at, at**0])[:, :, None], np.array([2 * at, at**0, 0 * at])[:, :, None]
         residual, slope = (sum(c * (x @ P.T) for c, P in zip(z, pencil, strict=True)) for z in (powers, slopes))
         rounding = sum(abs(c) * (abs(x) @ E.T) for c, E in zip(powers, errors, strict=True)) * 4 * (len(scale) + 2)
@@ -93,7 +93,7 @@ def eigenvalues(pencil: Sequence[Array], errors: Sequence[Array]) -> tuple[Any, 
         values[due[better]], error[due[better]] = at[better], bound[better]
         more = ~(bound <= 2 * least)
         due, at, x, y = due[more], at[more], x[more], y[more]
-        if not len(due) or turn + 1 == _ROUNDS:
+        if not len(due) or turn + 1 == _REFINEMENTS:
             break
         x, y = _inverse_iteration(pencil, at, x, y)
     values.real[np.abs(values.real) <= error] = 0.0
@@ -110,7 +110,7 @@ def _inverse_iteration(pencil: Sequence[Array], at: Any, x: Any, y: Any) -> tupl
     z = at[:, None, None]
     size = np.diagonal(np.abs(z * z) * np.abs(A) + np.abs(z) * np.abs(B) + np.abs(C), axis1=1, axis2=2)
     scale = 1 / np.sqrt(np.where(size > 0, size, 1.0))
-    # What rounding adds keeps the matrix regular, and changes its inverse along the vectors that are sought alone.
+    # A number of the size of rounding keeps the matrix regular, and changes its inverse along the sought vectors alone.
     inverse = np.linalg.inv(
         (z * z * A + z * B + C) * scale[:, :, None] * scale[:, None, :] + (1 + 1j) * _EPS * np.eye(len(A))
     )

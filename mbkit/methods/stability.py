@@ -147,7 +147,7 @@ class _EulerStability:
         return self.limit(damping) / frequency
 
 
-# Of the oscillator, with x = ω h, a step has the characteristic polynomials below, stable where both roots are within
+# A step on the oscillator, with x = ω h, has the characteristic polynomials below, stable where both roots are within
 # the unit circle (Jury 1964).
 
 #: λ² - (2 - 2ζx - x²) λ + 1 - 2ζx; at λ = -1, x² + 4ζx = 4.

@@ -57,10 +57,10 @@ def _stage_weights(A: Array, tree: Tree) -> Array:
     return out
 
 
-#: Of a step: rounding of a stage's time.
-_SAME_TIME: Final = 1e-12
-#: What the sixteen digits of published coefficients leave of a sum of a Rosenbrock method.
-_DIGITS: Final = 1e-12
+#: Largest difference of two times that are the same to rounding, in steps.
+_MAX_TIME_ROUNDING: Final = 1e-12
+#: Largest sum of a Rosenbrock method's published coefficients, of sixteen digits, that is zero.
+_MAX_SUM_ROUNDING: Final = 1e-12
 
 
 def rounding_of_condition(A: Array, b: Array, tree: Tree) -> float:
@@ -101,7 +101,7 @@ def _numbers(tableau: str, name: str, value: ArrayLike) -> Array:
 def _times(rows: Array) -> Array:
     sums = np.array([fsum(row) for row in rows])
     # No stage lies behind the end of the step by a rounding.
-    return np.where(np.abs(sums - 1.0) < _SAME_TIME, 1.0, sums)
+    return np.where(np.abs(sums - 1.0) < _MAX_TIME_ROUNDING, 1.0, sums)
 
 
 def _digest(*arrays: Array) -> str:
@@ -177,7 +177,7 @@ class Tableau:
     @property
     def ends_at_a_stage(self) -> bool:
         """Whether the last stage is at the end of the step, near the state there."""
-        return self.stages > 1 and bool(abs(self.c[-1] - 1) < _SAME_TIME)
+        return self.stages > 1 and bool(abs(self.c[-1] - 1) < _MAX_TIME_ROUNDING)
 
     @cached_property
     def _rows(self) -> list[tuple[float, Array]]:
@@ -377,7 +377,7 @@ class RosenbrockTableau:
     def d(self) -> Array:
         """Factors of ∂f/∂t, shape (s,)."""
         sums = np.array([fsum(row) for row in self._coupling])
-        return np.where(np.abs(sums) < _DIGITS, 0.0, sums)
+        return np.where(np.abs(sums) < _MAX_SUM_ROUNDING, 0.0, sums)
 
     @property
     def _coupling(self) -> Array:

@@ -22,8 +22,8 @@ from mbkit.model import Model
 
 #: state(t) -> (q, v) within a step
 State = Callable[[float], tuple[Array, Array]]
-#: Parabolas that are off by less, of a function's values, have its sign.
-_BEND: Final = 1e-4
+#: Largest error of parabolas, relative to a function's values, with which they have its sign.
+_MAX_PARABOLA_ERROR: Final = 1e-4
 #: A time and the value of a function there.
 Sample = tuple[float, float]
 
@@ -65,7 +65,7 @@ class Event:
         try:
             value = float(self.function(t, q.copy(), v.copy()))
         except self._named:
-            # Of a torque that it asks, or of an engine, which has a name and a message of its own.
+            # The error of a torque that it asks, or of an engine, has a name and a message of its own.
             raise
         except Exception as error:
             raise EventError(
@@ -84,9 +84,9 @@ class Followed(Event):
     Attributes
     ----------
     parts : int
-        Of a step, looked at on their own at least.
+        Fewest parts of a step that are looked at on their own.
     noise : float
-        What does not count, of the function's values.
+        Largest value that does not count, relative to the function's largest.
     """
 
     direction: int = -1
@@ -167,10 +167,10 @@ class Watch:
         while parts:
             part = parts.pop()
             x = [value for _, value in part]
-            # What the parabola through the ends and the middle leaves of the two samples in between.
+            # The two samples in between differ by this from the parabola through the ends and the middle.
             bend = max(abs(3 * a + 6 * x[2] - b - 8 * c) / 8 for a, b, c in ((x[0], x[4], x[1]), (x[4], x[0], x[3])))
             room = part[4][0] - part[0][0] > 1e-9 * (last[0] - first[0])
-            if room and bend > max(min(x) / 2, _BEND * size):
+            if room and bend > max(min(x) / 2, _MAX_PARABOLA_ERROR * size):
                 middles = [(a[0] + b[0]) / 2 for a, b in pairwise(part)]
                 finer = sorted([*part, *((t, self._value(event, t, state(t))) for t in middles)])
                 parts += [finer[4:], finer[:5]]

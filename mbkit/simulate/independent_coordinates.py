@@ -31,13 +31,14 @@ from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord, assemble_
 
 _WORN: Final = "the dependent coordinates are badly chosen"
 _NEAR: Final = "near a singular pose"
-# Steps of a fixed-step method between two looks at the chart.
-_BLOCK: Final = 100
-# How far behind a singular pose charts serve again, in terms of how near they end.
-_FAR: Final = 20
-# Least measure; its logarithm must be finite.
-_LEAST: Final = 1e-16
-_MOST: Final = 10_000
+#: Number of fixed steps between two looks at the chart.
+_STEPS_PER_LOOK: Final = 100
+#: Distance behind a singular pose from which charts serve again, in distances at which they end.
+_DISTANCE_BEHIND_POSE: Final = 20
+#: Smallest measure of a chart; its logarithm must be finite.
+_MIN_MEASURE: Final = 1e-16
+#: Most changes of the chart.
+_MAX_CHANGES: Final = 10_000
 
 
 def _on_charts(method: Method) -> bool:
@@ -82,7 +83,7 @@ class _Run:
         try:
             (self._adaptive if problem.equal_steps is None else self._stepped)(problem.q0, problem.v0)
         except FunctionError as error:
-            # Of a torque that samples.
+            # A sampled torque failed.
             self.record.fail(error)
         for t, value in self._near:
             warn(
@@ -161,9 +162,9 @@ class _Run:
             if ended or across:
                 chart, changes = None, changes + 1
             across = ended == _NEAR
-            if changes == _MOST:
+            if changes == _MAX_CHANGES:
                 record.ended = "step_too_small"
-                record.message = f"the independent coordinates changed {_MOST} times up to t = {t:.6g} s"
+                record.message = f"the independent coordinates changed {_MAX_CHANGES} times up to t = {t:.6g} s"
                 return
 
     def _behind(self, chart: Chart, q: Array, v: Array, t: float) -> float:
@@ -173,7 +174,7 @@ class _Run:
             return np.inf
         near = self.system.nearness(chart, q, t)
         rate = abs(self.system.nearness(chart, q + step / size * v, t) - near) * size / step
-        return _FAR * max(near, SINGULAR_VALUE_RATIO) / rate if rate else np.inf
+        return _DISTANCE_BEHIND_POSE * max(near, SINGULAR_VALUE_RATIO) / rate if rate else np.inf
 
     def _take(self, part: RunData, way: _Way, chart: Chart, left: list[float] | None) -> str:
         """Add a part; return why the run goes on from its end on another chart, or nothing."""
@@ -228,7 +229,7 @@ class _Run:
             t, first = grid.time(k), k
             problem.bar.update(k / grid.steps)
             self._hold(k, t, q, v)
-            end = k + 1 if torque.in_each_step else min(k + _BLOCK, torque.next_sample(k, grid.steps))
+            end = k + 1 if torque.in_each_step else min(k + _STEPS_PER_LOOK, torque.next_sample(k, grid.steps))
             way = _Way(self, chart or system.chart(q, t), q, v, t, new=chart is None)
             chart = cast("Chart", way.chart)
             part = self.integrated(way, q, v, grid.span(k, end), dt=grid.dt)
@@ -255,7 +256,7 @@ class _Run:
                 chart = None
             elif not part.stats.finished:
                 record.ended = part.stats.ended
-                # Of the run, and not of its last block.
+                # The message is that of the run, and not of its last block.
                 now = f"after t = {t:.6g} s (step {k + 1})"
                 record.message = re.sub(r"after t = \S+ s \(step \d+\)", now, part.stats.message)
                 return
@@ -339,7 +340,7 @@ class _Way:
                 value = measure(chart, self._passed(t, u), self.begin + t)
             except NumericalError:
                 value = 0.0
-            return float(np.log(max(value, _LEAST) / limit))
+            return float(np.log(max(value, _MIN_MEASURE) / limit))
 
         # On coordinates that stay, the motion beyond the pose would come out wrong.
         return Event(function, what, direction=-1, terminal=what == _WORN or system.model.time_parameter is None)

@@ -37,13 +37,13 @@ SMOOTH_RUNS: Final = Path(
     "runs without phases", "", ALL - {"jump"}, {"jump": "this method does not know dry friction"}, instead=_OTHERS
 )
 #: Smallest rtol of Taylor's method on the oracle, which computes with 113 bits.
-_LEAST_EXTENDED: Final = 1e-32
-#: Time of an evaluation from Python, in those in machine code.
-_IN_PYTHON: Final = 40
-#: Evaluations in machine code that take the time of one, in a batch.
+_MIN_RTOL_EXTENDED: Final = 1e-32
+#: Cost of an evaluation from Python, in evaluations in machine code.
+_COST_IN_PYTHON: Final = 40
+#: Number of evaluations in machine code that take the time of one in a batch.
 _SIDE_BY_SIDE: Final = 8
-#: Part of a step by which the period of a controller may differ from a multiple of it.
-_MULTIPLE: Final = 1e-6
+#: Largest difference of the period of a controller from a multiple of the step, in steps.
+_MAX_OFF_MULTIPLE: Final = 1e-6
 
 
 def integrate(
@@ -124,7 +124,7 @@ def integrate(
         states = settings.with_start(outcome.t, outcome.q, outcome.v)
         compiled = chosen.kind == "native" or (_compiles(own) and not read.callable)
         work = max(outcome.steps, outcome.evaluations)
-        work = work // min(batch or 1, _SIDE_BY_SIDE) if compiled else work * _IN_PYTHON
+        work = work // min(batch or 1, _SIDE_BY_SIDE) if compiled else work * _COST_IN_PYTHON
         driven = applied is not None or model.driven_by_forces
         doubts += tuple(diagnostics(dyn, chosen, setting, states, driven=driven, steps=outcome.steps, work=work))
     message = outcome.message + ("" if outcome.last is None else massless_joints(dyn, outcome.last))
@@ -147,7 +147,7 @@ def _period(
         raise InputError("hold: expected a torque function, which is sampled; an array is held as it is")
     hold, eps = real("hold", request.hold, positive=True), float(np.finfo(float).eps)
     steps = hold / dt if dt else 1.0
-    if not (1 - _MULTIPLE <= steps < np.inf and abs(steps - round(steps)) <= _MULTIPLE):
+    if not (1 - _MAX_OFF_MULTIPLE <= steps < np.inf and abs(steps - round(steps)) <= _MAX_OFF_MULTIPLE):
         raise InputError(f"hold: expected a multiple of the step, {dt:g} s, got {hold:g} s")
     if not hold > 4 * eps * max(abs(start), abs(end)):
         raise InputError(f"hold: expected samples at times that differ, got {hold:g} s beside t = {end:g} s")
@@ -162,11 +162,11 @@ def _intervals(
 
     A table of wrenches, where there are `rows` of one, has a row between two `times`.
     """
-    count = max(1, int(np.ceil(duration / hold - _MULTIPLE)))
+    count = max(1, int(np.ceil(duration / hold - _MAX_OFF_MULTIPLE)))
     ends: Array = np.append(start + hold * np.arange(count, dtype=float), start + duration)
     if times is not None and len(times):
         # A saved time that is a sample's to rounding is the same time.
-        inner, allowed = ends[1:-1], _MULTIPLE * hold
+        inner, allowed = ends[1:-1], _MAX_OFF_MULTIPLE * hold
         near = times[np.minimum(np.searchsorted(times, inner - allowed), len(times) - 1)]
         ends[1:-1] = np.where(np.abs(near - inner) <= allowed, near, inner)
     if not rows or times is None:
@@ -323,7 +323,7 @@ def _batch(dyn: Dynamics, states: int | None) -> int | None:
 
 def _tolerances(dyn: Dynamics, method: Method, rtol: float | None, atol: float | None) -> Tolerances:
     rtol = 1e-10 if rtol is None else real("rtol", rtol, positive=True)
-    least = _LEAST_EXTENDED if dyn._significand_bits > DOUBLE_BITS and method.extended else method.least
+    least = _MIN_RTOL_EXTENDED if dyn._significand_bits > DOUBLE_BITS and method.extended else method.least
     if rtol < least:
         raise InputError(f"rtol: expected at least {least:.3g} for {method.name} on {dyn.engine}, got {rtol:g}")
     return Tolerances(rtol, rtol if atol is None else real("atol", atol, positive=True))

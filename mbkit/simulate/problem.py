@@ -45,7 +45,7 @@ class IntegrationProblem:
     bar: Progress
     # Ends of the intervals with one force each, where an adaptive run has several; by default the times to keep.
     jumps: Array | None = None
-    # Of a fixed step: the steps, and the indices of the states to keep.
+    # Equal steps, and the indices of the states to keep, of a method with a fixed step.
     equal_steps: Grid | None = None
     kept: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
 

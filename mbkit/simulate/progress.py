@@ -15,8 +15,10 @@ from mbkit.errors import InputError
 #: progress(fraction), from 0 to 1
 ProgressFunction = Callable[[float], object]
 
-_PERIOD = 0.1  # s between reports
-_PATIENCE = 2.0  # s before a bar appears
+#: Time between two reports, s.
+_PERIOD = 0.1
+#: Time before a bar appears, s.
+_PATIENCE = 2.0
 
 
 class Bar:

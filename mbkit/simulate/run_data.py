@@ -20,10 +20,11 @@ from mbkit.simulate.events import Hit
 from mbkit.simulate.result import Stats
 from mbkit.simulate.torque import Applied, ForceFunctions, PiecewiseConstantTorque, SampledTorque
 
-# States at once: the matrices of a long run would fill the memory.
-_MANY: Final = 4096
-# Part of an interval for differences: they lose a third of the digits of a term that is h/12 of the whole.
-_NEAR: Final = 1e-4
+#: Most states at once: the matrices of a long run would fill the memory.
+_MAX_STATES: Final = 4096
+#: Fraction of an interval between the ends of differences, which lose a third of the digits of a term that is h/12 of
+#: the whole.
+_DIFFERENCE_FRACTION: Final = 1e-4
 
 #: Frames on which wrenches acted, and the axes of these.
 Acting = tuple[tuple[Frame, ...], str]
@@ -228,7 +229,7 @@ class RunData:
             raise UnsupportedError(f"momentum: {self.model.name} was written as energies and has no bodies")
         if dyn._samples is None:
             return along(dyn, (6,), _momentum, q, v)
-        # Of a batch with values of its own, each trajectory is a system of its own.
+        # Each trajectory of a batch with values of its own is a system of its own.
         each = [along(dynamics_of_trajectory(dyn, i), (6,), _momentum, q[i], v[i]) for i in range(len(q))]
         return np.array(each).reshape(*q.shape[:-1], 6)
 
@@ -273,8 +274,8 @@ def along(dyn: Dynamics, shape: tuple[int, ...], evaluate: Callable[..., Array],
     flat = [x.reshape(int(np.prod(lead)), x.shape[-1]) for x in states]
     good = np.flatnonzero(np.logical_and.reduce([np.isfinite(x).all(-1) for x in flat]))
     out = np.full((int(np.prod(lead)), *shape), np.nan)
-    for start in range(0, len(good), _MANY):
-        which = good[start : start + _MANY]
+    for start in range(0, len(good), _MAX_STATES):
+        which = good[start : start + _MAX_STATES]
         own = dyn
         if dyn.model.time_parameter is not None:
             # One sample for each state (`mbkit.engines.base.at_times`).
@@ -378,7 +379,7 @@ def _with_rate(
     """Return a power of (q, v), and its rate along the motion; by states on one side where `inward` is 1 or -1."""
     model, clock = dyn.model, dyn.model.time_parameter
     of_samples: Any = dyn
-    up = down = np.broadcast_to(_NEAR * h, (*q.shape[:-1], 1))
+    up = down = np.broadcast_to(_DIFFERENCE_FRACTION * h, (*q.shape[:-1], 1))
     if clock is not None:
         # The time is the last parameter; beyond its ends a table is not known.
         times = of_samples._parameter_values[:, -1].reshape(up.shape)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,12 +23,9 @@ from mbkit.engines.steps import differentiable_method
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.methods.registry import DEFAULT_METHOD
 from mbkit.simulate.run import simulate
-from mbkit.simulate.time_grid import DEFAULT_STEP, Grid
+from mbkit.simulate.time_grid import DEFAULT_STEP, MAX_NUMBERS, Grid
 from mbkit.simulate.torque import Torque
 from mbkit.simulate.trajectory import Trajectory
-
-#: Numbers of derivatives of a run, at most: 8 GiB of float64.
-_ROOM: Final = 2**30
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -167,7 +163,7 @@ def sensitivities(
     grid = Grid.of(float(run.t[0]), real("duration", duration), h)
     columns = 3 * n + (len(model.parameters) if by_parameters else 0)
     numbers = 4 * n * columns * len(run.t) * (batch or 1)
-    if numbers > _ROOM:
+    if numbers > MAX_NUMBERS:
         raise InputError(
             f"duration, dt: the derivatives of {grid.steps} steps would take {numbers * 8 / 2**30:.3g} GiB; "
             "take longer steps, or a shorter run at a time: transition matrices multiply"

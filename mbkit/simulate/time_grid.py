@@ -16,8 +16,8 @@ Indices = NDArray[np.intp]
 #: s
 DEFAULT_STEP: Final = 1e-3
 
-# 8 GiB of float64: beyond it, a system that overcommits memory kills the process.
-_ROOM = 2**30
+#: Most numbers of a result, 8 GiB of float64: beyond it, a system that overcommits memory kills the process.
+MAX_NUMBERS = 2**30
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ def check_room(
     instead: str = "keep fewer with save=, an every-n-th count or a grid of times",
 ) -> None:
     """Refuse to keep more numbers than a machine holds, before it is filled."""
-    if rows * numbers > _ROOM:
+    if rows * numbers > MAX_NUMBERS:
         raise InputError(
             f"{what} {rows:.16g} rows of {numbers} numbers, which would take {rows * numbers * 8 / 2**30:.3g} GiB; "
             f"{instead}"

@@ -185,7 +185,7 @@ class TorqueCallback:
             # Copies: the function may write into them.
             value = self.function(t, q.copy(), v.copy())
         except TorqueError:
-            # Of a function within this one.
+            # A function within this one failed.
             raise
         except Exception as error:
             raise self.failure(error, t, member) from error
@@ -306,7 +306,7 @@ class Torque:
     controller fills in each row when the run gets there (`sample`).
     """
 
-    #: Of a sampled torque; and of a part of a run, which trajectory it is and with which step it begins.
+    #: When a sampled torque is asked; and which trajectory a part of a run is, and the step with which it begins.
     samples: Samples | None = None
     _member: int | None = None
     _first = 0
@@ -322,7 +322,7 @@ class Torque:
         parts: list[tuple[slice, Array]] = []
         functions: list[tuple[slice, TorqueCallback]] = []
         size, self._nv, self._batch = model.nv, model.nv, batch
-        #: Of a torque that is nothing else.
+        #: The state feedback where nothing else acts.
         self.feedback = torque if isinstance(torque, StateFeedback) and not wrenches else None
         if isinstance(torque, StateFeedback) and torque.gain.shape != (model.nv, model.nq + model.nv):
             raise InputError(
@@ -469,7 +469,7 @@ class Torque:
         out, lead = copy(self), () if self._batch is None else (self._batch,)
         rows = self.table if table is None or not self.held else self.table[..., table, :]
         count = rows.shape[-2] if self.held else len(begins) - 1
-        # Of what was never sampled nothing is known.
+        # Nothing is known of a torque that was never sampled.
         out.table, out.held = np.full((*lead, count, rows.shape[-1]), np.nan), True
         out.table[..., self._nv :] = rows[..., self._nv :]
         asked = np.zeros(lead or 1, dtype=np.intp)

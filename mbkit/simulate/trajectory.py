@@ -36,14 +36,15 @@ if TYPE_CHECKING:
 
     from mbkit.show import Kind, View
 
-#: Times of an event that `repr` shows.
-_SHOWN: Final = 4
-#: Numbers of steps for which a method of first order is compared with itself at twice the step.
-_STEPS: Final = (4, 20_000)
-#: Part of the motion: a hundredth is wrong, and at a few times the gap is not yet the largest.
-_OFF: Final = 0.008
-#: Velocities at twice the step beyond this many times those of the run: unstable there, which says nothing of the run.
-_UNSTABLE: Final = 3.0
+#: Number of times of an event that `repr` shows.
+_SHOWN_TIMES: Final = 4
+#: Fewest and most steps with which a method of first order is compared with itself at twice the step.
+_DOUBLED_STEPS: Final = (4, 20_000)
+#: Largest gap, relative to the motion: a hundredth is wrong, and at a few times the gap is not yet the largest.
+_MAX_GAP: Final = 0.008
+#: Largest ratio of velocities at twice the step to those of the run: beyond it twice the step is unstable, which says
+#: nothing of the run.
+_MAX_VELOCITY_RATIO: Final = 3.0
 
 
 @dataclass(frozen=True)
@@ -344,7 +345,7 @@ class Trajectory(RunData):
     def _event_times(self) -> str:
         """Return the events' names and times, the first few of each name."""
         return "; ".join(
-            f"{name} at {', '.join(each[:_SHOWN])} s" + (f" ({len(each)})" if len(each) > _SHOWN else "")
+            f"{name} at {', '.join(each[:_SHOWN_TIMES])} s" + (f" ({len(each)})" if len(each) > _SHOWN_TIMES else "")
             for name, each in by_key((hit.name, f"{hit.t:.6g}") for hit in self.events).items()
         )
 
@@ -365,7 +366,7 @@ def _step_doubling(
         return
     t, q, v = states[0] - settings.t0, *(x.reshape(-1, *x.shape[-2:])[0] for x in states[1:])
     # Twice the step would change the length of the last one.
-    if not _STEPS[0] <= round(t[-1] / h) <= _STEPS[1] or not np.isfinite(q).all():
+    if not _DOUBLED_STEPS[0] <= round(t[-1] / h) <= _DOUBLED_STEPS[1] or not np.isfinite(q).all():
         return
     both = np.flatnonzero(np.abs(t / (2 * h) - np.rint(t / (2 * h))) < 1e-6)[1:]
     motion = float(np.abs(model.difference(np.broadcast_to(q[0], q.shape), q)).max(initial=0.0))
@@ -378,10 +379,10 @@ def _step_doubling(
         warnings.simplefilter("ignore", MbkitWarning)
         length = float(times[-1] - settings.t0)
         coarse, _ = integrate(own, RunRequest(q0, v0, length, method.name, 2 * h, save=times, t0=settings.t0))
-    if not coarse.stats.finished or np.abs(coarse.v).max() > _UNSTABLE * np.abs(v).max():
+    if not coarse.stats.finished or np.abs(coarse.v).max() > _MAX_VELOCITY_RATIO * np.abs(v).max():
         return
     off = float(np.abs(model.difference(q[both], coarse.q.reshape(len(both), -1))).max()) / motion
-    if off > _OFF:
+    if off > _MAX_GAP:
         yield (
             f"by a run with a step of {2 * h:g} s it is off by {off:.2g} of the motion, since {method.name} is of "
             f"first order; take a smaller step, or method={AUTOMATIC_METHOD!r}"

@@ -22,10 +22,10 @@ from mbkit.derivation.steps.symbols import SYMBOLS, SymbolicSpace, choose
 from mbkit.methods.one_step import StepFactors, embedded_error, end_of_attempt, larger, next_step, predictive_factors
 from mbkit.methods.tableaus import EmbeddedTableau
 
-#: A step's end that is too far from its constraints has at least so many times the tolerated error.
-_TOO_FAR: Final = 1e3
-#: Dependence of rows at which a pose counts as singular: a hundredth of the usual distance from one.
-_SINGULAR: Final = 1e4
+#: Smallest error, in tolerances, of a step whose end is too far from its constraints.
+_MIN_ERROR_TOO_FAR: Final = 1e3
+#: Largest dependence of rows before a pose counts as singular: a hundredth of the usual distance from one.
+_MAX_DEPENDENCE: Final = 1e4
 
 #: A round reads these and writes the same names with a 1 behind, from which the next one starts. `h` is the length to
 #: try, `most` what it may grow by at most, `last` the 32nd root of the last accepted error, `end` the time not to pass.
@@ -121,8 +121,8 @@ class AttemptParts:
         extra, space = self.equations.extra_arguments, self.space
         q, v, far = thorough_projection(self.equations)(q1, space.to_body_velocity(q1, w1), *extra.values())
         # NaN counts too: there is no acceleration at the pose itself.
-        singular = ca.logic_not(dependence(self.equations)(q1, *extra.values()) <= _SINGULAR)
-        error = choose(far, larger(SYMBOLS, error, _TOO_FAR), error)
+        singular = ca.logic_not(dependence(self.equations)(q1, *extra.values()) <= _MAX_DEPENDENCE)
+        error = choose(far, larger(SYMBOLS, error, _MIN_ERROR_TOO_FAR), error)
         return q, space.to_integrator_velocity(q, v), choose(singular, inf, error)
 
     def decide(self, rates: dict[str, Any], q1: Any, w1: Any, error: Any, factors: StepFactors) -> None:

@@ -31,15 +31,15 @@ from mbkit.derivation.steps.rosenbrock import Factors
 from mbkit.derivation.steps.symbols import SymbolicSpace, choose
 from mbkit.methods.tableaus import ImplicitTableau
 
-#: Steps through whose stages the first guess of the next ones is continued.
-_PAST: Final = 2
-#: Times of stages, in steps, that differ by less are one.
-_SAME_TIME: Final = 1e-9
-#: Numbers of an unknown behind its stages.
-_JUDGED: Final = 2
-#: The ratio of corrections up to which the iteration goes straight to the solution beside its guess (Kantorovich's
+#: Number of steps through whose stages the first guess of the next ones is continued.
+_PAST_STEPS: Final = 2
+#: Largest difference of two times of stages that are one, in steps.
+_MAX_TIME_ROUNDING: Final = 1e-9
+#: Count of numbers of an unknown behind its stages.
+_JUDGEMENTS: Final = 2
+#: Largest ratio of corrections with which the iteration goes straight to the solution beside its guess (Kantorovich's
 #: condition; Deuflhard 2011, Newton Methods for Nonlinear Problems, ch. 2.1).
-_STRAIGHT: Final = 0.5
+_MAX_CONTRACTION: Final = 0.5
 
 
 class Collocation:
@@ -52,7 +52,7 @@ class Collocation:
 
     carried = ("q", "w")
     #: The names of the unknowns of the last steps.
-    past = ("x", *(f"x_{i}" for i in range(1, _PAST)))
+    past = ("x", *(f"x_{i}" for i in range(1, _PAST_STEPS)))
     #: The time that the parameters hold, in steps behind the start of one.
     clock = 0.0
 
@@ -65,7 +65,7 @@ class Collocation:
         self._timed = eq.model.time_parameter is not None
         self._each = eq.model.nv + len(self._space.turning) + self._rows
         #: Entries of a step's unknown.
-        self.unknowns = s * self._each + _JUDGED
+        self.unknowns = s * self._each + _JUDGEMENTS
         # A tableau of a user's own has no name but its numbers.
         self._prefix = f"{tableau.name}_{tableau.digest}"
         extra, timed = tuple(eq.extra_arguments), ("parameters",) if self._timed else ()
@@ -126,7 +126,7 @@ class Collocation:
         """Return h times the weighted sums of u̇ and of ẇ."""
         w, h = self._symbols["w"], self._symbols["dt"]
         ks, rs, _ = zip(*self._split(x), strict=True)
-        # Of positions that add, u̇ is the stage's velocity.
+        # The rate u̇ of positions that add is the stage's velocity.
         speeds = [w + h * _sum(row, ks) for row in self._tableau.A]
         rates = [self._space.with_turns(speed, r) for speed, r in zip(speeds, rs, strict=True)]
         return h * _sum(weights, rates), h * _sum(weights, ks)
@@ -202,12 +202,12 @@ class Collocation:
             residuals.append(residual)
         factors = Factors.of(ca.sparsify(ca.vertcat(*rows)), self._order)
         change = factors.applied(factors.values, ca.vertsplit(ca.vertcat(*residuals)))
-        x1, (last, worst) = s["x"][:-_JUDGED] - change, ca.vertsplit(s["x"][-_JUDGED:])
+        x1, (last, worst) = s["x"][:-_JUDGEMENTS] - change, ca.vertsplit(s["x"][-_JUDGEMENTS:])
         size = ca.sqrt(self._square(change))
         # Once nothing but rounding is left, corrections say no more.
         counts = (last > 0) * (1 - self._is_rest(last**2, x1))
         worst = ca.fmax(worst, choose(counts, size / choose(last > 0, last, 1.0), 0.0))
-        solved = self._is_rest(size**2, x1) * (worst <= _STRAIGHT)
+        solved = self._is_rest(size**2, x1) * (worst <= _MAX_CONTRACTION)
         return function_of(self.iteration[-1].name, given, {"x1": ca.vertcat(x1, size, worst), "miss": 1 - solved})
 
     @property
@@ -254,14 +254,14 @@ class Collocation:
             for end, x in zip(c, self._parts(self._symbols[name]), strict=True):
                 time = end - 1 - back
                 # A stage at the end of a step and one at the start of the next are at one time.
-                if not any(abs(time - other) < _SAME_TIME for other in times):
+                if not any(abs(time - other) < _MAX_TIME_ROUNDING for other in times):
                     times.append(time)
                     values.append(x)
         guesses = []
         for at in c:
             weights = [prod((at - b) / (a - b) for b in times if b != a) for a in times]
             guesses.append(_sum(weights, values))
-        return ca.vertcat(*guesses, ca.SX(_JUDGED, 1))
+        return ca.vertcat(*guesses, ca.SX(_JUDGEMENTS, 1))
 
     def _start(self) -> ca.Function:
         eq, space, s = self._equations, self._space, self._symbols
@@ -270,7 +270,7 @@ class Collocation:
         parts = [space.acceleration(s["q"], s["v"], a), space.turns_of(s["w"]), ca.SX(0, 1)]
         if self._rows:
             parts[2] = eq.function("independent_multipliers")(s["q"], s["v"], s["tau"], *extra)
-        guess = ca.vertcat(ca.repmat(ca.vertcat(*parts), self._stages, 1), ca.SX(_JUDGED, 1))
+        guess = ca.vertcat(ca.repmat(ca.vertcat(*parts), self._stages, 1), ca.SX(_JUDGEMENTS, 1))
         return function_of(self.start.name, self._named("q", "v", "w", "tau"), {"guess": guess})
 
 

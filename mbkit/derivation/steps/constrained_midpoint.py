@@ -26,8 +26,8 @@ from mbkit.derivation.steps.fixed import at_time
 from mbkit.derivation.steps.midpoint import Midpoint, is_last, is_lost
 from mbkit.derivation.steps.rosenbrock import Factors
 
-#: Of a row without slope, or one that moves links without mass alone.
-_TINY: Final = 1e-150
+#: Slope of a row without one, and mass along one that moves links without mass alone.
+_MIN_SLOPE: Final = 1e-150
 
 
 class ConstrainedMidpoint(Midpoint):
@@ -113,7 +113,7 @@ class ConstrainedMidpoint(Midpoint):
         """
         eq = self._equations
         squares, masses = eq.constraints.jacobian**2, ca.diag(eq.mass_matrix)
-        out = (ca.mtimes(squares, masses) + _TINY) / (ca.sum2(squares) + _TINY) ** 2
+        out = (ca.mtimes(squares, masses) + _MIN_SLOPE) / (ca.sum2(squares) + _MIN_SLOPE) ** 2
         return ca.Function("masses", [eq.q, *eq.extra_arguments.values()], [out])
 
     def _end(self) -> tuple[Any, ...]:

@@ -31,12 +31,12 @@ from mbkit.methods.tableaus import Tableau
 
 _MARCH: Final = ("q", "w", "tau", "dt", "squares")
 _MARCHED: Final = ("q1", "w1", "squares1")
-#: Operations of all stages above which the forward dynamics is compiled once and called for each of them: LLVM's time
-#: grows faster than the step, which then runs no faster than its parts.
-_ONE_PIECE: Final = 20_000
+#: Number of operations of all stages above which the forward dynamics is compiled once and called for each of them:
+#: LLVM's time grows faster than the step, which then runs no faster than its parts.
+_MAX_OPERATIONS_IN_ONE_PIECE: Final = 20_000
 #: The numbers of a state feedback.
 LAW: Final = "law"
-#: What a march hands on from step to step.
+#: Names that a march hands on from step to step.
 STATE: Final = ("q", "w", "squares")
 #: Parts that evaluate forward dynamics, without and with constraints.
 DYNAMICS: Final = ("forward_dynamics", "held_dynamics")
@@ -214,13 +214,13 @@ def parts_of(
     *,
     thorough: bool = False,
     fed: bool = False,
-    most: int = _ONE_PIECE,
+    most: int = _MAX_OPERATIONS_IN_ONE_PIECE,
 ) -> tuple[Part, ...]:
     """Return the step in one part, or cut at its forward dynamics where these have more than `most` operations."""
     staged = march_in_stages(equations, method, thorough=thorough, fed=fed)
     forward = next(part for part in staged if part.name in DYNAMICS)
     law = equations.model.nv * (equations.model.nq + equations.model.nv) if fed else 0
-    if method_of(method).stages * (operations(forward) + law) > min(most, _ONE_PIECE):
+    if method_of(method).stages * (operations(forward) + law) > min(most, _MAX_OPERATIONS_IN_ONE_PIECE):
         return staged
     return march(equations, method, thorough=thorough, fed=fed)
 

@@ -28,14 +28,15 @@ from mbkit.derivation.steps.symbols import SymbolicSpace
 from mbkit.model.manifold import random_state
 
 #: A pose is singular ahead where J's rows would depend on each other within so many steps at the present pace.
-_AHEAD: Final = 4
-#: Iterations of the thorough projection.
+_STEPS_AHEAD: Final = 4
+#: Number of iterations of the thorough projection.
 _ITERATIONS: Final = 4
-#: Of the coordinates and velocities: about what an iteration may leave, if rows bend as much as they slope.
-_LEFT: Final = 1e-16
-#: Of the size of J and of the state: what rounding leaves of a residual.
-_ROUNDING: Final = 4e-16
-#: Configurations at which the usual size of a row is found.
+#: Largest error that an iteration may leave, relative to coordinates and velocities, if rows bend as much as they
+#: slope.
+_MAX_ERROR: Final = 1e-16
+#: Largest residual by rounding, relative to the sizes of J and of the state.
+_MAX_RESIDUAL: Final = 4e-16
+#: Number of configurations at which the usual size of a row is found.
 _POSES: Final = 8
 
 
@@ -55,7 +56,7 @@ def quick_projection(equations: Any) -> ca.Function:
     dv = change(near, rate, *more)
     size, apart = ca.sumsqr(du), ca.sumsqr(q - near)
     left = (size + ca.sumsqr(dv)) * (size + apart)
-    far = left > _LEFT**2 * (1 + ca.sumsqr(q) + ca.sumsqr(v))
+    far = left > _MAX_ERROR**2 * (1 + ca.sumsqr(q) + ca.sumsqr(v))
     outs = [_moved(equations, q, du), v + dv, far]
     return ca.Function("quick_projection", [q, v, near, *more], outs)
 
@@ -88,22 +89,22 @@ def projection(equations: Any, *, exact: bool = False) -> ca.Function:
     f, _ = rows(q1, v, *more)
     # A residual of rounding stays: the factors of a singular pose nearby would make a change of state of it.
     slopes = ca.sumsqr(c.jacobian)
-    left = ca.sumsqr(f) > _ROUNDING**2 * slopes * (1 + ca.sumsqr(q))
-    # What is left later is about the product of the last change and of the way from q, where the factors are, if
-    # rows bend as much as they slope.
+    left = ca.sumsqr(f) > _MAX_RESIDUAL**2 * slopes * (1 + ca.sumsqr(q))
+    # The error that is left later is about the product of the last change and of the way from q, where the factors are,
+    # if rows bend as much as they slope.
     for _ in range(_ITERATIONS):
         by = shift(q, rows(q1, v, *more)[0], *more)
         by = by if exact else ca.if_else(left, by, 0)
         moved = moved + by
         q1 = _moved(equations, q, moved)
-        left = ca.sumsqr(moved) * ca.sumsqr(by) > _LEFT**2 * (1 + ca.sumsqr(q1))
+        left = ca.sumsqr(moved) * ca.sumsqr(by) > _MAX_ERROR**2 * (1 + ca.sumsqr(q1))
     far, (_, rate) = left, rows(q1, v, *more)
-    left = ca.sumsqr(rate) > _ROUNDING**2 * slopes * ca.sumsqr(v)
+    left = ca.sumsqr(rate) > _MAX_RESIDUAL**2 * slopes * ca.sumsqr(v)
     for _ in range(_ITERATIONS):
         by = change(q, rows(q1, v1, *more)[1], *more)
         by = by if exact else ca.if_else(left, by, 0)
         v1 = v1 + by
-        left = ca.sumsqr(moved) * ca.sumsqr(by) > _LEFT**2 * (1 + ca.sumsqr(v1))
+        left = ca.sumsqr(moved) * ca.sumsqr(by) > _MAX_ERROR**2 * (1 + ca.sumsqr(v1))
     far = ca.logic_or(far, left)
     return ca.Function(name, [q, v, start, *more], [q1, v1, moved, far])
 
@@ -156,6 +157,6 @@ def nears_singular(before: Any, behind: Any) -> Any:
 
     With r = 1/√dependence, as far from such a pose: r1 < n abs(r1 - r0), or r1 > n/(n - 1) r0, or r1 < n/(n + 1) r0.
     """
-    nearer, farther = (_AHEAD + 1) ** 2 / _AHEAD**2, (_AHEAD - 1) ** 2 / _AHEAD**2
+    nearer, farther = (_STEPS_AHEAD + 1) ** 2 / _STEPS_AHEAD**2, (_STEPS_AHEAD - 1) ** 2 / _STEPS_AHEAD**2
     # A sum, which NumPy and CasADi both know.
     return (behind > nearer * before) + (behind < farther * before) > 0

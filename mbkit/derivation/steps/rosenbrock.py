@@ -111,7 +111,7 @@ class _Space(SymbolicSpace):
         """Return S: 1 on plain coordinates, and on a rotation (1 + g ŵ/2)⁻¹."""
         out = ca.SX.eye(self.nv)
         for _, b in self._turns:
-            # Of dexp⁻¹(u) w the part linear in u is ½ u × w.
+            # The linear part of dexp⁻¹(u) w is ½ u × w.
             x = (g / 2) * w[b]
             out[b, b] = (ca.SX.eye(3) - ca.skew(x) + ca.mtimes(x, x.T)) / (1 + ca.sumsqr(x))
         return out
@@ -205,7 +205,7 @@ class Factors:
     steps: list[tuple[int, int]]
     # (k, j): the remainder of row k before its pivot.
     rest: list[tuple[int, int]]
-    # Of each coordinate its row.
+    # Row of each coordinate.
     rows: tuple[int, ...]
 
     @classmethod
@@ -219,7 +219,7 @@ class Factors:
         steps: list[tuple[int, int]] = []
         inverses: list[Any] = [None] * len(rows)
         for k in reversed(range(len(rows))):
-            # Where nothing moves there is no entry at all: the quotient is then no number.
+            # A coordinate that moves nothing has no entry: the quotient is then no number.
             inverses[k] = 1 / ca.SX(rows[k].pop(k, 0.0))
             for i in range(k):
                 if k not in rows[i]:

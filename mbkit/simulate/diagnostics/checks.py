@@ -25,36 +25,43 @@ from mbkit.model.manifold import magnitude, unit_quaternions
 from mbkit.simulate.diagnostics.stiffness import linearized
 
 _EPS: Final = sys.float_info.epsilon
-#: Times and trajectories of a batch at which the mass matrix and the energy are evaluated, at most.
+#: Most times at which the mass matrix and the energy are evaluated.
 CHECKED_TIMES: Final = 7
-_MEMBERS: Final = 4
-#: A quick check evaluates one state for so many evaluations of the run in machine code: a few percent of its time.
-_WORK_A_STATE: Final = 3000
-#: Part of a step by which it differs from two of half its length, to the power of the order: that of h|λ| = 1.
-_HALVES: Final = 0.3
-#: Saved velocities among which a quick check looks for the largest kinetic energy.
-_VELOCITIES: Final = 32
-#: Change of the energy that makes a run wrong: methods of first or second order at a common step oscillate by
-#: some parts of a thousand; one of higher order has lost the motion by then.
-_ENERGY: Final = 0.01
-_ENERGY_HIGH: Final = 1e-3
-_LOW: Final = (1, 2)
-_DIGITS: Final = 1e-3
-#: h|λ| below which every method follows every mode for as long as runs are.
-_FOLLOWED: Final = 1e-3
-#: Of a mode's phase or amplitude, over a run. Where amplitudes are large the motion is off by 2 to 4 times that.
-_LOST: Final = 0.02
-_SUM: Final = 1e-3
-#: Of a run: motion that has decayed by then is a transient.
-_BRIEF: Final = 0.01
-#: Smallest eigenvalue of the mass matrix beside its largest, where a random configuration has a unit diagonal.
-_IDLE: Final = 1e-7
-#: m/s or rad/s: what rounding leaves of the velocities of a state at rest, as its projection.
-_STILL: Final = 1e3 * _EPS
-#: Times `atol` that a run must move, so that a hundredth of its motion is known.
-_MOVED: Final = 100.0
-#: m or rad: the precision that a position must have.
-_POSITION: Final = 1e-6
+#: Most trajectories of a batch for which they are.
+_CHECKED_MEMBERS: Final = 4
+#: Number of the run's evaluations in machine code for which a quick check evaluates one state: a few percent of its
+#: time.
+_EVALUATIONS_PER_STATE: Final = 3000
+#: Largest difference of a step from two of half its length, relative to the step, of a method of order 1, and to the
+#: power of the order of others: that of h|λ| = 1.
+_MAX_HALVING_DIFFERENCE: Final = 0.3
+#: Number of saved velocities among which a quick check looks for the largest kinetic energy.
+_SAMPLED_VELOCITIES: Final = 32
+#: Largest relative change of the energy by a method of first or second order, which oscillates by some parts of a
+#: thousand at a common step, and by one of higher order, which has lost the motion by then.
+_MAX_ENERGY_CHANGE_LOW_ORDER: Final = 0.01
+_MAX_ENERGY_CHANGE_HIGH_ORDER: Final = 1e-3
+_LOW_ORDERS: Final = (1, 2)
+#: Largest relative error of accelerations by rounding.
+_MAX_ROUNDING: Final = 1e-3
+#: Largest h|λ| with which every method follows every mode for as long as runs are.
+_MAX_FOLLOWED_STEP: Final = 1e-3
+#: Largest loss of a mode's phase or amplitude over a run. Where amplitudes are large the motion is off by 2 to 4 times
+#: that.
+_MAX_MODE_LOSS: Final = 0.02
+#: Largest sum of the errors that a tolerance allows, relative to the motion.
+_MAX_ERROR_SUM: Final = 1e-3
+#: Share of a run by whose end a transient has decayed.
+_TRANSIENT_SHARE: Final = 0.01
+#: Largest ratio of the mass matrix's smallest eigenvalue to its largest at which a joint moves next to no mass, where
+#: a random configuration has a unit diagonal.
+_MAX_EIGENVALUE_RATIO: Final = 1e-7
+#: Largest velocity of a state at rest, m/s or rad/s: rounding of its projection.
+_MAX_REST_VELOCITY: Final = 1e3 * _EPS
+#: Smallest motion of a run in units of `atol`, of which a hundredth is known.
+_MIN_MOTION: Final = 100.0
+#: Largest error of a position, m or rad.
+_MAX_POSITION_ERROR: Final = 1e-6
 
 
 def diagnostics(
@@ -77,12 +84,12 @@ def diagnostics(
     if len(t) < 2 or not model.nv or not states[2].size or dyn._significand_bits > DOUBLE_BITS:
         return []
     q, v = (x.reshape(-1, *x.shape[-2:]) for x in states[1:])
-    most = _MEMBERS * CHECKED_TIMES if work is None else work // _WORK_A_STATE
+    most = _CHECKED_MEMBERS * CHECKED_TIMES if work is None else work // _EVALUATIONS_PER_STATE
     # The forces of a system on paper may drive it.
     free = not (driven or model.constraints_do_work or (not model.has_bodies and model.needs.damping))
     if most < 2 and free and not isinstance(setting, Tolerances) and _rushes(dyn, method, setting, q, v):
         most = 2
-    members = max(1, min(_MEMBERS, len(q), most // 2))
+    members = max(1, min(_CHECKED_MEMBERS, len(q), most // 2))
     count = max(2, min(CHECKED_TIMES, most // members))
     times = sorted({k * (len(t) - 1) // (count - 1) for k in range(count)})
     at_q, at_v = q[:members].take(times, axis=1), v[:members].take(times, axis=1)
@@ -100,7 +107,7 @@ def diagnostics(
     if most >= 2 and free:
         whole = [i for i in range(members) if len(samples[i]) == len(times)]
         fast = [_fastest(v[i]) if quick else at_v[i, 0] for i in whole]
-        limit = _ENERGY if method.order in _LOW else _ENERGY_HIGH
+        limit = _MAX_ENERGY_CHANGE_LOW_ORDER if method.order in _LOW_ORDERS else _MAX_ENERGY_CHANGE_HIGH_ORDER
         damped = model.loses_energy or (model.constrained and dyn._soft_constraints)
         checks.append(energy_drift([samples[i] for i in whole], fast, damped, limit))
     # Neither the engine nor the method may solve with the mass matrix.
@@ -141,7 +148,7 @@ def _rushes(dyn: Dynamics, method: Method, h: float, q: Array, v: Array) -> bool
     off, moved = (
         max(np.abs(dyn.model.difference(x, q2)).max(), h * np.abs(v2 - y).max()) for x, y in ((q1, v1), (q, v))
     )
-    return bool(off > _HALVES**method.order * moved)
+    return bool(off > _MAX_HALVING_DIFFERENCE**method.order * moved)
 
 
 def softness(dyn: Dynamics, q: Array, v: Array) -> Iterator[str]:
@@ -193,7 +200,7 @@ def _samples(dyn: Dynamics, member: int, t: Array, q: Array, v: Array) -> Iterat
 
 def _fastest(v: Array) -> Array:
     """Return the largest of a few of a trajectory's velocities."""
-    few = v[:: max(1, len(v) // _VELOCITIES)]
+    few = v[:: max(1, len(v) // _SAMPLED_VELOCITIES)]
     return np.asarray(few[np.abs(few).max(axis=1).argmax()])
 
 
@@ -238,7 +245,7 @@ def condition(matrices: list[Array]) -> Iterator[str]:
         if not scale.min() > 0:
             return
         least = min(least, float(np.linalg.eigvalsh(M / scale / scale[:, None])[0]))
-    if least < _EPS * n / _DIGITS:
+    if least < _EPS * n / _MAX_ROUNDING:
         yield (
             f"the mass matrix is singular to {max(least, 0.0):.1g} of its size, so that accelerations hold "
             f"about {max(0, int(-np.log10(_EPS / max(least, _EPS)))):d} digits; leave out what has no mass, or compute "
@@ -267,7 +274,7 @@ def step_size(dyn: Dynamics, method: Method, h: float, duration: float, q: Array
         A, B = J[model.nv :, : model.nv], J[model.nv :, model.nv :]
         rates = np.linalg.eigvals(J)
         fastest = float(np.abs(rates).max())
-        if h * fastest < _FOLLOWED:
+        if h * fastest < _MAX_FOLLOWED_STEP:
             continue
         steps = np.linalg.eigvals(method.stability.matrix(h, A, B))
         # Growth of the motion itself, as of a pendulum upside down or a chaotic one, is not the method's.
@@ -281,7 +288,7 @@ def step_size(dyn: Dynamics, method: Method, h: float, duration: float, q: Array
             signs.append((np.inf, text))
             continue
         part, rate = lost(steps, h, np.linalg.eigvals(companion(A, B)), duration)
-        if part > _LOST:
+        if part > _MAX_MODE_LOSS:
             kind = f"an oscillation of {abs(rate.imag):.2g} rad/s" if abs(rate.imag) > abs(rate.real) else "a motion"
             text = (
                 f"a step of {h:g} s is too long to follow {kind} with h|λ| = {h * abs(rate):.2g}: where it is "
@@ -314,7 +321,7 @@ def lost(steps: Any, h: float, rates: Any, duration: float) -> tuple[float, comp
     off = distances[modes, partners]
     dies = np.minimum(-rates.real[modes], -steps.real[partners] / h)
     lasting = np.minimum(duration, 1 / np.maximum(dies, 1e-300))
-    part = np.where(lasting < _BRIEF * duration, 0.0, off * lasting / h)
+    part = np.where(lasting < _TRANSIENT_SHARE * duration, 0.0, off * lasting / h)
     worst = int(part.argmax())
     return float(part[worst]), complex(rates[modes[worst]])
 
@@ -323,12 +330,12 @@ def coordinate_magnitude(q: Array, tolerances: Tolerances | None) -> Iterator[st
     """Find coordinates so large that their last digit, or a relative tolerance, is a distance that matters."""
     # Past NaN.
     largest = float(np.fmax.reduce(np.abs(q), axis=None))
-    if _EPS * largest > _POSITION:
+    if _EPS * largest > _MAX_POSITION_ERROR:
         yield (
             f"a coordinate of {largest:.2g} is known to {_EPS * largest:.1g} in double precision; "
             "count it from a nearer origin"
         )
-    elif tolerances is not None and tolerances.rtol * largest > max(1e3 * tolerances.atol, _POSITION):
+    elif tolerances is not None and tolerances.rtol * largest > max(1e3 * tolerances.atol, _MAX_POSITION_ERROR):
         yield (
             f"rtol = {tolerances.rtol:g} of a coordinate of {largest:.2g} allows an error of "
             f"{tolerances.rtol * largest:.1g} in each step; count it from a nearer origin, or take a smaller rtol"
@@ -338,7 +345,7 @@ def coordinate_magnitude(q: Array, tolerances: Tolerances | None) -> Iterator[st
 def travel(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
     """Find a motion as small as the error that a tolerance allows; what starts at rest may stay there."""
     moved = float(np.abs(q - q[:, :1]).max(initial=0.0))
-    if np.abs(v[:, 0]).max(initial=0.0) > _STILL and moved < _MOVED * tolerances.atol:
+    if np.abs(v[:, 0]).max(initial=0.0) > _MAX_REST_VELOCITY and moved < _MIN_MOTION * tolerances.atol:
         yield (
             f"coordinates move by at most {moved:.2g}, and atol = {tolerances.atol:g} allows an error of that size in "
             "each step; take a smaller atol"
@@ -349,7 +356,7 @@ def scale_growth(q: Array, v: Array, tolerances: Tolerances) -> Iterator[str]:
     """Find numbers that have outgrown those of the start, which loosens the tolerance of the others."""
     largest = max(float(np.abs(x).max(initial=0.0, where=np.isfinite(x))) for x in (q, v))
     allowed = min(tolerances) * largest / magnitude(q[..., 0, :], v[..., 0, :])
-    if allowed > max(1e3 * tolerances.atol, _POSITION):
+    if allowed > max(1e3 * tolerances.atol, _MAX_POSITION_ERROR):
         yield (
             f"the state grew to {largest:.2g}, of which the tolerance allows an error of {allowed:.1g} to all "
             f"numbers in each step; take a smaller rtol, or method={ADAPTIVE_METHOD!r}"
@@ -360,7 +367,7 @@ def accumulated_error(method: str, tolerances: Tolerances, numbers: int, steps: 
     """Find so many steps that the errors allowed to each add up."""
     # The norm is a mean over the state's numbers.
     together = steps * tolerances.rtol * float(np.sqrt(numbers))
-    if together > _SUM:
+    if together > _MAX_ERROR_SUM:
         yield (
             f"errors of {steps:.2g} steps that each use the tolerance of {tolerances.rtol:g}, as those of {method} do, "
             f"add up to {together:.1g} of the motion and more; take a smaller rtol, or method={AUTOMATIC_METHOD!r}"
@@ -382,7 +389,7 @@ def massless_joints(dyn: Dynamics, q: Array) -> str:
     except (MbkitError, np.linalg.LinAlgError, NotImplementedError):
         # A user's engine may lack the mass matrix.
         return ""
-    if not values[0] < _IDLE * values[-1]:
+    if not values[0] < _MAX_EIGENVALUE_RATIO * values[-1]:
         return ""
     part = np.abs(vectors[:, 0])
     light = [j for j in model.independent_joints if part[model.layout.v[j.name]].max(initial=0.0) > 0.5 * part.max()]

@@ -31,16 +31,16 @@ from mbkit.simulate.torque import Force, TorqueCallback, TorqueFunction
 
 _TWIN: Final = "_derived_twin"
 _EPS: Final = float(np.finfo(float).eps)
-#: Of central differences in q: where truncation and rounding are alike for a function of its own size.
-_STEP: Final = _EPS ** (1 / 3)
-#: In v accelerations are of second order, which central differences do exactly: a wide step, for the digits.
-_WIDE: Final = 1e-4
-#: Re λ over |λ| above which a motion grows rather than oscillates.
-_GROWS: Final = 0.1
-#: Rates below this part of the fastest are not shown.
-_SHARE: Final = 1e-3
-#: Rows up to which a norm is not worth its time.
-_SMALL: Final = 20
+#: Step of central differences in q, at which truncation and rounding are alike for a function of its own size.
+_Q_DIFFERENCE: Final = _EPS ** (1 / 3)
+#: Step of central differences in v, wide for the digits: accelerations are of second order in v, and so exact.
+_V_DIFFERENCE: Final = 1e-4
+#: Smallest Re λ over |λ| of a motion that grows rather than oscillates.
+_MIN_GROWTH_SHARE: Final = 0.1
+#: Smallest rate that is shown, relative to the fastest.
+_MIN_SHOWN_SHARE: Final = 1e-3
+#: Number of rows up to which a norm is not worth its time.
+_MAX_SMALL_ROWS: Final = 20
 
 
 class RateJacobian:
@@ -53,7 +53,7 @@ class RateJacobian:
         self._joints = [(j.type, layout.q[j.name], layout.v[j.name]) for j in dyn.model.independent_joints]
         nq, nv = dyn.model.nq, dyn.model.nv
         self._last: Array = np.zeros((nq + nv,) * 2)
-        # Where positions add and v is q̇.
+        # Positions add and v is q̇.
         self._plain = np.eye(nq + nv, k=nq) if dyn.model.velocity_map is None and not dyn.model.quaternions else None
         self.evaluations = 0
 
@@ -151,8 +151,8 @@ def _twin(dyn: Dynamics) -> Dynamics:
 def linearized(space: Space, q: Array, w: Array, rates: Callable[[Array, Array], Array]) -> Array:
     """Return J by central differences, (2 nv, 2 nv); w is the integrators' own velocity, rates(q, w) is ẇ of rows."""
     nv = space.nv
-    length = _STEP * np.maximum(1.0, np.abs(space.magnitude(q, w)))
-    speed = np.full(nv, _WIDE * max(1.0, float(np.abs(w).max(initial=0.0))))
+    length = _Q_DIFFERENCE * np.maximum(1.0, np.abs(space.magnitude(q, w)))
+    speed = np.full(nv, _V_DIFFERENCE * max(1.0, float(np.abs(w).max(initial=0.0))))
     changes = np.diag(np.concatenate([length, speed]))
     both = np.concatenate([changes, -changes])
     u, there = both[:, :nv], w + both[:, nv:]
@@ -193,7 +193,7 @@ class Stiffness:
         if not len(self.eigenvalues):
             return self.bound
         size = np.abs(self.eigenvalues)
-        return float(size[self.eigenvalues.real <= _GROWS * size].max(initial=0.0))
+        return float(size[self.eigenvalues.real <= _MIN_GROWTH_SHARE * size].max(initial=0.0))
 
     @property
     def decay(self) -> float:
@@ -219,7 +219,7 @@ class Stiffness:
             return f"no rate above {self.bound:.2g} 1/s"
         units = {"decay": "1/s", "oscillation": "rad/s", "growth": "1/s"}
         rates = {name: getattr(self, name) for name in units}
-        parts = [f"fastest {k} {x:.2g} {units[k]}" for k, x in rates.items() if x > _SHARE * self.rate]
+        parts = [f"fastest {k} {x:.2g} {units[k]}" for k, x in rates.items() if x > _MIN_SHOWN_SHARE * self.rate]
         return ", ".join(parts) or "no motion of its own"
 
     def __repr__(self) -> str:
@@ -312,8 +312,8 @@ def stiffness_of(J: Array, enough: float, *, exact: bool, member: int | None = N
     """Return the rates of a linearized system's matrix; see `stiffness`."""
     if not np.isfinite(J).all():
         raise NumericalError("stiffness: the accelerations near the state are not finite")
-    # Of a small matrix the eigenvalues take no longer than the norm.
-    if len(J) > _SMALL:
+    # The eigenvalues of a small matrix take no longer than the norm.
+    if len(J) > _MAX_SMALL_ROWS:
         from scipy.linalg import matrix_balance
 
         # Scaled, positions and velocities count alike.

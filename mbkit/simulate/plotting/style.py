@@ -105,7 +105,7 @@ def legend(ax: Axes, handles: Sequence[Artist], side: Literal["upper", "lower"],
     whose.legend(handles=handles, ncols=columns, columnspacing=1.2, handlelength=1.4, **place)
 
 
-#: What the name of a line begins with whose points have texts; the texts follow, one a line.
+#: Prefix of the name of a line whose points have texts; these follow, one a line.
 POINTS: Final = "points:"
 
 
@@ -128,7 +128,7 @@ def log_ticks(ax: Axes, most: int = 9) -> None:
     for axis in (ax.xaxis, ax.yaxis):
         if axis.get_scale() == "log":
             if min(axis.get_view_interval()) <= 0:
-                # Of an empty axis; a logarithm has no zero.
+                # The axis is empty, and a logarithm has no zero.
                 axis.set_view_interval(1e-3, 1.0, ignore=True)
             low, high = (math.log10(x) for x in axis.get_view_interval())
             if math.floor(high) - math.ceil(low) < 1:

@@ -59,7 +59,7 @@ def run_groups(
                 attempts.start(which, q0[part], space.to_integrator_velocity(q0[part], v0[part]), problem.start)
                 to_end(group, partial(_report, problem, group, first))
             except FunctionError as error:
-                # Where the torque is a function, trajectories run one by one.
+                # Trajectories run one by one under a torque function.
                 member = getattr(error, "member", None)
                 group[0 if member is None else member - first].fail(error)
                 break

@@ -26,11 +26,11 @@ from mbkit.simulate.solvers.step_attempts import RungeKuttaAttempts
 from mbkit.simulate.solvers.trajectory_record import ROUNDS, AcceptedSteps, StoppedError, below_rounding, diverged
 from mbkit.simulate.solvers.vector_field import DivergenceError, Field
 
-#: Larger than any scale or length: no error is seen, and a step is as long as its gap.
+#: A tolerance with which no error is seen, and a length with which a step is as long as its gap.
 _HUGE: Final = 1e300
-#: Accepted steps that are taken again in Python before the first one that ends near a singular pose: whoever looks how
-#: fast the pose comes has to see it coming.
-_BEFORE: Final = 8
+#: Number of accepted steps that are taken again in Python before the first one that ends near a singular pose: whoever
+#: looks how fast the pose comes has to see it coming.
+_STEPS_BEFORE_POSE: Final = 8
 
 
 def _code(dyn: LagrangianDynamics, own: EmbeddedTableau | RosenbrockTableau) -> CompiledStepLoop:
@@ -98,7 +98,7 @@ class CompiledAttempts:
         self._row = {name: part.start for name, part in self._at.items()}
         self._evaluations = self._jacobians = self._k = 0
         self._stop = 0.0
-        # Of a place near a singular pose its steps in Python, and since when; all of these so far.
+        # Steps in Python of each place near a singular pose, and the time of the first, s; all of these so far.
         self._near: dict[int, RungeKuttaAttempts] = {}
         self._from: dict[int, float] = {}
         self._taken: list[RungeKuttaAttempts] = []
@@ -183,7 +183,7 @@ class CompiledAttempts:
         h = first_length(self._space, q, w, probe(q, w), self._tolerances, probe, self._grows)
         arena.state[:] = start
         self._evaluations += 2 * self._places
-        # Where there is no rate, the step finds that out.
+        # The step finds out where there is no rate.
         return np.where(h > 0, h, 1e-6 * (stop - arena.state[self._row["t"]]))
 
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
@@ -205,7 +205,7 @@ class CompiledAttempts:
             singular = np.isposinf(states[1:, self._row["error"]])
             if singular.any():
                 good[int(np.argmax(singular)) + 1 :] = False
-                good[np.flatnonzero(good)[1:][-_BEFORE:]] = False
+                good[np.flatnonzero(good)[1:][-_STEPS_BEFORE_POSE:]] = False
                 self._leave(place, states[np.flatnonzero(good)[-1]])
             accepted = states[good]
             t, q, w = (accepted[:, at] for at in (self._row["t"], self._at["q"], self._at["w"]))

@@ -29,46 +29,46 @@ from mbkit.simulate.solvers.step_attempts import StepAttempts
 from mbkit.simulate.solvers.trajectory_record import ROUNDS, AcceptedSteps, TrajectoryRecord, assemble_result
 
 EXPLICIT, IMPLICIT = ADAPTIVE_METHOD, STIFF_METHOD
-#: No tolerance below: rounding would count as error, and steps shrink without end.
-LEAST: Final = 1e-13
-#: rk853's part of the tolerance: with the whole of it, errors of a thousand steps come to 500 times as much, and a
-#: tenth costs a third more steps.
-_SHARE: Final = 0.1
-#: Steps whose mean is compared with the rates where they end.
-_RECENT: Final = 8
+#: Tightest relative tolerance: below it rounding would count as error, and steps shrink without end.
+MIN_RTOL: Final = 1e-13
+#: Share of the tolerance that rk853 has: with the whole of it, errors of a thousand steps come to 500 times as much,
+#: and a tenth costs a third more steps.
+_RK853_SHARE: Final = 0.1
+#: Number of steps whose mean length is compared with the rates where they end.
+_MEAN_STEPS: Final = 8
 #: h|λ| from which on stability holds rk853's steps: its region reaches to 6 on the negative and 5 on the imaginary
 #: axis; steps that follow an oscillation at a tolerance of 1e-6 or less have 2 at most.
-_EDGE: Final = 3.0
-#: h|λ| up to which steps follow every motion of the linearized system, so that rodas5 could not take longer ones for
-#: long: where steps are short in passing alone, a trial would get further as they grow.
-_FAST: Final = 0.2
+_STABILITY_LIMIT: Final = 3.0
+#: h|λ| up to which steps follow every motion of the linearized system, so that rodas5 is not tried: it could not take
+#: longer ones for long, and where steps are short in passing alone, a trial would get further as they grow.
+_FOLLOWING_LIMIT: Final = 0.2
 #: Errors of n steps, in a mean over 2 nv numbers, add up to n √(2 nv) tolerances at most: the limit, in the user's
 #: tolerances. Measured is a third to a three-hundredth of it.
-_SUM: Final = 300.0
-#: By how much a tolerance is loosened where rounding keeps steps short.
-_LOOSER: Final = 10.0
-#: Rounding of accelerations is the residual of a cubic through points within this part of a step: a smooth function
+_MAX_ERROR_SUM: Final = 300.0
+#: Factor by which a tolerance is loosened where rounding keeps steps short.
+_LOOSENING: Final = 10.0
+#: Share of a step within which a cubic is fitted to accelerations. Its residual is their rounding: a smooth function
 #: has next to none there.
-_NEAR: Final = 0.003
-_AHEAD: Final = np.linspace(0.0, 1.0, 12)[:, None]
-_CUBIC: Final = np.linalg.qr(_AHEAD ** np.arange(4))[0]
-_RESIDUAL: Final = np.eye(len(_AHEAD)) - _CUBIC @ _CUBIC.T
-_LEFT: Final = len(_AHEAD) - 4
-#: Sequences of methods in a batch that are described.
-_DESCRIBED: Final = 3
-#: Rounding times a step, beside the tolerance, that is too much: of that, rk853's weights make an error twice as large.
-_ROUNDED: Final = 0.015
-#: What a check takes, in steps of rk853: so many come before the first. Measured by validation/auto.py in processor
+_NOISE_SPAN: Final = 0.003
+_NOISE_PLACES: Final = np.linspace(0.0, 1.0, 12)[:, None]
+_CUBIC: Final = np.linalg.qr(_NOISE_PLACES ** np.arange(4))[0]
+_CUBIC_RESIDUAL: Final = np.eye(len(_NOISE_PLACES)) - _CUBIC @ _CUBIC.T
+_RESIDUAL_FREEDOM: Final = len(_NOISE_PLACES) - 4
+#: Number of sequences of methods in a batch that are described.
+_MAX_DESCRIBED: Final = 3
+#: Largest rounding of accelerations times a step, in tolerances; rk853's weights make an error twice as large of it.
+_MAX_NOISE: Final = 0.015
+#: Cost of a check, in steps of rk853: so many come before the first. Measured by validation/auto.py in processor
 #: time: 50 to 100 in machine code, 2 to 5 in Python; a trial takes 60 and 15, a step of rodas5 0.5 to 1.6.
-_COMPILED: Final = 64
-_IN_PYTHON: Final = 5
-#: By how many times as many steps a check comes later than the one before.
-_LATER: Final = 3
-#: Checks whose time is to come where one is worth it, and where a trial of rodas5 is in any case.
-_WORTH: Final = 20
-_GUESS: Final = 60
-#: Steps of a trial.
-_PILOT: Final = 12
+_CHECK_COST_COMPILED: Final = 64
+_CHECK_COST_IN_PYTHON: Final = 5
+#: Factor of the steps from one check to the next.
+_CHECK_GROWTH: Final = 3
+#: A check is worth its time where steps of so many times its cost are to come, and a trial of rodas5 where of so many.
+_MIN_COSTS_AHEAD: Final = 20
+_MIN_COSTS_FOR_TRIAL: Final = 60
+#: Number of steps of a trial.
+_TRIAL_STEPS: Final = 12
 
 
 class AutoContext:
@@ -77,13 +77,13 @@ class AutoContext:
     def __init__(self, problem: IntegrationProblem) -> None:
         self.problem, self.space, self.stops = problem, Space(problem.dyn.model), problem.stops
         self.attempts: list[StepAttempts] = []
-        self.check = _IN_PYTHON
+        self.check = _CHECK_COST_IN_PYTHON
 
     def make(self, method: str, tolerances: Tolerances) -> StepAttempts:
         """Return the step attempts of a method, whose evaluations are counted with all others."""
         attempts = make_attempts(self.problem, method, self.space, tolerances)
         self.attempts.append(attempts)
-        self.check = _COMPILED if attempts.rounds > 1 else _IN_PYTHON
+        self.check = _CHECK_COST_COMPILED if attempts.rounds > 1 else _CHECK_COST_IN_PYTHON
         return attempts
 
 
@@ -93,7 +93,7 @@ def _scaled(tolerances: Tolerances, factor: float) -> Tolerances:
 
 def loosest(method: str, base: Tolerances) -> Tolerances:
     """Return the loosest tolerances of a method."""
-    return base if method == IMPLICIT else _scaled(base, min(1.0, max(_SHARE, LEAST / base.rtol)))
+    return base if method == IMPLICIT else _scaled(base, min(1.0, max(_RK853_SHARE, MIN_RTOL / base.rtol)))
 
 
 class StepRateMonitor:
@@ -117,13 +117,13 @@ class StepRateMonitor:
         if steps.attempts > 1:
             self._marks.append((tries + steps.attempts // 2, float(steps.t[len(steps.t) // 2])))
         self._marks.append((tries + steps.attempts, float(steps.t[-1])))
-        self._ends = [*self._ends, *steps.t[1:].tolist()][-_RECENT - 1 :]
+        self._ends = [*self._ends, *steps.t[1:].tolist()][-_MEAN_STEPS - 1 :]
 
     def due(self) -> bool:
         """Return whether a check is due."""
         due = self.missing <= 0
         if due:
-            self._next = _LATER * self._marks[-1][0]
+            self._next = _CHECK_GROWTH * self._marks[-1][0]
         return due
 
     def rate(self) -> float:
@@ -170,7 +170,7 @@ class SwitchingController:
         self.doubt = ""
         # The first is the user's or loosened, the second for the number of steps.
         self._base, self._tolerances = self._user, loosest(EXPLICIT, self._user)
-        self._least, self._tightest = LEAST, math.inf
+        self._least, self._tightest = MIN_RTOL, math.inf
         # rk853's h|λ| when it was left: where accuracy kept its steps short, it would do so again.
         self._kept = 0.0
         self._segments = [Segment(EXPLICIT, problem.start)]
@@ -247,14 +247,14 @@ class SwitchingController:
         """Check whether rodas5 shall take over."""
         rate, step, check = monitor.rate(), monitor.step(), self._context.check
         to_come = rate * self._rest
-        if to_come >= _WORTH * check and step:
+        if to_come >= _MIN_COSTS_AHEAD * check and step:
             rates = self._spectrum(attempts, place)
             if self._rounding_limited(attempts, place, step):
                 return
-            held = rates is not None and step * rates.stable >= _EDGE
+            held = rates is not None and step * rates.stable >= _STABILITY_LIMIT
             # Compared with the steps as they are now, which may be short in passing only.
-            fast = rates is None or step * rates.stable >= _FAST
-            if (held or (fast and to_come >= _GUESS * check)) and (trial := self._faster_trial(1 / step)):
+            fast = rates is None or step * rates.stable >= _FOLLOWING_LIMIT
+            if (held or (fast and to_come >= _MIN_COSTS_FOR_TRIAL * check)) and (trial := self._faster_trial(1 / step)):
                 why = "stability held its steps" if held else "rodas5 got further with a trial"
                 size = "" if rates is None else f" (h|λ| = {step * rates.stable:.1f}; {rates})"
                 self._switch(IMPLICIT, trial, why + size)
@@ -266,17 +266,17 @@ class SwitchingController:
     def _faster_trial(self, rate: float) -> StepAttempts | None:
         """Let rodas5 try some steps, which are the next ones if it is faster than this rate."""
         trial, ahead, count = self._started(IMPLICIT), list[AcceptedSteps](), 0
-        monitor = StepRateMonitor(self._at[0], _PILOT)
+        monitor = StepRateMonitor(self._at[0], _TRIAL_STEPS)
         if trial.rounds > 1:
-            trial.rounds = _PILOT
+            trial.rounds = _TRIAL_STEPS
         try:
             trial.hold(self._interval, self._context.stops[self._interval])
-            while count < _PILOT and (accepted := trial.advance()):
+            while count < _TRIAL_STEPS and (accepted := trial.advance()):
                 ahead.append(accepted[0][1])
                 monitor.saw(ahead[-1])
                 count += ahead[-1].attempts
         except FunctionError:
-            # At a state that rk853 may never reach.
+            # rk853 may never reach this state.
             return None
         # With the tolerance for so many steps.
         tighter = self._factor(IMPLICIT, monitor.rate() * self._rest) ** (-1 / 5)
@@ -289,7 +289,7 @@ class SwitchingController:
         """Check whether rk853 shall take over again."""
         rate = monitor.rate()
         to_come = rate * self._rest
-        if to_come >= _WORTH * self._context.check:
+        if to_come >= _MIN_COSTS_AHEAD * self._context.check:
             rates = self._spectrum(attempts, place)
             if rates is not None and rates.stable < self._kept * rate:
                 self._returns += 1
@@ -311,9 +311,9 @@ class SwitchingController:
 
         Those until the next check count: then there is another one, and the first steps may be short.
         """
-        steps = max(1.0, min(to_come, _LATER * self._tries))
+        steps = max(1.0, min(to_come, _CHECK_GROWTH * self._tries))
         share = loosest(method, self._base).rtol / self._base.rtol
-        return min(share, _SUM / (steps * math.sqrt(2 * self._context.space.nv)))
+        return min(share, _MAX_ERROR_SUM / (steps * math.sqrt(2 * self._context.space.nv)))
 
     def _adapt_tolerance(self, attempts: StepAttempts, place: int, to_come: float) -> None:
         """Adapt the tolerance to the number of steps to come."""
@@ -333,13 +333,13 @@ class SwitchingController:
     def _rounding_limited(self, attempts: StepAttempts, place: int, step: float) -> bool:
         """Return whether rounding holds rk853's steps short, and loosen the tolerance there."""
         share, noise = self._rounding_noise(attempts, place, step)
-        limited = share > _ROUNDED
+        limited = share > _MAX_NOISE
         loosened = self._base.rtol > self._user.rtol or self._least == math.inf
         if limited:
             self._loosen(noise)
-        elif loosened and share * self._tolerances.rtol / loosest(EXPLICIT, self._user).rtol < _ROUNDED:
+        elif loosened and share * self._tolerances.rtol / loosest(EXPLICIT, self._user).rtol < _MAX_NOISE:
             # The noise is passed.
-            self._base, self._least = self._user, LEAST
+            self._base, self._least = self._user, MIN_RTOL
         else:
             return False
         self._adapt_tolerance(attempts, place, 0.0)
@@ -350,13 +350,13 @@ class SwitchingController:
         (_, q, w), space = self._at, self._context.space
         try:
             k = attempts.rates(place, q[None], w[None])
-            ahead = _NEAR * step * _AHEAD
+            ahead = _NOISE_SPAN * step * _NOISE_PLACES
             moved = space.retract(np.broadcast_to(q, (len(ahead), len(q))), ahead * w)
             rates = attempts.rates(place, moved, w + ahead * k)
         except FunctionError:
             return 0.0, 0.0
         rtol, atol = self._tolerances
-        scatter = np.sqrt(np.sum((_RESIDUAL @ rates) ** 2, axis=0) / _LEFT)
+        scatter = np.sqrt(np.sum((_CUBIC_RESIDUAL @ rates) ** 2, axis=0) / _RESIDUAL_FREEDOM)
         share = step * float(np.sqrt(np.mean((scatter / (atol + rtol * np.abs(w))) ** 2)))
         return share, float(scatter.max() / max(np.abs(k).max(), np.finfo(float).tiny))
 
@@ -366,7 +366,7 @@ class SwitchingController:
             # The user's own may still be possible.
             self._least = math.inf
             return
-        self._base = _scaled(self._base, _LOOSER)
+        self._base = _scaled(self._base, _LOOSENING)
         self.doubt = (
             f"near t = {self._at[0]:.6g} s accelerations are known to {noise:.0e} of themselves, which is not enough "
             f"for rtol = {self._user.rtol:g}; there it took {self._base.rtol:.0e}. Leave out what has next to no mass, "
@@ -425,11 +425,11 @@ def _chosen(controllers: Sequence[SwitchingController], batch: int | None) -> st
         return controllers[0].describe()
     sequences = [controller.method_sequence() for controller in controllers]
     kinds, parts = Counter(sequences), list[str]()
-    for kind, count in kinds.most_common(_DESCRIBED):
+    for kind, count in kinds.most_common(_MAX_DESCRIBED):
         example = sequences.index(kind)
         text = controllers[example].describe()
         such = "" if text == kind else f", such as trajectory {example}"
         parts.append(f"{count} of {batch}{such}: {text}")
-    if len(kinds) > _DESCRIBED:
-        parts.append(f"and {len(kinds) - _DESCRIBED} more kinds")
+    if len(kinds) > _MAX_DESCRIBED:
+        parts.append(f"and {len(kinds) - _MAX_DESCRIBED} more kinds")
     return "; ".join(parts)

@@ -17,11 +17,12 @@ from mbkit.simulate.solvers.fixed_step import to_body_velocity
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Indices
 
-#: Steps of the first launch; later ones take longer until one lasts so many seconds, so that Ctrl-C is heard.
-_FIRST: Final = 8
-_LONG: Final = 0.1
+#: Number of steps of the first launch.
+_FIRST_LAUNCH_STEPS: Final = 8
+#: Launches take twice as many steps until one lasts so long, s, so that Ctrl-C is heard.
+_LAUNCH_SECONDS: Final = 0.1
 #: Bytes of held torques that go to the GPU at once.
-_TORQUES: Final = 2**28
+_MAX_TORQUE_BYTES: Final = 2**28
 
 
 def step_on_device(
@@ -51,7 +52,7 @@ def _run(
     dyn, grid, torque = problem.dyn, problem.grid, problem.torque
     assert isinstance(dyn, LagrangianDynamics)
     space = Space(dyn.model)
-    # Of a batch that is whole or in parts; a list of indices would copy the rows of an array of torques.
+    # A list of indices would copy the rows of an array of torques.
     which = slice(int(members[0]), int(members[-1]) + 1)
     rows: slice | Indices = which if which.stop - which.start == len(members) else members
     values = dyn._parameter_values
@@ -63,7 +64,7 @@ def _run(
     arena.put("parameters", values[members].T if values.ndim == 2 else values[:, None])
     # The last step may have a length of its own.
     stops = {*record.kept.tolist(), grid.steps - 1 if grid.last != grid.dt else grid.steps, grid.steps} - {0}
-    k, most, dt = 0, _FIRST, np.nan
+    k, most, dt = 0, _FIRST_LAUNCH_STEPS, np.nan
     for stop in sorted(stops):
         while k < stop:
             if grid.step(k) != dt:
@@ -72,10 +73,10 @@ def _run(
             count = min(most, stop - k)
             force = torque.columns(rows, k, k + (count if torque.held else 1))
             if torque.held:
-                count = max(1, min(count, _TORQUES // max(force[0].nbytes, 1)))
+                count = max(1, min(count, _MAX_TORQUE_BYTES // max(force[0].nbytes, 1)))
             began = time.perf_counter()
             arena.take_steps(count, force[:count])
-            if time.perf_counter() - began < _LONG:
+            if time.perf_counter() - began < _LAUNCH_SECONDS:
                 most *= 2
             k += count
             problem.bar.update(done + (end - done) * k / grid.steps)

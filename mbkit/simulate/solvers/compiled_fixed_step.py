@@ -41,18 +41,19 @@ from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.solvers.vector_field import BOUND, are_bounded
 from mbkit.simulate.time_grid import Indices
 
-#: Samples between two reports of how far a run is.
-_REPORTED: Final = 64
-#: Steps of a block, at most: as many as have room in the cache, so that Python has little to do for each.
-_LONGEST: Final = 2048
-_MOST_STATES: Final = 1032
-# What a step writes -> what the next one reads.
+#: Number of samples between two reports of how far a run is.
+_SAMPLES_PER_REPORT: Final = 64
+#: Most steps of a block: as many as have room in the cache, so that Python has little to do for each.
+_MAX_BLOCK_STEPS: Final = 2048
+#: Most states of a chunk.
+_MAX_CHUNK_STATES: Final = 1032
+# Name that a step writes -> name that the next one reads.
 _STATE: Final = {"q1": "q", "w1": "w", "squares1": "squares", "margin1": "margin"}
 
 
 def _widest(plan: Plan) -> int:
     """Return how many states the cache holds with all that belongs to them, from 72 to 1032."""
-    return min(max(padded(CACHE // (8 * sum(plan.sizes.values()))), 9 * LANES), _MOST_STATES)
+    return min(max(padded(CACHE // (8 * sum(plan.sizes.values()))), 9 * LANES), _MAX_CHUNK_STATES)
 
 
 class Chunk(BlockLoop):
@@ -74,19 +75,19 @@ class Chunk(BlockLoop):
         watched: bool = False,
         clock: int | None = None,
     ) -> None:
-        #: What is written -> what the next step reads, or the host.
+        #: Name that a step writes -> name that the next one reads, or the host.
         state = {name: before for name, before in _STATE.items() if name in plan.sizes}
         sizes = {state.get(name, name): rows for name, rows in plan.sizes.items()}
         own = [*state.values(), *(["tau"] if torques else []), *([] if clock is None else ["parameters"])]
         fits = CACHE // (8 * padded(most) * sum(sizes[name] for name in own))
-        self.block = max(min(fits, _LONGEST, steps), SHORTEST)
+        self.block = max(min(fits, _MAX_BLOCK_STEPS, steps), SHORTEST)
         self.each_step = torques
         self.all_kept = all_kept or fits >= SHORTEST
         places = dict.fromkeys(own, self.block)
         places |= dict.fromkeys(state.values(), self.block + 1 if self.all_kept else 2)
         super().__init__({name: (places.get(name, 1), rows) for name, rows in sizes.items()}, most, clock)
         self._calls, self._space, self._watched = len(plan.parts), space, watched
-        # Of states that take turns a round has both.
+        # A round has both places of states that take turns.
         period = 1 if self.all_kept else 2
         calls = list[Call]()
         for j in range(period):
@@ -262,7 +263,7 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
                 if step is None:
                     forces[s, :nv] = controller.checked(force, start + k * dt)
                     force = forces[s]
-                if not s % _REPORTED:
+                if not s % _SAMPLES_PER_REPORT:
                     problem.bar.update(k / steps)
                 s, new = s + 1, True
                 sample = begins[s]
@@ -282,7 +283,7 @@ def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:
     except TorqueError as failed:
         record.error = failed
     except Exception as failed:
-        # A sample at which the answer is known is behind.
+        # The answer of the last sample is known.
         if isinstance(failed, NumericalError) and k != sample:
             if new:
                 forces[s - 1] = force

@@ -33,12 +33,12 @@ from mbkit.simulate.torque import Force
 
 _OTHERS: Final = f"{IMPLICIT_METHODS} are the implicit methods for it"
 SYMPLECTIC: Final = Path("symplectic runs", "implicit_midpoint: no form is kept of", ALL - {"speed"}, instead=_OTHERS)
-# With a torque function the iteration converges linearly.
-_WITH_FUNCTION: Final = 60
+#: Most iterations of a step under a torque function, with which they converge linearly.
+_MAX_ITERATIONS_WITH_FUNCTION: Final = 60
 _EPS: Final = float(np.finfo(float).eps)
 _UNSOLVED: Final = "Newton's iteration does not solve the step's equations"
-# Numbers that are turned from momenta into velocities at a time.
-_SLICE: Final = 2**16
+#: Count of momenta that are turned into velocities at a time.
+_MAX_MOMENTA: Final = 2**16
 
 
 def run_midpoint(problem: IntegrationProblem) -> SolverResult:
@@ -171,7 +171,7 @@ class MidpointStepper(Stepper):
         if isinstance(force, np.ndarray):
             tau[:] = force
         last, todo = np.full(len(q), np.inf), np.arange(len(q))
-        for _ in range(MOST if isinstance(force, np.ndarray) else _WITH_FUNCTION):
+        for _ in range(MOST if isinstance(force, np.ndarray) else _MAX_ITERATIONS_WITH_FUNCTION):
             # Never call the user's function with a non-finite state.
             todo = todo[np.isfinite(w[todo]).all(axis=1) & ~good[todo]]
             if not len(todo):
@@ -219,7 +219,7 @@ def _to_velocities(
     """Turn the kept momenta into velocities."""
     kept, (n, rows, nv) = record.kept, record.v.shape
     times = problem.grid.times_of(kept)
-    size = max(_SLICE // max(n * (nv or 1), 1), 1)
+    size = max(_MAX_MOMENTA // max(n * (nv or 1), 1), 1)
     for start in range(0, rows, size):
         q, v = (x[:, start : start + size] for x in (record.q, record.v))
         at_k = kept[start : start + size]

@@ -80,8 +80,8 @@ class StepAttempts(Protocol):
         """Return (q, w) at times, (m, nq) and (m, nv), each by one step from the state of the same row."""
 
 
-#: Tolerance of a step across a singular pose: what rounding lets a step of rk853 hold.
-_CROSSING: Final = 1e-13
+#: Tightest tolerance of a step across a singular pose, which rounding lets a step of rk853 hold.
+_MIN_RTOL_ACROSS_POSE: Final = 1e-13
 
 
 class RungeKuttaAttempts:
@@ -91,7 +91,7 @@ class RungeKuttaAttempts:
     #: The power of a step's length with which its estimated error grows.
     grows = 8
     _factors = staticmethod(predictive_factors)
-    #: What machine code makes the same steps of.
+    #: Coefficients of the same steps in machine code.
     formula: Callable[[], EmbeddedTableau | RosenbrockTableau] = staticmethod(dormand_prince_853)
 
     def __init__(self, problem: IntegrationProblem, space: Space, tolerances: Tolerances) -> None:
@@ -102,7 +102,7 @@ class RungeKuttaAttempts:
         self._force: Force = np.zeros(space.nv)
         self._h = self._t = self._stop = 0.0
         self._why = ""
-        #: What the tolerance is multiplied by.
+        #: Factor of the tolerance.
         self._slack = 1.0
 
     @property
@@ -163,7 +163,7 @@ class RungeKuttaAttempts:
             h = float(first_length(self._space, q, w, probe(q, w), self._tolerances, probe, self.grows)[0])
         except DivergenceError:
             h = math.nan
-        # Where there is no rate, the step finds that out; at the least length no step would be tried.
+        # The step finds out where there is no rate; at the least length no step would be tried.
         return max(h if h > 0 else 1e-6 * (self._stop - self._t), 2 * self._least)
 
     def advance(self) -> list[tuple[int, AcceptedSteps]]:
@@ -213,7 +213,7 @@ class RungeKuttaAttempts:
     def _attempt(self, step: float) -> tuple[Array, Array, float]:
         """Return q and w after a step, and its error in units of the tolerance."""
         q, w, u = self._step(self._t, self._q, self._w, step, fresh=self._fresh)
-        least = _CROSSING if self._field.near_singular else 0.0
+        least = _MIN_RTOL_ACROSS_POSE if self._field.near_singular else 0.0
         space, (rtol, atol) = self._space, (max(x, least) for x in self._tolerances)
         sizes = np.maximum(space.magnitude(self._q, u), space.magnitude(q, u)), np.maximum(np.abs(self._w), np.abs(w))
         by_u, by_w = (self._slack * (atol + rtol * x) for x in sizes)
@@ -312,8 +312,8 @@ class AcrossPoses(RungeKuttaAttempts):
         return np.concatenate([q, self._space.to_body_velocity(q, w)])
 
 
-#: Of a step: how far apart the rates are that tell the time's own part, by a parabola.
-_APART: Final = 1e-3
+#: Fraction of a step between the rates whose parabola has their change by the time alone.
+_RATE_DISTANCE: Final = 1e-3
 
 
 class RosenbrockAttempts(RungeKuttaAttempts):
@@ -414,7 +414,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
             self._own_rates.why = ""
             y = self._vector(self._q, self._w)
             arrived, self._arrived = self._arrived, None
-            # Where the last step ended the rate is known, unless another force acts from there.
+            # The rate is known where the last step ended, unless another force acts from there.
             known = arrived is not None and np.array_equal(arrived[0], y)
             rate = arrived[1] if known and arrived is not None else self._rate(self._t, y)
             self._start = y, rate, self._exact(self._t, y, self._force)
@@ -458,7 +458,7 @@ class RosenbrockAttempts(RungeKuttaAttempts):
         return k
 
     def _by_time(self, t: float, y: Array, h: float, there: Array) -> Array:
-        apart = _APART * h
+        apart = _RATE_DISTANCE * h
         near, far = self._rate(t + apart, y), self._rate(t + 2 * apart, y)
         return (4 * near - far - 3 * there) / (2 * apart)
 

@@ -30,8 +30,8 @@ from mbkit.simulate.solvers.trajectory_record import (
 )
 from mbkit.simulate.solvers.vector_field import BLAMELESS, DIVERGED, Rates, is_bounded
 
-# Of a rate, relative to the largest or 1: what no truncation of a series makes.
-_JUMP: Final = 1e-6
+#: Smallest jump of a rate, relative to the largest or 1: no truncation of a series makes one.
+_MIN_RATE_JUMP: Final = 1e-6
 
 
 def run_taylor(problem: IntegrationProblem) -> SolverResult:
@@ -216,7 +216,7 @@ class TaylorSteps:
         powers = np.arange(1, series.shape[1])
         slope = series[:, 1:] @ (powers * h ** (powers - 1))
         # Far above what truncation does, far below what a force does that turns round.
-        allowed = max(_JUMP, 1e3 * float(self._integrator.tol)) * max(1.0, float(np.abs(rate).max()))
+        allowed = max(_MIN_RATE_JUMP, 1e3 * float(self._integrator.tol)) * max(1.0, float(np.abs(rate).max()))
         return not bool(np.abs(rate - slope).max() <= allowed)
 
     def at(self, t: float) -> Any:

@@ -21,13 +21,13 @@ from mbkit.simulate.singular_poses import SingularPoses, describe_poses
 from mbkit.simulate.solvers.vector_field import DIVERGED, are_bounded
 from mbkit.simulate.time_grid import Indices
 
-#: Attempted steps between two looks at the time that they covered, and the least part of the run that they must
-#: cover. A run at that pace takes 2e10 steps.
-_ATTEMPTS: Final = 20_000
-_COVERED: Final = 1e-6
-#: Attempts of a trajectory between two looks at them, at most.
+#: Number of attempted steps between two looks at the time that they covered, and the smallest share of the run that
+#: they must cover. A run at that pace takes 2e10 steps.
+_ATTEMPTS_PER_LOOK: Final = 20_000
+_MIN_SHARE_COVERED: Final = 1e-6
+#: Most attempts of a trajectory between two looks at them.
 ROUNDS: Final = 256
-#: Of several ends a run tells the first in this order.
+#: A batch tells the first of its ends in this order.
 _ENDS: Final[tuple[Ended, ...]] = ("function_failed", "diverged", "step_too_small", "event")
 
 
@@ -305,11 +305,11 @@ class TrajectoryRecord(RunRecord):
     def crawls(self) -> bool:
         """End the run where many steps cover next to none of it; return whether they do."""
         attempts, (before, since) = self.steps + self.rejected, self._look
-        if attempts - before < _ATTEMPTS:
+        if attempts - before < _ATTEMPTS_PER_LOOK:
             return False
         covered = self.reached - since
         self._look = attempts, self.reached
-        if covered < _COVERED * self.problem.duration:
+        if covered < _MIN_SHARE_COVERED * self.problem.duration:
             why = f"stopped, as {attempts - before} steps covered {covered:.2g} s alone: stiff, singular or diverging"
             self.stop(StoppedError("step_too_small", why))
             return True

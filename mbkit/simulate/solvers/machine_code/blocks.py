@@ -22,11 +22,11 @@ from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Grid, Indices
 
-#: Half of what a core has in its second cache, bytes.
+#: Half of the second cache of a core, bytes.
 CACHE: Final = 2**19
-#: Steps of a block, at least.
+#: Fewest steps of a block.
 SHORTEST: Final = 16
-#: Numbers of a cache line.
+#: Number of doubles in a cache line.
 LANES: Final = 8
 
 
@@ -165,7 +165,7 @@ class SampleBarrier:
         self._problem, self._velocity, self._k = problem, velocity, 0
         self._loops: list[tuple[BlockLoop, Indices]] = []
         self._barrier, self._left = threading.Barrier(parts, self._ask) if parts > 1 else None, False
-        #: Of a torque function that failed.
+        #: Error of a torque function that failed.
         self.error: FunctionError | None = None
 
     def join(self, loop: BlockLoop, members: Indices) -> None:

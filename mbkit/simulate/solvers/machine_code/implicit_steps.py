@@ -28,16 +28,16 @@ from mbkit.simulate.solvers.machine_code.blocks import CACHE, SHORTEST, BlockLoo
 from mbkit.simulate.solvers.trajectory_record import GridRecord
 from mbkit.simulate.time_grid import Indices
 
-#: Multiplications of an implicit step's system beyond which compiling it takes longer than tens of thousands of steps
-#: in Python.
-_WORTH_COMPILING: Final = 10_000
-#: States that go side by side, at most: enough for the processor's vectors, and nine
+#: Number of multiplications of an implicit step's system beyond which compiling it takes longer than tens of thousands
+#: of steps in Python.
+_MAX_MULTIPLICATIONS: Final = 10_000
+#: Most states that go side by side: enough for the processor's vectors, and nine
 #: cache lines in a row of them, because an even number would meet in the same sets.
 WIDEST: Final = 72
-# Blocks without a miss after which one iteration less is tried.
-_PATIENCE: Final = 32
-# Steps of a block at most: one that is not solved is repeated.
-_LONGEST_IMPLICIT: Final = 256
+#: Number of blocks without a miss after which one iteration less is tried.
+_BLOCKS_WITHOUT_MISS: Final = 32
+#: Most steps of a block: one that is not solved is repeated.
+_MAX_BLOCK_STEPS: Final = 256
 
 
 class ImplicitParts(Protocol):
@@ -76,7 +76,7 @@ class ImplicitChunk(BlockLoop):
             rows |= dict(zip(part.writes, (r * c for r, c in code.shapes), strict=True))
         x, q, other = parts.past[0], *parts.carried
         fits = CACHE // (8 * padded(count) * (rows[q] + rows[other] + 2 * rows[x] + 1))
-        n, back = max(min(fits, _LONGEST_IMPLICIT, isqrt(steps)), SHORTEST), len(parts.past) - 1
+        n, back = max(min(fits, _MAX_BLOCK_STEPS, isqrt(steps)), SHORTEST), len(parts.past) - 1
         # Until there are unknowns to guess the next one from, more iterations are needed.
         self._longest, self.block = n, back + 1
         # The time is one of the parameters, and another in each step.
@@ -117,7 +117,7 @@ class ImplicitChunk(BlockLoop):
 
     def run_to(self, step: int) -> None:
         first, steps = self._taken, step - self._taken
-        if self._smooth >= _PATIENCE and self._iterations > 1:
+        if self._smooth >= _BLOCKS_WITHOUT_MISS and self._iterations > 1:
             self._iterations, self._smooth = self._iterations - 1, 0
         iterations, calls = self._iterations, len(self._parts.iteration)
         while True:
@@ -134,7 +134,7 @@ class ImplicitChunk(BlockLoop):
             iterations = min(iterations + max(iterations // 2, 1), MOST)
         self._iterations, self._taken = iterations, step
         if missed.any():
-            # What is lost asks for no more iterations.
+            # Trajectories that are lost ask for no more iterations.
             self._alive &= ~missed
             if self._iterations == MOST:
                 self._iterations = 2
@@ -203,7 +203,7 @@ def run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> So
     assert isinstance(dyn, LagrangianDynamics)
     parts, space, q0, v0 = Collocation(dyn.equations, tableau), Space(dyn.model), problem.q, problem.v
     every = (parts.start, *parts.iteration, parts.end)
-    if parts.size > _WORTH_COMPILING or any(isinstance(dyn._code(x.name, make=x.make), Machine) for x in every):
+    if parts.size > _MAX_MULTIPLICATIONS or any(isinstance(dyn._code(x.name, make=x.make), Machine) for x in every):
         return run_fixed(problem)
     w0, first = space.to_integrator_velocity(q0, v0), problem.torque.columns(np.arange(len(q0)), 0, 1)[0].T
     more = at_time(dyn, problem.start)._trailing(q0)
