@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import warnings
 from functools import cache
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import mbkit as mb
 from mbkit.engines import ENGINES, frames_and_momenta, loads
 from mbkit.engines.frames_and_momenta import ALIGNED, AXES, CLASSICAL, LOCAL, SPATIAL
 from mbkit.engines.registry import composes
-from mbkit.errors import KnownDefectWarning, UnsupportedError
+from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import simulate
 from tests.random_trees import ALL, IN_MUJOCO, SOUND, off, random_tree, states
@@ -35,10 +34,6 @@ TREES = {
 #: Engines that tell joint loads.
 LOADED = [x for x in ENGINES if "joint_wrenches" in mb.dynamics(mb.catalog.pendulum(), x).supports]
 QUANTITIES = (*frames_and_momenta.QUANTITIES, *loads.QUANTITIES)
-
-
-#: Quantities with a defect of an engine.
-MAY_LACK = {"jacobian_dot_v", "centroidal_momentum_bias"}
 
 
 @cache
@@ -85,39 +80,6 @@ def calls(model: Model, state: dict[str, np.ndarray]):
 def right(name: str) -> list[np.ndarray]:
     oracle = mb.dynamics(tree(name), "oracle")
     return [getattr(oracle, method)(*given, **more) for _, method, given, more in calls(tree(name), at(name))]
-
-
-@pytest.mark.thorough(
-    *("pinocchio-all joint types", "pinocchio-without springs", "pinocchio-sound"),
-    *("lagrangian-fixed to the world", "lagrangian-floating", "lagrangian-sound"),
-)
-@pytest.mark.parametrize("name", TREES)
-@pytest.mark.parametrize("engine", [x for x, info in ENGINES.items() if not info.reference])
-def test_engines_have_the_values_of_34_digits(engine, name):
-    model, state = tree(name), at(name)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", KnownDefectWarning)
-            dyn = mb.dynamics(model, engine)
-    except UnsupportedError:
-        pytest.skip(f"{engine} does not take this tree")
-    condition = np.linalg.cond(dyn.mass_matrix(state["q"])).max()
-    compared = set()
-    for (quantity, method, given, more), expected in zip(calls(model, state), right(name), strict=True):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", KnownDefectWarning)
-            try:
-                found = getattr(dyn, method)(*given, **more)
-            except UnsupportedError:
-                continue
-        if any(issubclass(w.category, KnownDefectWarning) for w in caught):
-            continue
-        factor = condition if quantity in ("forward dynamics", "mass_matrix_inverse") else 1.0
-        assert found.shape == expected.shape, (quantity, more)
-        assert off(found, expected) < CLOSE * factor, (quantity, given[3:], more)
-        compared.add(quantity)
-    wanted = {quantity for quantity, method, _, _ in calls(model, state) if method in dyn.supports}
-    assert wanted - MAY_LACK <= compared, wanted - compared
 
 
 def rate(f, h: float = 2e-3):
@@ -308,26 +270,6 @@ def test_nothing_outside_means_no_change_of_momentum():
     assert np.abs(h - h[0]).max() < 1e-9 * np.abs(h[0]).max()
     straight = dyn.center_of_mass(run.q) - run.t[:, None] * h[0, :3] / adrift.mass
     assert np.abs(straight - straight[0]).max() < 1e-9
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_model_without_velocities_has_a_mass_and_loads(engine):
-    b = mounted("rock", "a", "f", "fixed", mass=2.0, com=(1, 2, 3), inertia=(1, 1, 1))
-    dyn, none = mb.dynamics(b.build(), engine), np.zeros(0)
-    for quantity in dyn.supports & {*QUANTITIES}:
-        if quantity.endswith(("jacobian", "matrix", "inverse", "force")):
-            more = {"frame": "a"} if quantity == "jacobian" else {}
-            more |= {"wrenches": {"a": np.ones(6)}} if quantity == "generalized_force" else {}
-            assert getattr(dyn, quantity)(none, **more).shape[-1] == 0, quantity
-    if {*frames_and_momenta.QUANTITIES} <= dyn.supports:
-        assert np.array_equal(dyn.velocity(none, none, "a"), np.zeros(6))
-        assert np.array_equal(dyn.center_of_mass(none), [1, 2, 3])
-        assert np.array_equal(dyn.centroidal_momentum(none, none), np.zeros(6))
-        assert dyn.locked_inertia(none) == pytest.approx(np.diag([2, 2, 2, 1, 1, 1]), abs=1e-14)
-    if engine in LOADED:
-        load = dyn.joint_wrenches(none, none, none, joints=["f"])[0]
-        weight = 2.0 * 9.81
-        assert load == pytest.approx([0, 0, weight, 2 * weight, -weight, 0])
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco", "drake"])

@@ -20,7 +20,7 @@ from mbkit.engines import ENGINES, QUANTITIES, Dynamics
 from mbkit.errors import InputError, MbkitError, MbkitWarning, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.model import kind_of
 from mbkit.model.joint_types import KINDS
-from tests.random_trees import IN_MUJOCO, SOUND, off, random_tree, states
+from tests.random_trees import SOUND, off, random_tree, states
 from tests.scenes import mounted
 
 VECTORS = {
@@ -91,25 +91,6 @@ def arguments(letters, q, v, a, tau):
     return [{"q": q, "v": v, "a": a, "t": tau}[x] for x in letters]
 
 
-@pytest.mark.thorough(
-    "pinocchio-0-False", "pinocchio-0-True", "pinocchio-1-False", "pinocchio-1-True", "mujoco-1-False"
-)
-@pytest.mark.parametrize("mimic", [False, True])
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("engine", ["pinocchio", "mujoco"])
-def test_engines_agree_on_trees_of_every_joint_kind(engine, seed, mimic):
-    model = random_tree(seed, 10, IN_MUJOCO if engine == "mujoco" else SOUND, mimic=mimic, armature=engine == "mujoco")
-    own, other = mb.dynamics(model, "lagrangian"), mb.dynamics(model, engine)
-    q, v, a, tau = states(model, 5, seed)
-    for name, letters in VECTORS.items():
-        args = arguments(letters, q, v, a, tau)
-        assert off(getattr(other, name)(*args), getattr(own, name)(*args)) < close(name, own, q), name
-    for axes in ("local", "world", "local_world_aligned"):
-        assert off(other.jacobian(q, "tip", axes), own.jacobian(q, "tip", axes)) < CLOSE
-    assert off(other.pose(q, "tip"), own.pose(q, "tip")) < CLOSE
-    assert off(other.coriolis_force(q, v), own.coriolis_force(q, v)) < CLOSE
-
-
 @pytest.mark.thorough(every=3)
 @pytest.mark.parametrize("feature", ["armature", "damping", "springs", "gravity"])
 @pytest.mark.parametrize("engine", list(ENGINES))
@@ -126,18 +107,6 @@ def test_a_feature_acts_in_every_engine_and_can_be_taken_out(engine, feature):
 @cache
 def floating(robot, engine):
     return mb.dynamics(mb.load(robot, floating_base=True), engine)
-
-
-@pytest.mark.thorough("talos-pinocchio", "talos-oracle", "solo12-pinocchio")
-@pytest.mark.parametrize("engine", list(ENGINES))
-@pytest.mark.parametrize("robot", ["talos", "solo12"])
-def test_floating_robots_agree_accelerations_included(robot, engine):
-    own, other = floating(robot, "lagrangian"), floating(robot, engine)
-    q, v, _, tau = states(own.model, 4)
-    a = other.forward_dynamics(q, v, tau)
-    condition = np.linalg.cond(own.mass_matrix(q)).max()
-    assert off(a, own.forward_dynamics(q, v, tau)) < 1e-15 * condition
-    assert off(other.inverse_dynamics(q, v, a), tau) < 1e-15 * condition
 
 
 @pytest.mark.parametrize("engine", list(ENGINES))
@@ -194,56 +163,6 @@ def test_jacobians_and_poses_are_those_of_the_motion(engine):
     assert np.allclose(dyn.jacobian(q, "tip", "body") @ v, turned, atol=1e-8)
 
 
-@pytest.mark.thorough("False-lagrangian", "True-oracle")
-@pytest.mark.parametrize("engine", list(ENGINES))
-@pytest.mark.parametrize("floating", [False, True])
-def test_a_batch_is_its_states_one_by_one(engine, floating):
-    model = mb.load("solo12", floating_base=floating)
-    dyn = mb.dynamics(model, engine)
-    q, v, a, tau = states(model, 3)
-    for name, letters in VECTORS.items():
-        args = arguments(letters, q, v, a, tau)
-        whole = getattr(dyn, name)(*args)
-        alone = np.array([getattr(dyn, name)(*(x[i] for x in args)) for i in range(3)])
-        assert whole.shape == alone.shape, name
-        assert off(whole, alone) < 1e-14, name
-        assert getattr(dyn, name)(*(x[:0] for x in args)).shape == (0, *whole.shape[1:]), name
-        if len(args) > 1:
-            mixed = getattr(dyn, name)(args[0][0], *args[1:])
-            assert mixed.shape == whole.shape, name
-
-
-@pytest.mark.parametrize("engine", list(ENGINES))
-@pytest.mark.parametrize("n", [1, 2])
-def test_shapes_are_as_documented_for_one_velocity_too(engine, n):
-    model = mb.catalog.chain(n=n)
-    dyn = mb.dynamics(model, engine)
-    q, v = np.full(n, 0.3), np.full(n, 0.2)
-    shapes = {"mass_matrix": (n, n), "kinetic_energy": (), "potential_energy": ()}
-    for name, letters in VECTORS.items():
-        args = arguments(letters, q, v, v, v)
-        assert np.shape(getattr(dyn, name)(*args)) == shapes.get(name, (n,)), name
-        batch = [np.stack([x] * 4) for x in args]
-        assert np.shape(getattr(dyn, name)(*batch)) == (4, *shapes.get(name, (n,))), name
-    assert dyn.jacobian(q, model.bodies[-1].name).shape == (6, n)
-    assert dyn.pose(q, model.bodies[-1].name).shape == (4, 4)
-    if "coriolis_matrix" in dyn.supports:
-        assert dyn.coriolis_matrix(q, v).shape == (n, n)
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_a_model_without_velocities_has_empty_terms_and_poses(way):
-    b = mounted("rock", "a", "f", "fixed", mass=1.0, com=(0, 0, 0.3), translation=(1, 0, 0))
-    b.add_frame("top", body="a", translation=(0, 0, 1))
-    dyn, none = made_by(b.build(), way), np.zeros(0)
-    assert dyn.mass_matrix(none).shape == (0, 0)
-    assert dyn.mass_matrix(np.zeros((3, 0))).shape == (3, 0, 0)
-    assert dyn.forward_dynamics(none, none, none).shape == (0,)
-    assert dyn.potential_energy(none) == pytest.approx(0.3 * 9.81)
-    assert dyn.pose(none, "top")[:3, 3] == pytest.approx([1, 0, 1])
-    assert dyn.jacobian(none, "top").shape == (6, 0)
-
-
 @pytest.mark.parametrize("engine", list(ENGINES))
 def test_results_are_not_views_of_the_next_call(engine):
     model = mb.load("ur5")
@@ -254,14 +173,6 @@ def test_results_are_not_views_of_the_next_call(engine):
         kept = np.array(first)
         getattr(dyn, name)(*(x[1] for x in arguments(letters, q, v, a, tau)))
         assert np.array_equal(first, kept), name
-
-
-@pytest.mark.thorough("compiled")
-@pytest.mark.parametrize("way", WAYS)
-def test_every_quantity_takes_its_documented_argument_names(way):
-    dyn = small_tree(TURNING, way)
-    for name, call, given in calls(dyn, *(x[0] for x in states(dyn.model, 1))):
-        assert np.array_equal(call(**given), call(*given.values())), name
 
 
 def unaligned(x):
@@ -346,17 +257,6 @@ def test_every_array_is_read_rightly_or_refused(way, batch, kinds):
                 error = answer(call, given | {x: convert(value)})
                 assert isinstance(error, InputError), (name, x, kind)
                 assert str(error).startswith(f"{x}: expected"), (name, x, kind)
-
-
-@pytest.mark.parametrize("engine", list(ENGINES))
-def test_wrong_shapes_and_types_are_explained(engine):
-    dyn, good = mb.dynamics(mb.load("ur5"), engine), np.zeros(6)
-    wrong_shapes = [np.zeros(shape) for shape in (5, 7, (6, 1), (1, 5), (2, 2, 6))]
-    for bad in (*wrong_shapes, 0.0, None, "abc", np.zeros(6, complex), [1, [2]], {}):
-        for call, takes in (("mass_matrix", 1), ("nle", 2), ("inverse_dynamics", 3), ("forward_dynamics", 3)):
-            for k, name in enumerate("qv"[:takes]):
-                with pytest.raises(InputError, match=f"^{name}: expected"):
-                    getattr(dyn, call)(*[bad if i == k else good for i in range(takes)])
 
 
 def with_hidden_entries():

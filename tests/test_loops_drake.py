@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,11 @@ import pytest
 
 import mbkit as mb
 from mbkit.engines import Dynamics
-from mbkit.engines.constrained import QUANTITIES
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.model import Model
-from mbkit.model.parts import Loop, Prescribed
-from tests.random_trees import random_tree, rotation
+from mbkit.model.parts import Prescribed
+from tests.quantities import closed
+from tests.random_trees import random_tree
 from validation import four_bar as bare
 
 pytest.importorskip("pydrake")
@@ -33,24 +32,9 @@ def four_bar() -> tuple[Dynamics, np.ndarray, np.ndarray]:
 
 def closed_tree(seed: int, kind: str) -> tuple[Model, np.ndarray, np.ndarray]:
     """Return a random tree with a closed loop between two of its bodies, and a consistent state."""
-    rng = np.random.default_rng(seed)
-    model = random_tree(seed, 8, ("revolute", "prismatic"))
-    q, _ = model.random_state(rng)
-    names = [body.name for body in model.bodies]
-    a, b = (names[k] for k in rng.choice(len(names), 2, replace=False))
-    own = np.eye(4)
-    own[:3, :3], own[:3, 3] = rotation(rng), 0.3 * rng.standard_normal(3)
-    dyn = mb.dynamics(model, "lagrangian", compile=False)
-    length = 0.5 if kind == "distance" else 0.0
-    far = np.eye(4)
-    far[2, 3] = length
-    if kind == "universal":
-        # Its two axes cross at a right angle.
-        far[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-    other = np.linalg.inv(dyn.pose(q, b)) @ dyn.pose(q, a) @ own @ far
-    ends = (a, own[:3, :3], own[:3, 3], b, other[:3, :3], other[:3, 3])
-    closed = replace(model, loops=(Loop("loop", kind, *ends, length),))
-    return closed, *mb.dynamics(closed, "lagrangian", compile=False).project(q, 0.3 * rng.standard_normal(model.nv))
+    model, q = closed(random_tree(seed, 8, ("revolute", "prismatic")), seed, kind)
+    v = 0.3 * np.random.default_rng(seed).standard_normal(model.nv)
+    return model, *mb.dynamics(model, "lagrangian", compile=False).project(q, v)
 
 
 def test_drake_s_continuous_plant_refuses_to_accelerate_loops_and_has_the_tree_s_other_terms() -> None:
@@ -87,16 +71,6 @@ def test_drake_s_continuous_plant_refuses_to_accelerate_loops_and_has_the_tree_s
     )
 
 
-@pytest.mark.parametrize("quantity", ["forward_dynamics", *QUANTITIES, "actuator_forces", "loop_wrenches"])
-def test_terms_of_constrained_motion_are_refused_with_the_reason(quantity: str) -> None:
-    dyn, q, v = four_bar()
-    assert quantity not in dyn.supports
-    call = getattr(dyn, quantity)
-    states = (q, v, np.zeros(3))[: sum(x.default is x.empty for x in signature(call).parameters.values())]
-    with pytest.raises(UnsupportedError, match=r"continuous plant.*method='drake_sap'.*'lagrangian'"):
-        call(*states)
-
-
 def test_derivatives_and_other_methods_are_refused_with_the_reason() -> None:
     dyn, q, v = four_bar()
     with pytest.raises(UnsupportedError, match="continuous plant"):
@@ -105,17 +79,6 @@ def test_derivatives_and_other_methods_are_refused_with_the_reason() -> None:
         more = {} if method == "rk4" else {"save": [0.0, 0.1]}
         with pytest.raises(UnsupportedError, match="drake_sap"):
             mb.simulate(dyn, q, v, 0.1, method, **more)
-
-
-def test_terms_of_the_tree_are_given() -> None:
-    dyn, q, v = four_bar()
-    own = mb.dynamics(bare.described(), "lagrangian", compile=False)
-    assert np.abs(dyn.mass_matrix(q) - own.mass_matrix(q)).max() < 1e-14
-    assert np.abs(dyn.nle(q, v) - own.nle(q, v)).max() < 1e-13
-    assert np.abs(dyn.pose(q, "rocker") - own.pose(q, "rocker")).max() < 1e-15
-    assert dyn.constraint_names == own.constraint_names
-    theirs, ours = (d.inverse_dynamics_derivatives(q, v, v) for d in (dyn, own))
-    assert np.abs(theirs.q - ours.q).max() < 1e-12
 
 
 def test_a_run_is_drake_s_own_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:

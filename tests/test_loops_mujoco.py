@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 import warnings
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import mujoco
@@ -20,28 +19,15 @@ from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, ModelErro
 from mbkit.model import Model
 from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop, Prescribed
-from tests.random_trees import IN_MUJOCO, random_tree, rotation
+from tests.quantities import closed
+from tests.random_trees import IN_MUJOCO, off, random_tree
 
 #: Default, the stiffest for a step of 1 ms, and stiffness and damping with a spline that is no parabola.
 SETTINGS = ({}, stiffest(1e-3), {"solref": (-300.0, -20.0), "solimp": (0.5, 0.9, 1.0, 0.3, 3.0)})
 
 
-def off(x: np.ndarray, y: np.ndarray) -> float:
-    return float(np.linalg.norm(x - y) / np.linalg.norm(y))
-
-
-@cache
-def closed_tree(seed: int, kind: str, n: int = 8) -> tuple[Model, np.ndarray]:
-    """Return a random tree with a loop between two bodies, and a configuration in which it is closed."""
-    model, rng = random_tree(seed, n, IN_MUJOCO), np.random.default_rng(seed)
-    q, _ = model.random_state(rng)
-    dyn = mb.dynamics(model, "mujoco")
-    names = [b.name for b in model.bodies]
-    a, b = (names[k] for k in rng.choice(len(names), 2, replace=False))
-    own = np.eye(4)
-    own[:3, :3], own[:3, 3] = rotation(rng), 0.3 * rng.standard_normal(3)
-    other = np.linalg.inv(dyn.pose(q, b)) @ dyn.pose(q, a) @ own
-    return replace(model, loops=(Loop("loop", kind, a, own[:3, :3], own[:3, 3], b, other[:3, :3], other[:3, 3]),)), q
+def closed_tree(seed: int, kind: str) -> tuple[Model, np.ndarray]:
+    return closed(random_tree(seed, 8, IN_MUJOCO), seed, kind)
 
 
 def four_bar() -> tuple[Model, np.ndarray, np.ndarray]:
@@ -103,25 +89,6 @@ def test_stiffer_settings_keep_more_digits_and_never_more_than_the_cap_allows() 
     assert digits[0] < digits[1]
     assert 3 < digits[-1] < 6
     assert f"{digits[-1]:.1f} digits" in str(dyn.constraint_law(q, v, np.zeros(3)))
-
-
-@pytest.mark.thorough("0-frame", "1-point", "1-frame")
-@pytest.mark.parametrize("kind", ["point", "frame"])
-@pytest.mark.parametrize("seed", range(4))
-def test_rows_of_the_contract_from_mujoco_s_kinematics(seed: int, kind: str) -> None:
-    model, q = closed_tree(seed, kind)
-    rng = np.random.default_rng([seed, 2])
-    q, v = model.integrate(q, 0.2 * rng.standard_normal(model.nv)), rng.standard_normal(model.nv)
-    own, dyn = mb.dynamics(model, "lagrangian", compile=False), mb.dynamics(model, "mujoco")
-    assert dyn.constraint_names == own.constraint_names
-    for name, state in (("residual", (q,)), ("jacobian", (q,)), ("rate", (q, v)), ("bias", (q, v))):
-        expected = getattr(own, f"constraint_{name}")(*state)
-        assert np.abs(getattr(dyn, f"constraint_{name}")(*state) - expected).max() < 1e-13 * max(
-            1.0, float(np.abs(expected).max())
-        )
-    with pytest.raises(UnsupportedError, match=r"constraint_law\(q, v, tau\)\.force"):
-        dyn.constraint_forces(q, v, v)
-    assert "constraint_forces" not in dyn.supports
 
 
 def test_other_terms_are_those_of_the_tree_after_forward_dynamics_too() -> None:

@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 import tomllib
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,7 +61,7 @@ def defects() -> list[Defect]:
         return [Defect(d["file"], d["text"], d["wrong"], tuple(d["tests"])) for d in tomllib.load(file)["defect"]]
 
 
-def _copy(folder: Path) -> Path:
+def copied(folder: Path) -> Path:
     """Copy what a test needs, as it is now; a checkout may be an archive, without git.
 
     Bytecode goes with it, so that no defect has all of it compiled again; that of the file with the defect is older.
@@ -72,14 +73,17 @@ def _copy(folder: Path) -> Path:
     return folder
 
 
-def planted(defect: Defect, copy: Path) -> tuple[str, float]:
-    """Return the first test that fails with a defect, empty if none does, and the seconds that took."""
+def planted(defect: Defect, copy: Path, tests: Sequence[str] = ()) -> tuple[str, float]:
+    """Return the first test that fails with a defect, empty if none does, and the seconds that took.
+
+    The tests are the defect's own files, or those that are given.
+    """
     path = copy / defect.path
     sound = path.read_text(encoding="utf-8")
     if sound.count(defect.text) != 1:
         raise ValueError(f"{defect.path}: expected {defect.text!r} once, found it {sound.count(defect.text)} times")
     path.write_text(sound.replace(defect.text, defect.wrong), encoding="utf-8")
-    tests = [f"tests/{name}.py" for name in defect.tests]
+    tests = tests or [f"tests/{name}.py" for name in defect.tests]
     options = ["-x", "-q", "-n0", "-p", "no:cacheprovider"]
     begun = time.perf_counter()
     try:
@@ -115,7 +119,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder, Progress(console=Console(stderr=True)) as bar:
         task, copies = bar.add_task("planting", total=len(chosen)), Queue[Path]()
         for i in range(WORKERS):
-            copies.put(_copy(Path(folder) / str(i)))
+            copies.put(copied(Path(folder) / str(i)))
 
         def one(k: int) -> None:
             copy = copies.get()

@@ -278,8 +278,8 @@ class Loads:
         states = {"q": model.check_q(q), "v": model.check_v(v), "a": model.check_v(a, "a")}
         states["tau"] = model.check_v(tau, "tau")
         pushes = {name: np.asarray(w, dtype=float) for name, w in (wrenches or {}).items()}
-        size = self._samples or batch_of(**states, **pushes)
-        q, v, a, tau = (np.broadcast_to(x, (size or 1, x.shape[-1])) for x in states.values())
+        size = self._samples or batch_of(**states, **{f"wrench on {name!r}": w for name, w in pushes.items()})
+        q, v, a, tau = (np.broadcast_to(x, (1 if size is None else size, x.shape[-1])) for x in states.values())
         names = [joint.name for joint in model.tree]
         loads = self.joint_wrenches(q, v, None, wrenches, axes, names, tau)
         balance = _Balance(self, q, v, a)

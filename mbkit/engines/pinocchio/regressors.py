@@ -51,7 +51,9 @@ class PinRegressors:
     def torques(self, q: Array, v: Array, a: Array) -> Array:
         """Return Y(q, v, a)."""
         # One row comes back as a vector.
-        own = pin.computeJointTorqueRegressor(self._m, self._d, q, v, a).reshape(self._m.nv, -1)
+        own = pin.computeJointTorqueRegressor(self._m, self._d, q, v, a).reshape(
+            self._m.nv, _SIZE * (self._m.njoints - 1)
+        )
         return np.asarray(own @ self._map[_SIZE:])
 
     def momentum(self, q: Array, v: Array) -> Array:
