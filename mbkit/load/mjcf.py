@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbkit._check import Array
-from mbkit._reproducible import length, product
+from mbkit._reproducible import length
 from mbkit.errors import ModelError
-from mbkit.load.mjcf_attributes import Compiler, Defaults, about, check_names
+from mbkit.load.mjcf_attributes import Compiler, Defaults, check_names
 from mbkit.load.mjcf_compiled import infer_inertias, infer_springs, name_list
 from mbkit.load.mjcf_couplings import Transmissions
 from mbkit.load.mjcf_equalities import Equalities
@@ -191,23 +191,14 @@ class _Tree:
         for body in scene.bodies:
             anchors[body.name] = body.anchor
             at = body.mass_properties.scaled(scale) if scale != 1 else body.mass_properties
-            R, p = body.pose.R, body.pose.p - anchors[body.parent]
-            parent = body.parent
-            if not body.joints:
-                name = scene.unused("joint", f"{body.name}_fixed")
-                b.add_joint(name, "fixed", parent=parent, child=body.name, translation=p, rotation=snap(R))
-            before = np.zeros(3)
-            for joint in body.joints:
-                last = joint is body.joints[-1]
-                child = body.name if last else scene.unused("body", f"{body.name}_{joint.name}")
-                if joint.kind == "free":
-                    R, p = np.eye(3), np.zeros(3)
-                else:
-                    p = p + product(R, joint.anchor - before)
+            for joint, parent, child, R, p in body.chain(anchors[body.parent], scene.unused):
+                if joint is None:
+                    name = scene.unused("joint", f"{body.name}_fixed")
+                    b.add_joint(name, "fixed", parent=parent, child=child, translation=p, rotation=snap(R))
+                    continue
                 self._add_joint(joint, parent, child, R, p)
-                if not last:
+                if child != body.name:
                     b.add_body(child)
-                R, p, parent, before = np.eye(3), np.zeros(3), child, joint.anchor
             b.add_body(body.name, mass=at.mass, com=at.com - body.anchor, inertia=at.inertia)
             if body.anchor.any():
                 b.add_frame(body.name, body=body.name, translation=-body.anchor)
@@ -229,10 +220,7 @@ class _Tree:
             values["stiffness"], values["damping"] = self.springs[joint.name]
         if joint.scalar:
             axis = values["axis"] = self.snap(joint.axis / length(joint.axis))
-            if joint.ref and joint.kind == "hinge":
-                R = product(R, about(axis, -joint.ref))
-            elif joint.ref:
-                p = p - product(R, joint.ref * axis)
+            R, p = joint.at_zero(R, p, axis)
             if limits := _range(element, "range", "limited", item, scene):
                 values["lower"], values["upper"] = (angle * x for x in limits)
             if force := _range(element, "actuatorfrcrange", "actuatorfrclimited", item, scene):

@@ -10,7 +10,7 @@ act where the file is read with its actuators; without, a rotor's inertia and th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Final
@@ -21,7 +21,7 @@ from mbkit import spatial
 from mbkit._check import Array
 from mbkit.load.mjcf_reader import MjcfJoint, Scene
 from mbkit.load.xml_reader import MAX_MAGNITUDE, Element, Reader, reserved
-from mbkit.model import Joint, JointCoupling, Model, ModelBuilder, PointSpring
+from mbkit.model import GravityCompensation, Joint, JointCoupling, Model, ModelBuilder, PointSpring
 from mbkit.model.description import LEFT_OUT, SERVOS
 from mbkit.model.elements.forces import RATE
 from mbkit.model.validation import sample_mass_matrix
@@ -135,7 +135,7 @@ class _Band:
 
 
 @dataclass
-class _Acting:
+class Acting:
     """The forces of a tendon or an actuator."""
 
     item: str  # its name, or its number and its line
@@ -179,8 +179,10 @@ class _Acting:
         numbers = self.stiffness, self.rest_length, self.damping, self.armature
         return JointCoupling(self.name, tuple(self.factors), np.array([*self.factors.values()]), *numbers)
 
-    def point_spring(self) -> PointSpring:
-        """Return it as a spring between two points."""
+    def part(self) -> PointSpring | JointCoupling:
+        """Return it as a spring between two points, or as a coupling of joints."""
+        if not self.ends:
+            return self.coupling()
         (a, at_a), (b, at_b) = self.ends
         return PointSpring(self.name, a, at_a, b, at_b, self.stiffness, self.rest_length, self.damping)
 
@@ -240,12 +242,12 @@ class Transmissions:
             self._classes[inner] = replace(self._classes[name], parent=self._classes[name])
             self._collect(child, inner)
 
-    def _acting(self, element: Element, label: str, kind: str, number: int) -> _Acting:
-        return _Acting(label, reserved(element.attributes.get("name") or f"{kind}{number}", self._names))
+    def _acting(self, element: Element, label: str, kind: str, number: int) -> Acting:
+        return Acting(label, reserved(element.attributes.get("name") or f"{kind}{number}", self._names))
 
     # Tendons
 
-    def _tendon(self, element: Element, label: str, number: int) -> _Acting:
+    def _tendon(self, element: Element, label: str, number: int) -> Acting:
         read, item = self._read, f"tendon {label}"
         full = replace(self._scene.defaults.filled(replace(element, tag="tendon"), None), tag=element.tag)
         out = self._acting(element, label, "tendon", number)
@@ -274,7 +276,7 @@ class Transmissions:
         out.left_out += [f"{n} {own[n]}" for n, on in _TENDON_LIMITS.items() if n in own and own.get(on) != "false"]
         return out
 
-    def _hold(self, out: _Acting, element: Element, item: str, c: _Numbers, k: _Numbers, *rest: float) -> None:
+    def _hold(self, out: Acting, element: Element, item: str, c: _Numbers, k: _Numbers, *rest: float) -> None:
         """Give a tendon or actuator its damper and spring, by functions where they are not linear, or keep a fault."""
         line, held = bool(out.factors or out.ends), bool(out.factors or out.path)
         k, c = (_NONE if flag in self._disabled else x for x, flag in ((k, "spring"), (c, "damper")))
@@ -305,7 +307,7 @@ class Transmissions:
 
     # Actuators
 
-    def _actuator(self, element: Element, label: str, number: int) -> _Acting:
+    def _actuator(self, element: Element, label: str, number: int) -> Acting:
         item = f"actuator {label}"
         class_ = self._scene.defaults.known(element.attributes.get("class"), element) or "main"
         settings = self._classes.get(class_, _Actuator()).with_element(element, item, self._read)
@@ -323,7 +325,7 @@ class Transmissions:
         at = out.coupling().length if out.factors else element.attributes.get("tendon", "no sum of coordinates")
         out.control = f"{label} ({element.tag}, {gain}{f', range{limits}' if limits else ''}) on {at}"
         if "actuation" not in self._disabled and group not in self._groups:
-            servo = _Acting(out.item, out.name, out.factors)
+            servo = Acting(out.item, out.name, out.factors)
             _add_bias(settings, servo)
             servo.linear()
             if servo.acts or servo.left_out:
@@ -335,24 +337,24 @@ class Transmissions:
                 out.left_out += servo.left_out
         return out
 
-    def _driven(self, element: Element, item: str) -> _Acting:
+    def _driven(self, element: Element, item: str) -> Acting:
         """Return what has the length before the gear."""
         own = element.attributes
         name, tendon = own.get("jointinparent", own.get("joint", "")), own.get("tendon")
         # The last one wins in MuJoCo, in this order: joint, tendon, and what is no coordinate.
         if any(x in own for x in ("cranksite", "site", "body")):
-            return _Acting(item, "")
+            return Acting(item, "")
         if tendon is not None and tendon not in self._known:
             self._read.fault(f"{item}: tendon {tendon!r} is not in the file", element)
         if name and name not in self._joints:
             self._read.fault(f"{item}: joint {name!r} is not in the file", element)
-        out = _Acting(item, name, {name: 1.0} if name in self._joints and self._joints[name].scalar else {})
+        out = Acting(item, name, {name: 1.0} if name in self._joints and self._joints[name].scalar else {})
         return out if tendon is None else self._known.get(tendon, out)
 
     # Their effect on the model
 
     @property
-    def functions(self) -> list[_Acting]:
+    def functions(self) -> list[Acting]:
         """Tendons and actuators that act by functions, or have a rest length to be measured."""
         return [x for x in (*self._tendons, *self._actuators) if x.band or x.damper or x.measured]
 
@@ -391,15 +393,14 @@ class Transmissions:
     def applied(self, model: Model) -> Model:
         """Return the model with these springs, dampers and rotors, and with notes on them and on parts left out."""
         acting = [x for x in (*self._tendons, *self._actuators) if x.acts]
-        springs = tuple(x.point_spring() for x in acting if x.ends)
-        out = with_couplings(replace(model, springs=springs), [x.coupling() for x in acting if not x.ends])
+        out = with_parts(model, [x.part() for x in acting])
         ratios = []
         for x in acting:
             if x.dampratio:
                 # Relative to the critical damping of the inertia that the actuator moves in the pose of the file.
                 damping = 2 * x.dampratio * float(np.sqrt(x.stiffness * self._reflected(out, x.coupling())))
                 ratios.append(replace(x.coupling(), stiffness=0.0, armature=0.0, damping=damping))
-        out = with_couplings(out, ratios)
+        out = with_parts(out, ratios)
         notes = [*model.notes, *self._notes()]
         if branched := ", ".join(repr(c.name) for c in out.couplings if c.armature and out.branched(c)):
             notes.append(f"the armature of {branched} acts between branches; MuJoCo 4.0 leaves it out of M there")
@@ -453,7 +454,7 @@ class Transmissions:
             yield f"controls of actuators were left out, give their forces as tau: {controls}"
 
 
-def _length(x: _Acting, model: Model, m: Any, q: Any) -> Any:
+def _length(x: Acting, model: Model, m: Any, q: Any) -> Any:
     """Return the length of a tendon or an actuator, in the arithmetic of `m`."""
     total = sum(factor * q[model.layout.q[name].start] for name, factor in x.factors.items())
     # Joints that move all points along leave distances as they are.
@@ -474,17 +475,17 @@ def _length(x: _Acting, model: Model, m: Any, q: Any) -> Any:
     return total
 
 
-def with_couplings(model: Model, couplings: Iterable[JointCoupling]) -> Model:
-    """Return the model with more couplings; one of a single joint becomes numbers of that joint.
+def with_parts(model: Model, parts: Sequence[PointSpring | JointCoupling | GravityCompensation]) -> Model:
+    """Return the model with more parts; a coupling of a single joint becomes numbers of that joint.
 
     Dampings of couplings of one name add. Two springs on one joint become one; a constant energy is left out.
     """
     joints: dict[str, Joint] = {j.name: j for j in model.joints}
-    kept = {c.name: c for c in model.couplings}
-    for c in couplings:
+    couplings = {c.name: c for c in model.couplings}
+    for c in (x for x in parts if isinstance(x, JointCoupling)):
         if len(c.joints) > 1:
-            there = kept.get(c.name)
-            kept[c.name] = c if there is None else replace(there, damping=there.damping + c.damping)
+            known = couplings.get(c.name)
+            couplings[c.name] = c if known is None else replace(known, damping=known.damping + c.damping)
             continue
         joint, factor = joints[c.joints[0]], float(c.factors[0])
         stiffness = joint.stiffness + factor**2 * c.stiffness
@@ -496,10 +497,16 @@ def with_couplings(model: Model, couplings: Iterable[JointCoupling]) -> Model:
             damping=joint.damping + factor**2 * c.damping,
             armature=joint.armature + factor**2 * c.armature,
         )
-    return replace(model, joints=tuple(joints.values()), couplings=tuple(kept.values()))
+    return replace(
+        model,
+        joints=tuple(joints.values()),
+        couplings=tuple(couplings.values()),
+        springs=(*model.springs, *(x for x in parts if isinstance(x, PointSpring))),
+        forces=(*model.forces, *(x for x in parts if isinstance(x, GravityCompensation))),
+    )
 
 
-def _add_bias(settings: _Actuator, out: _Acting) -> None:
+def _add_bias(settings: _Actuator, out: Acting) -> None:
     """Add an actuator's force at zero control and activation."""
     for what, (low, high) in (
         (what, settings.numbers[f"{what}range"] or (0.0, 0.0)) for what in ("ctrl", "pos", "force")

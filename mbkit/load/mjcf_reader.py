@@ -28,6 +28,7 @@ from mbkit.load.mjcf_attributes import (
     Compiler,
     Defaults,
     Pose,
+    about,
     from_euler,
     has_length,
     mesh_name,
@@ -39,7 +40,8 @@ from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.load.xml_reader import MAX_ELEMENTS, Element, Reader, reserved, unused
 from mbkit.model.validation import listing
 
-KINDS: Final = {"hinge": "revolute", "slide": "prismatic", "ball": "ball", "free": "free"}
+#: MuJoCo's types of joints, in the order of its `mjtJoint`, and the kinds of joints here.
+KINDS: Final = {"free": "free", "ball": "ball", "slide": "prismatic", "hinge": "revolute"}
 _JOINTS: Final = ("joint", "freejoint")
 _NAMED: Final = {"body": "body", "joint": "joint", "freejoint": "joint", "site": "site"}
 # MuJoCo 4.0.0 counts geoms above this mass, in kg.
@@ -53,8 +55,8 @@ class MjcfJoint:
     name: str
     element: Element  # with the defaults of its class
     kind: str  # hinge, slide, ball or free
-    anchor: Array
-    axis: Array
+    anchor: Array = field(default_factory=lambda: np.zeros(3))
+    axis: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     ref: float = 0.0  # its coordinate in the pose of the file, rad or m
     rest: float = 0.0  # its coordinate where its spring rests, rad or m
 
@@ -62,6 +64,12 @@ class MjcfJoint:
     def scalar(self) -> bool:
         """Whether it has one coordinate."""
         return self.kind in ("hinge", "slide")
+
+    def at_zero(self, R: Array, p: Array, axis: Array) -> tuple[Array, Array]:
+        """Return its frame at q = 0, where R, p is the one at q = ``ref``, the pose of the file."""
+        if not self.ref:
+            return R, p
+        return (product(R, about(axis, -self.ref)), p) if self.kind == "hinge" else (R, p - product(R, self.ref * axis))
 
 
 @dataclass
@@ -73,13 +81,30 @@ class MjcfBody:
     pose: Pose  # in the parent's axes, with the <frame> elements around it
     joints: list[MjcfJoint]
     mass_properties: MassProperties  # in its own axes; nothing while `Scene.inferred` has the body
-    sites: list[tuple[str, Pose]]
+    sites: list[tuple[str, Pose]] = field(default_factory=list)
     gravcomp: float = 0.0  # share of its weight that is held
 
     @property
     def anchor(self) -> Array:
         """Origin of the `Model`'s body in the file's body."""
         return self.joints[-1].anchor if self.joints else np.zeros(3)
+
+    def chain(
+        self, anchor: Array, unused: Callable[[str, str], str]
+    ) -> Iterator[tuple[MjcfJoint | None, str, str, Array, Array]]:
+        """Yield each joint with its parent, its child and its frame; None is a fixed joint.
+
+        Massless bodies stand between joints. `anchor` is that of the parent.
+        """
+        R, p, parent, before = self.pose.R, self.pose.p - anchor, self.parent, np.zeros(3)
+        if not self.joints:
+            yield None, parent, self.name, R, p
+        for joint in self.joints:
+            child = self.name if joint is self.joints[-1] else unused("body", f"{self.name}_{joint.name}")
+            # The coordinates of a free joint are the pose in the world.
+            R, p = (np.eye(3), np.zeros(3)) if joint.kind == "free" else (R, p + product(R, joint.anchor - before))
+            yield joint, parent, child, R, p
+            R, p, parent, before = np.eye(3), np.zeros(3), child, joint.anchor
 
 
 @dataclass
@@ -587,7 +612,7 @@ def _read_body(element: Element, parent: str, X: Pose, childclass: str | None, s
         mass_properties = (mass_properties or NOTHING).moved(back.R, back.p)
         scene.aligned.append(name)
     gravcomp = read.number(element, "gravcomp", item, 0.0)
-    body = MjcfBody(name, parent, X @ own, joints, mass_properties or NOTHING, [], gravcomp)
+    body = MjcfBody(name, parent, X @ own, joints, mass_properties or NOTHING, gravcomp=gravcomp)
     scene.bodies.append(body)
     _read_children(parts, name, item, body.sites, scene)
 
@@ -631,7 +656,7 @@ def _joint(element: Element, body: str, X: Pose, childclass: str | None, scene: 
     type_ = "free" if free else full.attributes.get("type", "hinge")
     if type_ not in KINDS:
         read.fault(f"{item}: type {type_[:40]!r}; expected one of {', '.join(KINDS)}", element)
-    joint = MjcfJoint(name, full, type_ if type_ in KINDS else "hinge", np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    joint = MjcfJoint(name, full, type_ if type_ in KINDS else "hinge")
     if joint.kind != "free":
         joint.anchor = X.p + product(X.R, np.array(read.numbers(full, "pos", item, count=3, default=(0, 0, 0))))
     if joint.scalar:

@@ -15,23 +15,27 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from mbkit import spatial
 from mbkit._check import Array, by_key
+from mbkit._reproducible import turned
 from mbkit.engines.imported import Beside, Imported, Parts, checked
 from mbkit.engines.mujoco.constraints import matrix_of
 from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import INERTIA, full_mass_matrix, heard_warnings, mapped
 from mbkit.errors import UnsupportedError
 from mbkit.load.mjcf import JOINT_NUMBERS
-from mbkit.load.mjcf_couplings import with_couplings
+from mbkit.load.mjcf_attributes import Pose
+from mbkit.load.mjcf_couplings import Acting, with_parts
 from mbkit.load.mjcf_equalities import coupled
+from mbkit.load.mjcf_reader import KINDS, MjcfBody, MjcfJoint
+from mbkit.load.shapes import MassProperties
 from mbkit.load.urdf_reader import BASE_JOINT
+from mbkit.load.xml_reader import Element
 from mbkit.model import Coupler, GravityCompensation, Joint, JointCoupling, Loop, Model, PointSpring
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.joint_types import kind_of
 from mbkit.model.validation import listing
 
-_KINDS: Final = {0: "free", 1: "ball", 2: "prismatic", 3: "revolute"}
+_TYPES, _KINDS = tuple(KINDS), tuple(KINDS.values())
 #: Flags that change no smooth term, and may take long or leave a part of the tree out.
 _OFF: Final = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT)
 _ASLEEP: Final = int(mujoco.mjtEnableBit.mjENBL_SLEEP)
@@ -236,22 +240,19 @@ class _Description:
         self.numbers: dict[str, int] = {}
         for i in range(1, m.nbody):
             self._body(i)
+        #: Their names, in MuJoCo's order.
+        self.joints = [*self.numbers]
         self._tree = self._parts.model("mujoco", np.zeros(3) if self._off("GRAVITY") else np.array(m.opt.gravity))
         #: By key of `Beside`: the descriptions of tendons, actuators and gravity compensation.
         self.parts: dict[str, PointSpring | JointCoupling | GravityCompensation] = {
-            **dict(self._point_springs()),
-            **dict(self._couplings()),
+            **{key: x.part() for key, x in self._acting() if x.acts and (x.factors or x.ends)},
             **dict(self._held()),
         }
         self.model = self.without("")
 
     def without(self, key: str) -> Model:
         """Return the description less what it has of one tendon, actuator, or held body."""
-        kept = [part for name, part in self.parts.items() if name != key]
-        springs = tuple(x for x in kept if isinstance(x, PointSpring))
-        held = tuple(x for x in kept if isinstance(x, GravityCompensation))
-        tree = replace(self._tree, springs=springs, forces=held)
-        return with_couplings(tree, [x for x in kept if isinstance(x, JointCoupling)])
+        return with_parts(self._tree, [part for name, part in self.parts.items() if name != key])
 
     def constraints(self) -> tuple[Loop | Coupler, ...]:
         """Return the active equalities of bodies and sites, in the bodies' axes, and those of joints and tendons."""
@@ -276,14 +277,16 @@ class _Description:
         return Loop(m.eq(i).name, kind, *a, *b)
 
     def _coupler(self, i: int) -> Coupler | None:
-        m, names = self.m, {j: name for name, j in self.numbers.items()}
+        m = self.m
         refs = {name: float(m.qpos0[m.jnt_qposadr[j]]) for name, j in self.numbers.items()}
-        kinds = {int(mujoco.mjtEq.mjEQ_JOINT): lambda j: {j: 1.0}, int(mujoco.mjtEq.mjEQ_TENDON): self._row}
+        kinds = {
+            int(mujoco.mjtEq.mjEQ_JOINT): lambda j: {self.joints[j]: 1.0},
+            int(mujoco.mjtEq.mjEQ_TENDON): self._factors,
+        }
         of = kinds.get(int(m.eq_type[i]))
         if of is None:
             return None
-        rows = [of(k) for k in (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])) if k >= 0]
-        sides = [{names[j]: x for j, x in row.items() if x} for row in rows]
+        sides = [of(k) for k in (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])) if k >= 0]
         held = coupled(sides, m.eq_data[i][:5].tolist(), refs) if all(sides) else ""
         if isinstance(held, str):
             return None
@@ -294,35 +297,38 @@ class _Description:
         return bool(self.m.opt.disableflags & int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{flag}")))
 
     def _body(self, i: int) -> None:
-        m, parts, name = self.m, self._parts, self.names[i]
-        first, count = int(m.body_jntadr[i]), int(m.body_jntnum[i])
-        kinds = [_KINDS[int(m.jnt_type[j])] for j in range(first, first + count)]
-        # A body's frame is its last joint's, so it stands where that is anchored.
-        last = np.array(m.jnt_pos[first + count - 1]) if count and kinds[-1] != "free" else np.zeros(3)
-        self.anchors.append(last)
-        parent, start = self.names[m.body_parentid[i]], self.anchors[m.body_parentid[i]]
-        R, p, before = matrix_of(m.body_quat[i]), np.array(m.body_pos[i]) - start, np.zeros(3)
-        if not count:
-            self._joint(parts.name("joint", f"{name}_fixed"), "fixed", parent, name, R, p, -1)
-        for k, kind in enumerate(kinds):
-            j, own = first + k, parts.name("joint", m.joint(first + k).name or f"{name}_joint{k or ''}")
-            child = name if k == count - 1 else parts.name("body", f"{name}_{own}")
-            if kind == "free":
-                # Its coordinates are the pose in the world, wherever it is drawn.
-                R, p = np.eye(3), np.zeros(3)
-            else:
-                p, before = p + R @ (m.jnt_pos[j] - before), np.array(m.jnt_pos[j])
-            self._joint(own, kind, parent, child, R, p, j)
-            if k < count - 1:
-                parts.body(child)
-            R, p, parent = np.eye(3), np.zeros(3), child
+        m, parts, name, parent = self.m, self._parts, self.names[i], int(self.m.body_parentid[i])
+        joints: list[MjcfJoint] = []
+        for k in range(int(m.body_jntnum[i])):
+            j = len(self.numbers)
+            own = parts.name("joint", m.joint(j).name or f"{name}_joint{k or ''}")
+            self.numbers[own] = j
+            joints.append(joint := MjcfJoint(own, Element("joint", {}, 0), _TYPES[int(m.jnt_type[j])]))
+            if joint.kind != "free":
+                joint.anchor = np.array(m.jnt_pos[j])
+            if joint.scalar:
+                joint.axis, joint.ref = np.array(m.jnt_axis[j]), float(m.qpos0[m.jnt_qposadr[j]])
         axes = matrix_of(m.body_iquat[i])
-        inertia = axes @ np.diag(m.body_inertia[i]) @ axes.T
-        parts.body(name, float(m.body_mass[i]), np.array(m.body_ipos[i]) - last, inertia)
+        matter = MassProperties(
+            float(m.body_mass[i]), np.array(m.body_ipos[i]), turned(axes, np.diag(m.body_inertia[i]))
+        )
+        body = MjcfBody(
+            name, self.names[parent], Pose(matrix_of(m.body_quat[i]), np.array(m.body_pos[i])), joints, matter
+        )
+        for one, above, child, R, p in body.chain(self.anchors[parent], parts.name):
+            if one is None:
+                parts.joint(parts.name("joint", f"{name}_fixed"), "fixed", above, child, R, p)
+                continue
+            self._joint(one, above, child, R, p)
+            if child != name:
+                parts.body(child)
+        self.anchors.append(body.anchor)
+        parts.body(name, matter.mass, matter.com - body.anchor, matter.inertia)
 
-    def _joint(self, name: str, kind: str, parent: str, child: str, R: Array, p: Array, j: int) -> None:
-        m, nv = self.m, kind_of(kind).nv
-        v = slice(int(m.jnt_dofadr[j]), int(m.jnt_dofadr[j]) + nv) if j >= 0 else slice(0, 0)
+    def _joint(self, joint: MjcfJoint, parent: str, child: str, R: Array, p: Array) -> None:
+        m, name, kind, j = self.m, joint.name, KINDS[joint.kind], self.numbers[joint.name]
+        nv = kind_of(kind).nv
+        v = slice(int(m.jnt_dofadr[j]), int(m.jnt_dofadr[j]) + nv)
         effects = ["T", *["jump"] * kind_of(kind).coordinate_velocities, *["loss"] * (not self._off("DAMPER"))]
         fields = [x for effect in effects for x in Joint.adding_to(effect)]
         numbers: dict[str, Any] = {x: np.array(getattr(m, f"dof_{JOINT_NUMBERS[x]}")[v]) for x in fields}
@@ -334,13 +340,8 @@ class _Description:
                 f"model has no such body to compare. Set the {words} to 0; mbkit check compares the engines with it"
             )
         if nv == 1:
-            axis, ref = np.array(m.jnt_axis[j]), float(m.qpos0[m.jnt_qposadr[j]])
-            numbers["axes"] = axis[None, :]
-            # At q = ref the body is where it is drawn.
-            if ref and kind == "revolute":
-                R = R @ spatial.matrix_from_quaternion(spatial.exp_quaternion(-ref * axis))
-            elif ref:
-                p = p - R @ (ref * axis)
+            numbers["axes"] = joint.axis[None, :]
+            R, p = joint.at_zero(R, p, joint.axis)
             if m.jnt_limited[j]:
                 numbers["lower"], numbers["upper"] = np.split(np.array(m.jnt_range[j]), 2)
             elif kind == "revolute":
@@ -350,8 +351,6 @@ class _Description:
             stiffness = float(np.ravel(m.jnt_stiffness[j])[0])
             if stiffness and not self._off("SPRING"):
                 numbers["stiffness"], numbers["rest"] = np.array([stiffness]), m.qpos_spring[[m.jnt_qposadr[j]]]
-        if nv:
-            self.numbers[name] = j
         self._parts.joint(name, kind, parent, child, R, p, **numbers)
 
     def _spring(self, t: int) -> tuple[float, float, float]:
@@ -361,34 +360,19 @@ class _Description:
         damping = float(np.ravel(m.tendon_damping[t])[0]) * (not self._off("DAMPER"))
         return max(stiffness, 0.0), low, max(damping, 0.0)
 
-    def _path(self, t: int) -> tuple[set[int], slice]:
-        """Return the types of the parts that a tendon is wrapped on, and where they stand."""
+    def _wraps(self, t: int) -> tuple[set[int], slice]:
+        """Return the types of the parts that a tendon is wrapped on, and their place in the model's tables."""
         wraps = slice(int(self.m.tendon_adr[t]), int(self.m.tendon_adr[t]) + int(self.m.tendon_num[t]))
         return set(self.m.wrap_type[wraps].tolist()), wraps
 
-    def _row(self, t: int) -> dict[int, float]:
+    def _factors(self, t: int) -> dict[str, float]:
         """Return the factors of a tendon's length by joint; nothing where it is no sum of coordinates."""
-        types, wraps = self._path(t)
-        row: dict[int, float] = {}
+        types, wraps = self._wraps(t)
+        out: dict[str, float] = {}
         if types <= {int(mujoco.mjtWrap.mjWRAP_JOINT)}:
             for j, factor in zip(self.m.wrap_objid[wraps].tolist(), self.m.wrap_prm[wraps].tolist(), strict=True):
-                row[j] = row.get(j, 0.0) + factor
-        return row
-
-    def _point_springs(self) -> Iterator[tuple[str, PointSpring]]:
-        """Yield the tendons that are springs between two sites, with their keys."""
-        m = self.m
-        for t in range(m.ntendon):
-            types, wraps = self._path(t)
-            if types == {int(mujoco.mjtWrap.mjWRAP_SITE)} and m.tendon_num[t] == 2:
-                sites = m.wrap_objid[wraps]
-                a, b = m.site_bodyid[sites].tolist()
-                at_a, at_b = (m.site_pos[k] - self.anchors[i] for i, k in zip((a, b), sites, strict=True))
-                stiffness, rest, damping = self._spring(t)
-                if a != b and (stiffness or damping):
-                    name = m.tendon(t).name or f"tendon{t + 1}"
-                    ends = self.names[a], at_a, self.names[b], at_b
-                    yield f"tendon {t}", PointSpring(name, *ends, stiffness, rest, damping)
+                out[self.joints[j]] = out.get(self.joints[j], 0.0) + factor
+        return {name: x for name, x in out.items() if x}
 
     def _held(self) -> Iterator[tuple[str, GravityCompensation]]:
         """Yield gravity compensation; actuators hold their part where they act."""
@@ -402,35 +386,35 @@ class _Description:
             without = tuple(x for x in names if x in moving)
             yield f"body {b}", GravityCompensation(self.names[b], float(m.body_gravcomp[b]), without)
 
-    def _couplings(self) -> Iterator[tuple[str, JointCoupling]]:
-        """Yield what tendons and actuators do as springs, dampers and rotors on sums of joint coordinates."""
+    def _acting(self) -> Iterator[tuple[str, Acting]]:
+        """Yield the springs, dampers and rotors of tendons and actuators, with their keys."""
         m = self.m
-        names = {j: name for name, j in self.numbers.items()}
-
-        def coupling(
-            key: str, name: str, row: dict[int, float], *numbers: float
-        ) -> Iterator[tuple[str, JointCoupling]]:
-            name, row = self._parts.name("coupling", name), {j: x for j, x in row.items() if x}
-            if row and (numbers[0] or any(numbers[2:])):
-                yield key, JointCoupling(name, tuple(names[j] for j in row), np.array([*row.values()]), *numbers)
-
-        tendons: dict[int, dict[int, float]] = {}
+        tendons: dict[int, dict[str, float]] = {}
         for t in range(m.ntendon):
-            if self._path(t)[0] <= {int(mujoco.mjtWrap.mjWRAP_JOINT)}:
-                row = tendons[t] = self._row(t)
-                name = m.tendon(t).name or f"tendon{t + 1}"
-                yield from coupling(f"tendon {t}", name, row, *self._spring(t), float(m.tendon_armature[t]))
+            types, wraps = self._wraps(t)
+            out = self._named("tendon", m.tendon(t).name, t, self._factors(t))
+            tendons[t] = out.factors
+            if types == {int(mujoco.mjtWrap.mjWRAP_SITE)}:
+                sites = [(int(m.site_bodyid[k]), m.site_pos[k]) for k in m.wrap_objid[wraps]]
+                out.path = ((1.0, tuple((self.names[b], p - self.anchors[b]) for b, p in sites)),)
+            out.stiffness, out.rest_length, out.damping = self._spring(t)
+            out.armature = float(m.tendon_armature[t]) if out.factors else 0.0
+            yield f"tendon {t}", out
         of_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
         for i in range(len(m.actuator_trntype)):
-            target, row = int(m.actuator_trnid[i, 0]), {}
+            target, driven = int(m.actuator_trnid[i, 0]), dict[str, float]()
             if int(m.actuator_trntype[i]) in of_joint and _KINDS[int(m.jnt_type[target])] in ("prismatic", "revolute"):
-                row = {target: 1.0}
+                driven = {self.joints[target]: 1.0}
             elif m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON:
-                row = tendons.get(target, {})
-            row = {j: float(m.actuator_gear[i, 0]) * x for j, x in row.items()}
+                driven = tendons.get(target, {})
+            gear = float(m.actuator_gear[i, 0])
+            out = self._named("actuator", m.actuator(i).name, i, {j: gear * x for j, x in driven.items() if gear * x})
             affine = m.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE and not self._off("ACTUATION")
             b0, b1, b2 = m.actuator_biasprm[i, :3].tolist() if affine else (0.0, 0.0, 0.0)
             damping = float(np.ravel(m.actuator_damping[i])[0]) * (not self._off("DAMPER")) - min(b2, 0.0)
-            spring = max(-b1, 0.0), -b0 / b1 if b1 else 0.0, max(damping, 0.0)
-            name = m.actuator(i).name or f"actuator{i + 1}"
-            yield from coupling(f"actuator {i}", name, row, *spring, float(m.actuator_armature[i]))
+            out.stiffness, out.rest_length, out.damping = max(-b1, 0.0), -b0 / b1 if b1 else 0.0, max(damping, 0.0)
+            out.armature = float(m.actuator_armature[i])
+            yield f"actuator {i}", out
+
+    def _named(self, what: str, name: str, number: int, factors: dict[str, float]) -> Acting:
+        return Acting("", self._parts.name("coupling", name or f"{what}{number + 1}"), factors)

@@ -18,16 +18,12 @@ from mbkit.engines.mujoco.engine import MujocoDynamics
 from mbkit.engines.mujoco.model import INERTIA, MUJOCO, OF_COUPLING, Placed, by_mbkit, heard_warnings, mapped, specified
 from mbkit.errors import MbkitError, UnsupportedError
 from mbkit.load.mjcf import JOINT_NUMBERS
+from mbkit.load.mjcf_reader import KINDS
 from mbkit.model import Joint, Model
 from mbkit.model.elements.kinds import EFFECTS
 from mbkit.model.elements.paths import Path
 
-_TYPES: Final = {
-    int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
-    int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
-    int(mujoco.mjtJoint.mjJNT_BALL): "ball",
-    int(mujoco.mjtJoint.mjJNT_FREE): "free",
-}
+_TYPES: Final = tuple(KINDS)
 # MuJoCo refuses principal moments below 1e-15 kg m².
 _LEAST: Final = 2e-15
 
