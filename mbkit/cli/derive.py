@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from mbkit.lagrangian.system import Lagrangian
     from mbkit.model import Model
 
-_TEXT_WIDTH: Final = 100
 _C_FOLDER: Final = "mbkit-export"
 
 
@@ -186,7 +185,7 @@ def _text(
     summary = SystemSummary(lag, names=names, progress=lambda x, text: bar(0.1 + 0.9 * x, text), note=note)
     if as_json:
         return json_text(json.dumps(summary.data(), indent=1, ensure_ascii=False)), ".json"
-    return (summary.latex(), ".tex") if form == "latex" else (summary.text(_TEXT_WIDTH), ".txt")
+    return (summary.latex(), ".tex") if form == "latex" else (summary.text(), ".txt")
 
 
 # As C.

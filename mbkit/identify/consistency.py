@@ -31,8 +31,6 @@ PRIORS: Final = (ENTROPIC, EUCLIDEAN)
 _MIN_EIGENVALUE: Final = 1e-6
 #: Least extent of a body, relative to its largest, so that L exists.
 _POINT_EXTENT_RATIO: Final = 1e-6
-#: Noise below this part of the torque is rounding to the solver.
-NEGLIGIBLE: Final = 1e-6
 _SIZE: Final = len(STANDARD)
 
 

@@ -24,8 +24,8 @@ SINGULAR_VALUE_RATIO: Final = 1e-8
 #: Entries below this part of a direction's largest one are rounding.
 _DIRECTION_ENTRY_RATIO: Final = 1e-6
 _MAX_REWEIGHTINGS: Final = 10
-#: Part of the largest noise that the others are weighed with at least; a torque may be exact, or always zero.
-_LEAST: Final = 1e-6
+#: Least noise, relative to the largest noise or torque; a torque may be exact, or always zero.
+MIN_NOISE_RATIO: Final = 1e-6
 #: Change of variances between two rounds at which they are taken as settled.
 _VARIANCE_CHANGE: Final = 1e-3
 _EPS: Final = float(np.finfo(float).eps)
@@ -95,7 +95,7 @@ def stacked(given: Sequence[Equations], noise: Array) -> Array:
 def _weighing(noise: Array, given: Sequence[Equations]) -> Array:
     """Return the noise that weighs: no less than rounding, nor so small that the other equations would not count."""
     rounding = _EPS * (max((x.size for x in given), default=0.0) or 1.0)
-    return np.maximum(noise, max(rounding, _LEAST * float(noise.max(initial=0.0))))
+    return np.maximum(noise, max(rounding, MIN_NOISE_RATIO * float(noise.max(initial=0.0))))
 
 
 class _Solution:

@@ -15,11 +15,10 @@ from mbkit.model.validation import check_substituted, suspects
 from mbkit.studies.document import Block, Bullet, Column, Document, Items, Section, Table
 from mbkit.studies.results import ResultTable, columns_of
 
-_SIZE: Final = len(STANDARD)
 #: Velocities whose residuals are printed.
 _MAX_PRINTED_RESIDUALS: Final = 8
-#: Standard deviations below a bound within which an estimate is the bound.
-_UNSURE: Final = 3.0
+#: Standard deviations that are no accident: an estimate beyond a bound by less is the bound.
+SIGNIFICANT_DEVIATIONS: Final = 3.0
 
 
 @dataclass(frozen=True)
@@ -170,7 +169,7 @@ class Identification(ResultTable):
         if standard_names(model) != self.standard_names:
             raise InputError(f"model: expected one with the bodies of {self.model_name}, got {model.name}")
         plain = model.with_parameters(**{name: x for name, x in model.parameters.items() if x is not None})
-        parts = np.reshape(self.standard, (-1, _SIZE))
+        parts = np.reshape(self.standard, (-1, len(STANDARD)))
         length = length_of(plain)
         bodies = {j.child: body_of(plain.body(j.child), x, length) for j, x in zip(plain.tree, parts, strict=True)}
         faults = [f"body {name!r}: no mass, but a moment or an inertia" for name, x in bodies.items() if x is None]
@@ -195,8 +194,9 @@ class Identification(ResultTable):
                     beside = getattr(joint, field) - model.per_velocity(field)[model.layout.v[joint.name]]
                     values = np.array([found[n].value for n in names]) + beside
                     # Rounding and noise of what is zero have any sign.
-                    unsure = [_UNSURE * found[n].deviation if found[n].determined else 0.0 for n in names]
-                    changes[field] = np.where((values < 0) & (values >= np.negative(unsure)), 0.0, values)
+                    deviations = np.array([found[n].deviation if found[n].determined else 0.0 for n in names])
+                    insignificant = (values < 0) & (values >= -SIGNIFICANT_DEVIATIONS * deviations)
+                    changes[field] = np.where(insignificant, 0.0, values)
             out.append(replace(joint, **changes) if changes else joint)
         return tuple(out)
 

@@ -13,11 +13,11 @@ from mbkit._check import Array, real, shown
 from mbkit._warn import warn
 from mbkit.engines.lagrangian import LagrangianDynamics
 from mbkit.errors import InputError, MbkitWarning
-from mbkit.identify.consistency import ENTROPIC, NEGLIGIBLE, PRIORS, consistent, nearest
-from mbkit.identify.least_squares import Fit, fit, stacked
+from mbkit.identify.consistency import ENTROPIC, PRIORS, consistent, nearest
+from mbkit.identify.least_squares import MIN_NOISE_RATIO, Fit, fit, stacked
 from mbkit.identify.measurements import REST_SPEED_RATIO, Equations, Measurements, Unknowns, equations
 from mbkit.identify.motion_noise import bias, motion_noise
-from mbkit.identify.result import Identification, IdentifiedParameter, Residual, Undetermined
+from mbkit.identify.result import SIGNIFICANT_DEVIATIONS, Identification, IdentifiedParameter, Residual, Undetermined
 from mbkit.model import Model
 from mbkit.model.base_parameters import BASE_PARAMETERS, POWERS, length_of, standard_names
 from mbkit.model.builder import expect_model
@@ -35,8 +35,6 @@ IDENTIFICATION: Final = replace(
         f"{f}, which depends on masses that are sought" for f in m.forces if type(f) is GravityCompensation
     ),
 )
-#: Standard deviations of bias from which on the user is warned.
-_BIASED = 3.0
 
 
 def identify(
@@ -156,7 +154,7 @@ def identify(
     off = _bias(model, unknowns, data, fitted, length, weights is not None)
     values = fitted.values
     if physical:
-        noise = np.maximum(fitted.noise, NEGLIGIBLE * (max(x.size for x in given) or 1.0))
+        noise = np.maximum(fitted.noise, MIN_NOISE_RATIO * (max(x.size for x in given) or 1.0))
         if weights is not None:
             noise = np.sqrt(np.mean(noise**2)) * np.ones(len(noise))
         values, standard = consistent(stacked(given, noise), unknowns, length, prior or ENTROPIC, prior_weight)
@@ -206,12 +204,13 @@ def _bias(model: Model, unknowns: Unknowns, data: Measurements, fitted: Fit, len
     out = bias(data, fitted.values, fitted.noise, solve)
     known = np.isfinite(fitted.deviations) & (fitted.deviations > 0)
     ratio = np.where(known, np.abs(out) / np.where(known, fitted.deviations, 1.0), 0.0)
-    if (many := int(np.sum(ratio > _BIASED))) > 0:
+    if (many := int(np.sum(ratio > SIGNIFICANT_DEVIATIONS))) > 0:
         worst, (v, a) = int(np.argmax(ratio)), motion_noise(data)
         warn(
             f"{model.name}: noise of the motion (up to {v.max():.2g} in v, {a.max():.2g} in a) biases {many} of "
-            f"{len(ratio)} estimates by more than {_BIASED:g} standard deviations, {unknowns.names[worst]} by "
-            f"{ratio[worst]:.3g}; filter the positions first: mbkit.identify.filtered_motion",
+            f"{len(ratio)} estimates by more than {SIGNIFICANT_DEVIATIONS:g} standard deviations, "
+            f"{unknowns.names[worst]} by {ratio[worst]:.3g}; filter the positions "
+            "first: mbkit.identify.filtered_motion",
             MbkitWarning,
         )
     return out

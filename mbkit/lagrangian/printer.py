@@ -21,8 +21,8 @@ from mbkit._escape import latex, one_line
 _FRACTIONS: Final = {(1, 2): "½", (1, 3): "⅓", (1, 4): "¼", (1, 6): "⅙", (1, 8): "⅛", (2, 3): "⅔", (3, 4): "¾"}
 _HIGH: Final = str.maketrans("0123456789-/", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ")
 _MASS: Final = re.compile(r"[mM](\d*|_\w+)")
-#: Denominators that are read as such; longer fractions are decimals.
-_MAX_DENOMINATOR: Final = 10_000
+#: Largest denominator of a fraction that is written as one; others are decimals.
+MAX_DENOMINATOR: Final = 10_000
 _INERTIA: Final = re.compile(r"[A-CIJ](\d*|_\w+)|EI")
 
 
@@ -330,7 +330,7 @@ def _compared(x: Any, board: ExpressionPrinter) -> str:
 
 
 def _number(x: sp.Expr) -> str:
-    if x.is_Rational and 1 < x.q <= _MAX_DENOMINATOR:
+    if x.is_Rational and 1 < x.q <= MAX_DENOMINATOR:
         return _FRACTIONS.get((int(x.p), int(x.q)), str(x))
     return str(x) if x.is_Integer or not x.is_Number else f"{float(x):.15g}"
 

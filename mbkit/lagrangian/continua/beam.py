@@ -11,13 +11,12 @@ import sympy as sp
 from mbkit._check import count as counted
 from mbkit.errors import InputError, UnsupportedError
 from mbkit.lagrangian.continua.continuum import Continuum
+from mbkit.lagrangian.continua.integrals import MAX_MODES
 from mbkit.lagrangian.energies.energy_form import vanish
 from mbkit.lagrangian.energies.symbols import PlainSymbols, expression, listed
 from mbkit.lagrangian.trig.simplify import tidy
 
 _ROOT_DIGITS: Final = 40
-#: Beyond so many modes, sines added to cosh λ are lost in 40 digits.
-_MAX_MODES: Final = 20
 
 
 def clamped_free(count: int, x: sp.Symbol, length: Any) -> tuple[sp.Expr, ...]:
@@ -38,8 +37,8 @@ def clamped_free(count: int, x: sp.Symbol, length: Any) -> tuple[sp.Expr, ...]:
     Young, Felgar 1949, Tables of characteristic functions representing normal modes of vibration of a beam.
     """
     count = counted("count", count, least=1)
-    if count > _MAX_MODES:
-        raise UnsupportedError(f"count: expected at most {_MAX_MODES} modes, got {count}; take Continuum.normal_modes")
+    if count > MAX_MODES:
+        raise UnsupportedError(f"count: expected at most {MAX_MODES} modes, got {count}; take Continuum.normal_modes")
     if not isinstance(x, sp.Symbol):
         raise InputError(f"x: expected a SymPy symbol, got {x!r}")
     place, out = x / _above_zero(expression("length", length)), []

@@ -13,16 +13,17 @@ from mpmath.calculus.quadrature import GaussLegendre
 
 from mbkit.errors import InputError, NumericalError
 from mbkit.lagrangian.energies.symbols import expression, plain
+from mbkit.lagrangian.printer import MAX_DENOMINATOR
 
 #: The place on a continuum, from 0 at one end to 1 at the other; all shapes depend on it.
 XI: Final = sp.Symbol("xi", real=True)
 INTEGRAL_DIGITS: Final = 50
+#: Modes that the digits of beams and of Ritz's matrices are enough for: sines added to cosh λ are lost in 40 digits.
+MAX_MODES: Final = 20
 #: Orders of two rules of Gauss and Legendre, of 48 and 96 nodes, whose results are compared.
 _ORDERS: Final = (5, 6)
 #: Two rules agree, and an integral is zero, up to this part of the integral of the absolute value.
 _INTEGRAL_ERROR_RATIO: Final = 1e-22
-#: Largest denominator of a number that is written as a quotient.
-_MAX_DENOMINATOR: Final = 10_000
 
 
 @lru_cache(8)
@@ -150,7 +151,7 @@ def _settled(parts: Sequence[Shape], totals: Sequence[Any], same: Any, size: Any
 def number(x: sp.Expr) -> sp.Expr:
     """Return a number as a short quotient where it is one, else with 20 digits."""
     x = sp.sympify(x)
-    if x.is_Rational and x.q <= _MAX_DENOMINATOR:
+    if x.is_Rational and x.q <= MAX_DENOMINATOR:
         return x
     near = sp.Rational(str(x.n(30))).limit_denominator(24)
     if near != 0 and abs(x - near) < _INTEGRAL_ERROR_RATIO * abs(near):

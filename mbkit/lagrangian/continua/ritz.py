@@ -16,7 +16,7 @@ from mbkit._check import Array, real
 from mbkit._check import count as counted
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.lagrangian.continua.densities import Densities
-from mbkit.lagrangian.continua.integrals import Integrals, weights_of
+from mbkit.lagrangian.continua.integrals import MAX_MODES, Integrals, weights_of
 from mbkit.lagrangian.continua.jets import Order
 from mbkit.lagrangian.continua.reduction import terms
 from mbkit.lagrangian.energies.symbols import name_of, plain
@@ -44,9 +44,7 @@ class NormalModes:
         return f"<NormalModes: {', '.join(f'{x:.6g}' for x in self.frequencies)} rad/s>"
 
 
-#: The digits below are enough for so many modes.
-_MAX_MODES: Final = 20
-#: Digits of Ritz's matrices: n powers cost 1.2 n of them. Shapes are written with fewer.
+#: Digits of Ritz's matrices, enough for `MAX_MODES`: n powers cost 1.2 n of them. Shapes are written with fewer.
 _MATRIX_DIGITS: Final = 200
 _SHAPE_DIGITS: Final = 60
 #: Monomials beside 2 n for n modes; so many more have to give the same frequencies, in so many refinements.
@@ -60,8 +58,8 @@ _RIGID_EIGENVALUE_RATIO: Final = 1e-12
 def normal_modes(system: Densities, count: int, values: Mapping[Any, float]) -> NormalModes:
     """Return what `Continuum.normal_modes` does."""
     count = counted("count", count, least=1)
-    if count > _MAX_MODES:
-        raise UnsupportedError(f"count: expected at most {_MAX_MODES} modes, got {count}")
+    if count > MAX_MODES:
+        raise UnsupportedError(f"count: expected at most {MAX_MODES} modes, got {count}")
     if not isinstance(values, Mapping):
         raise InputError(f"values: expected a mapping of parameters to numbers, got {values!r}")
     moved = _moved(system)

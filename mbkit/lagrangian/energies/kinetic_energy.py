@@ -13,13 +13,20 @@ import sympy as sp
 
 from mbkit._warn import warn
 from mbkit.errors import InputError, MbkitWarning
-from mbkit.lagrangian.trig.simplify import MAX_SIMPLIFIED_OPERATIONS, PROBE_DIGITS, RandomEvaluation, settled, tidy
+from mbkit.lagrangian.trig.simplify import (
+    MAX_SIMPLIFIED_OPERATIONS,
+    PROBE_DIGITS,
+    PROBE_PLACES,
+    ZERO_PROBE_RATIO,
+    RandomEvaluation,
+    settled,
+    tidy,
+    tidy_short,
+)
 
 #: Lines through the velocities, and places on each.
 _PROBE_LINES: Final = 4
 _STEPS: Final = (3, 1, -1, -3)
-#: A number computed with 30 digits is zero below this part of those that it is computed from.
-_ZERO_AT_30_DIGITS: Final = 1e-20
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,7 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
     """Return whether an expression is of second degree at most: along random lines its third differences are zero."""
     probe = RandomEvaluation([x], velocities)
     with mpmath.workdps(PROBE_DIGITS):
-        for seed in range(_PROBE_LINES):
+        for seed in range(PROBE_PLACES):
             start, way = probe.place(2 * seed), probe.place(2 * seed + 1)
             # Through velocities of both signs, where what has a kink shows it.
             places = ({c: y / 3 + s * way[c] if c in velocities else y for c, y in start.items()} for s in _STEPS)
@@ -83,14 +90,13 @@ def _quadratic(x: sp.Expr, velocities: Sequence[sp.Symbol]) -> bool:
             if len(values) < len(_STEPS):
                 continue
             third = sum(k * value for k, value in zip((1, -3, 3, -1), values, strict=True))
-            if abs(third) > _ZERO_AT_30_DIGITS * max(abs(value) for value in values):
+            if abs(third) > ZERO_PROBE_RATIO * max(abs(value) for value in values):
                 return False
     return True
 
 
 # The test that every motion has kinetic energy, or is bound by a constraint.
 
-_PROBE_PLACES: Final = 3
 #: An eigenvalue is zero, and not negative, within this part of the largest one.
 _ZERO_EIGENVALUE_RATIO: Final = 1e-12
 #: Coordinates at every other place are nearer to zero by this factor.
@@ -111,7 +117,7 @@ def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: s
         names = ", ".join(w.name for w in idle)
         raise InputError(f"T: the mass matrix is singular everywhere: no kinetic energy has {names}{bound}")
     probe = RandomEvaluation([*M, *J])
-    for seed in range(_PROBE_PLACES):
+    for seed in range(PROBE_PLACES):
         values = probe(probe.place(seed))
         if values is None:
             # No judgement where it has no value.
@@ -127,7 +133,7 @@ def require_inertia(M: sp.ImmutableMatrix, velocities: Sequence[sp.Symbol], J: s
                 scale = mpmath.diag([1 / mpmath.sqrt(x) for x in rows])
                 scaled = scale * A * scale
                 sizes = (mpmath.norm(scaled[i, :]) for i in range(n))
-                if abs(mpmath.det(scaled)) > _ZERO_AT_30_DIGITS * mpmath.fprod(sizes):
+                if abs(mpmath.det(scaled)) > ZERO_PROBE_RATIO * mpmath.fprod(sizes):
                     return
     matrix = f" {M.tolist()}" if len(str(M)) <= _MAX_MESSAGE_LENGTH else ""
     raise InputError(
@@ -154,7 +160,7 @@ def warn_of_negative(
     if None in held.values():
         return
     probe, n, way = RandomEvaluation([*M]), len(velocities), None
-    for seed in range(2 * _PROBE_PLACES):
+    for seed in range(2 * PROBE_PLACES):
         # Small deflections too: what holds for these alone, as of beams, may be negative far away.
         near = {s: x * _NEAR_ZERO_FACTOR ** (seed % 2) for s, x in probe.place(seed).items()}
         found = probe({**near, **{s: mpmath.mpf(x) for s, x in held.items()}})
@@ -210,9 +216,6 @@ def blocks(A: sp.Matrix) -> list[list[int]]:
 # Completed squares are how books write H and effective potentials: (p_φ - p_ψ cos θ)² / (2 A sin² θ) + p_ψ² / (2 C),
 # where entries of M⁻¹ would be long. A pivot that is a product leaves the shortest quotients.
 
-#: Operations up to which a step of an elimination is tidied.
-_MAX_TIDIED_OPERATIONS: Final = 250
-
 
 def completed_squares(M: sp.ImmutableMatrix, what: str) -> _Eliminated | _Inverted:
     """Return the inverse of a symmetric matrix; InputError names a singular one."""
@@ -220,11 +223,6 @@ def completed_squares(M: sp.ImmutableMatrix, what: str) -> _Eliminated | _Invert
         return _Eliminated(M)
     except _NoPivotError:
         return _Inverted(M, what)
-
-
-def _shorter(x: sp.Expr) -> sp.Expr:
-    """Return an expression tidied; a long one as it is."""
-    return tidy(x) if x.count_ops() <= _MAX_TIDIED_OPERATIONS else x
 
 
 class _NoPivotError(Exception):
@@ -245,11 +243,11 @@ class _Eliminated:
                 raise _NoPivotError
             k = min(pivots, key=lambda i: (len(pivots[i].atoms(sp.Add)), pivots[i].count_ops()))
             left.remove(k)
-            factors = {i: _shorter(entries[i, k] / pivots[k]) for i in left if entries[i, k] != 0}
+            factors = {i: tidy_short(entries[i, k] / pivots[k]) for i in left if entries[i, k] != 0}
             for i, factor in factors.items():
                 for j in factors:
                     if j <= i:
-                        entries[i, j] = entries[j, i] = _shorter(entries[i, j] - factor * entries[j, k])
+                        entries[i, j] = entries[j, i] = tidy_short(entries[i, j] - factor * entries[j, k])
             self._steps.append((k, pivots[k], factors))
 
     def _lowered(self, x: Sequence[sp.Expr]) -> list[sp.Expr]:
@@ -257,7 +255,7 @@ class _Eliminated:
         out = list(x)
         for k, _, factors in self._steps:
             for i, factor in factors.items():
-                out[i] = _shorter(out[i] - factor * out[k])
+                out[i] = tidy_short(out[i] - factor * out[k])
         return out
 
     def form(self, x: Sequence[sp.Expr], y: Sequence[sp.Expr]) -> sp.Expr:

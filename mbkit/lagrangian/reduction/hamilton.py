@@ -36,10 +36,8 @@ from mbkit.lagrangian.energies.kinetic_energy import completed_squares
 from mbkit.lagrangian.energies.symbols import free_name, velocity_of
 from mbkit.lagrangian.energies.sympy_to_casadi import Numeric
 from mbkit.lagrangian.printer import ExpressionPrinter, Printable, aligned
-from mbkit.lagrangian.trig.simplify import is_zero, slope, tidy
+from mbkit.lagrangian.trig.simplify import is_zero, slope, tidy_short
 
-# Operations up to which a bracket is tidied.
-_MAX_TIDIED_OPERATIONS: Final = 100
 #: Meaning of h where it is not the energy.
 _JACOBI: Final = "Jacobi's integral T2 - T0 + V, not the energy T + V"
 
@@ -149,9 +147,7 @@ def bracket(f: Any, g: Any, coordinates: Sequence[sp.Symbol], momenta: Sequence[
 
 def shorter(x: sp.Expr) -> sp.Expr:
     """Return a short bracket tidied, and a long one as it is unless it is zero: nested ones grow fast."""
-    if is_zero(x):
-        return sp.Integer(0)
-    return tidy(x) if x.count_ops() <= _MAX_TIDIED_OPERATIONS else x
+    return sp.Integer(0) if is_zero(x) else tidy_short(x)
 
 
 @dataclass(frozen=True, repr=False)

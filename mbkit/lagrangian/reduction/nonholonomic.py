@@ -50,6 +50,8 @@ from mbkit.lagrangian.reduction.hamilton import ConservedQuantity, numbers_at
 from mbkit.lagrangian.reduction.quasi_equations import in_quasi_velocities, quasi_equations
 from mbkit.lagrangian.trig.simplify import (
     PROBE_DIGITS,
+    PROBE_PLACES,
+    ZERO_PROBE_RATIO,
     RandomEvaluation,
     is_zero,
     settled,
@@ -60,8 +62,6 @@ from mbkit.lagrangian.trig.simplify import (
 
 #: Choices of dependent velocities that are looked at.
 _MAX_CHOICES: Final = 200
-#: A singular value computed with 30 digits is zero below this part of the largest one.
-_ZERO_SINGULAR_VALUE_RATIO: Final = 1e-15
 
 
 @dataclass(frozen=True, repr=False)
@@ -494,7 +494,7 @@ def _rank(columns: Sequence[sp.Matrix]) -> int:
     whole = sp.Matrix.hstack(*columns)
     probe = RandomEvaluation([*whole])
     best = 0
-    for seed in range(3):
+    for seed in range(PROBE_PLACES):
         values = probe(probe.place(seed))
         if values is None:
             continue
@@ -504,7 +504,7 @@ def _rank(columns: Sequence[sp.Matrix]) -> int:
                 for j in range(whole.cols):
                     B[i, j] = values[i * whole.cols + j]
             sizes = [abs(x) for x in mpmath.svd_c(B, compute_uv=False)]
-            best = max(best, sum(x > _ZERO_SINGULAR_VALUE_RATIO * max(sizes) for x in sizes))
+            best = max(best, sum(x > ZERO_PROBE_RATIO * max(sizes) for x in sizes))
     return best
 
 

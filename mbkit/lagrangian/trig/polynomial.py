@@ -205,8 +205,8 @@ def _put(
 # generators with exponents of either sign. Such polynomials factor in one way only: whether one divides another is
 # computed term by term, modulo sin² + cos² = 1 and without a search.
 
-#: Terms of a quotient that is useful.
-_MAX_QUOTIENT_TERMS: Final = 400
+#: Terms of a sum or a quotient that can still be read.
+MAX_READABLE_TERMS: Final = 400
 
 #: Exponents of the z's and the generators -> a complex number of fractions.
 _Exponential = dict[tuple[int, ...], Any]
@@ -225,7 +225,7 @@ def quotient(above: TrigPolynomial, below: TrigPolynomial) -> TrigPolynomial | N
     while a:
         first = max(a)
         step = tuple(p - q for p, q in zip(first, lead, strict=True))
-        if any(not i <= e <= j for i, e, j in zip(low, step, high, strict=True)) or len(out) == _MAX_QUOTIENT_TERMS:
+        if any(not i <= e <= j for i, e, j in zip(low, step, high, strict=True)) or len(out) == MAX_READABLE_TERMS:
             return None
         out[step] = factor = a[first] / b[lead]
         for exponents, value in b.items():

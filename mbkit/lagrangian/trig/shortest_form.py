@@ -17,8 +17,8 @@ import sympy as sp
 
 from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing, gather
 
-#: Terms and angles up to which products of cosines and sines are looked for.
-_MAX_PRODUCT_TERMS: Final = 60
+#: Terms of a sum that is combined, and angles whose products of cosines and sines are looked for.
+MAX_COMBINED_TERMS: Final = 60
 _MAX_PRODUCT_ANGLES: Final = 4
 #: Terms up to which a sum is tried to be a product of sums.
 _MAX_FACTORED_TERMS: Final = 10
@@ -71,7 +71,7 @@ def _joined(forms: Iterable[Form]) -> Form:
 def _split_off(x: TrigPolynomial) -> list[int]:
     """Return the angles that powers are tried of; none of a large sum."""
     angles = [i for i in range(len(x.space.angles)) if any(key[1][i] for key in x.terms)]
-    return angles if len(angles) <= _MAX_PRODUCT_ANGLES and len(x.terms) <= _MAX_PRODUCT_TERMS else []
+    return angles if len(angles) <= _MAX_PRODUCT_ANGLES and len(x.terms) <= MAX_COMBINED_TERMS else []
 
 
 def _fewest_terms(x: TrigPolynomial) -> Form:

@@ -21,11 +21,13 @@ from sympy.core.function import AppliedUndef
 from sympy.functions.elementary.trigonometric import TrigonometricFunction
 
 from mbkit.errors import UnsupportedError
-from mbkit.lagrangian.trig.polynomial import Key, TrigPolynomial, TrigRing, quotient
-from mbkit.lagrangian.trig.shortest_form import complexity, shortest_form
+from mbkit.lagrangian.trig.polynomial import MAX_READABLE_TERMS, Key, TrigPolynomial, TrigRing, quotient
+from mbkit.lagrangian.trig.shortest_form import MAX_COMBINED_TERMS, complexity, shortest_form
 
 #: Operations up to which an expression is simplified.
 MAX_SIMPLIFIED_OPERATIONS: Final = 2000
+#: Operations up to which an intermediate result is tidied.
+_MAX_TIDIED_OPERATIONS: Final = 150
 # Roots of cosines: their factors often read better as they were.
 _ROOT_COMPLEXITY_RATIO: Final = 0.7
 
@@ -44,6 +46,11 @@ def tidy(x: sp.Expr) -> sp.Expr:
         (complexity(x) * (_ROOT_COMPLEXITY_RATIO if rooted else 1.0), x)
     ]
     return min(tried, key=lambda pair: pair[0])[1]
+
+
+def tidy_short(x: sp.Expr) -> sp.Expr:
+    """Return an expression tidied; a long one as it is."""
+    return tidy(x) if x.count_ops() <= _MAX_TIDIED_OPERATIONS else x
 
 
 #: Values of an angle on which an expression does not depend.
@@ -84,10 +91,6 @@ def tidy_matrix(x: Any) -> sp.ImmutableMatrix:
     return sp.ImmutableMatrix(x).applyfunc(tidy)
 
 
-#: Operations up to which the contents of brackets are tidied.
-_MAX_TIDIED_OPERATIONS: Final = 150
-
-
 def slope(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
     """Return ∂x/∂q, tidied; factors that all terms share stay in front.
 
@@ -125,7 +128,7 @@ def _product(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
         rate = _product(b, q) if b.is_Add else sp.diff(b, q)
         inside += e * rate * sp.Mul(*(other for i, (other, _) in enumerate(moving) if i != k))
     # A number would be multiplied into the sum.
-    number, rest = (tidy(inside) if inside.count_ops() <= _MAX_TIDIED_OPERATIONS else inside).primitive()
+    number, rest = tidy_short(inside).primitive()
     return shared * number * rest
 
 
@@ -134,9 +137,6 @@ def _product(x: sp.Expr, q: sp.Symbol) -> sp.Expr:
 #: Products of terms that one expression may cost: about half a second.
 _MAX_TERM_PRODUCTS: Final = 40_000
 _MAX_EXPONENT: Final = 12
-#: Terms of a readable sum, and up to which quotients are put over one denominator.
-_MAX_QUOTIENT_TERMS: Final = 300
-_MAX_SUBSTITUTED_TERMS: Final = 60
 
 #: Functions that are quotients of cosines and sines.
 _QUOTIENTS: Final[dict[Any, Callable[[sp.Expr], sp.Expr]]] = {
@@ -250,7 +250,7 @@ class _Reading:
     # Writing
 
     def _written(self, x: TrigPolynomial) -> sp.Expr:
-        if len(x.terms) > _MAX_QUOTIENT_TERMS:
+        if len(x.terms) > MAX_READABLE_TERMS:
             raise UnsupportedError(f"expression: {len(x.terms)} terms are more than anybody reads")
         return self._back(shortest_form(x, decimals=self._decimals))
 
@@ -267,7 +267,7 @@ class _Reading:
 
     def over_one_denominator(self) -> list[sp.Expr]:
         """Return the sum with terms of the same roots over one denominator each; none if it is long or has neither."""
-        if not self._known or len(self.sum.terms) > _MAX_SUBSTITUTED_TERMS:
+        if not self._known or len(self.sum.terms) > MAX_COMBINED_TERMS:
             return []
         # A symbol read later may depend on earlier ones.
         return [self._over_one(self.sum, list(reversed(self._known)))]
@@ -345,8 +345,10 @@ def _turns(angle: sp.Expr) -> dict[sp.Expr, int]:
 #: Digits of values, and of the second evaluation of a zero test.
 PROBE_DIGITS: Final = 30
 _FINE_DIGITS: Final = 60
-#: Remainder of zero at the second evaluation, relative to the first.
-_ZERO_REMAINDER_RATIO: Final = 1e-15
+#: A number computed with `PROBE_DIGITS` is zero below this part of those that it is computed from.
+ZERO_PROBE_RATIO: Final = 1e-20
+#: Random places at which a property of expressions is tested.
+PROBE_PLACES: Final = 4
 #: Negligible beside terms of the order of 1.
 _ZERO_VALUE: Final = 1e-50
 #: Places that must agree; more of them where signs decide.
@@ -399,7 +401,7 @@ def is_zero(x: sp.Expr) -> bool:
         rough, fine = (probe(place, digits) for digits in (PROBE_DIGITS, _FINE_DIGITS))
         if rough is None or fine is None:
             continue
-        if abs(fine[0]) > max(_ZERO_REMAINDER_RATIO * abs(rough[0]), _ZERO_VALUE):
+        if abs(fine[0]) > max(ZERO_PROBE_RATIO * abs(rough[0]), _ZERO_VALUE):
             return False
         needed -= 1
         if not needed:
