@@ -19,7 +19,7 @@ import numpy as np
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit._reproducible import length, product, turned
+from mbkit._reproducible import product, turned
 from mbkit.errors import LoadError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import (
@@ -33,9 +33,8 @@ from mbkit.load.mjcf_attributes import (
     has_length,
     mesh_name,
     pose,
-    z_to,
 )
-from mbkit.load.shapes import NOTHING, SIZES, MassProperties, solid, together
+from mbkit.load.shapes import NOTHING, MassProperties, counts, mass_properties_of, together
 from mbkit.load.urdf_reader import BASE_JOINT
 from mbkit.load.xml_reader import MAX_ELEMENTS, Element, Reader, reserved, unused
 from mbkit.model.validation import listing
@@ -690,7 +689,7 @@ def _body_mass_properties(
         read.fault(f"{item}: {len(inertials)} <inertial> elements; keep one", inertials[1][0])
     infer = compiler.inertiafromgeom
     if infer or (infer is None and not inertials):
-        masses = [_geom(e, X, compiler, read, item) for e, X in geoms]
+        masses = [mass_properties_of(e, X, compiler, read, item) for e, X in geoms]
         if any(x is None for x in masses):
             return None, []
         heavy = [x for x in masses if x and x.mass > _MIN_GEOM_MASS]
@@ -743,59 +742,3 @@ def _written(element: Element, X: Pose, compiler: Compiler, read: Reader, item: 
     else:
         inertia = np.diag(read.numbers(element, "diaginertia", item, count=3, default=(0, 0, 0)))
     return MassProperties(mass, np.zeros(3), inertia), placed
-
-
-def counts(geom: Element, compiler: Compiler, read: Reader, item: str) -> bool:
-    """Return whether a geom, with its defaults filled in, may give its body mass."""
-    first, last = compiler.groups
-    # A number that cannot be read is a fault where it is used.
-    amount = Reader().number(geom, "mass" if "mass" in geom.attributes else "density", item, 1000.0)
-    inside = first <= read.number(geom, "group", item, 0.0) <= last
-    return inside and amount != 0 and geom.attributes.get("type", "sphere") not in ("plane", "hfield")
-
-
-def _geom(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> MassProperties | None:
-    """Return what a geom adds to its body; None for a mesh or a shell."""
-    own = element.attributes
-    amount = read.number(element, "mass" if "mass" in own else "density", item, 1000.0)
-    if amount < 0:
-        read.fault(f"{item}: a geom's mass or density is negative; expected 0 or more", element)
-        return NOTHING
-    shape = own.get("type", "sphere")
-    if shape in ("mesh", "sdf") or "mesh" in own or own.get("shellinertia", "false") != "false":
-        return None
-    if shape not in SIZES:
-        read.fault(f"{item}: geom type {shape[:40]!r}; expected one of {', '.join((*SIZES, 'mesh'))}", element)
-        return NOTHING
-    before = len(read.faults)
-    size, own_pose = _sized(element, shape, compiler, read, item)
-    if len(read.faults) > before:
-        return NOTHING
-    mass_properties, placed = solid(shape, size), X @ own_pose
-    return mass_properties.scaled(amount / mass_properties.mass if "mass" in own else amount).moved(placed.R, placed.p)
-
-
-def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, item: str) -> tuple[tuple[float, ...], Pose]:
-    """Return the sizes of a geom and its pose; two end points may stand for length and pose."""
-    needed = SIZES[shape]
-    if "fromto" not in element.attributes:
-        size = read.numbers(element, "size", item, count=3, least=needed)[:needed]
-        placed = pose(element, compiler, read, item)
-    else:
-        ends = np.array(read.numbers(element, "fromto", item, count=6))
-        size = read.numbers(element, "size", item, count=3, least=1)
-        if shape == "sphere":
-            read.fault(f"{item}: a sphere has no fromto; use pos", element)
-        if "pos" in element.attributes:
-            read.fault(f"{item}: a geom has pos and fromto; keep one", element)
-        along = ends[3:] - ends[:3]
-        if not has_length(along):
-            read.fault(f"{item}: a geom's fromto has no length", element)
-            return size, Pose(np.eye(3), ends[:3])
-        half = length(along) / 2
-        size = (size[0], half) if needed == 2 else (size[0], size[0], half)
-        placed = Pose(z_to(along), (ends[:3] + ends[3:]) / 2)
-    if min(size) <= 0:
-        listing = " ".join(f"{x:g}" for x in size)
-        read.fault(f"{item}: a {shape} of size {listing}; expected sizes above 0", element)
-    return size, placed

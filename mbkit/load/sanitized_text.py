@@ -16,7 +16,8 @@ from xml.sax.saxutils import escape
 from mbkit.errors import LoadError, ModelError
 from mbkit.load import xml_reader
 from mbkit.load.mjcf_attributes import Compiler, Defaults, mesh_assets, mesh_name, read_mesh
-from mbkit.load.mjcf_reader import add_free_base, class_inside, counts
+from mbkit.load.mjcf_reader import add_free_base, class_inside
+from mbkit.load.shapes import counts
 from mbkit.load.xml_reader import MAX_FILE_BYTES, Element, Reader, element_text, unused, with_includes
 
 _FORMATS: Final = {"robot": "urdf", "mujoco": "mjcf"}

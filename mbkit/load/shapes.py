@@ -1,4 +1,4 @@
-"""Mass and inertia of MuJoCo's solid shapes, and of several together."""
+"""Mass and inertia of MuJoCo's solid shapes, of several together, and of the geoms of an MJCF."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Final
 import numpy as np
 
 from mbkit._check import Array
-from mbkit._reproducible import product, turned
+from mbkit._reproducible import length, product, turned
+from mbkit.load.mjcf_attributes import Compiler, Pose, has_length, pose, z_to
+from mbkit.load.xml_reader import Element, Reader
 from mbkit.spatial import skew
 
 # Number of sizes of each shape: half lengths and radii.
@@ -71,3 +73,62 @@ def together(masses: list[MassProperties]) -> MassProperties:
         d = skew(x.com - com)
         inertia += x.inertia - x.mass * product(d, d)
     return MassProperties(mass, com, inertia)
+
+
+# Geoms of an MJCF
+
+
+def counts(geom: Element, compiler: Compiler, read: Reader, item: str) -> bool:
+    """Return whether a geom, with its defaults filled in, may give its body mass."""
+    first, last = compiler.groups
+    # A number that cannot be read is a fault where it is used.
+    amount = Reader().number(geom, "mass" if "mass" in geom.attributes else "density", item, 1000.0)
+    inside = first <= read.number(geom, "group", item, 0.0) <= last
+    return inside and amount != 0 and geom.attributes.get("type", "sphere") not in ("plane", "hfield")
+
+
+def mass_properties_of(element: Element, X: Pose, compiler: Compiler, read: Reader, item: str) -> MassProperties | None:
+    """Return what a geom adds to its body; None for a mesh or a shell."""
+    own = element.attributes
+    amount = read.number(element, "mass" if "mass" in own else "density", item, 1000.0)
+    if amount < 0:
+        read.fault(f"{item}: a geom's mass or density is negative; expected 0 or more", element)
+        return NOTHING
+    shape = own.get("type", "sphere")
+    if shape in ("mesh", "sdf") or "mesh" in own or own.get("shellinertia", "false") != "false":
+        return None
+    if shape not in SIZES:
+        read.fault(f"{item}: geom type {shape[:40]!r}; expected one of {', '.join((*SIZES, 'mesh'))}", element)
+        return NOTHING
+    before = len(read.faults)
+    size, own_pose = _sized(element, shape, compiler, read, item)
+    if len(read.faults) > before:
+        return NOTHING
+    mass_properties, placed = solid(shape, size), X @ own_pose
+    return mass_properties.scaled(amount / mass_properties.mass if "mass" in own else amount).moved(placed.R, placed.p)
+
+
+def _sized(element: Element, shape: str, compiler: Compiler, read: Reader, item: str) -> tuple[tuple[float, ...], Pose]:
+    """Return the sizes of a geom and its pose; two end points may stand for length and pose."""
+    needed = SIZES[shape]
+    if "fromto" not in element.attributes:
+        size = read.numbers(element, "size", item, count=3, least=needed)[:needed]
+        placed = pose(element, compiler, read, item)
+    else:
+        ends = np.array(read.numbers(element, "fromto", item, count=6))
+        size = read.numbers(element, "size", item, count=3, least=1)
+        if shape == "sphere":
+            read.fault(f"{item}: a sphere has no fromto; use pos", element)
+        if "pos" in element.attributes:
+            read.fault(f"{item}: a geom has pos and fromto; keep one", element)
+        along = ends[3:] - ends[:3]
+        if not has_length(along):
+            read.fault(f"{item}: a geom's fromto has no length", element)
+            return size, Pose(np.eye(3), ends[:3])
+        half = length(along) / 2
+        size = (size[0], half) if needed == 2 else (size[0], size[0], half)
+        placed = Pose(z_to(along), (ends[:3] + ends[3:]) / 2)
+    if min(size) <= 0:
+        listing = " ".join(f"{x:g}" for x in size)
+        read.fault(f"{item}: a {shape} of size {listing}; expected sizes above 0", element)
+    return size, placed
