@@ -56,7 +56,7 @@ def untimed(monkeypatch):
 @pytest.fixture
 def brief(monkeypatch):
     """Leave little time to error against run time, where a test asks for something else."""
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_SECONDS", 0.5)
+    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_MAX_SECONDS", 0.5)
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ def test_it_evaluates_and_simulates(engine):
 
 
 def test_it_is_compared_and_shown(engine, monkeypatch):
-    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_WORK", 1_000)
+    monkeypatch.setattr(sys.modules["mbkit.studies.compare.study"], "_MAX_EVALUATIONS", 1_000)
     result = mb.compare(PENDULUM, ("lagrangian", engine), 2)
     assert result.passed
     assert {r.engine for r in result.rows} >= {engine}

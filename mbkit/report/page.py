@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 #: Letters of a table's cell that stay on one line, and above which the cell is wide.
-_SHORT: Final = 34
-_LONG: Final = 60
+_MAX_UNBROKEN_LETTERS: Final = 34
+_MIN_LONG_LETTERS: Final = 60
 
 
 def render(shown: Document, *, data: str = "", table: str = "", when: datetime | None = None) -> str:
@@ -74,4 +74,4 @@ def _environment() -> Environment:
 def _cellsize(cell: list[Span]) -> str:
     """Return the class of a cell that is not to be broken, or that needs room, by the length of its text."""
     size = sum(len(span.text) for span in cell)
-    return "nowrap " if size <= _SHORT else "long " if size > _LONG else ""
+    return "nowrap " if size <= _MAX_UNBROKEN_LETTERS else "long " if size > _MIN_LONG_LETTERS else ""

@@ -17,8 +17,7 @@ R = TypeVar("R", bound=ResultTable)
 Progress = Callable[[float, str], object]
 Checkpoint = str | os.PathLike[str] | Callable[[Any], object]
 
-#: Seconds between two results.
-_BETWEEN: Final = 5.0
+_SECONDS_BETWEEN_RESULTS: Final = 5.0
 
 
 class InterruptedSweepError(KeyboardInterrupt):
@@ -67,7 +66,7 @@ class Checkpointer:
         try:
             for fraction, text in steps:
                 self.report(fraction, text)
-                if self._checkpoint is not None and time.perf_counter() - self._saved > _BETWEEN:
+                if self._checkpoint is not None and time.perf_counter() - self._saved > _SECONDS_BETWEEN_RESULTS:
                     self.save(result(complete=False))
                     self._saved = time.perf_counter()
             whole = result(complete=True)

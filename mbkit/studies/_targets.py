@@ -96,7 +96,7 @@ def _from_function(module_name: str, name: str) -> Model:
 def _blamed(what: str) -> Iterator[None]:
     """Turn any exception of a user's code into a `LoadError` that says where it was."""
     try:
-        # What it prints must not end up among a caller's JSON.
+        # Its prints must not end up among a caller's JSON.
         with contextlib.redirect_stdout(sys.stderr):
             yield
     except KeyboardInterrupt:
@@ -111,7 +111,7 @@ def _blamed(what: str) -> Iterator[None]:
         raise LoadError(f"{what}: {type(error).__name__}: {error}{where}") from error
 
 
-# What a baseline was recorded of, as text: a robot's name, a function, or a file by its place beside the baseline.
+# Targets of baselines as text: a robot's name, a function, or a file by its place beside the baseline.
 
 
 def checked_target(target: object, options: object = None) -> None:
@@ -153,7 +153,7 @@ def resolved_options(options: Mapping[str, Any], baseline: Path) -> dict[str, An
     return {k: resolved(x, baseline) if k == "loops" and isinstance(x, str) else x for k, x in options.items()}
 
 
-# Which engines are there, and models as any of them takes them.
+# Engines that are there, and models as any of them takes them.
 
 
 def with_values(model: Model, purpose: str = "") -> Model:

@@ -28,7 +28,7 @@ from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, evaluated, gaps, model_terms, states_of
 
 FORMATS: Final = ("mjcf", "urdf")
-#: What rounding of rotations and of principal axes may cost.
+#: The largest relative error that rounding of rotations and of principal axes makes.
 _TOLERANCE: Final = 1e-11
 _STATES: Final = 5
 
@@ -125,7 +125,7 @@ def _to_mjcf(model: Model) -> Converted:
     text = mjcf_text(model, _head(model, "agreed with the description by MuJoCo's parser and terms"))
     at = states_of(model, _STATES, 0)
     back = read_back(model, text)
-    # What MuJoCo cannot give, it refuses by name: loops beside mimic joints.
+    # MuJoCo refuses by name the accelerations that it cannot give: loops beside mimic joints.
     back.mass_matrix(at.q)
     values = evaluated(back, at)
     if model.needs.loops:

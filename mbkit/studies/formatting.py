@@ -11,7 +11,7 @@ from mbkit.studies.document import Bullet, Span, Text
 from mbkit.studies.results import Refusal
 
 #: Letters of a list that has a place in a sentence.
-_LISTED: Final = 80
+_MAX_LISTED_LETTERS: Final = 80
 _UNITS: Final = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 
 
@@ -67,7 +67,7 @@ def choice(value: Any) -> str:
 
 def brief(missing: Iterable[str]) -> str:
     """Return what a study left out, to follow a sentence; of long lists their number alone, as they stand below."""
-    return "".join(f"; {x if len(x) <= _LISTED else x.rpartition(':')[0] or x}" for x in missing)
+    return "".join(f"; {x if len(x) <= _MAX_LISTED_LETTERS else x.rpartition(':')[0] or x}" for x in missing)
 
 
 def refusals(those: Iterable[Refusal]) -> list[Bullet]:

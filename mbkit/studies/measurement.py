@@ -27,14 +27,14 @@ Outcome = Literal[
 
 #: The default bar: a relative error that plots cannot hide and papers accept.
 BAR: Final = 1e-6
-#: Where an answer is no longer inaccurate but wrong: a hundredth of the motion, or of the term. A method of low order
+#: An answer with a larger error, relative to the motion or the term, is not inaccurate but wrong. A method of low order
 #: misses the bar with every affordable step, and misleads nobody by that.
 GROSS: Final = 1e-2
 #: The largest error that a result holds.
 MAX_ERROR: Final = 1e300
-#: Roundings of a double energy, and the part of the motion's from which on they can hide its error.
-_ROUNDING: Final = 16.0 * float(np.finfo(float).eps)
-_HIDDEN: Final = 1e-9
+#: Rounding of a double energy, relative to it; beyond this part of the motion's energy it can hide an error.
+_ENERGY_ROUNDING: Final = 16.0 * float(np.finfo(float).eps)
+_MIN_HIDING_ROUNDING: Final = 1e-9
 
 
 @dataclass(frozen=True)
@@ -209,6 +209,6 @@ def _energy_error(dyn: Dynamics, run: Trajectory) -> float:
         return math.nan
     gained, change = ((high - high[0]) + (low - low[0]) for high, low in (T, V))
     drift, size = float(np.abs(gained + change).max()), max(float(T[0].max()), float(np.ptp(V[0])))
-    rounding = 0.0 if dyn._significand_bits > DOUBLE_BITS else _ROUNDING * float(np.abs([T[0], V[0]]).max())
-    hidden = rounding > _HIDDEN * size and drift <= rounding
+    rounding = 0.0 if dyn._significand_bits > DOUBLE_BITS else _ENERGY_ROUNDING * float(np.abs([T[0], V[0]]).max())
+    hidden = rounding > _MIN_HIDING_ROUNDING * size and drift <= rounding
     return min(drift / size, MAX_ERROR) if size > 0 and not hidden else math.nan

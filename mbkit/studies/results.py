@@ -32,7 +32,7 @@ from mbkit.errors import InputError, writing
 from mbkit.model import Model
 from mbkit.studies.document import Document, to_html, to_markdown
 
-#: What JSON has for an infinite limit, where null stands for an unknown one.
+#: An infinite limit in JSON, where null stands for an unknown one.
 NO_LIMIT: Final = "no limit"
 
 
@@ -265,7 +265,7 @@ def model_info(model: Model) -> dict[str, Any]:
     }
 
 
-#: What computes beside the engines.
+#: Packages that compute beside the engines.
 _BESIDE: Final = ("numpy", "scipy", "llvmlite", "heyoka", "example-robot-data")
 
 

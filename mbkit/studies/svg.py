@@ -31,9 +31,9 @@ _VARIABLES: Final = {
     PAGE.bad: "var(--bad)",
     **{colour: f"var(--series{k})" for k, colour in enumerate(PAGE.series, 1)},
 }
-PAGE_WIDTH: Final = 10.4
+PAGE_WIDTH_INCHES: Final = 10.4
 #: Pixels of the smallest letters of a figure, however narrow the window.
-_SMALLEST: Final = 10.0
+_MIN_LETTER_PIXELS: Final = 10.0
 _DOTS_PER_INCH: Final = 160
 
 
@@ -67,7 +67,11 @@ def svg(fig: Figure, title: str) -> str:
     for size in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
     width = float(re.findall(r'viewBox="\S+ \S+ (\S+)', text)[0])
-    least = width * _SMALLEST / min(map(float, re.findall(r"font(?:-size)?: ([\d.]+)px", text)), default=_SMALLEST)
+    least = (
+        width
+        * _MIN_LETTER_PIXELS
+        / min(map(float, re.findall(r"font(?:-size)?: ([\d.]+)px", text)), default=_MIN_LETTER_PIXELS)
+    )
     text = text.replace("<svg", f'<svg role="img" aria-label="{html(title)}" style="--least: {math.ceil(least)}px"', 1)
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     for stand_in, variable in _VARIABLES.items():

@@ -120,7 +120,7 @@ class Worker(Child):
         return [sys.executable, "-c", _PROGRAM, *map(str, arguments)], self._environment
 
 
-# In the worker process
+# The worker process
 
 _to_parent: Connection[Any, Any] | None = None
 

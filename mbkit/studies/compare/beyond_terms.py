@@ -31,13 +31,13 @@ from mbkit.studies.study_runs import quiet_simulate, start_state, state_within_l
 
 DURATION: Final = 1.0
 TOLERANCE: Final = 1e-12
-#: Multiples of eps times the condition that two engines may differ by.
-_ROUNDINGS: Final = 256.0
+#: The largest difference of two engines over eps times the condition.
+_MAX_ROUNDINGS: Final = 256.0
 #: Beyond this condition a comparison could not see an error below 1e-9.
-_CHAOS: Final = 1e-9 / (_ROUNDINGS * EPS)
-_DISTURBANCE: Final = 1e-8
-#: Steps below which a rollout says nothing.
-_FEWEST: Final = 50
+_MAX_CONDITION: Final = 1e-9 / (_MAX_ROUNDINGS * EPS)
+_RELATIVE_DISTURBANCE: Final = 1e-8
+#: A rollout with fewer well-conditioned steps says nothing.
+_MIN_JUDGED_STEPS: Final = 50
 #: MuJoCo's own method of the same formula.
 _NATIVE: Final = {m.own: m.name for m in METHODS.values() if m.own}
 
@@ -58,7 +58,7 @@ def rollouts(model: Model, engines: Mapping[str, Dynamics], seed: int, note: str
         theirs = quiet_simulate(engines[MUJOCO], q0, v0, DURATION, native, STEP)
         condition = _condition(engines[MUJOCO], engines[ours_on[0]], native, theirs)
         # The last step before the condition says too little.
-        last = int(next(iter(np.flatnonzero(condition > _CHAOS)), len(condition))) - 1
+        last = int(next(iter(np.flatnonzero(condition > _MAX_CONDITION)), len(condition))) - 1
         own: list[tuple[RolloutRow, Trajectory]] = []
         for name in ours_on:
             # One step first: compiling it is not run time.
@@ -92,7 +92,7 @@ def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajector
     M, a = own.mass_matrix(q), own.forward_dynamics(q, v, np.zeros(model.nv))
     size = np.einsum("nij,nj->ni", np.abs(M), np.abs(a)) + np.abs(own.nle(q, v))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size[:-1].shape)
-    disturbance = _DISTURBANCE * size[:-1] * signs
+    disturbance = _RELATIVE_DISTURBANCE * size[:-1] * signs
     for joint in model.independent_joints:
         if joint.type.floating:
             # MuJoCo holds such a force in other axes; the torques disturb enough.
@@ -100,7 +100,7 @@ def _condition(mujoco: Dynamics, own: Dynamics, native: str, straight: Trajector
             disturbance[:, start : start + 3] = 0.0
     steps = len(disturbance)
     bent, _ = mujoco.rollout(native.removeprefix("mujoco_"), q[0], v[0], STEP, disturbance, steps)  # type: ignore[attr-defined]
-    off = np.abs(model.difference(q, np.where(np.isfinite(bent), bent, q))).max(axis=1) / _DISTURBANCE
+    off = np.abs(model.difference(q, np.where(np.isfinite(bent), bent, q))).max(axis=1) / _RELATIVE_DISTURBANCE
     off[~np.isfinite(bent).all(axis=1)] = np.inf
     return np.asarray(np.maximum.accumulate(off))
 
@@ -116,14 +116,14 @@ def _row(
     last = len(condition) - 1
     n = min(len(ours.t), last + 1)
     grown = float(condition[:n].max(initial=0.0))
-    tolerance = max(TOLERANCE, max(_ROUNDINGS, ROUNDINGS * amplified) * EPS * grown)
+    tolerance = max(TOLERANCE, max(_MAX_ROUNDINGS, ROUNDINGS * amplified) * EPS * grown)
     error = float(np.abs(model.difference(theirs.q[:n], ours.q[:n])).max()) if n > 1 else 0.0
     notes = [note] if note else []
     if n <= last:
         notes.append(f"stopped at t = {ours.t[-1]:.3g} s: {ours.stats.message}")
-    judged = last >= _FEWEST
+    judged = last >= _MIN_JUDGED_STEPS
     if last < round(DURATION / STEP):
-        grows = f"beyond it rounding errors have grown above {_ROUNDINGS * EPS * _CHAOS:.0e} of q"
+        grows = f"beyond it rounding errors have grown above {_MAX_ROUNDINGS * EPS * _MAX_CONDITION:.0e} of q"
         why = grows if beyond else "MuJoCo's own run diverges there"
         notes.append(f"{'judged' if judged else 'not judged: well conditioned'} up to {last * STEP:.3g} s alone; {why}")
         J = dyn.constraint_jacobian(q0) if model.constrained else None
@@ -173,11 +173,11 @@ def _implicit_damping(model: Model, dyn: Dynamics, q0: Array, v0: Array) -> Roll
     )
 
 
-# What a scene does not need: what was off, what that saved, and that nothing changed.
+# Omissions: parts that a scene does not need, the time that leaving them out saves, and that nothing changes.
 
 # Accelerations of the same model with one more feature compiled in differ by the
 # order of a few sums, amplified by the conditioning that both share.
-_UNCHANGED: Final = 1e-9
+_MAX_UNCHANGED: Final = 1e-9
 
 _JUMP: Final = EFFECTS["jump"]
 #: Need, field of Needs or effect, MuJoCo's bits, what was off.
@@ -191,7 +191,7 @@ _NEEDS: Final = (
     ("gravity", "gravity", ("GRAVITY",), "gravity"),
     ("loops", "loops", ("EQUALITY", "CONSTRAINT"), "loop closures and equality rows"),
 )
-#: What is on where the description has it.
+#: Needs that are on where the description has them.
 _KEPT: Final = ("damping", "springs", "gravity", "loops")
 
 
@@ -230,10 +230,10 @@ def _in_mujoco(model: Model, dyn: Any, q: Array, v: Array) -> list[Omission]:
         present = bool(field) and needs[field]
         saved = times[need][0] - times["lean"][0]
         spread = math.hypot(times[need][1], times["lean"][1])
-        # What is there and off would act: leaving it out is a choice, said aloud, and no engine's fault.
+        # A part that is there and off would act: leaving it out is a choice, said aloud, and no engine's fault.
         instead = f"without it mbkit's exact {_JUMP} acts" if need == _JUMP else ""
         note = instead or "it is off in every engine, so that the smooth terms compare" if present else ""
-        unchanged = changes[need] <= _UNCHANGED
+        unchanged = changes[need] <= _MAX_UNCHANGED
         rows.append(Omission(need, present, what, saved, spread, math.nan, changes[need], unchanged, note))
     return rows
 
@@ -248,7 +248,7 @@ def _coriolis(model: Model, q: Array, v: Array) -> Omission:
     start = time.perf_counter()
     matrix = Machine(equations.function("coriolis_matrix"))
     setup = time.perf_counter() - start
-    # Of a model with values for all parameters the time is left.
+    # The time alone is left of the parameters of a model with values.
     held = [np.array(list(model.parameters.values()), dtype=float)] if model.parameters else []
     times = interleaved({"matrix": lambda: matrix(q, v, *held), "nle": lambda: nle(q, v, *held)})
     force, M = nle(q, v, *held)[0][:, 0], Machine(equations.function("mass_matrix"))(q, *held)[0]
@@ -262,5 +262,5 @@ def _coriolis(model: Model, q: Array, v: Array) -> Omission:
         math.hypot(times["matrix"][1], times["nle"][1]),
         setup,
         change,
-        change <= _UNCHANGED,
+        change <= _MAX_UNCHANGED,
     )

@@ -26,8 +26,8 @@ from mbkit._check import Array
 EPS: Final = float(np.finfo(float).eps)
 #: Each of the largest terms of a sum went through about this many roundings on the way.
 ROUNDINGS: Final = 4.0
-#: Singular values of redundant rows, in terms of the largest one.
-_REDUNDANT: Final = 1e-11
+#: Singular values of redundant rows over the largest one.
+_REDUNDANT_SINGULAR_VALUE_RATIO: Final = 1e-11
 
 
 def epsilon(bits: int) -> float:
@@ -161,7 +161,7 @@ def condition_under_constraints(M: Array, J: Array) -> Array:
     zero = np.zeros((len(M), J.shape[1], J.shape[1]))
     whole = np.block([[scaled, rows.swapaxes(1, 2)], [rows, zero]])
     singular = np.linalg.svd(whole, compute_uv=False)
-    kept = np.where(singular > _REDUNDANT * singular[:, :1], singular, np.inf)
+    kept = np.where(singular > _REDUNDANT_SINGULAR_VALUE_RATIO * singular[:, :1], singular, np.inf)
     return np.asarray(singular[:, 0] / kept.min(axis=1))
 
 

@@ -20,14 +20,14 @@ from mbkit.simulate.plotting.style import (
 )
 from mbkit.studies.compare.rows import Row, by_term
 from mbkit.studies.formatting import error_text, time_text
-from mbkit.studies.svg import PAGE, PAGE_WIDTH, canvas, page_legend, page_style, svg
+from mbkit.studies.svg import PAGE, PAGE_WIDTH_INCHES, canvas, page_legend, page_style, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Where an error of exactly zero stands on an axis of digits.
-_SAME: Final = 17.0
+#: The place of an error of exactly zero on an axis of digits.
+_DIGITS_OF_SAME: Final = 17.0
 
 
 def figure(
@@ -73,11 +73,11 @@ def figure(
     ticks = range(begin, 17, 2)
     limit = -math.log10(tolerance)
     ax.axvline(limit, color=palette.muted, linestyle=(0, (2, 2)), linewidth=1.0)
-    side = "left" if limit < (begin + _SAME) / 2 else "right"
+    side = "left" if limit < (begin + _DIGITS_OF_SAME) / 2 else "right"
     text = f" tolerance {tolerance:g} "
     ax.text(limit, -0.75, text, color=palette.muted, ha=side, va="center", fontsize=9)
-    ax.set_xlim(begin - 0.1, _SAME + 0.3)
-    ax.set_xticks([*ticks, _SAME], [*map(str, ticks), "same"])
+    ax.set_xlim(begin - 0.1, _DIGITS_OF_SAME + 0.3)
+    ax.set_xticks([*ticks, _DIGITS_OF_SAME], [*map(str, ticks), "same"])
     ax.set_xlabel("digits of agreement, −log₁₀ of the relative error")
     ax.grid(axis="x")
     ax.tick_params(axis="y", length=0)
@@ -87,7 +87,7 @@ def figure(
 
 
 def _shown_digits(error: float) -> float:
-    return 0.0 if math.isnan(error) else _SAME if error == 0 else min(max(-math.log10(error), 0.0), 16.5)
+    return 0.0 if math.isnan(error) else _DIGITS_OF_SAME if error == 0 else min(max(-math.log10(error), 0.0), 16.5)
 
 
 def digits(rows: Sequence[Row], engines: Sequence[str], reference: str, tolerance: float) -> str:
@@ -101,12 +101,12 @@ def shown_error(error: float, least: float) -> float:
     return 1.0 if math.isnan(error) else min(max(error, least), 1.0)
 
 
-# What a digit of each term costs on each engine: errors against run times.
+# Errors of each term against run times: the price of a digit on each engine.
 
 _EPS: Final = 2.0**-52
-#: Where smaller errors stand, and none: below this, double precision tells nothing.
-_LEAST: Final = _EPS / 64
-_COLUMNS: Final = 5
+#: Smaller errors are drawn here, where double precision tells nothing.
+_MIN_DRAWN_ERROR: Final = _EPS / 64
+_PANELS_PER_ROW: Final = 5
 
 
 def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) -> str:
@@ -119,12 +119,12 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
     terms = list(dict.fromkeys(r.term for r in timed))
     if not terms:
         return ""
-    count = math.ceil(len(terms) / _COLUMNS)
+    count = math.ceil(len(terms) / _PANELS_PER_ROW)
     height = 1.0 + 1.55 * count
     margins = {"left": 0.07, "right": 0.995, "top": 1 - 0.6 / height, "bottom": 0.5 / height}
     grid = {**margins, "wspace": 0.15, "hspace": 0.3}
     shared = {"sharex": True, "sharey": True, "gridspec_kw": grid}
-    with canvas("term costs", PAGE_WIDTH, height, count, _COLUMNS, **shared) as (fig, panels):
+    with canvas("term costs", PAGE_WIDTH_INCHES, height, count, _PANELS_PER_ROW, **shared) as (fig, panels):
         level: dict[str, Any] = {"color": PAGE.muted, "linewidth": 0.9}
         dashed = {**level, "linestyle": (0, (4, 3))}
         for ax, term in zip(panels, terms, strict=False):
@@ -132,7 +132,7 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
             ax.axhline(tolerance, **dashed)
             for row in timed:
                 if row.term == term:
-                    place = [row.ns], [shown_error(row.relative, _LEAST)]
+                    place = [row.ns], [shown_error(row.relative, _MIN_DRAWN_ERROR)]
                     point = ax.plot(*place, engine_mark(row.engine), color=PAGE.engine(row.engine), markersize=7)
                     spent = time_text(row.ns * 1e-9)
                     name_points(point, [f"{term}, {row.engine}: worst error {error_text(row.relative)} in {spent}"])
@@ -141,7 +141,7 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
             ax.set_title(one_line(term, 28), loc="left", fontsize=9.5, pad=3)
         panels[0].set_xscale("log")
         panels[0].set_yscale("log")
-        times, errors = [r.ns for r in timed], [shown_error(r.relative, _LEAST) for r in timed]
+        times, errors = [r.ns for r in timed], [shown_error(r.relative, _MIN_DRAWN_ERROR) for r in timed]
         panels[0].set_xlim(min(times) / 1.6, max(times) * 1.6)
         panels[0].set_ylim(min(*errors, _EPS) / 3, max(*errors, tolerance) * 3)
         for k, ax in enumerate(panels):
@@ -150,7 +150,7 @@ def term_costs(rows: Sequence[Row], engines: Sequence[str], tolerance: float) ->
                 continue
             ax.grid(which="major")
             log_ticks(ax, 5)
-            ax.tick_params(labelsize=8.5, labelbottom=k + _COLUMNS >= len(terms))
+            ax.tick_params(labelsize=8.5, labelbottom=k + _PANELS_PER_ROW >= len(terms))
         fig.text(0.53, 0.0, "time of one call, ns", ha="center", va="bottom")
         fig.text(0.0, 0.5, "worst relative error", rotation=90, ha="left", va="center")
         levels = [level | {"label": "eps of double precision"}, dashed | {"label": f"tolerance {tolerance:g}"}]

@@ -27,7 +27,7 @@ from mbkit.studies.compare.terms import States, Term, power_errors
 _SEEDS: Final = (0, 1)
 #: An engine rounds on the way too: its error was at most 5.4 times that of the rounded numbers, over the terms of 66
 #: robots in Newton (validation/trained_engines.json).
-_ON_THE_WAY: Final = 8.0
+_ERROR_PER_ROUNDING: Final = 8.0
 
 
 class Precision:
@@ -50,7 +50,7 @@ class Precision:
     def allowed(self, term: Term | str) -> float:
         """Return the largest error that passes: of a term, or of the power balance by its name."""
         own = [self._error(term, *rounded) for rounded in self._rounded]
-        return _ON_THE_WAY * max(self._eps, *own)
+        return _ERROR_PER_ROUNDING * max(self._eps, *own)
 
     def _error(self, term: Term | str, dyn: Dynamics, at: States) -> float:
         try:

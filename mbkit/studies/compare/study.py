@@ -74,7 +74,7 @@ class Judge:
     def __post_init__(self) -> None:
         model, oracle, at = self.model, self.oracle, self.at
         self.refusals: list[Refusal] = []
-        #: Of each engine with soft constraints the digits of the exact acceleration that are left, at the median state.
+        #: Digits of the exact acceleration that each engine with soft constraints keeps, at the median state.
         self.softness: dict[str, float] = {}
         #: Gravity, velocity and passive forces at all states, as sums of their sizes.
         self.forces = np.zeros_like(at.tau)
@@ -247,11 +247,11 @@ def announced(caught: Iterable[warnings.WarningMessage]) -> str:
     return "; ".join(dict.fromkeys(str(w.message) for w in caught if issubclass(w.category, KnownDefectWarning)))
 
 
-#: What a comparison shows of `work_precision`: a few methods, runs of little work, and seconds at the most.
-_HORIZON: Final = 0.5
-_REPEATS: Final = 3
-_WORK: Final = 6_000
-_SECONDS: Final = 60.0
+#: Limits of the `work_precision` in a comparison: a short horizon, few timings, runs of little work.
+_HORIZON_SECONDS: Final = 0.5
+_TIMINGS: Final = 3
+_MAX_EVALUATIONS: Final = 6_000
+_MAX_SECONDS: Final = 60.0
 
 
 def compare(
@@ -301,7 +301,7 @@ def compare(
     reference = ""
     rows: list[Row] = []
     result: dict[str, Any] = {}
-    # What was written as energies has the derivation and its 34 digits, and no other engine.
+    # A system written as energies has the derivation and its 34 digits, and no other engine.
     enough = len(built) > 1 or (bool(built) and not model.has_bodies)
     if enough:
         tell(0.05, "34 digits")
@@ -344,7 +344,12 @@ def _beyond_terms(
     if notes:
         movers, _, _, _ = _build(moving, tuple(engines), silent, compile=True)
     methods = {engine: shown for engine in movers if (shown := find_engine(engine).shown)}
-    settings: dict[str, Any] = {"duration": _HORIZON, "repeats": _REPEATS, "seconds": _SECONDS, "work": _WORK}
+    settings: dict[str, Any] = {
+        "duration": _HORIZON_SECONDS,
+        "repeats": _TIMINGS,
+        "seconds": _MAX_SECONDS,
+        "work": _MAX_EVALUATIONS,
+    }
     settings["progress"] = lambda fraction, text: tell(0.6 + 0.3 * fraction, text)
     by_time = partial(work_precision, moving, tuple(movers), methods, seed=seed, **settings)
     studies: list[tuple[float, str, str, Callable[[], Any]]] = [

@@ -10,9 +10,9 @@ from mbkit.studies import document as doc
 from mbkit.studies.compare.rows import Omission, RolloutRow, Row
 from mbkit.studies.formatting import count_text, error_text, mark, time_text
 
-# Rounding stays far below this, and anything that acts is far above.
-_VISIBLE: Final = 1e-6
-#: What stands behind the name of a term.
+#: The least relative change of accelerations that is an effect: rounding stays far below it.
+_MIN_VISIBLE_CHANGE: Final = 1e-6
+#: Name of a term -> its meaning.
 MEANINGS: Final = {
     "M": "mass matrix",
     "g": "gravity force",
@@ -175,7 +175,7 @@ def rollout_blocks(rollouts: Sequence[RolloutRow]) -> list[doc.Block]:
     return [*out, doc.Items(below)]
 
 
-# What was left out of the computation, and what no engine could do.
+# Omissions: parts of the scene that were left out of the computation.
 
 
 def omission_state(omission: Omission) -> Literal["on", "same", "chosen", "changed"]:
@@ -184,7 +184,7 @@ def omission_state(omission: Omission) -> Literal["on", "same", "chosen", "chang
         return "on"
     if omission.fault:
         return "changed"
-    return "chosen" if omission.present and omission.change > _VISIBLE else "same"
+    return "chosen" if omission.present and omission.change > _MIN_VISIBLE_CHANGE else "same"
 
 
 def _saving(omission: Omission) -> doc.Span:

@@ -30,7 +30,7 @@ from mbkit.studies.compare.errors import (
 
 # An angle this far from gimbal lock loses four digits in anything that divides
 # by its cosine; none of the terms should.
-_NEAR: float = 1e-4
+_NEAR_SINGULAR_RADIANS: float = 1e-4
 _AT_REST: Final = "at rest"
 
 
@@ -87,7 +87,7 @@ def _near_singular(model: Model, rng: np.random.Generator, n: int) -> Array:
             turns = rng.integers(-1, 3, n)
             if i == joint.type.gimbal:
                 turns = 2 * rng.integers(0, 2, n) - 1
-            q[:, start + i] = turns * np.pi / 2 + rng.choice([-_NEAR, _NEAR], n)
+            q[:, start + i] = turns * np.pi / 2 + rng.choice([-_NEAR_SINGULAR_RADIANS, _NEAR_SINGULAR_RADIANS], n)
     return q
 
 
@@ -129,7 +129,7 @@ class LoadsUnderForce(Term):
     """Loads in the joints of a mechanism, which follow from the force τ and its motion."""
 
     def _given(self, dyn: Dynamics, states: States) -> list[Any]:  # noqa: ARG002  # as for the others
-        # Of accelerations, wrenches, axes and joints none is given.
+        # No accelerations, wrenches, axes or joints are given.
         return [states.q, states.v, None, None, LOCAL, None, states.tau]
 
 
@@ -151,7 +151,7 @@ FORWARD_DYNAMICS: Final = "forward_dynamics"
 JOINT_LOADS: Final = "joint_wrenches"
 #: Quantities that depend on how an engine holds constraints.
 OF_CONSTRAINED_MOTION: Final = (FORWARD_DYNAMICS, JOINT_LOADS, "generalized_constraint_force")
-#: Of models with constraints. Jᵀ λ is unique where λ is not.
+#: Terms of models with constraints. Jᵀ λ is unique where λ is not.
 CONSTRAINT_TERMS: Final = (
     Term("f", "constraint_residual", ("q",), row_errors),
     Term("J", "constraint_jacobian", ("q",), row_errors),
@@ -179,7 +179,7 @@ def power_errors(dyn: Dynamics, oracle: OracleDynamics, at: States, scales: Scal
             raise UnsupportedError(f"{model.name}: its energies depend on the time, or T has parts that are not of v²")
     a = dyn.forward_dynamics(at.q, at.v, at.tau)
     still = np.zeros_like(at.v)
-    # Of functions without a potential, what acts at rest does work too; springs written as energies are in V.
+    # Forces without a potential do work at rest too; springs written as energies are in V.
     damping = dyn.passive(at.q, at.v) - dyn.passive(at.q, still)
     damping = damping + (dyn._lost_force(at.q, still) if model.has_bodies else dyn.passive(at.q, still))
     damping = damping + dyn._friction_beside_passive(at.q, at.v, at.tau)

@@ -13,7 +13,7 @@ from mbkit.errors import InputError
 from mbkit.model import Model
 from mbkit.studies.measurement import Problem
 
-#: In the order of a study: stiff ones first, those that take longest last.
+#: Families stand in the order of a study: stiff ones first, those that take longest last.
 Family = Literal["stiffness", "mass ratio", "length", "spin", "near-singular", "friction", "large", "step", "long"]
 #: The error of q along a run, of the energy along a run, or of terms at states.
 Measure = Literal["motion", "energy", "terms"]
@@ -66,7 +66,7 @@ class Case:
 
 
 #: Parts of a run at whose ends errors are measured; the energy at more of them.
-_PARTS: Final[dict[Measure, int]] = {"motion": 10, "energy": 200}
+_INTERVALS: Final[dict[Measure, int]] = {"motion": 10, "energy": 200}
 
 
 def problem_of(case: Case, value: float) -> Problem:
@@ -102,7 +102,7 @@ def problem_of(case: Case, value: float) -> Problem:
 
 def times_of(problem: Problem, measure: Measure) -> Array:
     """Return the times at which a run is measured, s; steps of a given size end on them."""
-    parts = _PARTS[measure]
+    parts = _INTERVALS[measure]
     if problem.dt is None:
         return np.linspace(0.0, problem.duration, parts + 1)
     # The last step is whole, too: another length would be another method's.

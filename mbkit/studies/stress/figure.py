@@ -28,7 +28,7 @@ from mbkit.simulate.plotting.style import (
 )
 from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.stress.measurements import CaseResult, Line, Overview, engines_of, name_of, place
-from mbkit.studies.svg import PAGE, PAGE_WIDTH, canvas, page_legend, svg
+from mbkit.studies.svg import PAGE, PAGE_WIDTH_INCHES, canvas, page_legend, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.patches import Patch
 
 #: Where one shade ends and the next begins, in digits of error.
-_DIGITS: Final = (12.0, 9.0, 6.0, 3.0)
+_SHADE_DIGITS: Final = (12.0, 9.0, 6.0, 3.0)
 #: The shades on white paper: h held and w did not, by digits from many to few; grossly wrong;
 #: ended otherwise and said so; ended without a word; not run.
 SHADES: Final = {
@@ -70,7 +70,7 @@ WORDS: Final[dict[Outcome, tuple[str, str]]] = {
 }
 _MARKS: Final[dict[Outcome, str]] = {"silent": "✗ ", "warned": "! ", "unjudged": "? "}
 #: More columns than these have no room for words.
-ROOMY: Final = 14
+MAX_ROOMY_COLUMNS: Final = 14
 _DASHED: Final = (0, (1.5, 1))
 
 
@@ -79,7 +79,7 @@ def shade(cell: Measurement, outcome: Outcome) -> str:
     if outcome in _SHADES:
         return _SHADES[outcome]
     digits = math.inf if cell.seen == 0 else -math.log10(cell.seen) if cell.seen > 0 else -math.inf
-    return ("h" if outcome == "held" else "w") + str(sum(digits < d for d in _DIGITS))
+    return ("h" if outcome == "held" else "w") + str(sum(digits < d for d in _SHADE_DIGITS))
 
 
 def cell_text(cell: Measurement, outcome: Outcome, short: bool = False) -> str:
@@ -130,7 +130,7 @@ def _axes(ax: Axes | None, rows: int, height: float) -> Axes:
     # Figure without pyplot: no window system, nothing to close.
     from matplotlib.figure import Figure
 
-    return ax or Figure(figsize=(PAGE_WIDTH, 1.5 + height * max(rows, 1)), layout="constrained").add_subplot()
+    return ax or Figure(figsize=(PAGE_WIDTH_INCHES, 1.5 + height * max(rows, 1)), layout="constrained").add_subplot()
 
 
 def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
@@ -144,7 +144,7 @@ def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
         for x, (cell, how) in enumerate(zip(line.row.cells[:count], line.outcomes, strict=False)):
             face, weight = SHADES[shade(cell, how)], "bold" if how == "silent" else "normal"
             ax.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=face, edgecolor="white", linewidth=1.0))
-            text = cell_text(cell, how, short=count > ROOMY)
+            text = cell_text(cell, how, short=count > MAX_ROOMY_COLUMNS)
             # Cells are light on every paper.
             ax.text(x, y, text, ha="center", va="center", fontsize=7.5, weight=weight, color=PLAIN.ink)
         ends = [y - 0.5, y + 0.5]
@@ -166,7 +166,7 @@ def _map(case: CaseResult, palette: Palette, given: Axes | None) -> Figure:
         ax.text(0.5, 0.5, "nothing was run", transform=ax.transAxes, ha="center", color=palette.muted)
     about = one_line(f"{case.name}: {case.about}", 125)
     if given is None:
-        # From the figure's left edge, for a sentence is longer than the axes.
+        # A sentence is longer than the axes, so it begins at the figure's left edge.
         figure_of(ax).suptitle(about, x=0.01, ha="left", fontsize=10.0)
     else:
         ax.set_title(textwrap.fill(about, 45), loc="left")
@@ -231,7 +231,7 @@ def _overview(cases: Sequence[CaseResult], palette: Palette, given: Axes | None)
 
 # The largest stable steps: measured as a bar between held and not, linear theory as a mark.
 
-_STEP_COLUMNS: Final = 3
+_PANELS_PER_ROW: Final = 3
 _THEORY: Final[dict[str, Any]] = {"color": PAGE.ink, "linewidth": 1.6, "linestyle": (0, (1.2, 0.8))}
 
 
@@ -242,13 +242,16 @@ def stable_steps(cases: Sequence[tuple[CaseResult, Sequence[Line]]]) -> str:
     methods = list(dict.fromkeys(row.method for row in rows))
     rows.sort(key=lambda row: (methods.index(row.method), engine_index(row.engine)))
     names = list(dict.fromkeys(map(name_of, rows)))
-    columns = min(_STEP_COLUMNS, len(cases))
+    columns = min(_PANELS_PER_ROW, len(cases))
     count = math.ceil(len(cases) / columns)
     panel = 0.2 * len(names)
     height = 0.4 + (panel + 0.75) * count
     margins = {"left": 0.2, "right": 0.99, "top": 1 - 0.75 / height, "bottom": 0.5 / height}
     grid = {**margins, "wspace": 0.06, "hspace": 0.75 / panel}
-    with canvas("stable steps", PAGE_WIDTH, height, count, columns, sharey=True, gridspec_kw=grid) as (fig, panels):
+    with canvas("stable steps", PAGE_WIDTH_INCHES, height, count, columns, sharey=True, gridspec_kw=grid) as (
+        fig,
+        panels,
+    ):
         for ax, (case, lines) in zip(panels, cases, strict=False):
             _step_panel(ax, case, lines, names)
         for ax in panels[len(cases) :]:

@@ -34,8 +34,8 @@ from mbkit.studies.work_precision.reference import reference
 from mbkit.studies.worker import report_stage
 
 _EPS: Final = float(np.finfo(float).eps)
-#: A truth no better than this part of the motion cannot show even gross errors.
-_WORTHLESS: Final = 1e-3
+#: The largest floor of a truth over the size of the motion: a worse one cannot show even gross errors.
+_MAX_RELATIVE_FLOOR: Final = 1e-3
 
 # Reference motions
 
@@ -46,7 +46,7 @@ def reference_motion(problem: Problem, times: Array, wanted: float, seconds: flo
         return _closed_form(problem, times)
     motion = problem.model, problem.q, problem.v, float(times[-1]), times, problem.tau
     try:
-        known = reference(*motion, seconds=seconds, wanted=wanted, agree=_WORTHLESS)
+        known = reference(*motion, seconds=seconds, wanted=wanted, agree=_MAX_RELATIVE_FLOOR)
     except MbkitError as error:
         return None, f"no truth: {error}"
     if len(known.t) < len(times):
@@ -83,7 +83,7 @@ TERMS: Final = {x.quantity: x for x in COMPARED if x.name in ("M", "inverse dyna
 #: Beyond this condition number doubles do not know the smallest eigenvalue of a matrix.
 _MAX_DOUBLE_CONDITION: Final = 1e15
 #: Digits of their singular values.
-_DIGITS: Final = 40
+_SINGULAR_VALUE_DIGITS: Final = 40
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Terms:
     at: States
     #: Term -> high and low part, or why the oracle has no value.
     values: dict[str, tuple[Array, Array] | str]
-    #: In units of 2**exponent kg, m and s, in which nothing overflows.
+    #: Scales in units of 2**exponent kg, m and s, in which nothing overflows.
     scales: Scales
     exponent: int
 
@@ -139,10 +139,10 @@ def condition(oracle: OracleDynamics, q: Array) -> float:
     if not (numbers >= _MAX_DOUBLE_CONDITION).any():
         return float(numbers.max())
     k = int(np.argmax(numbers))
-    with mp.workdps(_DIGITS):
+    with mp.workdps(_SINGULAR_VALUE_DIGITS):
         values = mp.svd_r(mp.matrix(high[k].tolist()) + mp.matrix(low[k].tolist()), compute_uv=False)
         least, largest = min(values), max(values)
-        return float(largest / least) if least > largest * 10.0**-_DIGITS else np.nan
+        return float(largest / least) if least > largest * 10.0**-_SINGULAR_VALUE_DIGITS else np.nan
 
 
 # Cells
@@ -151,20 +151,20 @@ def condition(oracle: OracleDynamics, q: Array) -> float:
 #: process to some milliseconds only, unless there is a timer on it.
 _clock = time.thread_time
 
-#: Times a run's seconds that making the problem and the engine, and compiling, may take; and at the least, s.
-_PREPARATION: Final = 15.0
-_MIN_PREPARATION: Final = 6.0
-#: A run shorter than this is timed so many times in all, s.
-_SHORT: Final = 5e-3
-_REPEATS: Final = 3
+#: The time limit of making the problem and the engine and of compiling, over a run's; and its least.
+_PREPARATION_PER_RUN_TIME: Final = 15.0
+_MIN_PREPARATION_SECONDS: Final = 6.0
+#: A run shorter than this is timed so many times in all.
+_SHORT_RUN_SECONDS: Final = 5e-3
+_SHORT_RUN_TIMINGS: Final = 3
 #: Methods that another may switch to, which are compiled before it is timed.
 _SWITCHES_TO: Final = {AUTOMATIC_METHOD: (ADAPTIVE_METHOD, STIFF_METHOD)}
-#: Times the run's seconds that an untimed run may take, which compiles what it needs on its way.
-_UNTIMED: Final = 2.0
-#: Part of an interval that is integrated to compile a method; however stiff the system, steps are few in it.
-_MOMENT: Final = 1e-15
+#: The time limit of an untimed run, which compiles what it needs on its way, over a timed one's.
+_UNTIMED_PER_RUN_TIME: Final = 2.0
+#: The part of an interval that is integrated to compile a method; steps are few in it, however stiff the system.
+_COMPILING_INTERVAL_PART: Final = 1e-15
 #: Steps of an engine's own integrator from which the time of all steps is estimated.
-_TRIAL: Final = 2000
+_TRIAL_STEPS: Final = 2000
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ class Limits:
     @property
     def preparation(self) -> float:
         """Processor time of making the problem and the engine, and compiling, s."""
-        return max(_MIN_PREPARATION, _PREPARATION * self.seconds)
+        return max(_MIN_PREPARATION_SECONDS, _PREPARATION_PER_RUN_TIME * self.seconds)
 
 
 class _ValueCache:
@@ -274,20 +274,20 @@ def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, t
     start, duration = (dyn, problem.q, problem.v), float(times[-1])
     report_stage("method")
     try:
-        short = _MOMENT * float(times[1]) if adaptive else dt
+        short = _COMPILING_INTERVAL_PART * float(times[1]) if adaptive else dt
         for name in (*_SWITCHES_TO.get(method, ()), method):
             quiet_simulate(*start, short, name, save=[short], **step)
         if method in _SWITCHES_TO:
             # The controller's own functions are compiled when it first uses them.
-            look = Deadline(_UNTIMED * limits.seconds, clock=_clock).look
+            look = Deadline(_UNTIMED_PER_RUN_TIME * limits.seconds, clock=_clock).look
             quiet_simulate(*start, duration, method, save=times, progress=look, **step)
         report_stage("run")
         steps = round(duration / dt) if kind.kind == "native" else 0
-        if steps >= 2 * _TRIAL:
+        if steps >= 2 * _TRIAL_STEPS:
             # An engine's own integrator does not stop when it is asked to.
             begun = _clock()
-            quiet_simulate(*start, _TRIAL * dt, method, save=[_TRIAL * dt], **step)
-            expected = (_clock() - begun) * steps / _TRIAL
+            quiet_simulate(*start, _TRIAL_STEPS * dt, method, save=[_TRIAL_STEPS * dt], **step)
+            expected = (_clock() - begun) * steps / _TRIAL_STEPS
             if expected > limits.seconds:
                 return Measurement(value, "slow", note=f"not run: {steps} steps would take {expected:.2g} s")
         with heard_warnings() as heard:
@@ -297,7 +297,7 @@ def _integrate(cache: _ValueCache, method: str, limits: Limits, dyn: Dynamics, t
             seconds = [_clock() - begun]
     except TooLongError as error:
         return Measurement(value, "slow", note=str(error))
-    while seconds[0] < _SHORT and len(seconds) < _REPEATS:
+    while seconds[0] < _SHORT_RUN_SECONDS and len(seconds) < _SHORT_RUN_TIMINGS:
         begun = _clock()
         quiet_simulate(*start, duration, method, save=times, doubt=False, **step)
         seconds.append(_clock() - begun)

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: On a terminal: methods that were wrong in silence.
-_METHODS: Final = 6
+#: A terminal names so many methods that were wrong in silence.
+_MAX_SILENT_METHODS: Final = 6
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class StressResult(ResultTable):
             sections=[
                 Section("Who holds furthest, and what breaks first", [Table(columns, cases)]),
                 Section("Where another held further than auto", [Items(behind)]),
-                Section("Wrong in silence, and the mildest value where", [Items(silent, most=_METHODS)]),
+                Section("Wrong in silence, and the mildest value where", [Items(silent, most=_MAX_SILENT_METHODS)]),
                 *(map(_rows_of, self.cases) if full else ()),
             ],
             result=self,

@@ -38,26 +38,27 @@ from mbkit.studies.stress.result import StressResult
 from mbkit.studies.study_runs import OUT_OF_TIME, TooLongError
 from mbkit.studies.worker import CallError, Worker, WorkerPool, check_executor, check_sendable, describe, in_worker, run
 
-#: Seconds that a run may take, and the whole study, quick and not.
-_SECONDS: Final = {True: 0.5, False: 2.0}
-_BUDGET: Final = {True: 100.0, False: 1700.0}
-_MEMORY: Final = 2 * 2**30
+#: Seconds of a run and of the whole study, quick and not.
+_RUN_SECONDS: Final = {True: 0.5, False: 2.0}
+_STUDY_SECONDS: Final = {True: 100.0, False: 1700.0}
+_WORKER_BYTES: Final = 2 * 2**30
 #: Below it no worker starts, bytes.
-_MIN_MEMORY: Final = 2**29
+_MIN_WORKER_BYTES: Final = 2**29
 _MAX_JOBS: Final = 16
-#: Seconds between two looks at how far it is.
-_TICK: Final = 0.2
+#: Seconds between two looks at how far the study is.
+_LOOK_SECONDS: Final = 0.2
 #: A run is not begun with less time than this, s.
-_MIN_TIME: Final = 0.1
-#: Runs in a row that did not finish, after which a row is over.
-_MAX_FAILURES: Final = 2
+_MIN_RUN_SECONDS: Final = 0.1
+#: A row is over after so many runs in a row that did not finish.
+_MAX_FAILURES_IN_A_ROW: Final = 2
 #: The part of a truth's time that its search gets, and the time for making its engines besides, s.
-_SEARCH: Final = 0.7
-_MIN_TRUTH: Final = 2.0
-#: Terms with 34 digits at one value, for which there is no substitute, s.
-_TERMS: Final = 60.0
-#: Seconds, and the part of a limit, by which the worker may miss it before its process is ended.
-_GRACE: Final = (0.5, 0.25)
+_SEARCH_PART: Final = 0.7
+_MIN_TRUTH_SECONDS: Final = 2.0
+#: Seconds for terms with 34 digits at one value, for which there is no substitute.
+_TERMS_SECONDS: Final = 60.0
+#: The worker may miss a limit by these seconds and this part of it before its process is ended.
+_GRACE_SECONDS: Final = 0.5
+_GRACE_PART: Final = 0.25
 #: Stage of a call -> what to add to the note of a process that ended there.
 _DURING: Final = {
     "": ", making the problem",
@@ -87,11 +88,11 @@ class _Row:
     def add(self, index: int, cell: Measurement) -> None:
         """Keep a cell, and decide whether more are worth it."""
         self.cells[index] = cell
-        last = [c.end for _, c in sorted(self.cells.items())][-_MAX_FAILURES:]
+        last = [c.end for _, c in sorted(self.cells.items())][-_MAX_FAILURES_IN_A_ROW:]
         if cell.end in ("slow", "died"):
             # More extreme values cost as much again, and tell no more.
             self.stopped = f"not run: {cell.end} at {cell.value:g} before"
-        elif len(last) == _MAX_FAILURES and not {"finished", "not run"} & set(last):
+        elif len(last) == _MAX_FAILURES_IN_A_ROW and not {"finished", "not run"} & set(last):
             self.stopped = f"not run: {' and '.join(dict.fromkeys(last))} at milder values before"
 
 
@@ -173,7 +174,7 @@ class CaseSweep:
         except WorkerDiedError as error:
             return Measurement(value, "died", note=f"{error}{_DURING.get(worker.stage, '')}")
         except MemoryError as error:
-            # What its process keeps takes memory from the next call.
+            # Its process would keep memory that the next call needs.
             worker.end()
             return Measurement(value, "died", note=f"{OUT_OF_MEMORY} ({error})" if str(error) else OUT_OF_MEMORY)
         except Exception as error:
@@ -185,12 +186,12 @@ class CaseSweep:
             if i in self._prepared:
                 continue
             left = until - self.clock()
-            if left < _MIN_TIME:
+            if left < _MIN_RUN_SECONDS:
                 return False
             self.report(f"{self.case.name}: truth at {self.case.parameter} = {value:g}")
             share = left / (len(self.values) - i)
-            seconds = _TERMS if self.case.measure == "terms" else share + _MIN_TRUTH
-            answer = self._call(worker, value, prepare, self.bar, _SEARCH * share, truth=seconds)
+            seconds = _TERMS_SECONDS if self.case.measure == "terms" else share + _MIN_TRUTH_SECONDS
+            answer = self._call(worker, value, prepare, self.bar, _SEARCH_PART * share, truth=seconds)
             if isinstance(answer, Measurement):
                 answer = Prepared(f"no truth: {answer.note}") if worker.stage else Prepared(answer.note, failure=answer)
             self._prepared[i] = answer
@@ -210,7 +211,7 @@ class CaseSweep:
                     row.cells[i] = failure
                 elif row.stopped:
                     row.cells[i] = Measurement(value, "not run", note=row.stopped)
-                elif until - self.clock() < _MIN_TIME:
+                elif until - self.clock() < _MIN_RUN_SECONDS:
                     return False
                 else:
                     self.report(f"{self.case.name}: {row.method} on {engine}, {self.case.parameter} = {value:g}")
@@ -250,7 +251,7 @@ class CaseSweep:
 
 def _with_grace(seconds: float) -> float:
     """Return the processor time after which a process is ended that should have stopped by itself."""
-    return seconds * (1 + _GRACE[1]) + _GRACE[0]
+    return seconds * (1 + _GRACE_PART) + _GRACE_SECONDS
 
 
 # All cases side by side
@@ -301,7 +302,7 @@ def run_sweeps(sweeps: Sequence[CaseSweep], home: Path, memory: int, jobs: int, 
                 running[pool.lend(task.work, until)] = task
             if not running:
                 return
-            for future in wait(running, _TICK, FIRST_COMPLETED).done:
+            for future in wait(running, _LOOK_SECONDS, FIRST_COMPLETED).done:
                 task = running.pop(future)
                 task.state = "done" if future.result() or time.perf_counter() >= deadline else "waiting"
             yield
@@ -416,13 +417,13 @@ def stress(
     if not isinstance(quick, bool):
         raise InputError(f"quick: expected True or False, got {quick!r}")
     limits = Limits(
-        _SECONDS[quick] if seconds is None else real("seconds", seconds, positive=True),
+        _RUN_SECONDS[quick] if seconds is None else real("seconds", seconds, positive=True),
         real("dt", dt, positive=True),
         real("rtol", rtol, positive=True),
     )
     bar = real("bar", bar, positive=True)
-    memory = _MEMORY if memory is None else count("memory", memory, least=_MIN_MEMORY)
-    budget = _BUDGET[quick] if budget is None else real("budget", budget, positive=True)
+    memory = _WORKER_BYTES if memory is None else count("memory", memory, least=_MIN_WORKER_BYTES)
+    budget = _STUDY_SECONDS[quick] if budget is None else real("budget", budget, positive=True)
     width = min(cores(), _MAX_JOBS) if jobs is None else count("jobs", jobs, least=1)
     check_executor(executor)
     if executor is not None and jobs is not None:
@@ -450,7 +451,7 @@ def stress(
     doing, deadline = deque([""], maxlen=1), begun + budget
     parts = [(case, own, _rows(case, methods_of), case.bar or bar, limits) for case, own in swept]
     sweeps = [CaseSweep(*part, doing.append, deadline) for part in parts]
-    #: What an executor has answered.
+    #: Answers of an executor, by the case's name.
     answers: dict[str, CaseResult] = {}
 
     def result(*, complete: bool) -> StressResult:

@@ -16,7 +16,7 @@ from mbkit.studies.formatting import error_text, time_text
 from mbkit.studies.measurement import Measurement, Outcome
 from mbkit.studies.results import counted
 from mbkit.studies.stress.case import Family
-from mbkit.studies.stress.figure import ROOMY, cell_text, error_short, number_text, shade, stable_steps
+from mbkit.studies.stress.figure import MAX_ROOMY_COLUMNS, cell_text, error_short, number_text, shade, stable_steps
 from mbkit.studies.stress.measurements import CaseResult, Line, Overview, Row, engines_of, name_of, place
 
 #: Outcomes in words that follow "then".
@@ -43,12 +43,12 @@ _MEASURES: Final = {
     "energy": "the largest relative error of the energy along the run",
     "terms": "that of each term at the case's states, relative to the term",
 }
-#: What a truth's floor stands behind.
+#: The words before a truth's floor.
 _KNOWN: Final = "; known to "
 #: Names in one sentence; the tables have all.
-_NAMED: Final = 3
-#: On a terminal: cases in which a method was wrong in silence.
-_PLACES: Final = 2
+_MAX_NAMES: Final = 3
+#: A terminal names so many cases in which a method was wrong in silence.
+_MAX_PLACES: Final = 2
 
 
 def _left_out(o: Overview) -> list[tuple[str, str]]:
@@ -103,14 +103,14 @@ def leaders(cases: Iterable[Overview]) -> str:
         return f"nothing held in {counted(len(ranked), 'case')}"
     most = max(counts.values())
     names = [name for name, count in counts.items() if count == most]
-    if len(names) > _NAMED:
-        names = [", ".join(names[:_NAMED]), f"{len(names) - _NAMED} more"]
+    if len(names) > _MAX_NAMES:
+        names = [", ".join(names[:_MAX_NAMES]), f"{len(names) - _MAX_NAMES} more"]
     elif len(names) > 1:
         names = [", ".join(names[:-1]), names[-1]]
     return f"{' and '.join(names)} held furthest, or as far as any, in {most} of {counted(len(ranked), 'case')}"
 
 
-# Which method for which kind of scene: how often none held further, and at what price.
+# Methods by kind of scene: how often none held further, and at what price.
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def methods(cases: Iterable[Overview]) -> list[MethodLine]:
     return sorted(out, key=lambda m: (-m.ahead, -m.held, m.silent, math.isnan(m.factor), m.factor))
 
 
-# What was wrong in silence: row by row, and the methods to avoid.
+# Silent failures: row by row, and the methods to avoid.
 
 
 class SilentLine(NamedTuple):
@@ -205,7 +205,7 @@ def _mildest(group: list[SilentLine]) -> tuple[Overview, str, list[str]]:
 
 # The largest stable step of each method, against linear theory, and the rule that follows for a step.
 
-#: What a fact's name begins with that a step is to be short against: "fastest frequency", "fastest rate".
+#: A step is to be short against facts whose names begin so: "fastest frequency", "fastest rate".
 _FASTEST: Final = "fastest"
 #: Ends that say nothing about stability.
 _OTHER: Final = ("slow", "refused", "died")
@@ -264,7 +264,7 @@ def rules(cases: Iterable[Overview]) -> list[Rule]:
 def _bounds(line: Line) -> Iterator[tuple[str, Bound]]:
     held, failed, case = line.broken.held, line.broken.failed, line.case
     if line.rest is not None and (failed is None or line.rest in _OTHER):
-        # What stopped it there has nothing to do with the step.
+        # The reason why it stopped there has nothing to do with the step.
         return
     bound = (0.0 if held is None else held, math.nan if failed is None else failed, _limit(line))
     for kind, rate in case.facts[0].items() if case.facts else ():
@@ -327,7 +327,7 @@ def map_cells(line: Line) -> list[MapCell]:
         style += ["sil"] if how == "silent" else []
         style += ["brk"] if k == line.reach and line.broken.failed is not None else []
         style += ["lim"] if k == beyond else []
-        text = cell_text(cell, how, short=len(case.values) > ROOMY)
+        text = cell_text(cell, how, short=len(case.values) > MAX_ROOMY_COLUMNS)
         out.append(MapCell(" ".join(style), text, _title(case, line.row, cell, how)))
     # An interrupted study has fewer cells than values.
     return out + [MapCell("none", "", "")] * (len(case.values) - len(out))
@@ -400,7 +400,7 @@ def _limit_text(x: float | None, unit: str = "") -> str:
     return "no limit" if math.isinf(x) else f"{_three_digits(x)} {unit}".rstrip()
 
 
-#: What the template writes numbers and rows with.
+#: Filters by which the template writes numbers and rows.
 FILTERS: Final[Mapping[str, Any]] = {
     "short": error_short,
     "number": number_text,
@@ -441,5 +441,5 @@ def first_failure(o: Overview) -> str:
 
 def places_text(a: Avoid) -> str:
     """Return where a method was wrong in silence, the first few places."""
-    places = [f"{o.case.name} at {o.case.parameter} = {text}" for o, text, _ in a.places[:_PLACES]]
-    return ", ".join(places + ([f"{len(a.places) - _PLACES} more"] if len(a.places) > _PLACES else []))
+    places = [f"{o.case.name} at {o.case.parameter} = {text}" for o, text, _ in a.places[:_MAX_PLACES]]
+    return ", ".join(places + ([f"{len(a.places) - _MAX_PLACES} more"] if len(a.places) > _MAX_PLACES else []))

@@ -14,14 +14,14 @@ from mbkit.studies.measurement import Measurement, run_name
 
 T = TypeVar("T")
 #: Errors below so many times the reference's floor, or the rounding level, are not in the regression.
-_ABOVE_ROUNDING: Final = 100.0
+_MIN_ERROR_PER_FLOOR: Final = 100.0
 #: Errors above this part of the motion are pre-asymptotic.
-_COARSE: Final = 0.03
+_MAX_ERROR_PER_MOTION: Final = 0.03
 #: Largest spread of the slopes between neighbouring points in the regression.
-_SLOPE_SPREAD: Final = 0.3
+_MAX_SLOPE_SPREAD: Final = 0.3
 _MIN_POINTS: Final = 3
 #: An error that is so many times as large has turned.
-_WORSE: Final = 1.5
+_MIN_TURNED_ERROR_RATIO: Final = 1.5
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,9 @@ class Curve:
         known = [p for p in self.points if math.isfinite(p.error)]
         best = min(known, key=lambda p: p.error, default=None)
         finer = [] if best is None else [p for p in known if p.value < best.value]
-        worse = bool(finer) and all(p.setting == "dt" and p.error > _WORSE * best.error for p in finer if best)
+        worse = bool(finer) and all(
+            p.setting == "dt" and p.error > _MIN_TURNED_ERROR_RATIO * best.error for p in finer if best
+        )
         return best if worse else None
 
     def reach(self, error: float) -> Measurement | None:
@@ -97,11 +99,11 @@ def observed_order(steps: Sequence[float], errors: Sequence[float], *, floor: fl
     (4.0, 3)
     """
     h, e = np.asarray(steps, dtype=float), np.asarray(errors, dtype=float)
-    good = np.isfinite(e) & (e > 0) & (e < _COARSE * motion)
+    good = np.isfinite(e) & (e > 0) & (e < _MAX_ERROR_PER_MOTION * motion)
     h, e = h[good], e[good]
     by_step = np.argsort(-h)
     h, e = h[by_step], e[by_step]
-    above = e > _ABOVE_ROUNDING * max(floor, _rounding_level(h, e))
+    above = e > _MIN_ERROR_PER_FLOOR * max(floor, _rounding_level(h, e))
     x, y = np.log(h[above]), np.log(e[above])
     part = _longest_steady(x, y)
     if part is None:
@@ -123,7 +125,7 @@ def _longest_steady(x: Array, y: Array) -> slice | None:
     best: slice | None = None
     for start in range(len(slopes)):
         for stop in range(start + _MIN_POINTS - 1, len(slopes) + 1):
-            if np.ptp(slopes[start:stop]) > _SLOPE_SPREAD:
+            if np.ptp(slopes[start:stop]) > _MAX_SLOPE_SPREAD:
                 break
             if best is None or stop + 1 - start >= best.stop - best.start:
                 best = slice(start, stop + 1)

@@ -33,18 +33,19 @@ _Measure = Callable[[Measurement], float]
 
 #: MuJoCo's own integrators stand in the panel of the same formula.
 _SAME_FORMULA: Final = {m.name: m.own for m in METHODS.values() if m.own}
-_COLUMNS: Final = 5
-_WIDTH: Final = 10.4
-_TOP: Final = 4.4
+_PANELS_PER_ROW: Final = 5
+_WIDTH_INCHES: Final = 10.4
+_TOP_HEIGHT_INCHES: Final = 4.4
 #: Right end of the axes; leaves room for half of the last tick's label.
-_RIGHT: Final = 0.98
-_ROW: Final = 1.5
-_NAME: Final = 9.0  # points, and the width of a bold letter, in
-_LETTER: Final = 0.077
+_RIGHT_EDGE: Final = 0.98
+_PANEL_HEIGHT_INCHES: Final = 1.5
+#: Size of the front's names, and the width of one of their bold letters.
+_NAME_POINTS: Final = 9.0
+_LETTER_WIDTH_INCHES: Final = 0.077
 #: A run with a larger error, rad or m, is not on the front; with ten times as much it is not drawn.
-USEFUL: Final = 0.1
-_MAX_ERROR: Final = 1.0
-_MIN_ERROR: Final = 1e-17
+MAX_USEFUL_ERROR: Final = 0.1
+_MAX_DRAWN_ERROR: Final = 1.0
+_MIN_DRAWN_ERROR: Final = 1e-17
 _EPS: Final = 2.0**-52
 _DASHED: Final = (0, (4, 3))
 
@@ -59,11 +60,11 @@ def figure(
     """
     floor = floor if math.isfinite(floor) and floor > 0 else 0.0
     methods = _methods(curves)
-    rows = math.ceil(len(methods) / _COLUMNS)
+    rows = math.ceil(len(methods) / _PANELS_PER_ROW)
 
     def error(p: Measurement) -> float:
         # Below the reference's floor nothing is known; a logarithm has no zero.
-        return max(p.error, floor / 10, _MIN_ERROR) if math.isfinite(p.error) else math.nan
+        return max(p.error, floor / 10, _MIN_DRAWN_ERROR) if math.isfinite(p.error) else math.nan
 
     with drawing(palette):
         # Figure without pyplot: no window system, nothing to close.
@@ -73,12 +74,12 @@ def figure(
             _errors(only, curves, duration, floor, palette, error)
             legend(only, _handles(curves, floor, palette), "lower", own=False, columns=2)
             return figure_of(only)
-        height = _TOP + (0.75 + _ROW * rows if rows else 0.0)
-        fig = Figure(figsize=(_WIDTH, height))
-        split = 1 - _TOP / height
+        height = _TOP_HEIGHT_INCHES + (0.75 + _PANEL_HEIGHT_INCHES * rows if rows else 0.0)
+        fig = Figure(figsize=(_WIDTH_INCHES, height))
+        split = 1 - _TOP_HEIGHT_INCHES / height
         # With dampers the energy is not conserved, and there is no drift to show.
         conserved = any(_drawable(p.seconds, p.energy) for c in curves for p in c.points)
-        margins = {"left": 0.07, "right": _RIGHT, "top": 1 - 0.62 / height, "bottom": split + 0.55 / height}
+        margins = {"left": 0.07, "right": _RIGHT_EDGE, "top": 1 - 0.62 / height, "bottom": split + 0.55 / height}
         ratios = (1.55, 1.0) if conserved else (1.0,)
         gridspec = margins | {"wspace": 0.2}
         axes = fig.subplots(1, len(ratios), width_ratios=ratios, squeeze=False, gridspec_kw=gridspec)[0]
@@ -95,7 +96,7 @@ def figure(
                 caption += "; dashed: MuJoCo's own integrator of the same formulas"
             fig.text(0.025, split - 0.12 / height, caption, va="top")
             margins |= {"top": split - 0.58 / height, "bottom": 0.42 / height, "wspace": 0.08, "hspace": 0.3}
-            grid = fig.subplots(rows, _COLUMNS, sharex=True, sharey=True, squeeze=False, gridspec_kw=margins)
+            grid = fig.subplots(rows, _PANELS_PER_ROW, sharex=True, sharey=True, squeeze=False, gridspec_kw=margins)
             _by_method(list(grid.flat), methods, _places(curves, error), error, floor, palette)
     return fig
 
@@ -117,8 +118,8 @@ def _drawable(seconds: float, y: float) -> bool:
 
 def _places(curves: Sequence[Curve], measure: _Measure) -> list[_Place]:
     points = ((p.seconds, measure(p), c) for c in curves for p in c.points)
-    places = ((x, max(y, _MIN_ERROR), c) for x, y, c in points if _drawable(x, y))
-    return [place for place in places if place[1] <= _MAX_ERROR]
+    places = ((x, max(y, _MIN_DRAWN_ERROR), c) for x, y, c in points if _drawable(x, y))
+    return [place for place in places if place[1] <= _MAX_DRAWN_ERROR]
 
 
 def _xy(places: Sequence[_Place]) -> tuple[list[float], list[float]]:
@@ -136,7 +137,7 @@ def _front(places: Sequence[_Place], floor: float) -> list[_Place]:
 
 def _draw_front(ax: Axes, places: Sequence[_Place], floor: float, palette: Palette, width: float) -> list[_Place]:
     """Draw the front of all useful points as a band, and return it."""
-    front = _front([place for place in places if place[1] <= USEFUL], floor)
+    front = _front([place for place in places if place[1] <= MAX_USEFUL_ERROR], floor)
     ax.plot(*_xy(front), color=palette.ink, alpha=0.16, linewidth=width, solid_capstyle="round")
     return front
 
@@ -182,7 +183,7 @@ def _limits(ax: Axes, places: Sequence[_Place], floor: float, names: Sequence[tu
     low, high = math.log10(min(xs)) - 0.15, math.log10(max(xs)) + 0.15
     width = float(ax.get_window_extent().width) / figure_of(ax).dpi
     for (x, _, curve), below in names:
-        share = min(0.6, (_LETTER * len(_short(curve)) + (-0.2 if below else 0.2)) / width)
+        share = min(0.6, (_LETTER_WIDTH_INCHES * len(_short(curve)) + (-0.2 if below else 0.2)) / width)
         low = min(low, (math.log10(x) - share * high) / (1 - share))
     ax.set_xlim(10**low, 10**high)
     room = 0.7 + 0.9 * sum(below for _, below in names)
@@ -211,7 +212,7 @@ def _write_names(ax: Axes, names: Sequence[tuple[_Place, bool]], palette: Palett
         # Downwards, where the front is further right, so that no name meets another.
         last = min(at - (16.0 if below else 0.0), last - 12.0)
         offset, colour = (9.0 if below else -11.0, last - at), palette.engine(curve.engine)
-        font: dict[str, Any] = {"fontsize": _NAME, "fontweight": "bold", "color": colour}
+        font: dict[str, Any] = {"fontsize": _NAME_POINTS, "fontweight": "bold", "color": colour}
         ax.annotate(_short(curve), (x, y), offset, textcoords="offset points", ha="right", va="center", **font)
 
 
@@ -237,10 +238,10 @@ def _handles(curves: Sequence[Curve], floor: float, palette: Palette) -> list[Li
 def _legend(fig: Figure, curves: Sequence[Curve], floor: float, palette: Palette) -> None:
     handles = _handles(curves, floor, palette)
     place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (0.02, 1.0), "columnspacing": 1.6}
-    # On one line, in letters as small as long names need.
+    # The legend stays on one line: its letters are as small as long names need.
     for size in (10.0, 9.0, 8.0, 7.0, 6.0, 5.0):
         drawn = fig.legend(handles=handles, ncols=len(handles), prop={"size": size}, **place)
-        if size == 5.0 or drawn.get_window_extent().x1 <= _RIGHT * fig.bbox.width:
+        if size == 5.0 or drawn.get_window_extent().x1 <= _RIGHT_EDGE * fig.bbox.width:
             return
         drawn.remove()
 
@@ -274,6 +275,6 @@ def _by_method(
         ax.grid(which="major")
         log_ticks(ax, 5)
         ax.tick_params(labelsize=8.5)
-        if k + _COLUMNS >= len(methods):
+        if k + _PANELS_PER_ROW >= len(methods):
             # The last of a column, whose lower neighbours may be missing.
             ax.tick_params(labelbottom=True)

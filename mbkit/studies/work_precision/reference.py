@@ -51,10 +51,10 @@ from mbkit.studies.study_runs import Deadline, TooLongError, quiet_simulate
 
 # Pairs of runs of one motion: their difference bounds the error of either.
 
-# Parts of the motion that two engines run by turns: they stop soon after they part, and a start costs nothing.
-_LEGS: Final = 20
-# Tolerance of the second Taylor run: one order less, so with other steps, rounding and truncation.
-_COARSER: Final = 8.0
+# Parts of the motion that two engines run by turns, so that they stop soon after they part.
+_MAX_LEGS: Final = 20
+# The second Taylor run's tolerance over the first one's: one order less, so other steps, rounding and truncation.
+_SECOND_TOLERANCE_RATIO: Final = 8.0
 #: Engine and method of each of two independent roads, best first; and of roads that stiff motion does not make long.
 _Roads = tuple[tuple[tuple[str, str], ...], ...]
 _ROADS: Final[_Roads] = (
@@ -63,12 +63,12 @@ _ROADS: Final[_Roads] = (
 )
 _QUICK: Final[_Roads] = (_ROADS[0][1:], _ROADS[1])
 _STIFF: Final[_Roads] = (((DERIVED, STIFF_METHOD),), tuple((engine, SCIPY_STIFF_METHOD) for engine in INDEPENDENT))
-#: How well two runs must agree, relative to the size of the motion.
-AGREE: Final = 1e-12
-# Two engines that are farther apart than this, rad or m, have parted for good.
-_PARTED: Final = 1e-6
-# Tolerance of methods for stiff motion, as a part of what is wanted: a smaller one costs them dear.
-_FINER: Final = 1e-3
+#: The largest difference of two runs that agree, relative to the size of the motion.
+MAX_RELATIVE_GAP: Final = 1e-12
+# Two runs that are farther apart than this, rad or m, have parted for good.
+_PARTED_GAP: Final = 1e-6
+# Tolerance of methods for stiff motion over the wanted error: a smaller one costs them dear.
+_STIFF_TOLERANCE_PART: Final = 1e-3
 
 
 #: (high, low) parts of numbers with twice a double's digits.
@@ -143,7 +143,7 @@ class Known:
     how: str
     #: Why they ended before the duration did.
     why: str = ""
-    #: Of the first run, 0 if not known.
+    #: Steps of the first run, 0 if not known.
     steps: int = 0
     #: Whether both runs have the same formulas.
     shared: bool = False
@@ -172,7 +172,7 @@ def taylor_pair(motion: Motion, deadline: Deadline, bits: int) -> Known:
     with deadline.paused():
         system = taylor_system(motion.equations)
     constants = kind.array(motion.equations.constant_values)
-    tolerances = kind.eps, _COARSER * kind.eps
+    tolerances = kind.eps, _SECOND_TOLERANCE_RATIO * kind.eps
     runs: list[list[Any]] = []
     steps, why = 0, ""
     for i, tolerance in enumerate(tolerances):
@@ -187,7 +187,7 @@ def taylor_pair(motion: Motion, deadline: Deadline, bits: int) -> Known:
         steps, why = steps or count, why or early
     first, second = (np.stack(states[: min(map(len, runs))]) for states in runs)
     q, v = kind.pair(first[:, :nq]), kind.pair(first[:, nq:])
-    # What opens the loops of one of them may open those of the other alike.
+    # The same rounding may open the loops of both runs alike.
     opened = motion.gap(q, motion.save[: len(first)])
     apart = [np.maximum(gap(model, first[:, :nq], second[:, :nq]), opened), _largest(first[:, nq:] - second[:, nq:])]
     orders = " and ".join(str(order_of(x)) for x in tolerances)
@@ -228,7 +228,7 @@ def _largest(x: Any) -> Array:
 
 
 def two_engines(
-    motion: Motion, deadline: Deadline, choices: _Roads = _ROADS, rtol: float = 0.0, parted: float = _PARTED
+    motion: Motion, deadline: Deadline, choices: _Roads = _ROADS, rtol: float = 0.0, parted: float = _PARTED_GAP
 ) -> Known:
     """Return runs of two engines, each with a method of its own, marching by turns until they part.
 
@@ -239,7 +239,7 @@ def two_engines(
     how = " and ".join(f"{method} on {dyn.engine}" for dyn, method in roads)
     states = [(motion.q0[None], motion.v0[None]) for _ in roads]
     times, why = motion.save, ""
-    ends = np.unique(np.linspace(0, len(times) - 1, min(_LEGS, len(times) - 1) + 1).astype(int))
+    ends = np.unique(np.linspace(0, len(times) - 1, min(_MAX_LEGS, len(times) - 1) + 1).astype(int))
     for k, end in pairwise(ends.tolist()):
         legs: list[Trajectory] = []
         try:
@@ -255,7 +255,7 @@ def two_engines(
             (np.concatenate([q, leg.q[1:n]]), np.concatenate([v, leg.v[1:n]]))
             for (q, v), leg in zip(states, legs, strict=True)
         ]
-        # What has parted for good need not be followed to the end.
+        # Runs that have parted for good need not be followed to the end.
         if why or gap(motion.model, states[0][0][-1:], states[1][0][-1:])[0] > parted:
             break
     (q, v), (other_q, other_v) = states
@@ -298,18 +298,20 @@ def _leg(
     return quiet_simulate(dyn, q, v, length, method, progress=deadline.look, **settings)
 
 
-# Errors partly cancel in a difference: against more digits, a run was up to three times as wrong as two were apart.
-_SAFETY: Final = 4.0
-# Quadruple numbers cost about this many seconds per operation, order² and step.
-_QUADRUPLE: Final = 1.0e-8
-# Steps per second of motion that a small system takes: a guess before there is a run.
-_STEPS: Final = 40.0
-# Series need seconds to derive and compile that a search does not count: of a quick one they are not worth it.
-_MIN_SERIES: Final = 5.0
-# States at which accelerations are compared.
-_WITNESSED: Final = 64
-# Two doubles hold 106 bits of a number, which can be somewhat larger than the motion.
-_PAIR: Final = 2.0**-105
+# The floor over the difference of two runs: errors partly cancel in it, and by more digits a run was up to three times
+# as wrong.
+_FLOOR_PER_GAP: Final = 4.0
+# Seconds per operation, order² and step in quadruple precision.
+_SECONDS_PER_QUADRUPLE_OPERATION: Final = 1.0e-8
+# A small system's steps per second of motion: a guess before there is a run.
+_TYPICAL_STEPS_PER_SECOND: Final = 40.0
+# A search with less time left than this makes no series: they need seconds to derive and compile, which it does not
+# count.
+_MIN_SERIES_SECONDS: Final = 5.0
+# The largest number of states at which accelerations are compared.
+_MAX_WITNESSED_STATES: Final = 64
+# The relative resolution of a pair of doubles: 106 bits of a number that can be somewhat larger than the motion.
+_PAIR_RESOLUTION: Final = 2.0**-105
 _EPS: Final = float(np.finfo(np.float64).eps)
 
 
@@ -372,8 +374,8 @@ def reference(
     torque: ArrayLike | TorqueFunction | None = None,
     *,
     seconds: float = 30.0,
-    wanted: float = AGREE,
-    agree: float = AGREE,
+    wanted: float = MAX_RELATIVE_GAP,
+    agree: float = MAX_RELATIVE_GAP,
     progress: bool | ProgressFunction | None = None,
 ) -> Reference:
     """Return the motion from a state, known to 12 digits or cut where it is not.
@@ -473,7 +475,7 @@ def _search(
     refused: list[str] = []
 
     def holds(way: Any, *more: Any, within: float = inf) -> bool:
-        # Whether a way leads to the end is known at its end.
+        # A way shows only at its end whether it leads there.
         try:
             pairs.append(way(motion, deadline.part(within), *more))
         except UnsupportedError as error:
@@ -481,20 +483,20 @@ def _search(
             return False
         return bool(_cut(motion, pairs[-1], wanted).horizon == motion.save[-1])
 
-    if wanted > AGREE:
-        for roads, rtol, part in ((_QUICK, 0.0, 0.25), (_STIFF, _FINER * wanted, 0.75)):
-            if holds(two_engines, roads, rtol, max(agree, _PARTED), within=part * deadline.left):
+    if wanted > MAX_RELATIVE_GAP:
+        for roads, rtol, part in ((_QUICK, 0.0, 0.25), (_STIFF, _STIFF_TOLERANCE_PART * wanted, 0.75)):
+            if holds(two_engines, roads, rtol, max(agree, _PARTED_GAP), within=part * deadline.left):
                 return pairs, refused
-        if deadline.left < _MIN_SERIES:
+        if deadline.left < _MIN_SERIES_SECONDS:
             return pairs, refused
-    # A series cannot follow jumps: runs go from one to the next, phase by phase.
+    # A series cannot follow jumps; runs follow them phase by phase.
     if not (motion.torque.callable or "jump" in motion.model.effects):
-        small = _quadruple_seconds(motion, _STEPS * motion.duration) < seconds / 6
+        small = _quadruple_seconds(motion, _TYPICAL_STEPS_PER_SECOND * motion.duration) < seconds / 6
         if small and holds(taylor_pair, 113, within=seconds / 2):
             return pairs, refused
         if holds(taylor_pair, 64):
             return pairs, refused
-        steps = pairs[-1].steps if pairs else _STEPS * motion.duration
+        steps = pairs[-1].steps if pairs else _TYPICAL_STEPS_PER_SECOND * motion.duration
         if not small and _quadruple_seconds(motion, steps) < deadline.left:
             holds(taylor_pair, 113)
     if not pairs:
@@ -509,21 +511,21 @@ def _quadruple_seconds(motion: Motion, steps: float) -> float:
         order, operations = order_of(precision(113).eps), taylor_system(motion.equations).operations
     except UnsupportedError:
         return inf
-    return 2 * steps * operations * order**2 * _QUADRUPLE
+    return 2 * steps * operations * order**2 * _SECONDS_PER_QUADRUPLE_OPERATION
 
 
 def _cut(motion: Motion, known: Known, agree: float) -> Reference:
     """Return the reference from a pair of runs, up to where they part."""
     model, (q, q_low), (v, v_low) = motion.model, known.q, known.v
     moved = gap(model, q, np.broadcast_to(q[:1], q.shape))
-    # What rests has no size; it is then known absolutely.
+    # A motion at rest has no size; it is then known absolutely.
     scale = float(moved.max()) or 1.0, float(np.abs(v).max()) or 1.0
     apart = np.maximum.accumulate(known.apart, axis=1)
     relative = np.max(apart / np.array(scale)[:, None], axis=0)
     holds = relative <= agree
     n = len(holds) if holds.all() else int(np.argmin(holds))
     end = float(motion.save[n - 1])
-    worst = max(float(relative[:n].max()), _PAIR)
+    worst = max(float(relative[:n].max()), _PAIR_RESOLUTION)
     how = f"{known.how}, which agree to {worst:.1e} of the motion"
     if n < len(motion.save):
         why = known.why if n == len(q) else f"beyond, they part to {relative[n]:.1e} at t = {motion.save[n]:.6g} s"
@@ -535,21 +537,21 @@ def _cut(motion: Motion, known: Known, agree: float) -> Reference:
         v=v[:n],
         q_low=q_low[:n],
         v_low=v_low[:n],
-        floor=_SAFETY * apart[0, :n] + 0.5 * _EPS * size,
-        digits=float(-np.log10(_SAFETY * worst)),
+        floor=_FLOOR_PER_GAP * apart[0, :n] + 0.5 * _EPS * size,
+        digits=float(-np.log10(_FLOOR_PER_GAP * worst)),
         scale=scale,
         horizon=end,
         how=how,
     )
 
 
-#: Characters of a reason why an engine is no witness.
-_REASON: Final = 120
+#: Letters of a reason why an engine is no witness.
+_MAX_REASON_LETTERS: Final = 120
 
 
 def _witness(motion: Motion, best: Reference) -> str:
     """Return a text that compares accelerations along a motion with those of another engine."""
-    which = np.unique(np.linspace(0, len(best.t) - 1, min(_WITNESSED, len(best.t))).astype(int))
+    which = np.unique(np.linspace(0, len(best.t) - 1, min(_MAX_WITNESSED_STATES, len(best.t))).astype(int))
     q, v = best.q[which], best.v[which]
     force, last = motion.torque.of_member(None), max(len(motion.stops) - 1, 0)
     tau = np.array([force(min(int(k), last)) for k in which])
@@ -562,7 +564,7 @@ def _witness(motion: Motion, best: Reference) -> str:
             _require_rigid(dyn)
             other = _accelerations(dyn, best.t[which], q, v, tau)
         except MbkitError as error:
-            failed.append(one_line(str(error), _REASON))
+            failed.append(one_line(str(error), _MAX_REASON_LETTERS))
             continue
         apart = np.abs(a - other).max() / (np.abs(a).max() or 1.0)
         return f"; accelerations along it differ by {apart:.1e} from those of {engine}"

@@ -17,7 +17,7 @@ from mbkit.studies.results import Refusal, ResultTable, columns, counted
 from mbkit.studies.study_runs import OUT_OF_TIME
 from mbkit.studies.svg import PAGE, image, page_style, svg
 from mbkit.studies.work_precision.curve import Curve, pareto_front
-from mbkit.studies.work_precision.figure import USEFUL, figure
+from mbkit.studies.work_precision.figure import MAX_USEFUL_ERROR, figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 
 #: An observed order farther than this from the method's own is flagged.
-ORDER_TOLERANCE: Final = 0.2
-_EXPONENTS: Final = range(-2, -15, -2)
+MAX_ORDER_ERROR: Final = 0.2
+_ERROR_EXPONENTS: Final = range(-2, -15, -2)
 
 
 class Lead(NamedTuple):
@@ -205,7 +205,7 @@ class WorkPrecision(ResultTable):
         groups = itertools.groupby(leads(self), key=lambda lead: lead.curve.name)
         parts = [f"{name} for an error of {_range([e for lead in some for e in lead.errors])}" for name, some in groups]
         if not parts:
-            return f"{stopped}no run has an error of at most {10.0 ** _EXPONENTS[0]:g} rad or m"
+            return f"{stopped}no run has an error of at most {10.0 ** _ERROR_EXPONENTS[0]:g} rad or m"
         count = f"{len(self.curves)} curve{'s' * (len(self.curves) != 1)}"
         if self.untimed:
             stopped += f"no time was left for {' and '.join(self.untimed)}, so none is the fastest; "
@@ -253,7 +253,7 @@ class WorkPrecision(ResultTable):
 def leads(result: WorkPrecision) -> list[Lead]:
     """Return the fastest run for each error that anyone reaches, as far as the reference can tell, each run once."""
     out: dict[int, Lead] = {}
-    for error in (10.0**exponent for exponent in _EXPONENTS):
+    for error in (10.0**exponent for exponent in _ERROR_EXPONENTS):
         first = result.fastest(error)
         if first is None or error < result.floor:
             break
@@ -266,19 +266,19 @@ def leads(result: WorkPrecision) -> list[Lead]:
 
 def curve_lines(result: WorkPrecision) -> list[CurveLine]:
     """Return every curve in one line, in the order of the curves."""
-    front = {id(c) for c, p in result.front if p.error <= USEFUL}
+    front = {id(c) for c, p in result.front if p.error <= MAX_USEFUL_ERROR}
     floor = result.floor if math.isfinite(result.floor) else 0.0
     out = []
     for curve in result.curves:
         known = [p for p in curve.points if math.isfinite(p.error)]
         best = min(known, key=lambda p: (max(p.error, floor), p.seconds), default=None)
-        out.append(CurveLine(curve, best, abs(curve.order - curve.expected) > ORDER_TOLERANCE, id(curve) in front))
+        out.append(CurveLine(curve, best, abs(curve.order - curve.expected) > MAX_ORDER_ERROR, id(curve) in front))
     return out
 
 
 def front_names(result: WorkPrecision) -> list[str]:
     """Return the names of the curves on the front, the fastest first; no answers are left out."""
-    return list(dict.fromkeys(c.name for c, p in result.front if p.error <= USEFUL))
+    return list(dict.fromkeys(c.name for c, p in result.front if p.error <= MAX_USEFUL_ERROR))
 
 
 def error_against_time(result: WorkPrecision) -> str:
@@ -430,7 +430,7 @@ def _curve_blocks(result: WorkPrecision) -> list[doc.Block]:
     most = f" ({work:.0f} evaluations of the dynamics; one that is called from Python counts eight)" if work else ""
     legend = [doc.Bullet("", "on the front: nothing beats it in both error and run time", "●", "good")]
     if any(line.off for line in lines):
-        off = f"the observed order is not the method's own: it is more than {ORDER_TOLERANCE} off"
+        off = f"the observed order is not the method's own: it is more than {MAX_ORDER_ERROR} off"
         legend.append(doc.Bullet("", off, "!", "allowed"))
     return [
         doc.Table(_CURVES, lines),

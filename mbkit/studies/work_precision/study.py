@@ -30,22 +30,22 @@ from mbkit.studies.worker import check_executor
 #: An exact motion: from a time to q and v.
 Exact = Callable[[float], tuple[ArrayLike, ArrayLike]]
 
-#: A reference that starts farther than this from q0 and v0 belongs to another motion.
-_SAME_START: Final = 1e-9
+#: A reference that starts farther than this from q0 and v0, rad or m, belongs to another motion.
+_MAX_START_GAP: Final = 1e-9
 _EPS: Final = float(np.finfo(float).eps)
-#: Seconds that a study usually takes: base, for each velocity, and at the most.
-_USUAL: Final = 60.0
-_PER_VELOCITY: Final = 10.0
-_MAX_USUAL: Final = 120.0
-#: A study without `seconds` ends after this many times the usual time.
-_LATEST: Final = 5.0
-#: Counted work of a run up to so many velocities; it is less beyond, where an evaluation takes longer.
-_WORK: Final = 200_000
-_VELOCITIES: Final = 8
-#: Least part of the usual time for a study of less work.
-_LEAST_USUAL: Final = 0.1
-#: Part of the usual time for the search of a reference.
-_FOR_REFERENCE: Final = 0.25
+#: The usual seconds of a study: base, for each velocity, and at the most.
+_BASE_SECONDS: Final = 60.0
+_SECONDS_PER_VELOCITY: Final = 10.0
+_MAX_USUAL_SECONDS: Final = 120.0
+#: The limit of a study without `seconds`, over its usual time.
+_LIMIT_PER_USUAL_TIME: Final = 5.0
+#: Evaluations of a run at the most; fewer beyond so many velocities, where an evaluation takes longer.
+_MAX_EVALUATIONS: Final = 200_000
+_MAX_VELOCITIES_AT_FULL_WORK: Final = 8
+#: The least part of the usual time, for a study of less work.
+_MIN_USUAL_PART: Final = 0.1
+#: The part of the usual time that the search of a reference has.
+_REFERENCE_PART: Final = 0.25
 _ALONE: Final = "interleaved in one process"
 _TOGETHER: Final = "by workers that share the cores: errors are the same, run times are not those of a quiet machine"
 
@@ -148,12 +148,12 @@ def work_precision(
     """
     begun = time.perf_counter()
     require_motion(model, "integrate").require_values("a study of run time")
-    usual = min(_USUAL + _PER_VELOCITY * model.nv, _MAX_USUAL)
-    limit = _LATEST * usual if seconds is None else real("seconds", seconds, positive=True)
-    whole = _WORK * min(1.0, _VELOCITIES / model.nv)
+    usual = min(_BASE_SECONDS + _SECONDS_PER_VELOCITY * model.nv, _MAX_USUAL_SECONDS)
+    limit = _LIMIT_PER_USUAL_TIME * usual if seconds is None else real("seconds", seconds, positive=True)
+    whole = _MAX_EVALUATIONS * min(1.0, _MAX_VELOCITIES_AT_FULL_WORK / model.nv)
     most = whole if work is None else count("work", work, least=1)
-    # Of runs that are kept short, fewer are timed again, the longest least.
-    budget = TimeBudget(limit, min(usual * min(max(most / whole, _LEAST_USUAL), 1.0), limit), most)
+    # Studies with a small limit of work time their runs less often, the longest least.
+    budget = TimeBudget(limit, min(usual * min(max(most / whole, _MIN_USUAL_PART), 1.0), limit), most)
     repeats, seed = count("repeats", repeats, least=1), count("seed", seed)
     check_executor(executor, torque=torque)
     checkpoints = Checkpointer(progress, checkpoint)
@@ -169,7 +169,7 @@ def work_precision(
     start = _start(integrated, (q0, v0), seed, known)
     if known is None:
         known = _computed_reference(
-            *(integrated, *start, asked, force, _FOR_REFERENCE * min(usual, limit)),
+            *(integrated, *start, asked, force, _REFERENCE_PART * min(usual, limit)),
             lambda done: checkpoints.report(0.1 * done, "reference"),
         )
     truth = _truth(integrated, start[0], asked, known)
@@ -257,7 +257,7 @@ def _start(
     q0, v0 = model.check_q(q, "q0"), model.check_v(v, "v0")
     if q0.ndim != 1 or v0.ndim != 1:
         raise InputError(f"q0, v0: expected one state, got shapes {q0.shape} and {v0.shape}")
-    if known is not None and float(np.abs(v0 - known.v[0]).max()) > _SAME_START:
+    if known is not None and float(np.abs(v0 - known.v[0]).max()) > _MAX_START_GAP:
         raise InputError("reference: does not start with v0; leave v0 out, or use the reference of this start")
     return q0, v0
 
@@ -284,7 +284,7 @@ def _truth(model: Model, q0: Array, duration: float, reference: Reference) -> Tr
         )
     if q.shape != (len(times), model.nq):
         raise InputError(f"reference: expected states of {model.nq} coordinates, got {q.shape}; it is of another model")
-    if float(np.abs(model.difference(q0, q[0])).max()) > _SAME_START:
+    if float(np.abs(model.difference(q0, q[0])).max()) > _MAX_START_GAP:
         raise InputError("reference: does not start at q0 (and v0); leave them out, or use the reference of this start")
     return Truth(times, q, floor, reference.how)
 

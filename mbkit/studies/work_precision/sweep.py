@@ -36,29 +36,29 @@ from mbkit.studies.worker import run
 #: Errors are measured at the ends of this many equal parts of the horizon.
 INTERVALS: Final = 10
 #: The coarsest step, s, and the finest, as a part of the horizon.
-_COARSEST: Final = 0.05
-_FINEST: Final = 1e-7
+_COARSEST_STEP_SECONDS: Final = 0.05
+_FINEST_STEP_PART: Final = 1e-7
 #: Ratio of neighbouring steps, by the method's order: an error falls by 4 to 16 at each.
-_RATIOS: Final[dict[int | None, float]] = {1: 4.0, 2: 2.5, 4: 2.0, 6: 1.5}
-#: An evaluation called from Python costs so many compiled ones.
-_PYTHON_CALL: Final = 8
+_STEP_RATIOS: Final[dict[int | None, float]] = {1: 4.0, 2: 2.5, 4: 2.0, 6: 1.5}
+#: Compiled evaluations that cost as much as one that is called from Python.
+_EVALUATIONS_PER_PYTHON_CALL: Final = 8
 
 #: A run shorter than this is repeated within a round, s.
-_SHORT: Final = 2e-3
-_MAX_IN_A_ROUND: Final = 100
-#: Settings in a row that bring no smaller error, after which a sweep over the study's own grid ends.
-_MAX_WITHOUT_GAIN: Final = 2
-#: A setting is finer if it takes so many times the steps: a decade of a tolerance is 1.33 at order 8.
-_FINER: Final = 1.2
+_SHORT_RUN_SECONDS: Final = 2e-3
+_MAX_RUNS_IN_A_ROUND: Final = 100
+#: A sweep over the study's own grid ends after so many settings in a row that bring no smaller error.
+_MAX_SETTINGS_WITHOUT_GAIN: Final = 2
+#: A setting is finer if it takes at least so many times the steps: a decade of a tolerance is 1.33 at order 8.
+_MIN_STEPS_RATIO: Final = 1.2
 #: Larger errors may still fall again, as those of steps that are too large do.
-_CONVERGED: Final = 1e-6
+_MAX_CONVERGED_ERROR: Final = 1e-6
 #: Errors that differ by less than this part are one: that of an engine's own law, such as soft loops, at any step.
-_SETTLED: Final = 0.01
+_MAX_SETTLED_SPREAD: Final = 0.01
 #: Parts of the time allowed until which compilation may begin, and until which every setting has run once.
-_COMPILED: Final = 0.5
-_EXPLORED: Final = 0.65
+_COMPILING_PART: Final = 0.5
+_EXPLORING_PART: Final = 0.65
 #: Part of the time that each phase has at the least, however long the phases before took.
-_MIN_PART: Final = 0.2
+_MIN_PHASE_PART: Final = 0.2
 
 
 # The first run: derivation, compilation and construction.
@@ -128,7 +128,7 @@ class Settings:
 
     def work(self, run: Measurement) -> int:
         """Return the cost of a run in compiled evaluations of the forward dynamics, equal on every machine."""
-        each = 1 if self.info.runs_compiled(derived=find_engine(self.engine).derived) else _PYTHON_CALL
+        each = 1 if self.info.runs_compiled(derived=find_engine(self.engine).derived) else _EVALUATIONS_PER_PYTHON_CALL
         return each * (run.evaluations or run.steps * max(self.info.stages, 1))
 
 
@@ -160,9 +160,9 @@ def plans(
 
 
 def _steps(method: Method, interval: float) -> tuple[float, ...]:
-    ratio = _RATIOS.get(method.order, 2.0)
-    coarsest = min(interval, _COARSEST)
-    count = int(np.log(coarsest / (interval * INTERVALS * _FINEST)) / np.log(ratio)) + 1
+    ratio = _STEP_RATIOS.get(method.order, 2.0)
+    coarsest = min(interval, _COARSEST_STEP_SECONDS)
+    count = int(np.log(coarsest / (interval * INTERVALS * _FINEST_STEP_PART)) / np.log(ratio)) + 1
     return tuple(coarsest / ratio**k for k in range(count))
 
 
@@ -293,14 +293,14 @@ class CurveMeasurement:
         first, *others = (one.cell for one in self._runs)
         counted = [first]
         for one in others:
-            if not one.error > floor or one.steps >= _FINER * counted[-1].steps:
+            if not one.error > floor or one.steps >= _MIN_STEPS_RATIO * counted[-1].steps:
                 counted.append(one)
         errors = [one.error for one in counted]
-        least = min(filter(math.isfinite, errors[:-_MAX_WITHOUT_GAIN]), default=math.inf)
-        last = errors[-_MAX_WITHOUT_GAIN - 1 :]
-        if least > _CONVERGED:
-            return len(last) > _MAX_WITHOUT_GAIN and max(last) - min(last) < _SETTLED * min(last)
-        return all(not e < max(0.5 * least, floor) or e <= floor for e in errors[-_MAX_WITHOUT_GAIN:])
+        least = min(filter(math.isfinite, errors[:-_MAX_SETTINGS_WITHOUT_GAIN]), default=math.inf)
+        last = errors[-_MAX_SETTINGS_WITHOUT_GAIN - 1 :]
+        if least > _MAX_CONVERGED_ERROR:
+            return len(last) > _MAX_SETTINGS_WITHOUT_GAIN and max(last) - min(last) < _MAX_SETTLED_SPREAD * min(last)
+        return all(not e < max(0.5 * least, floor) or e <= floor for e in errors[-_MAX_SETTINGS_WITHOUT_GAIN:])
 
     def give_up(self, reason: str) -> None:
         """End here; settings that the caller chose are reported with the reason why they were not run."""
@@ -333,7 +333,7 @@ class CurveMeasurement:
 
     def _repeat(self, one: _Run) -> None:
         assert self._dyn is not None
-        count = int(np.clip(_SHORT / max(one.first, 1e-9), 1, _MAX_IN_A_ROUND))
+        count = int(np.clip(_SHORT_RUN_SECONDS / max(one.first, 1e-9), 1, _MAX_RUNS_IN_A_ROUND))
         begun = time.perf_counter()
         for _ in range(count):
             self._solve(self._dyn, one.value, self.truth.times)
@@ -422,7 +422,7 @@ class Sweep:
         return self._in_executor(self.executor) if self.executor else self._here()
 
     def _here(self) -> Iterator[tuple[float, str]]:
-        until = self.budget.until(_COMPILED, _MIN_PART)
+        until = self.budget.until(_COMPILING_PART, _MIN_PHASE_PART)
         # Jacobians and series take longest to derive; they come last, so that the others have their time. Engines take
         # turns, so that each has a curve before the time is used up.
         engines = {x.settings.engine for x in self._curves}
@@ -437,13 +437,13 @@ class Sweep:
             elif not one.over:
                 one.compile()
         begun = time.process_time()
-        for one in self._coarse_to_fine(self.budget.until(_EXPLORED, _MIN_PART)):
+        for one in self._coarse_to_fine(self.budget.until(_EXPLORING_PART, _MIN_PHASE_PART)):
             # Costs grow geometrically, so the root of the time shows the progress.
-            done = ((time.process_time() - begun) / (_EXPLORED * self.budget.usual)) ** 0.5
+            done = ((time.process_time() - begun) / (_EXPLORING_PART * self.budget.usual)) ** 0.5
             yield 0.2 + 0.4 * min(done, 1.0), f"{one.settings.method} on {one.settings.engine}"
         yield 0.6, "timing"
         usual = self.budget.usual
-        for k in self._repeat(max(self.budget.begun + usual, time.process_time() + _MIN_PART * usual)):
+        for k in self._repeat(max(self.budget.begun + usual, time.process_time() + _MIN_PHASE_PART * usual)):
             yield 0.6 + 0.4 * (k + 1) / self.repeats, f"timing, round {k + 1} of {self.repeats}"
 
     def _coarse_to_fine(self, until: float) -> Iterator[CurveMeasurement]:
@@ -470,7 +470,9 @@ class Sweep:
         Where time is short, the longest runs are repeated less.
         """
         runs = [x for one in self._curves for x in one.repeatable()]
-        counts = repetitions([max(first, _SHORT) for first, _ in runs], self.repeats, until - time.process_time())
+        counts = repetitions(
+            [max(first, _SHORT_RUN_SECONDS) for first, _ in runs], self.repeats, until - time.process_time()
+        )
         rng = np.random.default_rng(self.seed)
         for k in range(self.repeats):
             for i in rng.permutation(len(runs)):
@@ -480,7 +482,7 @@ class Sweep:
 
     def _in_executor(self, executor: Executor) -> Iterator[tuple[float, str]]:
         yield 0.0, f"{len(self.settings)} curves by {type(executor).__name__}"
-        left = self.budget.until(1.0, 2 * _MIN_PART) - time.process_time()
+        left = self.budget.until(1.0, 2 * _MIN_PHASE_PART) - time.process_time()
         each = 1 / max(len(self.settings), 1)
         part = replace(self.budget, seconds=left * each, usual=min(self.budget.usual, left) * each)
         calls = {

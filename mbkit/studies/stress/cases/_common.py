@@ -14,7 +14,7 @@ from mbkit.model import Model
 from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.case import Case, Family
 
-#: From times (K,) to q (K, nq).
+#: A function from times (K,) to q (K, nq).
 Exact = Callable[[Array], Array]
 Make = TypeVar("Make", bound=Callable[..., Problem])
 #: Name with unit -> number, for the report.

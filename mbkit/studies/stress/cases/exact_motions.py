@@ -24,9 +24,9 @@ from mbkit.studies.stress.cases._common import Exact
 # solves them for any k with steps that know nothing of the fast mode, which is hardly excited (Hairer, Wanner 1996,
 # VI.3 on singular perturbations, IV.5 on Radau IIA).
 
-_STAGES: Final = 8
-_SMALL: Final = 1e-30
-_ITERATIONS: Final = 30
+_RADAU_STAGES: Final = 8
+_COMPLEX_STEP: Final = 1e-30
+_MAX_NEWTON_ITERATIONS: Final = 30
 
 #: F(y, ẏ), each (s, n), real or complex.
 Residual = Callable[[Any, Any], Any]
@@ -51,7 +51,7 @@ def slow_motion(residual: Residual, start: Array, duration: float, steps: int) -
 
 def _step(residual: Residual, y: Array, before: Array | None, h: float) -> Array:
     """Return y at the points of a step, (s + 1, n), by Newton's method with the first iterate's derivatives."""
-    s, n = _STAGES, len(y)
+    s, n = _RADAU_STAGES, len(y)
     points, slopes, basis = _radau()
     slopes = slopes / h
     Y = np.tile(y, (s, 1)) if before is None else basis(1 + points[1:]) @ before
@@ -60,7 +60,7 @@ def _step(residual: Residual, y: Array, before: Array | None, h: float) -> Array
     J[np.arange(s), :, np.arange(s), :] += by_y
     inverse = np.linalg.inv(J.reshape(s * n, s * n))
     last = np.inf
-    for _ in range(_ITERATIONS):
+    for _ in range(_MAX_NEWTON_ITERATIONS):
         change = (inverse @ residual(Y, slopes @ np.vstack([y, Y])).ravel()).reshape(s, n)
         Y = Y - change
         size = float(np.abs(change).max())
@@ -74,25 +74,25 @@ def _step(residual: Residual, y: Array, before: Array | None, h: float) -> Array
 def _jacobians(residual: Residual, Y: Array, dY: Array) -> tuple[Array, Array]:
     """Return ∂F/∂y and ∂F/∂ẏ, (s, n, n) each, of one evaluation at all disturbed states."""
     s, n = Y.shape
-    unit = np.broadcast_to(1j * _SMALL * np.eye(n)[:, None], (n, s, n))
+    unit = np.broadcast_to(1j * _COMPLEX_STEP * np.eye(n)[:, None], (n, s, n))
     disturbed = np.concatenate([Y + unit, np.broadcast_to(Y, (n, s, n))])
     rates = np.concatenate([np.broadcast_to(dY, (n, s, n)), dY + unit])
-    F = residual(disturbed.reshape(-1, n), rates.reshape(-1, n)).imag.reshape(2, n, s, n) / _SMALL
+    F = residual(disturbed.reshape(-1, n), rates.reshape(-1, n)).imag.reshape(2, n, s, n) / _COMPLEX_STEP
     return np.moveaxis(F[0], 0, -1), np.moveaxis(F[1], 0, -1)
 
 
 @cache
 def _radau() -> tuple[Array, Array, BarycentricInterpolator]:
     """Return 0 and Radau's points in (0, 1]; the polynomials that are 1 at one of them; before, their derivatives."""
-    points = np.concatenate([[0.0], (np.sort(legroots([*[0.0] * (_STAGES - 1), -1.0, 1.0])) + 1) / 2])
+    points = np.concatenate([[0.0], (np.sort(legroots([*[0.0] * (_RADAU_STAGES - 1), -1.0, 1.0])) + 1) / 2])
     points[-1] = 1.0
-    basis = BarycentricInterpolator(points, np.eye(_STAGES + 1))
+    basis = BarycentricInterpolator(points, np.eye(_RADAU_STAGES + 1))
     return points, basis.derivative(points[1:]), basis
 
 
 _GRAVITY: Final = 9.81
 #: Steps a second: a taut chain hardly rings at frequencies above.
-_STEPS: Final = 200
+_STEPS_PER_SECOND: Final = 200
 
 
 class HangingChain:
@@ -120,7 +120,7 @@ class HangingChain:
             return np.asarray((x[0] * pull.sum(axis=1) + _GRAVITY * self._w * np.sin(phi)) / self._w)
 
         for _ in range(20):
-            J = np.stack([residual(x + 1j * _SMALL * e).imag / _SMALL for e in np.eye(n)], axis=1)
+            J = np.stack([residual(x + 1j * _COMPLEX_STEP * e).imag / _COMPLEX_STEP for e in np.eye(n)], axis=1)
             x = x - np.linalg.solve(J, residual(x))
         return np.diff([0.0, angle, *x[1:]])
 
@@ -136,7 +136,7 @@ class HangingChain:
             return np.concatenate([rate[:, :n] - turn, forces / w], axis=1)
 
         start = np.concatenate([np.cumsum(q), np.zeros(n)])
-        solved = slow_motion(residual, start, duration, round(_STEPS * duration))
+        solved = slow_motion(residual, start, duration, round(_STEPS_PER_SECOND * duration))
         return lambda t: np.diff(solved(t)[:, :n], axis=1, prepend=0.0)
 
 
@@ -186,8 +186,8 @@ def slowest_mode(M: Array, stiffness: Array) -> tuple[float, Array, float]:
 
 # Exact motions of the pendulum and the cart-pole, in double.
 
-_NODES: Final = 128
-_TABLE: Final = 4000
+_QUADRATURE_NODES: Final = 128
+_TABLE_ROWS: Final = 4000
 
 
 def pendulum(theta: float, speed: float, square: float) -> Exact:
@@ -218,7 +218,7 @@ def cart_pole(theta: float, cart: float) -> Exact:
     """
     k = math.sin(theta / 2)
     bend = math.sqrt(cart) / (2 * k)
-    nodes, weights = leggauss(_NODES)
+    nodes, weights = leggauss(_QUADRATURE_NODES)
     last = math.asinh(math.pi / 2 / bend)
 
     def slope(y: Array) -> Array:
@@ -236,7 +236,7 @@ def cart_pole(theta: float, cart: float) -> Exact:
         quarters = t / quarter + 1
         turns = np.rint(quarters / 2)
         rest = t - (2 * turns - 1) * quarter
-        table = np.linspace(0, last, _TABLE)
+        table = np.linspace(0, last, _TABLE_ROWS)
         y = np.interp(np.abs(rest), spent(table), table)
         for _ in range(4):
             y = np.clip(y + (np.abs(rest) - spent(y)) / slope(y), 0, last)
@@ -362,7 +362,7 @@ def past_gimbal_lock(distance: float, speed: float) -> tuple[Exact, Array]:
 
 # The exact motion of a mass on a spring, without gravity: Kepler's problem with another force.
 
-_POINTS: Final = 256
+_FOURIER_POINTS: Final = 256
 
 
 def ringing_spring(square: float, radius: float, push: float, turn: float) -> tuple[Exact, float]:
@@ -379,12 +379,12 @@ def ringing_spring(square: float, radius: float, push: float, turn: float) -> tu
     r2 = _turning_point(1 + math.sqrt(2 * energy / square), square, energy, momentum)
     p, s = r1 + r2 - 2, momentum**2 / (square * r1 * r2)
     a, b = (r1 + r2) / 2, (r2 - r1) / 2
-    grid = a - b * np.cos(2 * math.pi * np.arange(_POINTS) / _POINTS)
+    grid = a - b * np.cos(2 * math.pi * np.arange(_FOURIER_POINTS) / _FOURIER_POINTS)
     rate = grid / np.sqrt(square * (grid * (grid + p) + s))
-    order = np.arange(1, _POINTS // 2)
+    order = np.arange(1, _FOURIER_POINTS // 2)
 
     def integral(values: Array) -> tuple[float, Array]:
-        terms = np.fft.rfft(values).real / _POINTS
+        terms = np.fft.rfft(values).real / _FOURIER_POINTS
         return float(terms[0]), 2 * terms[1:-1] / order
 
     (mean, waves), (mean_turn, waves_turn) = integral(rate), integral(momentum * rate / grid**2)

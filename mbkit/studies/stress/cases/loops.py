@@ -21,7 +21,7 @@ from mbkit.model.parts import Prescribed
 from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.cases._common import EPS, Series, motion, powers, rows
 
-#: Of the four-bar that is cut down to a change point: crank, coupler, rocker, m.
+#: Crank, coupler and rocker of the four-bar that is cut down to a change point, m.
 _CRANK, _COUPLER, _ROCKER = 0.3, 0.9, 0.7
 _near = Series(
     *("near-singular", "distance", "m", powers(-1, -7), (1e-1, 1e-3, 1e-5)),
@@ -56,7 +56,7 @@ def _moving(model: Model, q: ArrayLike, v: ArrayLike, duration: float, **facts: 
 def change_point(distance: float) -> Problem:
     """A four-bar swings past the pose in which its rods would lie in line if the ground were shorter by so much."""
     ground = _COUPLER + _CRANK - _ROCKER + distance
-    # Of a shorter ground the rods fold flat at zero, and two motions meet there.
+    # With a shorter ground the rods fold flat at zero, and two motions meet there.
     model = catalog.four_bar(crank=_CRANK, coupler=_COUPLER, rocker=_ROCKER, ground=ground, gravity=0.0)
     return _moving(model, pose(np.array([1.5]), ground)[0], [-3.0, 3.0, 0.0], 1.0)
 
@@ -64,7 +64,7 @@ def change_point(distance: float) -> Problem:
 @_near
 def dead_centre(distance: float) -> Problem:
     """A slider-crank turns past the pose in which its piston stands nearly on the crank's axis."""
-    # Of equal lengths crank and rod fold onto each other there, and the piston could stand still from then on.
+    # Crank and rod of equal lengths fold onto each other there, and the piston could stand still from then on.
     model = catalog.slider_crank(crank=1.0, rod=1.0 + distance)
     return _moving(model, [0.0, 0.0, 0.0], [2.0, -4.0, 0.0], 2.0)
 
@@ -198,7 +198,7 @@ def condition_of_rows(model: Model) -> float:
     return float(np.linalg.cond(B / np.linalg.norm(B, axis=0)))
 
 
-#: Of a drive: amplitude, m, and frequency, rad/s.
+#: Amplitude and frequency of a drive, m and rad/s.
 _AMPLITUDE, _FREQUENCY = 0.1, 3.0
 
 
@@ -223,7 +223,7 @@ def stiff_drive(stiffness: float) -> Problem:
     return motion(b.build(), [0.0, 0.0], _FREQUENCY * size, 2.0, exact, 16 * EPS * _AMPLITUDE, source, facts, scale=0.1)
 
 
-#: Of a crank that turns steadily, rad/s, and its ground, m; the four-bar of `validation.four_bar` has the same.
+#: Speed of a crank that turns steadily, rad/s, and its ground, m; the four-bar of `validation.four_bar` has the same.
 _RATE, _GROUND = 5.0, 1.0
 _STEP: Final = 4e-3
 

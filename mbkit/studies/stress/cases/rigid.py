@@ -159,7 +159,7 @@ def chain(n: float) -> Problem:
 
 _spin = partial(Series, "spin")
 _SPINS: Final = (powers(0, 6), (1.0, 1e2, 1e4, 1e6))
-#: Of Gazebo's "boxes" benchmark, complex case without gravity: nearly about the middle axis, rad/s.
+#: The spin of Gazebo's "boxes" benchmark, complex case without gravity: nearly about the middle axis, rad/s.
 _BOX_SPIN: Final = (0.1, 5.0, 0.1)
 
 

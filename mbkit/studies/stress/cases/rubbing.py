@@ -13,7 +13,7 @@ from mbkit.studies.measurement import Problem
 from mbkit.studies.stress.cases._common import EPS, Series, motion, powers
 
 _rubbed = partial(Series, "friction")
-#: What pulls a block of 1 kg down its slope, N.
+#: The pull of gravity on a block of 1 kg along its slope, N.
 _PULL: Final = 4.0
 
 
@@ -56,7 +56,7 @@ def many_at_rest(count: float) -> Problem:
     """A stack of blocks swings on a spring; friction just holds each block on the one below."""
     n, frequency, reach = int(count), 3.0, 0.5
     b = ModelBuilder("stack", gravity=np.zeros(3))
-    # What accelerates the blocks above a joint, and a hundredth more.
+    # Friction is a hundredth above the force that accelerates the blocks above a joint.
     for i in range(n + 1):
         b.add_body(f"block{i}", mass=1.0)
         parent = f"block{i - 1}" if i else "world"

@@ -20,7 +20,7 @@ _RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))
 _joint = Series("stiffness", "stiffness", "N m/rad", *_RANGE)
 _point = Series("stiffness", "stiffness", "N/m", *_RANGE)
 
-#: Of slow motions, measured against Taylor series with 34 digits.
+#: The error of slow motions by collocation, measured against Taylor series with 34 digits.
 _SLOW_FLOOR: Final = 1e-11
 #: How far along the imaginary and the negative real axis the 8th order of Dormand and Prince 8(5,3) is stable: its
 #: stability polynomial is that of exp to z⁸, with four coefficients of its own behind. From the
@@ -233,7 +233,7 @@ def flexible_appendage(stiffness: float) -> Problem:
         bent = np.multiply.outer(np.cos(frequency * t), angle * shape)
         return np.concatenate([np.zeros((len(t), 2)), bent, bent[:, 1:]], axis=1)
 
-    # What is not linear bends the beams by the angle's square of what the motion bends them.
+    # Terms beyond the linear ones bend the beams by the square of the angle, relative to the motion.
     floor = angle**3 * float(np.abs(shape[1:]).sum()) ** 2 + 16 * EPS
     facts = _facts(fastest, duration) | {"slowest frequency, rad/s": frequency}
     model, start = replace(model, joints=(hub, *model.joints[1:])), exact(np.zeros(1))[0]
