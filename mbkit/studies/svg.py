@@ -67,11 +67,8 @@ def svg(fig: Figure, title: str) -> str:
     for size in ("width", "height"):
         text = re.sub(rf'(<svg[^>]*?) {size}="[^"]*"', r"\1", text, count=1)
     width = float(re.findall(r'viewBox="\S+ \S+ (\S+)', text)[0])
-    least = (
-        width
-        * _MIN_LETTER_PIXELS
-        / min(map(float, re.findall(r"font(?:-size)?: ([\d.]+)px", text)), default=_MIN_LETTER_PIXELS)
-    )
+    letters = map(float, re.findall(r"font(?:-size)?: ([\d.]+)px", text))
+    least = width * _MIN_LETTER_PIXELS / min(letters, default=_MIN_LETTER_PIXELS)
     text = text.replace("<svg", f'<svg role="img" aria-label="{html(title)}" style="--least: {math.ceil(least)}px"', 1)
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     for stand_in, variable in _VARIABLES.items():
