@@ -19,7 +19,7 @@ from mbkit.simulate.problem import IntegrationProblem
 from mbkit.simulate.progress import Progress
 from mbkit.simulate.solvers.trajectory_record import TrajectoryRecord
 from mbkit.simulate.torque import Torque
-from mbkit.studies.stress.cases.exact_motions import pendulum
+from mbkit.studies.motions.exact import pendulum
 from tests.scenes import METHODS, mounted
 
 # Drake's own runs have tests of their own.

@@ -342,7 +342,7 @@ def test_what_would_be_the_trees_alone_is_refused() -> None:
 @pytest.mark.thorough
 def test_a_whole_comparison_of_a_mechanism_passes_with_its_loops_on(monkeypatch: pytest.MonkeyPatch) -> None:
     # Little time to error against run time, which tests/test_loops_in_studies.py has.
-    monkeypatch.setattr(import_module("mbkit.studies.compare.study"), "_SECONDS", 0.5)
+    monkeypatch.setattr(import_module("mbkit.studies.compare.study"), "_MAX_SECONDS", 0.5)
     result = mb.compare(mb.catalog.four_bar(), samples=4)
     assert result.passed, result.verdict
     assert {r.engine for r in result.rollouts} == {"mujoco"}

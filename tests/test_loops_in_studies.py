@@ -14,9 +14,9 @@ from mbkit.model import Model
 from mbkit.model.parts import Loop, Prescribed
 from mbkit.studies.explain import terms
 from mbkit.studies.explain.loop_differences import exchanged
+from mbkit.studies.motions import reference as references
+from mbkit.studies.motions.reference import reference
 from mbkit.studies.study_runs import start_state
-from mbkit.studies.work_precision import reference as references
-from mbkit.studies.work_precision.reference import reference
 from tests.random_trees import rotation
 from validation import four_bar as bare
 

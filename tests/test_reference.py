@@ -21,9 +21,8 @@ from mbkit.engines import dynamics
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Model
 from mbkit.simulate import simulate
-from mbkit.studies.study_runs import Deadline, TooLongError
-from mbkit.studies.work_precision import reference as module
-from mbkit.studies.work_precision.reference import (
+from mbkit.studies.motions import reference as module
+from mbkit.studies.motions.reference import (
     Reference,
     checked_motion,
     gap,
@@ -31,6 +30,7 @@ from mbkit.studies.work_precision.reference import (
     taylor_pair,
     two_engines,
 )
+from mbkit.studies.study_runs import Deadline, TooLongError
 from tests.scenes import mounted
 
 hy = pytest.importorskip("heyoka")
@@ -131,7 +131,7 @@ def test_each_pair_knows_how_good_it_is() -> None:
     best = taylor_pair(motion, ample(), 113)
     for known in (taylor_pair(motion, ample(), 64), two_engines(motion, ample())):
         error = np.abs((known.q[0] - best.q[0]) + (known.q[1] - best.q[1])).max(axis=1)
-        allowed = module._SAFETY * np.maximum.accumulate(known.apart[0]) + 2 * EPS * (known.how.count(" on ") == 2)
+        allowed = module._FLOOR_PER_GAP * np.maximum.accumulate(known.apart[0]) + 2 * EPS * (known.how.count(" on ") == 2)
         assert (error <= allowed + 1e-19).all()
     assert known.how == "taylor on lagrangian and dop853 on pinocchio"
 

@@ -18,7 +18,7 @@ from mbkit.errors import InputError, MbkitWarning, UnsupportedError
 from mbkit.identify import filtered_motion
 from mbkit.model import Model
 from mbkit.studies.compare.rows import OWN_LAW
-from mbkit.studies.work_precision.reference import reference
+from mbkit.studies.motions.reference import reference
 from tests.random_trees import IN_MUJOCO, random_tree
 
 

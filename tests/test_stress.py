@@ -346,7 +346,7 @@ def test_two_runs_that_agree_are_a_truth_and_where_none_do_there_is_none(monkeyp
     assert np.abs(truth.q - other.q).max() < 1e-12
     # 1e5 swings cannot be followed in the time, and series would take longer to compile than is left.
     series = []
-    search = import_module("mbkit.studies.work_precision.reference")
+    search = import_module("mbkit.studies.motions.reference")
     monkeypatch.setattr(search, "taylor_pair", lambda *x: series.append(x))
     truth, told = reference_motion(own.sprung(1e12), times, 1e-7, 0.5)
     assert truth is None

@@ -28,9 +28,9 @@ from mbkit.studies.compare.errors import Scales, interleaved
 from mbkit.studies.compare.terms import FORWARD_DYNAMICS, States
 from mbkit.studies.compare.terms import TERMS as COMPARED
 from mbkit.studies.measurement import MAX_ERROR, Measurement, Problem, Truth
+from mbkit.studies.motions.reference import reference
 from mbkit.studies.stress.case import Case, problem_of, step_of, times_of
 from mbkit.studies.study_runs import Deadline, TooLongError, heard_warnings, quiet_simulate
-from mbkit.studies.work_precision.reference import reference
 from mbkit.studies.worker import report_stage
 
 _EPS: Final = float(np.finfo(float).eps)

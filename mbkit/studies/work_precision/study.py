@@ -20,9 +20,9 @@ from mbkit.studies import results
 from mbkit.studies._checkpoint import Checkpoint, Checkpointer, Progress
 from mbkit.studies._targets import methods_by_engine, numbers_of, with_values
 from mbkit.studies.measurement import Problem, Truth, farthest
+from mbkit.studies.motions.reference import Reference
+from mbkit.studies.motions.reference import reference as compute_reference
 from mbkit.studies.study_runs import integrable, require_motion, start_state
-from mbkit.studies.work_precision.reference import Reference
-from mbkit.studies.work_precision.reference import reference as compute_reference
 from mbkit.studies.work_precision.result import WorkPrecision
 from mbkit.studies.work_precision.sweep import INTERVALS, Sweep, TimeBudget, plans
 from mbkit.studies.worker import check_executor
@@ -107,7 +107,7 @@ def work_precision(
         Measures one curve a call: a pool of processes, Dask's or MPI's. Errors do not depend on it; run times do,
         because workers share the cores.
     reference : Reference or callable, optional
-        The motion: from `mbkit.studies.work_precision.reference`, whose times are then the saved ones, or an exact
+        The motion: from `mbkit.studies.motions.reference`, whose times are then the saved ones, or an exact
         function from t to (q, v). By default it is computed.
     progress : callable, optional
         Called as ``progress(fraction, text)``. An exception of it ends the study, after `checkpoint` has the result.

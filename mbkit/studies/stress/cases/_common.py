@@ -9,13 +9,11 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mbkit._check import Array
 from mbkit.model import Model
 from mbkit.studies.measurement import Problem
+from mbkit.studies.motions.exact import Exact
 from mbkit.studies.stress.case import Case, Family
 
-#: A function from times (K,) to q (K, nq).
-Exact = Callable[[Array], Array]
 Make = TypeVar("Make", bound=Callable[..., Problem])
 #: Name with unit -> number, for the report.
 Facts = dict[str, float]

@@ -13,7 +13,7 @@ from mbkit import catalog
 from mbkit._check import Array
 from mbkit.model import Model, ModelBuilder
 from mbkit.studies.measurement import Problem
-from mbkit.studies.stress.cases import exact_motions
+from mbkit.studies.motions import exact as exact_motions
 from mbkit.studies.stress.cases._common import EPS, SWING, Facts, Series, motion, powers, rows
 
 _RANGE: Final = (powers(0, 12, 2), (1.0, 1e4, 1e8, 1e12))

@@ -421,7 +421,7 @@ def reference(
     Examples
     --------
     >>> import mbkit as mb
-    >>> from mbkit.studies.work_precision.reference import reference
+    >>> from mbkit.studies.motions.reference import reference
     >>> truth = reference(mb.catalog.pendulum(), [1.0], [0.0], 2.0, [0.0, 1.0, 2.0])
     >>> truth.horizon
     2.0

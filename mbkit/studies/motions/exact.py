@@ -15,7 +15,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipj, ellipkinc, ellipkm1, elliprf, elliprj
 
 from mbkit._check import Array
-from mbkit.studies.stress.cases._common import Exact
+
+#: A function from times (K,) to q (K, nq).
+Exact = Callable[[Array], Array]
 
 # Slow motions of stiff systems, by collocation in variables in which nothing is stiff.
 #
