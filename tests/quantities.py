@@ -12,11 +12,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import mbkit as mb
-from mbkit.engines import QUANTITIES, frames_and_momenta, regressors
+from mbkit.engines import QUANTITIES
 from mbkit.engines.frames_and_momenta import AXES, CLASSICAL, SPATIAL
 from mbkit.model import KINDS, Model, kind_of
 from mbkit.model.loops import LOOP_KINDS
 from mbkit.model.parts import Loop, Prescribed
+from mbkit.model.quantities import of_groups
 from tests.joint_of_ones_own import OWN
 from tests.random_trees import ALL, IN_MUJOCO, SOUND, coupled, random_tree, rotation
 
@@ -24,7 +25,7 @@ DERIVATIVES = ("inverse_dynamics_derivatives", "forward_dynamics_derivatives")
 #: What an engine may have, but functions, which no other engine returns.
 TERMS = tuple(x for x in (*QUANTITIES, *DERIVATIVES) if x not in ("function", "reduced_inertia"))
 #: What there is of a tree whether or not constraints hold it, and need not be asked for again.
-OF_TREES = {*frames_and_momenta.QUANTITIES, *regressors.QUANTITIES, "gravity", "passive", "coriolis_matrix"}
+OF_TREES = {*of_groups("frame", "whole", "regressor"), "gravity", "passive", "coriolis_matrix"}
 OF_TREES |= {"coriolis_force", "kinetic_energy", "potential_energy", "mass_matrix_inverse", "generalized_force"}
 #: What the forces of constraints enter.
 OF_FORCES = {

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.engines import ENGINES, frames_and_momenta, loads
+from mbkit.engines import ENGINES
 from mbkit.engines.frames_and_momenta import ALIGNED, AXES, CLASSICAL, LOCAL, SPATIAL
 from mbkit.engines.registry import composes
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
+from mbkit.model.quantities import of_groups
 from mbkit.simulate import simulate
 from tests.random_trees import ALL, IN_MUJOCO, SOUND, off, random_tree, states
 from tests.scenes import mounted
@@ -33,7 +34,7 @@ TREES = {
 }
 #: Engines that tell joint loads.
 LOADED = [x for x in ENGINES if "joint_wrenches" in mb.dynamics(mb.catalog.pendulum(), x).supports]
-QUANTITIES = (*frames_and_momenta.QUANTITIES, *loads.QUANTITIES)
+QUANTITIES = [x for x in of_groups("frame", "whole", "inverse", "load", "body") if not x.startswith("loads_")]
 
 
 @cache

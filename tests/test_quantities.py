@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 
 import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.engines import ENGINES, closed_loops, constrained
+from mbkit.engines import ENGINES, Dynamics
 from mbkit.engines.frames_and_momenta import AXES
 from mbkit.errors import KnownDefectWarning, UnsupportedError
+from mbkit.model.quantities import QUANTITIES, of_groups
 from tests import quantities
 from tests.joint_of_ones_own import OWN
 from tests.quantities import BUILT_IN, DERIVATIVES, MODELS, NOTHING, TERMS, of_joint, scene, value
@@ -22,7 +24,7 @@ EPS = np.finfo(float).eps
 CLOSE = 500 * EPS
 
 
-OF_ROWS = [x for x in constrained.QUANTITIES if x.startswith(("constraint_r", "constraint_j", "constraint_b"))]
+OF_ROWS = [x for x in of_groups("row") if x.startswith(("constraint_r", "constraint_j", "constraint_b"))]
 
 
 @pytest.mark.thorough(
@@ -109,7 +111,7 @@ def test_one_state_has_the_values_of_its_row_in_a_batch(engine, feature):
     M = dyn.mass_matrix(batch["q"])
     # Derivatives as machine code are compiled for seconds, and tests/test_derivatives.py has their batches.
     for quantity in (*TERMS[: -len(DERIVATIVES)], *DERIVATIVES[: 0 if compiled else 2]):
-        if quantity in closed_loops.QUANTITIES:
+        if quantity in of_groups("actuator", "loop", "motion"):
             continue
         try:
             whole = value(dyn, quantity, batch, AXES[:1])
@@ -170,3 +172,20 @@ def test_a_run_keeps_the_energy_and_the_manifold(kind):
     assert np.abs(run.energy() - run.energy()[0]).max() < 1e-8 * (1 + np.abs(run.energy()[0]))
     step = model.difference(run.q[0], run.q[-1])
     assert np.abs(model.integrate(run.q[0], step) - run.q[-1]).max() < 1e-13
+
+
+@pytest.mark.parametrize("engine", ["lagrangian", "oracle", "pinocchio"])
+def test_methods_take_and_return_what_the_table_of_quantities_says(engine):
+    tree, closed = (mb.dynamics(make(), engine) for make in (mb.catalog.double_pendulum, mb.catalog.four_bar))
+    for name, row in QUANTITIES.items():
+        takes = inspect.signature(getattr(Dynamics, name)).parameters if row.listed else row.arguments
+        assert tuple(x for x in takes if x in (*"qva", "tau", "wrenches"))[: len(row.arguments)] == row.arguments, name
+        dyn = closed if row.group == "row" else tree
+        if not row.listed or not row.shape or name not in dyn.supports:
+            continue
+        n = dyn.model.nv
+        given = {x: np.full(n, 0.5) for x in (*"qva", "tau")} | {"wrenches": {"rod2": np.ones(6)}}
+        sizes = {"nv": n, "rows": 2, "columns": 20, "bodies": 2, "joints": 2, "frames": 3}
+        frames = [["rod1", "rod2", "world"]] if row.shape[0] == "frames" else []
+        value = getattr(dyn, name)(*(given[x] for x in row.arguments), *frames)
+        assert value.shape == tuple(int(sizes.get(x, x)) for x in row.shape), name

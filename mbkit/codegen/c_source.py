@@ -26,36 +26,9 @@ from mbkit.errors import InputError, OutputError, UnsupportedError, require_know
 from mbkit.model import Model
 from mbkit.model.changes.dry_friction import held_at_rest
 from mbkit.model.elements import paths
-from mbkit.model.elements.kinds import EFFECTS, kind
+from mbkit.model.elements.kinds import kind
+from mbkit.model.quantities import QUANTITIES
 
-#: Quantity -> (name in C of its one output, its meaning).
-_OUTPUTS: Final = {
-    "mass_matrix": ("M", "mass matrix M(q), symmetric"),
-    "coriolis_matrix": ("C", "Coriolis matrix C(q, v), Christoffel's"),
-    "gravity": ("g", "gravity g(q), without springs"),
-    "nle": ("nle", "C(q, v) v + g(q)"),
-    "coriolis_force": ("Cv", "C(q, v) v"),
-    "passive": ("tau_passive", f"forces of springs, dampers, {EFFECTS['jump']} and functions"),
-    "inverse_dynamics": ("tau", "forces M a + C(q, v) v + g(q) - tau_passive(q, v)"),
-    "forward_dynamics": ("a", "accelerations dv/dt under forces tau, by the equation of motion"),
-    "kinetic_energy": ("T", "kinetic energy, J"),
-    "potential_energy": ("V", "potential energy of gravity and springs, J"),
-    "energy_rate": ("dE_dt", "d(T + V)/dt at accelerations a, W"),
-    "pose": ("X", "pose X_WF of the frame, homogeneous"),
-    "jacobian": ("J", "Jacobian of the frame's velocity, linear then angular"),
-    "velocity": ("V", "velocity of the frame, linear then angular"),
-    "acceleration": ("A", "classical acceleration of the frame, linear then angular, without gravity"),
-    "jacobian_dot_v": ("Jdot_v", "rate of the frame's velocity at dv/dt = 0"),
-    "generalized_force": ("tau", "J^T w of a wrench on the frame, force then moment"),
-    "center_of_mass": ("p_G", "centre of mass of all bodies in the world, m"),
-    "center_of_mass_velocity": ("v_G", "its velocity, m/s"),
-    "center_of_mass_acceleration": ("a_G", "its acceleration, m/s^2"),
-    "center_of_mass_jacobian": ("J_G", "Jacobian of its velocity"),
-    "centroidal_momentum": ("h_G", "linear, then angular momentum about the centre of mass, in world axes"),
-    "centroidal_momentum_matrix": ("A_G", "matrix that takes v to the centroidal momentum"),
-    "centroidal_momentum_bias": ("Adot_G_v", "rate of the centroidal momentum at dv/dt = 0"),
-    "locked_inertia": ("I_G", "inertia of the whole about its centre of mass, in world axes"),
-}
 #: Output of a quantity that has several -> its meaning.
 _DERIVATIVES: Final = {
     "by_q": "derivative by q along the configuration manifold: column k is that of q (+) t e_k",
@@ -117,7 +90,7 @@ def _declaration(f: CFunction, macro: str, nv: int) -> str:
     for name, shape in f.outputs:
         extent = " * ".join(_extent(macro, "", n, nv) for n in shape if n > 1) or "1"
         arguments.append(f"double {name}[{extent}]")
-        text = _OUTPUTS[f.quantity][1] if f.quantity in _OUTPUTS else _DERIVATIVES.get(name, "")
+        text = QUANTITIES[f.quantity].meaning or _DERIVATIVES.get(name, "")
         matrix = shape[1] > 1
         size = f"{shape[0]} * {shape[1]}" if matrix else shape[0]
         rows.append((f"{name}[{size}]", f"out{', by columns' * matrix}: {text}"))
@@ -396,7 +369,7 @@ def export_c(
 def _described(name: str, function: ca.Function, quantity: str, of: str) -> CFunction:
     operations = program(function)
     inputs = tuple(zip(function.name_in(), operations.inputs, strict=True))
-    names = (_OUTPUTS[quantity][0],) if quantity in _OUTPUTS else function.name_out()
+    names = (QUANTITIES[quantity].symbol,) if QUANTITIES[quantity].symbol else function.name_out()
     outputs = tuple(zip(names, operations.shapes, strict=True))
     stack = 8 * (function.sz_w() + sum(operations.inputs))
     return CFunction(name, quantity, inputs, outputs, operations.arithmetic, stack, of)

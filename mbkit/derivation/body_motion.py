@@ -26,6 +26,7 @@ from mbkit.derivation.links import Inertia
 from mbkit.derivation.regressor import energy_regressor, momentum_regressor, torque_regressor
 from mbkit.derivation.rotations import SYMMETRIC, Matrix
 from mbkit.model.joint_types import cross3, dot3
+from mbkit.model.quantities import QUANTITIES, of_groups
 
 #: Linear and angular part.
 Pair = tuple[Vector, Vector]
@@ -288,22 +289,18 @@ class BodyQuantity(NamedTuple):
 
     Attributes
     ----------
-    arguments : tuple of str
-        Of q, v, a, and "wrenches", whose six numbers a frame stand one behind the other.
     make : callable
-        ``make(motion, *extra, wrenches)`` returns a matrix; `wrenches` is left out where it is no argument.
-    axes : int
-        Of one state's value: 1 where the matrix is a column, 2 where it is the value, 3 where `rows` of its rows
-        make one of several values.
-    rows : int
+        ``make(motion, *extra, wrenches)`` returns a matrix; `wrenches` is left out where it is no argument. Values of
+        several frames stand below each other.
+    arguments, shape : tuple of str
+        Those of `mbkit.model.quantities.Quantity`.
     acts_on : str
         Where the matrix is a force: the term of the equation of motion that is meant, with this force on the system.
     """
 
-    arguments: tuple[str, ...]
     make: Callable[..., Any]
-    axes: int = 2
-    rows: int = 1
+    arguments: tuple[str, ...]
+    shape: tuple[str, ...]
     acts_on: str = ""
 
 
@@ -319,41 +316,34 @@ def _rate(name: str, *, moved: bool) -> Callable[[BodyMotion], Any]:
     return lambda motion: motion.rate(getattr(motion, name), motion.a if moved else ca.SX(motion.model.nv, 1))
 
 
-#: Quantities of one frame, those of the whole, and the force of a wrench on a frame, that have a function in CasADi and
-#: in C.
-OF_FRAME: Final = ("pose", "jacobian", "velocity", "acceleration", "jacobian_dot_v", "generalized_force")
-OF_WHOLE: Final = (
-    *("center_of_mass", "center_of_mass_velocity", "center_of_mass_acceleration", "center_of_mass_jacobian"),
-    *("centroidal_momentum", "centroidal_momentum_matrix", "centroidal_momentum_bias", "locked_inertia"),
-)
+#: Quantities of a frame, and of the whole, that have a function in CasADi and in C.
+OF_FRAME: Final = tuple(of_groups("frame"))
+OF_WHOLE: Final = tuple(of_groups("whole"))
+_MAKE: Final[dict[str, Callable[..., Any]]] = {
+    "pose": lambda m, frames: ca.vertcat(*(m.pose(name) for name in frames)),
+    "jacobian": _frame_jacobians,
+    "velocity": lambda m, frames, axes: _rows([m.velocity(name, axes) for name in frames]),
+    "acceleration": lambda m, frames, axes, kind: _rows([m.acceleration(name, axes, kind, m.a) for name in frames]),
+    "jacobian_dot_v": lambda m, frames, axes: _rows([m.jacobian_rate_times_v(name, axes) for name in frames]),
+    "center_of_mass": lambda m: m.center_of_mass,
+    "center_of_mass_velocity": lambda m: m.center_of_mass_velocity,
+    "center_of_mass_acceleration": _rate("center_of_mass_velocity", moved=True),
+    "center_of_mass_jacobian": _by_v("center_of_mass_velocity"),
+    "centroidal_momentum": lambda m: m.centroidal_momentum,
+    "centroidal_momentum_matrix": _by_v("centroidal_momentum"),
+    "centroidal_momentum_bias": _rate("centroidal_momentum", moved=False),
+    "locked_inertia": lambda m: m.locked_inertia,
+    "generalized_force": BodyMotion.generalized_force,
+    "inverse_dynamics_with_wrenches": BodyMotion.generalized_force,
+    "forward_dynamics_with_wrenches": BodyMotion.generalized_force,
+    "joint_wrenches": BodyMotion.joint_wrenches,
+    "regressor": lambda m, columns: torque_regressor(m.kin, m.a, columns),
+    "momentum_regressor": lambda m, columns: momentum_regressor(m.kin, columns),
+    "energy_regressor": lambda m, columns: energy_regressor(m.kin, columns),
+}
+_ACTS_ON: Final = {f"{x}_with_wrenches": x for x in ("inverse_dynamics", "forward_dynamics")}
 #: Name of each quantity -> how it is derived. Those of frames take their names and axes, and return one value a frame.
-BODY_QUANTITIES: Final[dict[str, BodyQuantity]] = {
-    "pose": BodyQuantity(("q",), lambda m, frames: ca.vertcat(*(m.pose(name) for name in frames)), 3, 4),
-    "jacobian": BodyQuantity(("q",), _frame_jacobians, 3, 6),
-    "velocity": BodyQuantity(("q", "v"), lambda m, frames, axes: _rows([m.velocity(name, axes) for name in frames])),
-    "acceleration": BodyQuantity(
-        ("q", "v", "a"), lambda m, frames, axes, kind: _rows([m.acceleration(name, axes, kind, m.a) for name in frames])
-    ),
-    "jacobian_dot_v": BodyQuantity(
-        ("q", "v"), lambda m, frames, axes: _rows([m.jacobian_rate_times_v(name, axes) for name in frames])
-    ),
-    "center_of_mass": BodyQuantity(("q",), lambda m: m.center_of_mass, 1),
-    "center_of_mass_velocity": BodyQuantity(("q", "v"), lambda m: m.center_of_mass_velocity, 1),
-    "center_of_mass_acceleration": BodyQuantity(("q", "v", "a"), _rate("center_of_mass_velocity", moved=True), 1),
-    "center_of_mass_jacobian": BodyQuantity(("q",), _by_v("center_of_mass_velocity")),
-    "centroidal_momentum": BodyQuantity(("q", "v"), lambda m: m.centroidal_momentum, 1),
-    "centroidal_momentum_matrix": BodyQuantity(("q",), _by_v("centroidal_momentum")),
-    "centroidal_momentum_bias": BodyQuantity(("q", "v"), _rate("centroidal_momentum", moved=False), 1),
-    "locked_inertia": BodyQuantity(("q",), lambda m: m.locked_inertia),
-    "generalized_force": BodyQuantity(("q", "wrenches"), BodyMotion.generalized_force, 1),
-    "inverse_dynamics_with_wrenches": BodyQuantity(
-        ("q", "v", "a", "wrenches"), BodyMotion.generalized_force, 1, acts_on="inverse_dynamics"
-    ),
-    "forward_dynamics_with_wrenches": BodyQuantity(
-        ("q", "v", "tau", "wrenches"), BodyMotion.generalized_force, 1, acts_on="forward_dynamics"
-    ),
-    "joint_wrenches": BodyQuantity(("q", "v", "a", "wrenches"), BodyMotion.joint_wrenches),
-    "regressor": BodyQuantity(("q", "v", "a"), lambda m, columns: torque_regressor(m.kin, m.a, columns)),
-    "momentum_regressor": BodyQuantity(("q", "v"), lambda m, columns: momentum_regressor(m.kin, columns)),
-    "energy_regressor": BodyQuantity(("q", "v"), lambda m, columns: energy_regressor(m.kin, columns)),
+BODY_QUANTITIES: Final = {
+    name: BodyQuantity(make, QUANTITIES[name].arguments, QUANTITIES[name].shape, _ACTS_ON.get(name, ""))
+    for name, make in _MAKE.items()
 }

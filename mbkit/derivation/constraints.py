@@ -43,6 +43,7 @@ from mbkit.model.joint_types import cross3, dot3
 from mbkit.model.loops import LOOP_ROWS, LoopEnds
 from mbkit.model.manifold import closest_configuration, integrate, random_state
 from mbkit.model.parts import RESTING, Coupler, Loop
+from mbkit.model.quantities import of_groups
 from mbkit.model.rolling import NO_SLIP_ROWS, Contact, contact, discs_of
 from mbkit.model.validation import sample_mass_matrix
 
@@ -433,17 +434,7 @@ def _with_something_to_say(numbers: _Numbers, poses: list[Array]) -> list[int]:
 
 
 #: Name of each quantity of constraints -> the arguments of its function.
-CONSTRAINT_FUNCTIONS: Final = {
-    "constraint_residual": ("q",),
-    "constraint_jacobian": ("q",),
-    "every_jacobian": ("q",),
-    "constraint_rate": ("q", "v"),
-    "constraint_rate_gradient": ("q", "v"),
-    "constraint_bias": ("q", "v"),
-    "constraint_forces": ("q", "v", "tau"),
-    "independent_multipliers": ("q", "v", "tau"),
-    "generalized_constraint_force": ("q", "v", "tau"),
-}
+CONSTRAINT_FUNCTIONS: Final = of_groups("row")
 
 
 def singular_mass_matrix(model: Model) -> bool:

@@ -31,6 +31,7 @@ from mbkit.derivation.mass_matrix_solve import elimination_order, solve
 from mbkit.derivation.model_values import Constants, scalar
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Model
+from mbkit.model.quantities import of_groups
 
 Elimination = Literal["links", "mass matrix", "least constraint"]
 ELIMINATIONS: Final[tuple[Elimination, ...]] = get_args(Elimination)
@@ -41,22 +42,7 @@ NOTHING: Final[Acting] = ((), "")
 T = TypeVar("T")
 
 #: Name of each quantity -> the arguments of its function.
-FUNCTIONS: Final = {
-    "mass_matrix": ("q",),
-    "mass_matrix_inverse": ("q",),
-    "coriolis_matrix": ("q", "v"),
-    "gravity": ("q",),
-    "nle": ("q", "v"),
-    "coriolis_force": ("q", "v"),
-    "passive": ("q", "v"),
-    "inverse_dynamics": ("q", "v", "a"),
-    "forward_dynamics": ("q", "v", "tau"),
-    "kinetic_energy": ("q", "v"),
-    "potential_energy": ("q",),
-    "energy_rate": ("q", "v", "a"),
-    "inverse_dynamics_derivatives": ("q", "v", "a"),
-    "forward_dynamics_derivatives": ("q", "v", "tau"),
-}
+FUNCTIONS: Final = of_groups("equation", "inverse", "rate", "derivatives")
 
 
 def kept(make: Callable[..., T]) -> Callable[..., T]:

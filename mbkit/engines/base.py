@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from mbkit._attributes import ReadOnly, single_values
 from mbkit._check import Array, all_finite, batch_of, rows
 from mbkit._fork import fork_safe
-from mbkit.engines import closed_loops, constrained, frames_and_momenta, loads, regressors
+from mbkit.engines import constrained, loads
 from mbkit.engines.closed_loops.actuation import ACTUATOR_FORCES
 from mbkit.engines.closed_loops.loop_loads import LOOP_LOADS
 from mbkit.engines.closed_loops.reduced_inertia import REDUCED_INERTIA, IndependentMotion
@@ -28,6 +28,7 @@ from mbkit.engines.frames_and_momenta import (
     ALIGNED,
     JOINT,
     LOCAL,
+    OF_THE_WHOLE,
     FrameByFrame,
     FramesAndMomenta,
     axes_named,
@@ -45,34 +46,23 @@ from mbkit.errors import InputError, NumericalError, UnsupportedError
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.elements.kinds import EFFECTS, that_do
 from mbkit.model.elements.paths import Path
+from mbkit.model.quantities import OF_BODIES
+from mbkit.model.quantities import QUANTITIES as TABLE
 from mbkit.model.rolling import discs_of
 
 if TYPE_CHECKING:
     from mbkit.engines.elements.compiled_forces import CompiledForces
     from mbkit.show import Kind
 
-QUANTITIES: Final = (
-    *("mass_matrix", "coriolis_matrix", "coriolis_force", "gravity", "nle", "passive"),
-    *("inverse_dynamics", "forward_dynamics", "kinetic_energy", "potential_energy", "function"),
-    *frames_and_momenta.QUANTITIES,
-    *loads.QUANTITIES,
-    *regressors.QUANTITIES,
-    *constrained.QUANTITIES,
-    *closed_loops.QUANTITIES,
-)
-
-#: What a model that was written as energies does not have.
-_OF_BODIES: Final = frozenset(
-    {*frames_and_momenta.QUANTITIES, *loads.QUANTITIES, *regressors.QUANTITIES, *closed_loops.OF_BODIES}
-    - {"mass_matrix_inverse"}
-)
-#: Path of a quantity that not every model has.
+#: Names of the quantities that `Dynamics.supports` may list.
+QUANTITIES: Final = tuple(name for name, x in TABLE.items() if x.listed)
+#: Path of the quantities of a group that not every model has.
 _GATES: Final = {
-    **dict.fromkeys(loads.OF_SINGLE_BODIES, loads.LOADS),
-    **dict.fromkeys(closed_loops.OF_BODIES, LOOP_LOADS),
-    **dict.fromkeys(constrained.QUANTITIES, constrained.ROWS),
-    "actuator_forces": ACTUATOR_FORCES,
-    "reduced_inertia": REDUCED_INERTIA,
+    "load": loads.LOADS,
+    "loop": LOOP_LOADS,
+    "row": constrained.ROWS,
+    "actuator": ACTUATOR_FORCES,
+    "motion": REDUCED_INERTIA,
 }
 #: Bits of a double's significand.
 DOUBLE_BITS: Final = 53
@@ -135,6 +125,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     """
 
     engine: ClassVar[str]
+    _elsewhere: ClassVar[Mapping[str, str]] = {name: x for x, own in TABLE.items() for name in own.elsewhere}
     #: Reason for each quantity that this engine cannot give.
     _refuses: ClassVar[dict[str, str]] = {}
     #: Whether parameters may still be without values when the adapter is built.
@@ -180,12 +171,14 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     @property
     def supports(self) -> frozenset[str]:
         """Names of the quantities that this engine can give."""
-        following = loads.FOLLOWING | closed_loops.FOLLOWING
-        needed = {x: following.get(x, x) for x in QUANTITIES}
-        given = {x for x, y in needed.items() if y not in self._refuses and hasattr(self, f"_{y}")}
-        closed = {path for path in _GATES.values() if path.refuses(self.model)}
-        given = {x for x in given if not {_GATES.get(x), _GATES.get(needed[x])} & closed}
-        return frozenset(given if self.model.has_bodies else given - _OF_BODIES)
+        closed = {group for group, path in _GATES.items() if path.refuses(self.model)}
+        closed |= frozenset() if self.model.has_bodies else OF_BODIES
+        needed = {x: TABLE[x].follows or x for x in QUANTITIES}
+        return frozenset(
+            x
+            for x, y in needed.items()
+            if y not in self._refuses and hasattr(self, f"_{y}") and not {TABLE[x].group, TABLE[y].group} & closed
+        )
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self.model.name!r}: nq={self.model.nq}, nv={self.model.nv}>"
@@ -500,7 +493,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 
     def _method(self, quantity: str) -> Callable[..., Any]:
         """Return the method for a quantity, with dry friction; raise `UnsupportedError` where there is none."""
-        if quantity in frames_and_momenta.OF_THE_WHOLE and self.model.rotors:
+        if quantity in OF_THE_WHOLE and self.model.rotors:
             return self._matter._without_friction(quantity)
         method = self._without_friction(quantity)
         exact = "jump" in self.model.effects and not (self._soft_friction and quantity in UNDER_FORCE)
@@ -530,10 +523,11 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
 
     def _without_friction(self, quantity: str) -> Callable[..., Any]:
         """Return the adapter's method for a quantity; raise `UnsupportedError` where it has none."""
-        if quantity in _OF_BODIES:
+        group = TABLE[quantity].group if quantity in TABLE else ""
+        if group in OF_BODIES:
             self.model.require_bodies(quantity)
-        if quantity in _GATES:
-            _GATES[quantity].admit(self.model, f"{quantity}: not known of")
+        if group in _GATES:
+            _GATES[group].admit(self.model, f"{quantity}: not known of")
         method = getattr(self, f"_{quantity}", None)
         if method is None or quantity in self._refuses:
             reason = self._refuses.get(quantity, f"{type(self).__name__} has no _{quantity}")

@@ -25,15 +25,6 @@ CONSISTENT: Final = 1e-8
 ROUNDING: Final = 1e-12
 #: Of a unit vector: the entries of rows that depend on each other.
 TAKES_PART: Final = 0.1
-QUANTITIES: Final = (
-    "constraint_residual",
-    "constraint_jacobian",
-    "constraint_rate",
-    "constraint_rate_gradient",
-    "constraint_bias",
-    "constraint_forces",
-    "generalized_constraint_force",
-)
 ASKED: Final = frozenset({"row", "speed"}), "it has no loops and no other constraints (add_loop, or constraints=[...])"
 ROWS: Final = Path("constraint rows", "", ALL, asks=ASKED)
 

@@ -24,17 +24,12 @@ from mbkit._check import Array
 from mbkit._check import axes_named as axes_named
 from mbkit.errors import InputError
 from mbkit.model import Body, Frame, Model
+from mbkit.model.quantities import QUANTITIES, of_groups
 from mbkit.spatial import skew
 
-_OF_TWO_AXES: Final = ("pose", "jacobian")
 _EYE, _LAST_ROW = np.eye(3), np.eye(4)[3]
-#: Quantities of this part of the protocol.
 #: What tells of all matter together.
-OF_THE_WHOLE: Final = (
-    *("center_of_mass", "center_of_mass_velocity", "center_of_mass_acceleration", "center_of_mass_jacobian"),
-    *("centroidal_momentum", "centroidal_momentum_matrix", "centroidal_momentum_bias", "locked_inertia"),
-)
-QUANTITIES: Final = (*("pose", "jacobian", "velocity", "acceleration", "jacobian_dot_v"), *OF_THE_WHOLE)
+OF_THE_WHOLE: Final = frozenset(of_groups("whole"))
 
 
 def seen_from(R: Array, p: Array, linear: Array, angular: Array, axes: str) -> Array:
@@ -105,8 +100,8 @@ class FramesAndMomenta:
         out = self._evaluate(quantity, frames, *more, **states)
         if not single:
             return out
-        # Of one state the frames come first; a value of a frame has one axis, or two.
-        return out[0] if out.ndim == 2 + (quantity in _OF_TWO_AXES) else out[:, 0]
+        # The frames come first in the value of one state.
+        return out[0] if out.ndim == len(QUANTITIES[quantity].shape) else out[:, 0]
 
     def pose(self, q: ArrayLike, frame: str | Sequence[str]) -> Array:
         """Return X_WF of a frame or body, shape (4, 4) or (N, 4, 4).

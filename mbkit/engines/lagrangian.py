@@ -16,7 +16,7 @@ from mbkit._check import Array, count, finite_array, is_on_device, on_host, real
 from mbkit.codegen.backend import DERIVING, compile_by_default, executable, has_compiler
 from mbkit.codegen.interpreter import Machine
 from mbkit.derivation import ELIMINATIONS, Elimination, Equations, elimination_of, equations_of
-from mbkit.derivation.body_motion import BODY_QUANTITIES, BodyQuantity
+from mbkit.derivation.body_motion import BODY_QUANTITIES
 from mbkit.derivation.least_constraint import has_squares
 from mbkit.engines.base import DERIVATION, Dynamics, scalar
 from mbkit.engines.elements.added_force import UNDER_FORCE
@@ -29,6 +29,7 @@ from mbkit.methods.registry import DEFAULT_METHOD, METHODS, Method
 from mbkit.model import Frame, Joint, Model
 from mbkit.model.elements.kinds import that_do
 from mbkit.model.elements.paths import ALL, Path
+from mbkit.model.quantities import QUANTITIES, of_groups
 
 if TYPE_CHECKING:
     from mbkit.codegen.cuda.runs import CudaSteps
@@ -45,12 +46,13 @@ def _column(name: str, value: ArrayLike) -> Array:
     return finite_array(f"parameter {name!r}", value, (len(np.asarray(value)),))
 
 
-def _trimmed(quantity: BodyQuantity) -> Callable[[Array], Array]:
-    if quantity.axes == 1:
-        return lambda x: x[..., 0]
-    if quantity.axes == 2:
+def _trimmed(shape: tuple[str, ...]) -> Callable[[Array], Array]:
+    """Return what takes the axes from a compiled function's matrix that a quantity of this shape does not have."""
+    if len(shape) < 2:
+        return lambda x: x[..., 0] if shape else x[..., 0, 0]
+    if len(shape) == 2:
         return lambda x: x
-    rows = quantity.rows
+    rows = int(shape[1])
     return lambda x: x.reshape(*x.shape[:-2], x.shape[-2] // rows, rows, x.shape[-1])
 
 
@@ -65,30 +67,16 @@ GPU: Final = Path(
 #: The host decides the forces at rest of what jumps.
 GPU_ARRAYS: Final = Path("gpu under force", "", _ON_GPU, instead="copy them with numpy first")
 #: Quantities of three derivatives.
-_DERIVATIVES: Final = ("inverse_dynamics_derivatives", "forward_dynamics_derivatives")
+_DERIVATIVES: Final = tuple(of_groups("derivatives"))
 #: Three derivatives side by side, which `_TRIM` puts one behind the other.
 _STACKED: Final = "stacked"
 #: What one compiled function gives, and how its result loses the axes that the quantity does not have.
 _TRIM: Final[dict[str, Callable[[Array], Array]]] = {
-    **{name: _trimmed(quantity) for name, quantity in BODY_QUANTITIES.items()},
-    **dict.fromkeys(
-        (
-            *("mass_matrix", "mass_matrix_inverse", "coriolis_matrix"),
-            *("constraint_jacobian", "constraint_rate_gradient"),
-        ),
-        lambda x: x,
-    ),
-    _STACKED: lambda x: x.reshape(*x.shape[:-1], 3, x.shape[-1] // 3).swapaxes(-2, -3),
-    **dict.fromkeys(
-        (
-            *("coriolis_force", "gravity", "nle", "passive", "inverse_dynamics", "forward_dynamics"),
-            *("constraint_residual", "constraint_rate", "constraint_bias", "constraint_forces"),
-            "generalized_constraint_force",
-        ),
-        lambda x: x[..., 0],
-    ),
-    **dict.fromkeys(("kinetic_energy", "potential_energy", "energy_rate"), lambda x: x[..., 0, 0]),
+    name: _trimmed(x.shape)
+    for name, x in QUANTITIES.items()
+    if name in BODY_QUANTITIES or x.group in ("equation", "inverse", "rate") or (x.group == "row" and x.listed)
 }
+_TRIM[_STACKED] = lambda x: x.reshape(*x.shape[:-1], 3, x.shape[-1] // 3).swapaxes(-2, -3)
 
 
 def _quick(checked: _Function) -> _Function:
@@ -414,16 +402,6 @@ class LagrangianDynamics(Dynamics):
     def _trimmed(self, name: str, *arguments: Array) -> Array:
         return _TRIM[name](self._machine(name)(*arguments)[0])
 
-    _mass_matrix, _coriolis_matrix, _coriolis_force = map(_term, ("mass_matrix", "coriolis_matrix", "coriolis_force"))
-    _gravity, _nle, _passive, _inverse_dynamics = map(_term, ("gravity", "nle", "passive", "inverse_dynamics"))
-    _kinetic_energy, _potential_energy, _energy_rate = map(_term, ("kinetic_energy", "potential_energy", "energy_rate"))
-
-    _mass_matrix_inverse = _term("mass_matrix_inverse")
-    _constraint_residual, _constraint_jacobian = _term("constraint_residual"), _term("constraint_jacobian")
-    _constraint_rate, _constraint_bias = _term("constraint_rate"), _term("constraint_bias")
-    _constraint_forces, _constraint_rate_gradient = _term("constraint_forces"), _term("constraint_rate_gradient")
-    _generalized_constraint_force = _term("generalized_constraint_force")
-
     _mechanism = forwarded("equations", "The equations, of those with constraints.")
 
     def _every_jacobian(self, q: Array) -> Array:
@@ -470,8 +448,6 @@ class LagrangianDynamics(Dynamics):
         code = self._code(f"{quantity}_by_parameters", make=lambda: self.equations.parameter_derivatives(quantity))
         out = code(*states, *self._trailing(states[0]), threads=self.threads)[0]
         return np.asarray(of_parameters(self.model, quantity, out))
-
-    _forward_dynamics = _term("forward_dynamics")
 
     # Steps
 
@@ -630,8 +606,8 @@ class LagrangianDynamics(Dynamics):
         return ca.Function(name, given, f.call(given), f.name_in(), f.name_out(), {"cse": True})
 
 
-for _name in BODY_QUANTITIES:
-    setattr(LagrangianDynamics, f"_{_name}", _body_term(_name))
+for _name in _TRIM.keys() - {_STACKED}:
+    setattr(LagrangianDynamics, f"_{_name}", (_body_term if _name in BODY_QUANTITIES else _term)(_name))
 
 
 def _restore(model: Model, batched: dict[str, Array], options: dict[str, Any]) -> LagrangianDynamics:

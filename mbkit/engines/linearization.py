@@ -15,7 +15,6 @@ body axes. With the Boltzmann-Hamel term, hamel(v, p) = -Sᵀ p.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
@@ -30,16 +29,14 @@ from mbkit.methods.registry import DEFAULT_METHOD, Method
 from mbkit.methods.small_motions import graded
 from mbkit.model import Model
 from mbkit.model.elements.paths import ALL, Path
+from mbkit.model.quantities import QUANTITIES, of_groups
 
 if TYPE_CHECKING:
     pass
 
 LINEARIZE: Final = Path("linearize", "linearize: not known of", ALL)
 #: Quantities that `parameter_derivatives` differentiates.
-DIFFERENTIABLE: Final = (
-    *("mass_matrix", "coriolis_matrix", "coriolis_force", "gravity", "nle", "passive"),
-    *("inverse_dynamics", "forward_dynamics", "kinetic_energy", "potential_energy"),
-)
+DIFFERENTIABLE: Final = of_groups("equation")
 #: Numbers of derivatives of a batch that are computed at a time, which fit into a processor's cache.
 _SLICE: Final = 2**18
 
@@ -179,10 +176,10 @@ def of_second_order(out: Any) -> Any:
 
 def of_parameters(model: Model, quantity: str, out: Any) -> Any:
     """Return derivatives by parameters, (..., entries, p), in the quantity's shape and a last axis of p."""
-    n, p = model.nv, out.shape[-1]
-    if quantity.endswith("matrix"):
+    n, p, axes = model.nv, out.shape[-1], len(QUANTITIES[quantity].shape)
+    if axes == 2:
         return out.reshape(*out.shape[:-2], n, n, p).swapaxes(-2, -3)
-    return out[..., 0, :] if quantity.endswith("energy") else out
+    return out if axes else out[..., 0, :]
 
 
 def tangent_rate(model: Model, q: Array, v: Array) -> tuple[Array, Array]:
@@ -431,8 +428,7 @@ class LinearizationQuantities:
         (['m', 'l'], [[[0.25, 2.0]]])
         """
         require_known("quantity", DIFFERENTIABLE, quantity)
-        parameters = inspect.signature(getattr(self, quantity)).parameters.values()
-        names = [x.name for x in parameters if x.default is x.empty]
+        names = DIFFERENTIABLE[quantity]
         if len(arguments) != len(names):
             raise InputError(
                 f"parameter_derivatives: {quantity} takes {', '.join(names)}, got {len(arguments)} arguments"

@@ -27,11 +27,6 @@ from mbkit.model.parts import Loop
 
 #: Wrenches by the names of the frames on which they act.
 Wrenches = Mapping[str, ArrayLike]
-QUANTITIES: Final = ("mass_matrix_inverse", "generalized_force", "joint_wrenches", "newton_euler_residual")
-#: Quantity -> the one that it follows from.
-FOLLOWING: Final = {"newton_euler_residual": "joint_wrenches"}
-#: What needs the force on each body.
-OF_SINGLE_BODIES: Final = frozenset({"joint_wrenches", "undetermined_loads", "loads_under_force", "loads_of_motion"})
 _CARRIED: Final = ("q", "loss", "jump", "row", "bound", "t", "gravity", "point.spring")
 #: Whose energies are of coordinates alone, and act along the directions of joints.
 _OF_COORDINATES: Final = ("joints", "couplings")

@@ -32,14 +32,13 @@ from mbkit.engines.base import DERIVATION, Dynamics, scalar
 from mbkit.engines.linearization import of_parameters, of_second_order
 from mbkit.errors import InputError, UnknownNameError
 from mbkit.model import Frame, Joint, Model
+from mbkit.model.quantities import QUANTITIES
 
 #: Quantity -> its arguments, as in `Dynamics`.
+_WRITTEN: Final = FUNCTIONS | CONSTRAINT_FUNCTIONS
 _ARGUMENTS: Final = {
-    **FUNCTIONS,
-    **CONSTRAINT_FUNCTIONS,
-    **{name: tuple(x for x in of.arguments if x != "wrenches") for name, of in BODY_QUANTITIES.items()},
+    name: tuple(x for x in QUANTITIES[name].arguments if x != "wrenches") for name in (*_WRITTEN, *BODY_QUANTITIES)
 }
-_WRITTEN: Final = {**FUNCTIONS, **CONSTRAINT_FUNCTIONS}
 #: What one function gives together, in this order.
 _TERMS: Final = ("mass_matrix", "coriolis_force", "gravity", "passive", "nle")
 
@@ -59,36 +58,22 @@ def _term(name: str) -> Callable[..., Any]:
     return lambda self, *states: self._terms(*states)[name]
 
 
-def _single(name: str) -> Callable[..., Any]:
-    return lambda self, *states: self._run((name,), *states)[0][:, 0, 0]
-
-
-def _column(name: str) -> Callable[..., Any]:
-    return lambda self, *states: self._run((name,), *states)[0][:, :, 0]
-
-
-def _whole(name: str) -> Callable[..., Any]:
-    return lambda self, *states: self._run((name,), *states)[0]
-
-
-def _body_term(name: str) -> Callable[..., Any]:
-    quantity = BODY_QUANTITIES[name]
+def _of_shape(name: str) -> Callable[..., Any]:
+    """Return the method of a quantity that one program gives."""
+    of_bodies, shape = name in BODY_QUANTITIES, QUANTITIES[name].shape
 
     def evaluate(self: OracleDynamics, *given: Any) -> Any:
-        n = sum(isinstance(x, np.ndarray) for x in given[: len(quantity.arguments)])
+        n = sum(isinstance(x, np.ndarray) for x in given[: len(QUANTITIES[name].arguments)])
         extra = (tuple(x.name for x in e) if isinstance(e, tuple) else e for e in given[n:])
-        out = self._run((name, *extra), *given[:n])[0]
-        if quantity.axes == 1:
-            return out[:, :, 0]
-        if quantity.axes == 2:
-            return out
-        return out.reshape(len(out), out.shape[1] // quantity.rows, quantity.rows, out.shape[2])
+        out = self._run((name, *extra), *given[:n])
+        if len(shape) < 3:
+            return out[0] if len(shape) == 2 else out[0][:, :, 0] if shape else out[0][:, 0, 0]
+        if not of_bodies:
+            return np.stack(out, axis=1)
+        n, rows, columns = out[0].shape
+        return out[0].reshape(n, rows // int(shape[1]), int(shape[1]), columns)
 
     return evaluate
-
-
-def _stack(name: str) -> Callable[..., Any]:
-    return lambda self, *states: np.stack(self._run((name,), *states), axis=1)
 
 
 class OracleDynamics(Dynamics):
@@ -294,28 +279,16 @@ class OracleDynamics(Dynamics):
     def _pattern(self) -> Array:
         return np.asarray(ca.DM(self.equations.mass_matrix.sparsity(), 1).full())
 
-    def _coriolis_matrix(self, q: Array, v: Array) -> Any:
-        return self._run(("coriolis_matrix",), q, v)[0]
-
     def _mass_matrix_inverse(self, q: Array) -> Any:
         M, own = self._terms(q)["mass_matrix"], self._arithmetic
         unit = own.array(np.broadcast_to(np.eye(self.model.nv), M.shape))
         return solve(M, unit, self._pattern, self.equations.elimination_order, own)
-
-    _inverse_dynamics_derivatives = _stack("inverse_dynamics_derivatives")
-    _forward_dynamics_derivatives = _stack("forward_dynamics_derivatives")
 
     def _inverse_dynamics_second_derivatives(self, *states: Array) -> Any:
         return of_second_order(self._run(("inverse_dynamics_second_derivatives",), *states)[0])
 
     def _parameter_derivatives(self, quantity: str, *states: Array) -> Any:
         return of_parameters(self.model, quantity, self._run(("parameter_derivatives", quantity), *states)[0])
-
-    _constraint_jacobian, _constraint_rate_gradient = _whole("constraint_jacobian"), _whole("constraint_rate_gradient")
-    _every_jacobian = _whole("every_jacobian")
-    _constraint_residual, _constraint_rate = _column("constraint_residual"), _column("constraint_rate")
-    _generalized_constraint_force = _column("generalized_constraint_force")
-    _constraint_bias, _constraint_forces = _column("constraint_bias"), _column("constraint_forces")
 
     def _actuator_forces(self, q: Array, v: Array, a: Array, actuators: tuple[Joint, ...]) -> Any:
         which = self._moved_by(actuators)
@@ -337,12 +310,8 @@ class OracleDynamics(Dynamics):
         self._values.last = self._values.last[:, first:last]
         return super()._only(out, first, last)
 
-    _kinetic_energy, _potential_energy, _energy_rate = map(
-        _single, ("kinetic_energy", "potential_energy", "energy_rate")
-    )
 
-
-for _name, _quantity in BODY_QUANTITIES.items():
-    # Its accelerations come from M, and take the force of wrenches as any other.
-    if not _quantity.acts_on:
-        setattr(OracleDynamics, f"_{_name}", _body_term(_name))
+for _name in _ARGUMENTS:
+    # Accelerations take the force of wrenches as any other.
+    if f"_{_name}" not in vars(OracleDynamics) and not _name.endswith("_with_wrenches"):
+        setattr(OracleDynamics, f"_{_name}", _of_shape(_name))

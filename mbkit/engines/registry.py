@@ -12,7 +12,6 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, Final
 
-from mbkit.engines import closed_loops, loads
 from mbkit.engines.base import Dynamics
 from mbkit.engines.frames_and_momenta import Composed
 from mbkit.engines.remote.packages import EngineVersion, names_version, remote_engines
@@ -20,6 +19,7 @@ from mbkit.engines.remote.packages import engine as named_version
 from mbkit.errors import InputError, UnknownNameError, UnsupportedError
 from mbkit.model import Model
 from mbkit.model.builder import expect_model
+from mbkit.model.quantities import QUANTITIES
 
 #: Group of the entry points that name an `EngineInfo`, or a module that calls `register_engine`.
 ENTRY_POINTS: Final = "mbkit.engines"
@@ -210,7 +210,7 @@ def composes(adapter: type[Dynamics], quantity: str) -> bool:
 
     `quantity` is the name of a method that the adapter has, or of inverse or forward dynamics ``"..._with_wrenches"``.
     """
-    if quantity in loads.FOLLOWING | closed_loops.FOLLOWING:
+    if quantity in QUANTITIES and QUANTITIES[quantity].follows:
         return True
     if quantity.removesuffix("_with_wrenches") in adapter._takes_wrenches:
         return False

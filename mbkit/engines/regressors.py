@@ -14,7 +14,6 @@ from mbkit.model.base_parameters import PARAMETER_SETS, RegressorColumns, regres
 if TYPE_CHECKING:
     from mbkit.model import Model
 
-QUANTITIES: Final = ("regressor", "momentum_regressor", "energy_regressor")
 _STANDARD: Final = PARAMETER_SETS[0]
 
 

@@ -21,19 +21,18 @@ from pydrake.multibody.tree import MultibodyForces, MultibodyForces_
 
 from mbkit import spatial
 from mbkit._check import Array
-from mbkit.engines import closed_loops, loads, regressors
 from mbkit.engines.base import MappedDynamics
-from mbkit.engines.constrained import QUANTITIES as CONSTRAINT_QUANTITIES
 from mbkit.engines.drake.bodies import DrakeBodies
 from mbkit.engines.drake.model import DRAKE, NO_CONSTRAINTS, SAP, DrakeModel, build
 from mbkit.errors import NumericalError
 from mbkit.model import Model
+from mbkit.model.quantities import of_groups
 
 _WITHOUT_LOOPS: Final = {
     **dict.fromkeys(
         (
-            *("forward_dynamics", "forward_dynamics_derivatives", *CONSTRAINT_QUANTITIES),
-            *(*closed_loops.QUANTITIES, *loads.OF_SINGLE_BODIES),
+            *("forward_dynamics", "forward_dynamics_derivatives"),
+            *of_groups("row", "actuator", "load", "loop", "motion"),
         ),
         f"{{model}} has constraints ({{parts}}), and {NO_CONSTRAINTS}; mbkit.simulate(..., method={SAP!r}) runs its "
         "discrete one, and mbkit.dynamics(model, 'lagrangian') has the terms",
@@ -63,7 +62,7 @@ class DrakeDynamics(DrakeBodies, MappedDynamics):
     _refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "Drake forms C v without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no CasADi form; mbkit.dynamics(model, 'lagrangian') has",
-        **dict.fromkeys(regressors.QUANTITIES, "Drake has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
+        **dict.fromkeys(of_groups("regressor"), "Drake has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
     }
 
     def __init__(self, model: Model) -> None:

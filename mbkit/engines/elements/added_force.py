@@ -13,16 +13,18 @@ from typing import Any, Final
 import numpy as np
 
 from mbkit._check import Array
+from mbkit.model.quantities import QUANTITIES
 
-#: Quantities whose argument is a force, the third one.
-UNDER_FORCE: Final = (
-    *("forward_dynamics", "forward_dynamics_with_wrenches"),
-    *("constraint_forces", "generalized_constraint_force"),
-)
 #: Loads of mechanisms.
-LOADS: Final = ("loads_under_force", "loads_of_motion")
+LOADS: Final = tuple(name for name, x in QUANTITIES.items() if x.group == "load" and not x.listed)
 #: Place of the force among the arguments, by quantity.
-_PLACE: Final = dict.fromkeys((*UNDER_FORCE, LOADS[0]), 2) | {LOADS[1]: 3}
+_PLACE: Final = {
+    name: x.arguments.index("tau")
+    for name, x in QUANTITIES.items()
+    if "tau" in x.arguments and x.group in ("equation", "wrenches", "row", "load")
+}
+#: Quantities of the motion under a force.
+UNDER_FORCE: Final = tuple(name for name in _PLACE if name not in LOADS)
 
 
 class AddedForce:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from mbkit._attributes import single_values
 from mbkit._check import Array, batch_of, count, real, shown
 from mbkit._warn import warn
-from mbkit.engines import known_defects, regressors
+from mbkit.engines import known_defects
 from mbkit.engines.base import MappedDynamics
 from mbkit.engines.closed_loops.rows_of_frames import RowsOfFrames
 from mbkit.engines.constrained import off_by
@@ -41,6 +41,7 @@ from mbkit.engines.mujoco.model import (
 from mbkit.engines.mujoco.rollout import rollout
 from mbkit.errors import DoubtfulRunWarning, InputError, MbkitWarning, NumericalError
 from mbkit.model import Model
+from mbkit.model.quantities import of_groups
 
 if TYPE_CHECKING:
     from mbkit.engines.closed_loops.frame_rows import Rows
@@ -92,7 +93,7 @@ class MujocoDynamics(MujocoBodies, RowsOfFrames, MappedDynamics):
     _refuses: ClassVar[dict[str, str]] = {
         "coriolis_matrix": "MuJoCo forms C v + g without the matrix; nle(q, v) - gravity(q) is C v",
         "function": "it has no symbolic form; mbkit.dynamics(model, 'lagrangian') has",
-        **dict.fromkeys(regressors.QUANTITIES, "MuJoCo has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
+        **dict.fromkeys(of_groups("regressor"), "MuJoCo has no regressor; mbkit.dynamics(model, 'lagrangian') has"),
         "constraint_rate_gradient": "its derivatives are finite differences; the lagrangian engine has this one",
         "constraint_forces": "its soft constraints have rows of their own; constraint_law(q, v, tau).force is theirs, "
         "and generalized_constraint_force(q, v, tau) is Jᵀ λ",

@@ -22,6 +22,7 @@ from mbkit.engines.remote.packages import EngineVersion
 from mbkit.engines.remote.process import RemoteError, new_key, process_of
 from mbkit.errors import NumericalError, UnsupportedError
 from mbkit.model import Frame, Model
+from mbkit.model.quantities import QUANTITIES
 
 #: Quantities that not every engine gives by itself.
 _REFUSED: Final = {
@@ -33,14 +34,6 @@ _REFUSED: Final = {
 #: A run by the engine's own integrator is left this often, s, for signals and progress; after so many steps first.
 _PERIOD: Final = 0.1
 _FIRST_STEPS: Final = 16
-
-#: Methods below that take stacks of states too: one call of the process for all of them.
-_STACKED: Final = frozenset(
-    {
-        *("_mass_matrix", "_coriolis_matrix", "_coriolis_force", "_nle", "_gravity", "_passive", "_inverse_dynamics"),
-        *("_forward_dynamics", "_kinetic_energy", "_potential_energy", "_pose", "_jacobian"),
-    }
-)
 
 
 def _turn(R: Array, x: Array) -> Array:
@@ -121,7 +114,9 @@ class VersionDynamics(MappedDynamics):
         return self._process.call(name, arrays, self._key, self.version.seconds, stacked, **plain)
 
     def _value(self, method: Callable[..., Any], states: list[Array], more: tuple[Any, ...], size: int | None) -> Any:
-        together = size and getattr(method, "__name__", "") in _STACKED
+        # The methods below take stacks of states: one call of the process for all of them.
+        name = getattr(method, "__name__", "")
+        together = size and name in vars(VersionDynamics) and name[1:] in QUANTITIES
         return method(*states, *more) if together else super()._value(method, states, more, size)
 
     def _travelling(self) -> tuple[dict[str, Any], Mapping[str, Sequence[str]]]:

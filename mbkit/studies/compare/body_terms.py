@@ -14,7 +14,6 @@ forward dynamics follow from these and M⁻¹.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -216,33 +215,25 @@ def _wrench(model: Model) -> tuple[Any, ...]:
     return ({farthest(model): WRENCH},)
 
 
-_Measure = Callable[[Array, Array, Any], Errors]
-
-
-def _term(name: str, quantity: str, arguments: str, errors: _Measure, *more: Callable[[Model], Any]) -> Term:
-    return Term(name, quantity, tuple(arguments.split()), errors, *more)
-
-
 #: Compared after the terms of the equation of motion, where there are bodies with mass.
 BODY_TERMS: Final = (
-    _term("pose", "pose", "q", _pose_errors, _frame),
-    _term("Jacobian", "jacobian", "q", _jacobian_errors, _frame),
-    _term("velocity", "velocity", "q v", lambda e, _, scales: _halves(e, *scales.velocity.T), _frame),
-    _term("acceleration", "acceleration", "q v a", _acceleration_of_frame_errors, _frame),
-    _term("J̇ v", "jacobian_dot_v", "q v", _acceleration_of_frame_errors, _frame),
-    _term("centre of mass", "center_of_mass", "q", _center_errors),
-    _term("A_G", "centroidal_momentum_matrix", "q", _momentum_matrix_errors),
-    _term("Ȧ_G v", "centroidal_momentum_bias", "q v", _momentum_bias_errors),
-    _term("locked inertia", "locked_inertia", "q", _locked_inertia_errors),
-    _term("M⁻¹", "mass_matrix_inverse", "q", _inverse_errors),
-    _term("joint loads", JOINT_LOADS, "q v a", _load_errors),
-    _term("Jᵀ wrench", "generalized_force", "q", _pushed_errors, _wrench),
-    _term("forward dynamics, wrench", "forward_dynamics", "q v tau", acceleration_errors, _wrench),
-    _term("regressor", "regressor", "q v a", _regressor_errors),
-    _term("∂ID/∂(q, v, a)", "inverse_dynamics_derivatives", "q v a", _slope_errors),
+    Term("pose", "pose", _pose_errors, _frame),
+    Term("Jacobian", "jacobian", _jacobian_errors, _frame),
+    Term("velocity", "velocity", lambda e, _, scales: _halves(e, *scales.velocity.T), _frame),
+    Term("acceleration", "acceleration", _acceleration_of_frame_errors, _frame),
+    Term("J̇ v", "jacobian_dot_v", _acceleration_of_frame_errors, _frame),
+    Term("centre of mass", "center_of_mass", _center_errors),
+    Term("A_G", "centroidal_momentum_matrix", _momentum_matrix_errors),
+    Term("Ȧ_G v", "centroidal_momentum_bias", _momentum_bias_errors),
+    Term("locked inertia", "locked_inertia", _locked_inertia_errors),
+    Term("M⁻¹", "mass_matrix_inverse", _inverse_errors),
+    Term("joint loads", JOINT_LOADS, _load_errors),
+    Term("Jᵀ wrench", "generalized_force", _pushed_errors, _wrench),
+    Term("forward dynamics, wrench", "forward_dynamics", acceleration_errors, _wrench),
+    Term("regressor", "regressor", _regressor_errors),
+    Term("∂ID/∂(q, v, a)", "inverse_dynamics_derivatives", _slope_errors),
 )
 #: The same where a force τ decides the loads beside the motion.
 MECHANISM_TERMS: Final = tuple(
-    LoadsUnderForce(x.name, x.quantity, ("q", "v", "tau"), _mechanism_load_errors) if x.quantity == JOINT_LOADS else x
-    for x in BODY_TERMS
+    LoadsUnderForce(x.name, x.quantity, _mechanism_load_errors) if x.quantity == JOINT_LOADS else x for x in BODY_TERMS
 )

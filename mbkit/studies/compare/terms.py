@@ -16,6 +16,7 @@ from mbkit.engines.oracle import OracleDynamics
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 from mbkit.model.manifold import limits_box
+from mbkit.model.quantities import QUANTITIES
 from mbkit.studies.compare.errors import (
     Errors,
     Scales,
@@ -93,14 +94,13 @@ def _near_singular(model: Model, rng: np.random.Generator, n: int) -> Array:
 
 @dataclass(frozen=True)
 class Term:
-    """One compared quantity: a method of `Dynamics`, and the fields of `States` that it takes.
+    """One compared quantity, a method of `Dynamics`.
 
-    `more` returns the arguments behind those, such as a frame of the model.
+    `more` returns the arguments behind the arrays that it takes, such as a frame of the model.
     """
 
     name: str
     quantity: str
-    arguments: tuple[str, ...]
     errors: Callable[[Array, Array, Any], Errors]
     more: Callable[[Model], tuple[Any, ...]] = lambda _: ()
 
@@ -115,7 +115,8 @@ class Term:
         return oracle.extended(self.quantity, *self._given(oracle, states))
 
     def _given(self, dyn: Dynamics, states: States) -> list[Any]:
-        return [*(getattr(states, a) for a in self.arguments), *self.more(dyn.model)]
+        arrays = (x for x in QUANTITIES[self.quantity].arguments if x != "wrenches")
+        return [*(getattr(states, x) for x in arrays), *self.more(dyn.model)]
 
     def single(self, dyn: Dynamics, states: States) -> Callable[[], Any]:
         """Return a call at one random state, for timing."""
@@ -136,15 +137,15 @@ class LoadsUnderForce(Term):
 _HEAVY: Final = partial(force_errors, heavy=True)
 
 TERMS: Final = (
-    Term("M", "mass_matrix", ("q",), matrix_errors),
-    Term("g", "gravity", ("q",), _HEAVY),
-    Term("nle", "nle", ("q", "v"), _HEAVY),
-    Term("C v", "coriolis_force", ("q", "v"), force_errors),
-    Term("passive", "passive", ("q", "v"), force_errors),
-    Term("inverse dynamics", "inverse_dynamics", ("q", "v", "a"), _HEAVY),
-    Term("forward dynamics", "forward_dynamics", ("q", "v", "tau"), acceleration_errors),
-    Term("kinetic energy", "kinetic_energy", ("q", "v"), energy_errors),
-    Term("potential energy", "potential_energy", ("q",), energy_errors),
+    Term("M", "mass_matrix", matrix_errors),
+    Term("g", "gravity", _HEAVY),
+    Term("nle", "nle", _HEAVY),
+    Term("C v", "coriolis_force", force_errors),
+    Term("passive", "passive", force_errors),
+    Term("inverse dynamics", "inverse_dynamics", _HEAVY),
+    Term("forward dynamics", "forward_dynamics", acceleration_errors),
+    Term("kinetic energy", "kinetic_energy", energy_errors),
+    Term("potential energy", "potential_energy", energy_errors),
 )
 
 FORWARD_DYNAMICS: Final = "forward_dynamics"
@@ -153,10 +154,10 @@ JOINT_LOADS: Final = "joint_wrenches"
 OF_CONSTRAINED_MOTION: Final = (FORWARD_DYNAMICS, JOINT_LOADS, "generalized_constraint_force")
 #: Terms of models with constraints. Jᵀ λ is unique where λ is not.
 CONSTRAINT_TERMS: Final = (
-    Term("f", "constraint_residual", ("q",), row_errors),
-    Term("J", "constraint_jacobian", ("q",), row_errors),
-    Term("J̇ v rows", "constraint_bias", ("q", "v"), partial(row_errors, moving=True)),
-    Term("Jᵀ λ", "generalized_constraint_force", ("q", "v", "tau"), constraint_force_errors),
+    Term("f", "constraint_residual", row_errors),
+    Term("J", "constraint_jacobian", row_errors),
+    Term("J̇ v rows", "constraint_bias", partial(row_errors, moving=True)),
+    Term("Jᵀ λ", "generalized_constraint_force", constraint_force_errors),
 )
 
 
