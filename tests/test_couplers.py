@@ -16,7 +16,7 @@ import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
 from mbkit.model import Coupler
 from mbkit.studies.baseline.description import changes, described
-from mbkit.studies.importers.loops import Written, coupler_differences
+from mbkit.studies.importers.loops import Written, between_joints, coupler_differences
 from tests.random_trees import IN_MUJOCO, coupled, off, random_tree
 from tests.scenes import chain
 from tests.test_loops_pinocchio import against_34_digits
@@ -299,7 +299,9 @@ def test_an_epicyclic_train_on_paper(rows: str) -> None:
 
 def differ(a: Coupler, b: Coupler) -> list[tuple[float, str, str]]:
     names = {x: x for x in "abc"}
-    return coupler_differences(Written([a], [a]), mb.catalog.double_pendulum(), [b], names, 1e-12)
+    model = mb.catalog.double_pendulum()
+    (a,), (b,) = (between_joints(model, [x], names) for x in (a, b))
+    return coupler_differences(Written([a], [a]), model, [b], 1e-12)
 
 
 def test_a_row_is_the_same_whichever_of_its_joints_is_called_the_first() -> None:
@@ -314,7 +316,7 @@ def test_a_row_is_the_same_whichever_of_its_joints_is_called_the_first() -> None
         ((size, where, says),) = differ(written, replace(other, offset=other.offset + 1e-3))
         assert 1e-4 < size < 1e-2
         assert where == "'c' (of 'a', 'b' and 'c')"
-        assert says.startswith("ratio 0.5 0.25 and offset")
+        assert says.startswith("a = 0.5 b + 0.25 c - 0.1")
     assert [says for *_, says in differ(written, Coupler("", "b", "a", 2.0, 0.3))] == ["missing", "not in the file"]
 
 

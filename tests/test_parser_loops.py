@@ -13,10 +13,10 @@ import pytest
 import mbkit as mb
 from mbkit.errors import ModelError
 from mbkit.model import Loop
-from mbkit.studies.explain.loop_differences import moved
+from mbkit.studies.explain.loops import moved
 from mbkit.studies.explain.merged_model import Tolerances
 from mbkit.studies.importers import study
-from mbkit.studies.importers.loops import Written, coupler_differences, loop_differences
+from mbkit.studies.importers.loops import Written, between_joints, coupler_differences, loop_differences
 from mbkit.studies.importers.result import ParserComparison, Stage
 
 BODY = '<inertial pos=".2 0 0" mass="1" diaginertia=".1 .1 .1"/>'
@@ -214,17 +214,21 @@ def test_a_coupler_s_numbers_are_those_of_either_of_its_joints(swapped: bool) ->
     written = mb.model.Coupler("c", "a", "b", -0.5, 0.1)
     read = mb.model.Coupler("", "y", "x", -2.0, 0.2) if swapped else mb.model.Coupler("", "x", "y", -0.5, 0.1)
     names, plain = {"x": "a", "y": "b"}, mb.catalog.double_pendulum()
-    loops = Written([written], [written])
-    assert coupler_differences(loops, plain, [read], names, 1e-12) == []
+    (own,) = between_joints(plain, [written], {x: x for x in "ab"})
+    loops = Written([own], [own])
+
+    def differences(loops: Written, *read: mb.model.Coupler) -> list[tuple[float, str, str]]:
+        return coupler_differences(loops, plain, between_joints(plain, read, names), 1e-9)
+
+    assert differences(loops, read) == []
     for change in ({"ratio": read.ratio * (1 + 1e-6)}, {"offset": read.offset + 1e-6}):
-        ((size, where, says),) = coupler_differences(loops, plain, [replace(read, **change)], names, 1e-9)
+        ((size, where, says),) = differences(loops, replace(read, **change))
         assert 1e-7 < size < 1e-5
         assert where == "'c' (of 'a' and 'b')"
-        assert "ratio" in says
-    ((_, _, says),) = coupler_differences(loops, plain, [read, read], names, 1e-9)
+        assert says.startswith("a = ")
+    ((_, _, says),) = differences(loops, read, read)
     assert says == "not in the file"
-    off = Written(every=[written])
-    ((_, _, says),) = coupler_differences(off, plain, [read], names, 1e-9)
+    ((_, _, says),) = differences(Written(every=[own]), read)
     assert says == "inactive, read as active"
 
 
@@ -255,5 +259,5 @@ def test_mimic_joints_may_be_held_by_couplers_also_in_a_chain(tmp_path: Path) ->
     model, names = mb.load(path), {x: x for x in ("ja", "jb", "jc")}
     for ratio, offset, right in ((-0.5, 0.2, True), (0.5, 0.2, False), (-0.5, 0.3, False)):
         read = mb.model.Coupler("", "jc", "jb", ratio, offset)
-        some = coupler_differences(Written(), model, [read], names, 1e-9)
-        assert [says for _, _, says in some] == ([] if right else ["other numbers than the file's mimic joints"])
+        some = coupler_differences(Written(), model, between_joints(model, [read], names), 1e-9)
+        assert [says for _, _, says in some] == ([] if right else ["not in the file"])

@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, combinations, islice
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -23,8 +23,8 @@ from mbkit.load.shapes import NOTHING, MassProperties
 from mbkit.model import JointCoupling, Model
 from mbkit.model.elements.kinds import PART_KINDS, that_do
 from mbkit.studies.explain import terms
-from mbkit.studies.explain.hypotheses import body_mistakes, joint_mistakes
-from mbkit.studies.explain.merged_model import MergedModel, merge, number_text, with_mass_properties
+from mbkit.studies.explain.merged_model import MergedModel, merge, number_text
+from mbkit.studies.explain.mistakes import Mistake, body_mistakes, joint_mistakes
 from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, gaps, larger, model_terms
 
@@ -32,8 +32,21 @@ from mbkit.studies.explain.terms import Gap, Gaps, States, Values, evaluated, ga
 _ROTOR: Final = JointCoupling.adding_to("T")[0]
 #: Pairs of joints tried in each other's place.
 _MAX_SWAPS: Final = 400
+#: Numbers of a joint that an engine may leave out, and what they are called.
+_LEFT_OUT: Final = {n: n for n in ("armature", "damping", "friction")} | {"stiffness": "spring"}
 #: Quantities beside the terms of every explanation, in which known defects show.
 _MORE_TERMS: Final = (("C v", "coriolis_force"), ("kinetic energy", "kinetic_energy"))
+#: Terms mixed up: kind, sentence, and each term's parts with their factors.
+_MIXES: Final[tuple[tuple[str, str, dict[str, dict[str, float]]], ...]] = (
+    (
+        "gravity",
+        "has the gravity forces with the other sign",
+        {"g": {"g": -1.0}, "nle": {"nle": 1.0, "g": -2.0}},
+    ),
+    ("gravity", "leaves gravity out of nle", {"nle": {"nle": 1.0, "g": -1.0}}),
+    ("passive forces", "has springs and dampers in nle", {"nle": {"nle": 1.0, "passive": -1.0}}),
+    ("passive forces", "has passive forces with the other sign", {"passive": {"passive": -1.0}}),
+)
 #: Unit inertias xx, xy, xz, yy, yz, zz.
 _INERTIAS: Final = [np.maximum(x := np.outer(np.eye(3)[i], np.eye(3)[j]), x.T) for i in range(3) for j in range(i, 3)]
 #: Bodies whose terms span those of any matter: a mass at the origin and at a distance of one each way, and inertias.
@@ -116,30 +129,29 @@ class _Engines:
         """Return the known defects that show: the engine's other computation of the value is right."""
         out = []
         for term, quantity in _MORE_TERMS:
-            values: dict[Dynamics, Array] = {}
-            known: dict[Dynamics, list[str]] = {}
-            for dyn in (self.a, self.b):
-                with warnings.catch_warnings(record=True, action="always") as caught:
-                    try:
-                        values[dyn] = np.asarray(getattr(dyn, quantity)(self.at.q, self.at.v))
-                    except MbkitError:
-                        continue
-                known[dyn] = [str(w.message) for w in caught if issubclass(w.category, KnownDefectWarning)]
-            if len(values) < 2:
+            sides = [(dyn, *self._asked(dyn, quantity)) for dyn in (self.a, self.b)]
+            if any(values is None for _, values, _ in sides):
                 continue
-            gap = self._gap(term, values[self.a], values[self.b])
+            gap = self._gap(term, *(values for _, values, _ in sides))
             self.more.append(gap)
-            if gap.relative <= self.tolerance:
-                continue
-            for dyn, other in ((self.a, self.b), (self.b, self.a)):
-                right = self._from_terms(term, dyn)
-                if not known[dyn] or right is None:
-                    continue
-                if self._gap(term, right, values[other]).relative <= self.tolerance:
-                    says = f"{term}: {known[dyn][0].split('; returned as it is')[0]}"
-                    effects = {term: gap.relative}
-                    out.append(Cause("engine defect", dyn.engine, says, None, None, effects, acts=True))
+            for (dyn, _, known), (_, other, _) in (sides, sides[::-1]) if gap.relative > self.tolerance else ():
+                M, nle, g = map(self.values[dyn].get, ("M", "nle", "g"))
+                right = 0.5 * np.einsum("ni,nij,nj->n", self.at.v, M, self.at.v)
+                if term == "C v":
+                    right = None if nle is None or g is None else nle - g
+                if known and right is not None and self._gap(term, right, other).relative <= self.tolerance:
+                    says = f"{term}: {known[0].split('; returned as it is')[0]}"
+                    out.append(Cause("engine defect", dyn.engine, says, None, None, {term: gap.relative}, acts=True))
         return out
+
+    def _asked(self, dyn: Dynamics, quantity: str) -> tuple[Any, list[str]]:
+        """Return a quantity at all states, None where the engine refuses, and the known defects of which it warns."""
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            try:
+                values = np.asarray(getattr(dyn, quantity)(self.at.q, self.at.v))
+            except MbkitError:
+                values = None
+        return values, [str(w.message) for w in caught if issubclass(w.category, KnownDefectWarning)]
 
     def _gap(self, term: str, a: Array, b: Array) -> Gap:
         scale = max(float(np.abs(a).max()), float(np.abs(b).max()), 1e-300)
@@ -147,17 +159,11 @@ class _Engines:
         joint = self.owners[int(np.argmax(off.max(axis=0)))] if off.ndim == 2 and off.any() else ""
         return Gap(term, float(off.max()) / scale, joint)
 
-    def _from_terms(self, term: str, dyn: Dynamics) -> Array | None:
-        values = self.values[dyn]
-        if term == "C v":
-            return values["nle"] - values["g"] if {"nle", "g"} <= values.keys() else None
-        return np.asarray(0.5 * np.einsum("ni,nij,nj->n", self.at.v, values["M"], self.at.v))
-
     def causes(self) -> list[Cause]:
         """Return the first mistake after which the first engine answers as the second does."""
         if self.before.worst <= self.tolerance:
             return []
-        for x in chain(self._conventions(), self._linear(), self._bodies(), self._joints()):
+        for x in chain(self._conventions(), self._linear(), self._parts()):
             left = self._gaps(x.values)
             if left.worst <= self.tolerance:
                 self.after = left
@@ -171,27 +177,15 @@ class _Engines:
     def _conventions(self) -> Iterator[_Trial]:
         model, own = self.model, self._terms(self.model)
         yield from self._velocity_frames()
-        if model.quaternions:
-            for shift, one, other in ((1, "first", "last"), (-1, "last", "first")):
-                order = np.arange(model.nq)
-                for start, _ in model.quaternions:
-                    order[start : start + 4] = start + np.roll(np.arange(4), shift)
-                says = f"reads quaternions w {one}, which are written w {other}"
-                yield _Trial("quaternion order", "", says, self._answers(order))
-        mixes: list[tuple[str, str, dict[str, dict[str, float]]]] = []
-        if model.gravity.any():
-            other_sign = {"g": {"g": -1.0}, "nle": {"nle": 1.0, "g": -2.0}}
-            mixes.append(("gravity", "has the gravity forces with the other sign", other_sign))
-            mixes.append(("gravity", "leaves gravity out of nle", {"nle": {"nle": 1.0, "g": -1.0}}))
-        if model.needs.damping or model.needs.springs or model.needs.forces:
-            mixes.append(("passive forces", "has springs and dampers in nle", {"nle": {"nle": 1.0, "passive": -1.0}}))
-            mixes.append(("passive forces", "has passive forces with the other sign", {"passive": {"passive": -1.0}}))
-        for kind, says, mix in mixes:
+        for shift, one, other in ((1, "first", "last"), (-1, "last", "first")) if model.quaternions else ():
+            order = np.arange(model.nq)
+            for start, _ in model.quaternions:
+                order[start : start + 4] = start + np.roll(np.arange(4), shift)
+            says = f"reads quaternions w {one}, which are written w {other}"
+            yield _Trial("quaternion order", "", says, self._answers(order))
+        for kind, says, mix in _MIXES:
             known = {term: parts for term, parts in mix.items() if {term, *parts} <= own.keys()}
-            mixed = {
-                term: np.asarray(sum(factor * own[name] for name, factor in parts.items()))
-                for term, parts in known.items()
-            }
+            mixed = {t: np.asarray(sum(x * own[name] for name, x in parts.items())) for t, parts in known.items()}
             yield _Trial(kind, "", says, own | mixed)
         yield from self._joint_orders()
 
@@ -226,7 +220,7 @@ class _Engines:
 
     def _velocity_frames(self) -> Iterator[_Trial]:
         """Yield velocities of free joints in other axes or in the other order."""
-        layout = self.model.layout
+        layout, kind = self.model.layout, "velocity frame"
         free = [(layout.q[j.name], layout.v[j.name]) for j in self.model.independent_joints if j.type.floating]
         if not free:
             return
@@ -235,31 +229,28 @@ class _Engines:
             """Return -ω × v in the linear rows: how a velocity that stays changes in the body's axes."""
             out = np.zeros_like(v)
             for _, rows in free:
-                linear, angular = v[:, rows.start : rows.start + 3], v[:, rows.start + 3 : rows.stop]
+                linear, angular = np.split(v[:, rows], 2, axis=1)
                 out[:, rows.start : rows.start + 3] = -np.cross(angular, linear)
             return out
 
         def turned(parts: Sequence[int]) -> Array:
-            T = np.tile(np.eye(self.model.nv), (len(self.at.q), 1, 1))
+            T = self._permutation(np.arange(self.model.nv))
             for q, v in free:
                 R = spatial.matrix_from_quaternion(self.at.q[:, q.stop - 4 : q.stop])
-                for k in parts:
-                    rows = slice(v.start + k, v.start + k + 3)
+                for rows in (slice(v.start + k, v.start + k + 3) for k in parts):
                     T[:, rows, rows] = np.swapaxes(R, 1, 2)
             return T
 
-        kind = "velocity frame"
         says = "turns accelerations of free joints out of the world's axes without ω × v"
         yield _Trial(kind, "", says, self._answers(slip=slip))
         for parts, which in (((0,), "linear velocity"), ((3,), "angular velocity"), ((0, 3), "velocity")):
             says, T = f"has the {which} of free joints in the world's axes", turned(parts)
             # v = T w, so that v̇ = T ẇ + Ṫ w: the linear part turns away under the body.
             yield _Trial(kind, "", says, self._answers(velocities=T, slip=slip if 0 in parts else None))
-            says += ", turned without the term of the turning axes"
-            yield _Trial(kind, "", says, self._answers(velocities=T))
+            yield _Trial(kind, "", f"{says}, turned without the term of the turning axes", self._answers(velocities=T))
         order = np.arange(self.model.nv)
         for _, v in free:
-            order[v] = np.r_[v.start + 3 : v.stop, v.start : v.start + 3]
+            order[v] = np.roll(order[v], 3)
         says = "has the angular velocity of free joints before the linear one"
         yield _Trial(kind, "", says, self._answers(velocities=self._permutation(order)))
 
@@ -328,26 +319,33 @@ class _Engines:
             says = f"has no {_ROTOR} between branches"
             yield _Trial("joint coupling", f"coupling {turning}", says, own | {"M": own["M"] * related})
 
-    def _bodies(self) -> Iterator[_Trial]:
+    def _parts(self) -> Iterator[_Trial]:
+        """Yield the usual mistakes with each body whose ten numbers can explain M, and with each joint."""
         whole = merge(self.model)
         own = self._terms(whole.model)
         for joint in whole.model.joints:
-            fitted = self._fitted_matter(whole, joint.child, own)
-            if fitted is None:
-                continue
-            subject, a = f"body {joint.child!r}", whole.mass_properties(joint.child)
-            for x in body_mistakes(whole.links[joint.child], joint.rotation):
-                changed = with_mass_properties(whole.model, joint.child, replace(a, **x.fields))
-                yield _Trial(x.kind, subject, x.says, self._terms(changed))
-            more, values = fitted
-            says = f"has other matter in it: {number_text(more)} kg more than {number_text(a.mass)}"
-            yield _Trial("inertia", subject, says, values)
+            if fitted := self._fitted_matter(whole, joint.child, own):
+                where, subject = ("bodies", joint.child), f"body {joint.child!r}"
+                for x in body_mistakes(whole.links[joint.child], joint.rotation):
+                    yield _Trial(x.kind, subject, x.says, self._terms(whole.put(where, x.fields).model))
+                more, values = fitted
+                mass = number_text(whole.model.body(joint.child).mass)
+                says = f"has other matter in it: {number_text(more)} kg more than {mass}"
+                yield _Trial("inertia", subject, says, values)
+        for joint in whole.model.joints:
+            none = [Mistake(kind, f"has no {kind}", {n: 0.0 * getattr(joint, n)}) for n, kind in _LEFT_OUT.items()]
+            for x in (*none, *joint_mistakes(joint)):
+                # A mimic joint that is free has other coordinates, and could not have been compared.
+                if x.fields.get("mimic", joint) is not None:
+                    values = self._terms(whole.put(("joints", joint.name), x.fields).model)
+                    yield _Trial(x.kind, f"joint {joint.name!r}", x.says, values)
 
     def _fitted_matter(self, whole: MergedModel, name: str, own: Values) -> tuple[float, Values] | None:
         """Return the added mass and the terms with the body's ten numbers fitted, if these explain M."""
         bodies = tuple(replace(b, **vars(NOTHING)) for b in whole.model.bodies)
         empty = replace(whole.model, bodies=bodies).without(*that_do("T"), "damping", "springs")
-        columns = [self._terms(with_mass_properties(empty, name, mass_properties)) for mass_properties in _PROBES]
+        alone = replace(whole, model=empty)
+        columns = [self._terms(alone.put(("bodies", name), vars(matter)).model) for matter in _PROBES]
         common = set(own).intersection(*columns)
         if "M" not in common:
             # The engine refuses bodies without matter.
@@ -361,15 +359,6 @@ class _Engines:
             return None
         moved = {t: own[t] + sum(w * c[t] for w, c in zip(x, columns, strict=True)) for t in common - {"passive"}}
         return float(x @ [mass_properties.mass for mass_properties in _PROBES]), own | moved
-
-    def _joints(self) -> Iterator[_Trial]:
-        whole = merge(self.model)
-        for joint in whole.model.joints:
-            for x in joint_mistakes(joint):
-                # A mimic joint that is free has other coordinates, and could not have been compared.
-                if x.fields.get("mimic", joint) is not None:
-                    values = self._terms(whole.with_joint(x.fields, joint.name).model)
-                    yield _Trial(x.kind, f"joint {joint.name!r}", x.says, values)
 
     def subtree(self) -> tuple[str, ...]:
         """Return the smallest part on which the two engines still differ."""

@@ -17,7 +17,7 @@ from mbkit._check import Array, by_key
 from mbkit.model import Body, Joint, Model
 from mbkit.model.elements.references import _OF_BODIES, hung_on, names_in, renamed
 from mbkit.model.joint_types import FIXED, PRISMATIC
-from mbkit.studies.explain.hypotheses import Hypothesis
+from mbkit.studies.explain.hypotheses import Hypothesis, differences, links_in_common_axes
 from mbkit.studies.explain.merged_model import OTHERS, MergedModel, Tolerances, at_itself, merge, reattached
 from mbkit.studies.explain.terms import fitting, restricted
 
@@ -322,13 +322,9 @@ def _count_differences(a: Model, b: Model, near: Tolerances) -> float:
     one, other = merge(a), merge(b)
     matching = match(one.model, other.model, near)
     there, _ = align_frames(rename_joints(other, one.model, matching), one.model, near)
-    own = {j.name: j for j in there.model.joints}
-    count = 2.0 * (len(matching.only_a) + len(matching.only_b)) + (not near.number(one.ground.mass, there.ground.mass))
-    for joint in one.model.joints:
-        if joint.name in own:
-            count += len(near.differing(one.model.body(joint.child), there.model.body(joint.child)))
-            count += len(near.differing(joint, own[joint.name], *_FRAMES))
-    return count
+    alone = len(matching.only_a) + len(matching.only_b)
+    ground = not near.number(one.ground.mass, there.ground.mass)
+    return len(differences(*links_in_common_axes(one, there, near), near)) + 2.0 * alone + ground
 
 
 def _structural_cause(

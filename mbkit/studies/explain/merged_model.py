@@ -146,24 +146,28 @@ class MergedModel:
         x = self.model.body(body)
         return MassProperties(x.mass, x.com, x.inertia)
 
-    def with_fields(self, **fields: Any) -> MergedModel:
-        """Return the description with other fields of the model."""
-        return replace(self, model=replace(self.model, **fields))
+    def put(self, where: tuple[str, ...], values: Mapping[str, Any]) -> MergedModel:
+        """Return the description with other fields in one part.
 
-    def with_joint(self, fields: Mapping[str, Any], name: str) -> MergedModel:
-        """Return the description with other fields in one joint."""
-        return self.with_fields(joints=tuple(replace(j, **fields) if j.name == name else j for j in self.model.joints))
-
-    def with_body(self, fields: Mapping[str, Any], name: str) -> MergedModel:
-        """Return the description with another mass, centre of mass or inertia in one body."""
-        return replace(
-            self, model=with_mass_properties(self.model, name, replace(self.mass_properties(name), **fields))
-        )
-
-    def with_link(self, fields: Mapping[str, Any], body: str, link: str) -> MergedModel:
-        """Return the description with other matter in one link of a body, in the link's axes."""
-        links = tuple(replace(x, matter=replace(x.matter, **fields)) if x.name == link else x for x in self.links[body])
-        return MergedModel(with_mass_properties(self.model, body, composite(links)), {**self.links, body: links})
+        `where` is the part's section and name, or "links", the body and the link, or "" for the description itself.
+        With a section alone `values` are whole parts by name, None for one that is taken away.
+        """
+        section, *names = where
+        if not section:
+            return replace(self, model=replace(self.model, **values))
+        if not names:
+            kept = [p for p in getattr(self.model, section) if p.name not in values]
+            return self.put(("",), {section: (*kept, *(p for p in values.values() if p is not None))})
+        *body, name = names
+        if body:
+            old = self.links[body[0]]
+            links = tuple(replace(x, matter=replace(x.matter, **values)) if x.name == name else x for x in old)
+            changed = replace(self, links={**self.links, body[0]: links})
+            return changed.put(("bodies", *body), vars(composite(links)))
+        if "inertia" in values:
+            values = {**values, "inertia": _symmetric(values["inertia"])}
+        parts = (replace(p, **values) if p.name == name else p for p in getattr(self.model, section))
+        return self.put(("",), {section: tuple(parts)})
 
 
 #: A body's frame on another body: that one's name, and R and p there.
@@ -195,7 +199,8 @@ def merge(model: Model) -> MergedModel:
         body, R, p = at[joint.child]
         links[body].append(LinkInBody(own.name, R, p, MassProperties(own.mass, own.com, own.inertia)))
     joints = tuple(moving[j.name] for j in model.joints if j.name in moving)
-    matter = tuple(_body(j.child, composite(links[j.child])) for j in joints)
+    parts = ((j.child, composite(links[j.child])) for j in joints)
+    matter = tuple(Body(name, x.mass, x.com, _symmetric(x.inertia)) for name, x in parts)
     merged = replace(reattached(model, at), bodies=matter, joints=joints)
     return MergedModel(merged, {name: tuple(some) for name, some in links.items()})
 
@@ -224,7 +229,9 @@ def reattached(model: Model, places: Mapping[str, Place]) -> Model:
 def with_common_frames(*sides: MergedModel) -> Iterator[MergedModel]:
     """Yield the descriptions with each other's frames, so that forces can be exchanged."""
     frames = {f.name: f for side in sides for f in side.model.frames}
-    yield from (x.with_fields(frames=tuple((frames | {f.name: f for f in x.model.frames}).values())) for x in sides)
+    for x in sides:
+        own = frames | {f.name: f for f in x.model.frames}
+        yield x.put(("",), {"frames": tuple(own.values())})
 
 
 def composite(links: Iterable[LinkInBody]) -> MassProperties:
@@ -237,16 +244,9 @@ def composite(links: Iterable[LinkInBody]) -> MassProperties:
     return together(masses)
 
 
-def with_mass_properties(model: Model, name: str, mass_properties: MassProperties) -> Model:
-    """Return the description with other matter in one body."""
-    return replace(model, bodies=tuple(_body(name, mass_properties) if b.name == name else b for b in model.bodies))
-
-
-def _body(name: str, mass_properties: MassProperties) -> Body:
-    # A rotation of an inertia leaves rounding on one side of the diagonal.
-    return Body(
-        name, mass_properties.mass, mass_properties.com, 0.5 * (mass_properties.inertia + mass_properties.inertia.T)
-    )
+def _symmetric(inertia: Array) -> Array:
+    """Return an inertia without the rounding that a rotation leaves on one side of the diagonal."""
+    return np.asarray(0.5 * (inertia + inertia.T))
 
 
 def number_text(value: Any) -> str:

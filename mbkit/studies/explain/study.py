@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -20,9 +20,9 @@ from mbkit.studies.explain.engine_differences import engine_causes
 from mbkit.studies.explain.hypotheses import (
     CONSTRAINTS,
     Hypothesis,
-    differences,
-    link_differences,
+    ground_differences,
     links_in_common_axes,
+    summarized_differences,
 )
 from mbkit.studies.explain.joint_matching import Match, Matching, align_frames, reconcile_joint_sets, rename_joints
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge, number_text, with_common_frames
@@ -34,10 +34,6 @@ from mbkit.studies.results import to_plain
 EXPLAIN: Final = Path("explain", "explain compares bodies and joints of", frozenset(EFFECTS))
 #: At which forces of the time are compared, s.
 _TIME: Final = 0.37
-#: Relative difference of numbers written with five digits.
-_ROUNDED: Final = 2e-5
-#: More differences than this may be summarized as rounding.
-_MAX_LISTED: Final = 4
 
 
 def explain(
@@ -143,7 +139,7 @@ class _Descriptions:
         before = by_name or self._gaps(one.model, theirs.model)
         whole = self._whole(one.model, theirs.model) if before.worst <= self.tolerance else 0.0
         one, target = with_common_frames(*links_in_common_axes(one, target, near))
-        hypotheses = _summarized_differences(one, target, near) if one.model.nv else []
+        hypotheses = summarized_differences(one, target, near) if one.model.nv else []
         changed = one
         for h in hypotheses:
             changed = h.apply(changed)
@@ -152,7 +148,7 @@ class _Descriptions:
             *(self._cause(h, {"M": np.inf}) for h in structural),
             *self._naming_causes(one, other, matching, by_name),
             *(self._measured_cause(h, one, target) for h in hypotheses),
-            *self._ground_causes(one, target, near),
+            *(self._cause(h, {}) for h in ground_differences(one, target, near, self.names[0])),
         )
         constrained = any(c.kind in CONSTRAINTS and c.acts for c in causes)
         massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)
@@ -250,12 +246,13 @@ class _Descriptions:
     def _measured_cause(self, h: Hypothesis, one: MergedModel, target: MergedModel) -> Cause:
         """Return a difference with the larger of its two effects, added alone to one side or removed from the other."""
         effects: dict[str, float] = {}
-        for model, changed in ((one.model, h.apply(one).model), (target.model, h.revert(target).model)):
+        for model, changed in ((one, h.apply(one)), (target, h.revert(target))) if h.changes else ():
+            found = self._gaps(model.model, changed.model).effects
             if h.kind in CONSTRAINTS:
-                effects[WHOLE] = max(np.nan_to_num(self._whole(model, changed), nan=np.inf), effects.get(WHOLE, 0.0))
-                continue
-            for term, relative in self._gaps(model, changed).effects.items():
-                effects[term] = max(relative, effects.get(term, 0.0))
+                found = {WHOLE: float(np.nan_to_num(self._whole(model.model, changed.model), nan=np.inf))}
+            else:
+                found = self._gaps(model.model, changed.model).effects
+            effects |= {term: max(x, effects.get(term, 0.0)) for term, x in found.items()}
         return self._cause(h, effects)
 
     def _naming_causes(
@@ -281,21 +278,6 @@ class _Descriptions:
                 says = f"has joints {moved[0]!r} and {moved[1]!r} in each other's place in q and v"
             yield self._cause(Hypothesis("joint order", "", says), {})
 
-    def _ground_causes(self, one: MergedModel, other: MergedModel, near: Tolerances) -> Iterator[Cause]:
-        """Yield the difference in the matter that stands still."""
-        a, b = one.ground, other.ground
-        if near.same(a, b):
-            return
-        if not b.mass and a.mass:
-            says = f"has no mass in what stands still, where {self.names[0]} has {number_text(a.mass)} kg"
-        elif near.number(a.mass, b.mass):
-            some = link_differences(one.links["world"], other.links["world"], near)
-            links = ", ".join(f"link {name!r} {x.says}" for name, x in some or ())
-            says = f"has other matter of the same mass standing still{': ' if links else ''}{links}"
-        else:
-            says = f"has {number_text(a.mass)} -> {number_text(b.mass)} kg standing still"
-        yield self._cause(Hypothesis("base mass", "the base", says, a=a.mass, b=b.mass), {})
-
 
 def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) -> Iterator[str]:
     if moved_frames:
@@ -314,24 +296,3 @@ def _named_frames(a: Model, b: Model, near: Tolerances) -> Iterator[str]:
     moved = [f.name for f in a.frames if not near.same(f, there.get((f.name, f.body), f))]
     if moved:
         yield f"named frames that stand elsewhere, which changes no term: {', '.join(moved)}"
-
-
-def _summarized_differences(one: MergedModel, other: MergedModel, near: Tolerances) -> list[Hypothesis]:
-    """Return the differences between two descriptions; many small ones are one, called rounding."""
-    fine = differences(one, other, near)
-    if len(fine) <= _MAX_LISTED:
-        return fine
-    coarse = differences(one, other, replace(near, relative=max(_ROUNDED, near.relative)))
-    if len(coarse) > len(fine) // 2:
-        return fine
-    large = {(h.subject, field) for h in coarse for field in h.theirs or ()}
-    less = [h.without({field for subject, field in large if subject == h.subject}) for h in fine]
-    small = [h for h in less if h.theirs]
-
-    def put(x: MergedModel, side: Mapping[str, str]) -> MergedModel:
-        for h in small:
-            x = h.put(x, getattr(h, side["of"]))
-        return x
-
-    says = f"has rounded numbers: {len(small)} of them differ, by less than {_ROUNDED:.0e} of their size"
-    return [*coarse, Hypothesis("rounding", "", says, put, {"of": "ours"}, {"of": "theirs"})]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -32,16 +32,16 @@ from mbkit.studies.explain.merged_model import OTHERS
 
 #: Compared terms: name in tables, quantity, arguments.
 TERMS: Final = (("M", "mass_matrix", "q"), ("g", "gravity", "q"), ("nle", "nle", "qv"), ("passive", "passive", "qv"))
+#: Least size by which a force is divided.
 _TINY: Final = 1e-300
-#: Of each row's size: what rounded digits of a description leave of a state that keeps its constraints.
-_OPEN: Final = 1e-6
-#: Of two whole systems, with their constraints and all forces.
+#: Largest residual of a consistent state, relative to each row: rounded digits of a description leave as much.
+_CONSISTENT: Final = 1e-6
+#: The term of two whole systems, with their constraints and all forces.
 WHOLE: Final = "accelerations"
 Values = dict[str, Array]
 
 
-@dataclass(frozen=True)
-class States:
+class States(NamedTuple):
     """States at which terms are compared: (N, nq) and (N, nv)."""
 
     q: Array
@@ -197,12 +197,12 @@ def whole_gap(a: Model, b: Model, samples: int, seed: int) -> float:
 
 
 def _consistent(dyn: Dynamics, q: Array, v: Array) -> bool:
-    """Return whether a state keeps the constraints, to what a description's digits leave."""
-    J = np.abs(dyn.constraint_jacobian(q)).sum(axis=1)
-    open_, rates = dyn.constraint_residual(q), dyn.constraint_rate(q, v)
-    sizes = max(1.0, float(np.abs(q).max())), max(1.0, float(np.abs(v).max()))
-    most = [_OPEN * np.maximum(J[: len(x)], 1.0) * size for x, size in zip((open_, rates), sizes, strict=True)]
-    return all(bool((np.abs(x) <= y).all()) for x, y in zip((open_, rates), most, strict=True))
+    """Return whether a state keeps the constraints, to the digits that a description leaves of it."""
+    J = np.maximum(np.abs(dyn.constraint_jacobian(q)).sum(axis=1), 1.0)
+    for rows, x in ((dyn.constraint_residual(q), q), (dyn.constraint_rate(q, v), v)):
+        if not (np.abs(rows) <= _CONSISTENT * J[: len(rows)] * max(1.0, float(np.abs(x).max()))).all():
+            return False
+    return True
 
 
 # Parts of a description.

@@ -6,21 +6,22 @@ them, and by their poses in the world where all coordinates are zero.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from mbkit._check import Array
 from mbkit.load.xml_reader import Element
-from mbkit.model import Coupler, Loop, Mimic, Model
+from mbkit.model import Coupler, Loop, Model
 from mbkit.model.elements.references import hung_on
-from mbkit.studies.explain.loop_differences import exchanged, moved
+from mbkit.studies.explain.loops import exchanged, follows, moved, paired
 from mbkit.studies.explain.merged_model import Tolerances
 
 #: What switches equalities off, by element.
 _SWITCHES: Final = {**dict.fromkeys(("equality", "connect", "weld"), ("active",)), "flag": ("equality", "constraint")}
+#: By how much a part differs, its name, and what differs in words.
+Difference = tuple[float, str, str]
 
 
 class Written(NamedTuple):
@@ -34,93 +35,85 @@ class Written(NamedTuple):
 
 
 def between_joints(model: Model, parts: Sequence[Any], names: Mapping[str, str] | None = None) -> list[Any]:
-    """Return loops of a description on the joints that carry their ends, and couplers as they are.
+    """Return loops of a description on the joints that carry their ends, and couplers of these joints.
 
     The ends' poses are those in the world, which is the joint "", where all coordinates are zero; `names` has other
     names for joints. What no joint moves against each other is no loop.
     """
     at = {"world": ("", np.eye(3), np.zeros(3))}
+    other = dict(names or {j.name: j.name for j in model.joints})
     for joint in model.tree:
         placed = hung_on(joint, at, [])
-        carrier = (names or {}).get(joint.name, joint.name) if joint.type.nv else placed.parent
+        carrier = other.get(joint.name, joint.name) if joint.type.nv else placed.parent
         at[joint.child] = carrier, placed.rotation, placed.translation
-    moved = [hung_on(x, at, []) if isinstance(x, Loop) else x for x in parts]
-    loops = [x for x in moved if isinstance(x, Loop) and x.body_a != x.body_b]
-    ordered = [exchanged(x) if x.body_a > x.body_b else x for x in loops]
-    return [*ordered, *(x for x in moved if isinstance(x, Coupler))]
+    placed_loops = [hung_on(x, at, []) for x in parts if isinstance(x, Loop)]
+    loops = [exchanged(x) if x.body_a > x.body_b else x for x in placed_loops if x.body_a != x.body_b]
+    couplers = [x for x in parts if isinstance(x, Coupler)]
+    leaders = [tuple(other.get(n, "") for n in x.leaders) for x in couplers]
+    own = (replace(x, joint=other.get(x.joint, ""), leader=some) for x, some in zip(couplers, leaders, strict=True))
+    return [*loops, *map(_ordered, own)]
 
 
-def loop_differences(written: Written, read: Sequence[Any], near: Tolerances) -> list[tuple[float, str, str]]:
-    """Return by how much each loop differs, its name, and what differs in words; pairs are the nearest of a kind."""
-    out: list[tuple[float, str, str]] = []
-    active, inactive, left = ([x for x in some if isinstance(x, Loop)] for some in (*written[:2], read))
-    pairs, lost = _paired(active, left)
-    for a, b in pairs:
+def loop_differences(written: Written, read: Sequence[Any], near: Tolerances) -> list[Difference]:
+    """Return what differs between the loops of a file and those that were read."""
+
+    def apart(a: Loop, b: Loop) -> float:
+        return sum(moved(a, b)) if (a.kind, a.body_a, a.body_b) == (b.kind, b.body_a, b.body_b) else np.inf
+
+    def says(a: Loop, b: Loop) -> str:
         far, turn = moved(a, b)
         texts = [] if far <= near.relative * near.length else [f"moved by {far:.3g} m"]
-        texts += [] if turn <= near.relative else [f"turned by {turn:.3g} rad"]
-        if texts:
-            out.append((max(far, turn), _between(a), " and ".join(texts)))
-    out += [(1.0, _between(a), "missing") for a in lost]
-    _paired(active, inactive)
-    wrong, _ = _paired(inactive, left)
-    out += [(1.0, _between(a), "inactive, read as active") for a, _ in wrong]
-    return out + [(1.0, _between(b), "not in the file") for b in left]
+        return " and ".join([*texts, *([] if turn <= near.relative else [f"turned by {turn:.3g} rad"])])
+
+    return _differences(Loop, written, read, apart, says)
 
 
-def coupler_differences(
-    written: Written, file: Model, read: Sequence[Any], names: Mapping[str, str], tolerance: float
-) -> list[tuple[float, str, str]]:
-    """Return the same of couplers; `names` has the file's joint for each of the importer's.
+def coupler_differences(written: Written, file: Model, read: Sequence[Any], tolerance: float) -> list[Difference]:
+    """Return the same of couplers: an importer may hold the file's mimic joints by them, or leave these free."""
 
-    An importer may hold the file's mimic joints by couplers, or leave them free, which is not counted here.
-    """
-    out: list[tuple[float, str, str]] = []
-    left = [
-        _ordered(replace(x, joint=names.get(x.joint, ""), leader=tuple(names.get(n, "") for n in x.leaders)))
-        for x in read
-        if isinstance(x, Coupler)
-    ]
-    active, inactive = ([_ordered(x) for x in some if isinstance(x, Coupler)] for some in written[:2])
-    for a in active:
-        _taken(a, inactive)
-        if (b := _taken(a, left)) is None:
-            out.append((1.0, _says(a), "missing"))
-        elif (far := _apart(a, b)) > tolerance * max(1.0, float(np.abs(a.ratio).sum()) + abs(a.offset)):
-            says = f"ratio {_text(b.ratios)} and offset {b.offset:.6g} for {_text(a.ratios)} and {a.offset:.6g}"
-            if (a.curve != b.curve).any():
-                says += f", curve {_text(b.curve)} for {_text(a.curve)}"
-            out.append((far, _says(a), says))
+    def apart(a: Coupler, b: Coupler) -> float:
+        return _off(a, b) if (a.joint, a.leaders) == (b.joint, b.leaders) else np.inf
+
+    def says(a: Coupler, b: Coupler) -> str:
+        size = max(1.0, float(np.abs(a.ratio).sum()) + abs(a.offset))
+        return f"{follows(b)}, not {follows(a)}" if _off(a, b) > tolerance * size else ""
+
+    return _differences(Coupler, written, read, apart, says, lambda x: _is_mimicked(x, file, tolerance))
+
+
+def _differences(
+    of: type,
+    written: Written,
+    read: Sequence[Any],
+    apart: Callable[..., float],
+    says: Callable[..., str],
+    implied: Callable[..., bool] = lambda _: False,
+) -> list[Difference]:
+    active, inactive, left = ([x for x in some if isinstance(x, of)] for some in (*written[:2], read))
+    pairs, lost = paired(active, left, apart)
+    left = [x for x in left if not implied(x)]
+    paired(active, inactive, apart)
+    wrong, _ = paired(inactive, left, apart)
+    out = [(apart(a, b), _called(a), text) for a, b in pairs if (text := says(a, b))]
+    out += [(1.0, _called(a), "missing") for a in lost]
+    out += [(1.0, _called(a), "inactive, read as active") for a, _ in wrong]
+    return out + [(1.0, _called(b), "not in the file") for b in left]
+
+
+def _is_mimicked(x: Coupler, file: Model, tolerance: float) -> bool:
+    """Return whether a coupler says what mimic joints of the file do."""
     mimics = {j.name: j.mimic for j in file.joints if j.mimic}
-    for b in left:
-        (root, r1, o1), *others = (_from_root(name, mimics) for name in (b.joint, *b.leaders))
-        far = abs(r1 - sum(c * r for c, (_, r, _) in zip(b.ratios, others, strict=True)))
-        far += abs(o1 - sum(c * o for c, (_, _, o) in zip(b.ratios, others, strict=True)) - b.offset)
-        far += float(np.abs(b.curve).sum())
-        mimicked = all(name == root for name, *_ in others)
-        if mimicked and far <= tolerance * max(1.0, abs(r1) + abs(o1)):
-            continue
-        off = _taken(b, inactive) is not None
-        unlike = "other numbers than the file's mimic joints" if mimicked else "not in the file"
-        out.append((far if mimicked else 1.0, _says(b), "inactive, read as active" if off else unlike))
-    return out
+    total, offset = dict[str, float](), -x.offset
+    for name, factor in zip((x.joint, *x.leaders), (1.0, *-x.ratios), strict=True):
+        while mimic := mimics.get(name):
+            offset += factor * mimic.offset
+            name, factor = mimic.joint, factor * mimic.ratio
+        total[name] = total.get(name, 0.0) + factor
+    far = [offset, *total.values(), *x.curve]
+    return bool(np.abs(far).max() <= tolerance * (1.0 + abs(x.offset) + np.abs(x.ratios).sum()))
 
 
-def _from_root(name: str, mimics: Mapping[str, Mimic]) -> tuple[str, float, float]:
-    """Return the joint that leads in the end, with ratio and offset."""
-    ratio, offset = 1.0, 0.0
-    while mimic := mimics.get(name):
-        name, ratio, offset = mimic.joint, ratio * mimic.ratio, offset + ratio * mimic.offset
-    return name, ratio, offset
-
-
-def _taken(a: Coupler, some: list[Coupler]) -> Coupler | None:
-    """Take the nearest coupler of the same joints out of some."""
-    near = [(_apart(a, b), k) for k, b in enumerate(some) if (a.joint, a.leaders) == (b.joint, b.leaders)]
-    return some.pop(min(near)[1]) if near else None
-
-
-def _apart(a: Coupler, b: Coupler) -> float:
+def _off(a: Coupler, b: Coupler) -> float:
     return sum(float(np.abs(x - y).sum()) for x, y in zip(a._values()[3:], b._values()[3:], strict=True))
 
 
@@ -133,35 +126,13 @@ def _ordered(x: Coupler) -> Coupler:
     return replace(x, joint=joint, leader=tuple(name for name, _ in others), ratio=ratios, offset=x.offset / c)
 
 
-def _says(x: Coupler) -> str:
+def _called(x: Any) -> str:
+    """Return a part's name, or its kind where an importer gives none, and its joints."""
+    if isinstance(x, Loop):
+        joints = " and ".join(repr(name) if name else "the world" for name in (x.body_a, x.body_b))
+        return f"{x.name or f'a loop of {x.kind}s'} (between {joints})"
     *first, last = map(repr, (x.joint, *x.leaders))
     return f"{repr(x.name) if x.name else 'a coupler'} (of {', '.join(first)} and {last})"
-
-
-def _text(numbers: Array) -> str:
-    return " ".join(f"{x:.6g}" for x in numbers)
-
-
-def _between(x: Loop) -> str:
-    """Return a loop's name, or its kind where an importer gives none, and its joints."""
-    joints = " and ".join(repr(x) if x else "the world" for x in (x.body_a, x.body_b))
-    return f"{x.name or f'a loop of {x.kind}s'} (between {joints})"
-
-
-def _paired(some: Sequence[Loop], left: list[Loop]) -> tuple[list[tuple[Loop, Loop]], list[Loop]]:
-    """Pair loops with the nearest of `left`, which are taken out of it, and return those without a partner."""
-    waiting, pairs = list(some), list[tuple[Loop, Loop]]()
-    while True:
-        near = [
-            (sum(moved(a, b)), i, k)
-            for i, a in enumerate(waiting)
-            for k, b in enumerate(left)
-            if (a.kind, a.body_a, a.body_b) == (b.kind, b.body_a, b.body_b)
-        ]
-        if not near:
-            return pairs, waiting
-        _, i, k = min(near)
-        pairs.append((waiting.pop(i), left.pop(k)))
 
 
 def activated(root: Element) -> Element:

@@ -143,7 +143,7 @@ def stages(
     near = Tolerances.of(free, tolerance)
     for name, faults, compare in (
         ("loops", loops.faults or imported.hidden, partial(loop_differences, near=near)),
-        ("couplers", loops.faults, partial(coupler_differences, file=described, names=back, tolerance=tolerance)),
+        ("couplers", loops.faults, partial(coupler_differences, file=described, tolerance=tolerance)),
     ):
         if faults:
             out.append(Stage(name, None, math.nan, "", faults))

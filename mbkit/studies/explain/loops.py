@@ -1,4 +1,4 @@
-"""What differs between two loops, in sentences: kind, bodies, points, axes and length, but for what changes no motion.
+"""What differs between two loops or couplers: in words and numbers, and which is which.
 
 Ends may be exchanged. Of a hinge's frames the axis counts alone, of welded ones their turn against each other, and a
 slider's point may be anywhere along its axis.
@@ -6,17 +6,33 @@ slider's point may be anywhere along its axis.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from mbkit import spatial
 from mbkit._check import Array
 from mbkit.model.loops import CROSSED, HINGED, SLIDING, WELDED
-from mbkit.model.parts import Loop
+from mbkit.model.parts import Coupler, Loop
 from mbkit.studies.explain.merged_model import Tolerances, number_text
+from mbkit.studies.explain.mistakes import turn_of
+
+_OF_END: Final = ("body", "rotation", "translation")
+
+
+def paired(some: Iterable[Any], left: list[Any], apart: Callable[[Any, Any], float]) -> tuple[list[Any], list[Any]]:
+    """Pair parts with the nearest of `left`, which are taken out of it, and return those without a partner.
+
+    `apart` is the distance of two, infinite where they are no pair.
+    """
+    waiting, pairs = list(some), []
+    while near := [
+        (far, i, k) for i, a in enumerate(waiting) for k, b in enumerate(left) if (far := apart(a, b)) < np.inf
+    ]:
+        _, i, k = min(near)
+        pairs.append((waiting.pop(i), left.pop(k)))
+    return pairs, waiting
 
 
 def exchanged(loop: Loop) -> Loop:
@@ -25,7 +41,12 @@ def exchanged(loop: Loop) -> Loop:
     return replace(loop, **ends)
 
 
-_OF_END: Final = ("body", "rotation", "translation")
+def follows(x: Coupler) -> str:
+    """Return a coupler's equation."""
+    terms = [f"{number_text(r)} {name}" for r, name in zip(x.ratios, x.leaders, strict=True)]
+    terms += [number_text(x.offset)] if x.offset else []
+    curve = f", with curve {number_text(x.curve)}" if x.curve.any() else ""
+    return f"{x.joint} = {' + '.join(terms).replace('+ -', '- ')}{curve}"
 
 
 def loop_differences(a: Loop, b: Loop, near: Tolerances) -> list[str]:
@@ -37,11 +58,6 @@ def moved(a: Loop, b: Loop) -> tuple[float, float]:
     """Return by how much the ends of `b` are moved and turned against those of `a`, of one kind, in m and rad."""
     far = max(float(np.linalg.norm(x)) for x in _shifts(a, b).values())
     return far, _turn(a, b) if a.kind in WELDED else 0.0
-
-
-def turn_of(R: Array) -> Array:
-    """Return a rotation's axis times its angle in rad, (3,)."""
-    return spatial.log_quaternion(spatial.quaternion_from_matrix(R))
 
 
 def _differences(a: Loop, b: Loop, near: Tolerances) -> Iterator[str]:
@@ -66,16 +82,14 @@ def _shifts(a: Loop, b: Loop) -> dict[str, Array]:
     """Return how far each end's point is moved, less what both ends may move together without a change."""
     out = {side: getattr(b, f"translation_{side}") - getattr(a, f"translation_{side}") for side in "ab"}
     axes = {side: getattr(a, f"rotation_{side}")[:, 2] for side in "ab"}
-    if a.kind != b.kind:
-        return out
-    if a.kind in SLIDING:
-        return {side: x - axes[side] * (axes[side] @ x) for side, x in out.items()}
-    if a.kind == HINGED[0]:
-        along = axes["a"] @ out["a"]
-        return {side: x - axes[side] * along for side, x in out.items()}
-    if a.kind == WELDED[0]:
+    if a.kind == b.kind == WELDED[0]:
         # Any point of two bodies that are welded may be called theirs.
         return {"a": out["a"] - b.rotation_a @ b.rotation_b.T @ out["b"], "b": np.zeros(3)}
+    if a.kind == b.kind and a.kind in (*SLIDING, HINGED[0]):
+        # A slider's ends move along the axis each by itself, a hinge's together.
+        along = {side: axes[side] @ out[side] for side in "ab"}
+        along["b"] = along["b"] if a.kind in SLIDING else along["a"]
+        return {side: x - axes[side] * along[side] for side, x in out.items()}
     return out
 
 
