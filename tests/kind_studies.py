@@ -273,7 +273,7 @@ def _importers(x: Example, folder: Path) -> Told:
     tree = replace(back, loops=(), couplers=())
 
     def differing(text: str) -> list[Any]:
-        found = compared("mujoco", read(text, "mjcf", False, {}), tree, loops, "file", asked)
+        found = compared("mujoco", read(text, "mjcf", False, {}), tree, loops, asked)
         assert found.explanation is not None
         return [s for s in found.stages if s.same is False] + list(found.explanation.causes)
 

@@ -135,10 +135,10 @@ class _Engines:
             gap = self._gap(term, *(values for _, values, _ in sides))
             self.more.append(gap)
             for (dyn, _, known), (_, other, _) in (sides, sides[::-1]) if gap.relative > self.tolerance else ():
-                M, nle, g = map(self.values[dyn].get, ("M", "nle", "g"))
-                right = 0.5 * np.einsum("ni,nij,nj->n", self.at.v, M, self.at.v)
+                own = self.values[dyn]
+                right: Any = 0.5 * np.einsum("ni,nij,nj->n", self.at.v, own["M"], self.at.v)
                 if term == "C v":
-                    right = None if nle is None or g is None else nle - g
+                    right = own["nle"] - own["g"] if {"nle", "g"} <= own.keys() else None
                 if known and right is not None and self._gap(term, right, other).relative <= self.tolerance:
                     says = f"{term}: {known[0].split('; returned as it is')[0]}"
                     out.append(Cause("engine defect", dyn.engine, says, None, None, {term: gap.relative}, acts=True))

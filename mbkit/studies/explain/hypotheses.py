@@ -27,6 +27,7 @@ from mbkit.studies.explain.mistakes import (
     MATTER,
     Mistake,
     body_mistakes,
+    changed_text,
     fitted_body,
     fitted_joint,
     groups_of,
@@ -45,8 +46,6 @@ _WORDS: Final = {
 _ROUNDED: Final = 2e-5
 #: More differences than this may be summarized as rounding.
 _MAX_LISTED: Final = 4
-#: Numbers that a sentence says all of.
-_FEW: Final = 9
 
 
 class Change(NamedTuple):
@@ -243,15 +242,7 @@ def _other_numbers(a: Any, b: Any, near: Tolerances) -> str:
     others = near.differing(a, b)
     if isinstance(a, Coupler) and others:
         return f"has {follows(b)} for {follows(a)}"
-    return f"has {', '.join(_change(n, getattr(a, n), getattr(b, n)) for n in others)}" if others else ""
-
-
-def _change(name: str, a: Any, b: Any) -> str:
-    what = name.replace("_", " ")
-    if isinstance(a, (str, tuple)):
-        return f"{what} {b!r} for {a!r}"
-    few = isinstance(a, float) or (isinstance(a, np.ndarray) and a.size <= _FEW)
-    return f"{what} {number_text(b)} for {number_text(a)}" if few else f"another {what}"
+    return f"has {changed_text(a, b, others)}" if others else ""
 
 
 def _same_motion(a: Motion, b: Motion, near: Tolerances) -> bool:

@@ -67,7 +67,7 @@ class Tolerances:
 
         A force's formulas differ by their values, and a number that is not given by what acts in its place.
         """
-        rules = rules_of(Body if isinstance(a, MassProperties) else type(a))
+        rules = rules_for(a)
         of = names or [f.name for f in fields(a) if f.name != "name"]
         if "formula" in of:
             of = [n for n in of if n not in ("symbols", "numbers")]
@@ -92,6 +92,11 @@ class Tolerances:
         if isinstance(x, float) or rule.shape in (OF_Q, OF_V):
             return all(map(self.number, np.atleast_1d(x).tolist(), np.atleast_1d(y).tolist()))
         return self.vector(x, y, float(np.abs([x, y]).max(initial=0.0)))
+
+
+def rules_for(part: Any) -> Mapping[str, NumberRule]:
+    """Return the rules of a part's numbers, also of matter without a name."""
+    return rules_of(Body if isinstance(part, MassProperties) else type(part))
 
 
 def as_it_acts(name: str, part: Any) -> Any:

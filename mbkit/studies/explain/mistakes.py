@@ -1,7 +1,7 @@
 """Usual mistakes with bodies and joints as rows: kind, sentence, changed fields; and the name of a difference by them.
 
 A row may be known beforehand (`body_mistakes`, `joint_mistakes`), or follow from the numbers of the other side
-(`fitted_body`, `fitted_joint`). The last of these have any number, so that each difference has a name.
+(`fitted_body`, `fitted_joint`). What no row explains is told with its numbers, so that each difference has a name.
 """
 
 from __future__ import annotations
@@ -14,30 +14,42 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from mbkit import spatial
-from mbkit._check import Array
+from mbkit._check import Array, by_key
 from mbkit.load.shapes import NOTHING, MassProperties
-from mbkit.model import Body, Joint, Mimic
-from mbkit.model.parts import acting, rules_of
-from mbkit.studies.explain.merged_model import LinkInBody, Tolerances, composite, number_text
+from mbkit.model import Joint, Mimic
+from mbkit.model.elements.formula import Formula
+from mbkit.model.parts import NumberRule, acting, rules_of
+from mbkit.studies.explain.merged_model import LinkInBody, Tolerances, composite, number_text, rules_for
 
 _WATER: Final = 1000.0  # kg/m³
 _DEGREE: Final = np.pi / 180
 #: URDF's order of an inertia's six numbers, and MuJoCo's.
 _URDF: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _MJCF: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-#: Kinds of differences in numbers, where they are not the field's name.
-_KINDS: Final = {
+#: Numbers of a joint that are data.
+_BOUNDS: Final = tuple(name for name, rule in rules_of(Joint).items() if not rule.acts)
+#: What a field is called, where that is not its name.
+_WORDS: Final = {
     "com": "centre of mass",
-    "translation": "joint origin",
-    "axes": "axis",
-    "stiffness": "spring",
+    "lower": "lower limit",
+    "upper": "upper limit",
     "stribeck_velocity": "Stribeck velocity",
 }
-#: Numbers of a joint that are told together, and those that are compared one by one.
-BOUNDS: Final = tuple(name for name, rule in rules_of(Joint).items() if not rule.acts)
+#: Kinds of differences in fields, where they are not the field's name.
+_KINDS: Final = {
+    **_WORDS,
+    **dict.fromkeys(_BOUNDS, "limits"),
+    "translation": "joint origin",
+    "rotation": "joint rotation",
+    "axes": "axis",
+    "stiffness": "spring",
+    "rest": "spring",
+}
 _PLACE: Final = ("rotation", "translation")
-_NUMBERS: Final = tuple(n for n in rules_of(Joint) if n not in (*_PLACE, *BOUNDS, "axes", "pitch", "stiffness", "rest"))
+_SPRING: Final = ("stiffness", "rest")
 MATTER: Final = ("mass", "com", "inertia")
+#: Numbers that a sentence says all of.
+_FEW: Final = 9
 
 
 class Mistake(NamedTuple):
@@ -53,27 +65,50 @@ def named(
 ) -> Iterator[Mistake]:
     """Yield the differences that turn part `a` into part `b`, with the fields of `b`, each field once.
 
-    Of each group of fields, the first row that explains all that differ in it, else the first for each field.
+    Of each group of fields, the first row that explains all that differ in it, else the first for each field. Fields
+    that no row explains are told with their numbers, those of one kind together.
     """
     apart = [names for group in groups if (names := near.differing(a, b, *group))]
     known = list(rows) if apart else []
 
-    def first(names: list[str]) -> Iterator[Mistake]:
+    def fitting(names: Sequence[str]) -> Iterator[Mistake]:
         for x in known:
             changed = dict.fromkeys([*names, *x.fields])
             if x.fields.keys() & {*names} and not near.differing(replace(a, **x.fields), b, *changed):
                 yield x._replace(fields={n: getattr(b, n) for n in changed})
-                return
 
     for names in apart:
-        if whole := [*first(names)]:
-            yield from whole
+        if whole := next(fitting(names), None):
+            yield whole
             continue
-        done: set[str] = set()
+        left = dict.fromkeys(names)
         for name in names:
-            for x in first([name]) if name not in done else ():
-                done |= x.fields.keys()
+            if name in left and (x := next(fitting([name]), None)):
+                left = {n: None for n in left if n not in x.fields}
                 yield x
+        for kind, some in by_key((_KINDS.get(n, n.replace("_", " ")), n) for n in left).items():
+            yield Mistake(kind, f"has {changed_text(a, b, some)}", {n: getattr(b, n) for n in some})
+
+
+def changed_text(a: Any, b: Any, names: Iterable[str]) -> str:
+    """Return fields of two parts as text: their numbers, or that they are other ones."""
+    return ", ".join(_changed(n, acting(a, n), acting(b, n), rules_for(a).get(n)) for n in names)
+
+
+def _changed(name: str, a: Any, b: Any, rule: NumberRule | None) -> str:
+    what = _WORDS.get(name, name.replace("_", " "))
+    if isinstance(b, np.ndarray) and b.size and np.isinf(b).all():
+        return f"no {what} ({number_text(a)})"
+    if any((isinstance(x, np.ndarray) and x.size > _FEW) or isinstance(x, Formula) for x in (a, b)):
+        return f"another {what}"
+    unit = rule.unit if rule and rule.unit and "," not in rule.unit else ""
+    return f"{what} {_text(b)} for {_text(a)} {unit}".rstrip()
+
+
+def _text(x: Any) -> str:
+    if isinstance(x, Mimic):
+        return f"{number_text(x.ratio)} {x.joint} + {number_text(x.offset)}"
+    return number_text(x) if isinstance(x, (float, np.ndarray)) else "none" if x is None else repr(x)
 
 
 def _changing(part: Any, rows: Iterable[tuple[str, str, Mapping[str, Any]]]) -> list[Mistake]:
@@ -90,7 +125,8 @@ def _reordered(R: Array) -> list[Array]:
 
 def turn_of(R: Array) -> Array:
     """Return a rotation's axis times its angle in rad, (3,)."""
-    return spatial.log_quaternion(spatial.quaternion_from_matrix(R))
+    with np.errstate(divide="ignore"):
+        return spatial.log_quaternion(spatial.quaternion_from_matrix(R))
 
 
 # Bodies.
@@ -198,13 +234,12 @@ def fitted_body(a: MassProperties, b: MassProperties, usual: Iterable[Mistake], 
         yield Mistake("added body", "has matter in it", vars(b))
     # An inertia has the name of a usual mistake whatever else of the body differs.
     yield from (x._replace(fields={"inertia": x.fields["inertia"]}) for x in usual if "inertia" in x.fields)
-    change = f"{number_text(a.inertia)} -> {number_text(b.inertia)} kg m²"
-    moments = [np.diag(np.linalg.eigvalsh(x.inertia)) for x in (a, b)]
-    if near.inertia(*moments, a.mass):
+    moments, others = (np.diag(np.linalg.eigvalsh(x.inertia)) for x in (a, b))
+    if near.inertia(moments, others, a.mass):
         if _has_reordered_axes(a.inertia, b.inertia, a.mass, near):
             says = "has the inertia in axes whose quaternion was read in the wrong order"
             yield Mistake("quaternion order", says, {"inertia": b.inertia})
-        says = f"has the same principal moments in other axes: {change}"
+        says = f"has the same principal moments in other axes: {changed_text(a, b, ['inertia'])}"
         yield Mistake("inertia axes", says, {"inertia": b.inertia})
     # Newton's correction of an inertia that no body can have, or of less than 1e-6 kg m².
     if (more := np.trace(b.inertia - a.inertia) / 3) > 0:
@@ -213,9 +248,6 @@ def fitted_body(a: MassProperties, b: MassProperties, usual: Iterable[Mistake], 
     if np.trace(a.inertia):
         factor = float(np.trace(b.inertia) / np.trace(a.inertia))
         yield Mistake("inertia", f"has {number_text(factor)} times the inertia", {"inertia": factor * a.inertia})
-    for name in MATTER:
-        kind, x, y = _KINDS.get(name, name), *(number_text(getattr(side, name)) for side in (a, b))
-        yield Mistake(kind, f"has the {kind} {x} -> {y} {rules_of(Body)[name].unit}", {name: getattr(b, name)})
 
 
 def _has_reordered_axes(a: Array, b: Array, mass: float, near: Tolerances) -> bool:
@@ -249,9 +281,11 @@ def joint_mistakes(joint: Joint) -> list[Mistake]:
     )
     rows: list[tuple[str, str, dict[str, Any]]] = []
     if joint.mimic is not None:
-        rows.append(("mimic", _follows_otherwise(joint.mimic, None), {"mimic": None}))
-        mimic = Mimic(joint.mimic.joint, joint.mimic.ratio)
-        rows.append(("mimic", "leaves out the offset at which it follows", {"mimic": mimic}))
+        rows.append(("mimic", f"leaves it free, which follows {joint.mimic.joint!r}", {"mimic": None}))
+        rows.append(("mimic", "leaves out the offset at which it follows", {"mimic": replace(joint.mimic, offset=0.0)}))
+    for factor, says in ((_DEGREE, "per degree for per radian"), (1 / _DEGREE, "per radian for per degree")):
+        given = ((n, getattr(joint, n)) for n in ("damping", "stiffness"))
+        rows += [("unit of angle", f"has {n} {says}", {n: factor * x}) for n, x in given]
     misread = "reads the joint's quaternion in the wrong order"
     inverse = {"rotation": R.T, "translation": -R.T @ p}
     rows += [
@@ -276,68 +310,29 @@ def joint_mistakes(joint: Joint) -> list[Mistake]:
 
 def groups_of(a: Joint, b: Joint) -> list[Sequence[str]]:
     """Return the fields of two joints that are named together."""
+    own = [f.name for f in fields(Joint) if f.name not in ("name", "parent", "child")]
     if a.type.motion != b.type.motion:
         # The numbers of one joint type mean nothing to the other.
-        return [["parent"], [f.name for f in fields(Joint) if f.name not in ("name", "child", "parent")]]
-    springs = [["stiffness", "rest"]] if a.stiffness.any() or b.stiffness.any() else []
-    return [["parent"], _PLACE, ["axes"], ["pitch"], ["mimic"], *([n] for n in _NUMBERS), *springs, BOUNDS]
+        return [["parent"], own]
+    springs = [_SPRING] if a.stiffness.any() or b.stiffness.any() else []
+    alone = ([n] for n in own if n not in ("kind", *_PLACE, *_SPRING, *_BOUNDS))
+    return [["parent"], _PLACE, *alone, *springs, _BOUNDS]
 
 
 def fitted_joint(a: Joint, b: Joint, near: Tolerances) -> Iterator[Mistake]:
     """Yield the rows for what turns joint `a` into `b` beyond the usual mistakes."""
-    own = {f.name: getattr(b, f.name) for f in fields(b)}
-
-    def row(kind: str, says: str, *names: str) -> Mistake:
-        return Mistake(kind, says, {n: own[n] for n in names})
-
-    yield row("parent", f"hangs it on {b.parent!r} and not on {a.parent!r}", "parent")
     if a.type.motion != b.type.motion:
-        yield row("joint kind", f"has it as a {b.kind} joint, not a {a.kind} one", *groups_of(a, b)[1])
+        whole = {n: getattr(b, n) for n in groups_of(a, b)[1]}
+        yield Mistake("joint kind", f"has it as a {b.kind} joint, not a {a.kind} one", whole)
         return
     turn, shift = turn_of(a.rotation.T @ b.rotation), a.rotation.T @ (b.translation - a.translation)
-    angle, axis = float(np.linalg.norm(turn)), a.axes[0] if a.type.axial else np.zeros(3)
-    if a.type.axial and a.type.rotates and np.allclose(np.cross(turn, axis), 0.0, atol=1e-9):
-        yield row("zero position", f"counts from {_angle(float(turn @ axis))} further on", "rotation")
-    if a.type.axial and not a.type.rotates and near.point(np.cross(shift, axis), np.zeros(3)):
-        yield row("zero position", f"counts from {number_text(float(shift @ axis))} m further on", "translation")
-    yield row("joint rotation", f"has it turned by {_angle(angle)}", "rotation")
-    at, not_at, rest, no_rest, axes, no_axes = (
-        number_text(getattr(x, n)) for n in ("translation", "rest", "axes") for x in (b, a)
-    )
-    yield row("joint origin", f"has the joint at {at} m, not at {not_at}", "translation")
-    yield row("axis", f"has the axis {axes}, not {no_axes}", "axes")
-    yield row("pitch", f"has the pitch {number_text(b.pitch)} m/rad for {number_text(a.pitch)}", "pitch")
-    yield row("mimic", _follows_otherwise(a.mimic, b.mimic), "mimic")
-    yield row("spring", f"has the spring at rest at {rest}, not {no_rest}", "rest")
-    for name in (*_NUMBERS, "stiffness"):
-        kind, more = _KINDS.get(name, name.replace("_", " ")), ["rest"] if name == "stiffness" else []
-        yield row(kind, _other_number(kind, acting(a, name), acting(b, name)), name, *more)
-    yield row("limits", _other_limits(a, b, near), *BOUNDS)
+    rotation, translation = {"rotation": b.rotation}, {"translation": b.translation}
+    if a.type.axial and a.type.rotates and np.allclose(np.cross(turn, a.axes[0]), 0.0, atol=1e-9):
+        yield Mistake("zero position", f"counts from {_angle(float(turn @ a.axes[0]))} further on", rotation)
+    if a.type.axial and not a.type.rotates and near.point(np.cross(shift, a.axes[0]), np.zeros(3)):
+        yield Mistake("zero position", f"counts from {number_text(float(shift @ a.axes[0]))} m further on", translation)
+    yield Mistake("joint rotation", f"has it turned by {_angle(float(np.linalg.norm(turn)))}", rotation)
 
 
 def _angle(x: float) -> str:
     return f"{number_text(x)} rad ({number_text(x / _DEGREE)}°)"
-
-
-def _follows_otherwise(a: Mimic | None, b: Mimic | None) -> str:
-    if a and b:
-        one, other = (f"{number_text(m.ratio)} {m.joint} + {number_text(m.offset)}" for m in (b, a))
-        return f"lets it follow {one}, not {other}"
-    return f"lets it follow {b.joint!r}, which is free" if b else f"leaves it free, which follows {a and a.joint!r}"
-
-
-def _other_number(name: str, a: Array, b: Array) -> str:
-    units = ((_DEGREE, "per degree for per radian"), (1 / _DEGREE, "per radian for per degree"))
-    unit = [f" ({says})" for factor, says in units if a.any() and np.allclose(b, factor * a, rtol=1e-9)]
-    what = "spring of stiffness" if name == "spring" else name
-    return f"has {what} {number_text(b)} for {number_text(a)}{''.join(unit)}"
-
-
-def _other_limits(a: Joint, b: Joint, near: Tolerances) -> str:
-    parts = []
-    for name in near.differing(a, b, *BOUNDS):
-        x, y = (getattr(side, name) for side in (b, a))
-        what = f"{name} limit" if name in ("lower", "upper") else name.replace("_", " ")
-        lost = not np.isfinite(x).any()
-        parts.append(f"no {what} ({number_text(y)})" if lost else f"{what} {number_text(x)} for {number_text(y)}")
-    return f"has {', '.join(parts)}"

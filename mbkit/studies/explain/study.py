@@ -27,7 +27,7 @@ from mbkit.studies.explain.hypotheses import (
 from mbkit.studies.explain.joint_matching import Match, Matching, align_frames, reconcile_joint_sets, rename_joints
 from mbkit.studies.explain.merged_model import MergedModel, Tolerances, merge, number_text, with_common_frames
 from mbkit.studies.explain.result import Cause, Explanation
-from mbkit.studies.explain.terms import WHOLE, Gap, Gaps, model_terms, states_of
+from mbkit.studies.explain.terms import WHOLE, Gaps, model_terms, states_of
 from mbkit.studies.results import to_plain
 
 #: Parts of any kind are compared by their fields.
@@ -139,8 +139,7 @@ class _Descriptions:
         before = by_name or self._gaps(one.model, theirs.model)
         whole = self._whole(one.model, theirs.model) if before.worst <= self.tolerance else 0.0
         one, target = with_common_frames(*links_in_common_axes(one, target, near))
-        hypotheses = summarized_differences(one, target, near) if one.model.nv else []
-        changed = one
+        changed, hypotheses = one, summarized_differences(one, target, near) if one.model.nv else []
         for h in hypotheses:
             changed = h.apply(changed)
         after = self._gaps(changed.model, target.model)
@@ -150,29 +149,24 @@ class _Descriptions:
             *(self._measured_cause(h, one, target) for h in hypotheses),
             *(self._cause(h, {}) for h in ground_differences(one, target, near, self.names[0])),
         )
-        constrained = any(c.kind in CONSTRAINTS and c.acts for c in causes)
+        acting = [c.kind for c in causes if c.acts]
         massless = bool(one.model.nv) and self._is_massless(one.model) and self._is_massless(target.model)
-        compared = massless or not np.isnan(whole)
         alike = before.worst <= self.tolerance and not whole > self.tolerance
-        agree = not (structural or constrained or massless) and alike
-        explained = after.worst <= self.tolerance and (agree or massless or any(c.acts for c in causes))
+        agree = alike and not (structural or massless or CONSTRAINTS.intersection(acting))
+        explained = after.worst <= self.tolerance and (agree or massless or bool(acting))
         if explained and not agree and not massless:
             left = self._whole(changed.model, target.model)
-            explained = not left > self.tolerance
-            if not np.isnan(left):
-                after = replace(after, terms=(*after.terms, Gap(WHOLE, left, "")))
-        if whole > self.tolerance:
-            before = replace(before, terms=(*before.terms, Gap(WHOLE, whole, "")))
+            explained, after = not left > self.tolerance, after.with_whole(left)
+        found = before.with_whole(whole if whole > self.tolerance else np.nan)
 
         def differs(joints: set[str]) -> bool:
-            one, other = (terms.part(x.model, joints) for x in (changed, target))
-            return self._gaps(one, other).worst > self.tolerance
+            return self._gaps(*(terms.part(x.model, joints) for x in (changed, target))).worst > self.tolerance
 
         return Explanation(
             a=self.names[0],
             b=self.names[1],
             agree=agree,
-            gaps=before.terms,
+            gaps=found.terms,
             comparable=before.comparable and not structural,
             matches=matching.pairs,
             only_a=matching.only_a,
@@ -186,7 +180,7 @@ class _Descriptions:
             seed=self.seed,
             tolerance=self.tolerance,
             massless=massless,
-            compared=compared,
+            compared=massless or not np.isnan(whole),
         )
 
     def with_held(self, out: Explanation, a: Model, b: Model) -> Explanation:
@@ -195,15 +189,14 @@ class _Descriptions:
         `explain` merges bodies, and such a force acts on each of them.
         """
         ours, theirs = ({f.body: f for f in x.forces if isinstance(f, GravityCompensation)} for x in (a, b))
-        near, causes, found = Tolerances.of(a, self.tolerance), [], out.gaps
+        near, causes, found = Tolerances.of(a, self.tolerance), list[Cause](), out.gaps
         for body in dict.fromkeys([*ours, *theirs]):
-            held = [side.get(body) or GravityCompensation(body, 0.0) for side in (ours, theirs)]
-            one, other = held
+            one, other = (side.get(body) or GravityCompensation(body, 0.0) for side in (ours, theirs))
             if not (changed := near.differing(one, other)):
                 continue
             model = a if body in ours else b
             known = {j.name for j in model.joints}
-            held = [replace(x, without=tuple(j for j in x.without if j in known)) for x in held]
+            held = (replace(x, without=tuple(j for j in x.without if j in known)) for x in (one, other))
             gaps = self._gaps(*(replace(model, forces=(x,)) for x in held))
             says = f"holds {number_text(other.fraction)} of its weight for {number_text(one.fraction)}"
             says = says if "fraction" in changed else "holds its weight at other joints"
@@ -234,9 +227,8 @@ class _Descriptions:
 
     def _whole(self, a: Model, b: Model) -> float:
         """Return the difference between the accelerations of two whole systems; NaN where nothing can be compared."""
-        if a.velocity_names != b.velocity_names or not a.nv:
-            return float("nan")
-        return terms.whole_gap(a, b, self.samples, self.seed)
+        same = a.velocity_names == b.velocity_names and a.nv
+        return terms.whole_gap(a, b, self.samples, self.seed) if same else np.nan
 
     def _cause(self, h: Hypothesis, effects: dict[str, float]) -> Cause:
         acts = any(not x <= self.tolerance for x in effects.values())
@@ -247,7 +239,6 @@ class _Descriptions:
         """Return a difference with the larger of its two effects, added alone to one side or removed from the other."""
         effects: dict[str, float] = {}
         for model, changed in ((one, h.apply(one)), (target, h.revert(target))) if h.changes else ():
-            found = self._gaps(model.model, changed.model).effects
             if h.kind in CONSTRAINTS:
                 found = {WHOLE: float(np.nan_to_num(self._whole(model.model, changed.model), nan=np.inf))}
             else:
@@ -261,18 +252,18 @@ class _Descriptions:
         """Yield differences in the names of joints and in their order in q."""
         ours = {j.name for j in one.model.joints}
         by_structure = [m for m in matching.pairs if m.how == "structure"]
-        exchanged = ", ".join(f"{m.a!r} is {m.b!r}" for m in by_structure if m.b in ours)
+        exchanged, others = (
+            ", ".join(f"{m.a!r} is {m.b!r}" for m in by_structure if (m.b in ours) is own) for own in (True, False)
+        )
         if exchanged:
             h = Hypothesis("names exchanged", "", f"calls joints by each other's names: {exchanged}")
             yield self._cause(h, by_name.effects if by_name else {"M": np.inf})
-        others = ", ".join(f"{m.a!r} is {m.b!r}" for m in by_structure if m.b not in ours)
         if others:
             yield self._cause(Hypothesis("renamed", "", f"calls joints otherwise: {others}"), {})
-        places = {j.name: k for k, j in enumerate(other.model.independent_joints)}
-        order = [m.b for m in matching.pairs if m.b in places]
-        there = sorted(order, key=places.__getitem__)
-        if order != there:
-            moved = [x for x, y in zip(order, there, strict=True) if x != y]
+        there = [j.name for j in other.model.independent_joints if j.name in matching.to_b.values()]
+        order = [m.b for m in matching.pairs if m.b in there]
+        moved = [x for x, y in zip(order, there, strict=True) if x != y]
+        if moved:
             says = f"has q and v in another order: {', '.join(there)}"
             if len(moved) == 2:
                 says = f"has joints {moved[0]!r} and {moved[1]!r} in each other's place in q and v"
@@ -281,12 +272,10 @@ class _Descriptions:
 
 def _notes(one: MergedModel, moved_frames: Sequence[str], matching: Matching) -> Iterator[str]:
     if moved_frames:
-        frames = ", ".join(moved_frames)
-        if len(moved_frames) > 3:
-            frames = f"{len(moved_frames)} of {len(one.model.joints)} frames"
+        many = f"{len(moved_frames)} of {len(one.model.joints)} frames"
+        frames = many if len(moved_frames) > 3 else ", ".join(moved_frames)
         yield f"frames drawn elsewhere, which changes no term: {frames}"
-    by_structure = sum(m.how == "structure" for m in matching.pairs)
-    if by_structure:
+    if by_structure := sum(m.how == "structure" for m in matching.pairs):
         yield f"{by_structure} of {len(matching.pairs)} joints were matched by structure, the others by name"
 
 

@@ -82,6 +82,10 @@ class Gaps:
         """Term -> difference; an infinite one of M where nothing can be compared."""
         return {g.term: g.relative for g in self.terms} if self.comparable else {"M": np.inf}
 
+    def with_whole(self, relative: float) -> Gaps:
+        """Return them with the difference of the whole systems, unless it is not known."""
+        return self if np.isnan(relative) else replace(self, terms=(*self.terms, Gap(WHOLE, relative, "")))
+
 
 def larger(one: Iterable[Gap], other: Iterable[Gap]) -> tuple[Gap, ...]:
     """Return every term once, with the larger of two gaps."""

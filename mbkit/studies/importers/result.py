@@ -15,6 +15,8 @@ from mbkit.studies.results import ResultTable, columns
 
 #: The terms that each engine computes by itself, on its own model.
 TERMS: Final = ("M", "g", "nle", "passive")
+#: The name of the reference: the file as written.
+FILE: Final = "file"
 #: The version of an importer that is not there; it has refused nothing.
 MISSING: Final = "not installed"
 #: The stages that say whether two readings move alike.
@@ -46,8 +48,8 @@ class Stage:
 class Parsed:
     """One importer's reading.
 
-    `refused` says why it does not read the file, and is empty where it does. `stages` is empty for the reference
-    itself, and where there is no reference; `explanation` says why it differs from the reference; `notes` are what it
+    `refused` says why it does not read the file, and is empty where it does. `stages` is empty where there is no
+    reference; `explanation` says why it differs from the reference; `notes` are what it
     said, and what it holds beside bodies and joints.
     """
 
@@ -79,8 +81,8 @@ class ParserComparison(ResultTable):
 
     `source` is the file, and `format` is ``"urdf"`` or ``"mjcf"``. `reference` is what the importers are compared with:
     ``"file"``, the file as written, link by link. Where mbkit does not read it, for the reason in `faults`, it is
-    ``"mujoco"`` for an MJCF that MuJoCo reads, else empty, and nothing is compared. `notes` say what was removed from
-    the file before. `versions` are those of every package that took part, and `seconds` is the time of the whole.
+    empty, and nothing is compared. `notes` say what was removed from the file before. `versions` are those of every
+    package that took part, and `seconds` is the time of the whole.
     """
 
     source: str
@@ -100,7 +102,7 @@ class ParserComparison(ResultTable):
     @property
     def agree(self) -> bool:
         """Whether every importer reads the file, and all of them move alike."""
-        return len(self.importers) > 1 and all(p.agrees for p in self.importers if p.engine != self.reference)
+        return len(self.importers) > 1 and all(p.agrees for p in self.importers)
 
     @property
     def verdict(self) -> str:
@@ -109,28 +111,24 @@ class ParserComparison(ResultTable):
         differ = [p.engine for p in self.importers if p.stages and not p.agrees]
         missing = [p.engine for p in self.importers if p.refused and p.version == MISSING]
         refuse = [p.engine for p in self.importers if p.refused and p.engine not in missing]
-        against = "" if self.reference == "file" else f" from the {self.against}"
         alone = [p.engine for p in self.importers if not p.stages and not p.refused]
         other = {s.name for p in self.importers if p.agrees for s in p.stages if not s.same}
         other |= {c.kind for p in self.importers if p.agrees and p.explanation for c in p.explanation.causes}
         apart = [what for name, what in _APART.items() if name in other]
-        parts = [f"{_listed(same)} agree{_s(same)} with the {self.against.split(',')[0]}"] if same else []
+        parts = [f"{_listed(same)} agree{_s(same)} with the file as written"] if same else []
         parts = [f"{x}, {_listed(apart)} apart" if apart else x for x in parts]
-        parts += [f"{_listed(differ)} differ{_s(differ)}{against}"] if differ else []
+        parts += [f"{_listed(differ)} differ{_s(differ)}"] if differ else []
         parts += [f"{_listed(refuse)} refuse{_s(refuse)}"] if refuse else []
         parts += [f"{_listed(missing)} {'is' if len(missing) == 1 else 'are'} not installed"] if missing else []
-        if not self.reference and alone:
+        if alone:
             parts.insert(0, f"not compared: mbkit does not read the file; {_listed(alone)} read{_s(alone)} it")
-        elif alone and not same and not differ:
-            parts.insert(0, f"not compared: {_listed(alone)} alone reads it")
         return "; ".join(parts) or "no importer was asked"
 
     @property
     def against(self) -> str:
         """What the importers are compared with, in words; empty where there is no reference."""
-        if self.reference == "file":
-            return f"file as written, {'link by link' if self.format == 'urdf' else 'body by body'}"
-        return f"reading of {self.reference}" if self.reference else ""
+        how = "link by link" if self.format == "urdf" else "body by body"
+        return f"file as written, {how}" if self.reference else ""
 
     _derived = ("agree", "verdict")
     _called = "source"
@@ -212,14 +210,12 @@ def _importer(p: Parsed) -> Column:
 def _setting(result: ParserComparison, read: list[Parsed], alone: list[Parsed]) -> str:
     """Return what was done with the file, in words."""
     head = f"The same {'URDF' if result.format == 'urdf' else 'MJCF'} was read by each engine's own importer"
-    because = ", because mbkit itself does not read the file"
     if not read:
-        why = because if not result.reference else ""
+        why = "" if result.reference else ", because mbkit itself does not read the file"
         return f"{head}. Nothing is compared{why}." if alone else f"{head}, and none reads it."
     still = "stands still" if result.format == "urdf" else "is as the file has it"
-    why = because if result.reference != "file" else ""
     base = "floats" if result.floating_base else still
-    return f"{head}. What came out is compared with the {result.against}{why}; the base {base}."
+    return f"{head}. What came out is compared with the {result.against}; the base {base}."
 
 
 def _differences(read: list[Parsed]) -> Iterator[Section]:

@@ -22,7 +22,6 @@ from mbkit._check import Array, count, real
 from mbkit._child_process import WorkerDiedError, WorkerTimeoutError
 from mbkit.engines.base import DOUBLE_BITS
 from mbkit.engines.imported import IMPORTERS, Imported, Importer, check_installed, reader
-from mbkit.engines.registry import MUJOCO
 from mbkit.engines.remote import importer as remote_importer
 from mbkit.engines.remote.packages import EngineVersion, names_version
 from mbkit.engines.remote.packages import engine as engine_of
@@ -42,13 +41,14 @@ from mbkit.studies.explain.result import Cause, Explanation
 from mbkit.studies.explain.study import explain
 from mbkit.studies.explain.terms import Gap, Gaps, States, Values, gaps, model_terms, states_of
 from mbkit.studies.importers.loops import Written, activated, between_joints, coupler_differences, loop_differences
-from mbkit.studies.importers.result import MISSING, TERMS, Parsed, ParserComparison, Stage
+from mbkit.studies.importers.result import FILE, MISSING, TERMS, Parsed, ParserComparison, Stage
 from mbkit.studies.study_runs import free_of_mimic
 from mbkit.studies.worker import Worker, describe
 
 #: The least tolerance of an importer that holds single precision. Of robots that Newton reads rightly, M of tiago_pro
 #: is off by most: 9e-6, 150 times its unit roundoff.
 _SINGLE: Final = 2.0**-16
+_OWN_TERMS: Final = "own terms"
 
 # Importers run in worker processes, so that none of them can end, hang or fill the user's process. The processes are
 # kept from one comparison to the next: libraries take longer to load than files.
@@ -117,50 +117,65 @@ def _terms_of_held(q: Array, v: Array, without: tuple[str, ...]) -> Values:
     return _held.terms(q, v, without)
 
 
-# Stages.
+# One importer.
+
+
+def compared(engine: str, imported: Imported, file: Model, loops: Written, asked: Mapping[str, Any]) -> Parsed:
+    """Return an importer's reading, compared with the file at the states and to the tolerance asked for."""
+    unmatched, notes = by_functions(file), list[str]()
+    tree = replace(file, forces=tuple(f for f in file.forces if f not in unmatched))
+    why = explain(tree, imported.model, names=(FILE, engine), **asked)
+    # Links that are fused may be matter that cannot be, as the file or the importer has it.
+    with unchecked():
+        apart = stages(file, loops, imported, why, **asked)
+    own, idle = own_terms(engine, imported, **asked)
+    if unmatched:
+        notes = [f"compared by what they do to passive forces alone: {listing([*map(str, unmatched)], 6)}"]
+    terms = [s for s in apart if s.name in TERMS]
+    found, same = tuple(Gap(s.name, s.worst, s.where) for s in terms), all(s.same is True for s in terms)
+    known, notes = all(math.isfinite(s.worst) for s in terms), [*why.notes, *imported.notes, *idle, *notes]
+    if own and same and not (why.only_a or why.only_b):
+        silent = tuple(c for c in why.causes if not c.acts)
+        why = replace(why, agree=True, gaps=found, causes=silent, explained=True, left=(), subtree=())
+    elif own:
+        # The engine computes other terms than those of its bodies and joints.
+        explained = why.explained and all(c.kind != _OWN_TERMS for c in own)
+        why = replace(why, agree=False, comparable=why.comparable and known, causes=(*why.causes, *own))
+        why = replace(why, gaps=found if known else why.gaps, explained=explained)
+    else:
+        why = replace(why, agree=why.agree and same, gaps=found if why.agree and same else why.gaps)
+    if way := imported.holds_mimics:
+        # Their constraints are outside of all terms.
+        free, tied = "leaves it free, which", f"holds it {way}, outside its terms; it"
+        why = replace(why, causes=tuple(replace(c, says=c.says.replace(free, tied)) for c in why.causes))
+    return Parsed(engine, _version(engine), "", apart, why, tuple(notes))
 
 
 def stages(
-    reference: Model | Imported,
-    loops: Written,
-    imported: Imported,
-    why: Explanation,
-    samples: int,
-    seed: int,
-    tolerance: float,
+    file: Model, loops: Written, imported: Imported, why: Explanation, samples: int, seed: int, tolerance: float
 ) -> tuple[Stage, ...]:
     """Compare what no description shows: the terms that the importer's own engine computes, and what holds joints."""
-    described = reference.model if isinstance(reference, Imported) else reference
     # Importers leave mimic joints free.
-    free = free_of_mimic(described)
+    free = free_of_mimic(file)
     back, there = ({x: y for m in why.matches for x, y in [(m.b, m.a)[::step]]} for step in (1, -1))
     theirs = {j.name: j.mimic for j in imported.model.joints}
-    mimics = [j.name for j in described.joints if j.mimic and not theirs.get(there.get(j.name, ""))]
+    mimics = [j.name for j in file.joints if j.mimic and not theirs.get(there.get(j.name, ""))]
     lost = [*why.only_a, *why.only_b]
     held = f"held {imported.holds_mimics}" if imported.holds_mimics else "left free"
-    out = [_missing("joints", lost, "without a counterpart"), _missing("mimic", mimics, held)]
-    constraints = between_joints(imported.model, imported.constraints, back)
-    near = Tolerances.of(free, tolerance)
-    for name, faults, compare in (
-        ("loops", loops.faults or imported.hidden, partial(loop_differences, near=near)),
-        ("couplers", loops.faults, partial(coupler_differences, file=described, tolerance=tolerance)),
-    ):
-        if faults:
-            out.append(Stage(name, None, math.nan, "", faults))
-            continue
-        some = compare(written=loops, read=constraints)
-        size, where, _ = max(some, key=itemgetter(0), default=(0.0, "", ""))
-        out.append(Stage(name, not some, size, where, "; ".join(f"{where}: {says}" for _, where, says in some)))
+    read = between_joints(imported.model, imported.constraints, back)
+    near, names = Tolerances.of(free, tolerance), loops.faults or imported.hidden
+    out = [
+        _missing("joints", lost, "without a counterpart"),
+        _missing("mimic", mimics, held),
+        _constraints("loops", names, () if names else loop_differences(loops, read, near)),
+        _constraints("couplers", loops.faults, coupler_differences(loops, file, read, tolerance)),
+    ]
     apart = Gaps(comparable=False)
     if not lost:
         at = states_of(free, samples, seed)
-        own = Imported(free, lambda q, v, _: model_terms(free.smooth, States(q, v)), ())
-        sides = (
-            (reference if isinstance(reference, Imported) else own, {x: x for x in there}),
-            (imported, there),
-        )
-        ours, read = (_own_terms_of(free, *side, at) for side in sides)
-        apart = gaps(ours, read, at.v, free.velocity_joints)
+        own = model_terms(free.smooth, at)
+        own["passive"] = own["passive"] + DryFrictionLaw(free).force(at.v)
+        apart = gaps(own, _own_terms_of(free, imported, there, at), at.v, free.velocity_joints)
     by_term = {g.term: g for g in apart.terms}
     for name in TERMS:
         if g := by_term.get(name):
@@ -176,10 +191,16 @@ def _missing(name: str, missing: list[str], what: str) -> Stage:
     return Stage(name, not missing, float(len(missing)), missing[0] if missing else "", says)
 
 
-def _own_terms_of(reference: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
-    """Return the engine's own terms in the reference's coordinates; `names` has its joint for each of these."""
+def _constraints(name: str, faults: str, some: Sequence[tuple[float, str, str]]) -> Stage:
+    size, where, _ = max(some, key=itemgetter(0), default=(0.0, "", ""))
+    says = "; ".join(f"{part}: {text}" for _, part, text in some)
+    return Stage(name, None, math.nan, "", faults) if faults else Stage(name, not some, size, where, says)
+
+
+def _own_terms_of(file: Model, imported: Imported, names: Mapping[str, str], at: States) -> Values:
+    """Return the engine's own terms in the file's coordinates; `names` has its joint for each of these."""
     theirs = imported.model.layout
-    joints = [names[j.name] for j in reference.independent_joints]
+    joints = [names[j.name] for j in file.independent_joints]
     q_order, v_order = (np.concatenate([np.r_[rows[n]] for n in joints]) for rows in (theirs.q, theirs.v))
     q, v = np.empty((len(at.q), theirs.sizes[0])), np.empty((len(at.v), theirs.sizes[1]))
     if q.shape != at.q.shape or v.shape != at.v.shape:
@@ -197,8 +218,8 @@ def _terms(imported: Imported, at: States, without: tuple[str, ...] = ()) -> Val
 
 def own_terms(
     engine: str, imported: Imported, samples: int, seed: int, tolerance: float
-) -> tuple[list[Cause], list[str], bool]:
-    """Return what acts in an importer's model beside bodies and joints, what does not, and whether that is all."""
+) -> tuple[list[Cause], list[str]]:
+    """Return what acts in an importer's model beside bodies and joints, and what does not."""
     at = states_of(imported.model, samples, seed)
     joints = imported.model.velocity_joints
     whole, described = _terms(imported, at), model_terms(imported.model, at)
@@ -217,39 +238,14 @@ def own_terms(
             says = f"{engine}: {extra.says}{', and acts otherwise than described' if part else ''}"
             causes.append(Cause(extra.kind, extra.says, says, None, None, apart.effects, acts=True))
     apart = gaps(bare, described, at.v, joints)
-    held = apart.worst <= tolerance
-    if not held:
+    if not apart.worst <= tolerance:
         says = f"{engine}: its own terms are not those of its bodies and joints, most at {apart.joint or 'no joint'}"
-        causes.append(Cause("own terms", engine, says, None, None, apart.effects, acts=True))
-    return causes, idle, held
+        causes.append(Cause(_OWN_TERMS, engine, says, None, None, apart.effects, acts=True))
+    return causes, idle
 
 
 def _with(a: Values, b: Values) -> Values:
     return {name: x + b[name] if name in b else x for name, x in a.items()}
-
-
-def with_own_terms(
-    explanation: Explanation, stages: tuple[Stage, ...], own_causes: list[Cause], held: bool
-) -> Explanation:
-    """Return an explanation of two descriptions, corrected by the terms that the engine itself computes."""
-    terms = [s for s in stages if s.name in TERMS]
-    gaps_ = tuple(Gap(s.name, s.worst, s.where) for s in terms)
-    same = all(s.same is True for s in terms)
-    if not own_causes:
-        # The terms are those of the descriptions.
-        return replace(explanation, gaps=gaps_) if explanation.agree and same else replace(explanation, agree=False)
-    if same and not (explanation.only_a or explanation.only_b):
-        silent = tuple(c for c in explanation.causes if not c.acts)
-        return replace(explanation, agree=True, gaps=gaps_, causes=silent, explained=True, left=(), subtree=())
-    known = all(math.isfinite(s.worst) for s in terms)
-    return replace(
-        explanation,
-        agree=False,
-        comparable=explanation.comparable and known,
-        gaps=gaps_ if known else explanation.gaps,
-        causes=(*explanation.causes, *own_causes),
-        explained=explanation.explained and held,
-    )
 
 
 def compare_parsers(
@@ -273,8 +269,8 @@ def compare_parsers(
     itself on its own model, with all that it holds beside bodies and joints: flags, tendons, actuators at zero control,
     fluid, gravity compensation; here passive holds the dry friction. And what is in no term: mimic joints, and the
     loops and couplers of an MJCF, which decide nothing, as limits; the verdict names those that differ. Links that an
-    importer fuses are fused on the other side too. Where mbkit does not read the file, an MJCF is compared with
-    MuJoCo's own reading, and any other file with nothing: the importers that read it are only listed.
+    importer fuses are fused on the other side too. Where mbkit does not read the file, nothing is compared: the
+    importers that read it are only listed.
 
     Parameters
     ----------
@@ -311,19 +307,23 @@ def compare_parsers(
     engines = tuple(dict.fromkeys(str(remote.get(x, x)) for x in importers))
     elsewhere = {version.name: version for version in remote.values()}
     parsed: dict[str, Parsed] = {}
+    file, faults = None, ""
     with _lock:
         read, refused = _readings(stripped, engines, elsewhere, floating_base, seconds)
-        reference, label, faults = _reference(stripped, read, floating_base)
-        loops = _written_loops(stripped, reference, floating_base)
+        try:
+            file = _written(stripped, floating_base)
+            loops = _written_loops(stripped, floating_base)
+        except MbkitError as error:
+            faults = f"mbkit does not read it: {error}"
         for engine, imported in read.items():
-            if reference is None or engine == label:
+            if file is None:
                 notes = (*imported.notes, *(x.says for x in imported.beside))
                 parsed[engine] = Parsed(engine, _version(engine), notes=notes)
                 continue
             single = engine in elsewhere and elsewhere[engine].package.bits < DOUBLE_BITS
             near = {"tolerance": max(asked["tolerance"], _SINGLE)} if single else {}
             try:
-                parsed[engine] = compared(engine, imported, reference, loops, label, asked | near)
+                parsed[engine] = compared(engine, imported, file, loops, asked | near)
             except ImporterError as error:
                 refused[engine] = str(error)
     parsed |= {engine: Parsed(engine, _version(engine), why) for engine, why in refused.items()}
@@ -331,7 +331,7 @@ def compare_parsers(
         source=os.fspath(source),
         format=stripped.format,
         floating_base=floating_base,
-        reference=label,
+        reference="" if file is None else FILE,
         faults=faults,
         importers=tuple(parsed[engine] for engine in engines),
         notes=tuple(_notes(stripped)),
@@ -369,42 +369,6 @@ def _readings(
     return read, refused
 
 
-def compared(
-    engine: str,
-    imported: Imported,
-    reference: Model | Imported,
-    loops: Written,
-    label: str,
-    asked: Mapping[str, Any],
-) -> Parsed:
-    """Return an importer's reading, compared with the reference at the states and to the tolerance asked for."""
-    described = reference.model if isinstance(reference, Imported) else reference
-    unmatched = by_functions(described)
-    explanation = explain(
-        replace(described, forces=tuple(f for f in described.forces if f not in unmatched)),
-        imported.model,
-        names=(label, engine),
-        **asked,
-    )
-    # Links that are fused may be matter that cannot be, as the file or the importer has it.
-    with unchecked():
-        apart = stages(reference, loops, imported, explanation, **asked)
-    causes, idle, held = own_terms(engine, imported, **asked)
-    if isinstance(reference, Imported):
-        theirs, _, also = own_terms(label, reference, **asked)
-        causes, held = [*theirs, *causes], held and also
-    notes = (*explanation.notes, *imported.notes, *idle)
-    if unmatched:
-        notes = (*notes, f"compared by what they do to passive forces alone: {listing([*map(str, unmatched)], 6)}")
-    explanation = with_own_terms(explanation, apart, causes, held)
-    if way := imported.holds_mimics:
-        # Their constraints are outside of all terms.
-        free, tied = "leaves it free, which", f"holds it {way}, outside its terms; it"
-        causes = [replace(c, says=c.says.replace(free, tied)) for c in explanation.causes]
-        explanation = replace(explanation, causes=tuple(causes))
-    return Parsed(engine, _version(engine), "", apart, explanation, notes)
-
-
 def written(source: str | os.PathLike[str]) -> Model:
     """Return a file as it is written: nothing fused and no engine's parser between, a URDF link by link."""
     return _written(strip(_path(source)), floating_base=False)
@@ -439,24 +403,9 @@ def _written(stripped: Stripped, floating_base: bool, *, loops: bool = False) ->
         )
 
 
-def _reference(
-    stripped: Stripped, read: dict[str, Imported], floating_base: bool
-) -> tuple[Model | Imported | None, str, str]:
-    """Return what importers are compared with, its name, and why it is not the file; MuJoCo's reading of an MJCF."""
-    try:
-        return _written(stripped, floating_base), "file", ""
-    except MbkitError as error:
-        faults = f"mbkit does not read it: {error}"
-    if stripped.format == "mjcf" and MUJOCO in read:
-        return read[MUJOCO], MUJOCO, faults
-    return None, "", faults
-
-
-def _written_loops(stripped: Stripped, reference: Model | Imported | None, floating_base: bool) -> Written:
-    """Return the loops that importers are compared with: of the file, else of the reading that is the reference."""
-    if isinstance(reference, Imported):
-        return Written(between_joints(reference.model, reference.constraints), faults=reference.hidden)
-    if reference is None or stripped.format == "urdf":
+def _written_loops(stripped: Stripped, floating_base: bool) -> Written:
+    """Return the loops of a file; a URDF has none."""
+    if stripped.format == "urdf":
         return Written()
     try:
         roots = (replace(stripped, root=root) for root in (stripped.root, activated(stripped.root)))
