@@ -453,7 +453,8 @@ def kinds_in(source: ast.AST) -> Iterator[str]:
             row = node.args
         elif isinstance(node, ast.Tuple) and len(node.elts) == 3 and not isinstance(node.elts[2], ast.Constant):
             sentence = node.elts[1]
-            if isinstance(sentence, ast.JoinedStr | ast.Name) or " " in str(getattr(sentence, "value", "")):
+            named = isinstance(sentence, ast.JoinedStr) or getattr(sentence, "id", "body") != "body"
+            if named or " " in str(getattr(sentence, "value", "")):
                 row = node.elts
         if row and isinstance(row[0], ast.Constant) and isinstance(row[0].value, str):
             yield row[0].value

@@ -191,14 +191,14 @@ def _merge_mistakes(links: Sequence[LinkInBody]) -> Iterator[tuple[str, str, dic
         yield "lost body", "leaves out every link that is fixed to it", vars(composite([own]))
         groups.append(("its links", heavy))
     for which, some in groups:
-        for what, how, change in (
-            ("with a rotated frame", "without turning it", lambda x: replace(x, R=np.eye(3))),
-            ("with a rotated frame", "turned the wrong way", lambda x: replace(x, R=x.R.T)),
-            ("with a rotated frame", "without turning its inertia", _with_unturned_inertia),
-            ("at the wrong place", "at the origin", lambda x: replace(x, p=np.zeros(3))),
+        for kind, how, change in (
+            ("fused with a rotated frame", "without turning it", lambda x: replace(x, R=np.eye(3))),
+            ("fused with a rotated frame", "turned the wrong way", lambda x: replace(x, R=x.R.T)),
+            ("fused with a rotated frame", "without turning its inertia", _with_unturned_inertia),
+            ("fused at the wrong place", "at the origin", lambda x: replace(x, p=np.zeros(3))),
         ):
             whole = composite([change(x) if x in some else x for x in links])
-            yield f"fused {what}", f"fuses {which} {how}", vars(whole)
+            yield kind, f"fuses {which} {how}", vars(whole)
     if heavy:
         total = sum((x.mass_properties.inertia for x in links), np.zeros((3, 3)))
         says = "adds the inertias of its links, each about its own centre of mass"
