@@ -449,7 +449,7 @@ def kinds_in(source: ast.AST) -> Iterator[str]:
     """Yield the kinds that a module gives to causes: in calls, and in rows of kind, sentence and changed fields."""
     for node in ast.walk(source):
         row: list[ast.expr] = []
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in {"Mistake", "_Trial"}:
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in {"Mistake", "_Trial", "_vector_mistakes"}:
             row = node.args
         elif isinstance(node, ast.Tuple) and len(node.elts) == 3 and not isinstance(node.elts[2], ast.Constant):
             sentence = node.elts[1]
