@@ -17,9 +17,7 @@ from mbkit.engines.registry import composes
 from mbkit.errors import UnsupportedError
 from mbkit.model import Model
 from mbkit.model.quantities import of_groups
-from mbkit.simulate import simulate
 from tests.random_trees import ALL, IN_MUJOCO, SOUND, off, random_tree, states
-from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
 #: Normwise, of trees of ten bodies: what large terms leave of their rounding where they cancel.
@@ -251,26 +249,6 @@ def test_a_pendulums_pivot_carries_weight_and_centripetal_force():
         assert down @ out == pytest.approx(np.cos(angle), rel=1e-13)
         assert np.allclose(load[:3], -tension * out, atol=1e-13 * tension), engine
         assert np.allclose(load[3:], 0.0, atol=1e-13 * tension * L), engine
-
-
-def test_nothing_outside_means_no_change_of_momentum():
-    model = random_tree(21, 5, ("revolute", "ball", "prismatic"), **NOTHING, gravity=False)
-    b = mounted("adrift", "base", "float", "free", gravity=(0, 0, 0), mass=1.0, inertia=(0.2, 0.3, 0.4))
-    for body in model.bodies:
-        b.add_body(body.name, mass=body.mass, com=body.com, inertia=body.inertia)
-    for joint in model.joints:
-        axis = {"axis": joint.axes[0]} if joint.type.n_axes else {}
-        parent = "base" if joint.parent == "world" else joint.parent
-        place = {"translation": joint.translation, "rotation": joint.rotation}
-        b.add_joint(joint.name, joint.kind, parent=parent, child=joint.child, **place, **axis)
-    adrift = b.build()
-    dyn = mb.dynamics(adrift, "lagrangian")
-    q, v = adrift.random_state(np.random.default_rng(2))
-    run = simulate(dyn, q, 0.3 * v, 0.3, method="rk853", rtol=1e-11)
-    h = dyn.centroidal_momentum(run.q, run.v)
-    assert np.abs(h - h[0]).max() < 1e-9 * np.abs(h[0]).max()
-    straight = dyn.center_of_mass(run.q) - run.t[:, None] * h[0, :3] / adrift.mass
-    assert np.abs(straight - straight[0]).max() < 1e-9
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "mujoco", "drake"])

@@ -57,18 +57,6 @@ def test_a_builder_of_a_model_builds_the_same_model(seed):
     assert again.nonphysical == model.nonphysical
 
 
-@pytest.mark.thorough("talos", "romeo_small")
-@pytest.mark.parametrize("name", ["ur5", "panda", "anymal", "talos", "romeo_small"])
-def test_a_builder_of_a_robot_builds_the_same_robot(name):
-    robot = mb.load(name)
-    again = mb.ModelBuilder.of(robot).build()
-    assert again == robot
-    assert again.nonphysical == robot.nonphysical
-    # No file describes what a builder made, and its shapes are those of the file.
-    assert not again.source
-    assert [tuple(x)[:3] for x in again.drawn_from] == [("", robot.source, "world")]
-
-
 def test_what_is_set_is_what_a_new_description_would_have():
     b = mb.ModelBuilder.of(pendulum().build())
     b.set_body("link", mass=3.0, com=(0, 0, -0.2), inertia=(0.3, 0.3, 0.1))
@@ -187,19 +175,6 @@ def test_a_prefix_changes_names_alone(seed):
     assert np.array_equal(own(named).forward_dynamics(q, v, tau), own(tree).forward_dynamics(q, v, tau))
 
 
-def test_formulas_follow_a_prefix():
-    b = pendulum()
-    b.add_body("second", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("elbow", "revolute", parent="link", child="second", axis=(0, 1, 0))
-    elbow, rate, k, q = (ca.SX.sym(x) for x in ("elbow", "elbow_dot", "k", "q"))
-    b.add_joint_force("servo", "hinge", k * (elbow - q) - 0.3 * rate, parameters={"k": 2.0})
-    plain = b.build()
-    changed = mb.ModelBuilder.of(plain)
-    changed.add_prefix("a_")
-    q, v = [0.3, -0.4], [1.0, 2.0]
-    assert np.array_equal(own(changed.build()).passive(q, v), own(plain).passive(q, v))
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -311,21 +286,6 @@ def test_a_locked_robot_is_that_of_pinocchio(name):
     q, v = reduced.random_state(rng)
     for engine in ("lagrangian", "pinocchio"):
         assert_same_as(raw, mb.dynamics(reduced, engine), q, v)
-
-
-def test_a_locked_gripper_is_one_line():
-    robot = mb.load("panda")
-    arm = robot.lock({"panda_finger_joint1": 0.02})
-    assert arm.nv == 7
-    assert not arm.needs.mimic
-    # The finger that mimics is locked with it, and frames stay.
-    assert arm.joint("panda_finger_joint2").kind == "fixed"
-    assert {f.name for f in robot.frames} <= {f.name for f in arm.frames}
-    assert "panda_finger_joint1 at 0.02; with them panda_finger_joint2" in arm.notes[-1]
-    again = arm.lock({"panda_joint1": 0.5})
-    q, v = again.full_state(again.neutral())
-    assert (q[0], q[-1], v.tolist()) == (0.5, 0.02, [0.0] * 8)
-    assert pickle.loads(pickle.dumps(again)).full_state(again.neutral())[0].tolist() == q.tolist()
 
 
 @pytest.mark.parametrize("engine", ["lagrangian", "pinocchio", "mujoco"])
@@ -689,17 +649,6 @@ def test_one_name_is_one_number():
         mb.variants(shared, {"link.mass": 0.1}, size=2)
 
 
-def test_a_rotor_of_a_ball_is_one_number():
-    b = mb.ModelBuilder("ball")
-    b.add_body("link", mass=1.0, com=(0.1, 0.0, -0.5), inertia=(0.1, 0.1, 0.02))
-    b.add_joint("ball", "ball", parent="world", child="link", armature=0.2)
-    many = mb.variants(b.build(), {"*.armature": 0.3}, size=2)
-    assert [*many.values] == ["ball.armature"]
-    q, v = many[0].random_state(0)
-    assert off(many.dynamics().nle(np.tile(q, (2, 1)), np.tile(v, (2, 1)))[1], own(many[1]).nle(q, v)) < CLOSE
-    assert len([*many]) == 2
-
-
 def test_a_frame_with_a_parameter_carries_what_hangs_on_it():
     b = pendulum("base")
     b.add_frame("far", body="link", translation=(mb.Parameter("L", 1.0), 0, 0), rpy=(0.1, 0.2, 0.3))
@@ -715,15 +664,6 @@ def test_a_frame_with_a_parameter_carries_what_hangs_on_it():
     assert np.allclose(dyn.pose(q, "second")[:3, 3], dyn.pose(q, "load")[:3, 3], rtol=0, atol=1e-14)
     assert np.allclose(np.linalg.norm(dyn.pose(q, "far")[:3, 3]), 3.0, rtol=1e-15)
     assert off(dyn.pose(q, "load"), dyn.pose(q, "far") @ mb.spatial.pose((0.1, 0.2, 0.3))) < 1e-14
-
-
-def test_a_prefix_keeps_the_parameter_of_a_gravity_compensation():
-    b = pendulum()
-    b.add_gravity_compensation("link", mb.Parameter("f", 0.5))
-    plain = b.build()
-    b = mb.ModelBuilder.of(plain)
-    b.add_prefix("a_")
-    assert np.array_equal(own(b.build()).at(f=1.0).passive([0.3], [0.0]), own(plain).at(f=1.0).passive([0.3], [0.0]))
 
 
 def test_what_locked_places_depend_on_is_a_number():

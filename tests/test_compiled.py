@@ -34,7 +34,6 @@ from mbkit.codegen.program import Program, program
 from mbkit.codegen.python_call import python_call
 from mbkit.errors import InputError
 from tests.random_trees import random_tree, states
-from tests.scenes import mounted
 from validation.memory import allocated
 
 EPS = np.finfo(float).eps
@@ -93,14 +92,6 @@ def test_sine_and_cosine_are_right_to_three_quarters_of_an_ulp(angles):
                 assert abs(mpmath.mpf(float(got)) - exact) <= 0.76 * np.spacing(abs(float(exact)))
 
 
-def test_sine_and_cosine_of_what_is_not_finite_are_not_finite():
-    x = np.array([np.nan, np.inf, -np.inf, 1.0])
-    out, finite = built(sines()).call_checked(x[:, None])
-    assert not finite
-    assert np.isnan(out[0][:3]).all()
-    assert np.isfinite(out[0][3]).all()
-
-
 def layouts(x: np.ndarray) -> dict[str, np.ndarray]:
     """Return the same numbers in memory in many ways."""
     n, k = x.shape
@@ -145,25 +136,6 @@ def test_every_operation_agrees_with_casadi(code, numbers):
         np.testing.assert_allclose(got, np.array(want), rtol=0, atol=scale)
 
 
-@pytest.mark.parametrize("width", [2, 4, 8])
-def test_every_width_of_register_gives_the_same_numbers(monkeypatch, width):
-    here = jit.host()
-    if width > here.width:
-        pytest.skip(f"this processor's registers hold {here.width} doubles")
-    expected = built(mixed())
-    monkeypatch.setattr(jit, "host", lambda: here._replace(width=width))
-    from mbkit.codegen import compiled as module
-
-    monkeypatch.setattr(module, "_batch_object", jit.batch_object)
-    narrow = built(mixed())
-    rng = np.random.default_rng(1)
-    for n in (1, 5, 64):
-        x, y = rng.standard_normal((n, 9)), rng.standard_normal((n, 3))
-        for a, b in ((x, y), (np.asfortranarray(x), y)):
-            for got, want in zip(narrow(a, b), expected(x, y), strict=True):
-                np.testing.assert_allclose(got, want, rtol=4 * EPS, atol=4 * EPS)
-
-
 def test_a_program_in_pieces_gives_the_same_numbers_as_a_whole(monkeypatch):
     model = random_tree(3, 4)
     function = mb.dynamics(model, "lagrangian", compile=False).function("forward_dynamics")
@@ -203,27 +175,6 @@ def test_threads_give_the_same_bits_as_one(code):
     assert len(many) == 4
     for results in many:
         np.testing.assert_array_equal(results[0], one[0])
-
-
-def _in_a_child(queue, code, x, y):
-    queue.put(code(x, y, threads=2)[0])
-
-
-def test_a_forked_child_computes_the_same(code):
-    if "fork" not in multiprocessing.get_all_start_methods():
-        pytest.skip("this system does not fork")
-    rng = np.random.default_rng(4)
-    x, y = rng.standard_normal((400_000, 9)), rng.standard_normal((400_000, 3))
-    expected = code(x, y, threads=2)[0]
-    context = multiprocessing.get_context("fork")
-    queue = context.Queue()
-    with warnings.catch_warnings():
-        # Python warns of forking beside threads, which is what this is about.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        child = context.Process(target=_in_a_child, args=(queue, code, x[:5000], y[:5000]))
-        child.start()
-    np.testing.assert_array_equal(queue.get(timeout=60), expected[:5000])
-    child.join(60)
 
 
 @pytest.mark.thorough
@@ -305,17 +256,6 @@ def test_calls_move_from_round_to_round_and_go_on_where_they_ended():
     for k in range(8):
         one = np.sum(np.sin(path[k]) + given[k], axis=0) - path[k, 0]
         np.testing.assert_allclose(path[k + 1, 0], one, rtol=4 * EPS)
-
-
-def test_vectors_put_aside_lie_within_cache_lines():
-    if platform.machine() not in ("x86_64", "AMD64") or jit.host().width < 4:
-        pytest.skip("a wider vector than the stack's 16 bytes is needed")
-    x = ca.SX.sym("x", 80)
-    # All sums are needed until the end.
-    sums = ca.cumsum(x)
-    code, _ = jit.program_object(program(ca.Function("f", [x], [ca.sum1(sums) * sums])))
-    aligned = bytes([0x48, 0x83, 0xE4, 256 - 8 * jit.host().width])  # and rsp, -64 or -32
-    assert aligned in code
 
 
 @pytest.mark.thorough("rk853", "rodas5", "implicit_midpoint", "taylor")
@@ -411,21 +351,6 @@ def test_one_function_serves_all_who_ask_in_a_process(tmp_path, monkeypatch):
     first = compiled(("one function",), make)
     assert compiled(("one function",), make) is first
     assert len(made) == 1
-
-
-@pytest.mark.parametrize("kind", ["prismatic", "continuous"])
-def test_a_spring_in_one_dimension_is_compiled_too(kind):
-    """CasADi turns √(x²) into |x|, whose derivative is a sign."""
-    b = mounted("line", "b", "j", kind, mass=1.0, com=(0.1, 0, 0), inertia=(0.1, 0.1, 0.1), axis=(1, 0, 0))
-    b.add_spring("s", body_a="world", body_b="b", stiffness=3.0, rest_length=0.5, damping=0.2, point_b=(0.2, 0, 0))
-    model = b.build()
-    code, plain = (mb.dynamics(model, "lagrangian", compile=c) for c in (True, False))
-    q, v, a, tau = states(model, 9)
-    for name, last in (("inverse_dynamics", a), ("forward_dynamics", tau)):
-        got, want = (getattr(dyn, name)(q, v, last) for dyn in (code, plain))
-        np.testing.assert_allclose(got, want, rtol=0, atol=50 * EPS * max(np.abs(want).max(), 1))
-    exact = mb.dynamics(model, "oracle").inverse_dynamics(q, v, a)
-    np.testing.assert_allclose(code.inverse_dynamics(q, v, a), exact, rtol=0, atol=50 * EPS * np.abs(exact).max())
 
 
 def test_a_far_angle_leaves_its_neighbours_as_they_are():

@@ -6,7 +6,6 @@ from __future__ import annotations
 import pickle
 import warnings
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +20,6 @@ from mbkit.engines.mujoco import importer
 from mbkit.errors import KnownDefectWarning, ModelError, UnsupportedError
 from mbkit.model import JointCoupling, Model, ModelBuilder
 from mbkit.model.validation import sample_mass_matrix
-from mbkit.studies.baseline.description import described
-from mbkit.studies.explain.terms import part
 from tests.random_trees import ALL, SOUND, random_tree
 
 EPS = np.finfo(float).eps
@@ -352,12 +349,6 @@ def test_mujoco_loses_a_rotor_between_branches_and_says_so(tmp_path):
     assert any("armature of 'c'" in note for note in read.notes)
 
 
-@pytest.mark.skipif(find_spec("pydrake") is None, reason="Drake is not installed")
-def test_drake_has_no_couplings():
-    with pytest.raises(UnsupportedError, match="'c'"):
-        mb.dynamics(two_pendulums(stiffness=1.0).build(), "drake")
-
-
 def light_cart(factor: float) -> Model:
     b = mb.ModelBuilder("cart")
     b.add_body("cart", mass=1e-9)
@@ -417,20 +408,6 @@ def test_methods_that_eliminate_by_themselves_keep_the_energy(method):
     run = mb.simulate(dyn, [0.3, 0.1], [0.0, 0.0], 0.5, method=method, **step)
     assert np.ptp(run.energy()) < 1e-7
     assert np.abs(run.v[-1]).min() > 0.1
-
-
-@pytest.mark.parametrize("catalogued", [False, True])
-def test_on_paper(catalogued):
-    model = two_pendulums(stiffness=3.0, rest_length=0.25, damping=0.5, armature=0.5).build()
-    if catalogued:
-        # A system of the catalog has symbols of its own, which do not hold for what was added.
-        plain = mb.catalog.double_pendulum()
-        names = tuple(j.name for j in plain.joints)
-        model = replace(plain, couplings=(JointCoupling("c", names, np.array([1.0, -2.0]), 3.0, 0.25, 0.5, 0.5),))
-    paper, dyn = mb.lagrangian.from_model(model).dynamics(), mb.dynamics(model, "pinocchio")
-    q, v, tau = np.random.default_rng(0).normal(size=(3, 2))
-    assert_near(paper.mass_matrix(q), dyn.mass_matrix(q))
-    assert_near(paper.forward_dynamics(q, v, tau), dyn.forward_dynamics(q, v, tau))
 
 
 # The description.
@@ -496,14 +473,6 @@ def test_written_and_read_again(tmp_path):
         mb.convert(two_pendulums(damping=1.0).build(), "urdf")
 
 
-def test_a_difference_in_a_coupling_is_named():
-    model, other = (two_pendulums(armature=x).build() for x in (0.5, 0.75))
-    (cause,) = mb.explain(model, other).causes
-    assert cause.acts
-    assert "'c'" in cause.subject
-    assert described(model)["couplings"]["c"]["armature"] == 0.5
-
-
 def test_couplings_of_renamed_joints_are_the_same():
     model, other = (two_pendulums(joint=name, stiffness=2.0, armature=0.5).build() for name in ("j", "hinge"))
     found = mb.explain(model, other)
@@ -517,17 +486,6 @@ def test_a_rotor_that_an_engine_loses_is_named():
     (cause,) = found.causes
     assert cause.kind == "joint coupling"
     assert "branches" in str(cause)
-
-
-def test_a_coupling_of_a_joint_that_the_other_model_lacks():
-    b = two_pendulums(armature=0.5)
-    b.add_body("b2", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.1))
-    b.add_joint("j2", "revolute", parent="b1", child="b2", axis=(1, 0, 0))
-    b.add_coupling("d", {"j1": 1.0, "j2": 1.0}, stiffness=1.0)
-    found = mb.explain(b.build(), two_pendulums(armature=0.5).build())
-    assert any("'j2'" in cause.subject for cause in found.acting)
-    # A part keeps the couplings whose joints it has.
-    assert [c.name for c in part(b.build(), {"j1", "j2"}).couplings] == ["d"]
 
 
 @pytest.mark.parametrize("seed", range(6))

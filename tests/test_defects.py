@@ -16,7 +16,7 @@ from mbkit.engines import known_defects
 from mbkit.errors import KnownDefectWarning
 from mbkit.model.joint_types import KINDS
 from mbkit.report.page import render
-from tests.random_trees import off, random_tree, states
+from tests.random_trees import off, states
 
 PINOCCHIO = version("pin")
 in_this_version = pytest.mark.skipif(PINOCCHIO != "4.1.0", reason="reproduced in Pinocchio 4.1.0 only")
@@ -104,26 +104,6 @@ def test_a_wrong_kinetic_energy_never_comes_without_a_warning(kind, armature):
         right = 0.5 * v @ dyn.mass_matrix(q) @ v
         assert [w.category for w in caught] == [KnownDefectWarning] * int(abs(value - right) > 1e-11), (axis, value)
         assert all("'odd'" in str(w.message) and "'plain'" not in str(w.message) for w in caught)
-
-
-def test_models_that_the_defects_do_not_touch_get_no_warning():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for model in (one_joint("revolute", armature=0.8, axis=(0, 0, 1)), one_joint("ball"), mb.load("panda")):
-            q, v, _, _ = (x[0] for x in states(model, 1))
-            dyn = mb.dynamics(model)
-            assert off(dyn.coriolis_matrix(q, v) @ v, dyn.nle(q, v) - dyn.gravity(q)) < 1e-12
-            dyn.kinetic_energy(q, v)
-
-
-def test_own_answers_are_right_where_pinocchios_are_not():
-    model = random_tree(0, 12)
-    own = mb.dynamics(model, "lagrangian")
-    q, v, _, _ = states(model, 4)
-    C = own.coriolis_matrix(q, v)
-    assert off(np.einsum("nij,nj->ni", C, v), own.nle(q, v) - own.gravity(q)) < 1e-13
-    half = 0.5 * np.einsum("ni,nij,nj->n", v, own.mass_matrix(q), v)
-    assert off(own.kinetic_energy(q, v), half) < 1e-14
 
 
 @pytest.mark.thorough

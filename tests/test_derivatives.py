@@ -162,33 +162,6 @@ def test_pinocchio_gives_the_same(robot, floating):
         close(x, y, k=condition)
 
 
-def test_at_rest_only_damping_and_gravity_are_left():
-    model = random_tree(8, 7)
-    dyn = mb.dynamics(model, "lagrangian")
-    q = states(model, 1)[0][0]
-    zero = np.zeros(model.nv)
-    still = mb.dynamics(model.without("damping"), "lagrangian").inverse_dynamics_derivatives(q, zero, zero)
-    assert np.abs(still.v).max() == 0.0
-    damped = dyn.inverse_dynamics_derivatives(q, zero, zero).v
-    assert off(damped, damped.T) < 10 * EPS
-    assert np.linalg.eigvalsh(damped).min() > -10 * EPS * np.abs(damped).max()
-    free = mb.dynamics(model.without("gravity", "springs"), "lagrangian").inverse_dynamics_derivatives(q, zero, zero)
-    assert np.abs(free.q).max() == 0.0
-
-
-@pytest.mark.thorough("deep", "mimic", "free and balls")
-def test_a_batch_is_its_states_one_by_one(tree):
-    model, dyn, _ = tree
-    q, v, a, tau = states(model, 3)
-    for method, third in ((dyn.inverse_dynamics_derivatives, a), (dyn.forward_dynamics_derivatives, tau)):
-        together = method(q, v, third)
-        for k in range(3):
-            for x, y in zip(together, method(q[k], v[k], third[k]), strict=True):
-                assert x.shape == (3, model.nv, model.nv)
-                assert off(x[k], y) < 10 * EPS
-        assert [x.shape for x in method(q[:0], v[:0], third[:0])] == [(0, model.nv, model.nv)] * 3
-
-
 def test_fields_and_functions_are_named():
     dyn = mb.dynamics(mb.load("ur5"), "lagrangian")
     q, v, a, tau = (x[0] for x in states(dyn.model, 1))
@@ -223,17 +196,6 @@ def test_parameters_are_arguments_of_derivatives_too():
     for method in ("inverse_dynamics_derivatives", "forward_dynamics_derivatives"):
         for ours, theirs in zip(getattr(named, method)(q, v, x), getattr(plain, method)(q, v, x), strict=True):
             close(ours, theirs)
-
-
-def test_a_model_that_cannot_move_has_empty_derivatives():
-    b = mounted("block", "a", "j", "fixed", mass=1.0)
-    dyn = mb.dynamics(b.build(), "lagrangian")
-    nothing = np.zeros(0)
-    for result in (
-        dyn.inverse_dynamics_derivatives(nothing, nothing, nothing),
-        dyn.forward_dynamics_derivatives(nothing, nothing, nothing),
-    ):
-        assert [x.shape for x in result] == [(0, 0)] * 3
 
 
 def test_bad_input_and_singular_poses_are_named():

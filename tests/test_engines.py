@@ -523,12 +523,6 @@ def test_a_dynamics_is_read_only_and_knows_what_others_call_its_methods(engine):
     assert not hasattr(dyn, "_no_such_thing")
 
 
-def test_every_name_of_elsewhere_leads_to_a_method():
-    assert len(Dynamics._elsewhere) > 50
-    for meant in Dynamics._elsewhere.values():
-        assert callable(getattr(Dynamics, meant))
-
-
 def test_a_function_in_the_place_of_a_configuration_is_named():
     model = mb.load("panda")
     with pytest.raises(InputError, match=r"got a function; call it: neutral\(\)"):

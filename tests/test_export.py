@@ -5,11 +5,9 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import casadi as ca
@@ -108,16 +106,6 @@ def test_every_quantity_is_the_engines(compiled):
             want = [x[k] for x in wanted] if len(described.outputs) > 1 else [wanted[k]]
             for g, w in zip(got, want, strict=True):
                 assert off(g.reshape(np.shape(w)), w) < 256 * EPS * conditions[k], quantity
-
-
-@pytest.mark.thorough("panda")
-def test_threads_that_call_at_once_agree(compiled):
-    quantity = next(iter(compiled.functions))
-    rows = list(zip(*arguments_of(quantity, compiled.model, 256), strict=True))
-    alone = [compiled(quantity, *row) for row in rows]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda row: compiled(quantity, *row), rows))
-    np.testing.assert_array_equal(together, alone)
 
 
 def test_an_output_may_lie_on_an_input(compiled):
@@ -221,33 +209,6 @@ def test_headers_compile_alone_twice_over_and_in_cpp(tmp_path):
     subprocess.run([tmp_path / "main"], check=True)
     # The source is C++ as well.
     subprocess.run([CXX, "-std=c++11", *STRICT, "-x", "c++", "-fsyntax-only", str(tmp_path / "panda.c")], check=True)
-
-
-def test_the_header_tells_order_units_and_conventions():
-    made = export_c(mb.load("panda"), ["mass_matrix", "forward_dynamics"])
-    assert "void panda_mass_matrix(const double q[PANDA_NQ], double M[PANDA_NV * PANDA_NV]);" in made.header
-    for told in ("7  panda_finger_joint1  m/s    N\n", "x, y, z, w", "by columns", "0  panda_joint1         rad\n"):
-        assert told in made.header
-    assert "panda_finger_joint2 = 1.0 * panda_finger_joint1 + 0.0" in made.header
-    assert made.digest in made.header
-    free = export_c(mb.load("solo12", floating_base=True), ["gravity"]).header
-    assert "[6] = 1.0" in free
-    rows = [line.split()[1:] for line in free.splitlines() if line.startswith(" *  ") and "root_joint" in line]
-    units = [row[2:] for row in rows]
-    assert units == [["m"]] * 3 + [["1"]] * 4 + [["m/s", "N"]] * 3 + [["rad/s", "N", "m"]] * 3
-
-
-@needs_cc
-def test_names_from_a_file_do_no_harm(tmp_path):
-    b = mb.ModelBuilder("7 */ int x; /* naïve ??/")
-    b.add_body("b", mass=1.0, com=(0, 0, 1), inertia=np.eye(3))
-    evil = "*/ #error /* ??/ \u202e \\"
-    b.add_joint(evil, "revolute", parent="world", child="b", axis=(1, 0, 0))
-    made = export_c(b.build(), ["gravity"])
-    assert made.name == "model_7_int_x_na_ve"
-    assert made.header.isprintable() or "\u202e" not in made.header
-    made.write(tmp_path)
-    subprocess.run([*C99, "-c", str(tmp_path / f"{made.name}.c"), "-o", str(tmp_path / "x.o")], check=True)
 
 
 @pytest.mark.thorough
@@ -398,16 +359,6 @@ def test_functions_serve_in_an_optimal_control_expression():
     # q after two steps depends on the torque of the first alone: h² M(q0)⁻¹.
     inverse = h * h * np.linalg.inv(dyn.mass_matrix(q0))
     assert np.linalg.norm(J - inverse) < 256 * EPS * np.linalg.cond(dyn.mass_matrix(q0)) * np.linalg.norm(inverse)
-
-
-def test_the_header_holds_what_the_functions_hold() -> None:
-    b = mb.ModelBuilder("rubbing")
-    b.add_body("rod", mass=1.0, com=(0, 0, -0.5), inertia=(0.1, 0.1, 0.01))
-    limits = {"friction": 0.5, "lower": -1.0, "upper": 1.0, "effort_limit": 3.0}
-    b.add_joint("hinge", "revolute", parent="world", child="rod", axis=(0, 1, 0), damping=0.1, **limits)
-    header = export_c(b.build(), ["mass_matrix"]).header
-    (holds,) = re.findall(r"Holds +(.*)", header)
-    assert holds == "gravity, damping, friction"
 
 
 #: Of frames, their inputs; and of the whole.

@@ -14,7 +14,7 @@ import sympy as sp
 from scipy.spatial.transform import Rotation
 
 import mbkit as mb
-from mbkit.errors import InputError, ModelError, UnsupportedError
+from mbkit.errors import ModelError, UnsupportedError
 from mbkit.simulate import METHODS
 from tests.scenes import mounted
 
@@ -109,12 +109,6 @@ def test_every_engine_has_the_same_forces(engine: str, oracle: Any) -> None:
     one = dyn.forward_dynamics(Q[0], V[0], TAU[0])
     assert off(one, oracle.forward_dynamics(Q, V, TAU)[0]) < 1e-13
     assert off(dyn.at(t=0.0).passive(Q, V), oracle.passive(Q, V)) > 1e-3
-
-
-def test_gravity_and_nle_do_not_hold_them() -> None:
-    dyn, bare = (mb.dynamics(m, "lagrangian") for m in (MODEL, MODEL.without("forces")))
-    assert off(dyn.nle(Q, V), bare.nle(Q, V)) < 1e-14
-    assert off(dyn.gravity(Q), bare.gravity(Q)) < 1e-14
 
 
 @pytest.mark.parametrize("quantity", ["inverse_dynamics", "forward_dynamics"])
@@ -248,61 +242,6 @@ def test_expressions_of_either_library_and_functions_say_the_same() -> None:
     assert off(forces[2], forces[0]) < 1e-15
 
 
-def test_a_joint_of_several_velocities_takes_one_force_each() -> None:
-    b = mounted("disc", "disc", "plane", "planar", mass=1.0, inertia=(1.0, 1.0, 1.0))
-    q, v = ca.SX.sym("q", 3), ca.SX.sym("v", 3)
-    b.add_joint_force("f", "plane", -q - 0.1 * v**3, potential=ca.dot(q, q))
-    dyn = mb.dynamics(b.build())
-    assert np.allclose(dyn.passive([1.0, 2.0, 3.0], [1.0, 0.0, -1.0]), [-3.1, -6.0, -8.9], rtol=1e-15)
-    assert dyn.potential_energy([1.0, 2.0, 3.0]) == 14.0
-
-
-# Energy
-
-
-def still(*, drag: float) -> mb.Model:
-    b = tree()
-    law = (lambda _t, _q, v: -drag * v * abs(v)) if drag else None
-    b.add_joint_force("spring", "shoulder", law, potential=lambda q: 3 * q**4 - q)
-    b.add_force("well", "tip", potential=lambda p: 2 * p[0] ** 2 + p[1] ** 2 + p[0] * p[2])
-    ends = {"body_a": "base", "body_b": "lower"}
-    b.add_bushing("rubber", **ends, stiffness=np.diag([40.0] * 3 + [5.0] * 3) + 0.1 * STIFFNESS, damping=drag)
-    return b.build().without("damping")
-
-
-@pytest.mark.parametrize("engine", ["lagrangian", "pinocchio"])
-def test_potentials_keep_the_energy(engine: str) -> None:
-    model = still(drag=0.0)
-    assert not model.loses_energy
-    v = 0.5 * RNG(3).standard_normal(model.nv)
-    run = mb.simulate(mb.dynamics(model, engine), model.neutral(), v, 1.0, "rk853", rtol=1e-12)
-    assert np.ptp(run.energy()) < 1e-10 * np.abs(run.energy()).max()
-    assert np.array_equal(run.work(), np.zeros(len(run.t)))
-
-
-def test_the_work_of_the_other_forces_balances_the_energy() -> None:
-    """It is a quadrature of fourth order in the distance of the states, and the run is one of fourth order."""
-    model, errors = MODEL, []
-    v = 0.2 * RNG(3).standard_normal(model.nv)
-    dyn = mb.dynamics(model, "lagrangian")
-    for dt in (2e-3, 1e-3):
-        run = mb.simulate(dyn, model.neutral(), v, 0.4, "rk4", dt, t0=0.3)
-        assert not run.stats.doubts
-        errors.append(np.abs(run.power_balance()).max() / np.ptp(run.energy()))
-    assert errors[-1] < 1e-6
-    assert errors[0] / errors[1] > 12
-    both = mb.simulate(dyn, np.array([model.neutral()] * 2), np.array([v, v]), 0.4, "rk4", dt, t0=0.3)
-    assert np.allclose(both.power_balance()[1], run.power_balance(), rtol=0, atol=1e-12)
-
-
-def test_a_run_whose_damper_takes_energy_away_is_no_doubt() -> None:
-    model = still(drag=3.0)
-    run = mb.simulate(mb.dynamics(model), model.neutral(), np.ones(model.nv), 0.5)
-    assert run.energy()[-1] < run.energy()[0] - 0.01
-    assert not run.stats.doubts
-    assert np.abs(run.power_balance()).max() < 1e-6
-
-
 # Time
 
 
@@ -335,18 +274,6 @@ def test_every_method_starts_at_t0_and_follows_the_time(name: str) -> None:
     worst = {1: 5e-3, 2: 5e-6}.get(method.order, 1e-8) if method.kind == "fixed" else 1e-7
     assert abs(run.q[-1, 0] - x) < worst
     assert abs(run.v[-1, 0] - v) < worst
-
-
-@pytest.mark.parametrize("engine", ["pinocchio", "mujoco", "drake", "oracle"])
-def test_every_engine_starts_at_t0_and_follows_the_time(engine: str) -> None:
-    if engine == "drake":
-        pytest.importorskip("pydrake")
-    run = mb.simulate(mb.dynamics(slider(), engine), [0.0], [0.0], 0.2, "rk4", 0.01, t0=0.4)
-    x, v = closed_form(0.4, 0.6)
-    # h⁴ of a twentieth of the frequency.
-    assert np.abs([run.q[-1, 0] - x, run.v[-1, 0] - v]).max() < 1e-8
-    dyn = mb.dynamics(slider(), engine)
-    assert dyn.step([0.0], [0.0], [0.0], 0.01, t=0.4)[0][0] == pytest.approx(run.q[1, 0], rel=1e-12)
 
 
 def test_wrenches_of_a_run_stand_beside_a_force_of_the_time() -> None:
@@ -514,13 +441,6 @@ def test_what_does_not_know_forces_refuses_them_by_name() -> None:
             mb.convert(MODEL.with_parameters(k=1.0, M=1.0), form)
 
 
-def test_drakes_own_integrators_refuse_forces_by_name() -> None:
-    pytest.importorskip("pydrake")
-    name = next(n for n, m in METHODS.items() if m.engines == ("drake",))
-    with pytest.raises(UnsupportedError, match="'drive'"):
-        mb.simulate(mb.dynamics(slider(), "drake"), [0.0], [0.0], 0.1, name, save=[0.0, 0.1])
-
-
 def test_a_state_at_which_a_force_is_not_a_number_is_refused() -> None:
     b = tree()
     b.add_joint_force("f", "elbow", lambda _t, q, _v: -ca.sqrt(q))
@@ -537,8 +457,3 @@ def test_compare_judges_engines_with_forces() -> None:
     result = mb.compare(fixed, engines=("pinocchio", "lagrangian", "mujoco"), samples=4, terms_only=True)
     assert result.passed
     assert {"passive", "potential energy", "power balance"} <= {row.term for row in result.rows}
-
-
-def test_a_run_needs_a_time_that_is_a_number() -> None:
-    with pytest.raises(InputError, match="t0"):
-        mb.simulate(mb.dynamics(slider()), [0.0], [0.0], 0.1, t0=math.nan)

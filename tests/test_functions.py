@@ -6,7 +6,6 @@ import ctypes
 import itertools
 import math
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -19,17 +18,14 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from mbkit.catalog import double_pendulum
-from mbkit.codegen import extended_precision, jit, simd_kernel, step_loop, taylor
+from mbkit.codegen import extended_precision, simd_kernel, taylor
 from mbkit.codegen import program as program_module
 from mbkit.codegen.c_source import c_code
-from mbkit.codegen.compiled import aligned, compiled
 from mbkit.codegen.extended_precision import Extended, arithmetic
 from mbkit.codegen.interpreter import Machine
 from mbkit.codegen.llvm_ir import CALLS
 from mbkit.codegen.program import program
-from mbkit.codegen.step_loop import CompiledStepLoop
 from mbkit.codegen.taylor import TaylorSystem, precision
-from mbkit.derivation.steps.fixed import Part
 from mbkit.errors import UnsupportedError
 from tests.test_compiled import built
 from tests.test_export import C99, needs_cc
@@ -39,7 +35,8 @@ EPS_113 = mpmath.mpf(2) ** -112
 BACKENDS = ["mpmath", *(["real128"] if arithmetic().name == "real128" else [])]
 mp = mpmath.MPContext()
 mp.dps = 50
-Groups = Callable[[np.random.Generator], list[Any]]
+
+
 N = 60
 
 
@@ -336,18 +333,6 @@ def test_bits_depend_neither_on_place_nor_batch_nor_threads() -> None:
     np.testing.assert_array_equal(code(*columns(many), threads=2)[0], np.tile(out, (200, 1, 1)))
 
 
-@pytest.mark.parametrize("width", [2, 4])
-def test_every_width_of_register_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
-    here = jit.host()
-    if width > here.width:
-        pytest.skip(f"this processor's registers hold {here.width} doubles")
-    points = columns(np.random.default_rng(5).uniform(0.05, 0.95, (21, 2)))
-    expected = built(everything())(*points)[0]
-    monkeypatch.setattr(jit, "host", lambda: here._replace(width=width))
-    monkeypatch.setattr("mbkit.codegen.compiled._batch_object", jit.batch_object)
-    np.testing.assert_array_equal(built(everything())(*points)[0], expected)
-
-
 def test_pieces_give_the_same_bits_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     points = columns(np.random.default_rng(6).uniform(0.05, 0.95, (21, 2)))
     expected = built(everything())(*points)[0]
@@ -355,44 +340,6 @@ def test_pieces_give_the_same_bits_as_a_whole(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(simd_kernel, "_PIECE_OPERATIONS", 12)
     assert len(simd_kernel.pieces_of(program(everything()))) > 5
     np.testing.assert_array_equal(built(everything())(*points)[0], expected)
-
-
-def test_states_side_by_side_get_the_same_bits() -> None:
-    """The code that embedded steps run in, of a part that is alone."""
-    made = everything()
-    m = made.size1_out(0)
-    x = ca.SX.sym("state", m)
-    part = Part("f", ("state",), ("state1",), lambda: ca.Function("f", [x], [made(x[0], x[1])]))
-    code = CompiledStepLoop(*step_loop._compile([part], ("state",)))
-    w = step_loop.width()
-    points = np.random.default_rng(7).uniform(0.05, 0.95, (w, 2))
-    arena, log = aligned(code.size * w).reshape(code.size, w), np.empty((m, w))
-    start = np.zeros((m, w))
-    start[:2] = points.T
-    ways = np.array([start.ctypes.data, 0, log.ctypes.data, 0, 0])
-    code.loaded.run(arena.ctypes.data, ways.ctypes.data, 0, 1)
-    np.testing.assert_array_equal(log.T, built(made)(*columns(points))[0][:, :, 0])
-
-
-_LOADS = """
-import sys, numpy as np
-from mbkit.codegen import disk_cache as cache
-from mbkit.codegen.compiled import Compiled
-x, y = np.frombuffer(bytes.fromhex(sys.argv[1])).reshape(2, -1, 1)
-kept = [cache.read(path.name) for path in cache.folder().iterdir()]
-(found,) = [entry for entry in kept if "inputs" in entry[0]]
-print(Compiled(*found)(x, y)[0].tobytes().hex())
-"""
-
-
-def test_a_new_process_loads_what_this_one_compiled(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MBKIT_CACHE_DIR", str(tmp_path / "cache"))
-    points = np.random.default_rng(8).uniform(0.05, 0.95, (2, 13, 1))
-    expected = compiled(("functions of a test",), everything)(*points)[0]
-    told = subprocess.run(
-        [sys.executable, "-c", _LOADS, points.tobytes().hex()], capture_output=True, text=True, check=False
-    )
-    assert bytes.fromhex(told.stdout) == expected.tobytes(), told.stderr
 
 
 # Taylor series

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.derivation import FUNCTIONS, Equations
+from mbkit.derivation import Equations
 from mbkit.errors import UnknownNameError, UnsupportedError
 from tests.random_trees import off, random_tree, states
 
@@ -30,11 +30,6 @@ def test_mass_matrix_is_symmetric_positive_definite(tree):
     M = dyn.mass_matrix(q)
     assert off(M, M.swapaxes(1, 2)) < 1e-15
     assert np.linalg.eigvalsh(M).min() > 0
-
-
-def test_kinetic_energy_is_half_v_m_v(tree):
-    _, dyn, (q, v, _, _) = tree
-    assert off(dyn.kinetic_energy(q, v), 0.5 * np.einsum("ni,nij,nj->n", v, dyn.mass_matrix(q), v)) < CLOSE
 
 
 @pytest.mark.thorough("0", "1", "4", "5")
@@ -147,32 +142,6 @@ def test_gravity_free_models_have_no_gravity_in_the_graph():
     assert free < full
 
 
-@pytest.mark.parametrize("name", list(FUNCTIONS))
-def test_functions_are_casadi_functions_that_agree(name):
-    model = mb.load("ur5")
-    dyn = mb.dynamics(model, "lagrangian")
-    q, v, a, tau = (x[0] for x in states(model, 1))
-    f = dyn.function(name)
-    assert isinstance(f, ca.Function)
-    named = {"q": q, "v": v, "a": a, "tau": tau}
-    got = np.array(f(*(named[n] for n in FUNCTIONS[name]))).squeeze()
-    assert off(got, getattr(dyn, name)(*(named[n] for n in FUNCTIONS[name]))) < 1e-15
-
-
 def test_unknown_quantities_are_named():
     with pytest.raises(UnknownNameError, match="mass_matrix"):
         mb.dynamics(mb.load("ur5"), "lagrangian").function("mass_matrx")
-
-
-def test_quasi_velocities_give_eulers_equations():
-    """A free body without forces: I ω̇ + ω × I ω = 0 and m (v̇ + ω × v) = 0."""
-    b = mb.ModelBuilder("free", gravity=(0, 0, 0))
-    inertia = np.array([[2.0, 0.1, 0.2], [0.1, 3.0, 0.3], [0.2, 0.3, 4.0]])
-    b.add_body("a", mass=5.0, inertia=inertia)
-    b.add_joint("j", "free", parent="world", child="a")
-    model = b.build()
-    q, v, _, _ = (x[0] for x in states(model, 1))
-    linear, w = v[:3], v[3:]
-    expected = np.concatenate([-np.cross(w, linear), -np.linalg.solve(inertia, np.cross(w, inertia @ w))])
-    for engine in ("pinocchio", "lagrangian", "mujoco"):
-        assert off(mb.dynamics(model, engine).forward_dynamics(q, v, 0 * v), expected) < 1e-14

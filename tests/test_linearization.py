@@ -12,7 +12,7 @@ import mbkit as mb
 from mbkit.engines.linearization import DIFFERENTIABLE, tangent_rate
 from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from mbkit.spatial import skew
-from tests.random_trees import SOUND, random_tree, states
+from tests.random_trees import random_tree, states
 from tests.scenes import chain, slider
 
 EPS = np.finfo(float).eps
@@ -99,20 +99,6 @@ def test_it_is_the_generator_of_the_flow(tree):
     assert np.abs(limit - A).max() < 1e-6 * np.abs(A).max() ** 2
 
 
-@pytest.mark.thorough("oracle")
-@pytest.mark.parametrize("engine", ["oracle", "pinocchio", "drake"])
-def test_engines_agree(engine):
-    if engine == "drake":
-        pytest.importorskip("pydrake")
-    # Pinocchio has no dampers between points.
-    model = random_tree(4, 5, SOUND, springs=False, damping=engine != "pinocchio")
-    q, v, _, tau = states(model, 3, 1)
-    own, other = (mb.dynamics(model, name).linearize(q, v, tau) for name in ("lagrangian", engine))
-    digits = 100 * EPS * max(np.linalg.cond(mb.dynamics(model).mass_matrix(q)))
-    for x, y in zip(own, other, strict=True):
-        close(x, y, digits)
-
-
 def test_drake_differentiates_mimic_joints_and_reports_a_pole():
     pytest.importorskip("pydrake")
     model = random_tree(3, 7, ("revolute", "prismatic", "helical"), mimic=True, springs=False, damping=True)
@@ -124,18 +110,6 @@ def test_drake_differentiates_mimic_joints_and_reports_a_pole():
     upright = np.array([0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)])
     with pytest.raises(NumericalError, match="drake"):
         mb.dynamics(ball, "drake").inverse_dynamics_derivatives(upright, np.ones(3), np.ones(3))
-
-
-@pytest.mark.thorough("free and balls", "mimic")
-def test_batches_are_their_samples(tree):
-    dyn, _ = tree
-    q, v, _, tau = states(dyn.model, 3, 2)
-    for f in (dyn.linearize, lambda *x: dyn.discretize(*x, 0.01), lambda *x: dyn.discretize(*x, 0.01, "gauss4")):
-        many = f(q, v, tau)
-        for k in range(3):
-            for x, one in zip(many, f(q[k], v[k], tau[k]), strict=True):
-                close(x[k], one, 1e-13)
-        assert [x.shape for x in f(q[:0], v[:0], tau[:0])] == [(0, *x.shape[1:]) for x in many]
 
 
 def test_a_large_batch_is_computed_in_slices():
@@ -350,15 +324,6 @@ def test_derivatives_by_parameters_are_taken_at_their_values():
         dyn.parameter_derivatives("inverse_dynamic", [0.0])
     with pytest.raises(InputError, match="q, v"):
         dyn.parameter_derivatives("nle", [0.0])
-
-
-def test_systems_on_paper_have_them_too():
-    dyn = quasi()
-    q, v, a = np.array([0.7, 0.3]), np.array([0.4, -0.9]), np.array([0.1, 0.2])
-    got = dyn.inverse_dynamics_second_derivatives(q, v, a)
-    first = dyn.inverse_dynamics_derivatives
-    close(got.qq, columns(lambda e: first(dyn.model.integrate(q, e), v, a).q, 2), 1e-9)
-    close(got.qv, columns(lambda e: first(q, v + e, a).q, 2), 1e-9)
 
 
 def test_results_that_hold_arrays_are_shown_in_a_line() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
-from importlib import import_module
 
 import casadi as ca
 import numpy as np
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, UnsupportedError
-from mbkit.lagrangian import from_model
 from mbkit.model.loops import LOOP_KINDS
 from tests.quantities import T0, closed
 from tests.random_trees import random_tree
@@ -79,17 +77,6 @@ def test_bias_and_rate_are_derivatives_along_a_motion(seed: int) -> None:
     assert np.abs(second - whole).max() < 1e-5 * (1 + np.abs(whole).max())
 
 
-def test_catalog_system_moves_as_it_does_on_paper() -> None:
-    model = mb.catalog.slider_crank()
-    dyn, paper = mb.dynamics(model, "lagrangian"), from_model(model).dynamics()
-    q, v = model.random_state(0, 20)
-    tau = np.random.default_rng(1).standard_normal((20, model.nv))
-    a = dyn.forward_dynamics(q, v, tau)
-    assert np.allclose(a, paper.forward_dynamics(q, v, tau), rtol=1e-9, atol=1e-9)
-    runs = [mb.simulate(x, q[0], v[0], 1.0, "rk853", save=[1.0]) for x in (dyn, paper)]
-    assert np.allclose(runs[0].q, runs[1].q, atol=1e-8)
-
-
 def in_a_tilted_plane(model: mb.Model) -> mb.Model:
     R = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
     joints = tuple(
@@ -145,22 +132,6 @@ def test_a_prescribed_motion_is_followed_and_its_drive_pays_for_the_energy(compi
     assert abs(energy[-1] - energy[0] - work) < 2e-3 * np.abs(energy).max()
     exact = mb.simulate(dyn, q, v, 2.0, "rk853", rtol=1e-12, atol=1e-12, save=[2.0])
     assert np.abs(run.q[-1] - exact.q[-1]).max() < 1e-9
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("method", ["semi_implicit_euler", "rk4"])
-def test_compiled_steps_are_those_of_python(method: str) -> None:
-    model, q = closed_tree(1, "point", drive=True)
-    v = np.zeros(model.nv)
-    runs = []
-    for compiled in (True, False):
-        dyn = mb.dynamics(model, "lagrangian", compile=compiled)
-        start = dyn.project(q, v)
-        runs.append(mb.simulate(dyn, *start, 0.05, method, dt=1e-3))
-    assert np.abs(runs[0].q - runs[1].q).max() < 1e-10
-    dyn = mb.dynamics(model, "lagrangian")
-    gap = [np.abs(dyn.at(t=t).constraint_residual(x)).max() for t, x in zip(runs[0].t, runs[0].q, strict=True)]
-    assert max(gap) < 1e-14
 
 
 @pytest.mark.thorough
@@ -311,25 +282,6 @@ def test_engines_agree_on_mechanisms_mujoco_by_its_own_law(name: str) -> None:
     assert "mujoco holds loops softly" in result.verdict
 
 
-def test_a_wrong_loop_is_found() -> None:
-    model = mb.catalog.four_bar()
-    (loop,) = model.loops
-    moved = replace(model, loops=(replace(loop, translation_a=loop.translation_a + np.array([1e-9, 0.0, 0.0])),))
-    own = mb.dynamics(model, "lagrangian")
-    q, v = own.project([0.4, 0.1, 0.1], [1.0, 0.0, 0.0])
-    gap = mb.dynamics(moved, "pinocchio").forward_dynamics(q, v, np.zeros(3)) - own.forward_dynamics(q, v, np.zeros(3))
-    assert np.abs(gap).max() > 1e-11
-
-
-@pytest.mark.thorough
-def test_power_of_drives_counts_in_the_balance() -> None:
-    model, _ = closed_tree(1, "point", drive=True)
-    result = mb.compare(model, ("pinocchio", "lagrangian"), samples=4, terms_only=True)
-    rows = [r for r in result.rows if r.term == "power balance"]
-    assert len(rows) == 2
-    assert all(r.passed for r in rows), [r.relative for r in rows]
-
-
 def test_what_would_be_the_trees_alone_is_refused() -> None:
     dyn = mb.dynamics(mb.catalog.four_bar(), "lagrangian")
     q = np.zeros(3)
@@ -337,16 +289,3 @@ def test_what_would_be_the_trees_alone_is_refused() -> None:
         mb.operational_space(dyn, q, "coupler")
     with pytest.raises(InputError, match="tau: expected the force under which four_bar moves"):
         dyn.joint_wrenches(q, q, q)
-
-
-@pytest.mark.thorough
-def test_a_whole_comparison_of_a_mechanism_passes_with_its_loops_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Little time to error against run time, which tests/test_loops_in_studies.py has.
-    monkeypatch.setattr(import_module("mbkit.studies.compare.study"), "_MAX_SECONDS", 0.5)
-    result = mb.compare(mb.catalog.four_bar(), samples=4)
-    assert result.passed, result.verdict
-    assert {r.engine for r in result.rollouts} == {"mujoco"}
-    (loops,) = (o for o in result.omissions if o.need == "loops")
-    assert loops.present
-    assert "needed" in loops.what
-    assert type(result).from_json(result.to_json()).softness == result.softness

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
-
 import mujoco
 import numpy as np
 import pytest
 
 import mbkit as mb
-from mbkit.errors import InputError, ModelError, NumericalError, UnknownNameError, UnsupportedError
+from mbkit.errors import InputError, NumericalError, UnknownNameError, UnsupportedError
 from tests.scenes import chain
-from tests.test_loop_dynamics import closed_tree, four_bar, in_a_tilted_plane
+from tests.test_loop_dynamics import closed_tree, four_bar
 from validation.four_bar import COUPLER, CRANK, GRAVITY, GROUND, LINE, ROCKER, geometry
 
 OWN = {"compile": False}
@@ -167,17 +163,6 @@ def test_four_bar_at_rest_has_the_torque_and_the_pin_forces_of_statics() -> None
             turned = np.array([[np.cos(phi), -np.sin(phi)], [np.sin(phi), np.cos(phi)]]) @ pin[[0, 2]]
             assert turned == pytest.approx(forces[6:8], abs=1e-12)
             assert pin[3:] == pytest.approx(np.zeros(3), abs=1e-12)
-
-
-def test_loads_of_a_planar_mechanism_are_in_its_plane_in_any_plane() -> None:
-    """A tilted plane keeps two of the three rows of its pin; the load is carried by all three."""
-    flat, tilted = four_bar(), in_a_tilted_plane(four_bar())
-    q, v = flat.random_state(0)
-    tau = np.array([1.0, 0.0, 0.0])
-    for engine in RIGID:
-        loads = [dynamics(x, engine).joint_wrenches(q, v, None, tau=tau) for x in (flat, tilted)]
-        assert off(loads[1], loads[0]) < 1e-11
-        assert np.abs(loads[1][:, 1]).max() < 1e-11 * np.abs(loads[1]).max()
 
 
 # What is not unique
@@ -413,125 +398,6 @@ def test_coordinates_that_are_not_independent_are_refused() -> None:
     driven, at = closed_tree(1, "point", drive=True)
     with pytest.raises(UnsupportedError, match=r"'j0' is moved in time.*N θ̇ alone.*without\('prescribed'\)"):
         mb.dynamics(driven).reduced_inertia(at, driven.coordinate_names[0])
-
-
-# Couplers
-
-
-def geared(*, mimic: bool = False, ratio: Any = -2.0, offset: Any = 0.3) -> mb.Model:
-    """A pendulum whose second link and a rack follow the first by gears: as constraints, or as mimic joints."""
-    one = {"joint": "a", "mass": 1.0, "com": (0.1, 0, -0.2), "inertia": (0.1, 0.12, 0.05), "axis": (0, 1, 0)}
-    two = {"joint": "b", "mass": 0.5, "com": (0, 0.05, -0.1), "inertia": (0.01, 0.02, 0.015), "axis": (0, 1, 0)}
-    rack = {"joint": "c", "mass": 0.3, "com": (0, 0.02, -0.1), "inertia": (0.01, 0.02, 0.015), "axis": (0, 0, 1)}
-    two |= {"translation": (0, 0, -0.4), "mimic": ("a", ratio, offset) if mimic else None}
-    rack |= {
-        "kind": "prismatic",
-        "parent": "world",
-        "translation": (1, 0, 0),
-        "mimic": ("a", 0.25, 0.0) if mimic else None,
-    }
-    b = chain(one, two, rack, name="geared")
-    if not mimic:
-        b.add_coupler("gear", "b", "a", ratio=ratio, offset=offset)
-        b.add_coupler("pinion", "c", "a", ratio=0.25)
-    return b.build()
-
-
-def test_couplers_move_as_mimic_joints_do() -> None:
-    model, reduced = geared(), geared(mimic=True)
-    oracle = dynamics(model, "oracle")
-    assert oracle.constraint_names == ("coupler 'gear'", "coupler 'pinion'")
-    assert str(oracle.mobility()) == "geared: degrees of freedom 1, of 2 rows none is redundant"
-    q, v = model.random_state(0, 3)
-    tau = np.random.default_rng(0).standard_normal((3, 3))
-    ratios = np.array([1.0, -2.0, 0.25])
-    a = mb.dynamics(reduced).forward_dynamics(q[:, :1], v[:, :1], tau @ ratios[:, None])
-    for engine in ("oracle", *RIGID):
-        dyn = dynamics(model, engine)
-        assert off(dyn.forward_dynamics(q, v, tau), a * ratios) < 1e-13
-        assert np.abs(dyn.constraint_residual(q)).max() < 1e-14
-        assert off(dyn.constraint_forces(q, v, tau), oracle.constraint_forces(q, v, tau)) < 1e-12
-        left = dyn.newton_euler_residual(q, v, dyn.forward_dynamics(q, v, tau), tau)
-        assert np.abs(left).max() < 1e-12
-        # One drive takes the load of all, and the inertia that it feels is that of the mimic joints.
-        alone = dyn.actuator_forces(q, v, a * ratios, ["a"]).tau
-        assert alone[:, 0] == pytest.approx((tau @ ratios), abs=1e-11)
-        J, _, _ = dyn.reduced_inertia(q, "a")
-        assert pytest.approx(mb.dynamics(reduced).mass_matrix(q[:, :1])[:, 0, 0], rel=1e-13) == J
-    # The multiplier is the torque in the coupled joint beside its own.
-    load = oracle.joint_wrenches(q[0], v[0], None, tau=tau[0])
-    assert load[1, 4] == pytest.approx(tau[0, 1] + oracle.constraint_forces(q[0], v[0], tau[0])[0], rel=1e-12)
-    run = mb.simulate(dynamics(model, "lagrangian"), q[0], v[0], 0.2, dt=1e-3)
-    assert np.abs(oracle.constraint_residual(run.q)).max() < 1e-14
-    with pytest.raises(UnsupportedError, match="geared: it has no loops"):
-        oracle.loop_wrenches(q, v, tau)
-    assert not model.without("loops").couplers
-    assert model.digest != geared(ratio=3.0).digest
-
-
-def test_couplers_take_parameters_and_close_beside_a_loop() -> None:
-    model = geared(ratio=mb.Parameter("n", -2.0), offset=mb.Parameter("c", 0.3))
-    dyn = dynamics(model, "lagrangian")
-    assert dyn.at(n=3.0).constraint_jacobian([0.1, 0.2, 0.3])[0, 0] == -3.0
-    assert model.with_parameters(n=4.0).couplers[0].ratio == 4.0
-    # Two cranks of a five-bar, geared to each other: one degree of freedom is left.
-    five = mb.catalog.get("five_bar")()
-    (gear, *_) = geared(ratio=-1.0, offset=0.0).couplers
-    closed = replace(five, couplers=(replace(gear, joint="theta1", leader="theta2"),))
-    dyn, exact = (dynamics(closed, x) for x in ("pinocchio", "oracle"))
-    assert exact.mobility().degrees_of_freedom == 1
-    q, v = closed.random_state(0)
-    assert off(dyn.forward_dynamics(q, v, np.ones(4)), exact.forward_dynamics(q, v, np.ones(4))) < 1e-11
-
-
-def test_couplers_in_mujoco_follow_its_written_law_and_survive_mjcf(tmp_path: Path) -> None:
-    model = geared()
-    q, v = model.random_state(1)
-    tau = np.array([1.0, 2.0, 3.0])
-    for options in ({}, {"solref": (-1000.0, -50.0), "solimp": (0.99, 0.999, 0.001, 0.5, 2.0)}):
-        dyn = mb.dynamics(model, "mujoco", **options)
-        for state in (q, q + np.array([0.0, 0.01, -0.02])):
-            said = dyn.constraint_law(state, v, tau)
-            assert off(dyn.forward_dynamics(state, v, tau), said.acceleration) < 1e-11
-    rigid = mb.dynamics(model, "pinocchio").forward_dynamics(q, v, tau)
-    assert off(dyn.constraint_law(q, v, tau).rigid, rigid) < 1e-11
-    path = tmp_path / "geared.xml"
-    path.write_text(mb.convert(model, "mjcf").text)
-    assert mb.load(path).couplers == model.couplers
-    assert not mb.load(path, loops=False).couplers
-    m = mujoco.MjModel.from_xml_path(str(path))
-    d = mujoco.MjData(m)
-    open_state = q + np.array([0.0, 0.01, 0.0])
-    d.qpos[:] = open_state
-    mujoco.mj_forward(m, d)
-    assert d.efc_pos[:2] == pytest.approx(mb.dynamics(model, "oracle").constraint_residual(open_state), abs=1e-14)
-    # Reference angles: MuJoCo's polynomial is of what the joints are away from them.
-    text = path.read_text().replace('name="a"', 'name="a" ref="0.4"').replace('name="b"', 'name="b" ref="0.2"')
-    path.write_text(text)
-    back, m = mb.load(path), mujoco.MjModel.from_xml_path(str(path))
-    d = mujoco.MjData(m)
-    d.qpos[:] = [0.7, -0.1, 0.2]
-    mujoco.mj_forward(m, d)
-    assert mb.dynamics(back, "oracle").constraint_residual(d.qpos) == pytest.approx(d.efc_pos[:2], abs=1e-14)
-    with pytest.raises(UnsupportedError, match="coupler 'gear'"):
-        mb.convert(model, "urdf")
-
-
-@pytest.mark.parametrize(
-    ("joint", "leader", "words"),
-    [
-        ("b", "b", "joint 'b' against itself"),
-        ("b", "d", "unknown joint 'd'"),
-        ("e", "a", "expected joints of one velocity that mimic none, got 'e'"),
-    ],
-)
-def test_faulty_couplers_are_refused(joint: str, leader: str, words: str) -> None:
-    body = {"mass": 1.0, "com": (0.1, 0.1, 0), "inertia": (0.1,) * 3, "parent": "world"}
-    turning = [body | {"joint": name, "axis": (0, 1, 0)} for name in "ab"]
-    b = chain(*turning, body | {"joint": "e", "kind": "ball"})
-    b.add_coupler("gear", joint, leader)
-    with pytest.raises(ModelError, match=words):
-        b.build()
 
 
 # What else acts

@@ -152,13 +152,6 @@ def test_batches_are_their_states_one_by_one_and_may_be_empty(method: str) -> No
 
 
 @pytest.mark.parametrize("method", NATIVE)
-def test_the_same_inputs_give_the_same_bits(method: str) -> None:
-    model, q, v, _ = cases()["Dzhanibekov box"]
-    runs = [simulate(dynamics(model, "mujoco"), q, v, 0.05, method).q for _ in range(2)]
-    assert np.array_equal(*runs)
-
-
-@pytest.mark.parametrize("method", NATIVE)
 def test_a_run_is_interrupted_between_its_parts_and_does_not_depend_on_them(
     monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:

@@ -202,57 +202,6 @@ def test_methods_give_the_rounded_value_and_pairs_the_rest(quantity):
     assert np.array_equal(rest, low.ravel())
 
 
-def test_the_other_engines_are_within_rounding_of_it():
-    model = mb.load("ur5")
-    q, v, a, tau = states(model, 8)
-    oracle = mb.dynamics(model, "oracle")
-    for engine in ("pinocchio", "lagrangian", "mujoco"):
-        dyn = mb.dynamics(model, engine)
-        for quantity in dyn.supports & set(CALLS):
-            given = arguments(quantity, q, v, a, tau)
-            x, y = getattr(dyn, quantity)(*given), getattr(oracle, quantity)(*given)
-            if "matrix" not in quantity or quantity == "mass_matrix":
-                tolerance = 200 * EPS * (np.linalg.cond(oracle.mass_matrix(q)).max() if "forward" in quantity else 1)
-                assert np.abs(x - y).max() <= tolerance * max(np.abs(y).max(), 1), (engine, quantity)
-
-
-def test_poses_and_jacobians():
-    model = random_tree(3, 9)
-    oracle, own = mb.dynamics(model, "oracle"), mb.dynamics(model, "lagrangian")
-    q, *_ = states(model, 3)
-    assert np.abs(oracle.pose(q, "tip") - own.pose(q, "tip")).max() < 1e-14
-    for axes in ("local", "world", "local_world_aligned"):
-        assert np.abs(oracle.jacobian(q, "tip", axes) - own.jacobian(q, "tip", axes)).max() < 1e-13
-        high, _ = oracle.extended("jacobian", q, "tip", axes)
-        assert np.array_equal(high, oracle.jacobian(q, "tip", axes))
-    R = oracle.digits("pose", q[0], "tip")[:3, :3]
-    # As orthonormal as the description's own rotations, which are rounded.
-    assert size(R @ R.T - np.eye(3)) < 1e-14
-    with pytest.raises(UnknownNameError, match="tip"):
-        oracle.extended("pose", q, "tpi")
-
-
-def test_one_state_is_a_row_of_a_batch_and_batches_have_no_seams():
-    model = random_tree(4, 5)
-    oracle = mb.dynamics(model, "oracle")
-    q, v, a, _ = states(model, 300)
-    high, low = oracle.extended("inverse_dynamics", q, v, a)
-    for k in (0, 127, 128, 299):
-        single = oracle.extended("inverse_dynamics", q[k], v[k], a[k])
-        assert np.array_equal(single[0], high[k])
-        assert np.array_equal(single[1], low[k])
-    assert oracle.nle(q[:0], v[:0]).shape == (0, model.nv)
-    assert oracle.forward_dynamics(q, v[0], a[0]).shape == (300, model.nv)
-    assert isinstance(oracle.kinetic_energy(q[0], v[0]), float)
-
-
-def test_a_model_in_which_nothing_moves():
-    oracle = mb.dynamics(chain({"kind": "fixed", "mass": 1.0, "com": (0, 0, 1)}).build(), "oracle")
-    assert oracle.mass_matrix([]).shape == (0, 0)
-    assert oracle.forward_dynamics([], [], []).shape == (0,)
-    assert oracle.potential_energy([]) == pytest.approx(9.81)
-
-
 def test_a_quaternion_stands_for_its_rotation():
     """The length of a quaternion, which a double misses by an eps, changes nothing."""
     model = random_tree(0, 4, ("ball", "free"))

@@ -238,14 +238,6 @@ def test_dynamics_at_values_are_pickled(open_machine, batch):
     assert again.model == dyn.model
 
 
-def test_rollouts_follow_the_values():
-    model = mb.catalog.double_pendulum(mass1=mb.Parameter("m1", 2.0), length2=mb.Parameter("l2", 0.7))
-    dyn = mb.dynamics(model, "lagrangian").at(m1=3.0, l2=1.2)
-    plain = mb.dynamics(mb.catalog.double_pendulum(mass1=3.0, length2=1.2), "lagrangian")
-    runs = [mb.simulate(d, [0.4, 0.3], [0.0, 0.1], 0.2, dt=1e-3) for d in (dyn, plain)]
-    assert off(runs[0].q, runs[1].q) < 1e-12
-
-
 def test_missing_values_are_named(open_machine):
     model, dyn = open_machine
     values = draw(1)
@@ -287,15 +279,6 @@ def test_wrong_values_are_refused(open_machine):
 
 
 # The description
-
-
-def test_plain_models_know_no_parameters():
-    model = mb.load("ur5")
-    assert dict(model.parameters) == {}
-    assert model.form_digest == model.digest
-    assert model.with_parameters() == model
-    with pytest.raises(UnknownNameError, match="there are: none"):
-        model.with_parameters(m=1.0)
 
 
 def test_values_fixed_one_by_one_or_at_once():
@@ -521,18 +504,6 @@ def test_numpy_scalars_and_arrays_combine():
         nominal((-p) ** 0.5)
 
 
-@pytest.mark.parametrize("name", ["", None, 1])
-def test_parameters_have_names(name):
-    with pytest.raises(InputError, match="expected a name"):
-        mb.Parameter(name, 1.0)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, "1", True])
-def test_parameters_have_finite_values(value):
-    with pytest.raises(InputError, match="Parameter 'm'"):
-        mb.Parameter("m", value)
-
-
 # The model's numbers as symbols
 
 
@@ -589,11 +560,6 @@ def test_equal_numbers_share_a_symbol():
     # Length and mass 1, half a length, the rod's inertia, and gravity.
     assert len(eq.constant_values) == 4
     assert eq.constants.numel() == 4
-
-
-def test_unknown_kinds_of_constants_are_refused():
-    with pytest.raises(InputError, match="constants: expected 'literal' or 'symbols'"):
-        Equations(mb.catalog.pendulum(), "floats")
 
 
 @pytest.mark.parametrize("which", [[False, True], 1, [0.5], [[0]], "a"])

@@ -28,19 +28,6 @@ def assert_as_the_oracle(model, n: int = 4) -> None:
             assert np.abs(x - y).max() < 1000 * factor * EPS * max(1.0, np.abs(y).max())
 
 
-@pytest.mark.thorough("ball", "planar", "free")
-@pytest.mark.parametrize("kind", RIGHT)
-def test_each_joint_type_as_the_oracle(kind):
-    assert_as_the_oracle(random_tree(3, 4, (kind,), springs=False, damping=False))
-
-
-@pytest.mark.thorough("1-True")
-@pytest.mark.parametrize(("seed", "mimic"), [(0, False), (1, True)])
-def test_trees_of_all_types_as_the_oracle(seed, mimic):
-    model = random_tree(seed, 8, RIGHT, springs=False, damping=False, mimic=mimic)
-    assert_as_the_oracle(model)
-
-
 def test_joint_springs_dampers_armature_and_couplings():
     b = mb.ModelBuilder("arm", gravity=(0.0, -3.0, -9.0))
     parent = "world"
@@ -74,12 +61,6 @@ def test_point_springs_are_refused():
     dyn = mb.dynamics(random_tree(0, 3, ("revolute",)), "pinocchio")
     with pytest.raises(UnsupportedError, match=r"spring '.*' between two points"):
         dyn.forward_dynamics_derivatives(*(x[0] for x in states(dyn.model, 1)[:3]))
-
-
-def test_mujoco_says_that_it_has_none():
-    dyn = mb.dynamics(mb.catalog.pendulum(), "mujoco")
-    with pytest.raises(UnsupportedError, match=r"mujoco cannot give forward_dynamics_derivatives.*lagrangian"):
-        dyn.forward_dynamics_derivatives([0.1], [0.2], [0.0])
 
 
 def test_rodas5_on_pinocchio_needs_no_derivation(monkeypatch):

@@ -254,33 +254,6 @@ def test_on_a_turning_table_coriolis_and_centrifugal_forces_come_out():
 # Running
 
 
-@pytest.mark.thorough("compiled")
-@pytest.mark.parametrize("compiled", [False, True], ids=["interpreted", "compiled"])
-def test_body_turns_the_same_way_in_all_forms(pair, compiled):
-    """From Euler angles, from body rates, and with quaternions: one motion."""
-    whole, quasi = pair
-    q, rates = np.array([0.1, 0.9, 0.2]), np.array([0.5, 2.0, -1.0])
-    times, options = np.linspace(0.0, 4.0, 9), {"compile": compiled}
-    v = quasi.to_velocity(q, rates)
-    angles = mb.simulate(whole.dynamics(options=options), q, v, 4.0, "rk853", rtol=1e-13, save=times)
-    euler = mb.simulate(quasi.dynamics(options=options), q, rates, 4.0, "rk853", rtol=1e-13, save=times)
-    assert euler.q == pytest.approx(angles.q, abs=CLOSE)
-    assert quasi.to_velocity(euler.q, euler.v) == pytest.approx(angles.v, abs=CLOSE)
-    assert euler.energy() == pytest.approx(angles.energy(), rel=1e-12)
-    # A box of these moments: I = m/12 (b² + c²) and so on.
-    squares = np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0]]) / 12.0
-    sides = np.sqrt(np.linalg.solve(squares, list(VALUES.values())))
-    dyn = mb.dynamics(mb.catalog.free_body(mass=1.0, sides=tuple(sides)), "lagrangian", **options)
-    start = attitude(q)
-    quaternion = np.append([start[2, 1] - start[1, 2], start[0, 2] - start[2, 0], start[1, 0] - start[0, 1]], 0.0)
-    quaternion[3] = 1 + np.trace(start)
-    quaternion /= np.linalg.norm(quaternion)
-    box = mb.simulate(dyn, [0, 0, 0, *quaternion], [0, 0, 0, *rates], 4.0, "rk853", rtol=1e-13, save=times)
-    assert box.v[:, 3:] == pytest.approx(euler.v, abs=CLOSE)
-    for ours, theirs in zip(euler.q, box.q, strict=True):
-        assert attitude(ours) == pytest.approx(matrix(theirs[3:]), abs=CLOSE)
-
-
 #: What each method leaves behind after a second at 2 ms, or at 1e-11 a step.
 METHODS = {
     "rk853": 1e-10, "taylor": 1e-10, "dop853": 1e-10, "lsoda": 1e-9, "radau": 1e-8, "bdf": 1e-6,
@@ -353,16 +326,6 @@ def test_torque_functions_and_their_work(pair):
     assert run.energy() - run.energy()[0] == pytest.approx(run.work(), abs=1e-9)
     run = mb.simulate(dyn, q, rates, 0.5, "rk4", dt=2e-3, torque=np.array([0.1, 0.2, 0.3]))
     assert run.energy() - run.energy()[0] == pytest.approx(run.work(), abs=1e-9)
-
-
-def test_implicit_midpoint_is_the_same_in_both_forms(pair):
-    """Both hold the coordinates' own momenta, so that they take the very same steps."""
-    whole, quasi = pair
-    q, rates = np.array([0.1, 0.9, 0.2]), np.array([0.5, 2.0, -1.0])
-    ours = mb.simulate(quasi.dynamics(options={"compile": False}), q, rates, 1.0, "implicit_midpoint", dt=1e-2)
-    v = quasi.to_velocity(q, rates)
-    theirs = mb.simulate(whole.dynamics(options={"compile": False}), q, v, 1.0, "implicit_midpoint", dt=1e-2)
-    assert ours.q == pytest.approx(theirs.q, abs=1e-12)
 
 
 def test_derivatives_are_along_the_columns(pair):

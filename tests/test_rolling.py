@@ -12,11 +12,10 @@ import pytest
 
 import mbkit as mb
 from mbkit.errors import InputError, ModelError, NumericalError, UnsupportedError
-from mbkit.model import Model, Parameter
+from mbkit.model import Model
 from tests.scenes import mounted
 from validation import bicycle as paper
 
-EPS = float(np.finfo(float).eps)
 KINDS = ("blade of a", "blade of b", "disc", "sphere")
 #: The body whose plane or direction it is: the ground; one that shares joints with the wheel; the wheel's own carrier.
 GROUNDS = ("world", "plate", "base")
@@ -420,21 +419,6 @@ def test_a_wheel_in_a_plane_keeps_the_rows_that_say_something() -> None:
         assert dyn.constraint_names == ("no slip 'ground' forward velocity",)
         a = dyn.forward_dynamics(np.zeros(2), np.array([1.0, 2.0]), np.array([1.0, 0.0]))
         assert np.abs(a - np.array([1.0, 2.0]) / (3 + 0.2 * 4)).max() < 1e-15
-
-
-def test_parameters_stand_for_radius_place_and_speed() -> None:
-    model = mb.catalog.rolling_disc(radius=Parameter("R", 0.5))
-    dyn = mb.dynamics(model, "lagrangian")
-    assert dict(model.parameters) == {"R": 0.5}
-    other = mb.catalog.rolling_disc(radius=0.7)
-    assert model.with_parameters(R=0.7) == other
-    q, v = other.random_state(3)
-    tau = np.ones(6)
-    exact = mb.dynamics(other, "lagrangian").forward_dynamics(q, v, tau)
-    assert np.allclose(dyn.at(R=0.7).forward_dynamics(q, v, tau), exact, rtol=1e-12)
-    moving = cart(axles=1, speed=Parameter("u"))
-    q, v = mb.dynamics(moving, "lagrangian").at(u=0.3).project(np.zeros(3), np.zeros(3))
-    assert v[1] == pytest.approx(0.3)
 
 
 def test_a_description_carries_it_everywhere() -> None:

@@ -11,7 +11,6 @@ import pytest
 import mbkit as mb
 from mbkit.errors import InputError, NumericalError, UnsupportedError
 from tests.random_trees import random_tree, states
-from tests.scenes import mounted
 
 EPS = np.finfo(float).eps
 
@@ -119,14 +118,6 @@ def test_without_parameters_and_without_duration(arm):
     assert repr(out) == "<Sensitivities of 'double_pendulum': states (1,), 2nv = 4, p = 0>"
     none = mb.sensitivities(arm, np.empty((0, 2)), np.empty((0, 2)), 0.1, dt=0.05)
     assert none.state.shape == (0, 3, 4, 4)
-
-
-def test_of_a_model_that_cannot_move():
-    b = mounted("wall", "brick", "mortar", "fixed", mass=1.0)
-    dyn = mb.dynamics(b.build(), "lagrangian")
-    assert mb.sensitivities(dyn, [], [], 0.1, dt=0.05).state.shape == (3, 0, 0)
-    assert dyn.linearize([], [], []).discretize(0.1).A.shape == (0, 0)
-    assert dyn.discretize([], [], [], 0.1, "implicit_midpoint").A.shape == (0, 0)
 
 
 def test_what_cannot_be_differentiated_is_refused(arm):

@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from mbkit import catalog, dynamics, simulate
 from mbkit.cli import cli
-from mbkit.report import figures
+from mbkit.studies import svg
 from tests.test_report import AGREEING, STUDY
 from tests.test_stress_report import RESULT
 
@@ -30,7 +30,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def undrawn(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # noqa: ARG001
     """What a test does not look at is not drawn: that would be most of its time."""
-    monkeypatch.setattr(figures, "image", lambda _: b"")
+    monkeypatch.setattr(svg, "image", lambda _: b"")
 
 
 def call(*arguments: str) -> Result:
@@ -54,7 +54,7 @@ def test_a_run_is_the_librarys_and_is_written_whole(here: Path, monkeypatch: pyt
     assert (folder / "cart_pole-plot.png").read_bytes().startswith(b"\x89PNG")
     assert f"{run.q[-1, 1]:.6g}" in result.stdout
     assert "cart_pole-picture.png" in result.stdout
-    monkeypatch.setattr(figures, "image", lambda _: b"")
+    monkeypatch.setattr(svg, "image", lambda _: b"")
     # What mbkit wrote, it replaces; what somebody else wrote, it does not.
     assert call("simulate", "cart_pole", "--duration", "0.01").exit_code == 0
     (folder / "cart_pole-trajectory.csv").write_text("mine")

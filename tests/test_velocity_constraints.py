@@ -8,7 +8,6 @@ from functools import cache
 import numpy as np
 import pytest
 import sympy as sp
-from scipy.integrate import solve_ivp
 
 import mbkit as mb
 from mbkit.errors import DoubtfulRunWarning, InputError, NumericalError, UnsupportedError
@@ -115,32 +114,6 @@ def test_a_knife_edge_on_a_slope_draws_a_cycloid() -> None:
     turned = rate * out.t
     expected = force / (2 * rate**2) * np.stack([np.sin(turned) ** 2, turned - np.sin(2 * turned) / 2], axis=1)
     assert out.q[:, :2] == pytest.approx(expected, abs=CLOSE)
-
-
-def test_a_ball_on_a_turning_table_goes_in_circles_at_two_sevenths_of_its_rate() -> None:
-    lag = ball()
-    q, v = lag.project([1.0, 0.3, 0.2, 1.4, 0.1], [0.4, -0.1, 0.3, 0.2, 0.5])
-    out = run(lag, q, v, 2.0)
-    turn = 2 / 7 * 1.5
-    # v' = (2/7) Omega z × v.
-    c, d = np.cos(turn * out.t), np.sin(turn * out.t)
-    expected = np.stack([v[0] * c - v[1] * d, v[0] * d + v[1] * c], axis=1)
-    assert out.v[:, :2] == pytest.approx(expected, abs=CLOSE)
-    middle = q[:2] + np.array([-v[1], v[0]]) / turn
-    assert np.linalg.norm(out.q[:, :2] - middle, axis=1) == pytest.approx(np.linalg.norm(v[:2]) / turn, abs=CLOSE)
-
-
-def test_a_disc_keeps_its_steady_motion() -> None:
-    lag, tilt, heading = disc(), 0.3, 1.7
-    # phi' cos θ (phi' (I1 - I3 - m r²) sin θ - psi' (I3 + m r²)) = m g r sin θ (Neimark and Fufaev 1972, ch. VI).
-    spin = ((0.25 - 1.5) * heading * np.sin(tilt) - 9.81 * np.tan(tilt) / heading) / 1.5
-    q = np.array([0.0, 0.0, 0.4, tilt, 0.0])
-    v = np.array([-spin * np.cos(0.4), -spin * np.sin(0.4), heading, 0.0, spin])
-    assert lag.dynamics().forward_dynamics(q, v, np.zeros(5))[2:] == pytest.approx(np.zeros(3), abs=100 * EPS)
-    out = run(lag, q, v, 2.0)
-    assert out.q[:, 3] == pytest.approx(tilt, abs=CLOSE)
-    middle = q[:2] + spin / heading * np.array([np.sin(0.4), -np.cos(0.4)])
-    assert np.linalg.norm(out.q[:, :2] - middle, axis=1) == pytest.approx(abs(spin / heading), abs=CLOSE)
 
 
 @pytest.mark.parametrize(("i1", "i3"), [(0.25, 0.5), (0.5, 1.0)])
@@ -320,17 +293,6 @@ def test_suslov_s_body_has_two_short_equations() -> None:
         held = D * Odot1 + E * Odot2 + (B - A) * O1 * O2
         assert sp.expand(e.reactions[0] - held) == 0
         assert len(str(e)) < 70
-
-
-def test_the_reduced_form_runs_to_the_same_end() -> None:
-    lag = disc()
-    e, q = lag.maggi(), [0.1, 0.2, 0.3, 0.2, 0.4]
-    q, v = lag.project(q, [0.0, 0.0, 1.0, 0.3, 4.0])
-    out = run(lag, q, v, 1.0)
-    y0 = np.concatenate([q, e.to_quasi_velocity(q, v)])
-    end = solve_ivp(e.field(), (0, 1), y0, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-    assert end[:5] == pytest.approx(out.q[-1], abs=1e-9)
-    assert e.to_velocity(end[:5], end[5:]) == pytest.approx(out.v[-1], abs=1e-9)
 
 
 def test_rows_put_into_t_before_give_other_equations() -> None:
