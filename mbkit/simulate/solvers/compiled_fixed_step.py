@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -168,29 +167,22 @@ def run_rollout(
 
     def suspects_of(members: Indices, *, thorough: bool) -> Indices:
         """Take members of the batch to the end; return those that were not bounded, or lost to their constraints."""
-        n, squares = len(members), np.zeros(len(members))
+        squares = np.zeros(len(members))
         if dyn.device is not None and problem.batch is not None and clock is None and problem.torque.samples is None:
             from mbkit.simulate.solvers.compiled_device_steps import step_on_device
 
             squares = step_on_device(problem, record, w0, members, thorough=thorough)
             return members[~(squares < BOUND**2)]
         plan = dyn._step_plan(method, thorough=thorough, fed=law is not None, behind=behind)
-        # Parts that wait for one another have a thread each.
-        parts = _split(n, _widest(plan) if problem.torque.samples is None else max(-(-n // workers), 1), workers)
 
-        def new_loop() -> Callable[[Indices], Chunk]:
-            # The parts differ by one state at most.
-            return partial(begin, new_chunk(plan, -(-n // len(parts)), all_kept=dense))
+        def new_loop(width: int) -> Callable[[Indices], Chunk]:
+            return partial(begin, new_chunk(plan, width, all_kept=dense))
 
         def after_part(chunk: Chunk, part: slice) -> None:
             squares[part] = chunk.now("squares")[0]
 
-        def velocity(t: float, q: Array, w: Array, members: Indices) -> Array:  # noqa: ARG001
-            return to_body_velocity(space, q, w)
-
-        record.error = run_members(
-            problem, record, members, parts, workers, new_loop, velocity, read_margins, after_part
-        )
+        velocity = lambda _t, q, w, _members: to_body_velocity(space, q, w)  # noqa: E731
+        run_members(problem, record, members, _widest(plan), workers, new_loop, velocity, read_margins, after_part)
         # A NaN is not below anything.
         return members[~(squares < BOUND**2)]
 
@@ -210,7 +202,7 @@ def run_rollout(
             members = suspects[first : first + _widest(plan)]
             chunk = begin(new_chunk(plan, len(members), all_kept=True, watched=True), members)
             for _, last in run_blocks(problem, record, chunk, members):
-                lost |= last
+                lost |= last or {}
 
     def why(i: int) -> str:
         k, (q, w) = int(record.good[i]), lost[i]
@@ -223,17 +215,6 @@ def run_rollout(
 
     record.evaluations = method_of(method).stages * (int(record.good.sum()) + len(lost))
     return record.result(why)
-
-
-def _split(n: int, widest: int, workers: int) -> list[slice]:
-    """Return parts of about equal size, none above `widest`, as many as keep every worker busy."""
-    if not n:
-        return []
-    rounds = -(-n // (widest * workers))
-    # A core's vectors hold eight states: fewer are no work to share out.
-    parts = max(1, min(rounds * workers, n // 8))
-    ends = [n * i // parts for i in range(parts + 1)]
-    return [slice(a, b) for a, b in pairwise(ends)]
 
 
 def _run_step_by_step(problem: IntegrationProblem) -> SolverResult:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
+from itertools import pairwise
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -153,74 +155,20 @@ def padded(count: int) -> int:
     return -(-count // LANES) * LANES | LANES
 
 
-class SampleBarrier:
-    """Asks a torque that samples, once at each sample for all parts of a batch, which wait there for one another.
-
-    velocity(t, q, w, members) is mbkit's velocity of states (n, nq) and (n, nv).
-    """
-
-    def __init__(
-        self, problem: IntegrationProblem, parts: int, velocity: Callable[[float, Array, Array, Indices], Array]
-    ) -> None:
-        self._problem, self._velocity, self._k = problem, velocity, 0
-        self._loops: list[tuple[BlockLoop, Indices]] = []
-        self._barrier, self._left = threading.Barrier(parts, self._ask) if parts > 1 else None, False
-        #: Error of a torque function that failed.
-        self.error: FunctionError | None = None
-
-    def join(self, loop: BlockLoop, members: Indices) -> None:
-        """Add a part."""
-        self._loops.append((loop, members))
-
-    def __call__(self, k: int) -> bool:
-        """Ask at a step, when all parts are there; return whether to go on."""
-        self._k = k
-        if self._barrier is None:
-            self._ask()
-        elif self._left:
-            # Who leaves would wait for a turn beside many parts that meet often.
-            raise threading.BrokenBarrierError
-        else:
-            self._barrier.wait()
-        return self.error is None
-
-    def leave(self) -> None:
-        """Let nobody wait for a part that goes no further."""
-        self._left = True
-        if self._barrier is not None:
-            self._barrier.abort()
-
-    def _ask(self) -> None:
-        problem, k, t = self._problem, self._k, self._problem.grid.time(self._k)
-        members: Indices = np.concatenate([who[loop.alive] for loop, who in self._loops])
-        if not len(members):
-            return
-        order, states = np.argsort(members), list[Array]()
-        for name in self._loops[0][0].carried:
-            states.append(np.concatenate([loop.now(name).T[loop.alive] for loop, _ in self._loops])[order])
-        q, w = states
-        v = self._velocity(t, q, w, members[order])
-        try:
-            problem.torque.sample(k, t, q, v, members[order])
-        except FunctionError as error:
-            self.error = error
-
-
 def run_blocks(
     problem: IntegrationProblem,
     record: GridRecord,
     loop: BlockLoop,
     members: Indices,
-    barrier: SampleBarrier | None = None,
-) -> Iterator[tuple[int, dict[int, list[Array]]]]:
+) -> Iterator[tuple[int, dict[int, list[Array]] | None]]:
     """Take members of the batch, which are in the loop, through the run in blocks.
 
-    Yields the number of steps after each block, and the last good state of the trajectories that were lost in it.
-    Within a block it stops at samples, where all parts of a batch meet.
+    Yields the number of steps after each block, and the last good state of the trajectories that were lost in it; None
+    in place of these at a sample, before which the torque is to be asked.
     """
     grid, torque, kept = problem.grid, problem.torque, record.kept
     k, torques, alive = 0, np.empty(0), np.full(len(members), True)
-    samples, going = [*reversed(torque.changes(grid.steps))], True
+    samples = [*reversed(torque.changes(grid.steps))]
     # Most parts of a batch are contiguous, which is read and written faster.
     whole = slice(int(members[0]), int(members[-1]) + 1)
     which: slice | Indices = whole if whole.stop - whole.start == len(members) else members
@@ -234,8 +182,8 @@ def run_blocks(
             while at < k + n:
                 if samples and samples[-1] == at:
                     samples.pop()
-                    going = barrier is None or barrier(at)
-                    if not going:
+                    yield at, None
+                    if record.error is not None:
                         break
                 end = min(k + n, samples[-1]) if samples else k + n
                 if torque.held or not torques.size:
@@ -256,7 +204,7 @@ def run_blocks(
                     last[int(members[m])] = [loop.states(name, [good[m]])[m, 0] for name in loop.carried]
                 alive &= good == n
             yield k + n, last
-            if not going or (last and barrier is None and not alive.any()):
+            if record.error is not None or (last and not alive.any()):
                 return
             loop.again()
             k += n
@@ -266,62 +214,91 @@ def run_members(
     problem: IntegrationProblem,
     record: GridRecord,
     members: Indices,
-    parts: Sequence[slice],
+    widest: int,
     workers: int,
-    new_loop: Callable[[], Callable[[Indices], _Loop]],
+    new_loop: Callable[[int], Callable[[Indices], _Loop]],
     velocity: Callable[[float, Array, Array, Indices], Array],
     after_block: Callable[[_Loop, Indices, int, dict[int, list[Array]]], None],
     after_part: Callable[[_Loop, slice], None],
-) -> FunctionError | None:
-    """Take members of a batch to the end; return the error of a torque function that samples.
+) -> None:
+    """Take members of a batch to the end, or up to where a torque function that samples fails.
 
-    Their parts run in threads, at most `workers`; parts that meet at samples wait for one another, in a thread each.
-    new_loop(), called in each thread, returns begin(members), the loop with these states in it. `after_block` gets the
-    loop, its members and what `run_blocks` yields; velocity is as in `SampleBarrier`.
+    They go in parts of at most `widest` states in at most `workers` threads; under a torque that samples, which is
+    asked once for all, in a part for each thread. new_loop(width), called in each thread, returns begin(members), the
+    loop with these states in it, at most `width`; velocity(t, q, w, members) is mbkit's of states (n, nq) and (n, nv).
+    `after_block` gets the loop, its members and what `run_blocks` yields.
     """
-    barrier = None if problem.torque.samples is None else SampleBarrier(problem, len(parts), velocity)
-    done, left, stop, bar = [0] * len(parts), iter(list(enumerate(parts))), threading.Event(), problem.bar
-    total = max(len(parts) * problem.grid.steps, 1)
+    grid, torque, bar = problem.grid, problem.torque, problem.bar
+    sampled, n = torque.samples is not None, len(members)
+    parts = _split(n, max(-(-n // workers), 1) if sampled else widest, workers)
+    width = max((part.stop - part.start for part in parts), default=0)
+    ways: dict[int, tuple[_Loop, Iterator[tuple[int, dict[int, list[Array]] | None]]]] = {}
+    done, stop, local = [0] * len(parts), threading.Event(), threading.local()
+    total = max(len(parts) * grid.steps, 1)
 
-    def work(report: Callable[[], None]) -> None:
-        begin = new_loop()
-        # A list's iterator hands each part to one thread.
-        for i, part in left:
-            own = members[part]
+    def advance(i: int) -> bool:
+        """Take a part to its next sample, or to the end; return whether it waits there."""
+        own = members[parts[i]]
+        if i not in ways:
+            begin = getattr(local, "begin", None)
+            if begin is None or sampled:
+                begin = local.begin = new_loop(width)
             loop = begin(own)
-            if barrier is not None:
-                barrier.join(loop, own)
-            try:
-                for done[i], lost in run_blocks(problem, record, loop, own, barrier):
-                    after_block(loop, own, done[i], lost)
-                    report()
-                    if stop.is_set():
-                        return
-            except threading.BrokenBarrierError:
-                # Another part was stopped.
-                pass
-            except BaseException:
-                if barrier is not None:
-                    barrier.leave()
-                raise
-            after_part(loop, part)
+            ways[i] = loop, run_blocks(problem, record, loop, own)
+        loop, blocks = ways[i]
+        for done[i], lost in blocks:
+            if lost is None:
+                return True
+            after_block(loop, own, done[i], lost)
+            if pool is None:
+                bar.update(sum(done) / total)
+            if stop.is_set():
+                return False
+        after_part(loop, parts[i])
+        return False
 
-    workers = min(workers, len(parts)) if barrier is None else len(parts)
-    if workers < 2:
-        if parts:
-            work(lambda: bar.update(sum(done) / total))
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            waiting: set[Future[None]] = {pool.submit(work, lambda: None) for _ in range(workers)}
+    def ask(waiting: list[int]) -> None:
+        loops = [(ways[i][0], members[parts[i]]) for i in waiting]
+        who: Indices = np.concatenate([own[loop.alive] for loop, own in loops])
+        if len(who):
+            k = done[waiting[0]]
+            q, w = (np.concatenate([loop.now(name).T[loop.alive] for loop, _ in loops]) for name in loops[0][0].carried)
             try:
-                while waiting:
-                    finished, waiting = wait(waiting, timeout=0.1, return_when=FIRST_EXCEPTION)
-                    for future in finished:
-                        future.result()
-                    bar.update(sum(done) / total)
-            finally:
-                stop.set()
-                if barrier is not None:
-                    # A block may take as long as all its samples.
-                    barrier.leave()
-    return None if barrier is None else barrier.error
+                torque.sample(k, grid.time(k), q, velocity(grid.time(k), q, w, who), who)
+            except FunctionError as error:
+                record.error = error
+
+    def outcome(future: Future[bool]) -> bool:
+        while True:
+            try:
+                return future.result(timeout=0.1)
+            except TimeoutError:
+                if future.done():
+                    raise
+                bar.update(sum(done) / total)
+
+    waiting, several = [*range(len(parts))], min(workers, len(parts)) > 1
+    with ThreadPoolExecutor(min(workers, len(parts))) if several else nullcontext() as pool:
+        try:
+            while waiting:
+                if pool is None:
+                    waiting = [i for i in waiting if advance(i)]
+                else:
+                    futures = [pool.submit(advance, i) for i in waiting]
+                    waiting = [i for i, future in zip(waiting, futures, strict=True) if outcome(future)]
+                bar.update(sum(done) / total)
+                if waiting:
+                    ask(waiting)
+        finally:
+            stop.set()
+
+
+def _split(n: int, widest: int, workers: int) -> list[slice]:
+    """Return parts of about equal size, none above `widest`, as many as keep every worker busy."""
+    if not n:
+        return []
+    rounds = -(-n // (widest * workers))
+    # A core's vectors hold eight states: fewer are no work to share out.
+    parts = max(1, min(rounds * workers, n // 8))
+    ends = [n * i // parts for i in range(parts + 1)]
+    return [slice(a, b) for a, b in pairwise(ends)]

@@ -174,12 +174,7 @@ def run_implicit(
     """
     dyn, record, grid = problem.dyn, GridRecord(problem), problem.grid
     assert isinstance(dyn, LagrangianDynamics)
-    values, n = dyn._parameter_values, len(other)
-    count, workers = -(-n // WIDEST), dyn.threads or cores()
-    if problem.torque.samples is not None:
-        # Parts that wait for one another have a thread each.
-        count = min(count, workers)
-    ends = [n * i // max(count, 1) for i in range(count + 1)]
+    values = dyn._parameter_values
     # Threads append to it, and write their own members.
     iterations, lost = list[int](), dict[int, list[Array]]()
 
@@ -189,8 +184,8 @@ def run_implicit(
         chunk.begin(*(x[members] for x in own), *([] if values.ndim == 2 else [values]))
         return chunk
 
-    record.error = run_members(
-        *(problem, record, np.arange(n), [slice(a, b) for a, b in pairwise(ends)], workers, lambda: begin, velocity),
+    run_members(
+        *(problem, record, np.arange(len(other)), WIDEST, dyn.threads or cores(), lambda _: begin, velocity),
         after_block=lambda _chunk, _members, _k, last: lost.update(last),
         after_part=lambda chunk, _part: iterations.append(chunk.iterations),
     )
@@ -210,10 +205,7 @@ def run_collocation(problem: IntegrationProblem, tableau: ImplicitTableau) -> So
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         tau = np.broadcast_to(first, (len(q0), first.shape[-1]))
         guess = dyn._code(parts.start.name, make=parts.start.make)(q0, v0, w0, tau, *more)[0][..., 0]
-
-        def velocity(t: float, q: Array, w: Array, members: Indices) -> Array:  # noqa: ARG001
-            return to_body_velocity(space, q, w)
-
+        velocity = lambda _t, q, w, _members: to_body_velocity(space, q, w)  # noqa: E731
         record, iterations, lost = run_implicit(problem, parts, w0, guess, velocity)
         if not space.flat:
             # The start is there already, as it was given.
