@@ -19,7 +19,7 @@ K = TypeVar("K")
 V = TypeVar("V")
 _MAX_SUMMED: Final = 64
 #: Numbers of a piece of an array that is checked and copied in pieces.
-_PIECE: Final = 2**16
+_PIECE_SIZE: Final = 2**16
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 3, 60, 120, 60
 
@@ -74,16 +74,16 @@ def finite_array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     array = real_array(name, value)
     if array.shape != shape:
         raise InputError(f"{name}: expected shape {shape}, got {array.shape}")
-    if array.size <= _PIECE:
+    if array.size <= _PIECE_SIZE:
         require_finite(name, array)
         return array.copy()
     # In pieces that stay in a cache; between them Ctrl-C is heard.
     flat, out = array.reshape(-1), np.empty(array.size)
-    for start in range(0, len(flat), _PIECE):
-        piece = flat[start : start + _PIECE]
+    for start in range(0, len(flat), _PIECE_SIZE):
+        piece = flat[start : start + _PIECE_SIZE]
         if not all_finite(piece):
             require_finite(name, array)
-        out[start : start + _PIECE] = piece
+        out[start : start + _PIECE_SIZE] = piece
     return out.reshape(shape)
 
 

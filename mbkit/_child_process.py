@@ -33,12 +33,12 @@ from mbkit import _interrupt
 from mbkit.errors import UnsupportedError
 
 OUT_OF_MEMORY: Final = "it took more memory than allowed"
-#: A call that computes little is ended after so many times its processor time on the wall's clock.
-_WALL_PER_CPU: Final = 4.0
+#: Wall-clock limit as a multiple of the CPU limit.
+_WALL_SECONDS_PER_CPU_SECOND: Final = 4.0
 #: The longest and the shortest time between two looks at a process, s.
 _LONGEST_WAIT, _SHORTEST_WAIT = 3600.0, 0.05
 #: Seconds that may pass between two parts of a message.
-_STUCK: Final = 60.0
+_MAX_SILENT_SECONDS: Final = 60.0
 #: Characters of a process's output that are read after it died, and of its last line.
 _TAIL, _LAST = 20_000, 300
 
@@ -132,7 +132,7 @@ class Child:
             raise
         # Neither side waits for ever for the rest of a message.
         for option in (socket.SO_SNDTIMEO, socket.SO_RCVTIMEO):
-            ours.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(_STUCK), 0))
+            ours.setsockopt(socket.SOL_SOCKET, option, struct.pack("ll", int(_MAX_SILENT_SECONDS), 0))
         self._channel, self._output_before = Connection(ours.detach()), 0
         self.generation += 1
         _running.add(self)
@@ -151,7 +151,7 @@ class Child:
             self._channel.send_bytes(message)
         except BlockingIOError:
             self.end()
-            raise WorkerTimeoutError(_STUCK) from None
+            raise WorkerTimeoutError(_MAX_SILENT_SECONDS) from None
         except OSError:
             raise self._end_dead() from None
         except BaseException:
@@ -167,7 +167,7 @@ class Child:
         if self._process is None or self._channel is None:
             raise WorkerDiedError("the process is gone")
         spent, begun = _processor_seconds(self._process.pid) if seconds < inf else 0.0, time.perf_counter()
-        end, last = begun + seconds, min(begun + _WALL_PER_CPU * seconds, deadline)
+        end, last = begun + seconds, min(begun + _WALL_SECONDS_PER_CPU_SECOND * seconds, deadline)
         try:
             # `Connection.poll` makes such an object each time.
             coming = select.poll()
@@ -278,7 +278,7 @@ def _death(code: int | None, output: str) -> WorkerDiedError:
             name = signal.Signals(-code).name
         name = name or f"signal {-code}"
         ended = f"died of {name}"
-        # What came before Python's own report of the crash.
+        # The output before Python's own report of the crash.
         crash = re.compile(r"Fatal Python error|Current thread|Thread 0x|Extension modules")
         lines = lines[: next((k for k, line in enumerate(lines) if crash.match(line)), None)]
     last = lines[-1] if lines else ""

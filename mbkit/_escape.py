@@ -33,9 +33,9 @@ def html(text: str) -> str:
     return _html.escape(terminal(text))
 
 
-#: What Markdown reads as a mark inside a line; an underscore only where it does not stand inside a word.
+#: Characters that Markdown reads as a mark inside a line; an underscore only where it does not stand inside a word.
 _MARKS: Final = re.compile(r"[\\`*\[\]|~$]|(?<![^\W_])_|_(?![^\W_])")
-#: What it reads as a mark at the beginning of a line, a cell or a list's entry.
+#: Text that it reads as a mark at the beginning of a line, a cell or a list's entry.
 _LEADING: Final = re.compile(r"(?=[#+=>-])|(?<=\d)(?=[.)]\s)")
 
 

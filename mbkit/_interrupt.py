@@ -2,7 +2,7 @@
 
 Python raises KeyboardInterrupt in its main thread after a library call returns, and libraries may swallow, print or
 report it as a failure of their own. So a thread listens too. A command prints one line, is silent from then on, has
-`GRACE` seconds to close its files, and ends. A study that can show a part of its result marks itself with `keeping`:
+`CLOSING_SECONDS` to close its files, and ends. A study that can show a part of its result marks itself with `keeping`:
 there the first Ctrl-C is a KeyboardInterrupt, and the second ends the command.
 
 Only light modules of Python are imported here, because the entry point installs this before anything else.
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 #: Exit status of an interrupted command.
 INTERRUPTED = 130
 #: Seconds in which an interrupted command may close its files.
-GRACE = 0.3
+CLOSING_SECONDS = 0.3
 #: Seconds that the main thread has for what it does at Ctrl-C.
-_PATIENCE = 0.05
+_HANDLER_SECONDS = 0.05
 _LINE = b"interrupted: the command did not finish\n"
 #: To the line's beginning, clear it, and show the cursor that a progress bar hides.
 _CLEAR = b"\r\x1b[2K\x1b[?25h"
@@ -105,7 +105,7 @@ def beside(call: Callable[[], object]) -> None:
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     while thread.is_alive():
-        thread.join(_PATIENCE)
+        thread.join(_HANDLER_SECONDS)
     if errors:
         raise errors[0]
 
@@ -119,7 +119,7 @@ def _listen(listening: int) -> None:
     """End the command from a thread while the main thread is in a library."""
     while True:
         _interrupts.heard += os.read(listening, 64).count(signal.SIGINT)
-        time.sleep(_PATIENCE)
+        time.sleep(_HANDLER_SECONDS)
         if _interrupts.count < _interrupts.heard and (not keeping.depth or _interrupts.heard > 1):
             _begin_end()
 
@@ -139,7 +139,7 @@ def _begin_end() -> None:
 def _end(later: bool = False) -> None:
     """End this process and those that it started, at once or when its files are closed."""
     if later:
-        time.sleep(GRACE)
+        time.sleep(CLOSING_SECONDS)
         while uninterrupted.depth:
             time.sleep(0.01)
     for action in list(_interrupts.at_end):

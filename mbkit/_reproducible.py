@@ -20,8 +20,8 @@ from mbkit.errors import NumericalError
 #: Part of a row that is left of it, once the others are taken away, up to which it follows from them: rounding of J at
 #: a pose that is known to all digits, times the some thousand operations that lead to it.
 DEPENDENT: Final = 1e-12
-#: Of the largest remainder: those that differ by less are equal but for rounding and the digits of a description.
-_TIE: Final = 1e-6
+#: Part of the largest remainder: those that differ by less are equal but for rounding and a description's digits.
+_TIE_RATIO: Final = 1e-6
 
 
 def product(A: Array, B: Array) -> Array:
@@ -72,7 +72,7 @@ def pivoted(rows: Array, dependent: float = DEPENDENT) -> tuple[list[int], list[
         largest = float(norms.max())
         if not largest > dependent:
             break
-        k = int((norms >= (1 - _TIE) * largest).argmax())
+        k = int((norms >= (1 - _TIE_RATIO) * largest).argmax())
         known = basis[: len(order)]
         unit = left[k] - (known @ left[k]) @ known
         unit /= math.sqrt(unit @ unit)

@@ -40,7 +40,7 @@ __all__ = [
 
 # Below this angle the truncated series of the coefficients here are exact to
 # rounding: the first term left out is below 1e-17 relative.
-_SMALL = 1e-2
+_SMALL_ANGLE = 1e-2
 
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -179,10 +179,10 @@ def exp_quaternion(w: Array) -> Array:
     """Return the unit quaternions (..., 4) of rotation vectors w (..., 3), in radians."""
     theta = np.linalg.norm(w, axis=-1, keepdims=True)
     half = theta / 2
-    safe = np.where(theta < _SMALL, 1.0, theta)
+    safe = np.where(theta < _SMALL_ANGLE, 1.0, theta)
     half2 = half * half
     series = 0.5 * (1 - half2 / 6 * (1 - half2 / 20 * (1 - half2 / 42)))
-    scale = np.where(theta < _SMALL, series, np.sin(half) / safe)
+    scale = np.where(theta < _SMALL_ANGLE, series, np.sin(half) / safe)
     return np.concatenate([scale * w, np.cos(half)], axis=-1)
 
 
@@ -205,7 +205,7 @@ def left_jacobian(w: Array) -> Array:
     """
     theta2 = np.sum(w * w, axis=-1)
     theta = np.sqrt(theta2)
-    small = theta < _SMALL
+    small = theta < _SMALL_ANGLE
     safe = np.where(small, 1.0, theta)
     a_series = 0.5 * (1 - theta2 / 12 * (1 - theta2 / 30 * (1 - theta2 / 56)))
     b_series = (1 - theta2 / 20 * (1 - theta2 / 42 * (1 - theta2 / 72))) / 6

@@ -27,7 +27,7 @@ __all__ = ["STRICT", "assert_baseline", "assert_engines_agree", "assert_plausibl
 #: Set to 1, an engine that is not installed fails a test instead of being skipped.
 STRICT = "MBKIT_TEST_STRICT"
 #: Lines of a list in a message: people act on the first few.
-_MAX_LINES = 8
+_MAX_LISTED_LINES = 8
 
 
 def assert_engines_agree(
@@ -219,8 +219,8 @@ def _strict(strict: bool | None) -> bool:
 
 
 def _first(texts: Sequence[str], rest: str) -> list[str]:
-    more = len(texts) - _MAX_LINES
-    return [f"  {text}" for text in texts[:_MAX_LINES]] + ([f"  and {more} more{rest}"] if more > 0 else [])
+    more = len(texts) - _MAX_LISTED_LINES
+    return [f"  {text}" for text in texts[:_MAX_LISTED_LINES]] + ([f"  and {more} more{rest}"] if more > 0 else [])
 
 
 def _comparison_text(result: Comparison, failed: Sequence[Row], refused: Iterable[str]) -> str:

@@ -149,7 +149,7 @@ class Dynamics(ReadOnly, FramesAndMomenta, IndependentMotion, LinearizationQuant
     _acting: tuple[tuple[Frame, ...], str] = ((), LOCAL)
     #: The same dynamics without these wrenches, where there are some.
     _bare: Dynamics | None = None
-    # Of the adapter's methods those that others here use.
+    # These stand in adapters.
     _coriolis_matrix: Callable[..., Any]
     _forward_dynamics: Callable[..., Any]
     _inverse_dynamics_derivatives: Callable[..., Any]

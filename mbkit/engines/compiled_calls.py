@@ -135,11 +135,11 @@ class CompiledStep:
         nq, nv = model.nq, model.nv
         inputs = {"q": nq, "v": nv, "tau": equations.force.numel(), "dt": POSITIVE, "squares": FLOAT}
         inputs |= {name: x.numel() for name, x in equations.extra_arguments.items()}
-        # Of parts behind the step.
+        # These are of parts behind the step.
         self._more = [name for part in plan.parts for name in part.reads if name == "bound"]
         inputs |= {name: plan.sizes[name] for name in self._more}
         self._starts = tuple(start for start, _ in model.quaternions)
-        #: Of q, v, tau, dt, 0.0 and the extra arguments.
+        #: Call of q, v, tau, dt, 0.0 and the extra arguments.
         self.single: Call = python_call(self._steps, inputs, {"q1": (nq,), "v1": (nv,)}, self._starts)
         self._extra = [*self._more, *equations.extra_arguments]
         self._sizes = [inputs[name] for name in ("q", "v", "tau", *self._extra)]

@@ -19,11 +19,11 @@ from mbkit.model.elements.paths import ALL, Path
 if TYPE_CHECKING:
     from mbkit.model import Model
 
-#: Of each row's scale: what rounding and a few typed digits leave of a consistent state.
+#: Residual of a consistent state beside each row's scale: rounding and a few typed digits.
 CONSISTENT: Final = 1e-8
-#: Part of accelerations that is rounding, of sums and of a solution.
+#: Part of accelerations that sums and a solution lose to rounding.
 ROUNDING: Final = 1e-12
-#: Of a unit vector: the entries of rows that depend on each other.
+#: Least entry, in the unit vector of the smallest singular value, of a row that depends on others.
 TAKES_PART: Final = 0.1
 ASKED: Final = frozenset({"row", "speed"}), "it has no loops and no other constraints (add_loop, or constraints=[...])"
 ROWS: Final = Path("constraint rows", "", ALL, asks=ASKED)

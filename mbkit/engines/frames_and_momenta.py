@@ -28,7 +28,7 @@ from mbkit.model.quantities import QUANTITIES, of_groups
 from mbkit.spatial import skew
 
 _EYE, _LAST_ROW = np.eye(3), np.eye(4)[3]
-#: What tells of all matter together.
+#: Quantities of all matter together.
 OF_THE_WHOLE: Final = frozenset(of_groups("whole"))
 
 

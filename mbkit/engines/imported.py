@@ -40,9 +40,9 @@ IMPORTERS = {
 }
 #: Whose importer reads SDF.
 _OF_SDF: Final = "drake"
-_POSE: Final = 6
+_POSE_SIZE: Final = 6
 #: How many numbers elements of SDF hold; sdformat takes the first of more, and a default for none. A pose may be empty.
-_IN_SDF: Final = {"pose": _POSE, "xyz": 3} | dict.fromkeys(
+_IN_SDF: Final = {"pose": _POSE_SIZE, "xyz": 3} | dict.fromkeys(
     (
         *("mass", "ixx", "iyy", "izz", "ixy", "ixz", "iyz", "damping", "spring_stiffness", "spring_reference"),
         *("thread_pitch", "screw_thread_pitch"),
@@ -78,7 +78,7 @@ class Imported:
     #: The importer's messages, and parts of its model that are in none of the terms.
     notes: tuple[str, ...]
     beside: tuple[Beside, ...] = ()
-    #: What the importer holds by constraints, outside of all terms.
+    #: Parts that the importer holds by constraints, outside of all terms.
     constraints: tuple[Loop | Coupler, ...] = ()
     #: Why its loops are not among them, where the engine does not give them.
     hidden: str = ""
@@ -149,7 +149,7 @@ def model_of_sdf(
         raise LoadError(f"{path}: expected an SDF of one <model> and nothing beside it, got {there}")
     numbers = Reader()
     for element in models[0].walk():
-        if (n := _IN_SDF.get(element.tag)) and (element.text or n != _POSE):
+        if (n := _IN_SDF.get(element.tag)) and (element.text or n != _POSE_SIZE):
             n += element.attributes.get("rotation_format") == "quat_xyzw"
             numbers.numbers(replace(element, attributes={"text": element.text}), "text", "model", count=n)
     if numbers.faults:

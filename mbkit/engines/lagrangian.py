@@ -70,7 +70,7 @@ GPU_ARRAYS: Final = Path("gpu under force", "", _ON_GPU, instead="copy them with
 _DERIVATIVES: Final = tuple(of_groups("derivatives"))
 #: Three derivatives side by side, which `_TRIM` puts one behind the other.
 _STACKED: Final = "stacked"
-#: What one compiled function gives, and how its result loses the axes that the quantity does not have.
+#: Compiled functions by name, and how their results lose the axes that the quantity does not have.
 _TRIM: Final[dict[str, Callable[[Array], Array]]] = {
     name: _trimmed(x.shape)
     for name, x in QUANTITIES.items()
@@ -189,13 +189,13 @@ class LagrangianDynamics(Dynamics):
         self._batched: dict[str, Array] = {}
         self._machines: dict[tuple[str, ...], Any] = {}
         self._short: dict[tuple[str, ...], QuantityCall] = {}
-        #: Of those the quantities whose arguments are the state alone.
+        #: Those of them whose arguments are the state alone.
         self._direct: dict[str, QuantityCall] = {}
         self._steps: dict[str, tuple[Method, CompiledStep]] = {}
         #: For steps that the others lose to their constraints.
         self._thorough_steps: dict[str, tuple[Method, CompiledStep]] = {}
         self._wrenched: dict[Any, LagrangianDynamics] = {}
-        #: Of models that differ in the values of parameters alone, by their form.
+        #: Dynamics of models that differ in the values of parameters alone, by their form.
         self._others: dict[str, LagrangianDynamics] = {}
         self._parametric = bool(model.parameters)
 

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 LINEARIZE: Final = Path("linearize", "linearize: not known of", ALL)
 #: Quantities that `parameter_derivatives` differentiates.
 DIFFERENTIABLE: Final = of_groups("equation")
-#: Numbers of derivatives of a batch that are computed at a time, which fit into a processor's cache.
-_SLICE: Final = 2**18
+#: Derivatives of a batch that are computed at a time; so many fit into a processor's cache.
+_MAX_DERIVATIVES_AT_A_TIME: Final = 2**18
 
 
 class DiscreteLinearization(NamedTuple):
@@ -219,7 +219,7 @@ def _blocks(rate: Array, by_q: Array, by_v: Array) -> Array:
 class LinearizationQuantities:
     """The methods of `Dynamics` for control, for parameters, and of second order."""
 
-    # Of `Dynamics`.
+    # These stand in `Dynamics`.
     engine: ClassVar[str]
     model: Model
     _samples: Any
@@ -340,7 +340,7 @@ class LinearizationQuantities:
         The columns of the derivatives are those by δq, δv, τ and the parameters.
         """
         count = len(self.model.parameters) if parameters else 0
-        size = max(1, _SLICE // max(1, 2 * self.model.nv * (3 * self.model.nv + count)))
+        size = max(1, _MAX_DERIVATIVES_AT_A_TIME // max(1, 2 * self.model.nv * (3 * self.model.nv + count)))
         if q.ndim == 2 and len(q) > size:
             slices = [np.arange(k, min(k + size, len(q))) for k in range(0, len(q), size)]
             each = [

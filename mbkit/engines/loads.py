@@ -45,11 +45,11 @@ LOADS: Final = Path(
 class Loads:
     """Wrenches on bodies and in joints; `Dynamics` inherits it."""
 
-    #: Of inverse and forward dynamics those whose methods take wrenches, frames and axes behind their arguments.
+    #: Those of inverse and forward dynamics whose methods take wrenches, frames and axes behind their arguments.
     _takes_wrenches: ClassVar[tuple[str, ...]] = ()
     model: Model
     _evaluate: Callable[..., Array]
-    # Of the other parts of `Dynamics`.
+    # These stand in the other parts of `Dynamics`.
     _mass_matrix: Callable[[Array], Array]
     _inverse_dynamics: Callable[..., Any]
     _forward_dynamics: Callable[..., Any]
@@ -367,7 +367,7 @@ class _Balance:
                 continue
             X, V = self._X[:, self._index[body]], self._dyn.velocity(self._q, self._v, body)
             ends.append(X[:, :3, 3] + _times(X[:, :3, :3], point))
-            # Of the frame of the body's name, which may be another one than its own.
+            # It is that of the frame of the body's name, which may be another one than its own.
             speeds.append(V[:, :3] + np.cross(V[:, 3:], ends[-1] - self._dyn.pose(self._q, body)[:, :3, 3]))
         gap, rate = ends[1] - ends[0], speeds[1] - speeds[0]
         on_first = pull(spring, gap, rate)

@@ -39,7 +39,7 @@ _WRITTEN: Final = FUNCTIONS | CONSTRAINT_FUNCTIONS
 _ARGUMENTS: Final = {
     name: tuple(x for x in QUANTITIES[name].arguments if x != "wrenches") for name in (*_WRITTEN, *BODY_QUANTITIES)
 }
-#: What one function gives together, in this order.
+#: Terms that one function gives together, in this order.
 _TERMS: Final = ("mass_matrix", "coriolis_force", "gravity", "passive", "nle")
 
 
@@ -50,7 +50,7 @@ _Key = tuple[tuple[int, ...], bytes]
 
 
 def _key(x: Array) -> _Key:
-    # Of arrays without entries the shape tells how many states there are.
+    # The shape tells how many states there are, also where arrays have no entries.
     return x.shape, x.tobytes()
 
 
@@ -128,7 +128,7 @@ class OracleDynamics(Dynamics):
         self._values = threading.local()
         self._held: tuple[_Key, _Key, dict[str, Any]] | None = None
         self._digest = model.digest
-        #: Of models that differ in the values of parameters alone, by their form.
+        #: Dynamics of models that differ in the values of parameters alone, by their form.
         self._others: dict[str, OracleDynamics] = {}
 
     def __reduce__(self) -> tuple[type, tuple[Any, ...]]:

@@ -40,16 +40,16 @@ STEP_DERIVATIVE: Final = Path(
     instead="linearize(q, v, tau).discretize(dt) holds the linear system's force",
 )
 _EPS: Final = float(np.finfo(float).eps)
-#: Newton's iterations for the stages of an implicit method, at most, and the part of the numbers' size below which
-#: corrections that stop shrinking are rounding.
-_MOST: Final = 25
-_ROUNDING: Final = 1e-11
+#: Newton's iterations for the stages of an implicit method, and the part of the numbers' size below which corrections
+#: that stop shrinking are rounding.
+_MAX_NEWTON_ITERATIONS: Final = 25
+_STALLED_CORRECTION: Final = 1e-11
 
 
 class Steps:
     """The method of `Dynamics` that takes a step."""
 
-    # Of `Dynamics`.
+    # These stand in `Dynamics`.
     engine: ClassVar[str]
     model: Model
     _step_unchecked: bool
@@ -438,7 +438,7 @@ def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h:
     k = np.zeros((s, size, 2 * n))
     k[..., :n] = w.value.T
     last = np.full(size, np.inf)
-    for _ in range(_MOST):
+    for _ in range(_MAX_NEWTON_ITERATIONS):
         stages = h * np.einsum("ij,jbm->ibm", A, k)
         J, by_x, miss = np.empty((s, size, 2 * n, 2 * n)), np.empty((s, size, 2 * n, columns)), np.empty(k.shape)
         for i in range(s):
@@ -456,7 +456,7 @@ def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h:
             break
     else:
         raise NumericalError(f"{tableau.name}: the iteration does not solve the stages; take shorter steps")
-    # Of w itself the stages depend through their own w.
+    # The stages depend on w through their own w.
     by_w = np.einsum("ibkl,blm->ibkm", J[..., n:], w0.slope.swapaxes(0, 1))
     right = (by_x + by_w).swapaxes(0, 1).reshape(size, s * 2 * n, columns)
     slopes = np.linalg.solve(coupled, right).reshape(size, s, 2 * n, columns)
@@ -469,7 +469,7 @@ def _implicit_step(tableau: ImplicitTableau, space: DualSpace, rates: _Rates, h:
 def _settled(change: Array, last: Array, numbers: Array) -> tuple[bool, Array]:
     """Return whether Newton's corrections, one row per state, are rounding of these numbers, and their sizes."""
     far, limit = np.abs(change).max(axis=-1, initial=0.0), np.abs(numbers).max(axis=-1, initial=1.0)
-    done = (far <= 4 * _EPS * limit) | ((far >= last / 2) & (far <= _ROUNDING * limit))
+    done = (far <= 4 * _EPS * limit) | ((far >= last / 2) & (far <= _STALLED_CORRECTION * limit))
     return bool(done.all()), far
 
 
@@ -483,7 +483,7 @@ def momentum_step_slopes(
     n = model.nv
     y = np.concatenate([Space(model).to_integrator_velocity(q, v), v], axis=-1)
     last = np.full(y.shape[:-1], np.inf)
-    for _ in range(_MOST):
+    for _ in range(_MAX_NEWTON_ITERATIONS):
         residual, by_y, by_x, q1, q1_by_y, q1_by_x = equations(q, y[..., :n], y[..., n:])
         change = np.asarray(np.linalg.solve(by_y, residual)[..., 0])
         y = y - change

@@ -40,24 +40,24 @@ from mbkit.spatial import skew
 #: The ten standard parameters of a body, in the order of Khalil and Dombre, and the places of its inertia.
 STANDARD: Final = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "hx", "hy", "hz", "m")
 PAIRS: Final = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-#: What `Dynamics.regressor` may be linear in.
+#: Sets of parameters in which `Dynamics.regressor` may be linear.
 PARAMETER_SETS: Final = ("standard", "base")
 #: Power of a length in the energy of each.
 POWERS: Final = np.array([0] * 6 + [1] * 3 + [2])
 #: Fields of joints in which the torque is linear too: those that lose energy, and those of rotors.
 OF_JOINTS: Final = (Joint.adding_to("loss") + Joint.adding_to("jump"), Joint.adding_to("T"))
-#: What is smaller than this beside the largest is taken as not there, where nobody says otherwise.
+#: Size, beside the largest, below which a number is taken as not there, where nobody says otherwise.
 TOLERANCE: Final = 1e-7
 #: Rounding of a coefficient, and of right angles in a file: π is often written with eleven digits.
-_ROUNDING: Final = 1e-10
+_COEFFICIENT_ROUNDING: Final = 1e-10
 #: Spread of a body's mass, beside the square of the mechanism's length, that counts as none.
-_FLAT: Final = 1e-9
+_MASS_SPREAD_RATIO: Final = 1e-9
 #: How much smaller than the least kept singular value the largest dropped one has to be.
-_GAP: Final = 100.0
+_SINGULAR_VALUE_GAP: Final = 100.0
 #: A column whose independent part is this part of the largest one may be eliminated.
-_ABOUT: Final = 0.1
+_PIVOT_RATIO: Final = 0.1
 #: Poses at which the motion of a joint is sampled.
-_POSES: Final = 4
+_SAMPLED_POSES: Final = 4
 
 
 def _units() -> tuple[Array, Array]:
@@ -232,7 +232,7 @@ def body_of(before: Body, parameters: Array, length: float) -> Body | None:
     c = skew(com)
     inertia = about_origin + mass * c @ c
     spread, axes = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
-    if -_FLAT * mass * length**2 < spread[0] < 0:
+    if -_MASS_SPREAD_RATIO * mass * length**2 < spread[0] < 0:
         spread = np.maximum(spread, 0.0)
         inertia = np.sum(spread) * np.eye(3) - (axes * spread) @ axes.T
     return replace(before, mass=mass, com=com, inertia=inertia)
@@ -294,7 +294,7 @@ def base_parameters(model: Description, tolerance: float) -> BaseParameters:
     if kept:
         matrix, kept = _reduced(model, length, tolerance, matrix, kept)
     scale = np.tile(length**POWERS, len(bodies))
-    matrix[np.abs(matrix) * scale[kept, None] < _ROUNDING * scale] = 0.0
+    matrix[np.abs(matrix) * scale[kept, None] < _COEFFICIENT_ROUNDING * scale] = 0.0
     return BaseParameters(model.name, tuple(names[k] for k in kept), names, standard, matrix)
 
 
@@ -334,13 +334,15 @@ def _points_at_rest(joint: Joint, length: float, tolerance: float) -> tuple[Arra
     Points are homogeneous: (x, 1) at x, and (x, 0) infinitely far in the direction x.
     """
     kind, rng = joint.type, np.random.default_rng(0)
-    q = np.zeros((_POSES, kind.nq))
+    q = np.zeros((_SAMPLED_POSES, kind.nq))
     if kind.quaternion is not None:
         q[:, kind.quaternion + 3] = 1.0
     place = _frame(joint) @ _pose(joint, list(q[:1].T), 1)[0]
-    at = list(kind.integrate(q, rng.standard_normal((_POSES, kind.nv))).T)
+    at = list(kind.integrate(q, rng.standard_normal((_SAMPLED_POSES, kind.nv))).T)
     units = np.diag([length if k in kind.lengths else 1.0 for k in range(kind.nv)])
-    motions = np.concatenate([np.zeros((1, 4)), *(_rate(joint, at, list(v), _POSES).reshape(-1, 4) for v in units)])
+    motions = np.concatenate(
+        [np.zeros((1, 4)), *(_rate(joint, at, list(v), _SAMPLED_POSES).reshape(-1, 4) for v in units)]
+    )
     motions[:, 3] /= length
     _, sizes, axes = np.linalg.svd(motions)
     moving = int(np.sum(sizes > tolerance * sizes[0]))
@@ -369,7 +371,7 @@ def _reduced(
     scale = scale * np.where(columns > tolerance, columns, 1.0)
     _, sizes, axes = np.linalg.svd(np.linalg.qr(Y / scale, mode="r"))
     count = int(np.sum(sizes > tolerance * sizes[0]))
-    if 0 < count < len(sizes) and sizes[count] * _GAP > sizes[count - 1]:
+    if 0 < count < len(sizes) and sizes[count] * _SINGULAR_VALUE_GAP > sizes[count - 1]:
         raise NumericalError(
             f"base parameters: {model.name}: no clear gap between what motion can tell and what it cannot: "
             f"expected singular values far from the tolerance, got {sizes[count - 1] / sizes[0]:.1e} above and "
@@ -391,7 +393,7 @@ def eliminated(null: Array) -> tuple[list[int], Array]:
     left = np.linalg.qr(null.T)[0].T
     for _ in null:
         sizes = np.linalg.norm(left, axis=0)
-        k = int(np.flatnonzero(sizes >= _ABOUT * sizes.max())[-1])
+        k = int(np.flatnonzero(sizes >= _PIVOT_RATIO * sizes.max())[-1])
         gone.append(k)
         across = left[:, k] / sizes[k]
         left = left - np.outer(across, across @ left)

@@ -27,9 +27,9 @@ from mbkit.model.rolling import ROLLING_KINDS, RollingKind
 from mbkit.model.validation import body_faults, fault_sentences, static_bodies, structure_faults, suspects
 
 # The squares of sums of such lengths still fit a double.
-LONGEST: Final = 1e150
-_LONGEST_NAME: Final = 1000
-#: What the builder takes for a vector, and for one number or several.
+MAX_LENGTH: Final = 1e150
+_MAX_NAME_LENGTH: Final = 1000
+#: Types of a vector, and of one number or several, in the builder's methods.
 _Vector = ArrayLike | Sequence[Number]
 _Numbers = ArrayLike | Sequence[Number] | Number
 
@@ -40,7 +40,7 @@ class ArgumentReader:
     def __init__(self) -> None:
         self.faults: list[str] = []
 
-    def name(self, what: str, value: Any, longest: int = _LONGEST_NAME) -> str:
+    def name(self, what: str, value: Any, longest: int = _MAX_NAME_LENGTH) -> str:
         """Return a name: text that UTF-8 can hold, short enough for a message."""
         if not isinstance(value, str):
             self.faults.append(f"{what}: expected a name, got {shown(value)}")
@@ -111,8 +111,8 @@ class ArgumentReader:
         """Return three lengths, or expressions, whose squares do not overflow."""
         lengths = self.quantities(name, value, 3)
         largest = max(abs(nominal(x)) for x in lengths)
-        if largest > LONGEST:
-            self.faults.append(f"{name}: expected lengths up to {LONGEST:g} m, got {largest:g}")
+        if largest > MAX_LENGTH:
+            self.faults.append(f"{name}: expected lengths up to {MAX_LENGTH:g} m, got {largest:g}")
             return np.zeros(3)
         return lengths
 
@@ -281,7 +281,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
         self._gravity = self._numbers("gravity", "", gravity=self._read.quantities("gravity", gravity, 3))["gravity"]
         self._parts: dict[str, list[Any]] = {kind: [] for kind in KINDS_OF_PARTS}
         self._notes: list[str] = []
-        #: Of a model that is edited: bodies that were used as written, and where its shapes are.
+        #: For a model that is edited: bodies that were used as written, and where its shapes are.
         self._odd: set[str] = set()
         self._sources: list[Any] = []
         self._locked: list[tuple[Any, ...]] = []
@@ -659,7 +659,7 @@ class ModelBuilder(ElementBuilder, EditingBuilder):
             # Mimic joints without leaders, and joints that move nothing, are for a connected tree only.
             model = self._assemble(*_resolve(joints, self._bindings))
             inconsistent = suspects(model, point_masses=point_masses)
-        # What a model was used with already stays used.
+        # Bodies that a model was used with already stay used.
         known = {n for n, _ in inconsistent} & self._odd
         negative = {b.name for b in bodies if b.mass < 0}
         static = static_bodies(joints) - negative

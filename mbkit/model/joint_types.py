@@ -421,8 +421,8 @@ def kind_of(name: str) -> JointType:
 _ATTRIBUTES: Final = tuple(JointType.__annotations__)
 _REAL: Final = SimpleNamespace(sin=np.sin, cos=np.cos)
 #: Complex step: derivatives to rounding.
-_STEP: Final = 1e-30
-_ROUNDING: Final = 1e-11
+_COMPLEX_STEP: Final = 1e-30
+_FORMULA_ROUNDING: Final = 1e-11
 
 
 def register_joint_type(joint_type: JointType) -> JointType:
@@ -530,7 +530,7 @@ def _formula_faults(joint_type: JointType) -> Iterator[str]:
     nq, nv, k = joint_type.nq, joint_type.nv, joint_type.quaternion
     try:
         D = np.array([joint_type.qdot(q, e) for e in np.eye(nv).tolist()], dtype=float).T
-        moved = [x + 1j * _STEP * r for x, r in zip(q, joint_type.qdot(q, v), strict=True)]
+        moved = [x + 1j * _COMPLEX_STEP * r for x, r in zip(q, joint_type.qdot(q, v), strict=True)]
         R, p = (np.array(x, dtype=complex) for x in joint_type.placement(_REAL, joint, moved))
         linear, angular = (np.array(x, dtype=float) for x in joint_type.twist(_REAL, joint, q, v))
         g, momentum = np.arange(1.0, nq + 1), np.arange(1.0, nv + 1)
@@ -544,20 +544,20 @@ def _formula_faults(joint_type: JointType) -> Iterator[str]:
         expected = f"expected qdot, R, p, linear, angular, pullback and hamel of nq = {nq} and nv = {nv}"
         yield f"a formula returns another size: {expected}, got shapes {shapes}"
         return
-    if not np.abs(R.real @ R.real.T - np.eye(3)).max() < _ROUNDING or not np.linalg.det(R.real) > 0:
+    if not np.abs(R.real @ R.real.T - np.eye(3)).max() < _FORMULA_ROUNDING or not np.linalg.det(R.real) > 0:
         yield "placement: R is not a rotation matrix"
-    rate, spin = R.real.T @ p.imag / _STEP, R.real.T @ R.imag / _STEP
+    rate, spin = R.real.T @ p.imag / _COMPLEX_STEP, R.real.T @ R.imag / _COMPLEX_STEP
     turning = np.array([spin[2, 1], spin[0, 2], spin[1, 0]])
-    if not np.abs([linear - rate, angular - turning]).max() < _ROUNDING * max(1.0, np.abs(rate).max()):
+    if not np.abs([linear - rate, angular - turning]).max() < _FORMULA_ROUNDING * max(1.0, np.abs(rate).max()):
         x = [np.round(y, 6).tolist() for y in (rate, turning, q, linear, angular)]
         expected = f"expected the rate of the placement, linear {x[0]} and angular {x[1]} at q = {x[2]}"
         yield f"twist: {expected}, got {x[3]} and {x[4]}"
     if k is None and not np.array_equal(D, np.eye(nv)):
         yield "qdot: expected v, for a type without a quaternion"
-    if not np.abs(pulled - D.T @ g).max() < _ROUNDING * nq:
+    if not np.abs(pulled - D.T @ g).max() < _FORMULA_ROUNDING * nq:
         yield "pullback: expected D(q)ᵀ g, with D of qdot"
     brackets = np.einsum("ijk,j,k->i", _structure(joint_type, q, D), v, momentum)
-    if not np.abs(hamel - brackets).max() < _ROUNDING * nq:
+    if not np.abs(hamel - brackets).max() < _FORMULA_ROUNDING * nq:
         x = [y.round(6).tolist() for y in (brackets, hamel)]
         yield f"hamel: expected {x[0]}, by the brackets of D's columns, got {x[1]}"
     opaque = {i for i in joint_type.angular if i not in joint_type.screws}
@@ -575,8 +575,8 @@ def _structure(joint_type: JointType, q: list[float], D: Array) -> Array:
 
     def slope(direction: Array, unit: list[float]) -> Array:
         """Return the derivative of a column along a direction."""
-        moved = [x + 1j * _STEP * r for x, r in zip(q, direction, strict=True)]
-        return np.asarray(np.imag(joint_type.qdot(moved, unit)) / _STEP)
+        moved = [x + 1j * _COMPLEX_STEP * r for x, r in zip(q, direction, strict=True)]
+        return np.asarray(np.imag(joint_type.qdot(moved, unit)) / _COMPLEX_STEP)
 
     slopes = np.array([[slope(D[:, i], e) for e in units] for i in range(nv)])
     brackets = slopes - slopes.transpose(1, 0, 2)

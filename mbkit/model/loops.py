@@ -74,7 +74,7 @@ LOOP_ROWS: Final[dict[str, tuple[tuple[str, ...], Callable[[LoopEnds], list[Any]
     "distance": (("length",), lambda e: e.stretch()),
 }
 LoopKind = Literal["point", "frame", "revolute", "universal", "cylindrical", "prismatic", "distance"]
-#: What a loop holds together -> how many equations it has.
+#: Kind of loop -> how many equations it has.
 LOOP_KINDS: Final = {kind: len(names) for kind, (names, _) in LOOP_ROWS.items()}
 
 #: Kinds whose frames' z-axes lie along each other, those whose frames do not turn against each other, those that slide,

@@ -17,8 +17,8 @@ from mbkit.model.description import Description
 #: engines would read differently is not.
 NEAR_UNIT: Final = 1e-9
 #: Part of a Gauss-Newton step below which a residual that does not fall is at its least, and steps of a search.
-_SHORTEST: Final = 1e-6
-_MOST: Final = 60
+_LEAST_STEP_PART: Final = 1e-6
+_MAX_SEARCH_STEPS: Final = 60
 _EPS: Final = float(np.finfo(float).eps)
 
 
@@ -151,8 +151,8 @@ def unit_quaternions(model: Description, q: Array) -> tuple[Array, Array]:
     return q, lengths
 
 
-#: rad, m, rad/s, m/s.
-_COMMON: Final = 10.0
+#: Size of common numbers of a state, rad, m, rad/s and m/s.
+_COMMON_SIZE: Final = 10.0
 
 
 def magnitude(*states: Array) -> float:
@@ -167,7 +167,7 @@ def magnitude(*states: Array) -> float:
     (1.0, 100000.0)
     """
     largest = max(float(np.abs(y).max(initial=0.0)) for y in states)
-    return float(10.0 ** np.ceil(np.log10(largest))) if largest > _COMMON else 1.0
+    return float(10.0 ** np.ceil(np.log10(largest))) if largest > _COMMON_SIZE else 1.0
 
 
 def least_change(W: Array, J: Array, change: Array, held: Collection[int] = (), rounding: float = DEPENDENT) -> Array:
@@ -187,17 +187,17 @@ def closest_configuration(
 
     `rows` gives f and J. A change of q is the least one in the metric of W, and the velocities `held` move nothing. It
     is halved until the size falls, which is in units of what the rows at q change by with the coordinates. The search
-    ends at rounding, after `_MOST` steps, and where no step makes the size smaller.
+    ends at rounding, after `_MAX_SEARCH_STEPS` steps, and where no step makes the size smaller.
     """
     f, J = rows(q)
     sizes = np.abs(J).sum(axis=1)
     scale = np.where(sizes > DEPENDENT * sizes.max(initial=0.0), sizes, 1.0)
     size = float(np.linalg.norm(f / scale))
-    for _ in range(_MOST):
+    for _ in range(_MAX_SEARCH_STEPS):
         if size <= 4 * _EPS * (1.0 + float(np.abs(q).max(initial=0.0))):
             break
         whole, length = least_change(W, J, -f, held), 1.0
-        while length > _SHORTEST:
+        while length > _LEAST_STEP_PART:
             beyond = integrate(model, q, length * whole)
             there = rows(beyond)
             size_beyond = float(np.linalg.norm(there[0] / scale))

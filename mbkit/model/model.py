@@ -27,14 +27,14 @@ from mbkit.model.parameters import Parameter
 from mbkit.model.validation import check_substituted, model_faults
 
 #: Seeds that look like a number of states.
-_ROUND: Final = (100, 1_000, 10_000, 100_000, 1_000_000)
+_ROUND_NUMBERS: Final = (100, 1_000, 10_000, 100_000, 1_000_000)
 #: Modules that evaluate runs, or states of their own.
 _OF_RUNS: Final = (
     *(f"mbkit.simulate.{x}" for x in ("integrate", "run_data", "sensitivity", "trajectory")),
     "mbkit.studies",
 )
-#: rad: less than this beyond two turns a motion may have come in a step.
-_JUST_BEYOND: Final = 1.0
+#: Angle, rad, by which a motion may have come beyond two turns in a step.
+_MAX_TURN_IN_A_STEP: Final = 1.0
 
 
 _checked: Final = ContextVar("checked", default=True)
@@ -137,7 +137,7 @@ class Model(Description):
         """
         if size is not None:
             count("size", size)
-        elif isinstance(rng, (int, np.integer)) and rng in _ROUND:
+        elif isinstance(rng, (int, np.integer)) and rng in _ROUND_NUMBERS:
             warn(
                 f"random_state({rng}): {rng} is a seed, of one state; random_state(seed, {rng}) draws {rng}",
                 MbkitWarning,
@@ -170,7 +170,7 @@ class Model(Description):
         k = max(self._hinges, key=lambda i: abs(q[i]))
         if abs(q[k]) > TWO_TURNS:
             self.__dict__["_turns"] = True
-        if abs(q[k]) > TWO_TURNS + _JUST_BEYOND:
+        if abs(q[k]) > TWO_TURNS + _MAX_TURN_IN_A_STEP:
             where = f"{self.name}: {name}: {self.coordinate_names[k]}"
             hint_at_degrees(where, q[k], unless=_OF_RUNS if name == "q" else ())
 

@@ -75,7 +75,7 @@ class Expression:
         return _Power(self, float(exponent))
 
 
-#: What the builder and the catalog take for a physical number.
+#: Type of a physical number in the builder and the catalog.
 Number = float | Expression
 
 

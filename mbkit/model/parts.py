@@ -25,8 +25,8 @@ from mbkit.model.joint_types import JointType, kind_of, register_joint_type
 #: inertias beside it are those of a fixed joint to the last bit.
 RESTING: Final = 1e30
 _ONE: Final = np.eye(3)
-#: Of a matrix: what digits of a file leave of its orthogonality and symmetry.
-_TURNED: Final = 1e-6
+#: Defect of orthogonality and symmetry that a matrix with a file's digits may have.
+_ROTATION_DEFECT: Final = 1e-6
 
 
 #: Names of the entries of an axis of three or six numbers.
@@ -37,7 +37,7 @@ ENTRIES: Final = ("x", "y", "z", "rx", "ry", "rz")
 class NumberRule:
     """All that holds for a field with numbers; its annotation says it, as ``Annotated[float, NumberRule("kg")]``."""
 
-    #: Of a joint that of a turn, and that of a slide.
+    #: For a joint it is that of a turn, and that of a slide.
     unit: str = ""
     #: A text is an attribute of the part: how many, or the names of the entries. None stands for any shape.
     shape: tuple[int | str, ...] | None = ()
@@ -50,7 +50,7 @@ class NumberRule:
     added: bool = False
     #: Why it cannot be a free parameter; empty where it can.
     fixed: str = ""
-    #: What it adds along a coordinate x or its rate v: ½ number v² to ``"T"`` or Rayleigh's ``"loss"``, ½ number x² to
+    #: Its part along a coordinate x or its rate v: ½ number v² to ``"T"`` or Rayleigh's ``"loss"``, ½ number x² to
     #: ``"V"``, or a force of its size that may ``"jump"`` with the sign of v.
     does: str = ""
     #: The equations have it; other numbers are data.
@@ -133,7 +133,7 @@ Constants = Annotated[Array, NumberRule(shape=("symbols",))]
 
 def _turns(R: Array) -> bool:
     """Return whether a matrix is a rotation; one of unknown numbers may be."""
-    return not np.isfinite(R).all() or bool(np.abs(R @ R.T - _ONE).max() <= _TURNED and np.linalg.det(R) > 0)
+    return not np.isfinite(R).all() or bool(np.abs(R @ R.T - _ONE).max() <= _ROTATION_DEFECT and np.linalg.det(R) > 0)
 
 
 def read_only(array: Array) -> Array:
@@ -161,7 +161,7 @@ class _Frozen:
                 raise self._fault(f"{name}: expected shape {wanted}, got {number.shape}")
             if name.startswith("rotation") and not _turns(number):
                 raise self._fault(f"{name} is not a rotation matrix; expected R Rᵀ = 1 and det R = 1")
-            if name == "inertia" and np.abs(number - number.T).max() > _TURNED * np.abs(number).max():
+            if name == "inertia" and np.abs(number - number.T).max() > _ROTATION_DEFECT * np.abs(number).max():
                 raise self._fault("inertia is not symmetric; expected I = Iᵀ")
             object.__setattr__(self, name, float(number) if wanted == () else read_only(number))
 
@@ -505,7 +505,7 @@ class Coupler(_Frozen):
             object.__setattr__(self, "leader", self.leader[0])
             object.__setattr__(self, "ratio", float(self.ratios[0]))
 
-    #: Of the leader, which `curve` has.
+    #: Power of the leader, which `curve` has.
     _powers = ("2", "3", "4")
 
     @property
@@ -562,7 +562,7 @@ class Prescribed(OfJoint):
     frequency: Annotated[float, NumberRule("rad/s")] = 0.0
     phase: Annotated[float, NumberRule("rad", added=True)] = 0.0
 
-    #: Of a formula; numbers that are attributes do not count.
+    #: Constants of a formula; numbers that are attributes do not count.
     constants = ()
 
 

@@ -16,8 +16,8 @@ import numpy as np
 Components = Sequence[Any]
 
 # Below these angles squared the series are exact to rounding (as in mbkit.spatial).
-_SMALL_EXP: Final = 1e-4
-_SMALL_DEXP: Final = 1e-2
+_SMALL_SQUARED_ANGLE_EXP: Final = 1e-4
+_SMALL_SQUARED_ANGLE_DEXP: Final = 1e-2
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def exponential(m: Arithmetic, u: Components) -> list[Any]:
 
 def _half_angle(m: Arithmetic, square: Any) -> tuple[Any, Any]:
     # sin(θ/2)/θ and cos(θ/2) from θ². The argument of the root is never zero, where it has no derivative.
-    small = square < _SMALL_EXP
+    small = square < _SMALL_SQUARED_ANGLE_EXP
     angle = m.sqrt(m.choose(small, 1.0, square))
     quarter = square / 4
     sine = 0.5 * (1 - quarter / 6 * (1 - quarter / 20 * (1 - quarter / 42)))
@@ -112,7 +112,7 @@ def dexp_inverse(m: Arithmetic, u: Components, w: Components) -> list[Any]:
 
 
 def _dexp_coefficient(m: Arithmetic, square: Any) -> Any:
-    small = square < _SMALL_DEXP
+    small = square < _SMALL_SQUARED_ANGLE_DEXP
     safe = m.choose(small, 1.0, square)
     half = m.sqrt(safe) / 2
     series = 1 / 12 + square * (1 / 720 + square * (1 / 30240 + square * (1 / 1209600 + square / 47900160)))

@@ -104,7 +104,7 @@ def tangents(normal: Array) -> Array:
     The first is as near as can be to the axis that is farthest from the normal.
     """
     sizes = np.abs(normal)
-    # Of components that are equal but for rounding the first.
+    # The first of components that are equal but for rounding.
     first = np.eye(3)[np.argmax(sizes <= sizes.min() + 1e-9)]
     first = first - product(first[None], normal) * normal
     first = first / length(first)

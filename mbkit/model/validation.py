@@ -30,7 +30,7 @@ from mbkit.model.parts import (
 from mbkit.model.rolling import LIES_FLAT, ROLLING_KINDS
 from mbkit.spatial import skew
 
-# What adds to T along a joint's velocity, by the name of the field.
+# Fields that add to T along a joint's velocity.
 _TURNING: Final = " or ".join(Joint.adding_to("T"))
 # Names in a message.
 _MAX_NAMES: Final = 40
@@ -240,14 +240,14 @@ def _mimic_faults(joints: Sequence[Joint]) -> Iterator[str]:
 
 
 # A thin plate written with six digits may miss A + B >= C by its last digit.
-_TRIANGLE = 1e-6
+_TRIANGLE_DEFECT = 1e-6
 _JOINT = re.compile(r"joint '.*?'(?=, so)")
 # Ten times mjMINVAL is left of MuJoCo's smallest numbers, in kg and kg m².
-_LEAST = 1e-14
-# Of two numbers this far apart, the sum keeps five digits of the smaller. Real robots stay below 1e8.
-_APART = 1e11
+_MIN_MASS_OR_MOMENT = 1e-14
+# The sum of two numbers this far apart keeps five digits of the smaller. Real robots stay below 1e8.
+_MAX_SIZE_RATIO = 1e11
 # The largest coordinate at which M is sampled.
-_FAR = 1e6
+_MAX_SAMPLED_COORDINATE = 1e6
 
 
 def body_fault(body: Body, *, point_masses: bool) -> str | None:
@@ -266,7 +266,7 @@ def body_fault(body: Body, *, point_masses: bool) -> str | None:
     moments = f"principal moments {', '.join(f'{x:.4g}' for x in eigenvalues)} kg m²"
     if eigenvalues[0] < -1e-12 * largest:
         return f"inertia is not positive: {moments}"
-    if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE):
+    if eigenvalues[0] + eigenvalues[1] < eigenvalues[2] * (1 - _TRIANGLE_DEFECT):
         return f"inertia violates A + B >= C: {moments}"
     return None
 
@@ -402,18 +402,18 @@ def scale_doubts(model: Description) -> list[str]:
         if joint.mimic is not None or not joint.type.nv:
             continue
         least = float(diagonal[model.layout.v[joint.name]].min())
-        if least < _LEAST:
+        if least < _MIN_MASS_OR_MOMENT:
             small.append(f"{joint.name!r} ({least:.1e})")
-        elif joint.type.rotates and carried[joint.child] * extent**2 > _APART * least:
+        elif joint.type.rotates and carried[joint.child] * extent**2 > _MAX_SIZE_RATIO * least:
             far.append(f"{joint.name!r} ({least:.1e} kg m² of {carried[joint.child]:.1e} kg over {extent:.1e} m)")
     root = np.sqrt(diagonal)
     values = np.linalg.eigvalsh(M / root[:, None] / root)
     causes = (
-        (f"joints that move less than {_LEAST:g} kg or kg m², which MuJoCo takes for zero", small),
+        (f"joints that move less than {_MIN_MASS_OR_MOMENT:g} kg or kg m², which MuJoCo takes for zero", small),
         ("joints whose inertia is lost beside m L² of the whole mechanism", far),
     )
     out = [f"{what}: {listing(joints)}" for what, joints in causes if joints]
-    if values[0] * _APART * 10 < values[-1]:
+    if values[0] * _MAX_SIZE_RATIO * 10 < values[-1]:
         out.append(f"M is nearly singular (eigenvalues {values[0]:.1e} to {values[-1]:.1e}, scaled to a unit diagonal)")
     return out
 
@@ -432,9 +432,9 @@ class _Sample(NamedTuple):
     M: Array
     #: Centre of mass in the world of each body with mass.
     places: dict[str, Array]
-    #: Of each body the velocities that move it, and its (6, k) Jacobian for them in its axes, linear above angular.
+    #: For each body the velocities that move it, and its (6, k) Jacobian for them in its axes, linear above angular.
     jacobians: dict[str, tuple[list[int], Array]]
-    #: From each body's axes to the world's.
+    #: Rotation from each body's axes to the world's.
     rotations: dict[str, Array]
     #: Number of velocities before reduction.
     size: int
@@ -461,7 +461,7 @@ def _sample(model: Description, q: Array | None = None) -> _Sample:
     if q is None:
         q, _ = manifold.random_state(model, np.random.default_rng(0))
     # Limits may be as wide as doubles go; the squares of lengths must not overflow.
-    q_full = model.layout.expand_q(np.clip(q, -_FAR, _FAR))
+    q_full = model.layout.expand_q(np.clip(q, -_MAX_SAMPLED_COORDINATE, _MAX_SAMPLED_COORDINATE))
     n = model.layout.sizes[3]
     bodies = {b.name: b for b in model.bodies}
     # Motion of the child's frame for that of the parent's, and for the joint's velocities; linear above angular.

@@ -38,15 +38,15 @@ from mbkit.model.changes.freeing import (
 )
 from mbkit.model.model import Model
 
-#: What a spread says of a path: a size, the ends of a uniform range, or a function of a generator and how many to draw.
+#: Spread of a path: a size, the ends of a uniform range, or a function of a generator and how many to draw.
 Spread = float | tuple[float, float] | Callable[[np.random.Generator, int], Any]
 #: All ten numbers of a body together.
 _INERTIAL: Final = ".inertial"
-#: Beyond it one standard deviation is a factor of more than e: per cent are a common reason.
-_WIDE: Final = 1.0
-#: Of a moment of inertia: rounding.
-_ROUNDED: Final = 1e-12
-_SHOWN: Final = 12
+#: Standard deviation of a logarithm beyond which it is a factor of more than e: per cent are a common reason.
+_WIDE_LOG_DEVIATION: Final = 1.0
+#: Part of a moment of inertia that is rounding.
+_MOMENT_ROUNDING: Final = 1e-12
+_MAX_SHOWN_NUMBERS: Final = 12
 _LOWER: Final = np.tril_indices(3)
 
 
@@ -128,9 +128,10 @@ class Variants:
 
     def __str__(self) -> str:
         rows = [("number", "nominal", "mean", "std", "range"), *self._summary()]
-        more = len(rows) - 1 - _SHOWN
-        widths = [max(len(row[k]) for row in rows[: _SHOWN + 1]) for k in range(5)]
-        lines = ["  ".join(x.ljust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows[: _SHOWN + 1]]
+        more = len(rows) - 1 - _MAX_SHOWN_NUMBERS
+        rows = rows[: _MAX_SHOWN_NUMBERS + 1]
+        widths = [max(len(row[k]) for row in rows) for k in range(5)]
+        lines = ["  ".join(x.ljust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows]
         head = f"{self.model.name}: {len(self)} variants, seed {self.seed}"
         return "\n".join([head, *lines, *([f"and {more} more numbers"] if more > 0 else [])])
 
@@ -195,11 +196,11 @@ def variants(robot: Model, spread: Mapping[Any, Spread], *, size: int = 1000, se
     added = {x.path for x in numbers_of(model) if x.rule.added}
     for path, how in spread.items():
         rng = np.random.default_rng([seed, zlib.crc32(str(path).encode())])
-        # What leaves a double's range is told by name.
+        # A number beyond a double's range is told by name.
         with np.errstate(over="ignore", invalid="ignore"):
             drawn = _drawn(model, path, how, rng, size)
         factor = drawn and not callable(how) and shape_of(how) == () and not {*drawn} <= added
-        if factor and (away := real("spread", how)) > _WIDE:
+        if factor and (away := real("spread", how)) > _WIDE_LOG_DEVIATION:
             name, x = next(iter(drawn.items()))
             says = "is the standard deviation of the logarithm, in which 0.1 is about 10 %"
             warn(f"spread: {str(path)!r}: {away:g} {says}; {name!r} is {x.min():.1g} to {x.max():.1g}", MbkitWarning)
@@ -281,7 +282,7 @@ def _bodies_drawn(
     second = 0.5 * np.trace(body.inertia) * np.eye(3) - body.inertia
     try:
         # A rod or a point has none across.
-        L = np.linalg.cholesky(second + _ROUNDED * max(np.trace(second), body.mass * 1e-9) * np.eye(3))
+        L = np.linalg.cholesky(second + _MOMENT_ROUNDING * max(np.trace(second), body.mass * 1e-9) * np.eye(3))
     except np.linalg.LinAlgError:
         raise InputError(
             f"spread: body {name!r} has an inertia that no matter has, so that none is drawn about it; correct it"
@@ -335,7 +336,7 @@ def _require_bodies_that_can_be(model: Model, values: Mapping[str, Array], scale
             moments, says = 0.5 * (every + every.swapaxes(1, 2)), f"a {field} that drives the motion"
             instead = "give a smaller spread"
         least = np.linalg.eigvalsh(moments)[:, 0]
-        if len(bad := np.flatnonzero(least < -_ROUNDED * np.abs(trace))):
+        if len(bad := np.flatnonzero(least < -_MOMENT_ROUNDING * np.abs(trace))):
             raise InputError(
                 f"spread: {name!r} has {says} in {len(bad)} of {size} variants, such as {bad[0]}; {instead}"
             )

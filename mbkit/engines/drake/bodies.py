@@ -35,7 +35,7 @@ class DrakeBodies(MovingFrames, Composed):
     maps: DrakeModel
     plant: Any
     _context: Any
-    # Of the other parts.
+    # These stand in the other parts.
     _to_engine: Callable[[Array], Array]
     _columns: Callable[[Array], Array]
     _force: Callable[[Array], Array]
@@ -66,7 +66,7 @@ class DrakeBodies(MovingFrames, Composed):
 
     def _move(self, q: Array, v: Array, a: Array) -> None:
         b = self._place(q, v)
-        # Of the points at the bodies' origins: what Drake calls spatial has the point's own acceleration.
+        # They are those of the points at the bodies' origins: Drake's spatial ones have the point's own acceleration.
         self._moving = self.plant.CalcSpatialAccelerationsFromVdot(self._context, self._to_engine(a) + b)
 
     def _point_acceleration(self, p: Array, at: Any, w: Array) -> Array:
@@ -160,7 +160,7 @@ class DrakeBodies(MovingFrames, Composed):
         self.plant.CalcForceElementsContribution(self._context, forces)
         with self._pushed(*acting):
             forces = self._add_external(forces, *acting)
-            # Of Drake's own forward dynamics: these forces make the motion the one asked for.
+            # For Drake's own forward dynamics: these forces make the motion the one asked for.
             self._applied.FixValue(self._context, self.plant.CalcInverseDynamics(self._context, moved, forces))
             reactions = self.plant.get_reaction_forces_output_port().Eval(self._context)
         return np.array([_on_child(self.maps.joints[joint.name], reactions) for joint in joints]).reshape(-1, 6)

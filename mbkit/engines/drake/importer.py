@@ -44,10 +44,10 @@ _KINDS: Final = {
     "ball_rpy": "ball",
     "quaternion_floating": "free",
 }
-_TURN: Final = 2 * np.pi
-#: What Drake and sdformat call a text.
+_FULL_TURN: Final = 2 * np.pi
+#: Name of a text in Drake and sdformat.
 _PLACE: Final = re.compile(r"<(?:literal|data)-string>(?:\.sdf)?:")
-#: What Drake passes over without a word, though it acts.
+#: Elements that act, and that Drake passes over without a word.
 _UNREAD: Final = ("mimic", "fluid_added_mass")
 #: Force elements that are a joint's own spring, with the names of its stiffness and rest.
 _SPRINGS: Final = {
@@ -319,7 +319,7 @@ def _numbers(joint: Any, kind: str, effort: float, rotor: float) -> tuple[str, d
         numbers |= {"velocity_limit": np.array(joint.velocity_upper_limits())}
         numbers |= dict.fromkeys(Joint.adding_to("T"), np.full(1, rotor))
         if kind == "helical":
-            numbers["pitch"] = float(joint.screw_pitch()) / _TURN
+            numbers["pitch"] = float(joint.screw_pitch()) / _FULL_TURN
         if kind == "revolute" and not np.isfinite([lower, upper]).any():
             kind = "continuous"
     return kind, numbers

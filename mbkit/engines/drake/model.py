@@ -26,7 +26,7 @@ from mbkit.model.elements.paths import Path
 from mbkit.model.parts import Loop, PointSpring
 from mbkit.model.validation import static_bodies
 
-_TURN: Final = 2 * np.pi
+_FULL_TURN: Final = 2 * np.pi
 #: Name of the method that runs loops.
 SAP: Final = "drake_sap"
 #: Drake 1.51: evaluating a continuous plant's accelerations with constraints is an error.
@@ -59,7 +59,7 @@ def build(description: Model, *, gravity: bool = True, bushings: bool = True, st
     # A step of zero makes it continuous: ẋ = f(x) and nothing else.
     plant = MultibodyPlant(step)
     if step:
-        # Of Drake's discrete solvers the one that takes constraints.
+        # It is the one of Drake's discrete solvers that takes constraints.
         plant.set_discrete_contact_approximation(DiscreteContactApproximation.kSap)
     plant.mutable_gravity_field().set_gravity_vector(np.array(description.gravity) * gravity)
     bodies: dict[str, Any] = {"world": plant.world_body()}
@@ -197,7 +197,7 @@ DRAKE: Final = Path(
     also=_numbers_not_held,
     instead=SOLVED,
 )
-#: Of a continuous plant.
+#: Parts that a continuous plant does not carry.
 DRAKE_RUNS: Final = replace(
     DRAKE,
     name="drake runs",
@@ -231,7 +231,7 @@ def _one(plant: Any, joint: Joint, k: int, name: str, kind: str, axis: Array, at
         added = plant.AddJoint(tree.PrismaticJoint(name, at, body, axis, damping=damping))
     else:
         # Metres per radian here, per turn there.
-        added = plant.AddJoint(tree.ScrewJoint(name, at, body, axis, _TURN * joint.pitch, damping))
+        added = plant.AddJoint(tree.ScrewJoint(name, at, body, axis, _FULL_TURN * joint.pitch, damping))
     if rotor := float(joint.rotors[k]):
         actuator = plant.AddJointActuator(f"{name}.rotor", added)
         actuator.set_default_rotor_inertia(rotor)

@@ -135,6 +135,6 @@ class DiscreteRun(_PlantState):
         self.put(q, v)
         # A force on a free joint turns with its body, from step to step.
         self._force.FixValue(self._context, self._dyn.to_drake(q, tau)[1])
-        # What a simulator does at each period, without its clock.
+        # As a simulator does at each period, without its clock.
         self._plant.ExecuteForcedEvents(self._context, publish=False)
         return self.state()

@@ -29,24 +29,24 @@ from mbkit.model import Model
 from mbkit.model.changes.dry_friction import ROUNDING, DryFrictionLaw, Sliding, friction_bindings
 from mbkit.model.parts import RESTING
 
-#: What is at rest of velocities.
+#: Mask of the velocities at rest.
 Mask = NDArray[np.bool_]
-#: Exchanges that may leave as many conditions failing, before they go one by one.
-_PATIENCE: Final = 3
-#: Phases that dynamics keep, at most.
-_PHASES: Final = 256
+#: Rounds of exchanges that may leave as many conditions failing; then conditions are exchanged one by one.
+_MAX_ROUNDS_WITHOUT_PROGRESS: Final = 3
+#: Phases that dynamics keep.
+_MAX_KEPT_PHASES: Final = 256
 _FORWARD: Final = "forward_dynamics"
-_DOUBLE: Final = 53
+_DOUBLE_SIGNIFICAND_BITS: Final = 53
 _EPS: Final = float(np.finfo(float).eps)
-#: Of forces, what their sums lose to rounding.
-_ROUNDING: Final = 64 * _EPS
-#: Of a singular A, what is added to its diagonal: far from its own rounding and from what is not rounding.
-_PROXIMAL: Final = 2.0**-32
-#: Proximal points, at most; two are enough, unless A is nearly singular, too.
-_POINTS: Final = 10_000
+#: Part of the forces that their sums lose to rounding.
+_FORCE_ROUNDING: Final = 64 * _EPS
+#: Addition to the diagonal of a singular A: far from its own rounding and from what is not rounding.
+_PROXIMAL_SHIFT: Final = 2.0**-32
+#: Proximal points; two are enough, unless A is nearly singular, too.
+_MAX_PROXIMAL_POINTS: Final = 10_000
 _UNDECIDED: Final = "dry friction: which of {n} joints at rest begin to move cannot be decided: singular inertia"
 #: Joints whose power differs by less than this part let go together, as rounding does not break a symmetry.
-_TIE: Final = 1e-9
+_POWER_TIE_RATIO: Final = 1e-9
 
 
 def forces_at_rest(A: Array, b: Array, bound: Array) -> Array:
@@ -65,11 +65,11 @@ def solve_at_rest(A: Array, b: Array, bound: Array, on: Mask, *, definite: bool)
         return _of_definite(A, b, bound, on)
     size = np.abs(np.einsum("nii->ni", A))
     # To each its own: a joint that hardly responds takes as few points as the others.
-    near = _PROXIMAL * np.where(size > 0, size, 1.0)
+    near = _PROXIMAL_SHIFT * np.where(size > 0, size, 1.0)
     own = A + near[..., None] * np.eye(b.shape[1])
     noise = _noise(A, b, bound)
     forces = np.zeros(b.shape)
-    for _ in range(_POINTS):
+    for _ in range(_MAX_PROXIMAL_POINTS):
         before = forces
         forces, side = _of_definite(own, b - near * before, bound, on)
         if (near * np.abs(forces - before) <= noise).all():
@@ -86,7 +86,7 @@ def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Arr
     """
     size, n = b.shape
     forces = np.zeros((size, n))
-    side, best, left = np.zeros((size, n)), np.full(size, n + 1), np.full(size, _PATIENCE)
+    side, best, left = np.zeros((size, n)), np.full(size, n + 1), np.full(size, _MAX_ROUNDS_WITHOUT_PROGRESS)
     going = np.arange(size)
     # What is undecided to rounding is at rest.
     noise = _noise(A, b, bound)
@@ -105,7 +105,7 @@ def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Arr
         last = np.cumsum(wrong[:, ::-1], axis=1)[:, ::-1] == 1
         change = np.where(alone[:, None], wrong & last, wrong)
         best[going] = np.where(fewer, counts, best[going])
-        left[going] = np.where(fewer, _PATIENCE, np.maximum(left[going] - 1, 0))
+        left[going] = np.where(fewer, _MAX_ROUNDS_WITHOUT_PROGRESS, np.maximum(left[going] - 1, 0))
         side[going] = np.where(change, np.where(inner, np.sign(x), 0.0), here)
         going = going[counts > 0]
         if not len(going):
@@ -115,7 +115,7 @@ def _of_definite(A: Array, b: Array, bound: Array, on: Mask) -> tuple[Array, Arr
 
 def _noise(A: Array, b: Array, bound: Array) -> Array:
     """Return the rounding of accelerations under forces up to their bounds, (N, n)."""
-    return np.asarray(_ROUNDING * (np.abs(b) + (np.abs(A) @ bound[..., None])[..., 0]))
+    return np.asarray(_FORCE_ROUNDING * (np.abs(b) + (np.abs(A) @ bound[..., None])[..., 0]))
 
 
 def _restricted(A: Array, right: Array, on: Mask, *, definite: bool = True) -> Array:
@@ -124,7 +124,7 @@ def _restricted(A: Array, right: Array, on: Mask, *, definite: bool = True) -> A
     size = np.abs(np.einsum("nii->ni", A)).max(axis=1, initial=1e-300)[:, None, None]
     own = np.where(on[:, :, None] & on[:, None, :], A, size * np.eye(A.shape[-1]) * ~on[:, :, None])
     right = np.where(on, right, 0.0)[..., None]
-    x = np.linalg.solve(own, right) if definite else np.linalg.pinv(own, rcond=_PROXIMAL, hermitian=True) @ right
+    x = np.linalg.solve(own, right) if definite else np.linalg.pinv(own, rcond=_PROXIMAL_SHIFT, hermitian=True) @ right
     return np.asarray(x[..., 0])
 
 
@@ -149,12 +149,12 @@ def friction_forces(
         forces[rows] = x = np.where(side < 0, low, np.where(side > 0, high, middle + x))
         a = b[rows] + (own @ x[..., None])[..., 0]
         # Forces of loops are not unique: what is at its bound may be held by the others, to the rounding of A.
-        size = _PROXIMAL / _ROUNDING * _noise(own, b[rows], bound[rows])
+        size = _PROXIMAL_SHIFT / _FORCE_ROUNDING * _noise(own, b[rows], bound[rows])
         moves = side != 0 if definite else side * a < -size
         holds[rows] = act & ~loose & ~moves
         falls = moves & (np.abs(x) > less[rows])
         power = np.where(falls, np.abs(a) * bound[rows], 0.0)
-        first = falls & (power >= (1 - _TIE) * power.max(axis=1, keepdims=True))
+        first = falls & (power >= (1 - _POWER_TIE_RATIO) * power.max(axis=1, keepdims=True))
         lower[rows] = np.where(first & (side < 0), -less[rows], low)
         upper[rows] = np.where(first & (side > 0), less[rows], high)
         # What is known to leave may be held by what the others do then.
@@ -200,7 +200,7 @@ class DryFriction(AddedForce):
                 resting = law.at_rest(v)
                 if not resting.any():
                     return moving(q, v, tau, *rest)
-                if dyn._significand_bits > _DOUBLE:
+                if dyn._significand_bits > _DOUBLE_SIGNIFICAND_BITS:
                     return self._in_phase(quantity, dyn, q, v, tau, rest, resting)
                 held, still = self._each(dyn, quantity, moving, q, v, tau, rest, resting)
                 out = moving(q, v, tau + padded(held, tau), *rest)
@@ -308,7 +308,7 @@ class DryFriction(AddedForce):
         out = N @ np.linalg.solve(N.mT @ M @ N, N.mT)
         # A joint that loops hold responds by rounding alone, of either sign; the least response keeps A definite.
         masses, own = (np.einsum("...ii->...i", x) for x in (M, out))
-        own[...] = np.maximum(own, _PROXIMAL / np.where(masses > 0, masses, np.inf))
+        own[...] = np.maximum(own, _PROXIMAL_SHIFT / np.where(masses > 0, masses, np.inf))
         return np.asarray(0.5 * (out + out.mT))
 
     def phase(self, dyn: Any, sides: Array, still: Mask) -> Any:
@@ -318,7 +318,7 @@ class DryFriction(AddedForce):
         held: dict[Any, Any] = vars(bare).setdefault("_phases", {})
         key = np.where(still, 0.0, np.sign(sides)).tobytes(), still.tobytes(), dyn.model.time
         if key not in held:
-            if len(held) >= _PHASES:
+            if len(held) >= _MAX_KEPT_PHASES:
                 held.clear()
             held[key] = bare._of_model(sliding.at(sides, still, dyn.model), sliding.form)
             # The dynamics with friction have looked at the state, and what a phase goes through is open by rounding.

@@ -35,7 +35,7 @@ class MujocoBodies(MovingFrames, Composed):
     _d: Any
     _maps: MujocoModel
     _reduced: bool
-    # Of the other parts.
+    # These stand in the other parts.
     _set: Callable[..., Array]
     _velocities: Callable[[], None]
     _directed: Callable[[Array], Array]
@@ -100,7 +100,7 @@ class MujocoBodies(MovingFrames, Composed):
 
     def _point_acceleration(self, p: Array, body: int, w: Array) -> Array:
         six, turning = np.zeros(6), skew(w)
-        # Of the point at the body's origin: MuJoCo adds ω × v to the spatial one.
+        # It is that of the point at the body's origin: MuJoCo adds ω × v to the spatial one.
         mujoco.mj_objectAcceleration(self._m, self._d, _BODY_FRAME, body, six, 0)
         return np.concatenate([six[3:] + (skew(six[:3]) + turning @ turning) @ (p - self._d.xpos[body]), six[:3]])
 

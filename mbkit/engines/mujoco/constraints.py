@@ -40,8 +40,8 @@ if TYPE_CHECKING:
     from mbkit.engines.closed_loops.frame_rows import Rows
 
 #: Bounds that MuJoCo keeps an impedance in, and the least size that it divides by (mjMINIMP, mjMAXIMP, mjMINVAL).
-_LEAST, _MOST = 1e-4, 0.9999
-_TINY: Final = 1e-15
+_MIN_IMPEDANCE, _MAX_IMPEDANCE = 1e-4, 0.9999
+_MIN_DIVISOR: Final = 1e-15
 _DEFAULT_SOLREF: Final = (0.02, 1.0)
 _DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
 #: MuJoCo's equality for each kind of loop that it holds.
@@ -76,10 +76,12 @@ class Softness:
         if not ((ref > 0).all() or (ref < 0).all()):
             # MuJoCo would take its default instead, after a warning.
             raise InputError(f"solref: expected two positive or two negative numbers, got {tuple(ref.tolist())}")
-        if not ((imp[[0, 1, 3]] >= _LEAST).all() and (imp[[0, 1, 3]] <= _MOST).all() and imp[2] > 0 and imp[4] >= 1):
+        bounded = imp[[0, 1, 3]]
+        within = (bounded >= _MIN_IMPEDANCE).all() and (bounded <= _MAX_IMPEDANCE).all()
+        if not (within and imp[2] > 0 and imp[4] >= 1):
             raise InputError(
-                f"solimp: expected impedances and a midpoint from {_LEAST} to {_MOST}, a width above 0 and a power "
-                f"from 1 on, got {tuple(imp.tolist())}"
+                f"solimp: expected impedances and a midpoint from {_MIN_IMPEDANCE} to {_MAX_IMPEDANCE}, a width "
+                f"above 0 and a power from 1 on, got {tuple(imp.tolist())}"
             )
         return cls(tuple(ref.tolist()), tuple(imp.tolist()))
 
@@ -123,7 +125,10 @@ def stiffest(dt: float) -> dict[str, tuple[float, ...]]:
     >>> dyn.softness.solref
     (0.002, 1.0)
     """
-    return {"solref": (2 * real("dt", dt, positive=True), 1.0), "solimp": (_MOST, _MOST, *_DEFAULT_SOLIMP[2:])}
+    return {
+        "solref": (2 * real("dt", dt, positive=True), 1.0),
+        "solimp": (_MAX_IMPEDANCE, _MAX_IMPEDANCE, *_DEFAULT_SOLIMP[2:]),
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +205,7 @@ def law(
             continue
         weights = sum(m.body_invweight0[m.site_bodyid[s]] for s in (m.eq_obj1id[i], m.eq_obj2id[i]))
         estimate[own] = np.repeat(weights, 3)[: len(own)]
-    R = np.maximum((1 - impedance) / impedance * estimate, _TINY)
+    R = np.maximum((1 - impedance) / impedance * estimate, _MIN_DIVISOR)
     reference = -damping * rate - stiffness * impedance * r - bias
     # In coordinates in which M is the identity.
     L = np.linalg.cholesky(M)
@@ -223,7 +228,7 @@ def friction_law(
     which = np.flatnonzero(m.dof_frictionloss)
     J, rate, none = np.eye(m.nv)[which], d.qvel[which], np.zeros(len(which))
     impedance = none + softness.impedance(0.0)
-    R = np.maximum((1 - impedance) / impedance * m.dof_invweight0[which], _TINY)
+    R = np.maximum((1 - impedance) / impedance * m.dof_invweight0[which], _MIN_DIVISOR)
     reference = -softness.gains[1] * rate
     responses, free = np.linalg.solve(M, J.T), np.linalg.solve(M, d.qfrc_smooth)
     f = forces_at_rest(

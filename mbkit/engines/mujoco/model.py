@@ -70,9 +70,9 @@ _BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
 _X, _Y, _Z = np.eye(3)
 # A ball joint can only be the last of a stack: its quaternion is in the body's own axes.
 _STACKABLE: Final = tuple(STACKS)
-# MuJoCo's compiler refuses principal moments below this (mjMINVAL).
-_SMALLEST: Final = 1e-15
-_OPEN: Final = 1e10
+# MuJoCo's compiler refuses principal moments below this, kg m² (mjMINVAL).
+_MIN_PRINCIPAL_MOMENT: Final = 1e-15
+_OPEN_RANGE: Final = 1e10
 #: Numbers of a coupling that a tendon has by the same name, its inertia among them.
 OF_COUPLING: Final = tuple(name for name, rule in rules_of(JointCoupling).items() if rule.does)
 (INERTIA,) = JointCoupling.adding_to("T")
@@ -321,7 +321,7 @@ def _give_inertia(new: Any, body: Body, description: Model, placed: Placed) -> N
     listed = {name for name, _ in description.nonphysical}
     low, middle, high = np.sort(moments)
     harmless = body.name in placed.static or (body.mass > 0 and body.name not in listed)
-    if harmless and (low < _SMALLEST or low + middle < high):
+    if harmless and (low < _MIN_PRINCIPAL_MOMENT or low + middle < high):
         # A point mass, a thin rod or a plate is a fair idealization, and a body fixed to the world may have any
         # inertia. The compiler refuses them: they are compiled with a placeholder and get their own moments afterwards.
         placed.degenerate[body.name] = moments
@@ -403,7 +403,7 @@ def _add_joint(new: Any, joint: Joint, R: Array, p: Array, placed: Placed, at_or
             low, high = float(joint.lower[k]), float(joint.upper[k])
             if np.isfinite([low, high]).any() and low < high:
                 # MuJoCo has no open end; this one is never reached.
-                j.limited, j.range = 1, [max(low, -_OPEN), min(high, _OPEN)]
+                j.limited, j.range = 1, [max(low, -_OPEN_RANGE), min(high, _OPEN_RANGE)]
 
 
 def _set(element: Any, name: str, number: float) -> None:

@@ -33,7 +33,7 @@ _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
 _SINGULAR: Final = int(mujoco.mjtWarning.mjWARN_INERTIA)
 _FORCE: Final = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 # MuJoCo's code cannot be interrupted: it is left this often, s, for signals and progress. States do not depend on it.
-_PERIOD: Final = 0.1
+_SIGNAL_PERIOD: Final = 0.1
 
 
 def rollout(
@@ -92,7 +92,7 @@ def _run(
             m, data, first, part, control_spec=_FORCE, nstep=end - done, skip_checks=False
         )
         seconds = time.perf_counter() - started
-        count = max(1, int(count * min(16.0, _PERIOD / max(seconds, 1e-6))))
+        count = max(1, int(count * min(16.0, _SIGNAL_PERIOD / max(seconds, 1e-6))))
         done = end
         if progress is not None:
             progress(done / steps)

@@ -19,8 +19,8 @@ _TYPES: Final = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
     "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
 }
-#: The group that viewers show, and that menageries use for what only looks.
-_GROUP: Final = 2
+#: Group that viewers show, and that menageries use for shapes alone.
+_VISUAL_GROUP: Final = 2
 
 
 def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes: Sequence[Shape]) -> None:
@@ -35,7 +35,7 @@ def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes:
     for shape in shapes:
         if shape.body not in bodies:
             continue
-        look: dict[str, Any] = {"pos": shape.translation, "quat": wxyz(shape.rotation), "group": _GROUP}
+        look: dict[str, Any] = {"pos": shape.translation, "quat": wxyz(shape.rotation), "group": _VISUAL_GROUP}
         look |= {"mass": 0.0, "contype": 0, "conaffinity": 0}
         body = bodies[shape.body]
         if shape.kind != "mesh":
@@ -48,7 +48,7 @@ def add_shapes(spec: Any, bodies: Mapping[str, Any], description: Model, shapes:
                 meshes[id(surface)] = f"mesh{len(meshes)}"
                 mesh = spec.add_mesh(name=meshes[id(surface)])
                 mesh.uservert, mesh.userface = surface.vertices.ravel(), surface.triangles.ravel()
-                # Of surfaces with holes there is no volume.
+                # Surfaces with holes have no volume.
                 mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
             name, rgba = reserved(shape.name, names), surface.color or shape.color
             mesh_type = mujoco.mjtGeom.mjGEOM_MESH

@@ -37,7 +37,7 @@ class PinocchioBodies(Composed):
     _direct: bool
     _G: Array
     _placements: dict[str, tuple[int, Any]]
-    # Of the other part.
+    # These stand in the other part.
     _full_q: Callable[[Array], Array]
     _full_v: Callable[[Array], Array]
     _joints_of: Callable[[Callable[[Array, Array], bool]], str]
@@ -67,7 +67,7 @@ class PinocchioBodies(Composed):
         pin.computeJointJacobians(m, d, self._full_q(q))
         out = np.zeros((len(frames), 6, self.model.nv))
         for k, (carrier, X_JF) in enumerate(map(self._in_joint, frames)):
-            # Of the world's joint in a model without others, Pinocchio would read beyond an array.
+            # Pinocchio would read beyond an array for the world's joint in a model without others.
             if carrier:
                 out[k] = self._columns(pin.getFrameJacobian(m, d, carrier, X_JF, reference))
         return out
@@ -228,7 +228,7 @@ class PinocchioBodies(Composed):
     def _fixed_loads(self, outside: list[OnBody]) -> dict[str, Any]:
         """Return the loads of the fixed joints, of Pinocchio's motion and forces after `rnea`."""
         d, bodies = self._d, self._pin.bodies
-        # What a body and all behind it need, about the origin of the joint that carries it.
+        # The wrench of a body and all behind it, about the origin of the joint that carries it.
         needed = {name: pin.Force.Zero() for name in bodies}
         for body, force in outside:
             needed[body] -= force

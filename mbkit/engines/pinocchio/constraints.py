@@ -50,13 +50,13 @@ if TYPE_CHECKING:
 _RIGID: Final = {"point": pin.ContactType.CONTACT_3D, "frame": pin.ContactType.CONTACT_6D}
 #: μ in terms of the largest pivot of J M⁻¹ Jᵀ. An iteration leaves μ / σ of the error along a singular value σ, and
 #: rounding of a redundant row, eps / μ, must stay small.
-_MU: Final = 1e-10
-_ITERATIONS: Final = 20
-_ACCURACY: Final = 1e-14
+_PROXIMAL_RATIO: Final = 1e-10
+_MAX_PROXIMAL_ITERATIONS: Final = 20
+_PROXIMAL_ACCURACY: Final = 1e-14
 #: Pivot of a row that may depend on the others, in terms of μ, which leaves about as much of it: LAPACK decides then.
-_NO_PIVOT: Final = 1e3
+_DEPENDENT_PIVOT_RATIO: Final = 1e3
 #: Disagreement of the ends' accelerations in terms of these, up to which an answer is taken.
-_AGREES: Final = 1e-11
+_ACCELERATION_DISAGREEMENT: Final = 1e-11
 _ALIGNED: Final = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _LOCAL: Final = pin.ReferenceFrame.LOCAL
 _ONE: Final = np.eye(3)
@@ -68,7 +68,7 @@ def _frame(m: Any, d: Any, G: Array | None, joint: int, X_JF: Any) -> MovingFram
     from mbkit.engines.closed_loops.frame_rows import MovingFrame
 
     X = d.oMi[joint] * X_JF
-    # Of the world's joint in a model without others, Pinocchio would read beyond an array.
+    # Pinocchio would read beyond an array for the world's joint in a model without others.
     J = np.zeros((6, m.nv))
     if joint:
         J = pin.getFrameJacobian(m, d, joint, X_JF, _ALIGNED).reshape(6, m.nv)
@@ -182,7 +182,7 @@ class PinConstraints:
         first = 0
         for loop, (*_, (carrier, _)) in zip(model.loops, self._ends, strict=True):
             last = first + LOOP_KINDS[loop.kind]
-            # Of a plane that is carried along, what is redundant is so where the loop is closed, and not beside.
+            # On a plane that is carried along, rows are redundant where the loop is closed, and not beside.
             if carrier and any(i not in kept for i in range(first, last)):
                 return "LAPACK"
             first = last
@@ -201,10 +201,10 @@ class PinConstraints:
     @cached_property
     def _mu(self) -> float:
         q = pin.neutral(self._m)
-        settings = pin.ProximalSettings(_ACCURACY, _ACCURACY, _MU, 1)
+        settings = pin.ProximalSettings(_PROXIMAL_ACCURACY, _PROXIMAL_ACCURACY, _PROXIMAL_RATIO, 1)
         pin.constraintDynamics(self._m, self._d, q, self._still, self._still, *self._rigid, settings)
         largest = float(np.max(self._pivots(), initial=0.0))
-        return _MU * largest if 0.0 < largest < inf else _MU
+        return _PROXIMAL_RATIO * largest if 0.0 < largest < inf else _PROXIMAL_RATIO
 
     def _pivots(self) -> Array:
         """Return those of J M⁻¹ Jᵀ + μ, after constraintDynamics."""
@@ -216,12 +216,12 @@ class PinConstraints:
         """Return v̇ of constraintDynamics under a force without h, all by Pinocchio; None where it is refused."""
         m, d, mu = self._m, self._d, self._mu
         models, data = self._rigid
-        settings = pin.ProximalSettings(_ACCURACY, _ACCURACY, mu, _ITERATIONS)
+        settings = pin.ProximalSettings(_PROXIMAL_ACCURACY, _PROXIMAL_ACCURACY, mu, _MAX_PROXIMAL_ITERATIONS)
         a: Array = pin.constraintDynamics(m, d, q, v, force, models, data, settings).copy()
         if not isfinite(sum(a.tolist())):
             return None
         pivots = self._pivots()
-        if np.count_nonzero(pivots - mu > _NO_PIVOT * mu) != len(self.choice.independent):
+        if np.count_nonzero(pivots - mu > _DEPENDENT_PIVOT_RATIO * mu) != len(self.choice.independent):
             return None
         return a if self._agree(q, v, a) else None
 
@@ -244,7 +244,7 @@ class PinConstraints:
                 x, y = (x + v_a.cross(v_b)).vector, y.vector
             (*x,), (*y,) = x.tolist(), y.tolist()
             size = max(map(abs, (*x, *y)))
-            if not max(abs(s - t) for s, t in zip(x, y, strict=True)) <= _AGREES * max(size, 1e-3):
+            if not max(abs(s - t) for s, t in zip(x, y, strict=True)) <= _ACCELERATION_DISAGREEMENT * max(size, 1e-3):
                 return False
         return True
 
@@ -290,7 +290,7 @@ class PinocchioConstrained(RowsOfFrames):
     """Quantities of constraints; `PinocchioDynamics` inherits it."""
 
     _held: PinConstraints
-    # Of the other parts.
+    # These stand in the other parts.
     _full_q: Callable[[Array], Array]
     _full_v: Callable[[Array], Array]
     _force: Callable[[Array], Array]

@@ -151,7 +151,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
             "inverse_dynamics_derivatives": INVERSE_DERIVATIVES,
             "forward_dynamics_derivatives": FORWARD_DERIVATIVES,
         }
-        # Of this model alone, in the place of the class's.
+        # These are of this model alone, in the place of the class's.
         vars(self)["_refuses"] = self._refuses | {
             name: why for name, path in given.items() if (why := path.refuses(model))
         }
@@ -191,7 +191,7 @@ class PinocchioDynamics(PinocchioBodies, PinocchioConstrained, Dynamics):
         # One call of Pinocchio's holds the interpreter's lock, and needs no other on data that nothing else uses.
         m, d, needs, damping = self._m, self._m.createData(), self.model.needs, self._joint_passive.damping
         bare: dict[str, Call] = {name: self._locked(getattr(self, f"_{name}")) for name in _DIRECT}
-        # What is mixed by G_q q spreads a NaN to every coordinate.
+        # The product G_q q spreads a NaN to every coordinate.
         unread: dict[str, set[int]] = {}
         if self._direct:
             q, v, zero = self.model.neutral(), np.zeros(m.nv), np.zeros(m.nv)

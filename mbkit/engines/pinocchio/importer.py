@@ -47,7 +47,7 @@ def _mjcf(text: str, files: dict[str, bytes]) -> tuple[Any, list[tuple[str, Any]
         try:
             _, points, frames = pin.buildModelAndConstraintsFromMJCF(str(path))
         except Exception as error:
-            # Of body2="world", say: the tree is read all the same.
+            # One of body2="world", say: the tree is read all the same.
             return raw, f"its reader of constraints refuses: {' '.join(str(error).split())}"
     return raw, [("point", x) for x in points] + [("frame", x) for x in frames]
 

@@ -32,7 +32,7 @@ _REFUSED: Final = {
 
 
 #: A run by the engine's own integrator is left this often, s, for signals and progress; after so many steps first.
-_PERIOD: Final = 0.1
+_SIGNAL_PERIOD: Final = 0.1
 _FIRST_STEPS: Final = 16
 
 
@@ -76,7 +76,7 @@ class VersionDynamics(MappedDynamics):
         orders = (np.arange(n) for n in layout.sizes[2:])
         self._gives = frozenset(gives)
         self._springs = JointPassive(self.model, *orders)
-        #: What the engine does not know of.
+        #: Passive forces that the engine does not know of.
         self._beside = None if "passive" in gives else self._springs
         rotors = None if self._beside is None else self._beside.rotors
         self._rotors = None if rotors is None else layout.G.T @ rotors @ layout.G
@@ -352,14 +352,14 @@ class VersionDynamics(MappedDynamics):
                 raise UnsupportedError(str(error)) from None
             parts.append((xs[..., 1:, :], us[..., 1:, :]))
             # The first call may have compiled the step.
-            count = max(_FIRST_STEPS, int(count * min(16.0, _PERIOD / (time.perf_counter() - begun))))
+            count = max(_FIRST_STEPS, int(count * min(16.0, _SIGNAL_PERIOD / (time.perf_counter() - begun))))
             x, u, done = xs[..., -1, :], us[..., -1, :], end
             progress(done / steps)
         xs, us = (np.concatenate(one, axis=-2) for one in zip(*parts, strict=True))
         q = np.empty_like(xs)
         q[..., self._places.q_index] = xs
         for start, _ in model.quaternions:
-            # Of unit length to the engine's precision alone.
+            # They have unit length to the engine's precision alone.
             q[..., start : start + 4] /= np.linalg.norm(q[..., start : start + 4], axis=-1, keepdims=True)
         self._native(q)
         return q, self._force(us)

@@ -25,16 +25,16 @@ from platformdirs import user_cache_path
 from mbkit.errors import OutputError, UnknownNameError, UnsupportedError
 
 #: Seconds that pip may take, and the import of an engine.
-_INSTALL, _IMPORT = 1800.0, 120.0
-#: What pip says where a version does not exist, or where it reached no index.
+_INSTALL_SECONDS, _IMPORT_SECONDS = 1800.0, 120.0
+#: Words of pip where a version does not exist, or where it reached no index.
 _VERSIONS: Final = re.compile(r"from versions: ([^)]*)\)")
 _NO_VERSION: Final = "there is no version of"
 _AVAILABLE: Final = re.compile(r"^Available versions: (.+)$", re.MULTILINE)
 #: A shared library that the system does not find.
 _LIBRARY: Final = re.compile(r"(lib[\w+-]+)\.so[.\d]*: cannot open shared object")
 _OLD_NUMPY: Final = "numpy<2"
-#: So many bounds on dependencies are tried, one after the other.
-_MOST_LIMITS: Final = 12
+#: Bounds on dependencies that are tried, one after the other.
+_MAX_DEPENDENCY_BOUNDS: Final = 12
 
 Report = Callable[[str], object]
 
@@ -171,7 +171,7 @@ def _limit(path: Path, reason: str, limits: Sequence[str]) -> str:
     missing = _LIBRARY.search(reason)
     if missing is None:
         return "" if _OLD_NUMPY in limits else _OLD_NUMPY
-    if len(limits) > _MOST_LIMITS:
+    if len(limits) > _MAX_DEPENDENCY_BOUNDS:
         return ""
     for record in path.rglob("*.dist-info/RECORD"):
         if re.search(rf"/{re.escape(missing[1])}\.so[.,]", record.read_text(encoding="utf-8")):
@@ -185,7 +185,7 @@ def _limit(path: Path, reason: str, limits: Sequence[str]) -> str:
 def _install(pip: Sequence[str], distribution: str, version: str, limits: Sequence[str], extra: str) -> None:
     wanted = f"{distribution}{extra}=={version}"
     # A compiler would take long, and versions without a wheel are rarely built by one.
-    done = _finished([*pip, "--only-binary=:all:", wanted, *limits], _INSTALL)
+    done = _finished([*pip, "--only-binary=:all:", wanted, *limits], _INSTALL_SECONDS)
     if done.returncode == 0:
         return
     name = f"{distribution} {version}"
@@ -207,7 +207,7 @@ def available(distribution: str) -> tuple[str, ...]:
     """
     if not find_spec("pip"):
         raise UnsupportedError(f"the versions of {distribution} are not known without pip; name them one by one")
-    done = _finished([sys.executable, "-m", "pip", "index", "versions", distribution], _IMPORT)
+    done = _finished([sys.executable, "-m", "pip", "index", "versions", distribution], _IMPORT_SECONDS)
     found = _AVAILABLE.search(done.stdout)
     if found is None:
         raise UnsupportedError(f"the versions of {distribution} are not known; {_reason(done.stderr)}")
@@ -225,13 +225,13 @@ def _reason(said: str) -> str:
 
 def _import_failure(path: Path, module: str) -> str:
     """Return why the interpreter of an environment cannot import a module; empty where it can."""
-    done = _finished([str(python_of(path)), "-E", "-s", "-c", f"import numpy, {module}"], _IMPORT)
+    done = _finished([str(python_of(path)), "-E", "-s", "-c", f"import numpy, {module}"], _IMPORT_SECONDS)
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     return "" if done.returncode == 0 else (lines or [f"status {done.returncode}"])[-1]
 
 
 def _run(command: list[str], what: str) -> None:
-    done = _finished(command, _IMPORT)
+    done = _finished(command, _IMPORT_SECONDS)
     if done.returncode:
         said = " ".join((done.stderr or done.stdout).split())
         raise UnsupportedError(f"no environment can be made here; {what}: {said[:400]}")

@@ -80,8 +80,8 @@ _JAX: Final = {
     # place of 0.4 ms (jaxlib 0.10.2).
     "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
 }
-#: Where the first call of each function compiles it, s.
-_COMPILING: Final = 600.0
+#: Limit of a call where the first one of each function compiles it.
+_COMPILING_SECONDS: Final = 600.0
 _WARP: Final = {"WARP_CACHE_PATH": "{environment}/kernels"}
 _MJX: Final = Package(
     "mujoco-mjx",
@@ -91,7 +91,7 @@ _MJX: Final = Package(
     tested=("3.17.0",),
     file="mjx",
     variables={**_JAX, "JAX_ENABLE_X64": "1"},
-    limit=_COMPILING,
+    limit=_COMPILING_SECONDS,
     importer="mujoco_importer",
 )
 #: Engines with a file of their own in `remote`.
@@ -116,7 +116,7 @@ PACKAGES: Final[dict[str, Package]] = {
         tested=("1.8.0",),
         extra="[sim]",
         variables=_WARP,
-        limit=_COMPILING,
+        limit=_COMPILING_SECONDS,
         importer="newton_importer",
     ),
     "mujoco-warp": Package(
@@ -126,7 +126,7 @@ PACKAGES: Final[dict[str, Package]] = {
         tested=("4.0.0",),
         file="mujoco_warp",
         variables=_WARP,
-        limit=_COMPILING,
+        limit=_COMPILING_SECONDS,
         importer="mujoco_importer",
     ),
     "mjx": _MJX,

@@ -23,7 +23,7 @@ from mbkit.engines.remote.served import serve
 from mbkit.errors import EngineProcessError
 
 #: Seconds until a library is loaded.
-_START: Final = 120.0
+_START_SECONDS: Final = 120.0
 _SERVE: Final = Path(serve.__file__)
 
 
@@ -68,8 +68,8 @@ class EngineProcess(Child):
 
     def start(self) -> int:
         """Start the process unless it runs, and return its generation."""
-        with self._lock, self._told(_START):
-            self._start(_START)
+        with self._lock, self._told(_START_SECONDS):
+            self._start(_START_SECONDS)
         return self.generation
 
     def _command(self, handle: int) -> tuple[Sequence[str], Mapping[str, str]]:

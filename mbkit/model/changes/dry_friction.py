@@ -181,7 +181,7 @@ class Sliding:
         for joint in model.joints:
             part = layout.full_v[joint.name]
             joints.append(replace(joint, friction=np.zeros(joint.type.nv), stiction=None, stribeck_velocity=None))
-            # What follows by a ratio of zero does not move.
+            # A joint that follows by a ratio of zero does not move.
             own_free = {(field, k): x for (name, field, k), x in free.items() if name == joint.name}
             if not (own_free or numbers.bound[part].any()) or not layout.G[part].any():
                 continue

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from mbkit import spatial
 from mbkit._check import Array, shown
 from mbkit.errors import InputError
-from mbkit.model.builder import LONGEST, ModelBuilder, expect_model
+from mbkit.model.builder import MAX_LENGTH, ModelBuilder, expect_model
 from mbkit.model.elements.paths import OF_BODIES, Path
 from mbkit.model.elements.references import KINDS_OF_PARTS, entries, hung_on
 from mbkit.model.model import Model
@@ -26,8 +26,8 @@ def read_pose(name: str, pose: ArrayLike | None) -> tuple[Array, Array]:
     if pose is None:
         return np.eye(3), np.zeros(3)
     X = spatial.checked_pose(name, pose)
-    if np.abs(X[:3, 3]).max() > LONGEST:
-        raise InputError(f"{name}: expected lengths up to {LONGEST:g} m, got {np.abs(X[:3, 3]).max():g}")
+    if np.abs(X[:3, 3]).max() > MAX_LENGTH:
+        raise InputError(f"{name}: expected lengths up to {MAX_LENGTH:g} m, got {np.abs(X[:3, 3]).max():g}")
     return X[:3, :3], X[:3, 3]
 
 

@@ -19,10 +19,10 @@ from mbkit.model.parameters import nominal
 from mbkit.model.parts import Joint
 
 SEGMENTED: Final = Path("segmented", "segmented: not known of", ALL)
-#: Of a segment's inertia, that about its own axis: a beam has none, and MuJoCo takes no body without.
-_ABOUT_AXIS: Final = 1e-6
-#: Stiffnesses of modes that belong to one EI, to rounding.
-_SAME: Final = 1e-9
+#: Part of a segment's inertia that it has about its own axis: a beam has none, and MuJoCo takes no body without.
+_AXIAL_INERTIA_RATIO: Final = 1e-6
+#: Relative spread, by rounding, of the EI that stiffnesses of modes belong to.
+_STIFFNESS_SPREAD: Final = 1e-9
 
 
 def segmented(model: Model, segments: int) -> Model:
@@ -66,7 +66,7 @@ def _numbers(model: Model, joint: Joint, points: list[Joint]) -> tuple[list[Any]
         ("mass of its points", masses, [rho * w for w in beam.weights]),
     ):
         one, other = (np.array([nominal(x) for x in values]) for values in (own, whole))
-        if not np.allclose(one, other, rtol=_SAME, atol=0.0, equal_nan=True):
+        if not np.allclose(one, other, rtol=_STIFFNESS_SPREAD, atol=0.0, equal_nan=True):
             raise UnsupportedError(
                 f"segmented: the {what} of beam {joint.name!r} is not that of one uniform beam: {one}; let add_beam "
                 "set it"
@@ -98,7 +98,7 @@ def _add_chain(b: ModelBuilder, joint: Joint, n: int, EI: list[Any], tau: Any, r
 
     def segment(body: str, long: float) -> None:
         J = rho * (long**3 / 12)
-        b.add_body(body, mass=rho * long, com=(long / 2, 0.0, 0.0), inertia=[_ABOUT_AXIS * J, J, J])
+        b.add_body(body, mass=rho * long, com=(long / 2, 0.0, 0.0), inertia=[_AXIAL_INERTIA_RATIO * J, J, J])
 
     before, at, last = joint.parent, 0.0, h
     if any(nominal(x) for x in EI):

@@ -21,18 +21,18 @@ from mbkit._check import Array, count, shown
 from mbkit.errors import InputError
 from mbkit.model.joint_types import KINDS, JointType, Placement, Rows, Scalars, Twist, cross3, register_joint_type
 
-#: Of modes, and of a polynomial's degree: the rule integrates products of eight slopes to rounding.
-_MOST_MODES: Final = 10
-_MOST_DEGREE: Final = 20
+#: Modes of a beam, and degree of a shape: the rule integrates products of eight slopes to rounding.
+_MAX_MODES: Final = 10
+_MAX_POLYNOMIAL_DEGREE: Final = 20
 _RULE: Final = np.polynomial.legendre.leggauss(96)
 _EPS: Final = float(np.finfo(float).eps)
-#: What the fine rule's rounding leaves between two rules that are both exact; one point more gains a factor of 20.
-_ROUNDING: Final = 500 * _EPS
+#: Difference of two exact rules by the fine one's rounding; one point more gains a factor of 20.
+_RULE_ROUNDING: Final = 500 * _EPS
 _IDENTITY: Final[Rows] = np.eye(3).tolist()
 #: The straight line from the root.
 _ROOTED: Final = Polynomial((0.0, 1.0))
-#: Of what a shape may move its clamp by, of its largest coefficient.
-_CLAMPED: Final = 1e-12
+#: Motion of its clamp that a shape may have, beside its largest coefficient.
+_CLAMP_MOTION_RATIO: Final = 1e-12
 
 
 #: Lengths, m, of which the third power keeps its digits beside 1.
@@ -90,24 +90,26 @@ def modes_of(modes: Any, shapes: Any, *, string: bool) -> Modes:
         raise InputError("expected modes or shapes, one of them")
     if shapes is None:
         n = count("modes", modes, least=1)
-        if n > _MOST_MODES:
-            raise InputError(f"modes: expected at most {_MOST_MODES}, got {n}")
+        if n > _MAX_MODES:
+            raise InputError(f"modes: expected at most {_MAX_MODES}, got {n}")
         return (
             modes_within([_ROOTED * Legendre.basis(k, (0, 1)).convert(kind=Polynomial) for k in range(n)])
             if string
             else clamped_free(n)
         )
     given = list(shapes) if isinstance(shapes, (list, tuple)) else [shapes]
-    if not 0 < len(given) <= _MOST_MODES:
-        raise InputError(f"shapes: expected 1 to {_MOST_MODES} shapes, got {len(given)}")
+    if not 0 < len(given) <= _MAX_MODES:
+        raise InputError(f"shapes: expected 1 to {_MAX_MODES} shapes, got {len(given)}")
     for i, f in enumerate(given):
-        # Of NumPy's kinds floats alone: complex numbers and objects are none.
+        # Only floats of NumPy's kinds: complex numbers and objects are none.
         real = isinstance(f, Polynomial) and f.coef.dtype.kind == "f" and np.isfinite(f.coef).all()
-        if not real or f.degree() > _MOST_DEGREE:
-            expected = f"numpy.polynomial.Polynomial of s/length, real and finite, of degree <= {_MOST_DEGREE}"
+        if not real or f.degree() > _MAX_POLYNOMIAL_DEGREE:
+            expected = (
+                f"numpy.polynomial.Polynomial of s/length, real and finite, of degree <= {_MAX_POLYNOMIAL_DEGREE}"
+            )
             raise InputError(f"shapes[{i}]: expected a {expected}, got {shown(f)}")
         held = abs(f(0.0)) if string else max(abs(f(0.0)), abs(f.deriv()(0.0)))
-        if held > _CLAMPED * np.abs(f.coef).max() or not f.coef.any():
+        if held > _CLAMP_MOTION_RATIO * np.abs(f.coef).max() or not f.coef.any():
             where = "at the root" if string else "with its slope at the clamp"
             raise InputError(f"shapes[{i}]: expected zero {where} and not everywhere, got {f}")
     return modes_within(given)
@@ -267,7 +269,7 @@ def beam_types(length: float, modes: Modes, planes: int) -> tuple[BeamEnd, tuple
     size = np.sqrt(np.diag(exact))
     for points in range(2, len(fine)):
         xi, weights = _unit_rule(*np.polynomial.legendre.leggauss(points))
-        if (np.abs(moments(xi, weights) - exact) / size / size[:, None]).max() < _ROUNDING:
+        if (np.abs(moments(xi, weights) - exact) / size / size[:, None]).max() < _RULE_ROUNDING:
             break
 
     def blocks(A: Array) -> Array:

@@ -36,7 +36,7 @@ _AXES: Final = get_args(Axes)
 _ENDS: Final = get_args(Ends)
 _Vector = ArrayLike | Sequence[Number]
 #: Limit of a beam's amplitudes together, as a part of its length.
-_DEFLECTION: Final = 0.1
+_MAX_DEFLECTION_RATIO: Final = 0.1
 #: Values by the names that stand for them in expressions.
 Constants = Mapping[str, Number]
 
@@ -483,7 +483,7 @@ class ElementBuilder:
         each = end.nv // len(EI)
         K = [EI[k // each] * c for k, c in enumerate(end.squares)]
         loss = 0.0 if _is_zero(tau) else [tau * k for k in K]
-        reach = _DEFLECTION * long / each
+        reach = _MAX_DEFLECTION_RATIO * long / each
         self.add_joint(*(name, end.name), parent=root, child=name, stiffness=K, damping=loss, lower=-reach, upper=reach)
         for k, (point, weight) in enumerate(zip(points, end.weights, strict=True)):
             own = f"{name}.{k + 1}"

@@ -32,7 +32,7 @@ _Vector = ArrayLike | Sequence[Number]
 _Numbers = ArrayLike | Sequence[Number] | Number
 EDITED: Final = Path("editing", "ModelBuilder.of: not known of", OF_BODIES)
 #: Numbers up to which a note says them all.
-_FEW: Final = 3
+_MAX_NOTED_NUMBERS: Final = 3
 #: Arguments of joints with a number for each coordinate or velocity.
 NUMBERS_OF_JOINTS: Final = tuple(n for n, rule in rules_of(Joint).items() if rule.shape in (OF_Q, OF_V))
 
@@ -406,7 +406,7 @@ class EditingBuilder:
         old = {b.field for b in self._bindings if (b.where, b.part) == (kind, part.name)}
         changed = [*_changes(part, numbers, old, {b.field for b in (*new, *more)})]
         if kind == "bodies":
-            # What was used as written is judged again.
+            # Bodies that were used as written are judged again.
             self._odd.discard(part.name)
         self._bindings = [
             b for b in self._bindings if (b.where, b.part) != (kind, part.name) or b.field not in bound
@@ -469,7 +469,7 @@ def _changes(part: Any, numbers: Mapping[str, Any], were_free: set[str], free: s
             yield f"{name} has a parameter"
         elif name in were_free or (name == "mimic" and were_free & {"ratio", "offset"}):
             yield f"{name} has no parameter any more"
-        elif isinstance(old, Mimic) or isinstance(new, Mimic) or np.size(new) > _FEW:
+        elif isinstance(old, Mimic) or isinstance(new, Mimic) or np.size(new) > _MAX_NOTED_NUMBERS:
             yield from () if np.array_equal(old, new) else (name,)
         elif not np.array_equal(old, new):
             yield f"{name} {_short(old)} to {_short(new)}" if isinstance(new, (float, np.ndarray)) else name

@@ -29,8 +29,8 @@ TIME: Final = "t"
 POINT: Final = ENTRIES[:3]
 TWIST: Final = ("vx", "vy", "vz", "wx", "wy", "wz")
 DISPLACEMENT: Final = ENTRIES
-#: Asymmetry of a stiffness that is no rounding.
-_ASYMMETRY: Final = 1e-12
+#: Relative asymmetry of a stiffness that is rounding.
+_ASYMMETRY_ROUNDING: Final = 1e-12
 
 
 class Force(_Frozen):
@@ -251,9 +251,9 @@ class Bushing(Force):
             if np.isnan(matrix).any():
                 continue
             size = np.abs(matrix).max()
-            if what == "stiffness" and np.abs(matrix - matrix.T).max() > _ASYMMETRY * size:
+            if what == "stiffness" and np.abs(matrix - matrix.T).max() > _ASYMMETRY_ROUNDING * size:
                 yield "stiffness: expected a symmetric matrix, which has a potential energy; give the rest as a formula"
-            elif np.linalg.eigvalsh((matrix + matrix.T) / 2)[0] < -_ASYMMETRY * size:
+            elif np.linalg.eigvalsh((matrix + matrix.T) / 2)[0] < -_ASYMMETRY_ROUNDING * size:
                 yield f"{what}: expected a matrix without negative eigenvalues, got one that drives the motion"
 
     def __str__(self) -> str:
@@ -365,7 +365,7 @@ def force_faults(model: _Model) -> Iterator[str]:
 
 
 def _symbol_faults(force: Force, own: tuple[str, ...], others: Mapping[str, Any]) -> Iterator[str]:
-    # Of a joint named q, both are the same number.
+    # Both are the same number of a joint named q.
     same = {*force.joints} & {*own} if isinstance(force, JointElement) else set()
     for name in force.arguments:
         meanings = [

@@ -18,13 +18,13 @@ from mbkit._check import Array
 from mbkit.model.elements.formula import Arithmetic, Formula
 from mbkit.model.parts import Constants, NumberRule, OfJoint, Prescribed
 
-#: Of a table's end: what the rounding of a run's last time can be beyond it.
-_ROUNDING: Final = 1e-12
+#: Part of a table's end by which the rounding of a run's last time can be beyond it.
+_TABLE_END_ROUNDING: Final = 1e-12
 #: Jump of x, x' or x'' between pieces of a spline, beside the largest value, from which it is no rounding.
-_JUMP: Final = 1e-6
+_JUMP_RATIO: Final = 1e-6
 _TABLE: Final = NumberRule(shape=None, fixed="it is a table's")
 #: Comparisons of each evaluation grow with the knots: at so many a step takes some 0.1 ms.
-MOST_KNOTS: Final = 2000
+MAX_KNOTS: Final = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ def beyond(motions: tuple[Motion, ...], *times: float) -> str:
     """Return why not all motions are defined at some times; empty where they are."""
     for part in motions:
         first, last = interval(part)
-        slack = _ROUNDING * (abs(first) + abs(last))
+        slack = _TABLE_END_ROUNDING * (abs(first) + abs(last))
         for t in times:
             if not first - slack <= t <= last + slack:
                 return (
@@ -167,8 +167,8 @@ def motion_faults(motions: tuple[Motion, ...]) -> Iterator[str]:
 
 def _spline_faults(item: str, part: SplineMotion) -> Iterator[str]:
     knots, c = part.knots, part.coefficients
-    if len(knots) > MOST_KNOTS:
-        yield f"{item}: expected up to {MOST_KNOTS} knots, got {len(knots)}; thin out the table"
+    if len(knots) > MAX_KNOTS:
+        yield f"{item}: expected up to {MAX_KNOTS} knots, got {len(knots)}; thin out the table"
         return
     widths = np.diff(knots)
     if not (widths > 0).all():
@@ -180,7 +180,7 @@ def _spline_faults(item: str, part: SplineMotion) -> Iterator[str]:
         starts = c[-1] if len(c) else np.zeros(len(widths))
         size = float(np.abs([ends, starts]).max(initial=0.0))
         jumps = np.abs(ends[:-1] - starts[1:])
-        if size and (jumps > _JUMP * size).any():
+        if size and (jumps > _JUMP_RATIO * size).any():
             k = int(jumps.argmax())
             yield (
                 f"{item}: the {what} jumps by {jumps[k]:.3g} at {knots[k + 1]:.9g} s; expected a spline with a "

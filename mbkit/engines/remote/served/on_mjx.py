@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 __all__ = ["VERSION", "Engine", "built"]
 VERSION = version("mujoco-mjx")
 #: The smallest stack that is compiled, beside one state alone; larger ones have twice as many, and so on.
-_LEAST = 16
+_MIN_STACK = 16
 
 
 def put(m: Any) -> Any:
@@ -51,7 +51,7 @@ class Engine:
             axes = (0,) * len(states) + (None,) * len(shared)
             self._compiled[key] = jax.jit(jax.vmap(function, in_axes=axes))
         n = len(states[0])
-        size = n if n == 1 else max(_LEAST, 1 << (n - 1).bit_length())
+        size = n if n == 1 else max(_MIN_STACK, 1 << (n - 1).bit_length())
         # A stack of another size would be compiled again.
         full = [np.concatenate([x, np.repeat(x[-1:], size - n, axis=0)]) for x in states]
         out = self._compiled[key](*full, *shared)
@@ -130,11 +130,11 @@ class Engine:
             return jax.lax.scan(step, self._d.replace(qpos=q, qvel=v), tau)[1]
 
         # A run of another length would be compiled again.
-        length = steps if steps == 1 else _LEAST * -(-steps // _LEAST)
+        length = steps if steps == 1 else _MIN_STACK * -(-steps // _MIN_STACK)
         parts = [(q[:, None], v[:, None])]
         held = np.zeros((len(q), length, self._m.nv))
         held[:, :steps] = 0.0 if tau is None else tau
-        for part in np.split(held, max(1, length // _LEAST), axis=1):
+        for part in np.split(held, max(1, length // _MIN_STACK), axis=1):
             start = [x[:, -1] for x in parts[-1]]
             parts.append(self._over(("rollout", method), run, *start, part, shared=(dt,)))
         return [np.concatenate(x, axis=1)[:, : steps + 1] for x in zip(*parts, strict=True)]
